@@ -25,14 +25,15 @@ from torchcover.report.renderers.records import COLUMNS
 
 ROOT = Path(__file__).parent.parent
 ROOMS = (
-    "coverage", "evaluation", "placement", "targets", "data", "simulation", "cameras", "detection", "training",
-    "metrics", "estimation", "neighbors", "report", "geometry",
+    "coverage", "evaluation", "placement", "targets", "encounters", "data", "simulation", "cameras", "detection",
+    "training", "metrics", "estimation", "neighbors", "report", "geometry",
 )  # fmt: skip
 # Where the classes of documents are defined.
 DOCUMENTS = (
     "torchcover.simulation",
     "torchcover.recordings",
     "torchcover.targets",
+    "torchcover.encounters",
     "torchcover.coverage",
     "torchcover.placement",
 )

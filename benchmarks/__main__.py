@@ -3,6 +3,8 @@
 import importlib
 import sys
 
+from torchcover.evaluation.cores import set_threads
+
 # Of speed and memory, which docs/measured/performance.md is made of; the others have pages of their own.
 PERFORMANCE = ("run", "nearest", "crossover", "raycasting", "moving_actors", "reading", "omissions")
 BENCHMARKS = (
@@ -25,6 +27,7 @@ BENCHMARKS = (
     "scaling",
     "mutated_files",
     "targets",
+    "kinds",
     "towns",
     "pairing",
     "placement",
@@ -36,6 +39,7 @@ BENCHMARKS = (
 
 
 def main(names):
+    set_threads()  # as the command line does
     unknown = set(names) - set(BENCHMARKS)
     if unknown:
         sys.exit(f"no benchmark {', '.join(sorted(unknown))}; there are {', '.join(BENCHMARKS)}")

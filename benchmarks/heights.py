@@ -82,8 +82,7 @@ def of_world(world):
         coverages = measured(frames, {band_frame: Way.of(band_frame) for band_frame in FRAMES})
     maps = {}
     for band_frame, coverage in coverages.items():
-        m2, _ = coverage.area.spread_over(torch.ones(coverage.grid.shape, dtype=torch.bool))
-        maps[band_frame] = m2.sum(dim=0).view(coverage.grid.shape) / coverage.counts["steps"], coverage.grid
+        maps[band_frame] = coverage.area.totals()[0] / coverage.counts["steps"], coverage.grid
     return {band_frame: estimates(coverage) for band_frame, coverage in coverages.items()}, maps
 
 

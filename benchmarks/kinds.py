@@ -37,7 +37,8 @@ def main(steps=STEPS):
         pairs = list(combinations(RIGS, 2))
         turned = sum(any(_turns(world, result, place, pair) for world in worlds) for pair in pairs)
         most, error = max(spans)
-        rows.append((" ".join(place), f"{100 * most:.1f} +- {100 * error:.1f}", f"{turned} of {len(pairs)}"))
+        known = "" if math.isnan(error) else f" +- {100 * error:.1f}"
+        rows.append((" ".join(place), f"{100 * most:.1f}{known}", f"{turned} of {len(pairs)}"))
     table(("place", "points", "pairs of rigs"), rows)
 
 

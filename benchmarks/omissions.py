@@ -20,7 +20,7 @@ STEP = 200
 def main():
     """Print the table of run times and one of the counts that frames carry."""
     urban = Scene(Scenario.load("urban").world())
-    roof, kitti = (Rig.load(rig).sensors[0] for rig in ("front_roof_128", "kitti"))
+    roof, kitti = (Rig.load(rig).sensing("ideal").sensors[0] for rig in ("front_roof_128", "kitti"))
     rows = [
         row("bodies out of range, 120 m", *bodies_out_of_range(urban, roof)),
         row("bodies that a ray cannot meet", *rays_that_pass_by(urban)),

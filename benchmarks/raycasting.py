@@ -60,7 +60,7 @@ def main():
             def scan(pose=pose):
                 instant.scan(pose, tiles, threads=THREADS)
 
-            seconds, ratios = compare(embreex, generate_and_cast, scan, rounds=21)
+            seconds, ratios = compare(embreex, generate_and_cast, scan, rounds=7)
             rows.append((seed, *seconds, 1 / ratios[1], 1 / ratios[2]))
     header = ("pose", "bare embreex (s)", "rays and hits (s)", "and points (s)", "bare / rays and hits", "bare / all")
     table(header, rows)

@@ -52,7 +52,7 @@ def reading(recording):
         for index in range(SWEEPS):
             in_vehicle(recording.scan("velodyne", index), recording.body)
 
-    seconds, ratios = compare(straight, ours, clock=time.process_time)
+    seconds, ratios = compare(straight, ours)
     rows = [
         (name, 1000 * s / SWEEPS, r) for name, s, r in zip(("straight", "the reader"), seconds, ratios, strict=True)
     ]

@@ -1,10 +1,10 @@
-"""Ratios of run times. Two things are compared only within one run, in turns."""
+"""Ratios of processor times, which others change little. Two things are compared only within one run, in turns."""
 
 import statistics
 import time
 
 
-def compare(*functions, rounds=7, clock=time.perf_counter):
+def compare(*functions, rounds=7, clock=time.process_time):
     """Seconds of each function and their ratio to the first, as medians over rounds in which they take turns."""
     times = []
     for _ in range(rounds + 1):

@@ -2,6 +2,7 @@ from . import cameras as cameras
 from . import coverage as coverage
 from . import data as data
 from . import detection as detection
+from . import encounters as encounters
 from . import estimation as estimation
 from . import evaluation as evaluation
 from . import geometry as geometry
@@ -19,6 +20,7 @@ from .coverage import CoverageMetric as CoverageMetric
 from .coverage import Region as Region
 from .coverage import forward_regions as forward_regions
 from .evaluation import compare as compare
+from .evaluation import encounter as encounter
 from .evaluation import evaluate as evaluate
 from .evaluation import survey_target as survey_target
 from .neighbors import blind_spot_radius as blind_spot_radius

@@ -10,8 +10,9 @@ import torch
 
 from torchcover import Coverage
 from torchcover.coverage import Layer
-from torchcover.coverage.blocks import AreaSums, Blocks
+from torchcover.coverage.blocks import BlockSums, KnownCells
 from torchcover.coverage.region_sums import PlaceSums
+from torchcover.metrics import added_up
 
 
 def check_conditions(folder, conditions):
@@ -57,28 +58,36 @@ def merged(pieces):
     Args:
         pieces: Coverages of the same grid over different steps, without blocks of their own.
     """
-    first = pieces[0]
-    probed_steps = torch.stack([piece.probed_steps for piece in pieces])
-    means = torch.stack([torch.cat([piece.radius[None], piece.detection]) for piece in pieces])
-    sums = (means * probed_steps[:, None]).where(probed_steps[:, None] > 0, 0.0)  # (B, Q, H, Y, X)
-    steps = torch.tensor([piece.counts["steps"] for piece in pieces])
-    whole = sums.sum(dim=0) / probed_steps.sum(dim=0)  # 0 / 0, which is NaN, where no step had a point
+    first, steps = pieces[0], torch.tensor([piece.counts["steps"] for piece in pieces])
+    every = [piece.known for piece in pieces]
+    counts = [torch.stack([known.at, known.points, known.probed_steps], dim=1).double() for known in every]
+    means = [torch.stack([piece.listed[one.key].values for one in first.quantities]) for piece in pieces]
+    sums = [known.probed_steps * own for known, own in zip(every, means, strict=True)]
+    whole = added_up(torch.cat([torch.cat([one, own.T], dim=1) for one, own in zip(counts, sums, strict=True)])).T
+    at, points, probed_steps = whole[:3].long()
+    blocks = [
+        BlockSums(steps[:1], (1, *first.grid.shape), known.at, known.probed_steps, own)
+        for known, own in zip(every, sums, strict=True)
+    ]
     return Coverage(
         grid=first.grid,
         thresholds=first.thresholds,
         max_radius=first.max_radius,
-        probed_steps=probed_steps.sum(dim=0),
-        points=torch.stack([piece.points for piece in pieces]).sum(dim=0),
-        layers=map(Layer, first.quantities, whole),
+        known=KnownCells(first.grid.shape, at, probed_steps, points),
+        layers=map(Layer, first.quantities, whole[3:] / probed_steps),
         counts={name: sum(piece.counts[name] for piece in pieces) for name in Coverage.COUNTS},
-        blocks=Blocks.of(steps, probed_steps, sums),
-        area=_merged([piece.area for piece in pieces], steps, AreaSums.of),
+        blocks=_side_by_side(blocks, steps),
+        area=None if first.area is None else _side_by_side([piece.area for piece in pieces], steps),
         regions=first.regions,
-        places=_merged([piece.places for piece in pieces], steps, PlaceSums),
+        places=None
+        if first.places is None
+        else PlaceSums(steps, *map(torch.cat, zip(*(piece.places[1:] for piece in pieces), strict=True))),
     )
 
 
-def _merged(pieces, steps, of):
-    if pieces[0] is None:
-        return None
-    return of(steps, torch.cat([piece.m2 for piece in pieces]), torch.cat([piece.sums for piece in pieces]))
+def _side_by_side(pieces, steps):
+    """Sums in one block each, as blocks of one run."""
+    cells = torch.Size(pieces[0].shape[1:])
+    at = [piece.at + number * cells.numel() for number, piece in enumerate(pieces)]
+    base, listed = [piece.base for piece in pieces], [piece.listed for piece in pieces]
+    return BlockSums(steps, (len(pieces), *cells), torch.cat(at), torch.cat(base), torch.cat(listed, dim=1))

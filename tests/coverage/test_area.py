@@ -179,7 +179,7 @@ def test_a_region_that_was_not_asked_for_is_made_from_whole_cells_or_refused(tmp
 
 def test_a_cell_has_the_ratio_of_its_own_sums():
     coverage = metric_over(steps_of(30), cell=4.0).compute()
-    band = coverage.area.m2.sum(dim=0)[0]
+    band = coverage.area.totals()[0, 0]
     radius = coverage.layers["radius_area_m"].values[0]
     detection = coverage.layers["detection_area_0.8m"].values[0]
     value = coverage.estimate(REGION, "low", "area").value

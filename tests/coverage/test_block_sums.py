@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchcover.coverage.blocks import AreaSums
+from torchcover.coverage.blocks import BlockSums
 
 SHAPE, QUANTITIES = (5, 2, 3, 4), 3
 
@@ -22,13 +22,16 @@ def arrays(share, seed=0):
     return base, sums
 
 
+def listed_of(base, sums):
+    at, flat = np.flatnonzero(base), np.moveaxis(sums, 1, 0).reshape(QUANTITIES, -1)
+    return BlockSums(torch.arange(5), SHAPE, *map(torch.from_numpy, (at, base.flat[at], flat[:, at])))
+
+
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 1.0])
 def test_lists_say_what_the_arrays_said(share):
     base, sums = arrays(share)
-    listed = AreaSums.of(torch.arange(5), *map(torch.from_numpy, (base, sums)))
+    listed = listed_of(base, sums)
     assert len(listed.at) == (base > 0).sum()
-    np.testing.assert_array_equal(listed.m2, base)
-    np.testing.assert_array_equal(listed.sums, sums)
     for blocks in (1, 3):
         enough = (base > 0).sum(axis=0) >= blocks
         cells, *spread = listed.spread_where(blocks)
@@ -46,11 +49,11 @@ def test_lists_say_what_the_arrays_said(share):
     np.testing.assert_array_equal(spread[1], sums[:, :, band, known].swapaxes(0, 1))
 
 
-def test_nothing_in_the_lists_belongs_to_the_arrays():
-    """A result stays what it is while its metric goes on."""
-    steps, (base, sums) = torch.arange(5), map(torch.from_numpy, arrays(1.0))
-    listed = AreaSums.of(steps, base, sums)
-    before = [one.clone() for one in (listed.steps, listed.base, listed.listed)]
-    for array in (steps, base, sums):
-        array.add_(1)
-    assert all(map(torch.equal, before, (listed.steps, listed.base, listed.listed)))
+def test_what_is_moved_is_added_up_in_its_block():
+    base, sums = arrays(0.5)
+    moved = listed_of(base, sums).moved(lambda cell: cell // 2, SHAPE[1] * SHAPE[2] * 2, (*SHAPE[1:3], 2))
+    halves = base.reshape(*SHAPE[:3], 2, 2).sum(axis=-1)
+    np.testing.assert_array_equal(moved.at, np.flatnonzero(halves))
+    np.testing.assert_allclose(moved.base, halves[halves > 0], rtol=1e-14)
+    halves_of_sums = np.moveaxis(sums.reshape(5, QUANTITIES, *SHAPE[1:3], 2, 2).sum(axis=-1), 1, 0)
+    np.testing.assert_allclose(moved.listed, halves_of_sums[:, halves > 0], rtol=1e-13, atol=1e-13)

@@ -9,7 +9,7 @@ import torch
 
 from torchcover import BevGrid, CoverageMetric, Region
 from torchcover.coverage import Coverage, Layer, Maximum, MeanOfMeans, PooledMean, Quantiles
-from torchcover.coverage.blocks import Blocks, KnownCells
+from torchcover.coverage.blocks import BlockSums, KnownCells
 from torchcover.estimation import jackknife_error, ratio_errors
 
 # Cells so large that the sensor point below a reference point is always the nearest.
@@ -155,9 +155,11 @@ def test_sums_and_errors_are_those_of_plain_loops(count):
     steps = random_steps(count, seed=count)
     coverage, sums = metric_over(steps).compute(), slow_blocks(steps, 16)
     np.testing.assert_array_equal(coverage.blocks.steps, sums["steps"])
-    np.testing.assert_array_equal(coverage.blocks.probed_steps.flatten(1), sums["probed_steps"])
-    np.testing.assert_allclose(coverage.blocks.sums[:, 0].flatten(1), sums["radius"], rtol=1e-12)
-    np.testing.assert_allclose(coverage.blocks.sums[:, 1].flatten(1), sums["detection"], rtol=1e-12)
+    cells, probed_steps, listed = coverage.blocks.spread_where(1)
+    assert cells.tolist() == list(range(CELLS))
+    np.testing.assert_array_equal(probed_steps, sums["probed_steps"])
+    np.testing.assert_allclose(listed[0], sums["radius"], rtol=1e-12)
+    np.testing.assert_allclose(listed[1], sums["detection"], rtol=1e-12)
     (row,) = coverage.summary([EVERYWHERE])
     assert row.numbers["radius_m"].error == pytest.approx(slow_region_error(sums, "radius"), rel=1e-9)
     assert row.numbers["detection_0.5m"].error == pytest.approx(slow_region_error(sums, "detection"), rel=1e-9)
@@ -441,7 +443,7 @@ def coverage_of(radii: np.ndarray, probed: np.ndarray) -> Coverage:
     frames, sums = probed.sum(dim=1).long(), values.sum(dim=2)
     means = sums.sum(dim=1) / frames.sum(dim=0)
     steps, at = torch.full((16,), radii.shape[1]), frames.sum(dim=0).flatten().nonzero().squeeze(1)
-    counts = dict.fromkeys(Coverage.COUNTS, 0)
+    counts, listed = dict.fromkeys(Coverage.COUNTS, 0), frames.flatten().nonzero().squeeze(1)
     return Coverage(
         grid=GRID,
         thresholds=(THRESHOLD,),
@@ -449,7 +451,7 @@ def coverage_of(radii: np.ndarray, probed: np.ndarray) -> Coverage:
         known=KnownCells(GRID.shape, at, *[frames.sum(dim=0).flatten()[at]] * 2),
         layers=map(Layer, MeanOfMeans((THRESHOLD,)).quantities, means.flatten(1)[:, at]),
         counts=counts,
-        blocks=Blocks.of(steps, frames, sums.movedim(0, 1)),
+        blocks=BlockSums(steps, tuple(frames.shape), listed, frames.flatten()[listed], sums.flatten(1)[:, listed]),
     )
 
 

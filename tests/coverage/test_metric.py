@@ -204,6 +204,20 @@ def test_a_search_bounded_by_the_threshold_detects_the_same_to_the_last_bit():
     assert (bounded.radius[bounded.probed_steps > 0] <= 0.5).all()
 
 
+def test_without_radii_only_points_near_the_reference_matter_to_the_last_bit():
+    steps = random_steps(11, steps=6)
+    near = [(sensor[torch.cdist(sensor, reference).amin(dim=1) <= 0.6], reference) for sensor, reference in steps]
+    assert sum(len(sensor) for sensor, _ in near) < 0.5 * sum(len(sensor) for sensor, _ in steps)
+    whole, less = coverage(steps, GRID, (0.25, 0.5)), coverage(near, GRID, (0.25, 0.5), radii=False)
+    assert torch.equal(whole.detection.nan_to_num(-1), less.detection.nan_to_num(-1))
+    assert less.radius.isnan().all()
+    assert less.counts["saturated_points"] == 0
+    with pytest.raises(ValueError, match="radii: aggregations and sensors need them"):
+        CoverageMetric(GRID, (0.25,), radii=False, aggregations=[Maximum()])
+    with pytest.raises(ValueError, match="by another metric"):
+        CoverageMetric(GRID, (0.25,)).merge_state(CoverageMetric(GRID, (0.25,), radii=False))
+
+
 # Against plain loops
 
 

@@ -136,7 +136,7 @@ def assert_same(one, other):
     assert (one.blocks is None) == (other.blocks is None)
     if one.blocks is not None:
         pairs += [
-            (getattr(one.blocks, name), getattr(other.blocks, name)) for name in ("steps", "probed_steps", "sums")
+            (getattr(one.blocks, name), getattr(other.blocks, name)) for name in ("steps", "at", "base", "listed")
         ]
     for a, b in pairs:
         torch.testing.assert_close(a, b, rtol=0, atol=0, equal_nan=True)

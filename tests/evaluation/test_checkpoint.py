@@ -97,7 +97,7 @@ def bits(result):
     """All that was measured."""
     found = {"observed": result.observed, "steps": result.run.steps, "counts": dict(result.run.counts)}
     for name, coverage in result.coverages.items():
-        blocks = {"block sums": coverage.blocks.sums, "block steps": coverage.blocks.steps}
+        blocks = {"block sums": coverage.blocks.listed, "block steps": coverage.blocks.steps}
         layers = {key: layer.values for key, layer in coverage.layers.items()}
         for key, tensor in {**blocks, **layers, "points": coverage.points, "probed": coverage.probed_steps}.items():
             found[f"{name} {key}"] = tensor.numpy().tobytes()

@@ -241,6 +241,10 @@ def test_settings_have_one_form_whatever_they_are_given_as():
         ({"target_error": 0.1}, TypeError, "target error: numbers with their units"),
         ({"aggregations": Maximum()}, TypeError, "aggregations: names such as maximum"),
         ({"aggregations": "minimum"}, ValueError, "aggregation minimum: one of maximum"),
+        ({"only_detection": True}, ValueError, "only_detection: for simulations; a recording has all its points"),
+        ({"only_detection": True, "redundancy": True}, ValueError, "only_detection: there are no radii"),
+        ({"only_detection": True, "target_error": "0.02m"}, ValueError, "only_detection: there are no radii"),
+        ({"only_detection": True, "thresholds_m": ()}, ValueError, "there has to be a threshold"),
         ({"frames": [1, 2]}, TypeError, "FrameSource is needed; got list, which has no rigs, "),
     ],
 )
@@ -293,6 +297,26 @@ def test_aggregations_are_measured_drawn_and_saved(tmp_path):
     assert quantity.key in Coverage.load(tmp_path / "coverage.npz").layers
     (kept_not,) = [omission.what for omission in result.left_out if "not kept" in omission.what]
     assert Maximum.words not in kept_not
+
+
+def test_of_detections_alone_the_same_is_known_and_of_radii_nothing():
+    """Of a rig that errs, beside one that does not: with and without the rays that change no detection."""
+    errs = Rig.load("front_roof_32").sensors[0].model_copy(update={"range_noise_m": 0.2, "dropout": 0.1})
+    rigs = [Rig(name="errs", sensors=(errs,)), "front_roof_32"]
+    given = {"steps": 2, "cell_m": 4.0, "rays": 300, "thresholds_m": (0.2, 0.4)}
+    every, some = (torchcover.evaluate(rigs, "parking", **given, only_detection=only) for only in (False, True))
+    for name, coverage in every.coverages.items():
+        other = some.coverages[name]
+        np.testing.assert_array_equal(other.detection, coverage.detection)
+        assert other.radius.isnan().all()
+        for region, height in ((region, height) for region in every.regions for height in coverage.grid.heights):
+            one, less = (each.estimate(region, height).value for each in (coverage, other))
+            np.testing.assert_array_equal(less[1:], one[1:])
+            assert less[0].isnan()
+    spared = {one.what: one.count for one in some.left_out if "near a reference point" in one.what}
+    assert list(spared.values()) == [some.run.counts["sensor_rays_spared"]]
+    assert some.run.counts["sensor_rays_spared"] > 0.3 * some.run.counts["sensor_rays"]
+    assert every.run.counts["sensor_rays_spared"] == 0
 
 
 def test_what_a_run_left_out_is_told_as_it_was_at_its_end(monkeypatch):

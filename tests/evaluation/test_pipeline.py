@@ -16,7 +16,7 @@ from torch.utils.data import Subset
 from torchcover import BevGrid, CoverageMetric, Scenario, evaluate
 from torchcover.data import BadFrameError, ChosenRigs, SimulatedFrames
 from torchcover.evaluation import CoverageObserver, observe, pipeline
-from torchcover.evaluation.pipeline import MOST_TOGETHER, made_together
+from torchcover.evaluation.pipeline import MOST_TOGETHER, MeasuredFrames, made_together
 from torchcover.evaluation.progress import terminable
 from torchcover.frames import worlds_of
 from torchcover.simulation import PaperReference
@@ -107,7 +107,7 @@ def test_coverage_is_that_of_the_metric_with_weights_and_places_in_time(frames):
                 frame.clouds[rig], frame.reference, weights=frame.reference_weights, place_in_time=frame.index
             )
         assert torch.equal(observer.compute().radius, metric.compute().radius)
-        assert torch.equal(observer.compute().blocks.sums, metric.compute().blocks.sums)
+        assert torch.equal(observer.compute().blocks.listed, metric.compute().blocks.listed)
     assert (run.steps, dict(run.counts), run.complete) == (6, {"seen": 15}, True)
 
 
@@ -118,6 +118,34 @@ def test_workers_change_nothing_and_frames_come_in_order(frames, workers):
     assert names.names == ["f0", "f1", "f2", "f3", "f4"]
     assert run.steps == 5
     assert int(occupancy.compute().max()) <= 5
+
+
+@pytest.mark.parametrize("others", [(), (Occupancy,)])
+def test_frames_are_measured_where_they_are_made_and_travel_only_if_somebody_else_looks_at_them(frames, others):
+    apart = [coverage("a"), *(make() for make in others), coverage("b")]
+    seen = MeasuredFrames(frames, apart, "cpu")[2]
+    assert (seen.frame is None, seen.counts) == (not others, frames[2].counts)
+    assert set(seen.sums) == {number for number, one in enumerate(apart) if isinstance(one, CoverageObserver)}
+    assert MeasuredFrames(frames, apart, "cuda")[2].sums == {}
+    assert all(one.metric.steps == 0 for one in (apart[0], apart[-1])), "what is measured apart adds nothing"
+    alone = coverage("b")
+    for frame in frames:
+        alone.update(frame)
+    for workers in (0, 2):
+        together = [coverage("a"), *(make() for make in others), coverage("b")]
+        observe(frames, together, workers=workers)
+        state = together[-1].state_dict()
+        assert all(torch.equal(value, state[name]) for name, value in alone.state_dict().items())
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_what_cannot_be_measured_ends_the_run_with_what_was_seen_before(frames, workers):
+    """The metric wants square metres, which one frame lacks."""
+    observer = CoverageObserver(CoverageMetric(GRID, square_metres=True), "a")
+    frames[4] = replace(frames[4], reference_weights=None)
+    run = observe(frames, [observer], workers=workers, keep_partial=True, skip_bad_frames=True)
+    assert (run.steps, run.skipped, int(observer.metric.steps)) == (4, [], 4)
+    assert "weights: the square metres of each reference point are needed" in str(run.failure)
 
 
 def test_of_several_workers_one_makes_the_frames_of_a_world_and_all_come_in_order():

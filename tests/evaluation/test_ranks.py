@@ -1,11 +1,14 @@
 """Several processes share a run: one result, that of a single one; and whatever happens to one happens to all."""
 
+import math
 import os
 import pickle
 import signal
 import threading
 import time
 import warnings
+from concurrent.futures import ThreadPoolExecutor
+from queue import SimpleQueue
 
 import pytest
 import torch
@@ -95,7 +98,7 @@ def measured(source, ranks=None, **settings):
     counts, sums = {}, {}
     for name, coverage in result.coverages.items():
         counts[name] = (coverage.counts, coverage.points, coverage.probed_steps, coverage.blocks.steps)
-        sums[name] = (coverage.blocks.sums, coverage.radius)
+        sums[name] = (coverage.blocks.listed, coverage.radius)
     run = (result.run.steps, dict(result.run.counts), result.run.skipped, str(result.run.failure))
     return {"counts": (counts, run, result.observed), "sums": sums}
 
@@ -114,6 +117,37 @@ def test_all_get_the_result_of_a_single_process(frame_of, tmp_path, length, work
         tmp_path, lambda ranks: measured(source, ranks, skip_bad_frames=True, workers=workers), size
     ):
         check_equal(found, single)
+
+
+class Wired(Ranks):
+    """One of several ranks in a process, each in a thread; counts what it merges."""
+
+    def __init__(self, wires, rank, size):
+        super().__init__(None, rank, size)
+        self.wires, self.received = wires, 0
+
+    def _send(self, value, rank):
+        self.wires[self.rank, rank].put(value)
+
+    def _receive(self, rank):
+        self.received += 1
+        return self.wires[rank, self.rank].get(timeout=LONGEST_S)
+
+
+@pytest.mark.parametrize("size", [2, 3, 8, 11, 64])
+def test_ranks_merge_in_order_and_none_of_them_many(size):
+    wires = {(rank, other): SimpleQueue() for rank in range(size) for other in range(rank)}
+    ranks = [Wired(wires, rank, size) for rank in range(size)]
+
+    def merged(rank):
+        observer = Names()
+        observer.names = [f"{rank.rank}", f"{rank.rank} too"]
+        return rank._merged(observer)
+
+    with ThreadPoolExecutor(size) as pool:
+        first = next(pool.map(merged, ranks))
+    assert first.names == [name for rank in range(size) for name in (f"{rank}", f"{rank} too")]
+    assert max(rank.received for rank in ranks) == math.ceil(math.log2(size))
 
 
 def test_a_run_over_ranks_goes_on_from_its_checkpoints(frame_of, tmp_path):

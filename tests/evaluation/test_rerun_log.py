@@ -8,10 +8,7 @@ import torch
 import torchcover
 from torchcover.data import Frame
 from torchcover.detection import Boxes
-from torchcover.evaluation import survey_target
-from torchcover.evaluation.rerun_log import MOST_POINTS, RerunLog, write_target
-from torchcover.simulation import Rig
-from torchcover.targets import Raster
+from torchcover.evaluation.rerun_log import MOST_POINTS, RerunLog
 
 
 def read(path) -> dict[str, list]:
@@ -48,17 +45,6 @@ def test_steps_hold_clouds_coloured_by_radius_and_boxes(tmp_path):
     (corners,) = column(found["/front_roof_32/radius/ground"], "Mesh3D:vertex_positions")
     assert len(corners) == 4 * int(result.coverage.radius[0].isfinite().sum())
     assert "/ego" in found
-
-
-def test_a_target_is_written_with_the_line_where_it_is_first_seen(tmp_path):
-    seen = survey_target("front_roof_128", "dog", raster=Raster((2.0, 7.0), (-2.0, 2.0), 1.0))
-    write_target(seen, Rig.load("front_roof_128").sensors, tmp_path / "new" / "target.rrd")
-    found = read(tmp_path / "new" / "target.rrd")
-    (corners,) = column(found["/dog_57cm/seen"], "Mesh3D:vertex_positions")
-    assert len(corners) == 4 * int((~np.isnan(seen.seen)).sum())
-    strips = column(found["/dog_57cm/first\\ seen"], "LineStrips3D:strips")[0]
-    assert sum(map(len, strips)) <= int((~np.isnan(seen.first_seen_m()).any(axis=1)).sum())
-    assert strips
 
 
 def test_another_suffix_and_several_processes_are_refused(tmp_path):

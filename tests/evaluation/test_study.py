@@ -33,7 +33,7 @@ def trial(a, seconds=64.0, bias=0.0, options="", least=64):
     error = ErrorModel(a, bias)
     other = Studied("3m", "ground", False, DETECTION, 0.5, ErrorModel(9.0), None, False)
     own = Studied("20m", "ground", True, DETECTION, 0.5, error, None, False)
-    return Trial(options, 64, least, seconds, 1.0, seconds, "ground", [own, other])
+    return Trial(options, 64, least, seconds, seconds, "ground", [own, other])
 
 
 @pytest.mark.parametrize("a", [0.01, 0.36, 25.0])
@@ -73,7 +73,6 @@ def test_times_are_those_of_a_whole_command(study):
     first = study.trials[0]
     assert first.seconds_for(16, study.start_s) - first.seconds_for(8, study.start_s) == pytest.approx(first.seconds)
     assert study.start_s == pytest.approx(100.0 - first.seconds / 8)
-    assert 0 < first.measuring_s < first.seconds
     assert first.processor_s > 0
 
 
@@ -137,6 +136,6 @@ def test_a_run_that_was_cut_short_is_no_study(monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("torchcover.evaluation.observers.CoverageObserver.update", interrupted)
+    monkeypatch.setattr("torchcover.evaluation.observers.CoverageObserver.add", interrupted)
     with pytest.raises(KeyboardInterrupt):
         error_against_time(StudyPlan(SMALL))

@@ -26,13 +26,17 @@ def test_outside_its_times_a_body_rests_or_is_not_there():
     np.testing.assert_allclose(resting.positions_at(times)[:, 0], [0, 0, 0.5, 1, 1])
 
 
-def test_positions_at_many_times_are_those_of_the_poses():
+def test_poses_at_many_times_are_those_at_each():
     generator = np.random.default_rng(0)
     track = Trajectory.from_arrays(
-        np.sort(generator.uniform(0, 9, 20)), generator.normal(size=(20, 3)), np.zeros((20, 3))
+        np.sort(generator.uniform(0, 9, 20)), generator.normal(size=(20, 3)), generator.uniform(-180, 180, (20, 3))
     )
-    times = generator.uniform(-1, 10, 50)
-    np.testing.assert_allclose(track.positions_at(times), [track.at(time)[:3, 3] for time in times], atol=1e-12)
+    times = np.append(track.times_s, generator.uniform(-1, 10, 50))
+    poses = np.stack([track.at(time) for time in times])
+    np.testing.assert_allclose(track.positions_at(times), poses[:, :3, 3], atol=1e-12)
+    np.testing.assert_allclose(track.at_each(times), poses, atol=1e-12)
+    resting = Trajectory.resting((1, 2, 3), (4, 5, 6))
+    np.testing.assert_allclose(resting.at_each(times), np.stack([resting.at(0)] * len(times)), atol=1e-12)
 
 
 def test_poses_of_many_bodies_are_those_of_each():

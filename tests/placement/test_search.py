@@ -219,7 +219,6 @@ def test_a_budget_below_one_evaluation_says_what_one_takes(monkeypatch):
         ({"budget_s": 3.0, "evaluations": 3}, "seconds or a number of evaluations is needed; got both"),
         ({"evaluations": 0}, "evaluations: 1 or more is needed; got 0"),
         ({"budget_s": 0.0}, "more than 0 s is needed"),
-        ({"test_seed": 0}, "would not be fresh with the seed of the search; both are 0"),
         ({"optimiser": "luck"}, "one of auto, gp, cmaes, random, enumerate is needed; got 'luck'"),
         ({"estimate": "mean"}, "one of area, known is needed"),
     ],

@@ -167,7 +167,9 @@ def test_the_hover_shows_the_cell_as_it_is_in_the_file(seen, named, tmp_path):
         coverage.save(tmp_path / f"{name}.npz")
         with np.load(tmp_path / f"{name}.npz") as file:
             keys = ("radius_area_m", "radius_area_m_error", "detection_area_0.4m", "detection_area_0.4m_error")
-            cells.append([file[key][:, row, column].tolist() for key in keys])
+            number = np.arange(coverage.grid.cells).reshape(coverage.grid.shape)[:, row, column]
+            at = np.searchsorted(file["cell"], number)
+            cells.append([file[key][at].tolist() for key in keys])
     (radius, error, *_), (of_many, its_error, detection, detection_error) = cells
     m2 = named["many"].area.totals()[0][0, row, column].item()
     assert found["hover"].startswith("x 3 to 4 m, y 2 to 3 m: ")

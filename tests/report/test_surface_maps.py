@@ -7,10 +7,11 @@ import pytest
 import torch
 
 from torchcover.coverage import BevGrid, CoverageMetric, Region
-from torchcover.coverage.blocks import AreaSums
+from torchcover.coverage.blocks import BlockSums
 from torchcover.report.maps.surface import (
     FAINTEST,
     MIN_POINTS,
+    as_drawn,
     errors_of_ratios,
     opacity_of,
     over_squares,
@@ -88,7 +89,8 @@ def test_where_points_are_many_a_cell_has_its_own_ratio(coverage, sides):
 
 
 def test_a_square_has_the_ratio_of_the_sums_of_its_cells(coverage, sides):
-    m2, sums = coverage.area.m2.sum(dim=0).numpy(), coverage.area.sums.sum(dim=0).numpy()
+    m2, *sums = coverage.area.totals().numpy()
+    sums = np.stack(sums)
     found = ratios(coverage.area, sides).numpy()
     for band, y, x in zip(*(sides == 4).numpy().nonzero(), strict=True):
         rows, columns = (slice(at // 4 * 4, at // 4 * 4 + 4) for at in (y, x))
@@ -97,7 +99,7 @@ def test_a_square_has_the_ratio_of_the_sums_of_its_cells(coverage, sides):
 
 
 def test_what_is_drawn_weighs_as_much_as_the_region_has(coverage, sides):
-    m2 = over_squares(coverage.area.m2.sum(dim=0), sides)
+    m2 = over_squares(coverage.area.totals()[0], sides)
     each = m2 / over_squares(torch.ones_like(m2), sides)
     for band, height in enumerate(GRID.heights):
         weighted = (ratios(coverage.area, sides)[:, band] * each[band]).nansum(dim=(1, 2)) / each[band].sum()
@@ -105,7 +107,7 @@ def test_what_is_drawn_weighs_as_much_as_the_region_has(coverage, sides):
 
 
 def test_a_place_without_a_square_metre_is_unknown_and_has_no_opacity(coverage, sides):
-    seen = over_squares(coverage.area.m2.sum(dim=0), sides) > 0
+    seen = over_squares(coverage.area.totals()[0], sides) > 0
     assert 0 < int(seen.sum()) < seen.numel()
     assert torch.equal(ratios(coverage.area, sides).isfinite(), seen.expand(3, -1, -1, -1))
     opacity = opacity_of(coverage.area, 16, sides, CELL_M)
@@ -114,8 +116,14 @@ def test_a_place_without_a_square_metre_is_unknown_and_has_no_opacity(coverage, 
     assert opacity.max() <= 1
 
 
-def sums_of(m2: torch.Tensor) -> AreaSums:
-    return AreaSums.of(torch.tensor([10]), m2[None], torch.zeros(1, 1, *m2.shape))
+def listed_of(m2: torch.Tensor, sums: torch.Tensor) -> BlockSums:
+    """One block; (Q, cells) sums."""
+    at = m2.flatten().nonzero().squeeze(1)
+    return BlockSums(torch.tensor([10]), (1, *m2.shape), at, m2.flatten()[at], sums[:, at])
+
+
+def sums_of(m2: torch.Tensor) -> BlockSums:
+    return listed_of(m2, torch.zeros(1, m2.numel()))
 
 
 def test_opacity_grows_with_the_surface_up_to_that_of_open_ground():
@@ -144,8 +152,32 @@ def test_errors_are_those_of_cells_where_squares_are_cells(coverage, sides):
 
 
 def test_infinity_stays_in_its_square():
-    sums = torch.zeros(1, 1, 1, 4, 4).double()
+    sums = torch.zeros(1, 1, 4, 4).double()
     sums[..., 0, 0] = math.inf
-    area = AreaSums.of(torch.tensor([1]), torch.ones(1, 1, 4, 4).double(), sums)
+    area = listed_of(torch.ones(1, 4, 4).double(), sums.flatten(1))
     (found,) = ratios(area, torch.full((1, 4, 4), 2))
     assert torch.equal(found.isinf()[0], torch.tensor([[True, True, False, False]] * 2 + [[False] * 4] * 2))
+
+
+@pytest.mark.parametrize(("cell", "drawn_m"), [(0.25, 0.25), (0.15, 0.15), (0.125, 0.25), (0.05, 0.2)])
+def test_small_cells_are_drawn_in_squares_with_the_same_numbers(cell, drawn_m):
+    """Neither side of the grid is a whole number of squares; a region's ratio is that of its squares."""
+    grid = BevGrid(x=(0.0, 46 * cell), y=(0.0, 25 * cell), cell=cell, heights={"low": (0.0, 1.0), "high": (1.0, 2.0)})
+    metric = CoverageMetric(grid, (0.1,), blocks=8, square_metres=True, regions=[])
+    for seed in range(16):
+        random = torch.Generator().manual_seed(seed)
+        rig, reference = (torch.rand(99, 3, generator=random) * torch.tensor([7.0, 4.0, 2.0]) for _ in range(2))
+        metric.update(rig, reference, weights=torch.rand(99, generator=random) + 0.1, place_in_time=seed)
+    whole = metric.compute()
+    drawn = as_drawn(whole)
+    assert (drawn.grid.cell, drawn is whole) == (pytest.approx(drawn_m), drawn_m == cell)
+    assert drawn.points.sum() == whole.points.sum()
+    assert drawn.layers.keys() == whole.layers.keys()
+    assert drawn.errors.keys() == whole.errors.keys()
+    side = round(drawn_m / cell)
+    near = Region("near", (0.0, 4 * side * cell), (0.0, 2 * side * cell))
+    for one, other in zip(*(each.estimate(near, "low").left_out for each in (drawn, whole)), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12)
+    m2, sums, *_ = whole.area.totals()[:, 1, : 2 * side, : 4 * side].reshape(-1, 2, side, 4, side).sum(dim=(2, 4))
+    found = drawn.layers["radius_area_m"].values[1, :2, :4]
+    torch.testing.assert_close(found, sums / m2, rtol=1e-12, atol=0, equal_nan=True)

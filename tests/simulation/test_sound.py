@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from torchcover.geometry import rigid
-from torchcover.simulation import SurfaceReference, shapes, sound
+from torchcover.simulation import SurfaceReference, shapes
 from torchcover.simulation.local_ground import GroundSquares, level_faces
 from torchcover.simulation.patches import Bounds, Patches, outward_faces
 from torchcover.simulation.scene import Scene
@@ -100,7 +100,6 @@ def test_how_many_faces_are_looked_at_together_changes_nothing(monkeypatch):
     at_once = found()
     assert [int(mask.sum()) for mask in at_once[6:9]] == [20, 0, 20]
     monkeypatch.setattr(shapes, "PART", 7)
-    monkeypatch.setattr(sound, "PART", 7)
     for one, other in zip(at_once, found(), strict=True):
         np.testing.assert_array_equal(one, other)
 

@@ -56,7 +56,7 @@ def test_two_processes_give_the_numbers_of_one(tmp_path):
             job = torch.load(tmp_path / f"{name}_{rank}.pt")
             for stage in ("train", "val"):
                 assert_same(Coverage.load(tmp_path / f"{name}_{stage}_{rank}.npz"), truth)
-                np.testing.assert_allclose(job["blocks"][stage], truth.blocks.sums, rtol=1e-12)
+                np.testing.assert_allclose(job["blocks"][stage], truth.blocks.listed, rtol=1e-12)
                 assert job["logged"][f"coverage/{stage}/steps"] == 7
                 for tag, value in truth.scalars([REGION]).items():
                     assert job["logged"][f"coverage/{stage}/{tag}"] == pytest.approx(value, rel=1e-6, nan_ok=True)

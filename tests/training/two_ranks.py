@@ -98,7 +98,7 @@ def fit(name, *callbacks, ckpt_path=None):
     blocks = {}
     for stage, callback in (("train", train), ("val", validation)):
         callback.coverage.save(folder / f"{name}_{stage}_{trainer.global_rank}.npz")
-        blocks[stage] = callback.coverage.blocks.sums
+        blocks[stage] = callback.coverage.blocks.listed
     logged = {tag: float(value) for tag, value in trainer.callback_metrics.items()}
     result = {"logged": logged, "images": logger.images, "blocks": blocks}
     torch.save(result, folder / f"{name}_{trainer.global_rank}.pt")

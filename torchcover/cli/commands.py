@@ -28,7 +28,6 @@ def study(
     steps: Annotated[
         int, typer.Option(min=8, help="Steps of the first setting; the others see the first quarter of these instants.")
     ] = 512,
-    explain: Annotated[bool, typer.Option("--explain", help="Say where the seconds go.")] = False,
     out: options.Out = Path("out"),
     **settings: Any,  # noqa: ANN401
 ) -> None:
@@ -52,7 +51,7 @@ def study(
     with claimed(out):
         found = error_against_time(plan, progress=True)
         files = found.save(out)
-    print_study(found, files, out, explain=explain)
+    print_study(found, files, out)
 
 
 @with_options(of_evaluate("scenario", "seed", "vehicle", "sensor_model", "weather", "reference", "rays", "every_s"))
@@ -195,9 +194,6 @@ def targets(
     require: Annotated[
         Path | None, typer.Option(help="YAML file of requirements: exit code 1 if one is not met.")
     ] = None,
-    rerun: Annotated[
-        Path | None, typer.Option(help="Write the map to this .rrd file, for the Rerun viewer (extra `rerun`).")
-    ] = None,
     out: options.Out = Path("out/targets"),
     files: options.Files = options.ALL_FILES,
     **settings: Any,  # noqa: ANN401
@@ -215,12 +211,45 @@ def targets(
         threshold_m=threshold_m,
         heading=heading,
         require=require,
-        rerun=rerun,
         out=out,
         files=files,
         **settings,
     )
     raise typer.Exit(code)
+
+
+@with_options(of_evaluate("vehicle", "sensor_model", "seed"))
+def encounter(
+    rigs: Annotated[list[str], typer.Argument(help="Rigs: built-in names (see `list`) or YAML files.")],
+    encounters: Annotated[
+        str, typer.Option("--set", help="Set of encounters: a built-in name or a YAML file.")
+    ] = "crossing_like",
+    phases: Annotated[int, typer.Option(min=1, help="At how many places of their period the looks begin.")] = 10,
+    points: Annotated[int, typer.Option(min=1, help="Points that are enough, of LiDARs with the same rate.")] = 5,
+    pixels: Annotated[int, typer.Option(min=1, help="Pixels of the full image that are enough, of a camera.")] = 200,
+    looks: Annotated[int, typer.Option(min=1, help="In so many looks in a row.")] = 3,
+    deceleration: Annotated[float, typer.Option(help="Of the brakes, in m/s2.")] = 9.0,
+    latency_s: Annotated[
+        float, typer.Option("--latency-s", help="Seconds from the last of these looks to the brakes.")
+    ] = 0.5,
+    out: options.Out = Path("out/encounters"),
+    files: options.Files = options.ALL_FILES,
+    **settings: Any,  # noqa: ANN401
+) -> None:
+    """Would it see the child in time? Of crossings and other encounters: the time to collision at detection."""
+    from rich.console import Console
+
+    from torchcover.cli.printing import in_words, print_files, print_whole
+    from torchcover.encounters import Criterion
+    from torchcover.evaluation import encounter, save_encounters
+    from torchcover.files import claimed
+
+    criterion = Criterion(points, pixels, looks, deceleration, latency_s)
+    with claimed(out):
+        found = encounter(rigs, encounters, criterion, phases=phases, progress=True, **settings)
+        written = save_encounters(found, out, files=files)
+    print_whole([in_words(table) for table in found.tables()])
+    print_files(written, out, Console())
 
 
 @with_options(of_evaluate("sensor_model"))
@@ -244,10 +273,7 @@ def search(
     per_world: Annotated[int | None, typer.Option(min=1, help="Instants of each world (3).")] = None,
     every_s: Annotated[float | None, typer.Option("--every-s", help="Seconds between two of them (20).")] = None,
     rays: Annotated[int | None, typer.Option(min=1, help="Rays of the reference at each instant (16384).")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the search and of its worlds.")] = 0,
-    test_seed: Annotated[
-        int | None, typer.Option(min=0, help="Seed of the fresh worlds, another one (the next).")
-    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the search and its worlds; fresh ones have the next.")] = 0,
     workers: Annotated[int, typer.Option(min=0, help="Processes that score; 0 scores in this one.")] = 0,
     resume: Annotated[
         bool,
@@ -277,7 +303,6 @@ def search(
         optimiser=optimiser,
         estimate=estimate,
         seed=seed,
-        test_seed=test_seed,
         workers=workers,
         **{name: value for name, value in given.items() if value is not None},
     )
@@ -329,7 +354,7 @@ def list_builtin(
         str | None, typer.Argument(help="Only those with this word, with all that is said of them.")
     ] = None,
 ) -> None:
-    """List the built-in rigs, scenarios, LiDAR models, vehicles, materials and weather."""
+    """List the built-in rigs, scenarios, LiDAR models, vehicles, materials, weather and encounters."""
     from torchcover.cli.listing import run
 
     run(word)

@@ -31,6 +31,7 @@ def run(word: str | None) -> None:
         ("vehicles", None),
         ("materials", _reflectivity),
         ("weather", None),
+        ("encounters", None),
     ):
         rows = []
         for name, document in builtin_documents(kind).items():

@@ -74,10 +74,10 @@ def print_files(files: Sequence[Path], out: Path, console: Console) -> None:
     console.print(f"Wrote {', '.join(words)} to {out}", markup=False, soft_wrap=True)
 
 
-def print_study(study: Study, files: Sequence[Path], out: Path, *, explain: bool) -> None:
+def print_study(study: Study, files: Sequence[Path], out: Path) -> None:
     """The tables, and the settings that are recommended."""
     console = Console()
-    print_whole(study.tables(explain=explain))
+    print_whole(study.tables)
     for wanted in WANTED:
         console.print(study.advice(wanted), markup=False, soft_wrap=True)
     print_files(files, out, console)

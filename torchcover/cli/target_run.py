@@ -8,7 +8,6 @@ from rich.console import Console
 
 from torchcover.cli.printing import in_words, print_files, print_whole
 from torchcover.evaluation import save_targets, survey_target
-from torchcover.evaluation.rerun_log import write_target
 from torchcover.evaluation.target_survey import places_table, sides_table
 from torchcover.files import claimed
 from torchcover.simulation import Rig
@@ -25,7 +24,6 @@ def run(
     raster: str | None,
     heading: str,
     require: Path | None,
-    rerun: Path | None,
     out: Path,
     files: str,
     **settings: Any,  # noqa: ANN401  (those of `survey_target`)
@@ -54,8 +52,6 @@ def run(
         others = () if requirements is None else requirements.requirements
         not_checked = [other.words for other in others if not other.is_about(seen.target)]
         written = save_targets(seen, out, verdicts, sensors, not_checked=not_checked, files=files)
-        if rerun is not None:
-            write_target(seen, sensors, rerun)
     _print(seen, verdicts, not_checked)
     print_files(written, out, Console())
     return 0 if all(verdict.passed for verdict in verdicts) else FAILED

@@ -8,6 +8,8 @@ from typing import Generic, Self, TypeVar
 import torch
 from torch import Tensor
 
+from torchcover.metrics import added_up
+
 ListedT = TypeVar("ListedT")
 MapT = TypeVar("MapT")
 
@@ -63,6 +65,9 @@ class Maps(Mapping[str, MapT], Generic[ListedT, MapT]):
 class BlockSums:
     """Sums over cells in blocks of contiguous steps, as lists: most cells no step of a block has probed.
 
+    They are of the radius in metres, then of the share of points within each threshold: the means of each step in the
+    cell, which are divided by the steps; or these times the square metres of each point, divided by square metres.
+
     Args:
         steps: (B,) int64 steps in each block; 0 in the blocks that are not in use.
         shape: (B, H, Y, X) blocks and cells.
@@ -77,38 +82,26 @@ class BlockSums:
     base: Tensor
     listed: Tensor
 
-    @classmethod
-    def of(cls, steps: Tensor, base: Tensor, sums: Tensor) -> Self:
-        """Those of arrays, which are copied.
-
-        Args:
-            steps: (B,) steps in each block.
-            base: (B, H, Y, X) what is divided by.
-            sums: (B, Q, H, Y, X) sums; 0 wherever `base` is.
-
-        Example:
-            >>> few = AreaSums.of(torch.tensor([1]), torch.tensor([[[[0.0, 2.0]]]]), torch.tensor([[[[[0.0, 3.0]]]]]))
-            >>> few.at, few.listed, few.sums
-            (tensor([1]), tensor([[3.]]), tensor([[[[[0., 3.]]]]]))
-        """
-        where = base.nonzero(as_tuple=True)
-        at = torch.zeros_like(where[0])
-        for index, length in zip(where, base.shape, strict=True):
-            at = at * length + index
-        listed = torch.stack([quantity[where] for quantity in sums.unbind(dim=1)])
-        return cls(steps.clone(), tuple(base.shape), at, base[where], listed)
-
-    @property
-    def sums(self) -> Tensor:
-        """(B, Q, H, Y, X) float64 sums of each quantity."""
-        return self._spread(self.listed).movedim(0, 1)
-
     def totals(self) -> Tensor:
         """(1 + Q, H, Y, X) float64 over all blocks: what is divided by, then the sums."""
         totals = self.listed.new_zeros((1 + len(self.listed), self._cells), dtype=torch.float64)
         for cell, each in self._each_block():
             totals[:, cell] += each  # a cell is in a block once
         return totals.view(-1, *self.shape[1:])
+
+    def moved(self, to: Callable[[Tensor], Tensor], cells: int, shape: tuple[int, ...] | None = None) -> Self:
+        """What lies in a cell added to that of another one.
+
+        Args:
+            to: (N,) cells -> the others.
+            cells: How many of these there are.
+            shape: Theirs, if it is not that of the cells.
+        """
+        at = self.at // self._cells * cells + to(self.at % self._cells)
+        at, base, *listed = added_up(torch.stack([at, self.base, *self.listed], dim=1).double()).T
+        return type(self)(
+            self.steps, (len(self.steps), *(shape or self.shape[1:])), at.long(), base, torch.stack(listed)
+        )
 
     def over(self, cells: Tensor, band: int) -> Tensor:
         """(B, 1 + Q) float64 what is divided by, then the sums, of each block over some cells of a band, (Y, X)."""
@@ -143,38 +136,3 @@ class BlockSums:
         lists = (self.at % self._cells, self.base, self.listed)
         for cell, base, sums in zip(*(torch.split(one, lengths, dim=-1) for one in lists), strict=True):
             yield cell, torch.cat([base[None].double(), sums.double()])
-
-    def _spread(self, listed: Tensor) -> Tensor:
-        """(..., B, H, Y, X) zeros but for (..., N) what is listed."""
-        spread = listed.new_zeros((*listed.shape[:-1], math.prod(self.shape)))
-        spread[..., self.at] = listed
-        return spread.view(*listed.shape[:-1], *self.shape)
-
-
-BlockSumsT = TypeVar("BlockSumsT", bound=BlockSums)
-
-
-class Blocks(BlockSums):
-    """The sums of a run: over the steps of a block, of the means in a cell.
-
-    They are of the radius in metres, then of the share of points within each threshold; and are divided by the steps of
-    the block that had a reference point in the cell.
-    """
-
-    @property
-    def probed_steps(self) -> Tensor:
-        """(B, H, Y, X) int64 steps of the block that had a reference point in the cell."""
-        return self._spread(self.base)
-
-
-class AreaSums(BlockSums):
-    """The sums over the visible surface; one block if errors were not asked for.
-
-    They are of square metres times the radius in metres, then of the square metres of points within each threshold; and
-    are divided by the square metres of all points in the cell.
-    """
-
-    @property
-    def m2(self) -> Tensor:
-        """(B, H, Y, X) float64 square metres of the points in the cell."""
-        return self._spread(self.base)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.coverage.aggregations import Layer
-from torchcover.coverage.blocks import AreaSums, Blocks, BlockSums, BlockSumsT, KnownCells
+from torchcover.coverage.blocks import BlockSums, KnownCells
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.redundancy import Redundancy, redundancy_quantities
 from torchcover.coverage.region_sums import PlaceNumbers, PlaceSums
@@ -45,8 +45,8 @@ class CoverageParts(TypedDict):
     known: KnownCells
     layers: Sequence[Layer]
     counts: Mapping[str, int]
-    blocks: Blocks | None
-    area: AreaSums | None
+    blocks: BlockSums | None
+    area: BlockSums | None
     regions: Sequence[Region]
     places: PlaceSums | None
     aggregated: PlaceNumbers | None
@@ -149,8 +149,8 @@ def _parts(header: dict[str, Any], arrays: Arrays) -> CoverageParts:
         "known": known,
         "layers": layers,
         "counts": header["counts"],
-        "blocks": None if header["blocks"] == 1 else _read_listed(Blocks, IN_BLOCKS, header, grid, arrays),
-        "area": _read_listed(AreaSums, OVER_AREA, header, grid, arrays) if header["square_metres"] else None,
+        "blocks": None if header["blocks"] == 1 else _read_listed(IN_BLOCKS, header, grid, arrays),
+        "area": _read_listed(OVER_AREA, header, grid, arrays) if header["square_metres"] else None,
         "regions": [_region(stored) for stored in header["regions"]],
         "places": _places(header, grid, arrays) if header["by_area"] else None,
         "aggregated": _aggregated(header, grid, arrays) if header["aggregated"] else None,
@@ -225,9 +225,7 @@ def _listed(blocks: BlockSums, names: Sequence[str]) -> Arrays:
     return dict(zip(names, arrays, strict=True))
 
 
-def _read_listed(
-    of: type[BlockSumsT], names: Sequence[str], header: dict[str, Any], grid: BevGrid, arrays: Arrays
-) -> BlockSumsT:
+def _read_listed(names: Sequence[str], header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> BlockSums:
     steps, _, base, sums = (arrays[name] for name in names)
     if steps.shape != (header["blocks"],):
         raise ValueError(f"the steps of {header['blocks']} blocks have shape {steps.shape}")
@@ -235,4 +233,4 @@ def _read_listed(
     at = _ascending(names[1], arrays, math.prod(shape))
     if not (base.shape == at.shape == sums.shape[1:] and np.isin(at % grid.cells, arrays["cell"]).all()):
         raise ValueError(f"sums of shape {sums.shape} at {tuple(at.shape)} cells do not fit into {shape}")
-    return of(torch.from_numpy(steps), shape, at, *map(torch.from_numpy, (base, sums)))
+    return BlockSums(torch.from_numpy(steps), shape, at, *map(torch.from_numpy, (base, sums)))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 import torch
 from torch import Tensor
 
-from torchcover.coverage.blocks import Blocks, BlockSums, KnownCells
+from torchcover.coverage.blocks import BlockSums, KnownCells
 from torchcover.coverage.regions import Region
 from torchcover.estimation import MIN_BLOCKS_OF_A_CELL, Estimate, Quantity, ratio_errors
 
@@ -119,7 +119,7 @@ def known_mean(probed: Tensor, sums: Tensor) -> Tensor:
     return (sums[:, known] / probed[known]).mean(dim=1)
 
 
-def _known_again(blocks: Blocks, band: int, cells: Tensor, weights: Tensor) -> Tensor:
+def _known_again(blocks: BlockSums, band: int, cells: Tensor, weights: Tensor) -> Tensor:
     """(R, Q) the same if the blocks in use come as often as (R, g) they are weighted."""
     used = blocks.steps > 0
     # Not kept with the estimate: for all regions it is as large as the sums of the run.

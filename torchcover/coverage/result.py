@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage.aggregations import Layer, MeanOfMeans
-from torchcover.coverage.blocks import AreaSums, Blocks, KnownCells, Maps
+from torchcover.coverage.blocks import BlockSums, KnownCells, Maps
 from torchcover.coverage.coverage_file import CoverageParts, read_coverage, write_coverage
 from torchcover.coverage.grid import BandFrame, BevGrid
 from torchcover.coverage.measures import Measure, errors_of_cells, estimate_area, estimate_known, estimate_redundancy
@@ -70,8 +70,8 @@ class Coverage:
         known: KnownCells,
         layers: Iterable[Layer],
         counts: Mapping[str, int],
-        blocks: Blocks | None = None,
-        area: AreaSums | None = None,
+        blocks: BlockSums | None = None,
+        area: BlockSums | None = None,
         regions: Sequence[Region] | None = None,
         places: PlaceSums | None = None,
         aggregated: PlaceNumbers | None = None,

@@ -118,11 +118,6 @@ class Boxes:
         return cls(rows[:, :3], rows[:, 3:6], rows[:, 6], **others)  # type: ignore[arg-type]
 
     @classmethod
-    def from_openpcdet(cls, rows: Tensor, **others: object) -> "Boxes":
-        """From OpenPCDet's rows, which are those of `from_rows`: the centre is half-way up."""
-        return cls.from_rows(rows, **others)
-
-    @classmethod
     def from_mmdet3d(cls, rows: Tensor, **others: object) -> "Boxes":
         """From MMDetection3D's `LiDARInstance3DBoxes.tensor`: z is that of the bottom; columns 7 and 8 are velocities.
 
@@ -185,29 +180,6 @@ class Boxes:
         """
         lengthwise = np.asarray(size, dtype=np.float64).reshape(-1, 3)[:, [1, 0, 2]]
         return cls.from_rows(upright_rows(translation, lengthwise, headings(rotation), vehicle_T_global), **others)
-
-    @classmethod
-    def from_av2(
-        cls,
-        translation: ArrayLike,
-        size: ArrayLike,
-        rotation: ArrayLike,
-        vehicle_T_ego: NDArray[np.float64] | None = None,
-        **others: object,
-    ) -> "Boxes":
-        """From the columns of Argoverse 2's `annotations.feather`.
-
-        Args:
-            translation: (K, 3) `tx_m`, `ty_m`, `tz_m`: centres in the frame of the ego, at its rear axle.
-            size: (K, 3) `length_m`, `width_m`, `height_m`.
-            rotation: (K, 4) `qw`, `qx`, `qy`, `qz`.
-            vehicle_T_ego: (4, 4) where that frame is in the vehicle frame.
-            others: As `from_rows`.
-
-        Raises:
-            ValueError: Shapes that do not fit, or as the constructor.
-        """
-        return cls.from_rows(upright_rows(translation, size, headings(rotation), vehicle_T_ego), **others)
 
     @property
     def rows(self) -> Tensor:

@@ -3,6 +3,9 @@ from .agreeing import agree as agree
 from .agreeing import relation as relation
 from .agreeing import verdict as verdict
 from .checkpoint import Checkpoint as Checkpoint
+from .encountering import encounter as encounter
+from .encountering import encounter_picture as encounter_picture
+from .encountering import save_encounters as save_encounters
 from .evaluating import compare as compare
 from .evaluating import evaluate as evaluate
 from .mixed import MixedResult as MixedResult

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 from torchcover.evaluation.placement_scores import PlacementScores, score_placements
 from torchcover.files import Publication, csv_text
@@ -101,26 +101,16 @@ def agree(
     paper: str = PAPER,
     scenario: Scenario | str | Path = "urban",
     *,
-    metrics: Sequence[str] | None = None,
-    steps: int = 64,
     seed: int = 0,
-    every_s: float | None = None,
-    sensor_model: Literal["ideal", "real"] | None = None,
-    workers: int = 0,
-    progress: bool = False,
+    **settings: Any,  # noqa: ANN401  (those of `score_placements`)
 ) -> AgreementStudy:
     """Rank the placements of Place3D (NeurIPS 2024) by metrics, and by the published results of detectors.
 
     Args:
         paper: "place3d2024".
         scenario: The world that the metrics are measured in.
-        metrics: Those of others, of `torchcover.published.PUBLISHED`; all if not given.
-        steps: Steps.
         seed: Seed of the traffic.
-        every_s: Time between two steps in seconds; as in `evaluate` if not given.
-        sensor_model: What sensors make of their hits; as for `evaluate`.
-        workers: Processes that make frames.
-        progress: Whether to show a bar.
+        settings: Others of `score_placements`: `metrics`, `steps`, `sensor_model`, and of `evaluate`.
 
     Raises:
         ValueError: Another paper, an unknown metric, or as `evaluate`.
@@ -129,17 +119,7 @@ def agree(
     if paper != PAPER:
         raise ValueError(f"{paper}: no published placements of this name; there is {PAPER}")
     rigs = {name: name for name in builtin_names("rigs") if name.startswith(f"{PAPER}_")}
-    scores = score_placements(
-        rigs,
-        scenario,
-        metrics=metrics,
-        steps=steps,
-        seed=seed,
-        every_s=every_s,
-        sensor_model=sensor_model,
-        workers=workers,
-        progress=progress,
-    )
+    scores = score_placements(rigs, scenario, seed=seed, **settings)
     return AgreementStudy(agreements(scores), scores, str(getattr(scenario, "name", scenario)), seed)
 
 

@@ -88,7 +88,8 @@ def _workers(task: Task[FrameSource], settings: Settings) -> int:
     if settings.ranks or not isinstance(frames, SimulatedFrames):
         return 0
     most = min(len(frames), task.steps or len(frames), ENOUGH_FRAMES)
-    return usual_workers(most, len({frames.world_of(index) for index in range(most)}))
+    whole = bool(settings.observers or settings.metrics) or not settings.device.startswith("cpu")
+    return usual_workers(most, len({frames.world_of(index) for index in range(most)}), whole=whole)
 
 
 def _observed(task: Task[FrameSource], settings: Settings, others: Observers) -> tuple[Observers, Observers, Run]:
@@ -203,6 +204,7 @@ def metric_of(
         aggregations=settings.aggregations,
         regions=asked.regions,
         sensors=sensors,
+        radii=not settings.only_detection,
         square_metres=square_metres and settings.estimate != "known",
         sync_on_compute=False,  # within a process group of the caller's, whose other processes know of no such metric
     )

@@ -1,9 +1,10 @@
 """What is fed with frames: coverage, and whatever else a user wants to know of them."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, Self, TypeVar, runtime_checkable
 
 from torchcover.coverage import Coverage, CoverageMetric
+from torchcover.coverage.steps import StepSums
 from torchcover.frames import Frame
 
 ResultT = TypeVar("ResultT", covariant=True)
@@ -78,7 +79,13 @@ class CoverageObserver:
         self.rig = rig
 
     def update(self, frame: Frame) -> None:
-        """Add a frame, with the weights and the heights of its reference points and its place in time.
+        """Add a frame: what is made of it by `sums_of`."""
+        self.add(self.sums_of(frame))
+
+    def sums_of(self, frame: Frame) -> list[StepSums]:
+        """What a frame is to `add`, with the weights and the heights of its reference points and its place in time.
+
+        It is small, and the same in every process, so that frames are measured where they are made.
 
         Raises:
             ValueError: As `CoverageMetric.update`, several rigs and none was named, or reference points without the
@@ -86,7 +93,7 @@ class CoverageObserver:
                 and it wants that.
         """
         clouds = frame.clouds_by_sensor if self.metric.sensors else frame.cloud_of
-        self.metric.update(
+        return self.metric.sums_of(
             clouds(self.rig),
             frame.reference,
             error=frame.error_of(self.rig),
@@ -94,6 +101,11 @@ class CoverageObserver:
             height=frame.heights_in(self.metric.grid.band_frame),
             place_in_time=frame.place_in_time,
         )
+
+    def add(self, sums: Sequence[StepSums]) -> None:
+        """Add a frame that `sums_of` an observer of the same rig and parameters has measured."""
+        for one in sums:
+            self.metric.add(one)
 
     def compute(self) -> Coverage:
         """The coverage so far."""

@@ -2,19 +2,19 @@
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import groupby, islice
 from traceback import clear_frames, format_exc
-from typing import Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch.utils.data import DataLoader, Dataset, get_worker_info
 
 from torchcover.evaluation.checkpoint import Journal
 from torchcover.evaluation.cores import cores, warn_of_spinning
-from torchcover.evaluation.observers import AnyObserver
+from torchcover.evaluation.observers import AnyObserver, CoverageObserver
 from torchcover.evaluation.progress import ENDS, Progress, held_back
 from torchcover.evaluation.ranks import Ranks
 from torchcover.files import end_with_parent
@@ -58,6 +58,42 @@ class Run:
         """End as the run ended, once what was computed is safe: raise what ended it, if anything did."""
         if self.failure is not None:
             raise self.failure
+
+
+class MeasuredFrame(NamedTuple):
+    """What is left of a frame where it was measured.
+
+    Args:
+        frame: The frame, if an observer needs it; what travels between processes is small without it.
+        counts: `Frame.counts`.
+        sums: Number of an observer -> what it is to add.
+        measuring_s: How long that took, in this process.
+    """
+
+    frame: Frame | None
+    counts: Mapping[str, int]
+    sums: Mapping[int, Any]
+    measuring_s: float
+
+
+class MeasuredFrames:
+    """Frames that are measured where they are made, in this process or in a worker.
+
+    Coverage is, on the CPU; all other observers, and all on another device, are fed with the frame itself.
+    """
+
+    def __init__(self, frames: Frames, observers: Sequence[AnyObserver], device: torch.device | str) -> None:
+        on_the_cpu = torch.device(device).type == "cpu"
+        numbered = enumerate(observers if on_the_cpu else ())
+        self.frames = frames
+        self._observers = {number: one for number, one in numbered if isinstance(one, CoverageObserver)}
+        self._needs_frame = len(self._observers) < len(observers)
+
+    def __getitem__(self, index: int) -> MeasuredFrame:
+        frame, start = self.frames[index], time.perf_counter()
+        sums = {number: observer.sums_of(frame) for number, observer in self._observers.items()}
+        measuring_s = 0.0 if get_worker_info() else time.perf_counter() - start
+        return MeasuredFrame(frame if self._needs_frame else None, frame.counts, sums, measuring_s)
 
 
 class StoppingRule(Protocol):
@@ -150,12 +186,13 @@ def observe(
     try:
         with _threads_beside(workers), Progress(share, title, done=run.steps, shown=progress) as bar:
             tasks = made_together(() if run.reached else todo, world_of if workers > 1 else int)
-            for frame in _each(frames, tasks, workers, run, skip_bad_frames=skip_bad_frames):
+            apart = MeasuredFrames(frames, observers, device)
+            for seen in _each(apart, tasks, workers, run, skip_bad_frames=skip_bad_frames):
                 if ranks:
                     ranks.check_others()
                 with held_back():
                     consistent = False
-                    _feed(frame.to(device), observers, run)
+                    _feed(seen, observers, run, device)
                     run.reached = until is not None and until.is_reached(run.steps)
                     consistent = True
                 run.seconds = time.perf_counter() - start
@@ -208,12 +245,16 @@ def killed_worker(error: BaseException, workers: int, steps: int) -> ChildProces
     )
 
 
-def _feed(frame: Frame, observers: Sequence[AnyObserver], run: Run) -> None:
+def _feed(seen: MeasuredFrame, observers: Sequence[AnyObserver], run: Run, device: torch.device | str) -> None:
     start = time.perf_counter()
-    for observer in observers:
-        observer.update(frame)
-    run.measuring_s += time.perf_counter() - start
-    run.counts.update(frame.counts)
+    frame = None if seen.frame is None else seen.frame.to(device)
+    for number, observer in enumerate(observers):
+        if isinstance(observer, CoverageObserver) and number in seen.sums:
+            observer.add(seen.sums[number])
+        elif frame is not None:
+            observer.update(frame)
+    run.measuring_s += seen.measuring_s + time.perf_counter() - start
+    run.counts.update(seen.counts)
     run.steps += 1
 
 
@@ -237,13 +278,13 @@ def made_together(indices: Iterable[int], world_of: Callable[[int], int]) -> Ite
             yield together
 
 
-class FramesOrErrors(Dataset[Frame | ValueError]):
+class FramesOrErrors(Dataset[Any]):
     """Frames; what is wrong with one stands in its place, so that it costs none of those that are made with it."""
 
-    def __init__(self, frames: Frames) -> None:
+    def __init__(self, frames: Frames | MeasuredFrames) -> None:
         self.frames = frames
 
-    def __getitem__(self, index: int) -> Frame | ValueError:
+    def __getitem__(self, index: int) -> Any:  # noqa: ANN401  (what the frames are, or an error)
         try:
             return self.frames[index]
         except ValueError as error:
@@ -256,8 +297,8 @@ class FramesOrErrors(Dataset[Frame | ValueError]):
 
 
 def _each(
-    frames: Frames, tasks: Iterable[list[int]], workers: int, run: Run, *, skip_bad_frames: bool
-) -> Iterator[Frame]:
+    frames: MeasuredFrames, tasks: Iterable[list[int]], workers: int, run: Run, *, skip_bad_frames: bool
+) -> Iterator[MeasuredFrame]:
     """One frame at a time; notes bad ones if they are to be skipped."""
     loader = DataLoader(
         FramesOrErrors(frames),
@@ -269,7 +310,7 @@ def _each(
     )
     for batch in loader:
         for made in batch:
-            if isinstance(made, Frame):
+            if isinstance(made, MeasuredFrame):
                 yield made
             elif skip_bad_frames and isinstance(made, BadFrameError):
                 run.skipped.append(str(made))

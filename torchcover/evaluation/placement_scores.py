@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -64,10 +64,8 @@ def score_placements(
     metrics: Sequence[str] | None = None,
     steps: int = 64,
     seed: int = 0,
-    every_s: float | None = None,
     sensor_model: Literal["ideal", "real"] | None = None,
-    workers: int = 0,
-    progress: bool = False,
+    **settings: Any,  # noqa: ANN401  (those of `evaluate`)
 ) -> PlacementScores:
     """Measure placements in the same frames.
 
@@ -82,10 +80,8 @@ def score_placements(
             there.
         steps: Steps.
         seed: Seed of the traffic.
-        every_s: Time between two steps in seconds; as in `evaluate` if not given.
         sensor_model: What sensors make of their hits; as for `evaluate`.
-        workers: Processes that make frames.
-        progress: Whether to show a bar.
+        settings: Others of `evaluate`: `every_s`, `workers`, `progress`.
 
     Raises:
         ValueError: Fewer rigs, an unknown metric, or as `evaluate`.
@@ -109,9 +105,7 @@ def score_placements(
         metrics=tuple(dict.fromkeys([*(PUBLISHED if metrics is None else metrics), COUNTS_POINTS])),
         steps=steps,
         seed=seed,
-        every_s=every_s,
-        workers=workers,
-        progress=progress,
+        **settings,
     )
     if result.run is not None:
         result.run.raise_failure()  # ranks of a part of what was asked for would look like the whole

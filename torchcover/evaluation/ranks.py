@@ -127,7 +127,7 @@ class Ranks:
         Raises:
             ValueError: Observers that do not measure the same.
         """
-        return [self._from_first(self._merged(number, one)) for number, one in enumerate(observers)]
+        return [self._from_first(self._merged(one)) for one in observers]
 
     def gather(self, value: Payload) -> list[Payload]:
         """What each rank has, in their order; every rank gets all of it."""
@@ -146,12 +146,15 @@ class Ranks:
                 self._wait_for([PARTED])
                 self.store.set(f"{PARTED} {self.rank}", "")
 
-    def _merged(self, number: int, observer: AnyObserver) -> AnyObserver:
+    def _merged(self, observer: AnyObserver) -> AnyObserver:
+        """In rank 0 that of all: in pairs of neighbours, then in pairs of pairs, so that no rank merges many."""
+        apart = 1
+        while apart < self.size and self.rank % (2 * apart) == 0:
+            if self.rank + apart < self.size:
+                observer.merge_state(self._receive(self.rank + apart))
+            apart *= 2
         if self.rank:
-            self._send(observer, 0)
-            return observer
-        for rank in range(1, self.size):
-            observer.merge_state(self._receive(rank))
+            self._send(observer, self.rank - apart)
         return observer
 
     def _wait_for(self, keys: list[str], at_most_s: float = LONGEST_WAIT.total_seconds()) -> None:
@@ -162,11 +165,12 @@ class Ranks:
             time.sleep(LOOK_EVERY_S)
 
     def _from_first(self, value: Payload) -> Payload:
-        if self.rank == 0:
-            for rank in range(1, self.size):
-                self._send(value, rank)
-            return value
-        received: Payload = self._receive(0)
+        data = packed(value if self.rank == 0 else None)
+        length = torch.tensor([len(data)])
+        distributed.broadcast(length, 0)
+        data = data if self.rank == 0 else torch.empty(int(length), dtype=torch.uint8)
+        distributed.broadcast(data, 0)
+        received: Payload = value if self.rank == 0 else unpacked(data)
         return received
 
     def _send(self, value: object, rank: int) -> None:

@@ -1,6 +1,6 @@
 """A run as a recording for the Rerun viewer: what the rig saw step by step, and what was measured."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,17 +9,16 @@ from matplotlib import colormaps
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchcover.coverage import BevGrid
 from torchcover.coverage.quantity import RADIUS, by_area
 from torchcover.detection import Boxes
 from torchcover.files import write_durably
 from torchcover.frames import Frame
 from torchcover.neighbors import blind_spot_radius
 from torchcover.report import ColourScale, SensorView, scale_of
-from torchcover.simulation import Sensor
 
 if TYPE_CHECKING:
     from torchcover.evaluation.result import Result
-    from torchcover.targets import TargetMap
 
 # A viewer holds all steps in memory.
 MOST_POINTS = 50_000
@@ -43,8 +42,17 @@ class RerunLog:
 
     def __init__(self, path: str | Path) -> None:
         self._path = Path(path)
+        if self._path.suffix != ".rrd":
+            raise ValueError(f"rerun: a file that ends in .rrd is needed; got {path}")
+        try:
+            import rerun as rr
+        except ImportError as error:
+            raise ImportError(f"{path}: rerun-sdk is needed: pip install 'torchcover[rerun]'") from error
+        self._path.parent.mkdir(parents=True, exist_ok=True)
         self._unfinished = self._path.with_name(f".unfinished_{self._path.name}")
-        self._stream = opened(self._path, self._unfinished)
+        self._stream: Any = rr.RecordingStream("torchcover")  # optional, so its types are not known
+        self._stream.save(self._unfinished)
+        self._stream.log("", rr.ViewCoordinates.FLU, static=True)
 
     def update(self, frame: Frame) -> None:
         """Write the clouds of a frame as measured, the reference coloured by the radius of each rig, and the boxes."""
@@ -79,87 +87,25 @@ class RerunLog:
 
     def finish(self, result: "Result") -> None:
         """Write the rigs and the maps of the radius, and close the file."""
-        if result.ego_outline_m is not None:
-            log_outline(self._stream, "ego", result.ego_outline_m)
+        import rerun as rr
+
+        from torchcover.evaluation.result_page import sensor_views
+
+        if (outline_m := result.ego_outline_m) is not None:
+            around = _on_ground(np.vstack([outline_m, outline_m[:1]]))
+            self._stream.log("ego", rr.LineStrips3D([around]), static=True)
         for rig, sensors in result.sensors.items():
-            log_sensors(self._stream, rig, sensors)
+            for view in sensor_views(sensors):
+                self._stream.log([rig, "sensors", view.name], rr.LineStrips3D(frustum(view)), static=True)
         coverages = result.coverages
         key = (by_area(RADIUS) if result.table.measure == "area" else RADIUS).key
         for rig, coverage in coverages.items():
             layer, grid = coverage.layers[key], coverage.grid
             scale = scale_of(layer.quantity, layer.values)
             for name, values in zip(grid.heights, layer.values.cpu().numpy(), strict=True):
-                log_cells(self._stream, [rig, "radius", name], values, (grid.x[0], grid.y[0]), grid.cell, scale)
+                self._stream.log([rig, "radius", name], _cells(values, grid, scale), static=True)
         self._stream.disconnect()
         write_durably(self._path, self._unfinished.replace)
-
-
-def write_target(seen: "TargetMap", sensors: Sequence[Sensor], path: str | Path) -> None:
-    """Write what a rig sees of a target, place by place, and where it is first seen.
-
-    Args:
-        seen: From `survey_target`.
-        sensors: Those of the rig.
-        path: The file, `.rrd`.
-
-    Raises:
-        ImportError: rerun-sdk is not installed.
-        ValueError: Another suffix.
-    """
-    path = Path(path)
-    write_durably(path, lambda aside: _log_target(seen, sensors, opened(path, aside)))
-
-
-def _log_target(seen: "TargetMap", sensors: Sequence[Sensor], stream: Any) -> None:  # noqa: ANN401
-    import rerun as rr
-
-    corner = seen.raster.x[0], seen.raster.y[0]
-    log_outline(stream, "ego", seen.vehicle_outline_m)
-    log_sensors(stream, seen.rig, sensors)
-    scale = ColourScale("steps with enough points", "%", "viridis", 0.0, 1.0)
-    log_cells(stream, [seen.target, "seen"], seen.seen, corner, seen.raster.step_m, scale)
-    first = seen.first_seen_m()
-    parts = np.split(first, np.flatnonzero(np.isnan(first).any(axis=1)))
-    strips = [_at_height(part[~np.isnan(part).any(axis=1)], 0.05) for part in parts]
-    stream.log([seen.target, "first seen"], rr.LineStrips3D([strip for strip in strips if len(strip) > 1]), static=True)
-    stream.disconnect()
-
-
-def opened(path: Path, aside: Path) -> Any:  # noqa: ANN401  (rerun is optional, so its types are not known)
-    """A stream into what is to be a file, and lies aside until it is whole.
-
-    Raises:
-        ImportError: rerun-sdk is not installed.
-        ValueError: Another suffix.
-    """
-    if path.suffix != ".rrd":
-        raise ValueError(f"rerun: a file that ends in .rrd is needed; got {path}")
-    try:
-        import rerun as rr
-    except ImportError as error:
-        raise ImportError(f"{path}: rerun-sdk is needed: pip install 'torchcover[rerun]'") from error
-    path.parent.mkdir(parents=True, exist_ok=True)
-    stream = rr.RecordingStream("torchcover")
-    stream.save(aside)
-    stream.log("", rr.ViewCoordinates.FLU, static=True)
-    return stream
-
-
-def log_outline(stream: Any, name: str, outline_m: NDArray[Any]) -> None:  # noqa: ANN401
-    """A closed line on the ground."""
-    import rerun as rr
-
-    stream.log(name, rr.LineStrips3D([_at_height(np.vstack([outline_m, outline_m[:1]]), 0.0)]), static=True)
-
-
-def log_sensors(stream: Any, rig: str, sensors: Sequence[Sensor]) -> None:  # noqa: ANN401
-    """Where sensors are, and the edges of what they see."""
-    import rerun as rr
-
-    from torchcover.evaluation.result_page import sensor_views
-
-    for view in sensor_views(sensors):
-        stream.log([rig, "sensors", view.name], rr.LineStrips3D(frustum(view)), static=True)
 
 
 def frustum(view: SensorView) -> list[NDArray[np.float64]]:
@@ -182,26 +128,18 @@ def frustum(view: SensorView) -> list[NDArray[np.float64]]:
     return [*rims, *(np.stack([view.position_m, rim[end]]) for rim in rims for end in (0, -1))]
 
 
-def log_cells(
-    stream: Any,  # noqa: ANN401
-    name: Iterable[str],
-    values: NDArray[Any],
-    corner_m: tuple[float, float],
-    cell_m: float,
-    scale: ColourScale,
-) -> None:
+def _cells(values: NDArray[Any], grid: BevGrid, scale: ColourScale) -> Any:  # noqa: ANN401
     """Known cells as coloured squares on the ground."""
     import rerun as rr
 
     row, column = np.nonzero(~np.isnan(values))
-    low = np.array(corner_m) + cell_m * np.stack([column, row], axis=1)
+    low = np.array([grid.x[0], grid.y[0]]) + grid.cell * np.stack([column, row], axis=1)
     around = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
-    corners = (low[:, None] + cell_m * around).reshape(-1, 2)
+    corners = (low[:, None] + grid.cell * around).reshape(-1, 2)
     two_triangles = np.array([[0, 1, 2], [0, 2, 3]])
     faces = (4 * np.arange(len(row))[:, None, None] + two_triangles).reshape(-1, 3)
     colours = coloured(values[row, column], scale).repeat(4, axis=0)
-    mesh = rr.Mesh3D(vertex_positions=_at_height(corners, 0.0), triangle_indices=faces, vertex_colors=colours)
-    stream.log(list(name), mesh, static=True)
+    return rr.Mesh3D(vertex_positions=_on_ground(corners), triangle_indices=faces, vertex_colors=colours)
 
 
 def coloured(values: NDArray[Any], scale: ColourScale) -> NDArray[np.uint8]:
@@ -230,5 +168,5 @@ def _few(values: Tensor) -> NDArray[Any]:
     return values[::every].cpu().numpy()
 
 
-def _at_height(points_m: NDArray[Any], z_m: float) -> NDArray[np.float64]:
-    return np.column_stack([points_m, np.full(len(points_m), z_m)])
+def _on_ground(points_m: NDArray[Any]) -> NDArray[np.float64]:
+    return np.column_stack([points_m, np.zeros(len(points_m))])

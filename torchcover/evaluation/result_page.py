@@ -27,6 +27,7 @@ COUNTED = (
     ("road users of SUMO or a recording where bodies cannot be: not there", "road_users_left_out", "moving_bodies"),
     ("pairs of a ray and a moving body that cannot meet: not cast", "ray_body_pairs_left_out", "ray_body_pairs"),
     ("rays of sensors where nothing moves: cast once, for all steps", "sensor_rays_reused", "sensor_rays"),
+    ("rays of sensors that hit nothing near a reference point: not cast", "sensor_rays_spared", "sensor_rays"),
     ("rays that end on the ego itself: known from the first scan", "sensor_self_hits_reused", "sensor_self_hits"),
 )
 # Packages that take long to import, and what would have needed them; not all lenses with distortion need kornia, but

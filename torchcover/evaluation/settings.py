@@ -302,6 +302,14 @@ class Settings:
             list[str],
         ),
     ] = Read(_target, None)
+    only_detection: Annotated[
+        bool,
+        Option(
+            "Only the detections of regions: no radii, and rough maps. Few reference points (2048 rays), and of the "
+            "rig only those rays are cast that can change their detection: for target errors, with more steps.",
+            in_study="tried",
+        ),
+    ] = False
     redundancy: Annotated[
         bool, Option("Say by how many sensors places are seen, and what is lost when each one fails.")
     ] = False
@@ -354,6 +362,13 @@ class Settings:
             raise ValueError(f"sensor_model {self.sensor_model}: `ideal` or `real` is needed")
         if self.reference == "paper" and self.band_frame == "ground":
             raise ValueError("band_frame ground: the paper's reference has bands over z of the vehicle; leave it out")
+        radii = self.target_error is not None and self.target_error.radius_m is not None
+        needs = radii or self.aggregations or self.redundancy or self.metrics or self.observers
+        if self.only_detection and (needs or not self.thresholds_m):
+            raise ValueError(
+                "only_detection: there are no radii, no aggregations, redundancy, metrics or observers then, and there "
+                "has to be a threshold; leave one of them out"
+            )
 
     @cached_property
     def mixture(self) -> "Mapping[str, tuple[AnyScenario, float]] | None":
@@ -395,6 +410,8 @@ class Settings:
         """
         if self.sensor_model is not None or self.weather:
             raise ValueError("sensor_model and weather are for simulations; a recording has the points that returned")
+        if self.only_detection:
+            raise ValueError("only_detection: for simulations; a recording has all its points")
         if self.vehicle is not None:
             raise ValueError("vehicle: for simulations; a recording has its own")
         if any(setting is not None for setting in (self.reference, self.rays, self.every_s)):

@@ -26,7 +26,6 @@ from torchcover.evaluation.target_error import MIN_STEPS, rounded_up
 from torchcover.evaluation.task import simulation
 from torchcover.files import Publication, end_with_parent
 from torchcover.report import (
-    WorkPanel,
     difference_heading,
     difference_words,
     draw_work_precision,
@@ -39,7 +38,11 @@ from torchcover.report import (
 DEFAULT_STEPS = 512
 # Of the blocks of the first setting, which alone says how errors fall, the others see so many.
 SHARE_OF_OTHERS = 4
-FEWER_RAYS: tuple[Mapping[str, Any], ...] = ({"rays": 4096}, {"rays": 1024})
+FEWER_RAYS: tuple[Mapping[str, Any], ...] = (
+    {"rays": 4096},
+    {"only_detection": True},
+    {"only_detection": True, "rays": 512},
+)
 # Errors of the detection that settings are recommended for.
 WANTED = (0.02, 0.01, 0.005)
 # Another setting than the first is recommended only where it saves a fifth of the time.
@@ -95,7 +98,7 @@ class StudyPlan:
 def _options(settings: Mapping[str, Any]) -> Iterator[str]:
     for name, value in settings.items():
         for one in value if isinstance(value, tuple) else (value,):
-            yield f"--{name.replace('_', '-')}={one}"
+            yield f"--{name.replace('_', '-')}" + f"={one}" * (one is not True)
 
 
 class Studied(NamedTuple):
@@ -131,7 +134,6 @@ class Trial:
         steps: How many were measured.
         least_steps: The fewest that print an error of every number that is awaited.
         seconds: What they took.
-        measuring_s: That part of it that went into the search and the sums.
         processor_s: What it took of all processors, those of workers too.
         band_frame: What the bands are over.
         numbers: Of all regions and bands.
@@ -141,7 +143,6 @@ class Trial:
     steps: int
     least_steps: int
     seconds: float
-    measuring_s: float
     processor_s: float
     band_frame: BandFrame
     numbers: Sequence[Studied]
@@ -189,9 +190,10 @@ class Study:
         first = reached[0][0] is self.trials[0] and WORTH * times[0] <= min(times)
         return reached[0 if first else times.index(min(times))]
 
-    def tables(self, *, explain: bool) -> list[Table]:
-        """For people: the settings; the numbers of the first; where the time goes, if that is to be explained."""
-        return [self._settings(), self._numbers(), *([self._seconds()] if explain else [])]
+    @property
+    def tables(self) -> list[Table]:
+        """For people: the settings; the numbers of the first."""
+        return [self._settings(), self._numbers()]
 
     def _settings(self) -> Table:
         rows = []
@@ -220,17 +222,6 @@ class Study:
         return text_table(
             ("place", "number", f"error after {first.steps:,}", *wanted), [rows], title="Each number, as given"
         )
-
-    def _seconds(self) -> Table:
-        rows = [
-            [
-                trial.options or "as given",
-                *(f"{1000 * s / trial.steps:.0f}" for s in (trial.seconds - trial.measuring_s, trial.measuring_s)),
-            ]
-            for trial in self.trials
-        ]
-        headings = ("setting", "worlds and rays (ms a step)", "search and sums (ms a step)")
-        return text_table(headings, [rows], title="Where the time goes", caption=f"and {self.start_s:.1f} s once")
 
     def advice(self, error: float) -> str:
         """The options of `evaluate` that reach an error."""
@@ -264,7 +255,7 @@ class Study:
 
     def draw(self) -> Figure:
         """The diagram of error against run time: the largest error of each unit."""
-        panels = []
+        panels = {}
         for quantity in list(dict.fromkeys(one.quantity for one in self.trials[0].numbers))[:2]:
             lines = {}
             for trial in self.trials:
@@ -273,7 +264,7 @@ class Study:
                 errors = [factor * trial.error_after(each, quantity.unit) for each in steps]
                 times = [trial.seconds_for(each, self.start_s) for each in steps]
                 lines[trial.options or "as given"] = list(zip(times, errors, strict=True))
-            panels.append(WorkPanel(f"largest error of the {difference_heading(quantity)}", lines))
+            panels[f"largest error of the {difference_heading(quantity)}"] = lines
         return draw_work_precision(panels, title=" in ".join(map(str, self.plan.named)), legend_title="setting")
 
     def save(self, folder: str | Path) -> list[Path]:
@@ -313,7 +304,7 @@ def _record(trial: Trial) -> dict[str, Any]:
         told = {name: difference.get(name, math.nan) for name in ("value", "error", "p")}
         own = {"region": one.region, "height": one.height, "quantity": one.quantity.key, "value": one.value}
         numbers.append(json_record({**own, "a": one.error.a, "bias": one.error.bias, "difference": json_record(told)}))
-    names = ("options", "steps", "least_steps", "seconds", "measuring_s", "processor_s", "band_frame")
+    names = ("options", "steps", "least_steps", "seconds", "processor_s", "band_frame")
     return {**{name: getattr(trial, name) for name in names}, "numbers": numbers}
 
 
@@ -374,7 +365,7 @@ def _tried(options: str, settings: Settings, first: Coverage | None) -> tuple[Tr
             place = region.name, height, region in awaited
             numbers.append(Studied(*place, quantity, value, ErrorModel(own, bias), difference, is_biased))
     least = max(MIN_STEPS, math.ceil(MIN_BLOCKS * steps / worlds) if worlds > 0 else steps)
-    times = result.run.seconds, result.run.measuring_s, processor_s
+    times = result.run.seconds, processor_s
     return Trial(options, steps, least, *times, coverage.band_frame, numbers), coverage
 
 

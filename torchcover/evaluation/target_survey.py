@@ -31,7 +31,7 @@ from torchcover.simulation import Scenario, Sensor, with_ego
 from torchcover.simulation.bodies import Body
 from torchcover.simulation.scenario import Mover
 from torchcover.simulation.shapes import Plane
-from torchcover.targets import Heading, Place, Raster, Target, TargetMap, Verdict, survey, write_arrays, write_csv
+from torchcover.targets import Place, Target, TargetMap, Verdict, survey, write_arrays, write_csv
 
 # Steps of a world in which something moves, or a sensor is noisy; else they are all alike.
 DEFAULT_STEPS = 16
@@ -48,13 +48,9 @@ def survey_target(
     *,
     vehicle: str | Path | None = None,
     sensor_model: Literal["ideal", "real"] | None = None,
-    raster: Raster | None = None,
     steps: int | None = None,
     every_s: float | None = None,
-    seed: int = 0,
-    hits: int = 5,
-    threshold_m: float = 0.4,
-    heading: Heading = "narrow",
+    **settings: Any,  # noqa: ANN401  (those of `survey`)
 ) -> TargetMap:
     """Put a target at every place around a vehicle, and see what its rig gets of it.
 
@@ -64,13 +60,9 @@ def survey_target(
         scenario: The world: a scenario, a built-in name or a YAML file; flat ground with nothing on it if not given.
         vehicle: What carries the rig, as for `evaluate`, or a mesh file.
         sensor_model: What sensors make of their hits; as for `evaluate`.
-        raster: Where to put it; within 5 m of the vehicle in steps of 0.2 m if not given.
         steps: How many steps are averaged; 1 where all are alike, else 16.
         every_s: Time between two of them; as for `evaluate` if not given.
-        seed: Of traffic, random places, noise and drop-out.
-        hits: How many points are enough to see it.
-        threshold_m: How near a measured point on the target must be to a point of its surface, for the share.
-        heading: Which side of it the vehicle sees: "narrow" (fewest points), "wide" (most), or its yaw in degrees.
+        settings: Others of `torchcover.targets.survey`: `raster`, `seed`, `hits`, `threshold_m`, `heading`.
 
     Returns:
         The map; see `TargetMap`.
@@ -92,13 +84,9 @@ def survey_target(
         rig,
         world,
         target if isinstance(target, Target) else Target.load(target),
-        raster,
         steps=(1 if alike else DEFAULT_STEPS) if steps is None else steps,
         every_s=spread_s(world, every_s),
-        seed=seed,
-        hits=hits,
-        threshold_m=threshold_m,
-        heading=heading,
+        **settings,
     )
 
 
@@ -224,20 +212,14 @@ def target_page(
 def _maps(seen: TargetMap) -> list[PageMap]:
     some = seen.points[seen.points > 0]
     most = max(float(np.percentile(some, ROBUST_PERCENTILE)), 10.0) if len(some) else 10.0
-    each = {
-        "points on it": (seen.points, ColourScale("points on it", "points", "viridis", 1.0, most, logarithmic=True)),
-        "seen": (100 * seen.seen, ColourScale(f"steps with {seen.hits} points or more", "%", "viridis", 0.0, 100.0)),
-        "surface": (
-            100 * seen.share,
-            ColourScale(f"visible surface within {seen.threshold_m:g} m of a point", "%", "viridis", 0.0, 100.0),
-        ),
-        "sensors": (
-            seen.sensors,
-            ColourScale(
-                f"sensors with {seen.hits} points or more", "sensors", "viridis", 0.0, float(len(seen.sensor_names))
-            ),
-        ),
-    }
+    of_sensors = f"sensors with {seen.hits} points or more", "sensors", "viridis", 0.0, float(len(seen.sensor_names))
+    near = f"visible surface within {seen.threshold_m:g} m of a point"
+    each = [
+        (seen.points, ColourScale("points on it", "points", "viridis", 1.0, most, logarithmic=True)),
+        (100 * seen.seen, ColourScale(f"steps with {seen.hits} points or more", "%", "viridis", 0.0, 100.0)),
+        (100 * seen.share, ColourScale(near, "%", "viridis", 0.0, 100.0)),
+        (seen.sensors, ColourScale(*of_sensors)),
+    ]
     first_seen = seen.first_seen_m()
     line = Line(f"first seen, with {seen.hits} points, on the way out", np.vstack([first_seen, first_seen[:1]]))
     return [
@@ -253,7 +235,7 @@ def _maps(seen: TargetMap) -> list[PageMap]:
             unknown=NO_ROOM,
             lines=[line],
         )
-        for values, scale in each.values()
+        for values, scale in each
     ]
 
 

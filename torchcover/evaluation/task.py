@@ -27,12 +27,15 @@ from torchcover.simulation import (
     with_ego,
 )
 from torchcover.simulation.reference_sensor import DEFAULT_BAND_FRAME
+from torchcover.simulation.simulated_frames import DEFAULT_REFERENCE
 
 AnyRig = Rig | str | Path
 SourceT = TypeVar("SourceT", bound=FrameSource, covariant=True)
 
 # Steps that follow each other are alike (docs/measured/error_bars.md), and every minute is another city.
 EVERY_S_IN_TRAFFIC = 10.0
+# Of the reference where only detections are asked for. Fewer save rays, but take more steps, and worlds, to an error.
+FEW_RAYS = 2048
 # Where warnings point to: the call of `evaluate`, beyond its own function, the one around that, and ours.
 CALLER = 4
 # Options that frames, what is asked and observers say by what they are, and those that change no result.
@@ -143,8 +146,9 @@ def simulation(settings: Settings, *, boxes: bool = False) -> Task[SimulatedFram
         steps=settings.simulated_steps,
         seed=settings.seed,
         every_s=spread_s(world, settings.every_s),
-        reference_sensor=reference_called(settings.reference, settings.rays, asked),
+        reference_sensor=reference_called(settings.reference, _rays(settings), asked),
         boxes=boxes or settings.needs_boxes,
+        within_m=max(settings.thresholds_m) if settings.only_detection else None,
         kept_bytes=0.0,  # steps come in order: no world is needed again
     )
     frames.simulator.check_run(frames.steps)
@@ -166,6 +170,12 @@ def _in_weather(
     each = {f"{name}, {one.name}": (name, one) for name in carried for one in weather}
     in_each = {both: carried[name].model_copy(update={"weather": one}) for both, (name, one) in each.items()}
     return in_each, {both: given[name] for both, (name, _) in each.items()}
+
+
+def _rays(settings: Settings) -> int | None:
+    """Of the reference of a simulation; None for its own number."""
+    few = settings.only_detection and settings.reference in (None, DEFAULT_REFERENCE)
+    return FEW_RAYS if few and settings.rays is None else settings.rays
 
 
 def _band_frame(settings: Settings) -> BandFrame:

@@ -97,6 +97,15 @@ class Trajectory:
         places_m, angles_deg = self.positions_m, self.angles_deg
         return _between(places_m[before], places_m[after], angles_deg[before], angles_deg[after], share)
 
+    def at_each(self, times_s: Matrix) -> Matrix:
+        """(T, 4, 4) poses at (T,) times, as `at` has them but for rounding."""
+        after = np.clip(self.times_s.searchsorted(times_s, side="right"), 0, len(self.times_s) - 1)
+        before = np.maximum(after - (times_s < self.times_s[after]), 0)
+        taken_s = self.times_s[after] - self.times_s[before]
+        share = np.where(taken_s > 0, times_s - self.times_s[before], 0.0) / np.where(taken_s > 0, taken_s, 1.0)
+        places_m, angles_deg = self.positions_m, self.angles_deg
+        return _between(places_m[before], places_m[after], angles_deg[before], angles_deg[after], share[:, None])
+
     def positions_at(self, times_s: Matrix) -> Matrix:
         """(T, 3) positions at (T,) times; NaN where the body is not there."""
         if np.array_equal(times_s, self.times_s[: len(times_s)]):

@@ -3,16 +3,16 @@
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, Self
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, BeforeValidator, Field, PlainValidator, ValidationInfo
 
 from torchcover.geometry import BoundingBox
-from torchcover.simulation import Document, Rig, Scenario, with_ego
+from torchcover.simulation import Rig, Scenario, with_ego
 from torchcover.simulation.bodies import mount_regions_of
-from torchcover.simulation.documents import NameOrFile, beside, is_file_name, read_document
+from torchcover.simulation.documents import NameOrFile, Readable, beside, is_file_name
 from torchcover.simulation.mount_regions import MountRegion, Skin
 
 
@@ -91,7 +91,7 @@ class Carrier(NamedTuple):
         return self.regions[name]
 
 
-class VehicleSpace(Document):
+class VehicleSpace(Readable):
     """What a search and a choice have in common: the worlds, and the vehicle in them.
 
     Args:
@@ -106,16 +106,6 @@ class VehicleSpace(Document):
     description: str = ""
     scenario: Names
     vehicle: NamedVehicle | None = None
-
-    @classmethod
-    def load(cls, path: str | Path) -> Self:
-        """Read it from a YAML file.
-
-        Raises:
-            FileNotFoundError: No such file.
-            BadFileError: Not YAML, or nothing that makes sense; the message names the file and the key.
-        """
-        return read_document(cls, Path(path))
 
     @property
     def first_rig(self) -> Rig | None:

@@ -16,6 +16,7 @@ from torchcover.placement.objective import Objective
 from torchcover.placement.questions import Questions, RigNumbers
 from torchcover.placement.racing import TOGETHER, Prefix, racing_order
 from torchcover.simulation import Rig, Scenario, SimulatedFrames, Simulator, with_ego
+from torchcover.simulation.rays import Balls
 from torchcover.simulation.simulated_frames import of_rigs, with_boxes
 
 WORLDS = 6
@@ -64,7 +65,9 @@ class HeldWorlds(Dataset[Frame]):
         held = self._held[number]
         if rig is None:
             return held
-        scans = self._with(rig, instant.scenario).scans(instant.step)[rig.name]
+        within_m = self._questions.within_m
+        within = None if within_m is None else Balls(held.reference.numpy(), within_m)
+        scans = self._with(rig, instant.scenario).scans(instant.step, within)[rig.name]
         counts = {"rays": sum(scan.rays for scan in scans), "self_hits": sum(scan.self_hits for scan in scans)}
         frame = replace(held, **of_rigs({rig.name: rig}, {rig.name: scans}), counts=counts)
         return frame if held.boxes is None else with_boxes(frame, held.boxes, {rig.name: rig})
@@ -162,14 +165,10 @@ class CommonInstants:
             raise ValueError(f"workers: a number >= 0 is needed; got {workers}")
         self.scenarios = tuple(one if isinstance(one, Scenario) else Scenario.load(one) for one in given)
         self.seed, self.estimate, self.objectives = seed, estimate, dict(objectives)
-        self._settings: dict[str, Any] = {"vehicle": vehicle, "per_world": per_world, "every_s": every_s, "rays": rays}
         self.sensor_model = sensor_model
-        self._settings |= {
-            "estimate": estimate,
-            "sensor_model": sensor_model,
-            "budget_bytes": budget_bytes,
-            "workers": workers,
-        }
+        self._settings: dict[str, Any] = {"vehicle": vehicle, "per_world": per_world, "every_s": every_s, "rays": rays}
+        self._settings |= {"estimate": estimate, "sensor_model": sensor_model}
+        self._settings |= {"budget_bytes": budget_bytes, "workers": workers}
         self._vehicles: set[str | None] = {None}  # that were found to be that of these worlds
         self._worlds = [with_ego(one, {}, vehicle) for one in self.scenarios]
         self.questions = Questions.around(Carrier.of(self._worlds).outline_m, objectives)

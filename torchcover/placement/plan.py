@@ -45,8 +45,7 @@ class SearchPlan:
         evaluations: Candidates to look at after the start, those of the control included; or
         budget_s: seconds for all of it, the instants and the test on fresh worlds included. One of the two is needed.
         optimiser: "auto", a name in `OPTIMISERS`, or whatever makes an `Optimiser` from a `Cube` and a seed.
-        seed: Of the worlds that candidates are scored in, and of all that is drawn.
-        test_seed: Of the fresh worlds; not given, the next.
+        seed: Of the worlds that candidates are scored in, and of all that is drawn; fresh worlds have the next.
         estimate: What a score is: "area", the share of the visible surface, or "known", the mean of the known cells.
         sensor_model: What sensors make of their hits, "ideal" or "real"; not given: real where that is known of them.
         worlds: Worlds of each scenario to search in.
@@ -65,7 +64,6 @@ class SearchPlan:
     budget_s: float | None = None
     optimiser: str | MakesOptimiser = AUTO
     seed: int = 0
-    test_seed: int | None = None
     estimate: Measure = "area"
     sensor_model: Literal["ideal", "real"] | None = None
     worlds: int = WORLDS
@@ -84,10 +82,6 @@ class SearchPlan:
             raise ValueError(f"evaluations: 1 or more is needed; got {self.evaluations}")
         if self.budget_s is not None and not self.budget_s > 0:
             raise ValueError(f"budget: more than 0 s is needed; got {self.budget_s:g}")
-        if self.test_seed == self.seed:
-            raise ValueError(
-                f"test_seed: the worlds would not be fresh with the seed of the search; both are {self.seed}"
-            )
         if self.estimate not in MEASURES:
             raise ValueError(f"estimate: one of {', '.join(MEASURES)} is needed; got {self.estimate!r}")
         if isinstance(self.optimiser, str) and self.optimiser not in (AUTO, *OPTIMISERS):
@@ -95,8 +89,8 @@ class SearchPlan:
 
     @property
     def seed_of_test(self) -> int:
-        """Of the fresh worlds."""
-        return self.seed + 1 if self.test_seed is None else self.test_seed
+        """Of the fresh worlds: another one than that of the search."""
+        return self.seed + 1
 
     def optimiser_in(self, space: SearchSpace) -> tuple[str, MakesOptimiser]:
         """The optimiser and its name.

@@ -92,6 +92,11 @@ class Questions(NamedTuple):
         return tuple(dict.fromkeys(one.metric for one in self.objectives.values() if one.metric is not None))
 
     @property
+    def within_m(self) -> float | None:
+        """How near to a point of the reference all lies that can change a number; None if anything can."""
+        return self.max_radius_m if self.max_radius_m in self.thresholds_m else None
+
+    @property
     def boxes(self) -> bool:
         """Whether one of them is about objects."""
         return any("boxes" in PUBLISHED[name].needs for name in self.metrics)

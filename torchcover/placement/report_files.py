@@ -1,6 +1,5 @@
 """What a search, and a choice, write: the same kinds of files and one page."""
 
-import csv
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ from torchcover.evaluation import sensor_views
 from torchcover.evaluation.progress import held_back
 from torchcover.evaluation.result_page import rig_document, words_of
 from torchcover.evaluation.settings import FILES, wanted_files
-from torchcover.files import Publication
+from torchcover.files import Publication, csv_text
 from torchcover.placement.fresh import finite
 from torchcover.report import Page, PagePicture, PageRig, PageTable, page_html
 from torchcover.simulation import Rig
@@ -89,7 +88,7 @@ class PlacementReport:
         for name, rig in self.rigs.items():
             files.add(name, rig.save)
         for name, rows in self.rows.items():
-            files.add(name, partial(_write_rows, rows))
+            files.add_text(name, csv_text([*map(_digits, row)] for row in rows))
         record = json.dumps(finite({**self.record, "sentence": self.sentence}), indent=2, allow_nan=False)
         files.add_text("search.json", f"{record}\n")
 
@@ -110,13 +109,6 @@ class PlacementReport:
         )
 
 
-def _write_rows(rows: Iterable[Iterable[object]], path: Path) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        csv.writer(file, lineterminator="\n").writerows([*map(_cell, row)] for row in rows)
-
-
-def _cell(value: object) -> object:
-    """What stands in a table; nothing for what is unknown."""
-    if value is None or value != value:
-        return ""
-    return f"{value:.9g}" if isinstance(value, float) else value
+def _digits(value: object) -> object:
+    """As many as anybody can use."""
+    return f"{value:.9g}" if isinstance(value, float) and value == value else value

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchcover.coverage import BevGrid
 from torchcover.frames import Frame
 from torchcover.published.frame_metric import WorldRatios, said
-from torchcover.published.sights import Sights, rig_of
+from torchcover.published.sights import rig_of
 from torchcover.simulation import Sensor
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.shapes import Mesh
@@ -37,9 +37,7 @@ class FalseVisible(WorldRatios):
         grid: Extent and height bands; its cells are made `cell_m` long.
         threshold_m: Distance within which a point counts as seen.
         cell_m: Side of the cells.
-        rig: Whose clouds; those of the only rig if not given.
-        sights: What metrics of a run share.
-        kwargs: For `torchmetrics.Metric`.
+        kwargs: `rig` and `sights` of `FrameMetric`, and those of `torchmetrics.Metric`.
 
     Raises:
         ValueError: No sensors: of a recording, name the rig or give its file; a threshold that is negative.
@@ -60,9 +58,6 @@ class FalseVisible(WorldRatios):
         grid: BevGrid,
         threshold_m: float = 0.4,
         cell_m: float = 1.0,
-        *,
-        rig: str | None = None,
-        sights: Sights | None = None,
         **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
     ) -> None:
         if not sensors:
@@ -86,11 +81,10 @@ class FalseVisible(WorldRatios):
             for band in coarse.heights
         ]
         fingerprint = hashlib.sha256(predicted.numpy().tobytes()).hexdigest()
-        super().__init__(ratios, {**given, "grid": coarse, "predicted": fingerprint}, rig, **kwargs)
+        super().__init__(ratios, {**given, "grid": coarse, "predicted": fingerprint}, **kwargs)
         self.grid = coarse
         self.predicted = predicted.flatten()
         self.threshold_m = float(threshold_m)
-        self.sights = Sights() if sights is None else sights
 
     def _of_frame(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
         seen = self.sights.distance(frame, rig_of(frame, self.rig), self.threshold_m) <= self.threshold_m

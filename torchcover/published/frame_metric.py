@@ -12,6 +12,7 @@ from torchcover.estimation import MIN_BLOCKS, Estimate, Number, Quantity
 from torchcover.frames import Frame
 from torchcover.metrics import MergeableMetric, SumsInBlocks, figure_of
 from torchcover.neighbors import check_tensor
+from torchcover.published.sights import Sights
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,12 +30,21 @@ class FrameMetric(MergeableMetric):
     Args:
         meaning: What the sums depend on, as in `MergeableMetric`.
         rig: Whose clouds; those of the only rig if not given.
+        sights: What metrics of a run share; its own if not given.
         kwargs: For `torchmetrics.Metric`.
     """
 
-    def __init__(self, meaning: Mapping[str, object], rig: str | None = None, **kwargs: Any) -> None:  # noqa: ANN401
+    def __init__(
+        self,
+        meaning: Mapping[str, object],
+        *,
+        rig: str | None = None,
+        sights: Sights | None = None,
+        **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
+    ) -> None:
         super().__init__({**meaning, "rig": rig}, **kwargs)
         self.rig = rig
+        self.sights = Sights() if sights is None else sights
 
     @torch.no_grad()
     def update(self, frame: Frame | Sequence[Frame]) -> None:
@@ -127,22 +137,15 @@ class WorldRatios(SumsInBlocks, FrameMetric):
     Args:
         ratios: What they are, as from `said`.
         meaning: What the sums depend on.
-        rig: Whose clouds; those of the only rig if not given.
-        kwargs: For `torchmetrics.Metric`.
+        kwargs: `rig` and `sights` of `FrameMetric`, and those of `torchmetrics.Metric`.
     """
 
     base: Tensor
     sums: Tensor
     counts: Tensor
 
-    def __init__(
-        self,
-        ratios: Sequence[Number],
-        meaning: Mapping[str, object],
-        rig: str | None = None,
-        **kwargs: Any,  # noqa: ANN401
-    ) -> None:
-        super().__init__(BLOCKS, meaning, rig, **kwargs)
+    def __init__(self, ratios: Sequence[Number], meaning: Mapping[str, object], **kwargs: Any) -> None:  # noqa: ANN401
+        super().__init__(BLOCKS, meaning, **kwargs)
         self.ratios = tuple(ratios)
         self.add_block_sum("base", (len(self.ratios),))
         self.add_block_sum("sums", (len(self.ratios),))

@@ -10,7 +10,7 @@ from torchcover.coverage import BevGrid, Region, check_regions
 from torchcover.coverage.regions import Places
 from torchcover.frames import Frame
 from torchcover.published.frame_metric import WorldRatios, said
-from torchcover.published.sights import Sights, rig_of
+from torchcover.published.sights import rig_of
 
 AT_LEAST = (1, 2, 3)
 
@@ -27,9 +27,7 @@ class KCover(WorldRatios):
         threshold_m: Distance within which a point counts as seen.
         at_least: Numbers of sensors, k; more than the rig has are covered nowhere.
         square_metres: Whether the share is one of square metres, which frames are then to have; else one of points.
-        rig: Whose clouds; those of the only rig if not given.
-        sights: What metrics of a run share.
-        kwargs: For `torchmetrics.Metric`.
+        kwargs: `rig` and `sights` of `FrameMetric`, and those of `torchmetrics.Metric`.
 
     Raises:
         ValueError: k below 1, a threshold that is negative, regions that the grid does not hold. From `update`: points
@@ -53,8 +51,6 @@ class KCover(WorldRatios):
         at_least: Sequence[int] = AT_LEAST,
         *,
         square_metres: bool = True,
-        rig: str | None = None,
-        sights: Sights | None = None,
         **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
     ) -> None:
         if not 0 <= threshold_m < float("inf"):
@@ -77,12 +73,11 @@ class KCover(WorldRatios):
             "grid": grid,
             "regions": places.regions,
         }
-        super().__init__(ratios, meaning, rig, **kwargs)
+        super().__init__(ratios, meaning, **kwargs)
         self.places = places
         self.threshold_m = float(threshold_m)
         self.at_least = tuple(at_least)
         self.square_metres = square_metres
-        self.sights = Sights() if sights is None else sights
         self.sights.by_sensor = True
 
     def _of_frame(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor]:

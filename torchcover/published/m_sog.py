@@ -16,7 +16,6 @@ from torchcover.metrics import SumsInBlocks
 from torchcover.neighbors import check_cloud
 from torchcover.published.frame_metric import BLOCKS, FrameMetric, said
 from torchcover.published.region_voxels import REGION, check_sensors, checked_grid, crossed_by, ray_count
-from torchcover.published.sights import Sights
 from torchcover.simulation import Sensor
 
 # Numbers that are kept of each voxel and block: frames in which it is labelled as the category, and as anything else.
@@ -49,9 +48,7 @@ class MSog(SumsInBlocks, FrameMetric):
         voxel_m: Side of a voxel; the paper does not print its own.
         region: What the voxels fill, 60 x 40 x 4 m as of S-MIG if not given.
         category: Of the boxes that have a label of their own.
-        rig: Whose clouds; those of the only rig if not given.
-        sights: What metrics of a run share.
-        kwargs: For `torchmetrics.Metric`.
+        kwargs: `rig` and `sights` of `FrameMetric`, and those of `torchmetrics.Metric`.
 
     Raises:
         ValueError: No sensor, voxels that do not divide the region or do not fit into the memory. From `update`: a
@@ -78,19 +75,15 @@ class MSog(SumsInBlocks, FrameMetric):
         voxel_m: float = 0.5,
         region: BoundingBox = REGION,
         category: str = "car",
-        *,
-        rig: str | None = None,
-        sights: Sights | None = None,
         **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
     ) -> None:
         check_sensors(sensors)
         grid = checked_grid(region, voxel_m, BLOCKS * LABELS * 8)
         meaning = {"sensors": tuple(sensors), "voxel_m": float(voxel_m), "region": region, "category": category}
-        super().__init__(BLOCKS, meaning, rig, **kwargs)
+        super().__init__(BLOCKS, meaning, **kwargs)
         self.sensors = tuple(sensors)
         self.grid = grid
         self.category = category
-        self.sights = Sights() if sights is None else sights
         self.add_block_sum("labelled", (LABELS, grid.voxels), torch.int64)
 
     def _add_frame(self, frame: Frame) -> None:

@@ -10,7 +10,7 @@ from torchcover.detection.visibility import mean_by_box
 from torchcover.frames import Frame
 from torchcover.published.frame_metric import WorldRatios, said
 from torchcover.published.object_strata import CATEGORIES, RANGE_BORDERS_M, ObjectStrata
-from torchcover.published.sights import Sights, rig_of
+from torchcover.published.sights import rig_of
 
 HITS = (1, 5, 10)
 
@@ -27,9 +27,7 @@ class ObjectCoverage(WorldRatios):
         hits: Numbers of points, n.
         categories: Those that have numbers of their own.
         range_borders_m: Borders between bins of range; farther objects do not count.
-        rig: Whose clouds; those of the only rig if not given.
-        sights: What metrics of a run share.
-        kwargs: For `torchmetrics.Metric`.
+        kwargs: `rig` and `sights` of `FrameMetric`, and those of `torchmetrics.Metric`.
 
     Raises:
         ValueError: A threshold that is negative, n below 1, categories or borders that make no sense. From `update`:
@@ -51,9 +49,6 @@ class ObjectCoverage(WorldRatios):
         hits: Sequence[int] = HITS,
         categories: Sequence[str] = CATEGORIES,
         range_borders_m: Sequence[float] = RANGE_BORDERS_M,
-        *,
-        rig: str | None = None,
-        sights: Sights | None = None,
         **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
     ) -> None:
         if not 0 <= threshold_m < float("inf"):
@@ -69,13 +64,10 @@ class ObjectCoverage(WorldRatios):
             for name, parameters in zip(names, given, strict=True)
             for stratum in strata.names
         ]
-        super().__init__(
-            ratios, {"threshold_m": float(threshold_m), "hits": tuple(hits), **strata.meaning}, rig, **kwargs
-        )
+        super().__init__(ratios, {"threshold_m": float(threshold_m), "hits": tuple(hits), **strata.meaning}, **kwargs)
         self.strata = strata
         self.threshold_m = float(threshold_m)
         self.hits = tuple(hits)
-        self.sights = Sights() if sights is None else sights
 
     def _of_frame(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
         rig, boxes = rig_of(frame, self.rig), self.sights.boxes(frame)

@@ -12,7 +12,7 @@ from torchcover.coverage.quantity import MEASURED_WITHIN_M
 from torchcover.frames import Frame
 from torchcover.published.frame_metric import WorldRatios, said
 from torchcover.published.object_strata import CATEGORIES, RANGE_BORDERS_M, ObjectStrata
-from torchcover.published.sights import Sights, count_in_boxes, rig_of
+from torchcover.published.sights import count_in_boxes, rig_of
 from torchcover.simulation import CameraSensor, Sensor
 
 # Of average precision a ln m + b over m points or pixels on the object, as GO4ROBO has them.
@@ -68,9 +68,7 @@ class PerceptionEntropy(WorldRatios):
         sensors: The rig's sensors; if not given, or without a camera, all points are taken for those of LiDARs.
         categories: Those that have numbers of their own.
         range_borders_m: Borders between bins of range; farther objects do not count.
-        rig: Whose clouds; those of the only rig if not given.
-        sights: What metrics of a run share.
-        kwargs: For `torchmetrics.Metric`.
+        kwargs: `rig` and `sights` of `FrameMetric`, and those of `torchmetrics.Metric`.
 
     Raises:
         ValueError: From `update`: a frame without boxes; of a rig with cameras, if it is unknown which points are of
@@ -90,9 +88,6 @@ class PerceptionEntropy(WorldRatios):
         sensors: Sequence[Sensor] = (),
         categories: Sequence[str] = CATEGORIES,
         range_borders_m: Sequence[float] = RANGE_BORDERS_M,
-        *,
-        rig: str | None = None,
-        sights: Sights | None = None,
         **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
     ) -> None:
         cameras = {sensor.name: sensor.counts_as for sensor in sensors if isinstance(sensor, CameraSensor)}
@@ -103,10 +98,9 @@ class PerceptionEntropy(WorldRatios):
             for form in ("perception_entropy", "perception_entropy_bounded")
             for name in strata.names
         ]
-        super().__init__(ratios, {**strata.meaning, "cameras": tuple(sorted(cameras.items()))}, rig, **kwargs)
+        super().__init__(ratios, {**strata.meaning, "cameras": tuple(sorted(cameras.items()))}, **kwargs)
         self.strata = strata
         self.cameras = cameras
-        self.sights = Sights() if sights is None else sights
 
     def _of_frame(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
         sigma = self._sigma(frame, rig_of(frame, self.rig))

@@ -26,8 +26,7 @@ class PointDensity(WorldRatios):
         grid: Where points count: its extent, its height bands, and the cells of the uniformity. The ground below a
             point is that below the reference point which, seen from above, is next to it.
         regions: Those that have numbers of their own.
-        rig: Whose clouds; those of the only rig if not given.
-        kwargs: For `torchmetrics.Metric`.
+        kwargs: `rig` and `sights` of `FrameMetric`, and those of `torchmetrics.Metric`.
 
     Raises:
         ValueError: Regions that the grid does not hold.
@@ -44,8 +43,6 @@ class PointDensity(WorldRatios):
         self,
         grid: BevGrid,
         regions: Sequence[Region],
-        *,
-        rig: str | None = None,
         **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
     ) -> None:
         check_regions(regions, grid)
@@ -55,7 +52,7 @@ class PointDensity(WorldRatios):
             *(said(f"point_density{name}", "points/m2", "frames") for name in names),
             *(said(f"point_uniformity_{grid.cell:g}m{name}", "share", "frames") for name in names),
         ]
-        super().__init__(ratios, {"grid": grid, "regions": tuple(regions)}, rig, **kwargs)
+        super().__init__(ratios, {"grid": grid, "regions": tuple(regions)}, **kwargs)
         self.grid = grid
         everywhere = torch.ones(grid.shape[1:], dtype=torch.bool)
         self._members = torch.stack([everywhere, *(region.mask(grid) for region in regions)]).flatten(1).double()

@@ -77,8 +77,7 @@ def _point_density(setup: Setup) -> PointDensity:
     # A region that is smaller than a cell of 1 m needs the cells of the run.
     coarse = coarse_grid(setup.grid, UNIFORMITY_CELL_M)
     fits = all(region.mask(coarse).any() for region in setup.regions)
-    grid = coarse if fits else setup.grid
-    return PointDensity(grid, setup.regions, rig=setup.rig, sync_on_compute=setup.sync_on_compute)
+    return PointDensity(coarse if fits else setup.grid, setup.regions, **setup.of_frames)
 
 
 PUBLISHED: Mapping[str, Published] = {

@@ -25,7 +25,6 @@ from torchcover.published.region_voxels import (
     crossed_on_the_way,
     ray_count,
 )
-from torchcover.published.sights import Sights
 from torchcover.simulation import Sensor
 
 CATEGORIES = ("car", "pedestrian", "cyclist")
@@ -60,9 +59,7 @@ class SMig(FrameMetric):
         region: What the voxels fill, the published 60 x 40 x 4 m if not given.
         categories: Each has its own occupancy and number. The number of all is their sum.
         occlusion: Whether rays end at what they hit.
-        rig: Whose clouds; those of the only rig if not given.
-        sights: What metrics of a run share.
-        kwargs: For `torchmetrics.Metric`.
+        kwargs: `rig` and `sights` of `FrameMetric`, and those of `torchmetrics.Metric`.
 
     Raises:
         ValueError: No sensor, no category or one twice, voxels that do not divide the region or do not fit into the
@@ -91,8 +88,6 @@ class SMig(FrameMetric):
         categories: Sequence[str] = CATEGORIES,
         *,
         occlusion: bool = False,
-        rig: str | None = None,
-        sights: Sights | None = None,
         **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
     ) -> None:
         check_sensors(sensors)
@@ -106,12 +101,11 @@ class SMig(FrameMetric):
             "categories": tuple(categories),
             "occlusion": occlusion,
         }
-        super().__init__(meaning, rig, **kwargs)
+        super().__init__(meaning, **kwargs)
         self.sensors = tuple(sensors)
         self.grid = grid
         self.categories = tuple(categories)
         self.occlusion = occlusion
-        self.sights = Sights() if sights is None else sights
         self.add_table("boxes", COLUMNS)
         if occlusion:
             self.add_sum("crossings", (grid.voxels,), torch.int64)

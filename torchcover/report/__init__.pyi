@@ -1,3 +1,4 @@
+from .drawings.encounters import draw_encounters as draw_encounters
 from .drawings.film import check_film as check_film
 from .drawings.film import write_film as write_film
 from .drawings.frame import ActorMark as ActorMark
@@ -14,7 +15,6 @@ from .drawings.search import draw_slices as draw_slices
 from .drawings.targets import draw_targets as draw_targets
 from .drawings.vehicle import SkinPatch as SkinPatch
 from .drawings.vehicle import draw_vehicle as draw_vehicle
-from .drawings.work_precision import WorkPanel as WorkPanel
 from .drawings.work_precision import draw_work_precision as draw_work_precision
 from .maps.arrays import draw_map as draw_map
 from .maps.arrays import draw_side_by_side as draw_side_by_side

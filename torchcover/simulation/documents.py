@@ -11,6 +11,7 @@ from typing import Annotated, Any, ClassVar, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import (
+    AfterValidator,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -70,6 +71,15 @@ FARTHEST_M = 1e9
 Coordinate = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
 
 
+def _ascending(bounds: tuple[float, float]) -> tuple[float, float]:
+    if not bounds[0] < bounds[1]:
+        raise ValueError(f"the lower bound must be below the upper one; got {bounds[0]:g} to {bounds[1]:g} m")
+    return bounds
+
+
+Bounds = Annotated[tuple[Coordinate, Coordinate], AfterValidator(_ascending)]
+
+
 class Pose(Document):
     """Where a frame lies in another: `destination_T_source` as people write it.
 
@@ -122,6 +132,20 @@ def read_document(model: type[DocumentT], path: Path) -> DocumentT:
         return model.model_validate(content, context={"folder": path.parent})
     except ValidationError as error:
         raise BadFileError(f"{path}: {explain(error)}") from error
+
+
+class Readable(Document):
+    """A document that fills a file of its own."""
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read it from a YAML file.
+
+        Raises:
+            FileNotFoundError: No such file.
+            BadFileError: Not YAML, or a wrong key or value; the message names the file and the key.
+        """
+        return read_document(cls, Path(path))
 
 
 class BuiltIn(Document):

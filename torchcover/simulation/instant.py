@@ -41,7 +41,8 @@ class SensorScan(NamedTuple):
     is the number of pairs of a ray and a moving body at which it was cast: the other pairs could not meet. `struck`
     finds out what they hit, for who asks, and `ways` the (N, 3) directions of their rays in the vehicle frame; both are
     None of what a sensor has measured. `error_m` (N,) is how far off it measured them, along their rays, None if they
-    are exact, and `landed` (N, 3) where that is, None if where they are.
+    are exact, and `landed` (N, 3) where that is, None if where they are. `rays_spared` were not cast, for nothing
+    was asked about where they point.
     """
 
     points: Float32
@@ -54,6 +55,7 @@ class SensorScan(NamedTuple):
     error_m: Float32 | None = None
     landed: Float32 | None = None
     ways: Callable[[], Float32] | None = None
+    rays_spared: int = 0
 
     def some(self, which: NDArray[np.int64]) -> "SensorScan":
         """Some of its points."""

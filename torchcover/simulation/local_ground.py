@@ -1,7 +1,7 @@
 """The ground of a world: what one drives or walks on, and how high above it something is."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torchcover.geometry import transform
 from torchcover.simulation.patches import connected, edges_of, outward_faces
 from torchcover.simulation.raycaster import RayCaster
-from torchcover.simulation.shapes import Mesh
+from torchcover.simulation.shapes import Mesh, parts_of
 
 Bools = NDArray[np.bool_]
 Float32 = NDArray[np.float32]
@@ -235,7 +235,7 @@ class GroundSquares(NamedTuple):
     @classmethod
     def of(cls, meshes: Sequence[Mesh], origin_m: Float64) -> "GroundSquares":
         """Those of triangles, of whose bounding boxes all squares are taken, lest one be overlooked."""
-        parts = [(corners_m.min(axis=(0, 2)), corners_m.max(axis=(0, 2))) for corners_m in _corners(meshes)]
+        parts = [(corners_m.min(axis=(0, 2)), corners_m.max(axis=(0, 2))) for _, corners_m in parts_of(meshes)]
         if not parts:
             return cls(np.zeros(2), math.inf, [np.array([[[np.inf]], [[-np.inf]]], dtype=np.float32)])
         least_m, most_m = np.min([low for low, _ in parts], axis=0), np.max([high for _, high in parts], axis=0)
@@ -248,7 +248,7 @@ class GroundSquares(NamedTuple):
         first_m = np.floor((least_m[:2] + origin_m[:2]) / square_m) * square_m - origin_m[:2]
         columns, rows = (np.floor((most_m[:2] - first_m) / square_m + ROUNDING).astype(np.int64) + 1).tolist()
         lowest, highest = np.full(columns * rows, np.inf), np.full(columns * rows, -np.inf)
-        for corners_m in _corners(meshes):
+        for _, corners_m in parts_of(meshes):
             lower_m, upper_m = corners_m.min(axis=0), corners_m.max(axis=0)
             from_square = np.floor((lower_m[:2] - first_m[:, None]) / square_m + ROUNDING).astype(np.int64)
             to_square = np.ceil((upper_m[:2] - first_m[:, None]) / square_m - ROUNDING).astype(np.int64) - 1
@@ -308,11 +308,6 @@ class GroundSquares(NamedTuple):
         lower_m, upper_m = triangles_m.min(axis=0), triangles_m.max(axis=0)
         lowest_m, highest_m = self.between_m(lower_m[:2], upper_m[:2])
         return height_bounds(lower_m[2] - highest_m, upper_m[2] - lowest_m)
-
-
-def _corners(meshes: Sequence[Mesh]) -> Iterator[Float64]:
-    """(3, 3, N) corners, coordinates, faces, part by part of all meshes."""
-    return (corners_m for mesh in meshes for _, corners_m in mesh.parts())
 
 
 def height_bounds(low_m: Float64, high_m: Float64) -> Float32:

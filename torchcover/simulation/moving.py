@@ -40,7 +40,7 @@ class Solid:
     """
 
     def __init__(self, mesh: Mesh) -> None:
-        self._mesh = mesh
+        self.mesh = mesh
         self.box = BoundingBox.around(mesh.vertices_m)
         centre_m = (np.array(self.box.lower_m) + np.array(self.box.upper_m)) / 2
         self.radius_m = float(np.linalg.norm(mesh.vertices_m - centre_m, axis=1).max())
@@ -53,12 +53,12 @@ class Solid:
     @cached_property
     def caster(self) -> RayCaster:
         """It alone, to cast rays at."""
-        return RayCaster([self._mesh])
+        return RayCaster([self.mesh])
 
     @cached_property
     def patches(self) -> Patches:
         """All of its surface, cut small."""
-        return Patches.of(self._mesh)
+        return Patches.of(self.mesh)
 
 
 class Solids:

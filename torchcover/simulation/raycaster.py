@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torchcover.geometry import transform
 from torchcover.simulation.patches import outward_faces
 from torchcover.simulation.rays import rotate
-from torchcover.simulation.shapes import Mesh, corners_of, normals_of
+from torchcover.simulation.shapes import Mesh, corners_of, normals_of, parts_of
 
 Float32 = NDArray[np.float32]
 Matrix = NDArray[np.float64]
@@ -42,20 +42,16 @@ class Faces:
 
     def __init__(self, bodies: Sequence[Mesh], reach_m: float) -> None:
         self._bodies = bodies
-        starts = np.cumsum([0] + [len(body.faces) for body in bodies]).tolist()
-        count = starts[-1]
+        count = sum(len(body.faces) for body in bodies)
         self.contact_m, self.normals = np.empty(count, dtype=np.float32), np.empty((3, count), dtype=np.float32)
         self._lower_m, self._upper_m = (np.empty((3, count), dtype=np.float32) for _ in range(2))
-        for start, body in zip(starts, bodies, strict=False):
-            for part, corners_m in body.parts():
-                faces = slice(start + part.start, start + part.stop)
-                self.normals[:, faces] = normals_of(corners_m)
-                contact_m = np.maximum(_contact_m(corners_m), MIN_CONTACT * reach_m)
-                self.contact_m[faces] = contact_m
-                # Rounded outwards.
-                lower_m, upper_m = corners_m.min(axis=0) - 2 * contact_m, corners_m.max(axis=0) + 2 * contact_m
-                self._lower_m[:, faces] = np.nextafter(lower_m.astype(np.float32), np.float32(-np.inf))
-                self._upper_m[:, faces] = np.nextafter(upper_m.astype(np.float32), np.float32(np.inf))
+        for faces, corners_m in parts_of(bodies):
+            self.normals[:, faces] = normals_of(corners_m)
+            self.contact_m[faces] = contact_m = np.maximum(_contact_m(corners_m), MIN_CONTACT * reach_m)
+            # Rounded outwards.
+            lower_m, upper_m = corners_m.min(axis=0) - 2 * contact_m, corners_m.max(axis=0) + 2 * contact_m
+            self._lower_m[:, faces] = np.nextafter(lower_m.astype(np.float32), np.float32(-np.inf))
+            self._upper_m[:, faces] = np.nextafter(upper_m.astype(np.float32), np.float32(np.inf))
         self._least_m, self._most_m = (
             self._lower_m.min(axis=1, initial=np.inf),
             self._upper_m.max(axis=1, initial=-np.inf),

@@ -28,6 +28,10 @@ SLACK_M = 1e-3
 SLACK_SHARE = 1e-6
 # Ranges are compared with this much to spare, in metres: a grazing ray's range is not exact.
 RANGE_SLACK_M = 0.01
+# A cosine between two float32 directions is off by less.
+COSINE_ROUNDING = 5e-7
+# So many pairs of a ball and a block are looked at together.
+PAIRS_AT_ONCE = 1 << 20
 
 Float64 = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -54,6 +58,46 @@ class Tile:
     blocks: NDArray[np.int64]
     block_lower: Float64
     block_upper: Float64
+
+    def some(self, which: NDArray[np.bool_]) -> "Tile":
+        """The tile of those of its rays for which (n,) is true, in the same cone."""
+        filled = which[self.blocks]
+        kept = filled.any(axis=1)
+        # The others repeat the first one of their block.
+        blocks, filled = self.blocks[kept], filled[kept]
+        first = np.take_along_axis(blocks, filled.argmax(axis=1)[:, None], axis=1)
+        numbers = (np.cumsum(which) - 1)[np.where(filled, blocks, first)]
+        lower, upper = self.block_lower[:, kept], self.block_upper[:, kept]
+        return Tile(self.directions[:, which], self.axis, self.half_angle, numbers, lower, upper)
+
+
+class Balls(NamedTuple):
+    """(K, 3) `centres_m` of balls in the vehicle frame, all with one `radius_m`."""
+
+    centres_m: NDArray[np.floating]
+    radius_m: float
+
+    def met_by(self, tile: Tile, vehicle_T_sensor: Float64) -> NDArray[np.bool_]:
+        """(n,) whether each ray of a tile may pass through one of them, and of the others some."""
+        ways_m = (self.centres_m - vehicle_T_sensor[:3, 3]) @ vehicle_T_sensor[:3, :3]
+        distance_m = np.linalg.norm(ways_m, axis=1)
+        radius_m = self.radius_m + SLACK_M + SLACK_SHARE * distance_m
+        if (distance_m <= radius_m).any():
+            return np.ones(tile.directions.shape[1], dtype=bool)
+        towards, angle = ways_m / distance_m[:, None], np.arcsin(radius_m / distance_m) + ROUNDING
+        off_axis = np.arccos(np.clip(towards @ tile.axis, -1.0, 1.0))
+        near = np.flatnonzero(off_axis <= angle + tile.half_angle + ROUNDING)
+        met = np.zeros(tile.directions.shape[1], dtype=bool)
+        middle, half = (tile.block_lower + tile.block_upper) / 2, (tile.block_upper - tile.block_lower) / 2
+        for some in np.array_split(near, len(near) * len(tile.blocks) // PAIRS_AT_ONCE + 1):
+            # By the chords between directions: those of a block are within half of its diagonal of its middle.
+            chord = 2 * np.sin(angle[some] / 2)[:, None] + np.linalg.norm(half, axis=0)
+            ball, block = np.nonzero(1 + (middle**2).sum(axis=0) - 2 * towards[some] @ middle <= chord**2 + ROUNDING**2)
+            rays = tile.blocks[block]
+            x, y, z = towards[some].astype(np.float32).T[:, ball, None]
+            along = x * tile.directions[0][rays] + y * tile.directions[1][rays] + z * tile.directions[2][rays]
+            met[rays[along >= (np.cos(angle[some]) - COSINE_ROUNDING).astype(np.float32)[ball, None]]] = True
+        return met
 
 
 def unit_directions(elevation_deg: Float64, azimuth_deg: Float64) -> Float64:

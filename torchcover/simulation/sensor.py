@@ -149,6 +149,11 @@ class Sensor(Protocol):
         ...
 
     @property
+    def rate_hz(self) -> float:
+        """How often it looks in a second."""
+        ...
+
+    @property
     def housing(self) -> Sequence[Body]:
         """What it is built into, in its own frame: the other sensors of its rig see that, and it looks out of it."""
         ...
@@ -222,6 +227,7 @@ class Ranging(Document):
         max_range_m: Farther hits give no point.
         range_noise_m: Standard deviation of the measured range, along the ray.
         dropout: Probability that a point is missing, from 0 to 1.
+        rate_hz: How often it looks in a second, for encounters.
         housing: Bodies that it is built into or stands on, in its own frame, which are in the way of the rig's others.
     """
 
@@ -229,6 +235,7 @@ class Ranging(Document):
     max_range_m: PositiveFloat
     range_noise_m: NonNegativeFloat = 0.0
     dropout: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    rate_hz: Annotated[float, Field(gt=0.0, le=1000.0)] = 10.0
     housing: tuple[Body, ...] = ()
 
     @model_validator(mode="after")

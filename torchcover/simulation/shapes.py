@@ -50,9 +50,7 @@ class Mesh(NamedTuple):
 
     def parts(self) -> Iterator[tuple[slice, NDArray[np.float64]]]:
         """Which faces, and their (3, 3, N) corners, coordinates, faces: as many at a time as there is memory for."""
-        for first in range(0, len(self.faces), PART):
-            part = slice(first, min(first + PART, len(self.faces)))
-            yield part, np.ascontiguousarray(self.vertices_m[self.faces[part]].transpose(1, 2, 0))
+        return parts_of([self])
 
     def made_of(self, material: str) -> "Mesh":
         """The mesh with all its faces of a built-in material."""
@@ -62,6 +60,18 @@ class Mesh(NamedTuple):
     def materials(self) -> NDArray[np.uint8]:
         """(F,) the number of what each face is made of."""
         return np.zeros(len(self.faces), dtype=np.uint8) if self.material is None else self.material
+
+
+def parts_of(meshes: Sequence[Mesh]) -> Iterator[tuple[slice, NDArray[np.float64]]]:
+    """As `Mesh.parts`, of faces that are counted through all meshes: of small ones several together."""
+    first, held = 0, list[NDArray[np.float64]]()
+    for number, mesh in enumerate(meshes, 1):
+        for start in range(0, max(len(mesh.faces), 1), PART):
+            held.append(mesh.vertices_m[mesh.faces[start : start + PART]])
+            count, is_last = sum(map(len, held)), number == len(meshes) and start + PART >= len(mesh.faces)
+            if count and (count >= PART or is_last):
+                yield slice(first, first + count), np.ascontiguousarray(np.concatenate(held).transpose(1, 2, 0))
+                first, held = first + count, []
 
 
 def corners_of(meshes: Sequence[Mesh], faces: NDArray[np.int64]) -> NDArray[np.float64]:

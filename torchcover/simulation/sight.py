@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torchcover.geometry import rigid
 from torchcover.simulation.instant import Instant, SensorScan
 from torchcover.simulation.raycaster import RayCaster
-from torchcover.simulation.rays import BLOCK, Tile, into_tiles, pixels_in_tiles, rotate
+from torchcover.simulation.rays import BLOCK, Balls, Tile, into_tiles, pixels_in_tiles, rotate
 from torchcover.simulation.scene import Scene, ends_at
 from torchcover.simulation.sensor import Draws, RayHits, ScanTimes, Sensor
 from torchcover.simulation.sweep import RayTimes
@@ -18,6 +18,8 @@ from torchcover.simulation.weather import CLEAR, Weather
 
 # Rays in a tile: of neighbours all, so that a tile is narrow. A constant, so that nothing depends on threads.
 TILE_RAYS = 8192
+# Of so many places or less it is found out which rays can hit something there; of more, nearly all can.
+FEW = 800
 # A ray ends before its target by this share of its length, which float32 leaves open.
 SHORTER = 1e-6
 
@@ -61,21 +63,28 @@ class MountedSensor:
             )
         self._times = ray_times(sensor, self.tiles, self.pixel_of_ray) if scene.moves else None
         self._is_raw = bool(self._times and timing and not timing.deskewed)
-        self._own_m = scene.own_m(self.vehicle_T_sensor, self.tiles, max_range_m=reach_m)
+        self.own_m = scene.own_m(self.vehicle_T_sensor, self.tiles, max_range_m=reach_m)
         housings = [
             mesh.moved(other.mount.matrix()) for other in others for body in other.housing for mesh in body.meshes()
         ]
         if housings:
             caster = RayCaster(housings)
             ends_m = [ends_at(caster, self.vehicle_T_sensor, tile, reach_m) for tile in self.tiles]
-            ego_m = self._own_m or ends_m
-            self._own_m = tuple(np.minimum(*both) for both in zip(ends_m, ego_m, strict=True))
+            ego_m = self.own_m or ends_m
+            self.own_m = tuple(np.minimum(*both) for both in zip(ends_m, ego_m, strict=True))
         self._at_rest = not scene.moves
         self._resting: tuple[SensorScan, RayHits] | None = None
 
-    def scan(self, instant: Instant, draws: Draws, *, threads: int = 1) -> SensorScan:
-        """What it makes of what its rays hit at one time of the scene."""
-        scan, hits = self._cast(instant, threads)
+    def scan(self, instant: Instant, draws: Draws, *, threads: int = 1, within: Balls | None = None) -> SensorScan:
+        """What it makes of what its rays hit at one time of the scene.
+
+        Args:
+            instant: The scene then.
+            draws: Source of the random numbers, which each ray has of its own if some are not cast.
+            threads: Number of threads; the result does not depend on it.
+            within: What is asked about: rays that hit nothing there need not be cast. The points within are the same.
+        """
+        scan, hits = self._cast(instant, threads, within)
         if self._is_raw:
             scan = self._as_cast(scan)
         hit, error_m = self.sensor.measure(hits, draws)
@@ -96,25 +105,50 @@ class MountedSensor:
         landed = self.vehicle_T_sensor[:3, 3] + scan.range_m[:, None] * ways
         return scan._replace(landed=landed.astype(np.float32), ways=lambda: ways)
 
-    def _cast(self, instant: Instant, threads: int) -> tuple[SensorScan, RayHits]:
+    def _cast(self, instant: Instant, threads: int, within: Balls | None) -> tuple[SensorScan, RayHits]:
         if self._resting is not None:
             return self._resting
+        tiles, own_m, cast = self.tiles, self.own_m, None
+        # A ray that is cast at another time than that of the frame starts elsewhere.
+        may_spare = bool(own_m) and self._times is None and not self._at_rest
+        if within is not None and len(within.centres_m) <= FEW and may_spare:
+            met = self._met(within)
+            tiles = tuple(tile.some(some) for tile, some in zip(tiles, met, strict=True))
+            own_m, cast = tuple(ends_m[some] for ends_m, some in zip(own_m, met, strict=True)), np.concatenate(met)
         scan = instant.scan(
             self.vehicle_T_sensor,
-            self.tiles,
+            tiles,
             max_range_m=self.reach_m,
-            own_m=self._own_m,
+            own_m=own_m,
             times=self._times,
             threads=threads,
         )
+        if cast is not None:
+            ended = int((np.concatenate(self.own_m)[~cast] <= self.reach_m).sum())
+            scan = scan._replace(
+                ray=np.flatnonzero(cast)[scan.ray],
+                rays=len(cast),
+                rays_spared=len(cast) - scan.rays,
+                self_hits=scan.self_hits + ended,
+            )
         hits = RayHits(scan.ray, scan.range_m, self.pixel_of_ray, find=scan.struck, weather=self.weather)
         if self._at_rest:
             self._resting = scan, hits
         return scan, hits
 
+    def _met(self, within: Balls) -> list[NDArray[np.bool_]]:
+        """For each tile (n,) which of its rays have to be cast: all of a beam, or none."""
+        met = [within.met_by(tile, self.vehicle_T_sensor) for tile in self.tiles]
+        beams = self.sensor.beams()
+        if beams is None:
+            return met
+        beam = beams.ravel()[self.pixel_of_ray]
+        all_of_beams = np.isin(beam, beam[np.concatenate(met)])
+        return np.split(all_of_beams, np.cumsum([len(each) for each in met])[:-1])
+
     def ends(self, instant: Instant) -> Ends:
         """Where each of its rays ends: at what it hits first, the ego's body included, or at its reach."""
-        bodies, own = instant.outlines(self.vehicle_T_sensor[:3, 3]), self._own_m or [None] * len(self.tiles)
+        bodies, own = instant.outlines(self.vehicle_T_sensor[:3, 3]), self.own_m or [None] * len(self.tiles)
         range_m, is_hit = [], []
         for tile, own_m in zip(self.tiles, own, strict=True):
             limit_m = np.full(tile.directions.shape[1], self.reach_m, dtype=np.float32)

@@ -63,6 +63,7 @@ class SimulatedFrames(FrameDataset):
         vehicle: What carries the rigs: a built-in vehicle, the YAML file of one, or a mesh file. Not given: the
             scenario's own ego, else the vehicle that the rigs name, else an SUV.
         kept_bytes: As in `Simulator`.
+        within_m: As in `Simulator`: the clouds have the points near the reference, and hardly any others.
 
     Raises:
         FileNotFoundError: An unknown name or file.
@@ -89,6 +90,7 @@ class SimulatedFrames(FrameDataset):
         boxes: bool = False,
         vehicle: str | Path | None = None,
         kept_bytes: float | None = None,
+        within_m: float | None = None,
     ) -> None:
         if not 1 <= steps <= MAX_STEPS:
             raise ValueError(f"steps: a number from 1 to {MAX_STEPS:,} is needed; got {steps}")
@@ -104,6 +106,7 @@ class SimulatedFrames(FrameDataset):
             seed=seed,
             every_s=every_s,
             kept_bytes=kept_bytes,
+            within_m=within_m,
         )
         self.steps = steps
         self.boxes = boxes
@@ -203,6 +206,7 @@ class SimulatedFrames(FrameDataset):
             "seed": self.seed,
             "every_s": self.every_s,
             "boxes": self.boxes,
+            "within_m": self.simulator.within_m,
         }
 
     def with_reference_sensor(self, reference_sensor: ReferenceSensor) -> Self:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torchcover.geometry import BoundingBox
 from torchcover.simulation.instant import Instant, SensorScan
 from torchcover.simulation.memory import check_fits
+from torchcover.simulation.rays import Balls
 from torchcover.simulation.reference_sensor import ReferenceScan, ReferenceSensor, Surroundings
 from torchcover.simulation.rig import Rig, with_ego
 from torchcover.simulation.scenario import Scenario
@@ -72,6 +73,8 @@ class Simulator:
         every_s: Time between one step and the next, a multiple of the scenario's time step; that step if not given.
         kept_bytes: What the worlds that are kept, in case they are needed again, may take; a small share of the
             machine's memory if not given.
+        within_m: Only points of the rigs that lie so near to one of the reference are asked for, as detections up to
+            this threshold do: rays that hit nothing there are not cast. Those points are the same to the bit.
 
     Raises:
         ValueError: Rigs that name different vehicles, a negative seed, a time that is no multiple of the time step,
@@ -95,6 +98,7 @@ class Simulator:
         seed: int = 0,
         every_s: float | None = None,
         kept_bytes: float | None = None,
+        within_m: float | None = None,
     ) -> None:
         if seed < 0:
             raise ValueError(f"seed: a number >= 0 is needed; got {seed}")
@@ -102,6 +106,7 @@ class Simulator:
         self.rigs = rigs
         self.reference_sensor = reference_sensor
         self.seed = seed
+        self.within_m = within_m
         self._every_steps = 1 if every_s is None else scenario.steps_in(every_s)
         self._stages = Stages(scenario, rigs, seed, kept_bytes)
         self._check_size()
@@ -148,11 +153,12 @@ class Simulator:
         other._check_size()
         return other
 
-    def scans(self, index: int) -> Mapping[str, Sequence[SensorScan]]:
+    def scans(self, index: int, within: Balls | None = None) -> Mapping[str, Sequence[SensorScan]]:
         """What the sensors see at one step, as in `step`, bit for bit; the reference is not cast.
 
         Args:
             index: Number of the step, from 0.
+            within: What is asked about, as in `MountedSensor.scan`; everything if not given.
 
         Returns:
             Name of each rig -> what each of its sensors saw.
@@ -169,7 +175,7 @@ class Simulator:
             (230400, dtype('float32'))
         """
         stage, instant = self._placed(index)
-        return self._scans(stage, instant, index)
+        return self._scans(stage, instant, index, within)
 
     def step(self, index: int) -> Observation:
         """What is seen at one step.
@@ -183,8 +189,9 @@ class Simulator:
                 ego below the ground.
         """
         stage, instant = self._placed(index)
-        scans = self._scans(stage, instant, index)
         reference = self.reference_sensor.scan(self._surroundings(stage.scene, instant, index))
+        within = None if self.within_m is None else Balls(reference.points, self.within_m)
+        scans = self._scans(stage, instant, index, within)
         of_all_rigs = [scan for of_rig in scans.values() for scan in of_rig]
         return Observation(
             scans=scans,
@@ -297,14 +304,16 @@ class Simulator:
         ]
         return max([float(np.linalg.norm(farthest_m)) + self.reference_sensor.max_range_m, *reaches])
 
-    def _scans(self, stage: Stage, instant: Instant, index: int) -> dict[str, list[SensorScan]]:
-        return {name: self._scan_rig(sensors, instant, index) for name, sensors in stage.mounted.items()}
+    def _scans(self, stage: Stage, instant: Instant, index: int, within: Balls | None) -> dict[str, list[SensorScan]]:
+        return {name: self._scan_rig(sensors, instant, index, within) for name, sensors in stage.mounted.items()}
 
-    def _scan_rig(self, sensors: Sequence[MountedSensor], instant: Instant, index: int) -> list[SensorScan]:
+    def _scan_rig(
+        self, sensors: Sequence[MountedSensor], instant: Instant, index: int, within: Balls | None
+    ) -> list[SensorScan]:
         scans = []
         for k, mounted in enumerate(sensors, 1):
-            draws = Draws(np.random.default_rng([self.seed, index, k]))
-            scans.append(mounted.scan(instant, draws, threads=torch.get_num_threads()))
+            draws = Draws(np.random.default_rng([self.seed, index, k]), rays=len(mounted.pixel_of_ray))
+            scans.append(mounted.scan(instant, draws, threads=torch.get_num_threads(), within=within))
         return scans
 
     def _surroundings(self, scene: Scene, instant: Instant, index: int) -> Surroundings:
@@ -330,5 +339,6 @@ def _counts_of(scene: Scene, instant: Instant, scans: Sequence[SensorScan], refe
         "ray_body_pairs": pairs,
         "ray_body_pairs_left_out": pairs - reference.body_casts - sum(scan.body_casts for scan in scans),
         "sensor_rays_reused": 0 if scene.moves else rays,
+        "sensor_rays_spared": sum(scan.rays_spared for scan in scans),
         "sensor_self_hits_reused": self_hits if scene.knows_self_hits else 0,
     }

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from torchcover.simulation.patches import edges_of, outward_by, outward_faces, surfaces_of
 from torchcover.simulation.raycaster import RayCaster
-from torchcover.simulation.shapes import PART, Mesh, corners_of, normals_of
+from torchcover.simulation.shapes import Mesh, corners_of, normals_of, parts_of
 
 Bools = NDArray[np.bool_]
 Float64 = NDArray[np.float64]
@@ -80,12 +80,11 @@ def coincident_faces(meshes: Sequence[Mesh], within: Sequence[bool]) -> list[Boo
     outward = np.concatenate([outward_faces(mesh) for mesh in meshes])
     number = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
     caster, found = RayCaster(meshes), np.zeros(len(number), dtype=bool)
-    for start in range(0, len(number), PART):
-        corners_m = corners_of(meshes, np.arange(start, min(start + PART, len(number))))
+    for part, corners_m in parts_of(meshes):
         has_area = normals_of(corners_m).any(axis=0)
         is_long = np.linalg.norm(corners_m - corners_m[[2, 0, 1]], axis=1).max(axis=0) > LONG_M
         for some, points in ((has_area & ~is_long, SIDE_POINTS), (has_area & is_long, LONG_SIDE_POINTS)):
-            faces, corners = start + np.flatnonzero(some), corners_m[..., some]
+            faces, corners = part.start + np.flatnonzero(some), corners_m[..., some]
             normals = normals_of(corners).T
             for shares in _inner_points(points) if len(faces) else ():
                 places_m = np.tensordot(shares, corners, 1).T

@@ -212,9 +212,9 @@ def bounds_along(static_T_vehicle: Float64, box: Bounds) -> Bounds:
         static_T_vehicle: (T, 4, 4) poses of the vehicle, one after the other.
         box: One box in the vehicle frame.
     """
-    lower_m, upper_m = (
-        np.concatenate(side) for side in zip(*(_moved_bounds(pose, box) for pose in static_T_vehicle), strict=True)
-    )
+    rotation, half_m = static_T_vehicle[:, :3, :3], (box.upper_m - box.lower_m)[0] / 2
+    middle_m = rotation @ (box.lower_m + half_m)[0] + static_T_vehicle[:, :3, 3]
+    lower_m, upper_m = middle_m - np.abs(rotation) @ half_m, middle_m + np.abs(rotation) @ half_m
     way_m = np.cumsum(np.linalg.norm(np.diff(static_T_vehicle[:, :3, 3], axis=0, prepend=0), axis=1))
     first = np.flatnonzero(np.diff(way_m // STRETCH_M, prepend=-1))
     lower_m, upper_m = np.minimum.reduceat(lower_m, first), np.maximum.reduceat(upper_m, first)

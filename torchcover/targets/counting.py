@@ -53,7 +53,7 @@ class Sums(NamedTuple):
         return cls(np.zeros((sensors, positions), dtype=np.int64), *zeros, *never)
 
 
-class _Met(NamedTuple):
+class Met(NamedTuple):
     """Where the rays of one sensor meet the target, were it alone, in the order of positions and rays.
 
     `position`, `ray`, `range_m` and `triangle` (N,), `direction` (N, 3).
@@ -66,7 +66,7 @@ class _Met(NamedTuple):
     direction: Float32
 
 
-class _Beams(NamedTuple):
+class Beams(NamedTuple):
     """The rays of a sensor by the beam in which they are measured together.
 
     `of_ray` (rays,) the number of each ray's beam; `ray` (rays,) all rays, beam by beam, ascending in each; `first`
@@ -139,7 +139,7 @@ def count(
         `Sums`, which do not depend on the number of threads.
     """
     farthest_m = [np.max([step.sensors[k].ends.range_m for step in steps], axis=0) for k in range(len(mounted))]
-    beams = [_Beams.of(sensor) for sensor in mounted]
+    beams = [Beams.of(sensor) for sensor in mounted]
 
     def count_some(first: int) -> Sums:
         some = slice(first, first + CHUNK)
@@ -151,7 +151,7 @@ def count(
                 standing_there = standing(poses, z_m)
                 # No bodies of the scene: their numbers say so.
                 placed = Moving.placed([target.solid] * len(poses), standing_there, np.full(len(poses), -1))
-                met = [_meetings(placed, *sensor) for sensor in zip(mounted, farthest_m, strict=True)]
+                met = [meetings(placed, *sensor) for sensor in zip(mounted, farthest_m, strict=True)]
                 on_ground = _OnGround.of(surface, placed, mounted, met, threshold_m)
             cut = Step(step.sensors, z_m, step.free[some], step.visible[:, some])
             _count_step(sums, on_ground, mounted, beams, cut, hits, threshold_m)
@@ -166,7 +166,8 @@ def count(
     return Sums._make(np.concatenate(column, axis=-1) for column in zip(*parts, strict=True))
 
 
-def _meetings(placed: Moving, mounted: MountedSensor, farthest_m: Float32) -> _Met:
+def meetings(placed: Moving, mounted: MountedSensor, farthest_m: Float32) -> Met:
+    """Where the rays of a sensor meet each of some bodies, were it alone, if no farther off than (rays,) ranges."""
     origin_m, vehicle_R_sensor = mounted.vehicle_T_sensor[:3, 3], mounted.vehicle_T_sensor[:3, :3]
     bodies, first, parts = outlines(placed.corners_m, origin_m), 0, []
     for tile in mounted.tiles:
@@ -175,12 +176,12 @@ def _meetings(placed: Moving, mounted: MountedSensor, farthest_m: Float32) -> _M
         limit_m = farthest_m[first : first + rays]
         met, _ = placed.meetings(origin_m, vehicle_R_sensor, tile, directions, limit_m, bodies)
         towards = directions.take(met.ray, axis=1).T
-        parts.append(_Met(met.part, first + met.ray, met.range_m, met.triangle, towards))
+        parts.append(Met(met.part, first + met.ray, met.range_m, met.triangle, towards))
         first += rays
-    together = _Met._make(np.concatenate(column) for column in zip(*parts, strict=True))
+    together = Met._make(np.concatenate(column) for column in zip(*parts, strict=True))
     # A ray that fills up the block of a tile is cast more than once.
     _, once = np.unique(together.position * first + together.ray, return_index=True)
-    return _Met._make(column[once] for column in together)
+    return Met._make(column[once] for column in together)
 
 
 class _OnGround(NamedTuple):
@@ -190,7 +191,7 @@ class _OnGround(NamedTuple):
     """
 
     placed: Moving
-    met: Sequence[_Met]
+    met: Sequence[Met]
     near: Sequence[NDArray[np.uint8]]
 
     @classmethod
@@ -199,7 +200,7 @@ class _OnGround(NamedTuple):
         surface: Surface,
         placed: Moving,
         mounted: Sequence[MountedSensor],
-        met: Sequence[_Met],
+        met: Sequence[Met],
         threshold_m: float,
     ) -> Self:
         near = [
@@ -213,7 +214,7 @@ def _count_step(
     sums: Sums,
     there: _OnGround,
     mounted: Sequence[MountedSensor],
-    beams: Sequence[_Beams | None],
+    beams: Sequence[Beams | None],
     step: Step,
     hits: int,
     threshold_m: float,
@@ -222,14 +223,14 @@ def _count_step(
     points = np.zeros_like(sums.points)
     near = np.zeros((count, there.near[0].shape[1]), dtype=np.uint8)
     for k, (sensor, one, seen) in enumerate(zip(mounted, there.met, step.sensors, strict=True)):
-        measured = _measured(sensor, beams[k], one, seen, there.placed, threshold_m)
+        measured = measured_points(sensor, beams[k], one, seen, there.placed, threshold_m)
         points[k] = sensor.sensor.counts_as * np.bincount(one.position[measured], minlength=count)
         near |= _any_of_each(one.position[measured], there.near[k][measured], count)
     _add(sums, step, points, near, hits)
 
 
-def _measured(
-    mounted: MountedSensor, beams: _Beams | None, met: _Met, seen: SensorStep, placed: Moving, within_m: float
+def measured_points(
+    mounted: MountedSensor, beams: Beams | None, met: Met, seen: SensorStep, placed: Moving, within_m: float
 ) -> Numbers:
     """Which of N meetings give a point that is no farther off along its ray, by position: nothing else is in the way.
 
@@ -253,7 +254,7 @@ def _measured(
     return arrived[of_target[counts]]
 
 
-def _in_target(mounted: MountedSensor, met: _Met, vehicle_T_target: Float64) -> Float64:
+def _in_target(mounted: MountedSensor, met: Met, vehicle_T_target: Float64) -> Float64:
     """(N, 3) the points in the frame of the target."""
     range_m = met.range_m.astype(np.float64)
     from_origin_m = mounted.vehicle_T_sensor[:3, 3] + met.direction * range_m[:, None]

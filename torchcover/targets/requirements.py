@@ -1,13 +1,12 @@
 """What a rig must see of a target, and whether it does."""
 
 import math
-from pathlib import Path
 from typing import Annotated, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
-from torchcover.simulation.documents import Document, read_document
+from torchcover.simulation.documents import Document, Readable
 from torchcover.targets.result import SIDES, Place, TargetMap
 from torchcover.targets.target import TARGETS
 
@@ -66,7 +65,7 @@ class Requirement(Document):
         return self.target is None or target in (self.target, TARGETS.get(self.target))
 
 
-class Requirements(Document):
+class Requirements(Readable):
     """A list of them.
 
     Args:
@@ -74,16 +73,6 @@ class Requirements(Document):
     """
 
     requirements: tuple[Requirement, ...] = Field(min_length=1)
-
-    @classmethod
-    def load(cls, path: str | Path) -> Self:
-        """Read them from a YAML file.
-
-        Raises:
-            FileNotFoundError: No such file.
-            BadFileError: Not such a document; the message names the file and the key.
-        """
-        return read_document(cls, Path(path))
 
 
 class Verdict(NamedTuple):

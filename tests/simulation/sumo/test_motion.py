@@ -116,8 +116,8 @@ def test_who_is_where_another_one_is_goes_and_of_two_the_one_that_meets_more():
     assert [body.poses[0].round(1).tolist() for body in possible(bodies)] == [
         bodies[k].poses[0].round(1).tolist() for k in (0, 1, 3, 4)
     ]
-    (rest,) = motions([user(np.tile([[50.0, 20.5]], (51, 1)))], 10.0, ORIGIN)
-    assert possible([bodies[0], rest]) == [bodies[0]]
+    rest = motions([user(np.tile([[x, 20.5]], (51, 1))) for x in (30.0, 50.0)], 10.0, ORIGIN)
+    assert possible([bodies[0], *rest]) == [bodies[0]]
     (later,) = motions([user(straight(0.1, 2.0, x_m=50.0, y_m=20.5), begin_s=7.0)], 10.0, ORIGIN)
     assert possible([bodies[0], later]) == [bodies[0], later]
 
@@ -156,3 +156,5 @@ def test_who_cannot_get_round_is_not_there(corner):
     assert lorry.over_kerb_m > 0.05
     assert not lorry.can_be
     assert possible([lorry]) == [lorry]  # the first is the ego
+    (walker,) = motions([user(turn(5.0, 1.4), on_foot=True)], 40.0, ORIGIN, corner)
+    assert walker.can_be

@@ -2,14 +2,17 @@
 
 import math
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor
 
+TINY = 1e-30
 # Hyperparameters are learnt from so many values, which costs their third power at every step.
 MOST_LEARNT_FROM = 150
-STEPS, LONGEST_STEP, SHORTEST_STEP, ENOUGH = 40, 2.0, 1e-3, 1e-3
+DESCENT: dict[str, Any] = {"max_iter": 40, "tolerance_change": 1e-3, "line_search_fn": "strong_wolfe"}
+# Of logarithms: nothing that is learnt lies beyond.
+FARTHEST = 30.0
 # Of the variance of the values: with less, duplicates make the kernel matrix singular.
 LEAST_NOISE = 1e-8
 # Where marginal likelihoods are flat, lengths near half of a range, a signal as large as the values, little noise.
@@ -99,7 +102,7 @@ def _squared_apart(levels: tuple[int, ...], first: Tensor, second: Tensor) -> Te
 def _kernel(apart: Tensor, log_lengths: Tensor, log_signal: Tensor) -> Tensor:
     """Matérn 5/2, with a length for each variable."""
     squared = torch.einsum("vnm,v->nm", apart, torch.exp(-2.0 * log_lengths))
-    far = (5.0 * squared).sqrt()
+    far = (5.0 * squared + TINY).sqrt()  # whose slope at 0 is infinite
     return log_signal.exp() * (1.0 + far + far.square() / 3.0) * torch.exp(-far)
 
 
@@ -121,55 +124,29 @@ def _learnt(apart: Tensor, standard: Tensor, noise: Tensor) -> tuple[Tensor, Ten
     usual = torch.tensor([length] * count + [0.0, PRIOR_NOISE], dtype=standard.dtype)
     ends = []
     for longer, noisier in RESTARTS:
-        first = usual + torch.tensor([longer] * count + [0.0, noisier], dtype=standard.dtype)
-        ends.append(_descended(first, usual, apart, standard, noise))
-    best = min(ends, key=lambda end: end[1])[0]
+        values = usual + torch.tensor([longer] * count + [0.0, noisier], dtype=standard.dtype)
+        descent = torch.optim.LBFGS([values.requires_grad_()], **DESCENT)
+
+        def loss(values: Tensor = values, descent: torch.optim.Optimizer = descent) -> Tensor:
+            descent.zero_grad()
+            found = _loss(values, usual, apart, standard, noise)
+            found.backward()  # type: ignore[no-untyped-call]
+            return found
+
+        with torch.enable_grad():
+            descent.step(loss)
+        values = values.detach().clamp(-FARTHEST, FARTHEST)
+        ends.append((float(_loss(values, usual, apart, standard, noise)), values))
+    best = min(ends, key=lambda end: end[0])[1]
     return best[:count], best[count], best[count + 1]
 
 
-def _descended(values: Tensor, usual: Tensor, apart: Tensor, standard: Tensor, noise: Tensor) -> tuple[Tensor, float]:
-    """The nearest minimum of the negative log posterior, by BFGS (Nocedal and Wright 2006, algorithm 6.1)."""
-    loss, slope = _loss_and_slope(values, usual, apart, standard, noise)
-    inverse = torch.eye(len(values), dtype=values.dtype)
-    for _ in range(STEPS):
-        direction = -inverse @ slope
-        direction = direction * min(1.0, LONGEST_STEP / max(float(direction.norm()), 1e-300))
-        step, expected = 1.0, float(slope @ direction)
-        while step > SHORTEST_STEP:
-            new_loss, new_slope = _loss_and_slope(values + step * direction, usual, apart, standard, noise)
-            if new_loss <= loss + 1e-4 * step * expected:
-                break
-            step *= 0.4
-        else:
-            break
-        moved, bent = step * direction, new_slope - slope
-        values, gained, loss, slope = values + moved, loss - new_loss, new_loss, new_slope
-        if gained < ENOUGH:
-            break
-        curvature = float(moved @ bent)
-        if curvature > 1e-10:
-            left = torch.eye(len(values), dtype=values.dtype) - torch.outer(moved, bent) / curvature
-            inverse = left @ inverse @ left.T + torch.outer(moved, moved) / curvature
-    return values, loss
-
-
-def _loss_and_slope(
-    values: Tensor, usual: Tensor, apart: Tensor, standard: Tensor, noise: Tensor
-) -> tuple[float, Tensor]:
-    """The negative log posterior density of the hyperparameters, and its gradient (equation 5.9)."""
-    count = len(apart)
-    closer = apart * torch.exp(-2.0 * values[:count])[:, None, None]
-    far = (5.0 * closer.sum(0)).sqrt()
-    decay = values[count].exp() * torch.exp(-far)
-    kernel = decay * (1.0 + far + far.square() / 3.0)
-    own = values[count + 1].exp()
-    cholesky = _factor(kernel + torch.diag(noise + own + LEAST_NOISE))
-    weights = torch.cholesky_solve(standard[:, None], cholesky)[:, 0]
+def _loss(values: Tensor, usual: Tensor, apart: Tensor, standard: Tensor, noise: Tensor) -> Tensor:
+    """The negative log posterior density of the hyperparameters."""
+    count, near = len(apart), values.clamp(-FARTHEST, FARTHEST)
+    kernel = _kernel(apart, near[:count], near[count])
+    cholesky = _factor(kernel + torch.diag(noise + near[count + 1].exp() + LEAST_NOISE))
+    whitened = torch.linalg.solve_triangular(cholesky, standard[:, None], upper=False)
     widths = torch.tensor([PRIOR_WIDTH] * (count + 1) + [PRIOR_NOISE_WIDTH], dtype=values.dtype)
     off = (values - usual) / widths
-    loss = 0.5 * (weights @ standard + off.square().sum()) + cholesky.diagonal().log().sum()
-    unexplained = torch.cholesky_inverse(cholesky) - torch.outer(weights, weights)
-    by_length = torch.einsum("nm,vnm->v", unexplained * decay * (1.0 + far) * (5.0 / 3.0), closer)
-    by_signal, by_noise = (unexplained * kernel).sum(), own * unexplained.diagonal().sum()
-    slope = 0.5 * torch.cat([by_length, by_signal[None], by_noise[None]])
-    return float(loss), slope + off / widths
+    return 0.5 * (whitened.square().sum() + off.square().sum()) + cholesky.diagonal().log().sum()

@@ -1,6 +1,5 @@
 """The tables of a plain folder: `poses.csv`, of the vehicle or of a sensor, and `boxes/FRAME.csv`."""
 
-import csv
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchcover.detection.boxes import Boxes
-from torchcover.files import naming, read_csv
+from torchcover.files import csv_text, naming, read_csv
 from torchcover.geometry import rigid, rotation_from_quaternion
 from torchcover.geometry.rigid import RIGID_TOLERANCE, Matrix
 from torchcover.recordings.formats.file_names import check_frames, some_of
@@ -92,8 +91,7 @@ def write_boxes(path: Path, boxes: Boxes) -> None:
     if boxes.bottom_heights_m.isfinite().all():
         columns[BOTTOM] = boxes.bottom_heights_m.tolist()
     columns |= {DRAWN: boxes.drawn_points.tolist(), "id": boxes.ids, "category": boxes.categories}
-    with path.open("w", newline="", encoding="utf-8") as file:
-        csv.writer(file).writerows([list(columns), *zip(*columns.values(), strict=True)])
+    path.write_text(csv_text([list(columns), *zip(*columns.values(), strict=True)]), encoding="utf-8")
 
 
 def _whole_numbers(name: str, values: NDArray[np.float64]) -> list[int]:

@@ -1,6 +1,5 @@
 """A recording as a plain folder, which `FolderRecording` reads."""
 
-import csv
 import json
 from collections.abc import Sequence
 from functools import partial
@@ -9,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from torchcover.files import write_npz
+from torchcover.files import csv_text, write_npz
 from torchcover.geometry import BoundingBox, invert, quaternion_from_rotation, transform
 from torchcover.recordings.formats.folder import BOXES, POSES_FILE, REFERENCE, SETTINGS_FILE
 from torchcover.recordings.formats.folder_tables import PLACE, ROTATION, write_boxes
@@ -55,9 +54,9 @@ class FolderRecorder:
 
     def finish(self, steps: Sequence[Sequence[Any]]) -> None:
         """Write `poses.csv` and `frames.yaml`."""
-        self._add(POSES_FILE, partial(_write_poses, steps))
-        settings = self._settings(self._setup)
-        self._add(SETTINGS_FILE, lambda path: path.write_text(settings, encoding="utf-8"))
+        poses = csv_text([["frame", "time_s", *PLACE, *ROTATION, "instant"], *steps])
+        for name, text in ((POSES_FILE, poses), (SETTINGS_FILE, self._settings(self._setup))):
+            self._add(name, partial(Path.write_text, data=text, encoding="utf-8"))
 
     def _settings(self, setup: RecordingSetup) -> str:
         """The text of `frames.yaml`; values as JSON, which YAML reads."""
@@ -69,8 +68,3 @@ class FolderRecorder:
             lines.append("reference: {square_metres: true}")
         lines.append(f"vehicle: {json.dumps({'lower_m': body.lower_m, 'upper_m': body.upper_m})}")
         return "\n".join(lines) + "\n"
-
-
-def _write_poses(steps: Sequence[Sequence[Any]], path: Path) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        csv.writer(file).writerows([["frame", "time_s", *PLACE, *ROTATION, "instant"], *steps])

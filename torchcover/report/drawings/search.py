@@ -152,8 +152,7 @@ def draw_choice(
     Returns:
         A figure of its own, outside pyplot.
     """
-    figure = Figure(figsize=(6.4, 4.0), dpi=120, layout="constrained")
-    axes = figure.subplots()
+    figure, ((axes,),) = _sheet(1, 1, title)
     if sizes:
         numbers, values, bounds = 100 * np.array(sizes).T
         numbers = numbers / 100
@@ -166,7 +165,7 @@ def draw_choice(
     axes.plot(
         [drawn_sensors], [100 * best], color=COLOURS[0], marker="*", markersize=12, linestyle="none", label="best"
     )
-    axes.set(title=title, xlabel="sensors", ylabel="objective (%)")
+    axes.set(xlabel="sensors", ylabel="objective (%)")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.grid(visible=True, alpha=0.2)
     axes.legend(frameon=False)

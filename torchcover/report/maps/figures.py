@@ -18,6 +18,7 @@ from torchcover.report.maps.arrays import draw_map, draw_side_by_side
 from torchcover.report.maps.colours import difference_scale, scale_of
 from torchcover.report.maps.overlay import SensorView
 from torchcover.report.maps.subjects import Subject, difference, error_subjects_of, subjects_of
+from torchcover.report.maps.surface import as_drawn
 from torchcover.report.maps.window import Window, asked_and_known, near_field
 from torchcover.report.wording import capitalised, span
 
@@ -66,6 +67,7 @@ def map_figures(
     """
     if len(coverages) > 1:
         check_paired(coverages)
+    coverages = {name: as_drawn(coverage) for name, coverage in coverages.items()}
     return _figures(coverages, _Setting(ego_outline_m, sensors or {}, vehicle), errors=errors)
 
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage import Coverage
-from torchcover.coverage.blocks import AreaSums
+from torchcover.coverage.blocks import BlockSums
 from torchcover.coverage.quantity import by_area
 from torchcover.estimation import MIN_BLOCKS_OF_A_CELL, Quantity
 from torchcover.report.maps.colours import NEVER_PROBED, ColourScale, error_scale, scale_of
@@ -103,7 +103,7 @@ def _of_surface(coverages: Mapping[str, Coverage]) -> Iterator[Subject]:
         yield _subject(quantity, values, scale_of, NOTHING_FOUND, _conditions(first) + LARGER, opacity)
 
 
-def _areas(coverages: Mapping[str, Coverage]) -> dict[str, AreaSums]:
+def _areas(coverages: Mapping[str, Coverage]) -> dict[str, BlockSums]:
     return {name: coverage.area for name, coverage in coverages.items() if coverage.area is not None}
 
 

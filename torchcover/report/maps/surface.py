@@ -6,17 +6,22 @@ region together have its number.
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from torchcover.coverage.blocks import AreaSums
+from torchcover.coverage import Coverage, Layer
+from torchcover.coverage.blocks import BlockSums, KnownCells
+from torchcover.coverage.quantity import by_area
 from torchcover.estimation import Quantity, ratio_errors
+from torchcover.metrics import added_up
 
 # A detection from 8 points is off by 18 percentage points at most: 1 / sqrt(4 * 8).
 MIN_POINTS = 8
 LARGEST_M = 2.0
+SMALLEST_M = 0.25
 # Of what is seen at all.
 FAINTEST = 0.3
 
@@ -66,19 +71,75 @@ def over_squares(values: Tensor, sides: Tensor) -> Tensor:
     return sums
 
 
-def ratios(area: AreaSums, sides: Tensor) -> Tensor:
+def ratios(area: BlockSums, sides: Tensor) -> Tensor:
     """(Q, H, Y, X) the radius in metres, then the detection at each threshold; NaN where nothing was seen."""
     m2, *sums = area.totals()
     return over_squares(torch.stack(sums), sides) / over_squares(m2, sides)
 
 
-def errors_of_ratios(area: AreaSums, quantities: Sequence[Quantity], sides: Tensor) -> list[Tensor]:
+def errors_of_ratios(area: BlockSums, quantities: Sequence[Quantity], sides: Tensor) -> list[Tensor]:
     """(H, Y, X) standard errors of each of the `ratios`, which are of these quantities."""
-    m2, each = over_squares(area.m2, sides), zip(quantities, area.sums.unbind(dim=1), strict=True)
-    return [ratio_errors(m2, over_squares(sums, sides), one.unit) for one, sums in each]
+    rows, columns = sides.shape[1:]
+    y, x = (torch.arange(count, device=sides.device) for count in (rows, columns))
+    first = torch.arange(len(sides), device=sides.device)[:, None, None] * rows + y[:, None] // sides * sides
+    square = (first * columns + x // sides * sides).flatten()  # by the cell in its lower corner
+    cells = len(square)
+    at, m2, sums = area.moved(lambda cell: square[cell], cells).spread_where(1)
+    errors = []
+    for quantity, own in zip(quantities, sums, strict=True):
+        of_square = sums.new_full((cells,), math.nan).index_copy_(0, at, ratio_errors(m2, own, quantity.unit))
+        errors.append(of_square[square].view(sides.shape))
+    return errors
 
 
-def opacity_of(area: AreaSums, steps: int, sides: Tensor, cell_m: float) -> Tensor:
+def as_drawn(coverage: Coverage) -> Coverage:
+    """The same over squares of cells that are smaller than pictures show: of the largest up to 0.25 m.
+
+    Itself where cells are as large, and where there are layers that are no ratios of sums.
+    """
+    grid, known, means = coverage.grid, coverage.known, coverage.quantities
+    side = 2 ** max(0, math.floor(math.log2(SMALLEST_M / grid.cell)))
+    by_surface = tuple(map(by_area, means)) if coverage.area else ()
+    if side == 1 or coverage.redundancy or len(coverage.listed) > len(means) + len(by_surface):
+        return coverage
+    rows, columns = (-(-count // side) for count in grid.shape[1:])
+    cell_m = side * grid.cell
+    coarse = replace(
+        grid,
+        x=(grid.x[0], grid.x[0] + columns * cell_m),
+        y=(grid.y[0], grid.y[0] + rows * cell_m),
+        cell=cell_m,
+    )
+
+    def square(cell: Tensor) -> Tensor:
+        y, x = cell // grid.shape[2], cell % grid.shape[2]
+        own: Tensor = (y // grid.shape[1] * rows + y % grid.shape[1] // side) * columns + x // side
+        return own
+
+    def moved(sums: BlockSums | None) -> BlockSums | None:
+        return None if sums is None else sums.moved(square, coarse.cells, coarse.shape)
+
+    area, own = moved(coverage.area), [known.probed_steps * coverage.listed[one.key].values for one in means]
+    columns_of = [square(known.at), known.points, *own, known.probed_steps]
+    summed = added_up(torch.stack(columns_of, dim=1).double()).T
+    layers = list(map(Layer, means, summed[2:-1] / summed[-1]))
+    if area is not None:
+        m2, *sums = area.totals().flatten(1)[:, summed[0].long()]
+        layers += [Layer(quantity, own / m2) for quantity, own in zip(by_surface, sums, strict=True)]
+    return Coverage(
+        grid=coarse,
+        thresholds=coverage.thresholds,
+        max_radius=coverage.max_radius,
+        known=KnownCells(coarse.shape, summed[0].long(), summed[-1].long(), summed[1].long()),
+        layers=layers,
+        counts=coverage.counts,
+        blocks=moved(coverage.blocks),
+        area=area,
+        regions=coverage.regions,
+    )
+
+
+def opacity_of(area: BlockSums, steps: int, sides: Tensor, cell_m: float) -> Tensor:
     """How opaque a place is drawn, by how much surface is seen there in a step.
 
     Args:

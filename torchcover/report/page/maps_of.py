@@ -1,4 +1,4 @@
-"""The maps of a page from what was measured: the cells themselves, as in `coverage.npz`."""
+"""The maps of a page from what was measured: the cells themselves, as in `coverage.npz`, or squares of small ones."""
 
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple
@@ -11,7 +11,7 @@ from torchcover.coverage import BevGrid, Coverage, Layer
 from torchcover.report.maps.arrays import as_array
 from torchcover.report.maps.colours import NEVER_PROBED, difference_scale, scale_of
 from torchcover.report.maps.subjects import NOTHING_FOUND, difference, quantities_shown
-from torchcover.report.maps.surface import square_sides
+from torchcover.report.maps.surface import as_drawn, square_sides
 from torchcover.report.page.content import Array, PageMap, Sides
 from torchcover.report.wording import shown_unit, span
 
@@ -22,6 +22,7 @@ def maps_of(coverages: Mapping[str, Coverage]) -> Iterator[PageMap]:
     Args:
         coverages: By the name of the rig; one, or several that are paired.
     """
+    coverages = {name: as_drawn(coverage) for name, coverage in coverages.items()}
     first = next(iter(coverages.values()))
     shown = quantities_shown(first)
     surface = _weights(first) if first.measure == "area" else None

@@ -33,15 +33,13 @@ WORDS = (
 )  # fmt: skip
 
 
-def type_of(name: str, on_foot: bool, known: Mapping[str, VehicleType]) -> VehicleType:
+def type_of(name: str, known: Mapping[str, VehicleType]) -> VehicleType:
     """A type by its name: one that is known, else what its name says.
 
     Example:
-        >>> type_of("DEFAULT_BIKETYPE", False, {}).vehicle_class
+        >>> type_of("DEFAULT_BIKETYPE", {}).vehicle_class
         'bicycle'
     """
-    if on_foot:  # all have one class, and the same length
-        return VehicleType("child" if "child" in name.lower() else "pedestrian", USUAL_LENGTH_M["pedestrian"])
     if name in known:
         return known[name]
     vehicle_class = next((found for word, found in WORDS if word in name.lower()), "passenger")
@@ -105,8 +103,11 @@ def crowd(
     lengths_m = {kind: fleet.length_m(kind) for kind in CATEGORIES}
     users: list[RoadUser] = []
     for track in recorded.tracks:
-        found = type_of(track.kind, track.on_foot, known)
+        found = type_of(track.kind, known)
         kind = found.body(lengths_m)
+        if track.on_foot:  # all have one length; those that were drawn are called as their bodies are
+            named = "child" if "child" in track.kind.lower() else "adult"
+            kind = track.kind if CATEGORIES.get(track.kind) == "pedestrian" else named
         if kind is not None:
             users.append(RoadUser(track, kind, found.length_m, (fleet.length_m(kind), fleet.width_m(kind))))
     ego = _ego(users, recorded, ego_name, ego_type, duration_s, generator)

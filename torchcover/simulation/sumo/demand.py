@@ -1,14 +1,14 @@
 """Traffic on the streets of a network, drawn: ways without an aim that never end within a run."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
 from torchcover.simulation.sumo.network import Network
 from torchcover.simulation.sumo.streets import DrawnStreets
+from torchcover.simulation.traffic.fleet import CATEGORIES, Fleet
 
 # Nobody is so much faster than what is allowed, nor walks faster.
 FASTER = 1.1
@@ -21,16 +21,9 @@ EGO_TYPE, EGOS = "ego", 8
 MAX_AGENTS = 20_000
 
 
-class Kind(NamedTuple):
-    """A kind of road users: SUMO's class, its weight among the traffic, and its length."""
-
-    vehicle_class: str
-    weight: float
-    length_m: float
-
-
 # Weight by our kinds of bodies.
-TRAFFIC = {"sedan": 4.0, "hatchback": 4.0, "suv": 3.0, "van": 1.5, "truck": 0.5, "motorcycle": 0.6}
+TRAFFIC = {"sedan": 4.0, "hatchback": 4.0, "suv": 3.0, "pickup": 0.5, "van": 1.5, "lorry": 0.4, "truck": 0.1}
+TRAFFIC |= {"motorcycle": 0.6}
 PEOPLE = {"adult": 5.0, "child": 1.0}
 CLASSES = {"truck": "truck", "bus": "bus", "motorcycle": "motorcycle", "cyclist": "bicycle"}
 
@@ -39,7 +32,7 @@ def write_routes(
     path: Path,
     network: Network,
     streets: DrawnStreets,
-    sizes_m: Mapping[str, tuple[float, float]],
+    fleet: Fleet,
     duration_s: float,
     generator: np.random.Generator,
 ) -> None:
@@ -48,13 +41,13 @@ def write_routes(
     Raises:
         ValueError: No street that cars may use leads anywhere, or there would be more than 20,000.
     """
-    kinds = {**TRAFFIC, EGO_TYPE: 0.0, "bus": 0.0, "cyclist": 0.0}
     rows = [
-        f'<vType id="{kind}" vClass="{CLASSES.get(kind, "passenger")}" length="{sizes_m[kind][0]:.2f}" '
-        f'width="{sizes_m[kind][1]:.2f}" {DRIVERS}/>'
-        for kind in kinds
+        f'<vType id="{kind}" vClass="pedestrian"/>'
+        if category == "pedestrian"
+        else f'<vType id="{kind}" vClass="{CLASSES.get(category, "passenger")}" length="{fleet.length_m(kind):.2f}" '
+        f'width="{fleet.width_m(kind):.2f}" {DRIVERS}/>'
+        for kind, category in {**CATEGORIES, EGO_TYPE: "car"}.items()
     ]
-    rows += [f'<vType id="{kind}" vClass="pedestrian"/>' for kind in PEOPLE]
     roads = _Ways(network, "passenger", "road")
     if not roads.length_m.any():
         raise ValueError("the network has no street that cars may use and that leads on to another one")
@@ -75,7 +68,7 @@ def write_routes(
         on_foot = mix is PEOPLE
         speed_mps = WALKING_MPS if on_foot else FASTER * max(ways.speed_mps, SLOWEST_MPS)
         for k in range(round(number) if ways.length_m.any() else 0):
-            kind = str(generator.choice(list(mix), p=np.array(list(mix.values())) / sum(mix.values())))
+            kind = EGO_TYPE if EGO_TYPE in mix else fleet.draw_kind(mix)
             way = ways.draw(speed_mps * duration_s, generator)
             if on_foot and generator.random() < 0.5:
                 way = way[::-1]

@@ -1,7 +1,7 @@
 """How bodies move along the places that SUMO tells: the front axle leads and the rest is drawn along, off the kerbs."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import shapely
@@ -12,29 +12,20 @@ from torchcover.simulation.sumo.floating import TIME_SLACK_S, SumoTrack
 Numbers = NDArray[np.float64]
 
 # Bodies have a pose this often, and places are means over so much time before and after.
-FINE_S = 0.1
-SMOOTH_S = 1.0
+FINE_S, SMOOTH_S = 0.1, 1.0
 # Corners of ways are rounded over so much before and after them; ways are looked at this often.
 CORNER_M, ALONG_M = 3.0, 0.5
-STANDS_M = 1e-6
 # The axles of vehicles lie so far from their middle, as a share of the length; people turn about a point behind them.
-AXLE_SHARE = 0.3
-HEELS_M = 0.4
+AXLE_SHARE, HEELS_M = 0.3, 0.4
 # Nobody walks faster: SUMO lets people jump where ways meet, which they walk off with so much more speed instead.
-FASTEST_ON_FOOT_MPS = 4.0
-CATCH_UP_MPS = 0.8
-# Who follows its own way so closely is off the kerbs, as its lane is.
+FASTEST_ON_FOOT_MPS, CATCH_UP_MPS = 4.0, 0.8
+# Whose rear axle follows its own way so closely is off the kerbs, as its lane is; poses are looked at this often.
 ASTRAY_M, LOOKS_EVERY = 0.25, 2
-# How often a way is moved aside, and over which length before and after; some room is left.
-SWINGS = 4
-SWING_LENGTHS, SWING_M = 1.0, 8.0
-ROOM_M = 0.1
-# Wheels that come so near to a kerb rub along it.
-RUBS_M = 0.05
-BODIES_AT_ONCE = 256
+# How often a way is moved aside, over which length before and after, and the room that is left; to rub is to be off.
+SWINGS, SWING_M, SWING_LENGTHS, ROOM_M, RUBS_M = 4, 8.0, 1.0, 0.1, 0.05
 # Outlines of bodies are that far apart. Who meets whom is looked for in pieces of ways of so many poses.
-APART_M = 0.05
-PIECE_STEPS = 20
+APART_M, PIECE_STEPS = 0.05, 20
+BODIES_AT_ONCE = 256
 
 
 class RoadUser(NamedTuple):
@@ -52,6 +43,16 @@ class RoadUser(NamedTuple):
     length_m: float
     size_m: tuple[float, float]
 
+    @property
+    def ahead_m(self) -> float:
+        """How far the point that leads is before the middle."""
+        return 0.0 if self.track.on_foot else AXLE_SHARE * self.size_m[0]
+
+    @property
+    def drawn_m(self) -> float:
+        """How far the point that is drawn along is behind the one that leads."""
+        return HEELS_M if self.track.on_foot else 2 * self.ahead_m
+
 
 class Motion(NamedTuple):
     """Where a body is.
@@ -60,7 +61,7 @@ class Motion(NamedTuple):
         user: Whose.
         times_s: (K,) evenly spaced; those who are there all the time share them.
         poses: (K, 3) x and y of its middle, and its heading in radians, without leaps.
-        over_kerb_m: How far its outline reaches onto the pavement at the worst.
+        over_kerb_m: How far its outline reaches over a kerb at the worst.
     """
 
     user: RoadUser
@@ -71,17 +72,13 @@ class Motion(NamedTuple):
     @property
     def can_be(self) -> bool:
         """Whether it walks as people do, or stays off the kerbs."""
-        ways_m = _lengths(np.diff(self.poses, axis=0))
         if self.user.track.on_foot:
-            return bool((ways_m < FASTEST_ON_FOOT_MPS * np.diff(self.times_s)).all())
+            return bool((_lengths(np.diff(self.poses, axis=0)) < FASTEST_ON_FOOT_MPS * np.diff(self.times_s)).all())
         return self.over_kerb_m < RUBS_M
 
 
 def motions(
-    users: Sequence[RoadUser],
-    duration_s: float,
-    origin_m: Numbers,
-    obstacles: NDArray[np.object_] | None = None,
+    users: Sequence[RoadUser], duration_s: float, origin_m: Numbers, obstacles: NDArray[np.object_] | None = None
 ) -> list[Motion]:
     """Move bodies along their tracks, without those who are there for no time.
 
@@ -92,127 +89,78 @@ def motions(
         obstacles: Polygons in plan, of pavements and what is parked: vehicles swing out for them where they can.
     """
     times_s = np.linspace(0.0, duration_s, int(np.ceil(duration_s / FINE_S - TIME_SLACK_S)) + 1)
-    by_time = sorted(range(len(users)), key=lambda number: users[number].track.times_s[0])
-    found: dict[int, Motion] = {}
-    for start in range(0, len(users), BODIES_AT_ONCE):
-        some = by_time[start : start + BODIES_AT_ONCE]
-        group = _Group([users[number] for number in some], times_s, origin_m)
-        if obstacles is not None:
-            group.keep_off(obstacles)
-        found |= {some[at]: motion for at, motion in group.motions()}
-    return [found[number] for number in sorted(found)]
+    there: list[tuple[RoadUser, Numbers]] = []
+    for user in users:
+        first, end = np.searchsorted(times_s, user.track.times_s[[0, -1]] + [-TIME_SLACK_S, TIME_SLACK_S]).tolist()
+        if end - first > 1:
+            there.append((user, times_s if end - first == len(times_s) else times_s[first:end]))
+    found: list[Motion] = []
+    for start in range(0, len(there), BODIES_AT_ONCE):
+        some, own_s = zip(*there[start : start + BODIES_AT_ONCE], strict=True)
+        ways_m = [_lead_m(user, at_s, origin_m) for user, at_s in zip(some, own_s, strict=True)]
+        poses = _poses(some, ways_m)
+        over_m = np.zeros(len(some)) if obstacles is None else _keep_off(some, ways_m, poses, obstacles)
+        found += map(Motion, some, own_s, poses, over_m.tolist())
+    return found
 
 
-class _Group:
-    """Bodies side by side, (T, N): before and after its time each goes straight on."""
+def _lead_m(user: RoadUser, times_s: Numbers, origin_m: Numbers) -> Numbers:
+    """(K, 2) where the point goes that leads, at (K,) times."""
+    track = user.track
+    told_m = (_without_jumps(track) if track.on_foot else track.places_m[:, :2]) - origin_m
+    even_m = np.stack([np.interp(times_s, track.times_s, axis) for axis in told_m.T], axis=1)
+    half_s = max(SMOOTH_S, float(np.median(np.diff(track.times_s))))
+    smooth_m = rounded(even_m, int(np.ceil(half_s / (times_s[1] - times_s[0]))))
+    behind_m = 0.0 if track.on_foot else max(user.length_m / 2 - user.ahead_m, 0.0)
+    return _behind(smooth_m, behind_m, np.deg2rad(track.yaw_deg[0]))
 
-    def __init__(self, users: Sequence[RoadUser], times_s: Numbers, origin_m: Numbers) -> None:
-        self.users = users
-        self._times_s = times_s
-        step_s = times_s[1] - times_s[0]
-        tracks = [user.track for user in users]
-        self._first, self._end = (
-            np.array([rounded((at - slack_s) / step_s) for at in ends]).astype(np.int64).clip(0, len(times_s))
-            for rounded, slack_s, ends in (
-                (np.ceil, TIME_SLACK_S, [track.times_s[0] for track in tracks]),
-                (lambda at: np.floor(at) + 1, -TIME_SLACK_S, [track.times_s[-1] for track in tracks]),
-            )
-        )
-        steps_s = [float(np.median(np.diff(track.times_s))) for track in tracks if len(track.times_s) > 1]
-        half = int(np.ceil(max(SMOOTH_S, *steps_s, 0.0) / step_s))
-        self._from = int(self._first.min()) - half
-        own_s = step_s * np.arange(self._from - half, int(self._end.max()) + 2 * half)
-        places_m = np.empty((len(own_s), len(users), 2))
-        yaw = np.deg2rad([track.yaw_deg[0] for track in tracks])
-        for number, track in enumerate(tracks):
-            told_m = _without_jumps(track) if track.on_foot else track.places_m[:, :2]
-            places_m[:, number] = _straight_on(own_s, track.times_s, told_m - origin_m)
-        weights = np.hanning(2 * half + 3)[1:-1]
-        smooth_m = sum(
-            weight / weights.sum() * places_m[k : len(places_m) - 2 * half + k] for k, weight in enumerate(weights)
-        )
-        on_foot = np.array([track.on_foot for track in tracks])
-        self._size_m = np.array([user.size_m for user in users])
-        told_length_m = np.array([user.length_m for user in users])
-        self._ahead_m = np.where(on_foot, 0.0, AXLE_SHARE * self._size_m[:, 0])
-        self._wheelbase_m = np.where(on_foot, HEELS_M, 2 * self._ahead_m)
-        self._heading = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
-        behind_m = np.where(on_foot, 0.0, np.maximum(told_length_m / 2 - self._ahead_m, 0.0))
-        self._lead_m = self._along(np.asarray(smooth_m), behind_m)
-        self._on_foot = on_foot
-        self.yaw = tractrix(self._lead_m, self._wheelbase_m, yaw)
-        self.over_kerb_m = np.zeros(len(users))
 
-    def _along(self, ways_m: Numbers, behind_m: Numbers) -> Numbers:
-        """The same ways so much behind, without corners; before their begin and after their end they are straight."""
-        along_m = _along_m(ways_m)
-        begin, end = (
-            CORNER_M * np.where(stands[:, None], self._heading, step / np.maximum(_lengths(step), STANDS_M)[:, None])
-            for step in np.diff(ways_m, axis=0)[[0, -1]]
-            for stands in (_lengths(step) < STANDS_M,)
-        )
-        half = round(CORNER_M / ALONG_M)
-        weights = np.hanning(2 * half + 3)[1:-1] / np.hanning(2 * half + 3).sum()
-        found = np.empty_like(ways_m)
-        for number, back_m in enumerate(behind_m.tolist()):
-            far = 1 + back_m / CORNER_M
-            way_m = np.vstack(
-                [ways_m[0, number] - far * begin[number], ways_m[:, number], ways_m[-1, number] + 2 * end[number]]
-            )
-            told_m = np.concatenate([[-far * CORNER_M], along_m[:, number], [along_m[-1, number] + 2 * CORNER_M]])
-            at_m = np.arange(told_m[0], told_m[-1], ALONG_M)
-            for axis in (0, 1):
-                rounded_m = np.convolve(np.interp(at_m, told_m, way_m[:, axis]), weights, mode="valid")
-                found[:, number, axis] = np.interp(along_m[:, number] - back_m, at_m[half:-half], rounded_m)
-        return found
+def _poses(users: Sequence[RoadUser], ways_m: Sequence[Numbers]) -> list[Numbers]:
+    """(K, 3) of each, along the (K, 2) way of its point that leads."""
+    longest = max(map(len, ways_m))
+    lead_m = np.stack([np.pad(way_m, ((0, longest - len(way_m)), (0, 0)), "edge") for way_m in ways_m], axis=1)
+    start = np.deg2rad([user.track.yaw_deg[0] for user in users])
+    yaw = tractrix(lead_m, np.array([user.drawn_m for user in users]), start)
+    ahead_m = np.array([user.ahead_m for user in users])[:, None] * np.stack([np.cos(yaw), np.sin(yaw)], axis=2)
+    poses = np.concatenate([lead_m - ahead_m, yaw[..., None]], axis=2)
+    return [poses[: len(way_m), number].copy() for number, way_m in enumerate(ways_m)]
 
-    def poses(self, at: tuple[Any, ...] = ()) -> Numbers:
-        """(..., 3) x and y of the middles, and headings: of (T, N), or of those at some places of that."""
-        yaw, number = self.yaw[at], at[1] if at else slice(None)
-        x_m, y_m = np.moveaxis(self._lead_m[at], -1, 0)
-        ahead_m = self._ahead_m[number]
-        return np.stack([x_m - ahead_m * np.cos(yaw), y_m - ahead_m * np.sin(yaw), yaw], axis=-1)
 
-    def keep_off(self, obstacles: NDArray[np.object_]) -> None:
-        """Swing out where the inner side of a turn would come over a kerb, as long vehicles do."""
-        lead_m, start = self._lead_m.copy(), self.yaw[0].copy()
-        along_m, way = _along_m(lead_m), _held(np.gradient(lead_m, axis=0))
-        left = np.stack([-way[..., 1], way[..., 0]], axis=2)
-        rear_m = 2 * self.poses()[..., :2] - lead_m
-        astray_m = _lengths(rear_m - self._along(lead_m, self._wheelbase_m))
-        step = np.arange(len(lead_m))[:, None] + self._from
-        there = (step >= self._first) & (step < self._end) & (step % LOOKS_EVERY == 0) & ~self._on_foot
-        aside_m, look = np.zeros(lead_m.shape[:2]), there & (astray_m > ASTRAY_M)
-        for swing in range(SWINGS + 1):
-            at, number = np.nonzero(look)
-            push_m = _push_m(obstacles, self.poses((at, number)), self._size_m[number])
-            self.over_kerb_m[look.any(axis=0)] = 0.0
-            np.maximum.at(self.over_kerb_m, number, np.abs(push_m))
-            met = np.flatnonzero(self.over_kerb_m)
-            if len(met) == 0 or swing == SWINGS:
-                return
-            for one in met.tolist():
-                own = np.flatnonzero((number == one) & (push_m != 0.0))
-                wanted_m = push_m[own] + np.copysign(ROOM_M, push_m[own])
-                within_m = SWING_M + SWING_LENGTHS * self._size_m[one, 0]
-                away = np.abs(along_m[:, one, None] - along_m[at[own], one]) / within_m
-                bumps_m = wanted_m * np.where(away < 1, (1 + np.cos(np.pi * away)) / 2, 0.0)
-                aside_m[:, one] += bumps_m.max(axis=1).clip(min=0.0) + bumps_m.min(axis=1).clip(max=0.0)
-            self._lead_m[:, met] = lead_m[:, met] + aside_m[:, met, None] * left[:, met]
-            self.yaw[:, met] = tractrix(self._lead_m[:, met], self._wheelbase_m[met], start[met])
-            look = there & (aside_m != 0.0)
-
-    def motions(self) -> list[tuple[int, Motion]]:
-        """Of those who are there for some time, by number."""
-        found, poses = [], self.poses()
-        for number, user in enumerate(self.users):
-            first, end = int(self._first[number]), int(self._end[number])
-            own = slice(first - self._from, end - self._from)
-            if end - first > 1:
-                times_s = self._times_s if end - first == len(self._times_s) else self._times_s[first:end]
-                over_m = float(self.over_kerb_m[number])
-                found.append((number, Motion(user, times_s, poses[own, number].copy(), over_m)))
-        return found
+def _keep_off(
+    users: Sequence[RoadUser], ways_m: Sequence[Numbers], poses: list[Numbers], obstacles: NDArray[np.object_]
+) -> Numbers:
+    """Let vehicles swing out where the inner side of a turn would come over a kerb; (N,) how far they still do."""
+    over_m, moved_m, aside_m = np.zeros(len(users)), list(ways_m), [np.zeros(len(way_m)) for way_m in ways_m]
+    left = [np.stack([-np.sin(own[:, 2]), np.cos(own[:, 2])], axis=1) for own in poses]
+    look: dict[int, NDArray[np.int64]] = {}
+    for number, (user, way_m, own) in enumerate(zip(users, ways_m, poses, strict=True)):
+        if not user.track.on_foot:
+            astray_m = _lengths(2 * own[:, :2] - way_m - _behind(way_m, user.drawn_m, own[0, 2]))
+            look[number] = np.flatnonzero(astray_m > ASTRAY_M)[::LOOKS_EVERY]
+    for swing in range(SWINGS + 1):
+        of = np.repeat(np.array(list(look), dtype=np.int64), [len(at) for at in look.values()])
+        size_m = np.array([user.size_m for user in users])[of]
+        looked_at = [poses[number][at] for number, at in look.items()]
+        push_m = _push_m(obstacles, np.concatenate([np.empty((0, 3)), *looked_at]), size_m)
+        over_m[list(look)] = 0.0
+        np.maximum.at(over_m, of, np.abs(push_m))
+        met = [number for number in look if over_m[number] > 0.0]
+        if not met or swing == SWINGS:
+            break
+        for number in met:
+            pushed_m = push_m[of == number]
+            at, wanted_m = look[number][pushed_m != 0.0], pushed_m[pushed_m != 0.0]
+            wanted_m += np.copysign(ROOM_M, wanted_m)
+            along_m = _along_m(ways_m[number])
+            away = np.abs(along_m[:, None] - along_m[at]) / (SWING_M + SWING_LENGTHS * users[number].size_m[0])
+            bumps_m = wanted_m * np.where(away < 1, (1 + np.cos(np.pi * away)) / 2, 0.0)
+            aside_m[number] += bumps_m.max(axis=1).clip(min=0.0) + bumps_m.min(axis=1).clip(max=0.0)
+            moved_m[number] = ways_m[number] + aside_m[number][:, None] * left[number]
+        again = _poses([users[number] for number in met], [moved_m[number] for number in met])
+        for number, own in zip(met, again, strict=True):
+            poses[number] = own
+        look = {number: np.flatnonzero(aside_m[number])[::LOOKS_EVERY] for number in met}
+    return over_m
 
 
 def possible(bodies: Sequence[Motion]) -> list[Motion]:
@@ -287,13 +235,7 @@ def tractrix(lead_m: Numbers, length_m: Numbers, yaw: Numbers) -> Numbers:
 
 
 def _push_m(obstacles: NDArray[np.object_], poses: Numbers, size_m: Numbers) -> Numbers:
-    """(K,) how far K rectangles have to go to their left to be off obstacles, or to their right if that is negative.
-
-    Args:
-        obstacles: Polygons in plan.
-        poses: (K, 3) x and y of their middles, and their headings in radians.
-        size_m: (K, 2) their lengths and widths.
-    """
+    """(K,) how far K rectangles have to go to their left to be off obstacles, or to their right if that is negative."""
     outlines = shapely.polygons(corners_m(poses, size_m))
     part, body = shapely.STRtree(outlines).query(obstacles, predicate="intersects")
     common = shapely.intersection(outlines[body], obstacles[part])
@@ -330,31 +272,27 @@ def _lengths(vectors: Numbers) -> Numbers:
     return lengths
 
 
-def _along_m(ways_m: Numbers) -> Numbers:
-    """(T, N) the lengths of (T, N, 2) ways up to each place."""
-    steps_m = _lengths(np.diff(ways_m, axis=0))
-    return np.concatenate([np.zeros((1, ways_m.shape[1])), steps_m.cumsum(axis=0)])
+def _along_m(way_m: Numbers) -> Numbers:
+    """(K,) the length of a (K, 2) way up to each place."""
+    return np.concatenate([[0.0], _lengths(np.diff(way_m, axis=0)).cumsum()])
 
 
-def _held(ways: Numbers) -> Numbers:
-    """(T, N, 2) unit vectors; who stands keeps the last, or has the first to come."""
-    size = _lengths(ways)
-    at = np.where(size > STANDS_M, np.arange(len(ways))[:, None], 0)
-    at = np.maximum.accumulate(at, axis=0)
-    first = (size > STANDS_M).argmax(axis=0)
-    at = np.maximum(at, first)
-    found = np.take_along_axis(ways, at[..., None], axis=0)
-    return found / np.maximum(_lengths(found), STANDS_M)[..., None]
+def rounded(places_m: Numbers, half: int) -> Numbers:
+    """(K, 2) means over so many places before and after; beyond the ends it goes on as it came."""
+    weights = np.hanning(2 * half + 3)[1:-1] / np.hanning(2 * half + 3).sum()
+    padded_m = np.pad(places_m, ((half, half), (0, 0)), "reflect", reflect_type="odd")
+    return np.stack([np.convolve(axis, weights, "valid") for axis in padded_m.T], axis=1)
 
 
-def _straight_on(times_s: Numbers, told_s: Numbers, told_m: Numbers) -> Numbers:
-    """(T, 2) places at times; before the first and after the last it goes on as it did."""
-    if len(told_s) > 1:
-        step_s = times_s[-1] - times_s[0] + told_s[-1] - told_s[0]
-        before, after = ((told_m[one] - told_m[two]) / (told_s[one] - told_s[two]) for one, two in ((1, 0), (-1, -2)))
-        told_s = np.concatenate([[told_s[0] - step_s], told_s, [told_s[-1] + step_s]])
-        told_m = np.concatenate([[told_m[0] - step_s * before], told_m, [told_m[-1] + step_s * after]])
-    return np.stack([np.interp(times_s, told_s, axis) for axis in told_m.T], axis=1)
+def _behind(way_m: Numbers, behind_m: float, yaw: float) -> Numbers:
+    """(K, 2) the same way so much behind, with corners rounded; before its begin it has a heading."""
+    along_m = _along_m(way_m)
+    told_m = np.concatenate([[-behind_m], along_m])
+    way_m = np.concatenate([way_m[:1] - behind_m * np.array([np.cos(yaw), np.sin(yaw)]), way_m])
+    at_m = np.linspace(-behind_m, along_m[-1], 2 + int((along_m[-1] + behind_m) / ALONG_M))
+    even_m = np.stack([np.interp(at_m, told_m, axis) for axis in way_m.T], axis=1)
+    round_m = rounded(even_m, round(CORNER_M / ALONG_M))
+    return np.stack([np.interp(along_m - behind_m, at_m, axis) for axis in round_m.T], axis=1)
 
 
 def _without_jumps(track: SumoTrack) -> Numbers:

@@ -11,7 +11,7 @@ from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.height_field import Ground, Plain
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.sumo.ground import Pavement, tilts_deg
-from torchcover.simulation.sumo.motion import Motion, corners_m
+from torchcover.simulation.sumo.motion import Motion, corners_m, rounded
 from torchcover.simulation.sumo.vicinity import Vicinity
 from torchcover.simulation.traffic.assemble import attitude
 from torchcover.simulation.traffic.city import FREE_AT_CORNERS_M, PARKED, PARKED_GAP_M
@@ -24,8 +24,8 @@ Numbers = NDArray[np.float64]
 
 # Who is so far above the ground is on a bridge.
 BRIDGE_M = 0.4
-# How long it takes to step onto a kerb.
-STEP_S = 0.4
+# So long, in poses, before and after it does it take to step onto a kerb.
+STEP_POSES = 2
 
 
 class Placing:
@@ -70,21 +70,11 @@ class Placing:
         angles_deg = np.column_stack([yaw_deg, np.zeros((len(yaw_deg), 2))])
         if track.on_foot:
             raised_m = np.where(self._pavement.holds(middle_m) & ~up, PAVEMENT_M, 0.0)
-            heights_m = heights_m + _smooth(raised_m, motion.times_s)
+            heights_m = heights_m + rounded(raised_m[:, None], STEP_POSES)[:, 0]
         elif not isinstance(self._ground, Plain):
             angles_deg[:, 1:] = tilts_deg(self._ground, middle_m, yaw_deg, size_m)
             angles_deg[up, 1], angles_deg[up, 2] = -slope_deg[up], 0.0
         return np.column_stack([middle_m, np.where(up, on_deck_m, heights_m)]), angles_deg
-
-
-def _smooth(heights_m: Numbers, times_s: Numbers) -> Numbers:
-    """Steps that take a moment; never below or above what is smoothed."""
-    if len(times_s) < 2 or not np.ptp(heights_m):
-        return heights_m
-    half = max(round(STEP_S / 2 / float(np.median(np.diff(times_s)))), 1)
-    padded = np.pad(heights_m, half, mode="edge")
-    smooth: Numbers = np.convolve(padded, np.full(2 * half + 1, 1 / (2 * half + 1)), mode="valid")
-    return smooth
 
 
 def park(

@@ -28,7 +28,7 @@ WITH_BAYS, WITH_BICYCLE_LANES, WITH_MEDIAN = 0.7, 0.5, 0.3
 APART_M = 40.0
 BEND_PIECES = 10
 # Of kerbs at corners; nobody turns there with more than so much to the side, by much.
-CORNER_M, TURN_MPS2 = 6.0, 1.9
+CORNER_M, TURN_MPS2 = 6.0, 1.6
 HILL_WAVELENGTHS_M = (250.0, 700.0)
 HILL_WAVES = 4
 

@@ -137,8 +137,7 @@ class Sumo(Procedural):
         if self.random is None:
             return self.routes
         drawn = folder / "drawn.rou.xml"
-        sizes_m = {kind: (fleet.length_m(kind), fleet.width_m(kind)) for kind in fleet.meshes}
-        write_routes(drawn, network, self.random, sizes_m, WARM_UP_S + duration_s, generator)
+        write_routes(drawn, network, self.random, fleet, WARM_UP_S + duration_s, generator)
         return (drawn,)
 
     def _recorded(

@@ -44,9 +44,10 @@ LORRY = Driver(23.6, 1.6, 3.0, 0.6)
 LANE_USERS = (
     {"sedan": (4.0, Driver(35.0)), "suv": (3.0, Driver(34.5)), "motorcycle": (0.4, Driver(35.0))},
     {"sedan": (4.0, Driver(32.0)), "hatchback": (4.0, Driver(31.0)), "suv": (3.0, Driver(32.0)),
-     "van": (2.0, Driver(29.5)), "bus": (0.4, Driver(27.0, 1.5, 3.0, 0.8))},
-    {"truck": (4.0, LORRY), "hatchback": (2.0, Driver(30.0)), "van": (1.5, Driver(29.0))},
-    {"truck": (1.0, LORRY), "sedan": (2.0, Driver(31.0)), "hatchback": (2.0, Driver(30.0)), "van": (1.0, Driver(29.0))},
+     "pickup": (0.5, Driver(31.0)), "van": (2.0, Driver(29.5)), "bus": (0.4, Driver(27.0, 1.5, 3.0, 0.8))},
+    {"truck": (3.0, LORRY), "lorry": (1.0, LORRY), "hatchback": (2.0, Driver(30.0)), "van": (1.5, Driver(29.0))},
+    {"truck": (0.7, LORRY), "lorry": (0.3, LORRY), "sedan": (2.0, Driver(31.0)), "hatchback": (2.0, Driver(30.0)),
+     "van": (1.0, Driver(29.0))},
 )  # fmt: skip
 SPEED_SPREAD, HEAVY_SPREAD = 0.09, 0.02
 # Of those who drive beside the side lane, who leave; and on ramps there are fewer.

@@ -30,8 +30,8 @@ WORTH_MPS2, TO_THE_RIGHT_MPS2, SAFE_MPS2, POLITENESS, FLOWS_MPS = 0.2, 0.3, 2.0,
 SHORTEST_HEADWAY_S = 0.6
 # Who has to enter or exit does so where it is safe, gain or not.
 HAS_TO_MPS2 = 100.0
-# Each driver looks once a second, half of them at a time; of those who want the same gap, one goes.
-LOOKS_EVERY_S, TURNS, APART_M = 0.5, 2, 120.0
+# Each driver looks every two seconds, half of them at a time; of those who want the same gap, one goes.
+LOOKS_EVERY_S, TURNS, APART_M = 1.0, 2, 120.0
 # How long a change takes, and which share of it one is still in the way of those in the old lane.
 CHANGE_S, SHORTEST_CHANGE_M, IN_BOTH = (4.5, 6.5), 30.0, 0.7
 # On ramps; who exits slows down before.
@@ -87,14 +87,14 @@ class Overtaking:
             2 * np.pi / generator.uniform(*UNEVEN_S, len(agents)),
             generator.uniform(0, 2 * np.pi, len(agents)),
         )
-        self._pace_mps = self._driver.desired_speed_mps
         self._may_change_m = np.full(len(agents), -np.inf)
         self._leaving: list[Change] = []
         self._turn, self._looks_s, self._time_s = 0, LOOKS_EVERY_S, 0.0
         self.speed_mps = np.zeros(len(agents))
         self._line_up()
         room_m = np.maximum(self._gaps_m()[: len(agents)] - self._driver.standstill_gap_m, 0.0)
-        self.speed_mps = np.minimum(0.95 * self._desired_mps(), room_m / self._driver.headway_s)
+        self._desired_mps = self._desired()
+        self.speed_mps = np.minimum(0.95 * self._desired_mps, room_m / self._driver.headway_s)
         self._wanted_mps2 = np.zeros(len(agents))
 
     def run(self, times_s: Numbers, warm_up_s: float) -> Flow:
@@ -115,7 +115,7 @@ class Overtaking:
         twice = self._who[count:]
         tight[twice] = np.maximum(tight[twice], tight[count:])
         gap_m[twice] = np.minimum(gap_m[twice], gap_m[count:])
-        self._wanted_mps2 = acceleration_in(self._driver, speed_mps, tight[:count], self._desired_mps())
+        self._wanted_mps2 = acceleration_in(self._driver, speed_mps, tight[:count], self._desired_mps)
         way_m, self.speed_mps = advance(speed_mps, self._wanted_mps2, gap_m[:count], step_s)
         self.place_m += way_m
         self._time_s += step_s
@@ -126,8 +126,6 @@ class Overtaking:
     def _look(self) -> None:
         """Let some change lanes, and those who have changed be in one lane."""
         self._turn = (self._turn + 1) % TURNS
-        per_s, phase = self._waves
-        self._pace_mps = self._driver.desired_speed_mps * (1 + UNEVEN * np.sin(per_s * self._time_s + phase))
         begun = self._begin(np.arange(self._turn, len(self.place_m), TURNS))
         leaving = [
             change for change in self._leaving if self.place_m[change.agent] < change.place_m + IN_BOTH * change.way_m
@@ -135,6 +133,7 @@ class Overtaking:
         if begun or len(leaving) < len(self._leaving):
             self._leaving = leaving + begun
             self._line_up()
+        self._desired_mps = self._desired()
 
     def _line_up(self) -> None:
         """Find out who is ahead of whom; nobody passes anybody in a lane, so it stays so until somebody changes.
@@ -155,7 +154,6 @@ class Overtaking:
         self._rank = rank[:count]
         self._between_m = (self._length_m[who] + self._length_m[self._leader]) / 2
         self._drivers = self._some(who)
-        self._beside = np.flatnonzero(self.lane % LANES == SIDE_LANE)
 
     def _some(self, who: Indices) -> Driver:
         return Driver(*(getattr(self._driver, name)[who] for name in Driver.__dataclass_fields__))
@@ -168,13 +166,15 @@ class Overtaking:
         gap_m -= self._between_m
         return gap_m
 
-    def _desired_mps(self) -> Numbers:
-        """(N,) what everybody wants to drive here: on ramps less."""
-        desired_mps = np.array(self._pace_mps)
-        begin_m, end_m = self._side_m[self.lane[self._beside] // LANES].T
-        to_end_m = np.where(self.place_m[self._beside] < begin_m, 0.0, end_m - self.place_m[self._beside])
+    def _desired(self) -> Numbers:
+        """(N,) what everybody wants to drive now and here: on ramps less."""
+        per_s, phase = self._waves
+        desired_mps = self._driver.desired_speed_mps * (1 + UNEVEN * np.sin(per_s * self._time_s + phase))
+        beside = np.flatnonzero(self.lane % LANES == SIDE_LANE)
+        begin_m, end_m = self._side_m[self.lane[beside] // LANES].T
+        to_end_m = np.where(self.place_m[beside] < begin_m, 0.0, end_m - self.place_m[beside])
         ramp_mps = np.sqrt(RAMP_MPS**2 + 2 * EXIT_BRAKING_MPS2 * np.maximum(to_end_m, 0.0))
-        desired_mps[self._beside] = np.minimum(desired_mps[self._beside], ramp_mps)
+        desired_mps[beside] = np.minimum(desired_mps[beside], ramp_mps)
         return desired_mps
 
     def _begin(self, who: Indices) -> list[Change]:

@@ -181,11 +181,10 @@ def _trees(
 ) -> list[Mesh]:
     pieces = []
     for side, lane in sides.items():
-        place = span_m[0]
-        while place < span_m[1]:
-            foot = (place, side * float(lane.kept_off(place, generator.uniform(*TREES_M), 3.5)))
+        x_m = span_m[0] + np.cumsum(generator.uniform(7.0, 25.0, int((span_m[1] - span_m[0]) / 16.0)))
+        y_m = lane.kept_off(x_m, generator.uniform(*TREES_M, len(x_m)), 3.5)
+        for x, y in zip(x_m.tolist(), y_m.tolist(), strict=True):
             shape = generator.uniform(0.8, 2.2), generator.uniform(4.0, 11.0), generator.uniform(1.2, 2.8)
-            if all(abs(place - bridge) > NO_TREES_NEAR_BRIDGE_M for bridge in bridges):
-                pieces += tree(foot, 0.0, *shape)
-            place += generator.uniform(7.0, 25.0)
+            if all(abs(x - bridge) > NO_TREES_NEAR_BRIDGE_M for bridge in bridges):
+                pieces += tree((x, side * y), 0.0, *shape)
     return pieces

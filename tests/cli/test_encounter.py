@@ -1,0 +1,51 @@
+"""`torchcover encounter`: tables, files, and what is wrong with a set."""
+
+import json
+
+import pytest
+
+SET = """name: two
+encounters:
+  - name: child
+    ego: {speed_kmh: [10, 60]}
+    other: {body: child, speed_kmh: 5, from_m: 2.0, yaw_deg: [90, -90]}
+"""
+
+
+def test_rigs_side_by_side_in_words_and_files(torchcover, worlds):
+    (worlds / "two.yaml").write_text(SET)
+    arguments = ("--set", worlds / "two.yaml", "--phases", "2", "--points", "1", "--looks", "1", "--vehicle", "suv")
+    ended, printed, _ = torchcover("encounter", worlds / "low.yaml", worlds / "both.yaml", *arguments)
+    assert ended == 0
+    for words in ("child: 90", "child: -90", "too late", "In time up to", "worst to lose", "1 points of LiDARs"):
+        assert words in printed
+    out = worlds / "out" / "encounters"
+    record = json.loads((out / "summary.json").read_text())
+    assert record["files"] == ["encounters.csv", "report.html", "encounters.png"]
+    assert [(row["encounter"], row["speed_kmh"], row["rig"]) for row in record["rows"]][:2] == [
+        ("child: 90", 10.0, "low"), ("child: 90", 10.0, "both")]  # fmt: skip
+    assert len(record["rows"]) == len((out / "encounters.csv").read_text().splitlines()) - 1 == 8
+    assert record["rows"][0]["interval_low"] is None
+    assert {one["in_time_up_to_kmh"] for one in record["speeds"]} == {10.0}
+    assert "In time? low, both" in (out / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("text", "arguments", "message"),
+    [
+        (SET.replace("child, s", "chidl, s"), [], "encounters.0: other.body: "),
+        (SET.replace("from_m: 2.0", "form_m: 2.0"), [], "encounters.0: other.form_m"),
+        (SET.replace("yaw_deg: [90, -90]", "yaw_deg: 0, at_width: 4"), [], "the two never touch"),
+        (SET.replace("name: two", "name: [two]"), [], "name: "),
+        (SET, ["--points", "0"], "--points"),
+        (SET, ["--deceleration", "0"], "deceleration: m/s2 above 0"),
+        (SET, ["--latency-s", "-1"], "latency: seconds of 0 or more"),
+        (SET, ["--set", "crosing_like"], "is 'crossing_like' meant?"),
+    ],
+)
+def test_a_mistake_is_one_line(torchcover, worlds, text, arguments, message):
+    (worlds / "two.yaml").write_text(text)
+    given = ("--set", worlds / "two.yaml", "--phases", "1", "--vehicle", "suv", *arguments)
+    ended, _, error = torchcover("encounter", worlds / "low.yaml", *given)
+    assert ended == 2
+    assert message in error.strip().splitlines()[-1]

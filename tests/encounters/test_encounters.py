@@ -1,0 +1,316 @@
+"""When a rig detects whom it meets: geometry, and the same as looking all the time."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from tests.targets.worlds import EGO, FLOOR, lidar, on_target
+from torchcover.encounters import Criterion, Encounter, EncounterSet, Staged, sight_encounter
+from torchcover.encounters.sighting import NEVER, Looks, MountedRig, channels, first_run, look_steps
+from torchcover.evaluation import encounter, free_space
+from torchcover.geometry import euler_from_rotation
+from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, with_ego
+from torchcover.simulation.bodies import called
+from torchcover.simulation.moving import Solid
+from torchcover.targets import Target
+
+torch.set_num_threads(1)
+
+BOX = {"type": "box", "size_m": [2.0, 1.0, 0.5]}
+WALKER = {"type": "box", "size_m": [0.02, 0.02, 1.0]}
+WALL = {"type": "box", "size_m": [3.0, 0.5, 3.0]}
+SOLID = Solid(Scenario.model_validate({"name": "s", "ego": EGO, "bodies": [FLOOR]}).ego_mesh())
+
+
+def crossing(speed_kmh=36.0, other=None, **keys):
+    other = {"body": "child", "speed_kmh": 5.4, "from_m": 1.5} | (other or {})
+    return Encounter.model_validate({"name": "e", "ego": {"speed_kmh": speed_kmh}, "other": other, **keys})
+
+
+def rig(*sensors):
+    return Rig.model_validate({"name": "small", "sensors": list(sensors) or [lidar()]})
+
+
+def mounted(*sensors):
+    world = free_space().model_copy(update={"ego": Scenario.model_validate(
+        {"name": "s", "ego": EGO, "bodies": [FLOOR]}).ego})  # fmt: skip
+    return MountedRig(rig(*sensors), with_ego(world, {}))
+
+
+def ahead(name="ahead", **keys):
+    """A dense LiDAR in the middle of the front."""
+    return lidar(name, mount={"x_m": 1.9, "z_m": 1.2}, columns=900, channels=11, vertical_fov_deg=[-12, 0], **keys)
+
+
+def high(name, **keys):
+    return lidar(name, **{"mount": {"x_m": 1.0, "z_m": 1.9}, "columns": 900, "vertical_fov_deg": [-20, 0]} | keys)
+
+
+@pytest.mark.parametrize("speed_kmh", [18.0, 36.0])
+def test_the_sight_opens_when_the_line_past_the_corner_of_a_wall_meets_the_walker(speed_kmh):
+    scanner = {
+        "name": "front", "mount": {"x_m": 1.5, "z_m": 1.5}, "channels": 1, "vertical_fov_deg": [-6, -6],
+        "horizontal_fov_deg": 40, "columns": 4000, "max_range_m": 90, "rate_hz": 500,
+    }  # fmt: skip
+    walls = [{"body": WALL, "beside_m": 0.6, "gap_m": 1.0}]
+    walker = {"body": WALKER, "from_m": 2.1}
+    one = sight_encounter(
+        mounted(scanner), crossing(speed_kmh, walker, obstacles=walls), Criterion(points=1, looks=1), phases=1
+    )
+    # Seconds before the ego's front is at the walker's way, which the line past (-1.01, -1.6) meets at y = ..
+    before_s = np.linspace(0.3, 1.39, 100_001)
+    sensor_m = -0.5 - speed_kmh / 3.6 * before_s
+    opens_s = before_s[-1.5 * before_s + 0.01 >= -1.6 * sensor_m / (sensor_m + 1.01)].max()
+    assert 1.1 < opens_s < 1.35
+    assert one.ttc_s[0] == pytest.approx(opens_s - 0.01 / (speed_kmh / 3.6), abs=0.005)
+
+
+def test_outlines_touch_when_the_front_has_come_to_the_side():
+    assert Staged(crossing(36.0, {"body": BOX}), SOLID).contact_s == pytest.approx(1.0 - 0.5 / 10, abs=2e-6)
+    oncoming = {"body": BOX, "yaw_deg": 180, "speed_kmh": 18, "from_m": 5}
+    assert Staged(crossing(36.0, oncoming), SOLID).contact_s == pytest.approx(1.0 - 1.0 / 15, abs=2e-6)
+    behind = Staged(crossing(-36.0, {"body": BOX}), SOLID)
+    assert behind.contact_s == pytest.approx(1.0 - 0.5 / 10, abs=2e-6)
+    assert behind.vehicle_T_other(np.array([1.0]))[0, :2, 3] == pytest.approx([-2.0, 0.0])
+    standing = crossing(0.0, {"body": BOX, "from_m": 3})
+    assert Staged(standing, SOLID).contact_s == pytest.approx(2.0 - (1.0 + 1.0) / 1.5, abs=2e-6)
+
+
+@pytest.mark.parametrize("speed_kmh", [36.0, -36.0])
+def test_rows_of_obstacles_lie_where_the_ego_comes_from_or_beyond(speed_kmh):
+    rows = [{"body": BOX, "gap_m": 0.5}, {"body": WALL, "beside_m": 2.0, "gap_m": 0.4}]
+    beyond = {"body": BOX, "side": "left", "where": "beyond", "yaw_deg": 90, "gap_m": 0.3, "beside_m": 0.7}
+    staged = Staged(crossing(speed_kmh, {"body": BOX}, obstacles=[*rows, beyond]), SOLID)
+    back = -math.copysign(1.0, speed_kmh)
+    placed = {called(one.body) + one.side + str(one.gap_m): pose[:2, 3] for one, pose in staged.obstacles}
+    # The other is 1 m wide along x, the ego 2 m along y.
+    assert placed["boxright0.5"] == pytest.approx([back * (0.5 + 0.5 + 1.0), -1.0 - 1.0 - 0.5])
+    assert placed["boxright0.4"] == pytest.approx([back * (0.5 + 0.5 + 2.0 + 0.4 + 1.5), -1.0 - 2.0 - 0.25])
+    assert placed["boxleft0.3"] == pytest.approx([-back * (0.5 + 0.3 + 0.5), 1.0 + 0.7 + 1.0])
+
+
+def test_a_bend_ends_at_the_meeting_and_is_as_long_as_its_angle():
+    turning = Encounter.model_validate(
+        {"name": "t", "ego": {"speed_kmh": 18, "radius_m": 8, "turn_deg": 90}, "seconds": 4,
+         "other": {"body": "child", "speed_kmh": 5, "from_m": 4}}
+    )  # fmt: skip
+    staged = Staged(turning, SOLID)
+    bend_s = 8 * math.pi / 2 / 5
+    poses = staged.world_T_ego(turning.before_s - np.array([0.0, bend_s, bend_s + 0.1]))
+    yaw_deg = [euler_from_rotation(pose[:3, :3])[0] for pose in poses]
+    assert yaw_deg == pytest.approx([0.0, -90.0, -90.0], abs=1e-6)
+    assert poses[:, :2, 3] == pytest.approx(np.array([[-2.0, 0.0], [-10.0, 8.0], [-10.0, 8.5]]))
+
+
+@pytest.mark.parametrize("looks", [1, 2, 3, 5])
+def test_the_first_run_is_that_of_all_looks_with_few_of_them(looks):
+    generator = np.random.default_rng(looks)
+    for chance in (0.2, 0.6, 0.9):
+        steps = 10 * np.arange(40) + np.arange(7)[:, None]
+        steps[3:, 35:] = NEVER
+        enough = generator.random((7, 40)) < chance
+        asked = []
+
+        def is_enough(some, asked=asked, enough=enough):
+            asked.extend(some.tolist())
+            return enough[some % 10, some // 10]
+
+        expected = []
+        for phase in range(7):
+            ends = [j for j in range(looks - 1, 40) if enough[phase, j - looks + 1 : j + 1].all()]
+            expected.append(steps[phase, ends[0]] if ends and steps[phase, ends[0]] < NEVER else NEVER)
+        assert first_run(is_enough, steps, looks).tolist() == expected
+        assert len(asked) == len(set(asked))
+    dark = []
+    first_run(lambda some: dark.extend(some) or np.zeros(len(some), dtype=bool), steps, looks)
+    assert len(dark) <= 7 * (40 // looks)
+
+
+CAMERA = {
+    "type": "camera", "name": "cam", "mount": {"x_m": 2.05, "z_m": 0.9}, "width": 240, "height": 160, "fov_deg": 90,
+    "stride": 2, "max_range_m": 60, "rate_hz": 20,
+}  # fmt: skip
+RADAR = {
+    "type": "radar", "name": "radar", "mount": {"x_m": 2.05, "z_m": 0.5}, "horizontal_fov_deg": 90,
+    "vertical_fov_deg": [-8, 8], "azimuth_cell_deg": 6, "range_cell_m": 0.4, "max_range_m": 40,
+}  # fmt: skip
+HIDDEN = [{"body": WALL, "beside_m": 0.4, "gap_m": 0.5}, {"body": BOX, "side": "left", "where": "beyond"}]
+
+
+def test_points_are_those_of_a_simulation_with_the_other_in_the_world():
+    case = crossing(obstacles=HIDDEN)
+    small = mounted(ahead(), CAMERA, RADAR)
+    staged = Staged(case, small.ego)
+    looks, child = Looks(small, staged, 0), Target.load("child")
+    child = Target("child", staged.other.mesh)
+    seen = np.zeros(3)
+    for step in (200, 500, 620, 800, 930):
+        vehicle_T_other = staged.vehicle_T_other(np.array([step / 1000]))[0]
+        vehicle_T_world = np.linalg.inv(staged.world_T_ego(np.array([step / 1000]))[0])
+        shapes = [("wall", WALL), ("box", BOX)]
+        poses = {"left": BOX, "right": WALL}
+        bodies = [FLOOR]
+        for one, pose in staged.obstacles:
+            x_m, y_m, _ = (vehicle_T_world @ pose)[:3, 3].tolist()
+            bodies.append({"name": one.side, "shape": poses[one.side], "poses": [{"x_m": x_m, "y_m": y_m}]})
+        assert len(bodies) == 1 + len(shapes)
+        x_m, y_m, _ = vehicle_T_other[:3, 3].tolist()
+        yaw_deg = float(euler_from_rotation(vehicle_T_other[:3, :3])[0])
+        actor = {"name": "c", "category": "child", "shape": {"type": "vehicle", "vehicle": "child"},
+                 "pose": {"x_m": x_m, "y_m": y_m, "yaw_deg": yaw_deg}}  # fmt: skip
+        world = Scenario.model_validate({"name": "s", "ego": EGO, "bodies": bodies, "actors": [actor]})
+        scans = Simulator(world, {"r": small.rig}, PaperReference(rows=2, columns=2)).step(0).scans["r"]
+        for k, (sensor, scan) in enumerate(zip(small.rig.sensors, scans, strict=True)):
+            points = int(looks.points([k], np.array([step]))[0])
+            assert points == sensor.counts_as * on_target(scan.points, child, x_m, y_m, math.radians(yaw_deg))
+            seen[k] += points
+    assert (seen > 0).all()
+
+
+def test_the_answer_is_that_of_looking_all_the_time():
+    case, criterion = crossing(obstacles=HIDDEN), Criterion(points=12, pixels=150)
+    small = mounted(ahead(dropout=0.3), ahead("noisy", rate_hz=20, range_noise_m=0.3), CAMERA)
+    found = sight_encounter(small, case, criterion, phases=4, seed=3)
+    staged = Staged(case, small.ego)
+    looks, sensors = Looks(small, staged, 3), small.rig.sensors
+    for k, sensor in enumerate(sensors):
+        steps = look_steps(sensor.rate_hz, 4, staged.contact_s)
+        need = criterion.pixels if sensor.name == "cam" else criterion.points
+        for phase, of_phase in enumerate(steps):
+            known = of_phase[of_phase < NEVER]
+            enough = looks.points([k], known) >= need
+            runs = enough[:-2] & enough[1:-1] & enough[2:]
+            expected = staged.contact_s - known[2:][runs][0] / 1000 if runs.any() else 0.0
+            assert found.sensor_ttc_s[k, phase] == pytest.approx(expected)
+    assert (found.sensor_ttc_s > 0).any(axis=1).all()
+    again, another = (Looks(small, staged, seed).points([1], known) for seed in (3, 4))
+    assert (again == looks.points([1], known)).all()
+    assert (another != again).any()
+    assert (found.ttc_s == found.sensor_ttc_s.max(axis=0)).all()  # none counts with another
+    assert (found.without_ttc_s[0] == found.sensor_ttc_s[1:].max(axis=0)).all()
+
+
+def test_lidars_of_one_rate_count_together_and_a_loss_is_never_a_gain():
+    sensors = rig(lidar("a"), lidar("b"), lidar("c", rate_hz=20), CAMERA, RADAR).sensors
+    assert channels(sensors, range(5)) == [(0, 1), (2,), (3,), (4,)]
+    few = lidar("few", columns=180, channels=8, vertical_fov_deg=[-20, 0])
+    found = sight_encounter(mounted(few, few | {"name": "same"}), crossing(), Criterion(points=6), phases=3)
+    assert (found.without_ttc_s <= found.ttc_s).all()
+    assert (found.without_ttc_s == found.sensor_ttc_s[::-1]).all()
+    assert (found.ttc_s > found.sensor_ttc_s[0]).any()
+
+
+def test_a_sensor_that_is_slower_than_the_encounter_is_too_late():
+    with pytest.warns(UserWarning, match=r"3 looks of sensor 'top' take 3 s, .* ends after 0.98"):
+        found = sight_encounter(mounted(lidar(rate_hz=1)), crossing(), Criterion(), phases=2)
+    assert not found.ttc_s.any()
+    assert not found.from_the_beginning.any()
+
+
+def test_fog_hides_what_is_beyond_and_it_is_said_what_was_there_from_the_beginning():
+    far = crossing(72.0, {"from_m": None, "speed_kmh": 0}, seconds=3)
+    sensor = lidar(channels=60, vertical_fov_deg=[-4, 0], columns=7200, max_range_m=80)
+    found = [sight_encounter(mounted(sensor), case, Criterion(points=1), phases=2) for case in (
+        far, far.model_copy(update={"weather": crossing(weather="fog_50m").weather}))]  # fmt: skip
+    assert found[0].from_the_beginning.all()
+    assert found[0].ttc_s.min() > 2.5
+    assert not found[1].from_the_beginning.any()
+    assert found[1].ttc_s.max() < 2.5
+
+
+FAMILY = {
+    "name": "f", "ego": {"speed_kmh": [20, 40]}, "other": {"body": "child", "speed_kmh": {"from": 3, "to": 7},
+    "at_width": {"from": 0.2, "to": 0.8}, "from_m": 1.5}, "obstacles": [{"body": ["hatchback", "van"]}],
+}  # fmt: skip
+
+
+def test_lists_are_combined_and_ranges_drawn_evenly_for_each_combination():
+    these = EncounterSet.model_validate({"name": "s", "draws": 8, "encounters": [FAMILY]}).encounters
+    assert len(these) == 2 * 2 * 8
+    assert [one.name for one in these[::8]] == ["f: hatchback", "f: van"] * 2
+    assert [one.ego.speed_kmh for one in these[::8]] == [20, 20, 40, 40]
+    for first in range(0, 32, 8):
+        share = np.array([one.other.at_width for one in these[first : first + 8]])
+        assert sorted(np.floor((share - 0.2) / 0.6 * 8).tolist()) == list(range(8))
+        assert share.tolist() == [one.other.at_width for one in these[:8]]
+
+
+def test_rows_are_of_speeds_with_intervals_over_draws():
+    these = EncounterSet.model_validate({"name": "s", "draws": 4, "encounters": [FAMILY | {"obstacles": []}]})
+    two = rig(high("ahead"), high("top", columns=40))
+    found = encounter([two], these, Criterion(points=3), phases=3, vehicle="suv")
+    rows = found.rows
+    assert [(row.speed_kmh, row.draws, row.first) for row in rows] == [(20, 4, "ahead"), (40, 4, "ahead")]
+    for row in rows:
+        of_draws_s = [one.ttc_s.mean() for one in found.sightings if one.encounter.ego.speed_kmh == row.speed_kmh]
+        margin_s = 3.18245 * np.std(of_draws_s, ddof=1) / 2
+        assert (row.ttc_s, row.interval_high) == pytest.approx((np.mean(of_draws_s), row.ttc_s + margin_s), rel=1e-5)
+        assert row.ttc_s_low <= row.ttc_s <= row.ttc_s_high
+        assert row.needed_s == pytest.approx(row.speed_kmh / 3.6 / 18 + 0.5)
+        assert row.worst == "ahead"
+    slow = [one.ttc_s for one in found.sightings if one.encounter.ego.speed_kmh == 20]
+    assert rows[0].in_time == np.mean(np.stack(slow) >= rows[0].needed_s)
+    ((name, of_rigs, needed),) = found.bands()
+    bands = of_rigs["small"]
+    assert (name, [band[0] for band in bands]) == ("f", [20, 40])
+    assert [at for _, at in needed] == [row.needed_s for row in rows]
+    assert bands[0][1:] == (rows[0].ttc_s_low, rows[0].ttc_s_high)
+
+
+def test_in_time_up_to_a_speed_is_in_time_at_all_that_are_slower():
+    these = EncounterSet.model_validate(
+        {"name": "s", "encounters": [FAMILY | {"ego": {"speed_kmh": [50, 10, 30]}, "obstacles": [], "other":
+         {"body": "child", "speed_kmh": 5, "from_m": 1.5}}]}
+    )  # fmt: skip
+    partly = encounter(rig(high("ahead")), these, phases=5)
+    ttc_s = np.sort(partly.sightings[0].ttc_s)
+    between = Criterion(deceleration_mps2=50 / 3.6 / 2 / (ttc_s[2] - 0.1), latency_s=0.1)
+    found = encounter(rig(high("ahead")), these, between, phases=5)
+    assert [row.in_time for row in found.rows][-1] == 0.6
+    assert list(found.up_to_kmh().values()) == [30.0]
+    for brakes, expected in ((1e6, 50.0), (1.0, 0.0)):
+        found = encounter(rig(high("ahead")), these, Criterion(deceleration_mps2=brakes, latency_s=0.1), phases=5)
+        assert list(found.up_to_kmh().values()) == [expected]
+
+
+MISTAKES = [
+    ({"ego": {"speed_kmh": 0}, "other": {"body": "child", "speed_kmh": 0}}, "nobody moves"),
+    ({"other": {"body": "chidl", "speed_kmh": 5}}, "is 'child' meant"),
+    ({"other": {"body": "child", "speed_kmh": 5, "from_m": -1}}, "from_m"),
+    ({"ego": {"speed_kmh": []}}, "ego.speed_kmh: a list of values is empty"),
+    ({"ego": {"speed_kmh": {"from": 5, "to": 5}}}, "from 5 must be below to 5"),
+    ({"ego": {"speed_kmh": {"from": 5, "to": "x"}}}, "two numbers from and to"),
+    ({"ego": {"speed_kmh": [10, 20], "radius_m": 0.1}}, "radius_m: at least 1 m"),
+    ({"weather": "fog"}, "is 'fog_50m' meant|fog_100m"),
+    ({"ego": {"speed_kmh": list(range(1, 201))}, "seconds": list(range(1, 60))},
+     "11,800 encounters of a family, of at most 10,000"),
+    ({"obstacle": []}, "obstacle"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("keys", "told"), MISTAKES)
+def test_a_family_that_makes_no_sense_is_told_once(keys, told, tmp_path):
+    family = {"name": "f", "ego": {"speed_kmh": 10}, "other": {"body": "child", "speed_kmh": 5}} | keys
+    path = tmp_path / "set.yaml"
+    path.write_text(yaml.safe_dump({"name": "s", "encounters": [family]}))
+    with pytest.raises((ValueError, FileNotFoundError), match=told) as failure:
+        encounter(rig(high("top")), path, phases=1)
+    assert len(str(failure.value)) < 1000
+
+
+@pytest.mark.parametrize(
+    ("case", "told"),
+    [
+        (crossing(36, {"at_width": 3.0, "yaw_deg": 0, "from_m": 4}), "never touch"),
+        (crossing(5.4, {"yaw_deg": 0}), "overlap from the beginning|never touch"),
+        (crossing(36, {"body": BOX, "yaw_deg": 0, "speed_kmh": 36}), "overlap from the beginning"),
+        (crossing(36, obstacles=[{"body": WALL, "beside_m": -1.0}]), "'box' is in the way of the ego"),
+        (crossing(36, {"from_m": 3}, obstacles=[{"body": WALL, "gap_m": -1.0}]), "'box' is in the way of the other"),
+    ],
+)
+def test_ways_that_never_meet_or_are_blocked_are_mistakes(case, told):
+    with pytest.raises(ValueError, match=told):
+        Staged(case, SOLID)

@@ -1,0 +1,91 @@
+"""Rays that hit nothing near what is asked about are not cast, and what is near is the same to the bit."""
+
+import numpy as np
+import pytest
+
+from torchcover.simulation import CameraSensor, Draws, Lidar, Pose, Radar, Scenario
+from torchcover.simulation.camera_sensor import Stereo
+from torchcover.simulation.rays import Balls, into_tiles, pixels_in_tiles, unit_directions
+from torchcover.simulation.scene import Scene
+from torchcover.simulation.sensor import ScanTimes
+from torchcover.simulation.sight import FEW, MountedSensor
+
+ROOF = Pose(x_m=0.45, z_m=1.73, yaw_deg=20, pitch_deg=3)
+ERRS = {"range_noise_m": 0.05, "dropout": 0.1}
+ROWS = {"channels": 40, "vertical_fov_deg": (-60, 10), "horizontal_fov_deg": 360, "columns": 150, "max_range_m": 90}
+SENSORS = {
+    "lidar": Lidar(name="a", mount=ROOF, **ROWS, **ERRS, range_at_10_percent_m=15.0),
+    "exact lidar": Lidar(name="a", mount=ROOF, **ROWS),
+    "lidar that takes time": Lidar(name="a", mount=ROOF, **ROWS, **ERRS, scan=ScanTimes(period_s=0.1)),
+    "camera": CameraSensor(
+        name="a", mount=Pose(x_m=1.0, z_m=1.5), width=320, height=200, stride=4, lens="brown_conrady", fx=200, fy=190,
+        cx=160, cy=100, coefficients=(-0.2, 0.05, 0, 0), max_range_m=90, stereo=Stereo(baseline_m=0.2, subpixel_px=0.2),
+    ),
+    "radar": Radar(
+        name="a", mount=Pose(x_m=2.6, z_m=0.5), horizontal_fov_deg=90, vertical_fov_deg=(-10, 10), azimuth_cell_deg=3,
+        range_cell_m=0.5, max_range_m=70, ray_spacing_m=1.0, **ERRS,
+    ),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return Scene(Scenario.load("parking").world(seed=3))
+
+
+def is_near(scan, balls):
+    """(N,) of its points, which ones lie in a ball."""
+    away_m = np.linalg.norm(scan.points[:, None].astype(float) - balls.centres_m, axis=2)
+    return (away_m <= balls.radius_m).any(axis=1)
+
+
+@pytest.mark.parametrize("name", SENSORS)
+@pytest.mark.parametrize("radius_m", [0.1, 0.4, 2.0])
+def test_points_near_what_is_asked_about_are_the_same_to_the_bit(scene, name, radius_m):
+    instant, sensor = scene.at(30, within_m=90.0), SENSORS[name]
+    mounted = MountedSensor(sensor, scene, sensor.max_range_m)
+
+    def scan(**asked):
+        draws = Draws(np.random.default_rng(7), rays=len(mounted.pixel_of_ray))
+        return mounted.scan(instant, draws, threads=2, **asked)
+
+    full, generator = scan(), np.random.default_rng(8)
+    places_m = full.points[generator.choice(len(full.points), 12)] + generator.normal(0, radius_m / 2, (12, 3))
+    balls = Balls(places_m.astype(np.float32), radius_m)
+    spared = scan(within=balls)
+    of_full, of_spared = is_near(full, balls), is_near(spared, balls)
+    assert of_full.sum() > 0
+    for column in ("points", "ray", "range_m", "error_m", "landed"):
+        one, other = getattr(full, column), getattr(spared, column)
+        assert (one is None) == (other is None)
+        if one is not None:
+            np.testing.assert_array_equal(one[of_full], other[of_spared], err_msg=column)
+    assert (spared.rays, spared.self_hits) == (full.rays, full.self_hits)
+    assert (spared.rays_spared > 0.3 * full.rays) == (name != "lidar that takes time") or radius_m > 1
+
+
+def test_a_ray_is_met_exactly_if_it_passes_through_a_ball():
+    """But for some millimetres, and a millimetre in a metre far away; at the sensor every ray is."""
+    generator = np.random.default_rng(5)
+    directions = unit_directions(np.linspace(-89, 89, 50)[:, None], np.linspace(-179, 179, 100)[None])
+    pose = ROOF.matrix()
+    pixels, tiles = pixels_in_tiles(directions), into_tiles(directions)
+    towards = (pose[:3, :3] @ directions.reshape(3, -1)[:, pixels]).T
+    for count, far_m, radius_m in ((1, 3, 1.5), (40, 60, 0.4), (300, 200, 0.2), (3, 0.5, 0.6), (0, 1, 1)):
+        centres_m = generator.normal(0, far_m, (count, 3)).astype(np.float32)
+        ways_m = centres_m - pose[:3, 3]
+        along_m = np.maximum(towards @ ways_m.T, 0)
+        squared_m2 = (ways_m**2).sum(axis=1)
+        away_m = np.sqrt(np.maximum(squared_m2 - 2 * along_m * (towards @ ways_m.T) + along_m**2, 0))
+        met = np.concatenate([Balls(centres_m, radius_m).met_by(tile, pose) for tile in tiles])
+        assert met[(away_m <= radius_m).any(axis=1)].all()
+        if (squared_m2 > radius_m**2).all():
+            assert not met[(away_m > np.hypot(radius_m + 5e-3, 1.5e-3 * np.sqrt(squared_m2))).all(axis=1)].any()
+
+
+def test_of_many_places_all_rays_are_cast(scene):
+    sensor = SENSORS["exact lidar"]
+    mounted, instant = MountedSensor(sensor, scene, 90.0), scene.at(0, within_m=90.0)
+    for count, spares in ((FEW, True), (FEW + 1, False)):
+        balls = Balls(np.tile(np.float32([20, 0, 0]), (count, 1)), 0.4)
+        assert (mounted.scan(instant, Draws(None), within=balls).rays_spared > 0) == spares

@@ -1,0 +1,293 @@
+"""Encounters as documents: a few numbers each, of which some are swept or drawn."""
+
+import math
+from collections.abc import Iterator
+from functools import lru_cache
+from itertools import product
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    PositiveFloat,
+    PositiveInt,
+    ValidationError,
+    ValidationInfo,
+    model_validator,
+)
+
+from torchcover.simulation.bodies import Shape, Vehicle, VehicleShape
+from torchcover.simulation.documents import BuiltIn, Document, beside, explain, is_file_name
+from torchcover.simulation.weather import CLEAR, Weather
+
+# Of a family: ten times what anybody would wait for.
+MOST = 10_000
+FASTEST_KMH = 500.0
+# The key that tables have a column for; values of others become part of the name.
+SPEED = ("ego", "speed_kmh")
+
+Place = tuple[str | int, ...]
+Speed = Annotated[float, Field(ge=-FASTEST_KMH, le=FASTEST_KMH)]
+
+
+def _body(content: Any) -> Any:  # noqa: ANN401  (whatever stood in the file)
+    """The name or file of a vehicle is its shape."""
+    return {"type": "vehicle", "vehicle": content} if isinstance(content, str) else content
+
+
+def _weather(content: Any, info: ValidationInfo) -> Any:  # noqa: ANN401
+    if not isinstance(content, str):
+        return content
+    try:
+        return Weather.load(beside(Path(content), info) if is_file_name(content) else content)
+    except FileNotFoundError as error:
+        raise ValueError(str(error)) from error
+
+
+def _known(shape: Shape) -> Shape:
+    """At the door, and once: a set has few bodies."""
+    if isinstance(shape, VehicleShape):
+        _check_vehicle(shape.vehicle)
+    return shape
+
+
+@lru_cache(maxsize=64)
+def _check_vehicle(name_or_path: str) -> None:
+    try:
+        Vehicle.load(name_or_path)
+    except FileNotFoundError as error:
+        raise ValueError(str(error)) from error
+
+
+AnyBody = Annotated[Shape, BeforeValidator(_body), AfterValidator(_known)]
+
+
+class Way(Document):
+    """How somebody comes to the place of the meeting: straight, or around a bend and then straight.
+
+    Args:
+        speed_kmh: Constant; negative is in reverse.
+        radius_m: Of the bend, positive to the left; straight if not given.
+        turn_deg: How much of the bend lies before the meeting, and as much behind it; beyond it the way is straight.
+    """
+
+    speed_kmh: Speed
+    radius_m: float | None = None
+    turn_deg: Annotated[float, Field(gt=0.0, le=180.0)] = 90.0
+
+    @model_validator(mode="after")
+    def _check_radius(self) -> Self:
+        if self.radius_m is not None and abs(self.radius_m) < 1.0:
+            raise ValueError(f"radius_m: at least 1 m to either side is needed; got {self.radius_m:g}")
+        return self
+
+    @property
+    def speed_mps(self) -> float:
+        """Signed, in metres a second."""
+        return self.speed_kmh / 3.6
+
+
+class Other(Way):
+    """Who is met.
+
+    Args:
+        body: A built-in vehicle, the YAML file of one, or a shape; people are built-in vehicles, too.
+        yaw_deg: Where it heads at the meeting, from the ego's heading to the left: 90 crosses from the right.
+        from_m: How long its way to the meeting is; before, it is not there. From the beginning if not given.
+        at_width: Where its middle is at the meeting, as a share of the ego's width, from its right side.
+    """
+
+    body: AnyBody
+    yaw_deg: float = 90.0
+    from_m: PositiveFloat | None = None
+    at_width: float = 0.5
+
+
+class Obstacle(Document):
+    """What stands in the way of the sight, beside the ego's way; rows are nearest first.
+
+    Args:
+        body: As of `Other`.
+        side: Of the ego's way, straight on from the meeting.
+        where: Before the meeting, or beyond it.
+        beside_m: Between its side and that of the ego.
+        gap_m: Between its end and the outline of the other at the meeting, or the end of the one before on that side.
+        yaw_deg: Where it heads, from the ego's heading to the left.
+    """
+
+    body: AnyBody
+    side: Literal["left", "right"] = "right"
+    where: Literal["before", "beyond"] = "before"
+    beside_m: float = 1.0
+    gap_m: float = 1.0
+    yaw_deg: float = 0.0
+
+
+class Encounter(Document):
+    """Two ways that meet: the middle of the ego's front, of its rear in reverse, reaches the way of the other.
+
+    Args:
+        name: What tables call it.
+        ego: The vehicle that carries the rig.
+        other: Who is met.
+        obstacles: What hides it.
+        weather: Built in, or a YAML file; clear if not given.
+        seconds: How long before the meeting it begins, unless the other comes later.
+        speed_is_swept: Whether tables have a row for this speed of the ego; else it was drawn, among others.
+    """
+
+    name: str
+    ego: Way
+    other: Other
+    obstacles: tuple[Obstacle, ...] = ()
+    weather: Annotated[Weather, BeforeValidator(_weather)] = CLEAR
+    seconds: Annotated[float, Field(gt=0.0, le=60.0)] = 6.0
+    speed_is_swept: bool = True
+
+    @model_validator(mode="after")
+    def _check_speeds(self) -> Self:
+        if self.ego.speed_kmh == 0 and self.other.speed_kmh == 0:
+            raise ValueError("nobody moves: ego.speed_kmh and other.speed_kmh are 0")
+        return self
+
+    @property
+    def words(self) -> str:
+        """Which one of its set."""
+        return f"encounter {self.name!r} at {self.ego.speed_kmh:g} km/h"
+
+    @property
+    def closing_mps(self) -> float:
+        """What the brakes must take away: the ego's speed, less that of the other in the same direction.
+
+        Example:
+            >>> ways = {"ego": {"speed_kmh": 90}, "other": {"body": "hatchback", "speed_kmh": 54, "yaw_deg": 0}}
+            >>> round(Encounter.model_validate({"name": "ahead", **ways}).closing_mps, 9)
+            10.0
+        """
+        along_mps = self.other.speed_mps * math.cos(math.radians(self.other.yaw_deg))
+        speed_mps = self.ego.speed_mps
+        return max(abs(speed_mps) - max(math.copysign(along_mps, along_mps * speed_mps), 0.0), 0.0)
+
+    @property
+    def before_s(self) -> float:
+        """How long before the meeting it begins."""
+        speed_mps, from_m = abs(self.other.speed_mps), self.other.from_m
+        return self.seconds if from_m is None or speed_mps == 0 else min(self.seconds, from_m / speed_mps)
+
+
+class EncounterSet(BuiltIn):
+    """Encounters of some families. In a family any value may be swept, as a list, or drawn, as `{from: 1.0, to: 1.4}`.
+
+    All lists are combined with each other, and each combination with the same `draws` of what is drawn: evenly from
+    each range (a Latin hypercube).
+
+    Args:
+        name: What tables call it.
+        description: What it is, and where its numbers come from.
+        draws: How many are drawn.
+        seed: Of what is drawn.
+        encounters: The families; in Python all of their encounters.
+
+    Example:
+        >>> crossings = EncounterSet.load("crossing_like").encounters
+        >>> len(crossings), crossings[0].name
+        (22, 'child from behind a parked car: hatchback')
+    """
+
+    folder: ClassVar[str] = "encounters"
+
+    name: str
+    description: str = ""
+    draws: PositiveInt = 16
+    seed: Annotated[int, Field(ge=0)] = 0
+    encounters: tuple[Encounter, ...] = Field(min_length=1)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _expand(cls, content: Any, info: ValidationInfo) -> Any:  # noqa: ANN401  (whatever stood in the file)
+        families = content.get("encounters") if isinstance(content, dict) else None
+        draws, seed = (content.get(key, usual) for key, usual in (("draws", 16), ("seed", 0))) if families else (16, 0)
+        sound = isinstance(draws, int) and isinstance(seed, int) and 1 <= draws <= MOST and seed >= 0
+        if not isinstance(families, list | tuple) or not sound:
+            return content  # which is told field by field
+        found: list[Any] = []
+        for number, family in enumerate(families):
+            if not isinstance(family, dict):
+                found.append(family)
+                continue
+            try:
+                for one in expanded(family, draws, np.random.default_rng([seed, number])):
+                    found.append(Encounter.model_validate(one, context=info.context))
+            except ValidationError as error:
+                raise ValueError(f"encounters.{number}: {explain(error)}") from error
+        return {**content, "encounters": tuple(found)}
+
+
+def expanded(family: dict[str, Any], draws: int, generator: np.random.Generator) -> Iterator[dict[str, Any]]:
+    """The encounters of a family, each with one value where the family has a list or a range.
+
+    Raises:
+        ValueError: A list of none, a range that is none, or too many.
+    """
+    swept, drawn = dict[Place, Any](), dict[Place, Any]()
+    for place, value in _leaves(family, ()):
+        if isinstance(value, dict):
+            drawn[place] = _between(place, value, draws, generator)
+        else:
+            if len(value) == 0:
+                raise ValueError(f"{'.'.join(map(str, place))}: a list of values is empty")
+            swept[place] = value
+    count = math.prod(map(len, swept.values())) * (draws if drawn else 1)
+    if count > MOST:
+        raise ValueError(f"{count:,} encounters of a family, of at most {MOST:,}; sweep or draw less")
+    for combination in product(*swept.values()):
+        of_swept = dict(zip(swept, combination, strict=True))
+        words = [str(value) for place, value in of_swept.items() if place != SPEED]
+        for draw in range(draws if drawn else 1):
+            values = of_swept | {place: each[draw] for place, each in drawn.items()}
+            one = _with(family, values, ())
+            if words:
+                one["name"] = f"{family.get('name')}: {', '.join(words)}"
+            if SPEED in drawn:
+                one["speed_is_swept"] = False
+            yield one
+
+
+def _leaves(value: Any, place: Place) -> Iterator[tuple[Place, Any]]:  # noqa: ANN401
+    """What is swept or drawn; a shape has lists of its own."""
+    if isinstance(value, dict):
+        if set(value) == {"from", "to"}:
+            yield place, value
+        elif place[-1:] != ("body",):
+            for key, inner in value.items():
+                yield from _leaves(inner, (*place, key))
+    elif isinstance(value, list | tuple):
+        if any(isinstance(each, dict) for each in value):
+            for number, inner in enumerate(value):
+                yield from _leaves(inner, (*place, number))
+        elif place != ("obstacles",):
+            yield place, value
+
+
+def _between(place: Place, ends: dict[str, Any], draws: int, generator: np.random.Generator) -> list[float]:
+    low, high = ends["from"], ends["to"]
+    for end in (low, high):
+        if isinstance(end, bool) or not isinstance(end, int | float) or not math.isfinite(end):
+            raise ValueError(f"{'.'.join(map(str, place))}: two numbers from and to are needed; got {end!r}")
+    if low >= high:
+        raise ValueError(f"{'.'.join(map(str, place))}: from {low:g} must be below to {high:g}")
+    evenly = (generator.permutation(draws) + generator.random(draws)) / draws
+    return [float(value) for value in low + evenly * (high - low)]
+
+
+def _with(value: Any, values: dict[Place, Any], place: Place) -> Any:  # noqa: ANN401
+    if place in values:
+        return values[place]
+    if isinstance(value, dict):
+        return {key: _with(inner, values, (*place, key)) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_with(inner, values, (*place, number)) for number, inner in enumerate(value)]
+    return value

@@ -1,0 +1,325 @@
+"""When a rig detects whom it meets: looks at whole milliseconds, of which only those are taken that decide."""
+
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.encounters.encounter import Encounter
+from torchcover.encounters.staging import STEP_S, Staged
+from torchcover.simulation.camera_sensor import CameraSensor
+from torchcover.simulation.lidar import Lidar
+from torchcover.simulation.moving import Moving, Solid, Solids
+from torchcover.simulation.radar import Radar
+from torchcover.simulation.rig import Rig
+from torchcover.simulation.scenario import Scenario
+from torchcover.simulation.scene import Scene
+from torchcover.simulation.sensor import Draws, Sensor
+from torchcover.simulation.sight import Ends, MountedSensor, sight
+from torchcover.targets.counting import Beams, Met, measured_points, meetings
+from torchcover.targets.steps import SensorStep
+
+Float64 = NDArray[np.float64]
+Numbers = NDArray[np.int64]
+
+# A point that is measured farther from where it is than this is none on the other.
+WITHIN_M = 0.4
+# A radar has few points on anybody: a cell of its range holds a child.
+RADAR_POINTS = 1
+# Later than any step.
+NEVER = np.iinfo(np.int64).max
+
+
+@dataclass(frozen=True)
+class Criterion:
+    """What is detected, and what is in time.
+
+    Args:
+        points: So many points on the other are enough, of all LiDARs with the same rate together; of a radar one is.
+        pixels: So many pixels of the full image are enough, of a camera alone.
+        looks: In so many looks in a row.
+        deceleration_mps2: Of the brakes.
+        latency_s: From the last of these looks to the brakes.
+
+    Raises:
+        ValueError: A number out of its bounds.
+    """
+
+    points: int = 5
+    pixels: int = 200
+    looks: int = 3
+    deceleration_mps2: float = 9.0
+    latency_s: float = 0.5
+
+    def __post_init__(self) -> None:
+        for name in ("points", "pixels", "looks"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: a number >= 1 is needed; got {getattr(self, name)}")
+        if not 0 < self.deceleration_mps2 < math.inf:
+            raise ValueError(f"deceleration: m/s2 above 0 are needed; got {self.deceleration_mps2}")
+        if not 0 <= self.latency_s < math.inf:
+            raise ValueError(f"latency: seconds of 0 or more are needed; got {self.latency_s}")
+
+    def needed_s(self, closing_mps: float) -> float:
+        """The time to collision at which braking still prevents it: v / (2 a) + latency.
+
+        Example:
+            >>> round(Criterion().needed_s(50 / 3.6), 2)
+            1.27
+        """
+        return closing_mps / (2 * self.deceleration_mps2) + self.latency_s
+
+
+class Sighting(NamedTuple):
+    """What a rig had of an encounter, for P phases of its looks and S sensors; 0 is not before the collision.
+
+    `ttc_s` (P,) time to collision at detection; `sensor_ttc_s` (S, P) of each sensor alone, `without_ttc_s` (S, P)
+    of all others; `from_the_beginning` (P,) whether it was seen as soon as the encounter began, and the other may
+    have been there before.
+    """
+
+    encounter: Encounter
+    rig: str
+    contact_s: float
+    ttc_s: Float64
+    sensor_ttc_s: Float64
+    without_ttc_s: Float64
+    from_the_beginning: NDArray[np.bool_]
+
+
+class MountedRig:
+    """A rig on its vehicle, for any number of encounters.
+
+    Args:
+        rig: The sensors; what takes time to scan is looked at as if it took none.
+        scenario: Whose ego carries it; see `with_ego`.
+    """
+
+    def __init__(self, rig: Rig, scenario: Scenario) -> None:
+        self.rig, self._scenario = rig, scenario
+        self.ego, self.solids = Solid(scenario.ego_mesh()), Solids()
+        self._mounted: dict[str, Sequence[MountedSensor]] = {}
+        self._told = set[str]()
+
+    def mounted(self, encounter: Encounter, scene: Scene) -> Sequence[MountedSensor]:
+        """The sensors, in the weather of an encounter.
+
+        Raises:
+            ValueError: A sensor inside the ego's body.
+        """
+        weather = self.rig.weather or encounter.weather
+        key = weather.model_dump_json()
+        if key not in self._mounted:
+            sensors = [_at_once(sensor) for sensor in self.rig.sensors]
+            for sensor in sensors:
+                if scene.encloses(sensor.mount.matrix()[:3, 3]):
+                    raise ValueError(
+                        f"rig {self.rig.name!r}: sensor {sensor.name!r} lies inside the vehicle "
+                        f"{self._scenario.ego_name!r}; move its mount, or use its own vehicle (--vehicle)"
+                    )
+            self._mounted[key] = [
+                MountedSensor(
+                    sensor,
+                    scene,
+                    self._scenario.reach_m(sensor, weather),
+                    weather,
+                    [other for other in sensors if other is not sensor],
+                )
+                for sensor in sensors
+            ]
+        return self._mounted[key]
+
+    def check_rates(self, looks: int, staged: Staged) -> None:
+        """Warn, once, of a sensor of which so many looks take longer than an encounter."""
+        for sensor in self.rig.sensors:
+            takes_s = looks / sensor.rate_hz
+            if takes_s > staged.contact_s and sensor.name not in self._told:
+                self._told.add(sensor.name)
+                warnings.warn(
+                    f"rig {self.rig.name!r}: {looks} looks of sensor {sensor.name!r} take {takes_s:.3g} s, and "
+                    f"{staged.encounter.words} ends after {staged.contact_s:.3g} s: too late, whatever it sees",
+                    stacklevel=3,
+                )
+
+    @cached_property
+    def beams(self) -> Sequence[Beams | None]:
+        """Of each sensor, once it is mounted."""
+        return [Beams.of(one) for one in next(iter(self._mounted.values()))]
+
+
+def _at_once(sensor: Sensor) -> Sensor:
+    scan = getattr(sensor, "scan", None)
+    return sensor if scan is None else sensor.model_copy(update={"scan": None})  # type: ignore[attr-defined]
+
+
+def sight_encounter(
+    mounted_rig: MountedRig, encounter: Encounter, criterion: Criterion, *, phases: int = 10, seed: int = 0
+) -> Sighting:
+    """When a rig detects whom it meets.
+
+    The looks of all sensors begin together, at `phases` places of their period; the result of each is that of looking
+    at every millisecond.
+
+    Args:
+        mounted_rig: The rig.
+        encounter: What happens.
+        criterion: What is detected.
+        phases: How many phases there are.
+        seed: Of noise and drop-out.
+
+    Raises:
+        ValueError: What `Staged` and `MountedRig.mounted` refuse.
+    """
+    staged = Staged(encounter, mounted_rig.ego)
+    looks = Looks(mounted_rig, staged, seed)
+    sensors = mounted_rig.rig.sensors
+    mounted_rig.check_rates(criterion.looks, staged)
+    found = dict[tuple[int, ...], NDArray[np.int64]]()
+
+    def steps_of(together: tuple[int, ...]) -> NDArray[np.int64]:
+        if together not in found:
+            rate_hz = sensors[together[0]].rate_hz
+            enough = _enough(criterion, sensors[together[0]])
+            at = look_steps(rate_hz, phases, staged.contact_s)
+            found[together] = first_run(lambda steps: looks.points(together, steps) >= enough, at, criterion.looks)
+        return found[together]
+
+    def ttc_s(numbers: Sequence[int]) -> Float64:
+        detected = [steps_of(channel) for channel in channels(sensors, numbers)]
+        steps = np.min([np.full(phases, NEVER), *detected], axis=0)
+        return np.where(steps < NEVER, staged.contact_s - STEP_S * steps, 0.0)
+
+    everything = range(len(sensors))
+    times_s = ttc_s(everything)
+    longest_s = max((criterion.looks / sensor.rate_hz for sensor in sensors), default=0.0)
+    return Sighting(
+        encounter,
+        mounted_rig.rig.name,
+        staged.contact_s,
+        times_s,
+        np.stack([ttc_s([k]) for k in everything]),
+        np.stack([ttc_s([other for other in everything if other != k]) for k in everything]),
+        (times_s > staged.contact_s - longest_s) & (encounter.before_s == encounter.seconds),
+    )
+
+
+def _enough(criterion: Criterion, sensor: Sensor) -> int:
+    if isinstance(sensor, CameraSensor):
+        return criterion.pixels
+    return RADAR_POINTS if isinstance(sensor, Radar) else criterion.points
+
+
+def channels(sensors: Sequence[Sensor], numbers: Sequence[int]) -> list[tuple[int, ...]]:
+    """Whose points count together, among some sensors: LiDARs of one rate do; each other sensor is alone."""
+    found: dict[object, list[int]] = {}
+    for k in numbers:
+        key = sensors[k].rate_hz if isinstance(sensors[k], Lidar) else ("alone", k)
+        found.setdefault(key, []).append(k)
+    return [tuple(channel) for channel in found.values()]
+
+
+def look_steps(rate_hz: float, phases: int, contact_s: float) -> Numbers:
+    """(P, J) whole milliseconds of the looks before the contact, for each phase; those after it are `NEVER`."""
+    count = math.ceil(contact_s * rate_hz)
+    times = (np.arange(count) + np.arange(phases)[:, None] / phases) / rate_hz / STEP_S
+    steps = np.round(times).astype(np.int64)
+    return np.where(steps * STEP_S < contact_s, steps, NEVER)
+
+
+def first_run(is_enough: Callable[[Numbers], NDArray[np.bool_]], steps: Numbers, looks: int) -> Numbers:
+    """When so many looks in a row were enough for the first time: (P,) the step of the last of them, or `NEVER`.
+
+    A look that is not enough rules out all runs that it is in, so the last look of a run is asked first: before
+    anything is seen, one look in `looks`.
+
+    Args:
+        is_enough: Tells it of (N,) steps.
+        steps: (P, J) of the looks of each phase, `NEVER` at the end.
+        looks: How many.
+    """
+    phases, most = steps.shape
+    known = np.zeros(steps.shape, dtype=np.int8)  # 1 enough, -1 not
+    first = np.zeros(phases, dtype=np.int64)
+    found = np.full(phases, NEVER)
+    running = np.ones(phases, dtype=bool)
+    while True:
+        running &= first + looks <= most
+        running[running] &= steps[running, first[running] + looks - 1] < NEVER
+        asked = np.full(phases, -1)
+        for phase in np.flatnonzero(running).tolist():
+            run = known[phase, first[phase] : first[phase] + looks]
+            unknown = np.flatnonzero(run == 0)
+            if len(unknown) == 0:
+                found[phase], running[phase] = steps[phase, first[phase] + looks - 1], False
+            else:
+                asked[phase] = first[phase] + unknown[-1]
+        some = np.flatnonzero(running)
+        if len(some) == 0:
+            return found
+        enough = is_enough(steps[some, asked[some]])
+        known[some, asked[some]] = np.where(enough, 1, -1)
+        first[some[~enough]] = asked[some[~enough]] + 1
+
+
+class Looks:
+    """How many points each sensor has on the other, at any millisecond; each is found once.
+
+    Args:
+        mounted_rig: The rig.
+        staged: Who is where.
+        seed: Of noise and drop-out.
+    """
+
+    def __init__(self, mounted_rig: MountedRig, staged: Staged, seed: int) -> None:
+        self._staged, self._seed, self._rig = staged, seed, mounted_rig
+        self._scene = staged.scene(mounted_rig.solids)
+        self._mounted = mounted_rig.mounted(staged.encounter, self._scene)
+        self._points: list[dict[int, int]] = [{} for _ in self._mounted]
+
+    def points(self, sensors: Sequence[int], steps: Numbers) -> Numbers:
+        """(N,) points, or pixels, of some sensors together at (N,) steps."""
+        points: Numbers = np.sum([self._of_sensor(k, steps) for k in sensors], axis=0, dtype=np.int64)
+        return points
+
+    def _of_sensor(self, number: int, steps: Numbers) -> Numbers:
+        known = self._points[number]
+        new = np.array(sorted({step for step in steps.tolist() if step not in known}), dtype=np.int64)
+        if len(new):
+            known.update(zip(new.tolist(), self._look(number, new).tolist(), strict=True))
+        return np.array([known[step] for step in steps.tolist()])
+
+    def _look(self, number: int, steps: Numbers) -> Numbers:
+        mounted, other = self._mounted[number], self._staged.other
+        poses = self._staged.vehicle_T_other(STEP_S * steps.astype(np.float64))
+        placed = Moving.placed([other] * len(steps), poses, np.full(len(steps), -1))
+        reach_m = np.concatenate(mounted.own_m).clip(max=np.float32(mounted.reach_m))
+        met = meetings(placed, mounted, reach_m)
+        first = np.searchsorted(met.position, np.arange(len(steps) + 1)).tolist()
+        points = np.zeros(len(steps), dtype=np.int64)
+        for k, step in enumerate(steps.tolist()):
+            there = Met._make(column[first[k] : first[k + 1]] for column in met)
+            if len(there.ray):
+                ends = self._ends(number, step, there, len(reach_m))
+                draws = Draws(np.random.default_rng([self._seed, step, number]), rays=len(reach_m))
+                seen, beams = SensorStep(ends, draws), self._rig.beams[number]
+                measured = measured_points(mounted, beams, there, seen, placed, WITHIN_M)
+                points[k] = mounted.sensor.counts_as * len(measured)
+        return points
+
+    def _ends(self, number: int, step: int, met: Met, rays: int) -> Ends:
+        """Where the rays end that meet the other; of those that are measured together with others, all."""
+        mounted = self._mounted[number]
+        # The ego's body ends its rays already.
+        instant = self._scene.at(step, within_m=-math.inf)
+        if self._rig.beams[number] is not None:
+            return mounted.ends(instant)
+        origin_m = mounted.vehicle_T_sensor[:3, 3]
+        at_m = (origin_m + met.direction * met.range_m[:, None]).astype(np.float32)
+        range_m = np.full(rays, np.inf, dtype=np.float32)
+        range_m[met.ray[~sight(instant, origin_m, at_m).seen]] = 0.0
+        return Ends(range_m, np.zeros(rays, dtype=bool))

@@ -1,0 +1,167 @@
+"""An encounter with the vehicle that has it: who is where at any time, and when they touch."""
+
+import math
+from functools import lru_cache
+from itertools import groupby
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.encounters.encounter import Encounter, Obstacle, Way
+from torchcover.geometry import BoundingBox, invert
+from torchcover.geometry.trajectory import Trajectory
+from torchcover.simulation.bodies import Shape, called, mover_mesh
+from torchcover.simulation.moving import Solid, Solids
+from torchcover.simulation.scene import Scene
+from torchcover.simulation.shapes import Plane
+from torchcover.simulation.world import Actor, World
+from torchcover.targets.placing import overlapping, poses
+
+Bools = NDArray[np.bool_]
+Float64 = NDArray[np.float64]
+
+# Looks are at whole ones of these.
+STEP_S = 0.001
+# A bend is straight in between.
+BEND_S = 0.01
+# The meeting is of middles: outlines may touch later, as where one drives into the side of the other's end.
+AFTER_S = 2.0
+GROUND_M = 2000.0
+
+
+@lru_cache(maxsize=64)
+def solid_of(shape: Shape) -> Solid:
+    """The body, made once for all encounters that have it."""
+    return Solid(mover_mesh(f"body {called(shape)!r}", shape, "other"))
+
+
+class Staged:
+    """Who is where. Time 0 is where it begins; `contact_s` is when the outlines touch if nobody brakes or turns away.
+
+    Outlines are boxes, upright, of the ego and of the other.
+
+    Args:
+        encounter: What happens.
+        ego: The body of the vehicle that carries the rig, in the vehicle frame.
+
+    Raises:
+        ValueError: The two never touch, or do from the beginning; an obstacle on a way.
+    """
+
+    def __init__(self, encounter: Encounter, ego: Solid) -> None:
+        self.encounter, self.ego = encounter, ego
+        self.other = solid_of(encounter.other.body)
+        self.obstacles = self._placed_obstacles()
+        self.contact_s = self._contact_s()
+        self._check_ways()
+
+    def world_T_ego(self, times_s: Float64) -> Float64:
+        """(T, 4, 4) where the ego is; the meeting is at the origin, and the ego heads along x there."""
+        way = self.encounter.ego
+        end_m = self.ego.box.upper_m[0] if way.speed_kmh >= 0 else self.ego.box.lower_m[0]
+        return _along(way, times_s - self.encounter.before_s, (-end_m, 0.0), 0.0)
+
+    def world_T_other(self, times_s: Float64) -> Float64:
+        """(T, 4, 4) where the other is."""
+        way, box = self.encounter.other, self.ego.box
+        y_m = box.lower_m[1] + way.at_width * box.size_m[1]
+        return _along(way, times_s - self.encounter.before_s, (0.0, y_m), math.radians(way.yaw_deg))
+
+    def vehicle_T_other(self, times_s: Float64) -> Float64:
+        """(T, 4, 4) where the other is, as the ego has it."""
+        pose: Float64 = invert(self.world_T_ego(times_s)) @ self.world_T_other(times_s)
+        return pose
+
+    def scene(self, solids: Solids) -> Scene:
+        """All but the other, with a time step of a millisecond."""
+        steps = math.ceil(self.contact_s / STEP_S)
+        times_s = np.linspace(0.0, steps * STEP_S, 1 + math.ceil(steps * STEP_S / BEND_S))
+        along = Trajectory.from_poses(times_s, self.world_T_ego(times_s))
+        # Transient: even an ego at rest is no part of what never moves, as it is in all other encounters.
+        drive = Trajectory(along.times_s, along.positions_m, along.angles_deg, transient=True)
+        ground = Plane(type="plane", size_m=(GROUND_M, GROUND_M)).mesh().made_of("road")
+        static = (ground, *(solid_of(one.body).mesh.moved(pose) for one, pose in self.obstacles))
+        ego = Actor("ego", "ego", self.ego.mesh, drive)
+        return Scene(World(static, ego, time_step_s=STEP_S, duration_s=steps * STEP_S, ground=(0,)), solids)
+
+    def _placed_obstacles(self) -> list[tuple[Obstacle, Float64]]:
+        """Each and its (4, 4) pose: rows on either side of the ego's way, before and beyond the other."""
+        lower_m, upper_m = _extent_m(self.other.box, math.radians(self.encounter.other.yaw_deg))
+        ego_m, backwards = self.ego.box, self.encounter.ego.speed_kmh < 0
+        found = list[tuple[Obstacle, Float64]]()
+        rows = sorted(self.encounter.obstacles, key=lambda one: (one.side, one.where))
+        for (side, where), row in groupby(rows, key=lambda one: (one.side, one.where)):
+            # The ego comes from -x, in reverse from x.
+            ahead = (where == "beyond") != backwards
+            end_m = upper_m[0] if ahead else -lower_m[0]
+            for one in row:
+                low_m, high_m = _extent_m(solid_of(one.body).box, math.radians(one.yaw_deg))
+                end_m += one.gap_m
+                x_m = end_m - low_m[0] if ahead else -end_m - high_m[0]
+                end_m += high_m[0] - low_m[0]
+                if side == "left":
+                    y_m = ego_m.upper_m[1] + one.beside_m - low_m[1]
+                else:
+                    y_m = ego_m.lower_m[1] - one.beside_m - high_m[1]
+                found.append((one, poses(np.array([[x_m, y_m]]), np.array([math.radians(one.yaw_deg)]))[0]))
+        return found
+
+    def _contact_s(self) -> float:
+        def touching(times_s: Float64) -> Bools:
+            return overlapping(self.other.box, self.vehicle_T_other(times_s), self.ego.box.corners_m)
+
+        end_s, words = self.encounter.before_s + AFTER_S, self.encounter.words
+        times_s = STEP_S * np.arange(math.ceil(end_s / STEP_S) + 1, dtype=np.float64)
+        touches = touching(times_s)
+        if not touches.any():
+            raise ValueError(
+                f"{words}: the two never touch, up to {AFTER_S:g} s after the meeting; change other.at_width, yaw_deg "
+                "or a speed"
+            )
+        first = int(touches.argmax())
+        if first == 0:
+            raise ValueError(
+                f"{words}: the outlines of the two overlap from the beginning; let it begin earlier (seconds, from_m), "
+                "or give them other speeds"
+            )
+        finely_s = times_s[first] - STEP_S * np.linspace(1.0, 0.0, 1001)
+        return float(finely_s[touching(finely_s).argmax()])
+
+    def _check_ways(self) -> None:
+        """Until they touch, nobody drives or walks through an obstacle."""
+        times_s = np.append(np.arange(0.0, self.contact_s, BEND_S), self.contact_s)
+        ways = (("the ego", self.ego, self.world_T_ego), ("the other", self.other, self.world_T_other))
+        for obstacle, pose in self.obstacles:
+            for who, solid, way in ways:
+                there = np.linalg.inv(way(times_s)) @ pose
+                on_way = overlapping(solid_of(obstacle.body).box, there, solid.box.corners_m)
+                if on_way.any():
+                    at_s = times_s[on_way.argmax()] - self.contact_s
+                    raise ValueError(
+                        f"{self.encounter.words}: the obstacle {called(obstacle.body)!r} is in the way of {who}, "
+                        f"{-at_s:.2f} s before the two touch; change its beside_m or gap_m, or let the encounter begin "
+                        "later (from_m, seconds)"
+                    )
+
+
+def _along(way: Way, before_s: Float64, at_m: tuple[float, float], heading: float) -> Float64:
+    """(T, 4, 4) poses at (T,) times after the meeting, where somebody is at a place with a heading."""
+    gone_m = way.speed_mps * before_s
+    if way.radius_m is None:
+        turned, x_m, y_m = np.zeros_like(gone_m), gone_m, np.zeros_like(gone_m)
+    else:
+        bend_m = abs(way.radius_m) * math.radians(way.turn_deg)
+        turned = np.clip(gone_m, -bend_m, bend_m) / way.radius_m
+        straight_m = gone_m - turned * way.radius_m
+        x_m = way.radius_m * np.sin(turned) + straight_m * np.cos(turned)
+        y_m = way.radius_m * (1 - np.cos(turned)) + straight_m * np.sin(turned)
+    cos, sin = math.cos(heading), math.sin(heading)
+    positions_m = np.stack([at_m[0] + cos * x_m - sin * y_m, at_m[1] + sin * x_m + cos * y_m], axis=1)
+    return poses(positions_m, heading + turned)
+
+
+def _extent_m(box: BoundingBox, yaw: float) -> tuple[Float64, Float64]:
+    """(2,) lowest and (2,) highest x, y of a box that is turned."""
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    corners_m = box.corners_m[:, :2] @ np.array([[cos, sin], [-sin, cos]])
+    return corners_m.min(axis=0), corners_m.max(axis=0)
