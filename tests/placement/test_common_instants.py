@@ -13,6 +13,7 @@ from torchcover.coverage import CoverageMetric
 from torchcover.evaluation import evaluate
 from torchcover.placement import Objective
 from torchcover.placement.common_instants import HeldWorlds
+from torchcover.placement.questions import Questions
 from torchcover.simulation import RegionsOfInterest, Scenario, SimulatedFrames, Simulator, SurfaceReference
 
 NOISY = lidar("noisy", range_noise_m=0.03, dropout=0.2, mount={"x_m": 0.5, "z_m": 2.2, "yaw_deg": 40})
@@ -50,6 +51,15 @@ def test_ideal_sensors_have_a_point_for_every_hit():
     assert points[0] == [len(frame.sensor) for frame in real.frames(rig(name=short.name))]
     assert points[1][0] < points[0][0]
     assert ideal.anew(1, 1).sensor_model == "ideal"
+
+
+def test_rays_that_change_no_objective_are_not_cast_and_change_none(monkeypatch):
+    near = {"near": Objective(detection=0.2, band="ground", region={"ahead": {"x_m": (3, 8), "y_m": (-2, 2)}})}
+    of = held(objectives=near, worlds=1, rays=200)
+    some, [frame, *_] = of.estimates(TWO), of.frames(TWO)
+    monkeypatch.setattr(Questions, "within_m", None)
+    same(of.estimates(TWO), some)
+    assert len(frame.sensor) < 0.7 * len(next(of.frames(TWO)).sensor)
 
 
 def test_numbers_are_those_of_evaluate_on_the_same_instants_to_the_last_bit():
