@@ -99,10 +99,16 @@ def test_a_quaternion_turns_about_its_axis(axis, norm, angle_deg):
     np.testing.assert_allclose(rotation @ across, turned, atol=1e-12)
 
 
-@pytest.mark.parametrize("bad", [[1.0, 0.0, 0.0], [1.0, 0.0, 0.0, np.nan], [[1.0, 0.0, 0.0, 0.0]], np.inf])
+@pytest.mark.parametrize("bad", [[1.0, 0.0, 0.0], [1.0, 0.0, 0.0, np.nan], [[1.0, 0.0, 0.0]], np.inf])
 def test_a_quaternion_of_the_wrong_kind_is_refused(bad):
     with pytest.raises(ValueError, match="four finite numbers w, x, y, z"):
         rotation_from_quaternion(bad)
+
+
+def test_many_quaternions_are_turned_at_once_as_each_alone():
+    many = np.random.default_rng(0).normal(size=(2, 3, 4))
+    each = [[rotation_from_quaternion(one) for one in row] for row in many]
+    np.testing.assert_allclose(rotation_from_quaternion(many), each, rtol=0.0, atol=1e-15)
 
 
 def test_a_quaternion_of_norm_zero_is_refused():

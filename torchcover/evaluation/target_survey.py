@@ -72,6 +72,7 @@ def survey_target(
         ValueError: A file that cannot be used, a number out of its bounds.
 
     Example:
+        >>> from torchcover.targets import Raster
         >>> seen = survey_target("front_roof_128", "dog", raster=Raster((3.0, 7.0), (-1.0, 1.0), 1.0))
         >>> seen.target, seen.counts["free"]
         ('dog_57cm', 8)

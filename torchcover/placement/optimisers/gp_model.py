@@ -134,7 +134,7 @@ def _learnt(apart: Tensor, standard: Tensor, noise: Tensor) -> tuple[Tensor, Ten
             return found
 
         with torch.enable_grad():
-            descent.step(loss)
+            descent.step(loss)  # type: ignore[no-untyped-call]
         values = values.detach().clamp(-FARTHEST, FARTHEST)
         ends.append((float(_loss(values, usual, apart, standard, noise)), values))
     best = min(ends, key=lambda end: end[0])[1]
@@ -149,4 +149,5 @@ def _loss(values: Tensor, usual: Tensor, apart: Tensor, standard: Tensor, noise:
     whitened = torch.linalg.solve_triangular(cholesky, standard[:, None], upper=False)
     widths = torch.tensor([PRIOR_WIDTH] * (count + 1) + [PRIOR_NOISE_WIDTH], dtype=values.dtype)
     off = (values - usual) / widths
-    return 0.5 * (whitened.square().sum() + off.square().sum()) + cholesky.diagonal().log().sum()
+    found: Tensor = 0.5 * (whitened.square().sum() + off.square().sum()) + cholesky.diagonal().log().sum()
+    return found
