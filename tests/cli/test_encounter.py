@@ -17,13 +17,20 @@ def test_rigs_side_by_side_in_words_and_files(torchcover, worlds):
     arguments = ("--set", worlds / "two.yaml", "--phases", "2", "--points", "1", "--looks", "1", "--vehicle", "suv")
     ended, printed, _ = torchcover("encounter", worlds / "low.yaml", worlds / "both.yaml", *arguments)
     assert ended == 0
-    for words in ("child: 90", "child: -90", "too late", "In time up to", "worst to lose", "1 points of LiDARs"):
+    for words in (
+        "child: yaw_deg 90",
+        "child: yaw_deg -90",
+        "too late",
+        "In time up to",
+        "worst to lose",
+        "1 points of LiDARs",
+    ):
         assert words in printed
     out = worlds / "out" / "encounters"
     record = json.loads((out / "summary.json").read_text())
     assert record["files"] == ["encounters.csv", "report.html", "encounters.png"]
     assert [(row["encounter"], row["speed_kmh"], row["rig"]) for row in record["rows"]][:2] == [
-        ("child: 90", 10.0, "low"), ("child: 90", 10.0, "both")]  # fmt: skip
+        ("child: yaw_deg 90", 10.0, "low"), ("child: yaw_deg 90", 10.0, "both")]  # fmt: skip
     assert len(record["rows"]) == len((out / "encounters.csv").read_text().splitlines()) - 1 == 8
     assert record["rows"][0]["interval_low"] is None
     assert {one["in_time_up_to_kmh"] for one in record["speeds"]} == {10.0}

@@ -245,7 +245,11 @@ def expanded(family: dict[str, Any], draws: int, generator: np.random.Generator)
         raise ValueError(f"{count:,} encounters of a family, of at most {MOST:,}; sweep or draw less")
     for combination in product(*swept.values()):
         of_swept = dict(zip(swept, combination, strict=True))
-        words = [str(value) for place, value in of_swept.items() if place != SPEED]
+        words = [
+            value if isinstance(value, str) else f"{place[-1]} {value}"
+            for place, value in of_swept.items()
+            if place != SPEED
+        ]
         for draw in range(draws if drawn else 1):
             values = of_swept | {place: each[draw] for place, each in drawn.items()}
             one = _with(family, values, ())
