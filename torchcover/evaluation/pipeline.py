@@ -60,7 +60,7 @@ class Run:
             raise self.failure
 
 
-class Seen(NamedTuple):
+class MeasuredFrame(NamedTuple):
     """What is left of a frame where it was measured.
 
     Args:
@@ -89,11 +89,11 @@ class MeasuredFrames:
         self._observers = {number: one for number, one in numbered if isinstance(one, CoverageObserver)}
         self._needs_frame = len(self._observers) < len(observers)
 
-    def __getitem__(self, index: int) -> Seen:
+    def __getitem__(self, index: int) -> MeasuredFrame:
         frame, start = self.frames[index], time.perf_counter()
         sums = {number: observer.sums_of(frame) for number, observer in self._observers.items()}
         measuring_s = 0.0 if get_worker_info() else time.perf_counter() - start
-        return Seen(frame if self._needs_frame else None, frame.counts, sums, measuring_s)
+        return MeasuredFrame(frame if self._needs_frame else None, frame.counts, sums, measuring_s)
 
 
 class StoppingRule(Protocol):
@@ -245,7 +245,7 @@ def killed_worker(error: BaseException, workers: int, steps: int) -> ChildProces
     )
 
 
-def _feed(seen: Seen, observers: Sequence[AnyObserver], run: Run, device: torch.device | str) -> None:
+def _feed(seen: MeasuredFrame, observers: Sequence[AnyObserver], run: Run, device: torch.device | str) -> None:
     start = time.perf_counter()
     frame = None if seen.frame is None else seen.frame.to(device)
     for number, observer in enumerate(observers):
@@ -298,7 +298,7 @@ class FramesOrErrors(Dataset[Any]):
 
 def _each(
     frames: MeasuredFrames, tasks: Iterable[list[int]], workers: int, run: Run, *, skip_bad_frames: bool
-) -> Iterator[Seen]:
+) -> Iterator[MeasuredFrame]:
     """One frame at a time; notes bad ones if they are to be skipped."""
     loader = DataLoader(
         FramesOrErrors(frames),
@@ -310,7 +310,7 @@ def _each(
     )
     for batch in loader:
         for made in batch:
-            if isinstance(made, Seen):
+            if isinstance(made, MeasuredFrame):
                 yield made
             elif skip_bad_frames and isinstance(made, BadFrameError):
                 run.skipped.append(str(made))

@@ -68,15 +68,15 @@ def added_up(rows: Tensor, maxima: int = 0) -> Tensor:
         >>> added_up(torch.tensor([[7.0, 1.0, 3.0], [2.0, 5.0, 4.0], [7.0, 2.0, 9.0]]).double(), maxima=1).tolist()
         [[2.0, 5.0, 4.0], [7.0, 3.0, 9.0]]
     """
-    keys, of_row = torch.unique(rows[:, 0], return_inverse=True)
-    if len(keys) == len(rows):
-        return torch.empty_like(rows).index_copy_(0, of_row, rows)
-    columns = rows[:, 1:].T.contiguous()
-    first = len(columns) - maxima
-    sums = [torch.bincount(of_row, weights=column, minlength=len(keys)) for column in columns[:first]]
-    lowest = columns.new_full((maxima, len(keys)), -math.inf)
-    largest = lowest.scatter_reduce_(1, of_row.expand(maxima, -1), columns[first:], "amax")
-    return torch.stack([keys, *sums, *largest], dim=1)
+    keys, of_row = torch.unique(rows[:, 0].long(), return_inverse=True)
+    first = rows.shape[1] - maxima
+    added = rows.new_zeros((len(keys), rows.shape[1]))
+    added[:, 0] = keys
+    added[:, 1:first] = added[:, 1:first].index_add(0, of_row, rows[:, 1:first])
+    if maxima:
+        lowest = rows.new_full((len(keys), maxima), -math.inf)
+        added[:, first:] = lowest.scatter_reduce_(0, of_row[:, None].expand(-1, maxima), rows[:, first:], "amax")
+    return added
 
 
 def _of_parts(tables: Tensor, maxima: int) -> Tensor:
