@@ -118,6 +118,12 @@ class Stopwatches:
 
         return call
 
+    def watch_all(self):
+        for place, part in WATCHED.items():
+            owner, name = owner_of(place)
+            if hasattr(owner, name):  # in another checkout it may be called otherwise
+                setattr(owner, name, self.watch(getattr(owner, name), part))
+
     def within(self, part):
         return part in self._running
 
@@ -152,10 +158,7 @@ def parts(folder):
 
     observe = owner_of("torchcover.evaluation.measuring:observe")
     setattr(*observe, first(getattr(*observe)))
-    for place, part in WATCHED.items():
-        owner, name = owner_of(place)
-        if hasattr(owner, name):  # in another checkout it may be called otherwise
-            setattr(owner, name, watches.watch(getattr(owner, name), part))
+    watches.watch_all()
     raycaster, choice = (import_module(f"torchcover.{name}") for name in ("simulation.raycaster", "neighbors.choice"))
 
     class Scene(raycaster.EmbreeScene):
