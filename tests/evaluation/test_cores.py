@@ -93,7 +93,8 @@ def test_who_does_not_is_told_nothing(nothing_said, said):
     [
         (1, 64, 11, 0),
         (2, 64, 11, 2),
-        (16, 64, 11, module.MOST_WORKERS),
+        (16, 64, 11, 8),
+        (64, 640, 110, module.MOST_MEASURING),
         (16, 24, 4, 3),
         (16, 64, 2, 2),
         (16, 64, 1, 0),
@@ -113,9 +114,10 @@ def test_workers_need_room_for_what_they_hand_over(monkeypatch, tmp_path):
     monkeypatch.setattr(module, "cores", lambda: 16)
     monkeypatch.setattr(module, "SHARED_MEMORY", str(tmp_path))
     monkeypatch.setattr(multiprocessing, "get_start_method", lambda allow_none: "fork")
-    for room, expected in ((64e6, 0), (512e6, 2), (1e12, module.MOST_WORKERS)):
+    for room, frames, sums in ((8e6, 0, 0), (64e6, 0, 4), (512e6, 2, 16), (1e12, module.MOST_WORKERS, 16)):
         monkeypatch.setattr(os, "statvfs", lambda _, room=room: os.statvfs_result([1] * 4 + [int(room)] + [1] * 5))
-        assert usual_workers(64, 64) == expected
+        assert usual_workers(640, 64, measuring=False) == frames
+        assert usual_workers(640, 64) == sums
 
 
 def test_a_simulation_has_the_usual_workers_and_frames_of_others_none(monkeypatch):
@@ -125,8 +127,8 @@ def test_a_simulation_has_the_usual_workers_and_frames_of_others_none(monkeypatc
     def observe(*_, workers, **__):
         raise KnownError(workers)
 
-    def usual(frames, worlds):
-        asked.append((frames, worlds))
+    def usual(frames, worlds, *, measuring):
+        asked.append((frames, worlds, measuring))
         return 2
 
     asked = []
@@ -136,10 +138,11 @@ def test_a_simulation_has_the_usual_workers_and_frames_of_others_none(monkeypatc
     for given, expected in (
         ({"scenario": "urban", "steps": 64}, 2),
         ({"scenario": "urban", "steps": 9999}, 2),
+        ({"scenario": "urban", "steps": 64, "metrics": ["k_cover"]}, 2),
         ({"scenario": "urban", "steps": 64, "workers": 0}, 0),
         ({"frames": frames}, 0),
     ):
         with pytest.raises(KnownError) as found:
             evaluate("front_roof_32", **given)
         assert found.value.args == (expected,)
-    assert asked == [(64, 11), (measuring.ENOUGH_FRAMES, 43)]
+    assert asked == [(64, 11, True), (measuring.ENOUGH_FRAMES, 43, True), (64, 11, False)]

@@ -14,12 +14,12 @@ CPU_QUOTAS = (
 )
 # Each of these says how threads of OpenMP wait: of the standard, of GNU, of Intel and LLVM.
 WAITING = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME")
-# More processes wait for the one that measures what they make.
-MOST_WORKERS = 6
+# More processes wait for the one that adds up what they measure, or that measures what they make.
+MOST_MEASURING, MOST_WORKERS = 16, 6
 LEAST_FRAMES = 8
-# What finished frames wait in, where the system tells; a container often has 64 MB of it.
+# What finished frames, or their sums, wait in, where the system tells; a container often has 64 MB of it.
 SHARED_MEMORY = "/dev/shm"
-SHARED_BYTES = 256e6
+SHARED_BYTES, BYTES_OF_SUMS = 256e6, 16e6
 
 
 def cores() -> int:
@@ -51,7 +51,7 @@ def set_threads() -> None:
     os.environ.setdefault("OMP_NUM_THREADS", str(cores()))
 
 
-def usual_workers(frames: int, worlds: int) -> int:
+def usual_workers(frames: int, worlds: int, *, measuring: bool = True) -> int:
     """Processes that make the frames of a simulation, if nobody says how many.
 
     None where a process can only be started anew: a program that is not made for that would start itself.
@@ -59,6 +59,7 @@ def usual_workers(frames: int, worlds: int) -> int:
     Args:
         frames: How many.
         worlds: How many they are of; a world is built by one process.
+        measuring: Whether they hand over sums alone, and no frames.
 
     Example:
         >>> usual_workers(frames=64, worlds=1)
@@ -68,7 +69,8 @@ def usual_workers(frames: int, worlds: int) -> int:
     if not forks or multiprocessing.current_process().daemon:  # which may start none
         return 0
     room = os.statvfs(SHARED_MEMORY) if os.path.isdir(SHARED_MEMORY) else None
-    most = MOST_WORKERS if room is None else min(MOST_WORKERS, int(room.f_bavail * room.f_frsize / SHARED_BYTES))
+    most, each_bytes = (MOST_MEASURING, BYTES_OF_SUMS) if measuring else (MOST_WORKERS, SHARED_BYTES)
+    most = most if room is None else min(most, int(room.f_bavail * room.f_frsize / each_bytes))
     workers = min(most, cores(), worlds, frames // LEAST_FRAMES)
     return workers if workers > 1 else 0
 
