@@ -32,6 +32,8 @@ WATCHED = {
     "torchcover.simulation.scene:Scene.at": MOVING,
     "torchcover.neighbors.query:_nearest": SEARCH,
     "torchcover.coverage.metric:CoverageMetric.update": SUMS,
+    "torchcover.coverage.metric:CoverageMetric.sums_of": SUMS,
+    "torchcover.coverage.metric:CoverageMetric.add": SUMS,
     "torchcover.report.maps.figures:draw_side_by_side": MAPS,
     "torchcover.files.publishing:Publication.add_figure": MAPS,
     "torchcover.evaluation.result:Result.save": FILES,
@@ -151,8 +153,9 @@ def parts(folder):
     observe = owner_of("torchcover.evaluation.measuring:observe")
     setattr(*observe, first(getattr(*observe)))
     for place, part in WATCHED.items():
-        owner = owner_of(place)
-        setattr(*owner, watches.watch(getattr(*owner), part))
+        owner, name = owner_of(place)
+        if hasattr(owner, name):  # in another checkout it may be called otherwise
+            setattr(owner, name, watches.watch(getattr(owner, name), part))
     raycaster, choice = (import_module(f"torchcover.{name}") for name in ("simulation.raycaster", "neighbors.choice"))
 
     class Scene(raycaster.EmbreeScene):

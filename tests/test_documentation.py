@@ -21,6 +21,7 @@ from tests.recordings.layouts import argoverse2_log, kitti_raw
 from torchcover import BevGrid
 from torchcover.cli.app import app
 from torchcover.data import RegionsOfInterest, SimulatedFrames, collate_frames
+from torchcover.encounters import EncounterSet
 from torchcover.placement import ChoiceSpace, SearchSpace
 from torchcover.recordings.formats.folder_settings import read_folder_settings
 from torchcover.simulation import Rig, Scenario
@@ -149,6 +150,7 @@ READERS = (
     Vehicle.load,
     RegionsOfInterest.load,
     Requirements.load,
+    EncounterSet.load,
     SearchSpace.load,
     ChoiceSpace.load,
     read_folder_settings,

@@ -226,20 +226,10 @@ def test_nuscenes_vehicles_are_told_apart(tmp_path):
 @pytest.mark.parametrize(
     ("file", "old", "new", "message"),
     [
-        ("sensor.json", "]", "", r"sensor\.json: not JSON"),
-        (
-            "sensor.json",
-            '"s1"',
-            "1",
-            r"sensor\.json: a list of objects is needed, each with the texts token and channel",
-        ),
-        ("sensor.json", "[", "[" * 100_000, r"sensor\.json: not readable as a nuScenes table \(RecursionError"),
-        (
-            "calibrated_sensor.json",
-            '"sensor_token"',
-            '"other"',
-            r"calibrated_sensor\.json: a list of objects is needed",
-        ),
+        ("sensor.json", "]", "", r"sensor\.json: Expecting"),
+        ("sensor.json", '"s1"', "1", "no calibrated camera 'CAM_FRONT'"),
+        ("sensor.json", "[", "[" * 100_000, r"sensor\.json: not readable as a table of rows \(RecursionError"),
+        ("calibrated_sensor.json", '"sensor_token"', '"other"', r"nuScenes' tables \(KeyError: 'sensor_token'"),
         (
             "calibrated_sensor.json",
             "[1.7, 0.0, 1.5]",

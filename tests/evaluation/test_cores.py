@@ -94,7 +94,6 @@ def test_who_does_not_is_told_nothing(nothing_said, said):
         (1, 64, 11, 0),
         (2, 64, 11, 2),
         (16, 64, 11, 8),
-        (64, 640, 110, module.MOST_MEASURING),
         (16, 24, 4, 3),
         (16, 64, 2, 2),
         (16, 64, 1, 0),
@@ -104,20 +103,27 @@ def test_who_does_not_is_told_nothing(nothing_said, said):
 def test_workers_are_as_many_as_have_something_to_do(monkeypatch, count, frames, worlds, expected):
     monkeypatch.setattr(module, "cores", lambda: count)
     monkeypatch.setattr(multiprocessing, "get_start_method", lambda allow_none: "fork")
-    monkeypatch.setattr(module, "SHARED_MEMORY", "/nowhere")
-    assert usual_workers(frames, worlds) == expected
+    monkeypatch.setattr(module, "machine_bytes", lambda: 1e12)
+    assert usual_workers(frames, worlds, whole=False) == expected
     monkeypatch.setattr(multiprocessing, "get_start_method", lambda allow_none: "spawn")
-    assert usual_workers(frames, worlds) == 0
+    assert usual_workers(frames, worlds, whole=False) == 0
 
 
-def test_workers_need_room_for_what_they_hand_over(monkeypatch, tmp_path):
+def test_workers_need_memory_and_room_for_frames_that_they_hand_over(monkeypatch, tmp_path):
     monkeypatch.setattr(module, "cores", lambda: 16)
     monkeypatch.setattr(module, "SHARED_MEMORY", str(tmp_path))
     monkeypatch.setattr(multiprocessing, "get_start_method", lambda allow_none: "fork")
-    for room, frames, sums in ((8e6, 0, 0), (64e6, 0, 4), (512e6, 2, 16), (1e12, module.MOST_WORKERS, 16)):
+    for memory, room, whole, expected in (
+        (1e12, 64e6, True, 0),
+        (1e12, 64e6, False, 8),
+        (1e12, 512e6, True, 2),
+        (1e12, 1e12, True, 8),
+        (2e9, 1e12, True, 3),
+        (1e9, 1e12, False, 0),
+    ):
+        monkeypatch.setattr(module, "machine_bytes", lambda memory=memory: memory)
         monkeypatch.setattr(os, "statvfs", lambda _, room=room: os.statvfs_result([1] * 4 + [int(room)] + [1] * 5))
-        assert usual_workers(640, 64, measuring=False) == frames
-        assert usual_workers(640, 64) == sums
+        assert usual_workers(64, 64, whole=whole) == expected
 
 
 def test_a_simulation_has_the_usual_workers_and_frames_of_others_none(monkeypatch):
@@ -127,8 +133,8 @@ def test_a_simulation_has_the_usual_workers_and_frames_of_others_none(monkeypatc
     def observe(*_, workers, **__):
         raise KnownError(workers)
 
-    def usual(frames, worlds, *, measuring):
-        asked.append((frames, worlds, measuring))
+    def usual(frames, worlds, *, whole):
+        asked.append((frames, worlds, whole))
         return 2
 
     asked = []
@@ -137,12 +143,11 @@ def test_a_simulation_has_the_usual_workers_and_frames_of_others_none(monkeypatc
     frames = SimulatedFrames("urban", "front_roof_32", steps=64)
     for given, expected in (
         ({"scenario": "urban", "steps": 64}, 2),
-        ({"scenario": "urban", "steps": 9999}, 2),
-        ({"scenario": "urban", "steps": 64, "metrics": ["k_cover"]}, 2),
+        ({"scenario": "urban", "steps": 9999, "metrics": "k_cover"}, 2),
         ({"scenario": "urban", "steps": 64, "workers": 0}, 0),
         ({"frames": frames}, 0),
     ):
         with pytest.raises(KnownError) as found:
             evaluate("front_roof_32", **given)
         assert found.value.args == (expected,)
-    assert asked == [(64, 11, True), (measuring.ENOUGH_FRAMES, 43, True), (64, 11, False)]
+    assert asked == [(64, 11, False), (measuring.ENOUGH_FRAMES, 43, True)]

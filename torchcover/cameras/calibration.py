@@ -1,6 +1,5 @@
 """Reading calibrations: each reader turns one kind of source into a `Calibration`, from which a `Camera` is made."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from torchcover.cameras.entries import first, has_numbers, numbers, numbers_of, told, whole
 from torchcover.cameras.models import as_vector, check_image, check_model
-from torchcover.files import check_memory, decode, naming, parse_yaml, read_short_text, reads
+from torchcover.files import naming, parse_yaml, read_json_table, read_short_text, reads
 from torchcover.geometry import check_rigid, invert, rigid, rotation_from_euler, rotation_from_quaternion
 from torchcover.geometry.rigid import Matrix
 
@@ -25,8 +24,6 @@ _MODEL_NAMES = {
     "equidistant": "kannala_brandt",
     "fisheye": "kannala_brandt",
 }
-# Bytes in memory for each of the file.
-_JSON_GROWTH = 20
 
 
 @dataclass(frozen=True)
@@ -209,9 +206,9 @@ def read_nuscenes(
         BadFileError: Not such tables, no such camera, several that differ, or one that cannot be.
     """
     folder = Path(folder)
-    table = _read_table(folder / "calibrated_sensor.json", ("token", "sensor_token"))
-    channels = {row["token"]: row["channel"] for row in _read_table(folder / "sensor.json", ("token", "channel"))}
+    table, sensors = (read_json_table(folder / f"{name}.json").rows for name in ("calibrated_sensor", "sensor"))
     with naming(folder, "nuScenes' tables"):
+        channels = {row["token"]: row["channel"] for row in sensors}
         rows = [row for row in table if channels.get(row["sensor_token"]) == channel and token in (None, row["token"])]
         if not rows or not rows[0].get("camera_intrinsic"):
             raise ValueError(f"no calibrated camera {channel!r}, token {token}; channels: {sorted(channels.values())}")
@@ -237,20 +234,6 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise ValueError(f"a mapping of names to values is needed; got {type(content).__name__}")
     return content
-
-
-@reads("a nuScenes table")
-def _read_table(path: Path, keys: Sequence[str]) -> list[dict[str, Any]]:
-    """Rows of a table, each with these keys, whose values are text."""
-    check_memory(_JSON_GROWTH * path.stat().st_size)
-    try:
-        table = json.loads(decode(path.read_bytes()))
-    except json.JSONDecodeError as error:
-        raise ValueError(f"not JSON: {error}") from error
-    rows = table if isinstance(table, list) else [table]
-    if not all(isinstance(row, dict) and all(isinstance(row.get(key), str) for key in keys) for row in rows):
-        raise ValueError(f"a list of objects is needed, each with the texts {' and '.join(keys)}")
-    return rows
 
 
 def _distorted(name: str, size: tuple[int, int], matrix: Matrix, model: str, coefficients: Matrix) -> Calibration:

@@ -34,7 +34,7 @@ def upright_rows(centre_m: ArrayLike, size_m: ArrayLike, heading: ArrayLike, veh
 def headings(quaternions_wxyz: ArrayLike) -> NDArray[np.float64]:
     """(K, 3) the first axes of K rotations given as quaternions."""
     given = np.asarray(quaternions_wxyz, dtype=np.float64).reshape(-1, 4)
-    return np.array([rotation_from_quaternion(one)[:, 0] for one in given]).reshape(-1, 3)
+    return rotation_from_quaternion(given)[..., 0]
 
 
 def _rows(name: str, given: ArrayLike) -> NDArray[np.float64]:

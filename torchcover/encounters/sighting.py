@@ -104,6 +104,7 @@ class MountedRig:
         self.rig, self._scenario = rig, scenario
         self.ego, self.solids = Solid(scenario.ego_mesh()), Solids()
         self._mounted: dict[str, Sequence[MountedSensor]] = {}
+        self._told = set[str]()
 
     def mounted(self, encounter: Encounter, scene: Scene) -> Sequence[MountedSensor]:
         """The sensors, in the weather of an encounter.
@@ -132,6 +133,18 @@ class MountedRig:
                 for sensor in sensors
             ]
         return self._mounted[key]
+
+    def check_rates(self, looks: int, staged: Staged) -> None:
+        """Warn, once, of a sensor of which so many looks take longer than an encounter."""
+        for sensor in self.rig.sensors:
+            takes_s = looks / sensor.rate_hz
+            if takes_s > staged.contact_s and sensor.name not in self._told:
+                self._told.add(sensor.name)
+                warnings.warn(
+                    f"rig {self.rig.name!r}: {looks} looks of sensor {sensor.name!r} take {takes_s:.3g} s, and "
+                    f"{staged.encounter.words} ends after {staged.contact_s:.3g} s: too late, whatever it sees",
+                    stacklevel=3,
+                )
 
     @cached_property
     def beams(self) -> Sequence[Beams | None]:
@@ -165,14 +178,7 @@ def sight_encounter(
     staged = Staged(encounter, mounted_rig.ego)
     looks = Looks(mounted_rig, staged, seed)
     sensors = mounted_rig.rig.sensors
-    for sensor in sensors:
-        takes_s = criterion.looks / sensor.rate_hz
-        if takes_s > staged.contact_s:
-            warnings.warn(
-                f"rig {mounted_rig.rig.name!r}: {criterion.looks} looks of sensor {sensor.name!r} take {takes_s:.3g} "
-                f"s, and {encounter.words} ends after {staged.contact_s:.3g} s: too late, whatever it sees",
-                stacklevel=2,
-            )
+    mounted_rig.check_rates(criterion.looks, staged)
     found = dict[tuple[int, ...], NDArray[np.int64]]()
 
     def steps_of(together: tuple[int, ...]) -> NDArray[np.int64]:

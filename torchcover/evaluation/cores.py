@@ -6,6 +6,9 @@ import warnings
 from functools import cache
 from pathlib import Path
 
+from torchcover.evaluation.settings import BYTES_PER_WORKER
+from torchcover.simulation.memory import machine_bytes
+
 # What a container may take, where the system tells: microseconds of processor time, and of the time that they are for.
 # Of cgroups of version 2 in one file, of version 1 in two.
 CPU_QUOTAS = (
@@ -14,12 +17,12 @@ CPU_QUOTAS = (
 )
 # Each of these says how threads of OpenMP wait: of the standard, of GNU, of Intel and LLVM.
 WAITING = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME")
-# More processes wait for the one that adds up what they measure, or that measures what they make.
-MOST_MEASURING, MOST_WORKERS = 16, 6
+# Of each worker, or it is not worth its start; and of the memory, of all.
 LEAST_FRAMES = 8
-# What finished frames, or their sums, wait in, where the system tells; a container often has 64 MB of it.
+MOST_MEMORY = 0.5
+# Where the frames of a worker wait that are handed over whole, if the system tells; a container often has 64 MB of it.
 SHARED_MEMORY = "/dev/shm"
-SHARED_BYTES, BYTES_OF_SUMS = 256e6, 16e6
+SHARED_BYTES = 256e6
 
 
 def cores() -> int:
@@ -51,7 +54,7 @@ def set_threads() -> None:
     os.environ.setdefault("OMP_NUM_THREADS", str(cores()))
 
 
-def usual_workers(frames: int, worlds: int, *, measuring: bool = True) -> int:
+def usual_workers(frames: int, worlds: int, *, whole: bool) -> int:
     """Processes that make the frames of a simulation, if nobody says how many.
 
     None where a process can only be started anew: a program that is not made for that would start itself.
@@ -59,19 +62,19 @@ def usual_workers(frames: int, worlds: int, *, measuring: bool = True) -> int:
     Args:
         frames: How many.
         worlds: How many they are of; a world is built by one process.
-        measuring: Whether they hand over sums alone, and no frames.
+        whole: Whether frames are handed over, rather than sums of them.
 
     Example:
-        >>> usual_workers(frames=64, worlds=1)
+        >>> usual_workers(frames=64, worlds=1, whole=False)
         0
     """
     forks = (multiprocessing.get_start_method(allow_none=True) or multiprocessing.get_all_start_methods()[0]) == "fork"
     if not forks or multiprocessing.current_process().daemon:  # which may start none
         return 0
-    room = os.statvfs(SHARED_MEMORY) if os.path.isdir(SHARED_MEMORY) else None
-    most, each_bytes = (MOST_MEASURING, BYTES_OF_SUMS) if measuring else (MOST_WORKERS, SHARED_BYTES)
-    most = most if room is None else min(most, int(room.f_bavail * room.f_frsize / each_bytes))
-    workers = min(most, cores(), worlds, frames // LEAST_FRAMES)
+    workers = min(cores(), worlds, frames // LEAST_FRAMES, int(MOST_MEMORY * machine_bytes() / BYTES_PER_WORKER))
+    if whole and os.path.isdir(SHARED_MEMORY):
+        room = os.statvfs(SHARED_MEMORY)
+        workers = min(workers, int(room.f_bavail * room.f_frsize / SHARED_BYTES))
     return workers if workers > 1 else 0
 
 

@@ -88,8 +88,8 @@ def _workers(task: Task[FrameSource], settings: Settings) -> int:
     if settings.ranks or not isinstance(frames, SimulatedFrames):
         return 0
     most = min(len(frames), task.steps or len(frames), ENOUGH_FRAMES)
-    sums_alone = settings.device == "cpu" and not (settings.observers or settings.metrics)
-    return usual_workers(most, len({frames.world_of(index) for index in range(most)}), measuring=sums_alone)
+    whole = bool(settings.observers or settings.metrics) or not settings.device.startswith("cpu")
+    return usual_workers(most, len({frames.world_of(index) for index in range(most)}), whole=whole)
 
 
 def _observed(task: Task[FrameSource], settings: Settings, others: Observers) -> tuple[Observers, Observers, Run]:

@@ -40,8 +40,8 @@ DEFAULT_STEPS = 512
 SHARE_OF_OTHERS = 4
 FEWER_RAYS: tuple[Mapping[str, Any], ...] = (
     {"rays": 4096},
-    {"only_detection": True, "rays": 1024},
-    {"only_detection": True, "rays": 256},
+    {"only_detection": True},
+    {"only_detection": True, "rays": 512},
 )
 # Errors of the detection that settings are recommended for.
 WANTED = (0.02, 0.01, 0.005)

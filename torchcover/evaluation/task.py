@@ -34,8 +34,8 @@ SourceT = TypeVar("SourceT", bound=FrameSource, covariant=True)
 
 # Steps that follow each other are alike (docs/measured/error_bars.md), and every minute is another city.
 EVERY_S_IN_TRAFFIC = 10.0
-# Of the reference where only detections are asked for: between 256 and 2,048 a run to the same error takes as long.
-FEW_RAYS = 1024
+# Of the reference where only detections are asked for. Fewer save rays, but take more steps, and worlds, to an error.
+FEW_RAYS = 2048
 # Where warnings point to: the call of `evaluate`, beyond its own function, the one around that, and ours.
 CALLER = 4
 # Options that frames, what is asked and observers say by what they are, and those that change no result.

@@ -96,30 +96,31 @@ def euler_from_rotation(rotation: Matrix) -> Matrix:
 
 
 def rotation_from_quaternion(wxyz: ArrayLike) -> Matrix:
-    """Rotation matrix of a quaternion (w, x, y, z), which is normalised first.
+    """(..., 3, 3) rotation matrices of quaternions (..., 4), each w, x, y, z, which are normalised first.
 
     Raises:
-        ValueError: The quaternion is not four finite numbers, or its norm is 0.
+        ValueError: A quaternion is not four finite numbers, or its norm is 0.
 
     Example:
         >>> rotation_from_quaternion([1.0, 0.0, 0.0, 0.0]).tolist()
         [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
     quaternion = np.asarray(wxyz, dtype=np.float64)
-    if quaternion.shape != (4,) or not np.isfinite(quaternion).all():
+    if quaternion.shape[-1:] != (4,) or not np.isfinite(quaternion).all():
         raise ValueError(f"a quaternion needs four finite numbers w, x, y, z; got {wxyz!r}")
-    largest = float(np.abs(quaternion).max())
-    if largest == 0.0:
+    largest = np.abs(quaternion).max(axis=-1, keepdims=True)
+    if not largest.all():
         raise ValueError("a quaternion of norm 0 is no rotation; the identity is [1, 0, 0, 0] (w, x, y, z)")
     scaled = quaternion / largest  # whose square neither overflows nor vanishes
-    w, x, y, z = scaled / np.linalg.norm(scaled)
-    return np.array(
+    w, x, y, z = np.moveaxis(scaled / np.linalg.norm(scaled, axis=-1, keepdims=True), -1, 0)
+    rotation = np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
             [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
             [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
         ]
     )
+    return rotation.transpose(*range(2, rotation.ndim), 0, 1)
 
 
 def quaternion_from_rotation(rotation: Matrix) -> Matrix:

@@ -20,7 +20,7 @@ BACKENDS = {
 DEVICES = {"kdtree": ("cpu",), "packets": ("cpu",), "warp": ("cpu", "cuda")}
 
 # On the CPU brute force beats the tree only for few queries against many points, where building it does not pay
-# (docs/measured/performance.md, crossover).
+# (python -m benchmarks crossover).
 MAX_QUERIES_COMPARED = 16
 MANY_POINTS = 10_000
 # Once loaded, packets are faster than the KD-tree for any clouds, by at least so much (docs/measured/performance.md,

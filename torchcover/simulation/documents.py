@@ -11,6 +11,7 @@ from typing import Annotated, Any, ClassVar, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import (
+    AfterValidator,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -68,6 +69,15 @@ class Document(BaseModel):
 # Farther away rays know no place any more.
 FARTHEST_M = 1e9
 Coordinate = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
+
+
+def _ascending(bounds: tuple[float, float]) -> tuple[float, float]:
+    if not bounds[0] < bounds[1]:
+        raise ValueError(f"the lower bound must be below the upper one; got {bounds[0]:g} to {bounds[1]:g} m")
+    return bounds
+
+
+Bounds = Annotated[tuple[Coordinate, Coordinate], AfterValidator(_ascending)]
 
 
 class Pose(Document):

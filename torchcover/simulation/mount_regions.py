@@ -1,13 +1,13 @@
 """The skin of a body, where straight lines from outside first meet it, and patches of it that carry sensors."""
 
 from functools import cached_property
-from typing import Annotated, Literal, NamedTuple, Self
+from typing import Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, model_validator
+from pydantic import model_validator
 
-from torchcover.simulation.documents import Coordinate, Document
+from torchcover.simulation.documents import Bounds, Document
 from torchcover.simulation.instant import ALL_AROUND_RAYS
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.shapes import Mesh
@@ -92,15 +92,6 @@ class Skin:
     @cached_property
     def _caster(self) -> RayCaster:
         return RayCaster([self.mesh])
-
-
-def _ascending(bounds: tuple[float, float]) -> tuple[float, float]:
-    if not bounds[0] < bounds[1]:
-        raise ValueError(f"the lower bound must be below the upper one; got {bounds[0]:g} to {bounds[1]:g} m")
-    return bounds
-
-
-Bounds = Annotated[tuple[Coordinate, Coordinate], AfterValidator(_ascending)]
 
 
 class MountRegion(Document):

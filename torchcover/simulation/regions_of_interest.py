@@ -6,11 +6,11 @@ from typing import Annotated, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, Field, PositiveFloat, model_validator
+from pydantic import Field, PositiveFloat, model_validator
 
 from torchcover.coverage import BevGrid, Region, check_regions, forward_regions, near_field_regions
 from torchcover.coverage.grid import PAPER_HEIGHTS, BandFrame
-from torchcover.simulation.documents import Coordinate, Document, Readable
+from torchcover.simulation.documents import Bounds, Coordinate, Document, Readable
 from torchcover.simulation.reference_sensor import DEFAULT_BAND_FRAME, Areas, Bands
 
 # Holds the paper's regions, and the space beside and behind the vehicle.
@@ -19,13 +19,6 @@ GRID_Y_M = (-40.0, 40.0)
 CELL_M = 0.25
 
 
-def _checked(bounds: tuple[float, float]) -> tuple[float, float]:
-    if not bounds[0] < bounds[1]:
-        raise ValueError(f"the lower bound must be below the upper one; got {bounds[0]:g} to {bounds[1]:g} m")
-    return bounds
-
-
-Bounds = Annotated[tuple[Coordinate, Coordinate], AfterValidator(_checked)]
 Name = Annotated[str, Field(min_length=1)]
 
 

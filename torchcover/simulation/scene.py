@@ -113,7 +113,7 @@ class Scene:
         box = (*lower_m.tolist(), *upper_m.tolist(), *(heights_m or ()))
         if box not in self._surfaces:
             ego, step_s = self.world.ego, self.world.time_step_s
-            poses = ego.trajectory.at_each(step_s * np.arange(self.world.steps))
+            poses = ego.trajectory.at_each(step_s * np.arange(self.world.steps, dtype=np.float64))
             bounds = bounds_along(invert(self._world_T_local) @ poses, Bounds(lower_m[None], upper_m[None]))
             objects = self.world.objects
             number = {id(actor): k for k, actor in enumerate(objects)}

@@ -99,7 +99,8 @@ class Argoverse2(Layout):
 
     def world_T_vehicle(self, index: int) -> Matrix:
         """The pose of the ego in the city."""
-        return self._poses[index] @ invert(vehicle_T_ego)
+        pose: Matrix = self._poses[index] @ invert(vehicle_T_ego)
+        return pose
 
     def boxes(self, index: int) -> Boxes | None:
         """The cuboids of that sweep; None without the file."""
@@ -129,7 +130,7 @@ class Argoverse2(Layout):
             return None
         return SeenObjects(_seen(read_feather(path, CUBOIDS), int(self._times_ns[0])), longest_gap_s=0.0)
 
-    def _read_poses(self) -> list[Matrix]:
+    def _read_poses(self) -> Matrix:
         path = self.path / POSES
         columns = read_feather(path, ("timestamp_ns", *POSE))
         times_ns = columns["timestamp_ns"].astype(np.int64)
@@ -165,7 +166,7 @@ def read_objects(path: Path) -> RecordedObjects:
         origin_ns = int(poses["timestamp_ns"].min())
         ego_s = _seconds(poses, origin_ns)
         order = np.argsort(ego_s, kind="stable")
-        world_T_driven = np.stack(poses_of(poses))[order]
+        world_T_driven = poses_of(poses)[order]
         drive = Trajectory.from_poses(ego_s[order], world_T_driven)
     with naming(annotations, "cuboids of Argoverse 2"):
         times_s = _seconds(cuboids, origin_ns)
@@ -198,11 +199,11 @@ def _seconds(columns: Mapping[str, NDArray[Any]], origin_ns: int) -> Matrix:
     return np.asarray((columns["timestamp_ns"].astype(np.int64) - origin_ns) * 1e-9, dtype=np.float64)
 
 
-def poses_of(columns: Mapping[str, NDArray[Any]]) -> list[Matrix]:
-    """(4, 4) of each row of a table with the columns `POSE`."""
+def poses_of(columns: Mapping[str, NDArray[Any]]) -> Matrix:
+    """(N, 4, 4) of the rows of a table with the columns `POSE`."""
     rotations = np.column_stack([columns[name] for name in POSE[:4]])
     places = np.column_stack([columns[name] for name in POSE[4:]])
-    return [rigid(rotation_from_quaternion(one), place) for one, place in zip(rotations, places, strict=True)]
+    return rigid(rotation_from_quaternion(rotations), places)
 
 
 _LENS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "height_px", "width_px")

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.files import naming
-from torchcover.geometry import quaternion_from_rotation, rigid
+from torchcover.geometry import quaternion_from_rotation, rigid, rotation_from_quaternion
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.formats.bag import Bag
 from torchcover.recordings.formats.frame_tree import FrameTree, frame_name, pose_of
@@ -53,9 +53,8 @@ class PoseSeries(NamedTuple):
             )
         share = (since_s / gap_s)[:, None]
         first_m, second_m = self.places_m[after - 1], self.places_m[after]
-        return rigid(
-            _rotations(_slerp(self.wxyz[after - 1], self.wxyz[after], share)), first_m + share * (second_m - first_m)
-        )
+        rotations = rotation_from_quaternion(_slerp(self.wxyz[after - 1], self.wxyz[after], share))
+        return rigid(rotations, first_m + share * (second_m - first_m))
 
 
 class VehiclePoses:
@@ -190,17 +189,5 @@ def _slerp(first: Matrix, second: Matrix, share: Matrix) -> Matrix:
     sine = np.where(straight, 1.0, np.sin(angle))
     of_first = np.where(straight, 1 - share, np.sin((1 - share) * angle) / sine)
     of_second = np.where(straight, share, np.sin(share * angle) / sine)
-    wxyz = of_first * first + of_second * second
-    unit: Matrix = wxyz / np.linalg.norm(wxyz, axis=1, keepdims=True)
-    return unit
-
-
-def _rotations(wxyz: Matrix) -> Matrix:
-    """(N, 3, 3) of unit quaternions."""
-    w, x, y, z = wxyz.T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.array(rows).transpose(2, 0, 1)
+    between: Matrix = of_first * first + of_second * second
+    return between

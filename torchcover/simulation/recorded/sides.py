@@ -7,7 +7,7 @@ import shapely
 from numpy.typing import NDArray
 
 from torchcover.simulation.traffic.assemble import HORIZON_M
-from torchcover.simulation.traffic.frontage import Side
+from torchcover.simulation.traffic.frontage import Side, sides_around
 from torchcover.simulation.world import Actor
 
 Numbers = NDArray[np.float64]
@@ -16,8 +16,6 @@ Numbers = NDArray[np.float64]
 TO_KERB_M, BETWEEN_M, SIDEWALK_M = 5.0, 12.0, 3.0
 # Nothing stands nearer to where somebody was, and labels tremble by centimetres.
 CLEAR_M, TREMBLE_M = 0.5, 0.3
-# A side is built up or open for so long, and has corners so often.
-SIDE_M, CORNER_EVERY_M = 60.0, 4.0
 
 
 def sides_of(
@@ -45,14 +43,8 @@ def sides_of(
         if actor is ego or (actor.category != "pedestrian" and way.length > CLEAR_M)
     ]
     street = shapely.union_all(shapely.buffer(driven, TO_KERB_M)).buffer(BETWEEN_M / 2).buffer(-BETWEEN_M / 2)
-    seen, sides = ways[0].buffer(HORIZON_M), list[Side]()
-    walked = street.buffer(SIDEWALK_M)
-    for area, is_kerb in ((street, True), (walked, False)):
-        for ring in shapely.get_parts(shapely.boundary(shapely.orient_polygons(area))):
-            line_m = shapely.get_coordinates(shapely.segmentize(ring.simplify(TREMBLE_M), CORNER_EVERY_M))
-            pieces = max(round(ring.length / SIDE_M), 1)
-            for side_m in np.array_split(line_m, pieces):
-                if len(side_m) > 1 and shapely.contains_xy(seen, *side_m.T).all():
-                    built = generator.random() < built_share
-                    sides.append(Side("kerb" if is_kerb else "built" if built else "open", side_m))
-    return sides, [street, *was_m], [walked, *was_m]
+    seen = ways[0].buffer(HORIZON_M)
+    sides = sides_around(
+        street, (0.0, SIDEWALK_M), lambda places_m: shapely.contains_xy(seen, *places_m.T), built_share, generator
+    )
+    return sides, [street, *was_m], [street.buffer(SIDEWALK_M - TREMBLE_M), *was_m]

@@ -25,6 +25,8 @@ Zone = Literal["kerb", "built", "open"]
 SUNK_M = 1.0
 # Walls and hedges are straight for so long at most.
 WALL_M = 10.0
+# A side is built up or open for so long, and has corners so often; what is shorter is around no block.
+SIDE_M, CORNER_EVERY_M, SMOOTH_M, SHORTEST_M = 60.0, 4.0, 0.3, 30.0
 # Corners of a line may coincide.
 TINY_M = 1e-9
 TAPERED = 0.6
@@ -68,18 +70,18 @@ BEHIND: tuple[Zone, ...] = ("built", "open")
 KINDS: Mapping[str, _Kind] = {
     "house": _Kind("house", ("built",), 1.0, (0.0, 5.0), (9.0, 24.0), (0.1, 4.0), (9.0, 15.0), (5.0, 24.0)),
     "back_house": _Kind("house", ("built",), 1.0, (24.0, 44.0), (9.0, 22.0), (4.0, 22.0), (9.0, 14.0), (5.0, 22.0)),
-    "hedge": _Kind("hedge", ("built",), 0.85, (0.2, 0.8), (6.0, 24.0), (1.5, 7.0), (0.5, 1.1), (0.9, 2.2), WALL_M),
-    "hedgerow": _Kind("hedge", ("open",), 1.0, (0.3, 2.0), (20.0, 70.0), (3.0, 10.0), (0.8, 1.6), (1.2, 2.6), WALL_M),
-    "fence": _Kind("fence", BEHIND, 0.6, (0.2, 1.2), (6.0, 24.0), (2.0, 14.0), (0.08, 0.08), (0.9, 1.8), WALL_M),
+    "hedge": _Kind("hedge", ("built",), 0.95, (0.2, 0.8), (8.0, 40.0), (1.0, 5.0), (0.5, 1.1), (0.9, 2.2), WALL_M),
+    "hedgerow": _Kind("hedge", ("open",), 1.0, (0.3, 2.0), (20.0, 70.0), (2.0, 6.0), (0.8, 1.6), (1.2, 2.6), WALL_M),
+    "fence": _Kind("fence", BEHIND, 0.7, (0.2, 1.2), (8.0, 40.0), (1.0, 9.0), (0.08, 0.08), (0.9, 1.8), WALL_M),
     "lamp": _Kind("lamp", ("kerb",), 0.9, (0.35, 0.45), (0.2, 0.2), (22.0, 34.0), (0.2, 0.2), (6.0, 8.0)),
-    "tree": _Kind("tree", ("kerb",), 0.6, (-0.9, -0.6), (2.0, 3.0), (5.0, 14.0), (2.0, 3.0), (6.5, 9.0), foot=TRUNK),
-    "sign": _Kind("sign", ("kerb",), 0.9, (0.25, 0.35), (0.06, 0.06), (14.0, 45.0), (0.5, 0.6), (2.4, 3.0)),
-    "bin": _Kind("bin", ("kerb",), 0.7, (0.3, 0.4), (0.5, 0.8), (20.0, 60.0), (0.4, 0.5), (0.8, 1.3)),
+    "tree": _Kind("tree", ("kerb",), 0.7, (-0.9, -0.6), (2.0, 3.0), (4.0, 11.0), (2.0, 3.0), (6.5, 9.0), foot=TRUNK),
+    "sign": _Kind("sign", ("kerb",), 0.9, (0.25, 0.35), (0.06, 0.06), (12.0, 32.0), (0.5, 0.6), (2.4, 3.0)),
+    "bin": _Kind("bin", ("kerb",), 0.8, (0.3, 0.4), (0.5, 0.8), (12.0, 40.0), (0.4, 0.5), (0.8, 1.3)),
     "bicycle": _Kind(
         "bicycle", ("kerb",), 0.4, (0.3, 0.4), (1.8, 9.0), (15.0, 60.0), (0.5, 0.5), (1.0, 1.1), 1.75, 0.3
     ),
     "bollard": _Kind(
-        "bollard", ("kerb",), 0.35, (0.3, 0.4), (4.0, 16.0), (8.0, 40.0), (0.12, 0.12), (0.8, 1.0), 0.12, 1.5
+        "bollard", ("kerb",), 0.35, (0.3, 0.4), (4.0, 16.0), (8.0, 30.0), (0.12, 0.12), (0.8, 1.0), 0.12, 1.5
     ),
     "garden_tree": _Kind("tree", BEHIND, 0.8, (1.5, 20.0), (2.0, 4.0), (4.0, 22.0), (2.0, 4.0), (5.0, 11.0)),
     "bush": _Kind("bush", BEHIND, 0.8, (0.5, 12.0), (1.0, 2.5), (3.0, 16.0), (1.0, 2.5), (0.7, 2.5)),
@@ -105,6 +107,36 @@ class Side(NamedTuple):
 
     zone: Zone
     line_m: Numbers
+
+
+def sides_around(
+    street: shapely.Geometry,
+    off_m: tuple[float, float],
+    sees: Callable[[Numbers], NDArray[np.bool_]],
+    built_share: float,
+    generator: np.random.Generator,
+) -> list[Side]:
+    """The sides of all streets that are known in plan only.
+
+    Args:
+        street: What is driven and walked on.
+        off_m: How far beyond its edge kerb furniture begins, and how far what stands behind it.
+        sees: Which of (N, 2) places matter.
+        built_share: Share of the sides that are built up.
+        generator: Draws which.
+    """
+    sides: list[Side] = []
+    for number, away_m in enumerate(off_m):
+        area = shapely.orient_polygons(shapely.buffer(street, away_m, quad_segs=4))
+        for ring in shapely.get_parts(shapely.boundary(area)):
+            line_m = shapely.get_coordinates(shapely.segmentize(ring.simplify(SMOOTH_M), CORNER_EVERY_M))
+            for side_m in (
+                np.array_split(line_m, max(round(ring.length / SIDE_M), 1)) if ring.length > SHORTEST_M else ()
+            ):
+                zone: Zone = "built" if generator.random() < built_share else "open"
+                if len(side_m) > 1 and sees(side_m).all():
+                    sides.append(Side(zone if number else "kerb", side_m))
+    return sides
 
 
 class _Pieces(NamedTuple):

@@ -22,6 +22,7 @@ BODIES: Mapping[str, tuple[str, ...]] = {
     "emergency": ("van",),
 }
 CARS = ("hatchback", "sedan", "suv", "pickup", "van")
+ON_FOOT = ("adult", "child")
 # They need no road, or one that is not built.
 LEFT_OUT = frozenset({"rail", "rail_urban", "rail_electric", "rail_fast", "subway", "cable_car", "ship", "drone"})
 
@@ -37,5 +38,7 @@ class VehicleType(NamedTuple):
         if self.vehicle_class in LEFT_OUT:
             return None
         kinds = BODIES.get(self.vehicle_class, CARS)
+        if kinds[0] in ON_FOOT:
+            return kinds[0]  # the simulation's lengths of people are all the same
         bodies = [name for name in lengths_m if name.partition("_")[0] in kinds]
         return min(bodies, key=lambda kind: abs(lengths_m[kind] - self.length_m))
