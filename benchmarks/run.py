@@ -31,7 +31,6 @@ WATCHED = {
     "torchcover.simulation.surface_reference:SurfaceReference.scan": REFERENCE,
     "torchcover.simulation.scene:Scene.at": MOVING,
     "torchcover.neighbors.query:_nearest": SEARCH,
-    "torchcover.coverage.metric:CoverageMetric.update": SUMS,
     "torchcover.coverage.metric:CoverageMetric.sums_of": SUMS,
     "torchcover.coverage.metric:CoverageMetric.add": SUMS,
     "torchcover.report.maps.figures:draw_side_by_side": MAPS,

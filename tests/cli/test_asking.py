@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 
 import numpy as np
 import pytest
@@ -115,7 +116,6 @@ def test_a_run_goes_on_with_the_same_question_only(evaluate):
         (["--height", "a:0,1", "--height", "a:0,2"], "the name 'a' is given already"),
         (["--grid", "0,1,2"], "--grid 0,1,2: 4 numbers x0,x1,y0,y1 in metres are needed"),
         (["--grid", "-2000,2000,-2000,2000"], "128,000,000 cells, over 100,000,000: use larger cells"),
-        (["--grid", "-1500,1500,-1500,1500"], "sums of 72,000,000 cells in 16 blocks"),
         (["--ask", "nowhere.yaml"], "nowhere.yaml"),
     ],
 )
@@ -124,6 +124,13 @@ def test_what_asks_nothing_ends_in_one_line(evaluate, options, message):
     assert code == 2
     assert message in complaints
     assert len(complaints.strip().splitlines()) == 1
+
+
+def test_maps_without_room_are_refused_before_anything_runs(evaluate, monkeypatch):
+    monkeypatch.setattr("torchcover.simulation.memory.machine_bytes", lambda: 1e6)
+    code, _, complaints = evaluate()
+    assert code == 2
+    assert re.search(r"maps of [\d,]+ cells: .* of memory are needed", complaints)
 
 
 @pytest.mark.filterwarnings("always:region:UserWarning")

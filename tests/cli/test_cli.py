@@ -123,12 +123,12 @@ def test_a_simulation_is_evaluated_and_repeats_itself(torchcover, tmp_path):
 def test_the_weights_of_the_surface_reference_reach_the_metric(torchcover, worlds, monkeypatch):
     given = []
 
-    def noted(self, sensor, reference, *, weights, height, place_in_time):
-        given.append((len(reference), weights, place_in_time))
-        update(self, sensor, reference, weights=weights, height=height, place_in_time=place_in_time)
+    def noted(self, sensor, reference, **more):
+        given.append((len(reference), more["weights"], more["place_in_time"]))
+        return sums_of(self, sensor, reference, **more)
 
-    update = CoverageMetric.update
-    monkeypatch.setattr(CoverageMetric, "update", noted)
+    sums_of = CoverageMetric.sums_of
+    monkeypatch.setattr(CoverageMetric, "sums_of", noted)
     options = ["--scenario", worlds / "yard.yaml", "--steps", 2, "--cell-m", 4, "--rays", 4096, "--out", worlds / "out"]
     for reference in ("surface", "paper"):
         assert torchcover("evaluate", worlds / "low.yaml", *options, "--reference", reference)[0] == 0
@@ -166,11 +166,11 @@ def test_the_mean_over_known_cells_is_the_same_whether_it_heads_the_result_or_no
 
 def test_frames_that_are_skipped_leave_their_place_in_time(torchcover, recording, tmp_path, monkeypatch):
     (recording / "reference" / "f2.npy").write_bytes(b"rubbish")
-    update, given = CoverageMetric.update, []
+    sums_of, given = CoverageMetric.sums_of, []
     monkeypatch.setattr(
         CoverageMetric,
-        "update",
-        lambda self, *clouds, **more: given.append(more["place_in_time"]) or update(self, *clouds, **more),
+        "sums_of",
+        lambda self, *clouds, **more: given.append(more["place_in_time"]) or sums_of(self, *clouds, **more),
     )
     assert torchcover("evaluate", "--frames", recording, "--out", tmp_path / "out", "--skip-bad-frames")[0] == 0
     assert given == [0, 2, 3]

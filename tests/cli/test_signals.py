@@ -49,15 +49,15 @@ def at_update(monkeypatch):
     """Have something done before a rig sees a frame: number 3 is the first rig in the second step."""
 
     def have(number, act):
-        update, calls = CoverageMetric.update, []
+        add, calls = CoverageMetric.add, []
 
-        def acting(self, *clouds, **more):
+        def acting(self, sums):
             calls.append(self)
             if len(calls) == number:
                 act()
-            update(self, *clouds, **more)
+            add(self, sums)
 
-        monkeypatch.setattr(CoverageMetric, "update", acting)
+        monkeypatch.setattr(CoverageMetric, "add", acting)
 
     return have
 
