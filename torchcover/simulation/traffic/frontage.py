@@ -237,7 +237,7 @@ def _drawn(kind: _Kind, lines: _Lines, times: float, generator: np.random.Genera
     numbers = np.flatnonzero(has)
     if not len(numbers) or times == 0:
         return _Pieces(np.empty((0, 4, 2)), np.empty(0), np.empty(0, dtype=np.int64))
-    length_m, gap_m = lines.length_m[numbers], np.array(kind.gap_m) / times
+    length_m, gap_m = lines.length_m[numbers], (kind.gap_m[0] / times, kind.gap_m[1] / times)
     shape = len(numbers), int(length_m.max() / (kind.run_m[0] + gap_m[0])) + 1
     run_m, between_m = generator.uniform(*kind.run_m, shape), generator.uniform(*gap_m, shape)
     # The first begins anywhere in a gap.
@@ -309,7 +309,7 @@ def _meeting(outlines_m: Numbers) -> NDArray[np.int64]:
         beyond = np.einsum("pkc,plkc->plk", normals, outlines_m[other][:, :, None] - outlines_m[one][:, None])
         meet = ~(beyond.min(axis=1) > 0).any(axis=1)
         pairs = pairs[:, meet]
-    return pairs
+    return np.asarray(pairs)
 
 
 def _copies(form: Mesh, outlines_m: Numbers, bottom_m: Numbers, base_m: Numbers, high_m: Numbers) -> Mesh:
