@@ -253,3 +253,14 @@ def test_who_is_left_out_changes_nothing(monkeypatch, bodies):
     for one, other in zip((few.ego, *few.actors), (everybody.ego, *everybody.actors), strict=True):
         np.testing.assert_array_equal(one.trajectory.positions_m, other.trajectory.positions_m)
         np.testing.assert_array_equal(one.trajectory.angles_deg, other.trajectory.angles_deg)
+
+
+def test_nobody_is_where_the_street_is_not_built(monkeypatch, bodies):
+    # Farther on a street may come back, through what stands beside it here.
+    for name, way_m in {"BEHIND_M": 30.0, "AHEAD_M": 60.0, "ASIDE_M": 20.0}.items():
+        monkeypatch.setattr(urban, name, way_m)
+    city = Urban(bend_deg=0.5, turn_share=0.0, duration_s=4.0, time_step_s=0.5).world(0, bodies=bodies)
+    first_m, last_m = city.ego.trajectory.positions_m[[0, -1], 0]
+    along = [actor for actor in city.actors if abs(np.sin(np.deg2rad(actor.trajectory.angles_deg[0, 0]))) < 0.1]
+    x_m = np.concatenate([actor.trajectory.positions_m[:, 0] for actor in along])
+    assert len(x_m) > 20 and first_m - 51.0 < x_m.min() and x_m.max() < last_m + 81.0
