@@ -263,4 +263,6 @@ def test_nobody_is_where_the_street_is_not_built(monkeypatch, bodies):
     first_m, last_m = city.ego.trajectory.positions_m[[0, -1], 0]
     along = [actor for actor in city.actors if abs(np.sin(np.deg2rad(actor.trajectory.angles_deg[0, 0]))) < 0.1]
     x_m = np.concatenate([actor.trajectory.positions_m[:, 0] for actor in along])
-    assert len(x_m) > 20 and first_m - 51.0 < x_m.min() and x_m.max() < last_m + 81.0
+    assert len(x_m) > 20
+    assert first_m - 51.0 < x_m.min()
+    assert x_m.max() < last_m + 81.0
