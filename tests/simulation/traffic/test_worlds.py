@@ -220,6 +220,7 @@ def test_extreme_parameters_still_make_a_world(model, options, bodies):
     [
         (Urban, {"lanes": 3}),
         (Urban, {"parked_share": 1.5}),
+        (Urban, {"cross_share": 1.5}),
         (Urban, {"traffic_per_km": -1}),
         (Urban, {"lane": 4}),
         (Highway, {"ego_lane": 4}),
@@ -266,3 +267,13 @@ def test_nobody_is_where_the_street_is_not_built(monkeypatch, bodies):
     assert len(x_m) > 20
     assert first_m - 51.0 < x_m.min()
     assert x_m.max() < last_m + 81.0
+
+
+def test_cross_streets_have_a_share_of_the_traffic(bodies):
+    def across(share):
+        city = Urban(bend_deg=0.0, turn_share=0.0, cross_share=share, duration_s=2.0, time_step_s=0.5)
+        drivers = [actor for actor in city.world(0, bodies=bodies).actors if actor.category != "pedestrian"]
+        return sum(abs(np.sin(np.deg2rad(actor.trajectory.angles_deg[0, 0]))) > 0.9 for actor in drivers)
+
+    assert across(0.0) == 0
+    assert 5 < across(0.5) < across(1.0)

@@ -66,6 +66,7 @@ class Urban(Procedural):
             streets that cross it have two or four.
         speed_mps: What drivers want to drive, about.
         traffic_per_km: Vehicles to a kilometre of lane.
+        cross_share: Streets that cross the ego's have this share of that.
         cyclists_per_km: To a kilometre of bicycle lane.
         people_per_km: On foot, to a kilometre of sidewalk in each direction.
         parked_share: Share of the parking bays that are taken.
@@ -81,6 +82,7 @@ class Urban(Procedural):
     lanes: Literal[2, 4] | None = None
     speed_mps: float = Field(default=13.9, ge=5.0, le=20.0)
     traffic_per_km: MostVehicles = 20.0
+    cross_share: float = Field(default=0.75, ge=0.0, le=1.0)
     cyclists_per_km: MostPeople = 6.0
     people_per_km: MostPeople = 25.0
     parked_share: float = Field(default=0.45, ge=0.0, le=1.0)
@@ -144,7 +146,7 @@ class Urban(Procedural):
             *[(self.traffic_per_km, turning)] * len(main),
             *[(self.cyclists_per_km, {"cyclist": (1.0, CYCLING)})] * len(bicycles),
             *[(self.people_per_km, {"adult": (5.0, WALKING), "child": (1.0, WALKING)})] * len(sidewalks),
-            *[(self.traffic_per_km / 2, driving)] * len(cross),
+            *[(self.cross_share * self.traffic_per_km, driving)] * len(cross),
         ]
         # Who has left a cross street's junction far behind does not come back.
         ends_m = [2 * streets.reach_m] * (len(lanes) - len(cross)) + [streets.reach_m + AHEAD_M] * len(cross)
