@@ -24,7 +24,7 @@ def sides_of(
     shapely.prepare(bridges)
 
     def sees(places_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-        return vicinity.sees(places_m) & ~shapely.contains_xy(bridges, *places_m.T)
+        return np.asarray(vicinity.sees(places_m) & ~shapely.contains_xy(bridges, *places_m.T))
 
     taken = shapely.buffer(vicinity.covered, CLEAR_M).tolist()
     return sides_around(street, (KERB_M, BEHIND_M), sees, built_share, generator), taken

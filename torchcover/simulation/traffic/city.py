@@ -164,7 +164,7 @@ class City:
         kerb_m = float(self._streets.cross_lanes_each_way[index]) * self._section.lane_m + GUTTER_M
         x, y, yaw_deg = street.poses(-inwards * float(self._streets.cross_kerbs_m[index]), -turn * kerb_m)
         away = np.array([np.cos(np.deg2rad(yaw_deg)), np.sin(np.deg2rad(yaw_deg))])
-        return np.array([x, y]) + ((face_m - [x, y]) @ away)[:, None] * away
+        return np.asarray(np.array([x, y]) + ((face_m - [x, y]) @ away)[:, None] * away)
 
     def _ground(self, seen_m: Bounds) -> Mesh:
         """Under everything: as far as lanes go, or as far as it can be seen."""
@@ -227,15 +227,16 @@ class City:
         return cars
 
     def _park(self, cars: list[tuple[BuildingSite, list[tuple[str, float, float, float]]]]) -> None:
-        kinds, poses = [], []
+        kinds: list[str] = []
+        found: list[Numbers] = []
         for site, of_front in cars:
             if of_front:
-                kind, x_m, y_m, yaw_deg = zip(*of_front, strict=True)
-                kinds += kind
-                poses.append(site.street.poses(x_m, np.array(y_m)) + np.outer(yaw_deg, (0.0, 0.0, 1.0)))
+                names, x_m, y_m, yaw_deg = zip(*of_front, strict=True)
+                kinds += names
+                found.append(site.street.poses(x_m, np.array(y_m)) + np.outer(yaw_deg, (0.0, 0.0, 1.0)))
         if not kinds:
             return
-        poses = np.concatenate(poses)
+        poses = np.concatenate(found)
         stances = self._hills.stances(poses[:, :2], poses[:, 2])
         for kind, (x, y, yaw), (height_m, *tilt_deg) in zip(kinds, poses.tolist(), stances.tolist(), strict=True):
             self._fleet.park(kind, (x, y, yaw), height_m, (tilt_deg[0], tilt_deg[1]))

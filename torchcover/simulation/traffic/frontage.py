@@ -11,7 +11,7 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator
 
 from torchcover.simulation.bodies import merge
 from torchcover.simulation.shapes import Mesh, circle
@@ -90,16 +90,17 @@ HOUSES = ("house", "back_house")
 MOST_TIMES = 4.0
 
 
-def _known(times: Mapping[str, float]) -> Mapping[str, float]:
-    unknown = sorted(times.keys() - (KINDS.keys() - set(HOUSES)))
-    if unknown:
+def _known(times: float | Mapping[str, float]) -> float | Mapping[str, float]:
+    some = times if isinstance(times, Mapping) else {"tree": times}
+    if unknown := sorted(some.keys() - (KINDS.keys() - set(HOUSES))):
         raise ValueError(f"{', '.join(unknown)}: there are {', '.join(kind for kind in KINDS if kind not in HOUSES)}")
+    if not all(0.0 <= factor <= MOST_TIMES for factor in some.values()):
+        raise ValueError(f"0 to {MOST_TIMES:g} times as much as usually is needed; got {times}")
     return times
 
 
-Factor = Annotated[float, Field(ge=0.0, le=MOST_TIMES)]
 # How many times as much there is as usually of all kinds but houses, or of some of them.
-Times = Factor | Annotated[dict[str, Factor], AfterValidator(_known)]
+Times = Annotated[float | dict[str, float], AfterValidator(_known)]
 
 
 class Side(NamedTuple):
@@ -237,7 +238,7 @@ def _drawn(kind: _Kind, lines: _Lines, times: float, generator: np.random.Genera
     numbers = np.flatnonzero(has)
     if not len(numbers) or times == 0:
         return _Pieces(np.empty((0, 4, 2)), np.empty(0), np.empty(0, dtype=np.int64))
-    length_m, gap_m = lines.length_m[numbers], np.array(kind.gap_m) / times
+    length_m, gap_m = lines.length_m[numbers], (kind.gap_m[0] / times, kind.gap_m[1] / times)
     shape = len(numbers), int(length_m.max() / (kind.run_m[0] + gap_m[0])) + 1
     run_m, between_m = generator.uniform(*kind.run_m, shape), generator.uniform(*gap_m, shape)
     # The first begins anywhere in a gap.
@@ -309,7 +310,7 @@ def _meeting(outlines_m: Numbers) -> NDArray[np.int64]:
         beyond = np.einsum("pkc,plkc->plk", normals, outlines_m[other][:, :, None] - outlines_m[one][:, None])
         meet = ~(beyond.min(axis=1) > 0).any(axis=1)
         pairs = pairs[:, meet]
-    return pairs
+    return np.asarray(pairs)
 
 
 def _copies(form: Mesh, outlines_m: Numbers, bottom_m: Numbers, base_m: Numbers, high_m: Numbers) -> Mesh:
