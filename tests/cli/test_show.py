@@ -266,16 +266,23 @@ def test_a_film_that_cannot_be_written_is_refused_at_once(options, message, torc
     assert message in told
 
 
-def test_what_stands_on_a_slope_is_as_high_as_it_is_above_the_slope(torchcover, worlds, drawn):
+@pytest.mark.parametrize("at_m", [50.0, 160.8])
+def test_what_stands_on_a_slope_is_as_high_as_it_is_above_the_slope(at_m, torchcover, worlds, drawn):
+    slope = np.deg2rad(4.0)
+    # The second piece of the slope begins where the picture ends, but below what still reaches into that.
+    grounds, kerb = (
+        ", ".join(f"{{x_m: {x * np.cos(slope)}, z_m: {x * np.sin(slope)}, pitch_deg: -4}}" for x in along_m)
+        for along_m in ([-39.5, 360.5], [at_m])
+    )
     (worlds / "slope.yaml").write_text(
         "name: slope\nego: {shape: {type: box, size_m: [4, 2, 1]}, pose: {z_m: 0.2}}\nbodies:\n"
-        "  - {name: ground, shape: {type: plane, size_m: [400, 400]}, poses: [{pitch_deg: -4}]}\n"
-        "  - {name: kerb, shape: {type: box, size_m: [9, 5, 1]}, poses: [{x_m: 49.878, z_m: 3.488, pitch_deg: -4}]}\n"
+        f"  - {{name: ground, shape: {{type: plane, size_m: [400, 400]}}, poses: [{grounds}]}}\n"
+        f"  - {{name: kerb, shape: {{type: box, size_m: [9, 5, 1]}}, poses: [{kerb}]}}\n"
     )
     code, _, _ = torchcover("show", worlds / "slope.yaml", "--rig", worlds / "low.yaml", "--out", worlds)
     assert code == 0
     standing = drawn["standing"]
-    assert np.abs(standing.triangles_m[..., 0] - 50.0).max() < 5.0  # the slope itself is no scenery
+    assert np.abs(standing.triangles_m[..., 0] - at_m).max() < 5.0  # the slope itself is no scenery
     # The last two faces of a box are its top, the two before them its bottom, which lies on the slope.
     np.testing.assert_allclose(standing.height_m[-4:], [0, 0, 1.0024, 1.0024], atol=1e-3)
     assert standing.height_m.max() < 1.5  # and not 4.5, as above the ego

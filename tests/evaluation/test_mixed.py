@@ -147,11 +147,12 @@ def test_what_is_no_mixture_is_refused_before_anything_is_measured(scenario, say
         evaluate(RIGS[0], scenario, **SMALL)
 
 
-def test_who_cannot_be_mixed_is_refused(yards):
+def test_who_cannot_be_mixed_is_refused_before_anything_is_measured(yards, monkeypatch):
+    monkeypatch.setattr("torchcover.evaluation.mixed.measured", None)
     tall = yards / "tall.yaml"
     tall.write_text(YARD.format(name="tall", wall_m=8, height_m=1.5).replace("[4, 2, 1.5]", "[6, 2, 1.5]"))
     near = str(yards / "near.yaml")
-    with pytest.raises(ValueError, match="differ in their regions"):
+    with pytest.raises(ValueError, match="near, tall cannot be mixed: the regions around their egos differ"):
         evaluate(RIGS[0], [near, tall], steps=1, cell_m=1.0, rays=64)
     with pytest.raises(TypeError, match="got int"):
         evaluate(RIGS[0], [near, 3], **SMALL)

@@ -9,7 +9,7 @@ from embreex.rtcore_scene import EmbreeScene
 from torchcover.geometry import rigid, rotation_from_euler, transform
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.raycaster import RayCaster
-from torchcover.simulation.rays import into_tiles
+from torchcover.simulation.rays import Balls, into_tiles, unit_directions
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.shapes import Box, Mesh, Plane
 from torchcover.simulation.sweep import parabola_weights
@@ -226,6 +226,42 @@ def lost_by_cosine():
     return int((cosine <= np.cos(np.arcsin(radius / distance))).sum())
 
 
+@lru_cache
+def around_and_ahead():
+    """A turn of 40 rows, and a narrow field of view, as tiles; and where they are mounted."""
+    turn = unit_directions(np.linspace(-60.0, 60.0, 40)[:, None], np.linspace(-180.0, 180.0, 180)[None])
+    ahead = unit_directions(np.linspace(-0.01, 0.01, 16)[:, None], np.linspace(-0.01, 0.01, 16)[None])
+    return (*into_tiles(turn), *into_tiles(ahead)), rigid(rotation_from_euler(37.0, 11.0, -8.0), [1.7, -0.4, 1.9])
+
+
+def spared(met_by):
+    """Rays that pass through a ball that is aimed at, and would not be cast."""
+    tiles, vehicle_T_sensor = around_and_ahead()
+    lost = 0
+    for tile in tiles:
+        rays = tile.directions.T.astype(np.longdouble)
+        rays /= np.sqrt((rays**2).sum(axis=1))[:, None]
+        for distance_m in (0.0, 1e-9, 1e-3, 1.0, 250.0, 1e5):
+            for radius_m in (1e-9, 0.2, 2.0, 0.999 * distance_m):
+                # Ahead, behind, and beside the sensor.
+                for towards in (rays[0], -rays[0], np.roll(rays[0], 1)):
+                    centre_m = transform(vehicle_T_sensor, (towards * distance_m).astype(np.float64)[None])
+                    way_m = (centre_m[0] - vehicle_T_sensor[:3, 3]).astype(np.longdouble) @ vehicle_T_sensor[:3, :3]
+                    along_m = np.maximum(rays @ way_m, 0.0)
+                    through = np.sqrt(((along_m[:, None] * rays - way_m) ** 2).sum(axis=1)) <= radius_m
+                    lost += int((through & ~met_by(Balls(centre_m, radius_m), tile, vehicle_T_sensor)).sum())
+    return lost
+
+
+def met_by_cosine(balls, tile, vehicle_T_sensor):
+    """By the cosine of the angle to the middle of a ball, in float32."""
+    way_m = ((balls.centres_m[0] - vehicle_T_sensor[:3, 3]) @ vehicle_T_sensor[:3, :3]).astype(np.float32)
+    distance_m = np.linalg.norm(way_m)
+    with np.errstate(all="ignore"):
+        least = np.sqrt(1 - (np.float32(balls.radius_m) / distance_m) ** 2)
+        return (way_m / distance_m) @ tile.directions >= least
+
+
 def slope_from(offset_m):
     """A slope of 400 m in general position at UTM-like coordinates, under an ego."""
     here = np.array([offset_m, -offset_m, 0.0])
@@ -310,4 +346,6 @@ CASES = [
          "arccos of the dot product", partial(narrow_by_arccos, 1e-9)),
     Case("corners of a moving box of 0.2 m at 250 m", "every ray hits", "of 1,600 missed", 0, lost_at_corners,
          "cone by a float32 cosine", lost_by_cosine),
+    Case("rays through balls of 1e-9 m to 100 km, around the sensor, beside and behind it, 100 km away", "longdouble",
+         "of 536,832 spared", 0, partial(spared, Balls.met_by), "cosine in float32", partial(spared, met_by_cosine)),
 ]  # fmt: skip

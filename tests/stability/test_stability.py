@@ -7,12 +7,15 @@ import torch
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.shapes import Mesh
 
-from . import faces, ground, lenses, metric, poses, rays, returns, search
+from . import faces, ground, lenses, metric, motion, poses, rays, returns, search, sums
 from .case import CPU_SEARCHES, CUDA_SEARCHES
 
 
 def cases_of(*rooms):
     return [case for room in rooms for case in room.CASES if not case.benchmark_only]
+
+
+BY_THEMSELVES = (rays, faces, ground, lenses, poses, returns, sums, motion)
 
 
 def each(cases):
@@ -46,12 +49,12 @@ def test_on_cuda(case, backend):
     assert case.ours(backend) <= case.bound
 
 
-@each(cases_of(rays, faces, ground, lenses, poses, returns))
+@each(cases_of(*BY_THEMSELVES))
 def test_without_a_search(case):
     assert case.ours() <= case.bound
 
 
-@each([case for case in cases_of(search, metric, rays, faces, ground, lenses, poses, returns) if case.naive_fails])
+@each([case for case in cases_of(search, metric, *BY_THEMSELVES) if case.naive_fails])
 def test_the_naive_way_is_found_out(case):
     """So that a case whose bound is too wide, or that measures nothing, is noticed."""
     assert case.naive() > case.bound

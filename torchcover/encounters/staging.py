@@ -154,7 +154,8 @@ def _along(way: Way, before_s: Float64, at_m: tuple[float, float], heading: floa
         turned = np.clip(gone_m, -bend_m, bend_m) / way.radius_m
         straight_m = gone_m - turned * way.radius_m
         x_m = way.radius_m * np.sin(turned) + straight_m * np.cos(turned)
-        y_m = way.radius_m * (1 - np.cos(turned)) + straight_m * np.sin(turned)
+        # Wide bends would lose the digits of 1 - cos.
+        y_m = 2 * way.radius_m * np.sin(turned / 2) ** 2 + straight_m * np.sin(turned)
     cos, sin = math.cos(heading), math.sin(heading)
     positions_m = np.stack([at_m[0] + cos * x_m - sin * y_m, at_m[1] + sin * x_m + cos * y_m], axis=1)
     return poses(positions_m, heading + turned)

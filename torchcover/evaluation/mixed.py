@@ -18,7 +18,6 @@ from torchcover.evaluation.task import task_of
 from torchcover.files import Publication, csv_text
 from torchcover.report import RENDERERS, CoverageTable, file_stems, table_dict
 from torchcover.report.renderers.records import records_of
-from torchcover.simulation import Scenario
 
 MIXTURE = "mixture"
 
@@ -137,24 +136,31 @@ def measured_in_each(settings: Settings) -> MixedResult:
         settings: Of `evaluate`, with several scenarios.
 
     Raises:
-        ValueError: A recording among them, processes that share the run, or observers; as `evaluate`.
+        ValueError: A recording among them, other regions in one than in another, processes that share the run, or
+            observers; as `evaluate`.
     """
     assert settings.mixture is not None  # as its caller knows
     if settings.frames is not None:
         raise ValueError("scenario and frames exclude each other: a recording is measured apart")
     if settings.ranks or settings.observers:
         raise ValueError("several scenarios: observers, and processes that share a run, are for one at a time")
-    for scenario, _ in settings.mixture.values():
-        if not isinstance(scenario, Scenario):
-            Scenario.load(scenario)  # before the first is measured
-    worlds = {}
+    tasks = {}
     for (name, (scenario, _)), stem in zip(settings.mixture.items(), file_stems(list(settings.mixture)), strict=True):
         checkpoint = settings.checkpoint
         if checkpoint is not None:
             checkpoint = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(Path(checkpoint))
             checkpoint = checkpoint.within(stem)
         of_one = replace(settings, scenario=scenario, checkpoint=checkpoint)
-        worlds[name] = measured(task_of(of_one), of_one)
+        tasks[name] = task_of(of_one), of_one  # all of them before the first is measured, which may take hours
+    asked = [tasks[name][0].asked.regions for name, (_, weight) in settings.mixture.items() if weight > 0.0]
+    if any(regions != asked[0] for regions in asked):
+        raise ValueError(
+            f"{', '.join(tasks)} cannot be mixed: the regions around their egos differ; give `vehicle`, or ask about "
+            "the same"
+        )
+    worlds = {}
+    for name in settings.mixture:
+        worlds[name] = measured(*tasks.pop(name))
         if (run := worlds[name].run) is not None:
             run.raise_failure()
     return MixedResult.of(worlds, {name: weight for name, (_, weight) in settings.mixture.items()})

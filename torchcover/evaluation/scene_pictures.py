@@ -135,8 +135,9 @@ def _standing(world: World, time_s: float) -> StandingFaces:
         corners = transform(vehicle_T_world, mesh.vertices_m)[mesh.faces]
         # What faces up everywhere is the ground, and no body on it.
         lies = (_normals(corners)[:, 2] > 0).all()
+        # What reaches into the picture may have its middle, and the ground below that, outside.
         inside = ((corners[..., :2].max(axis=1) > low) & (corners[..., :2].min(axis=1) < high)).all(axis=1)
-        (terrain if lies else standing).append(corners[inside])
+        (terrain if lies else standing).append(corners if lies else corners[inside])
     corners = np.concatenate(standing)
     ground_m = _ground_m(np.concatenate(terrain), corners.mean(axis=1)[:, :2])
     return StandingFaces(corners[..., :2], _heights_m(corners) - ground_m)

@@ -124,7 +124,7 @@ class Page:
         title: Its name.
         lead: One line below.
         tables: The numbers.
-        pictures: Below the numbers.
+        pictures: Above them.
         maps: In the order of the menus; differences are to the first rig.
         rigs: Drawn on the ego, and as YAML.
         ego_outline_m: (K, 2) corners x, y of the ego in metres.

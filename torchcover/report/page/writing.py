@@ -119,6 +119,7 @@ def page_html(page: Page) -> str:
         tables="\n".join(map(table_html, page.tables)),
         pictures="\n".join(map(_picture, page.pictures)),
         map_notes=_notes(notes),
+        no_rigs="" if page.rigs else " hidden",
         rigs_heading="Rigs" if len(page.rigs) > 1 else "Rig",
         rigs="\n".join(_rig(rig, page.ego_outline_m, at) for at, rig in enumerate(page.rigs)),
         facts="\n".join(_facts(heading, facts) for heading, facts in page.facts.items()),

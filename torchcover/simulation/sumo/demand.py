@@ -50,7 +50,10 @@ def write_routes(
     ]
     roads = _Ways(network, "passenger", "road")
     if not roads.length_m.any():
-        raise ValueError("the network has no street that cars may use and that leads on to another one")
+        raise ValueError(
+            "the network has no street that cars may use and that leads on to another one: give routes instead of "
+            "random, or a larger network"
+        )
     cycling, walking = _Ways(network, "bicycle", "road"), _Ways(network, "passenger", "sidewalk")
     groups = [
         ({EGO_TYPE: 1.0}, roads, float(EGOS)),

@@ -11,7 +11,7 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator
 
 from torchcover.simulation.bodies import merge
 from torchcover.simulation.shapes import Mesh, circle
@@ -90,16 +90,17 @@ HOUSES = ("house", "back_house")
 MOST_TIMES = 4.0
 
 
-def _known(times: Mapping[str, float]) -> Mapping[str, float]:
-    unknown = sorted(times.keys() - (KINDS.keys() - set(HOUSES)))
-    if unknown:
+def _known(times: float | Mapping[str, float]) -> float | Mapping[str, float]:
+    some = times if isinstance(times, Mapping) else {"tree": times}
+    if unknown := sorted(some.keys() - (KINDS.keys() - set(HOUSES))):
         raise ValueError(f"{', '.join(unknown)}: there are {', '.join(kind for kind in KINDS if kind not in HOUSES)}")
+    if not all(0.0 <= factor <= MOST_TIMES for factor in some.values()):
+        raise ValueError(f"0 to {MOST_TIMES:g} times as much as usually is needed; got {times}")
     return times
 
 
-Factor = Annotated[float, Field(ge=0.0, le=MOST_TIMES)]
 # How many times as much there is as usually of all kinds but houses, or of some of them.
-Times = Factor | Annotated[dict[str, Factor], AfterValidator(_known)]
+Times = Annotated[float | dict[str, float], AfterValidator(_known)]
 
 
 class Side(NamedTuple):

@@ -1,0 +1,233 @@
+"""Sums of touched cells, mixtures of worlds and the sort along a curve, at the extremes."""
+
+from functools import lru_cache, partial
+from math import fsum
+
+import numpy as np
+import torch
+
+from torchcover.estimation import Estimate, Quantity
+from torchcover.metrics.blocks import SumsInBlocks, added_up
+from torchcover.neighbors import packets
+
+from .case import LIBRARIES, Case, find_spec, most, relative
+
+ROWS = 1_000_000
+LARGEST_KEY = 2**53
+RADIUS = Quantity("radius_m", "radius", "m", lower_is_better=True)
+TINY_WEIGHT = 1e-12
+
+
+# Sums of touched cells
+
+
+@lru_cache
+def of_one_cell():
+    """(N,) numbers of 1e-8 to 1e8, which go to one key."""
+    generator = np.random.default_rng(0)
+    return 10.0 ** generator.uniform(-8, 8, ROWS)
+
+
+def one_cell():
+    rows = torch.from_numpy(np.stack([np.full(ROWS, LARGEST_KEY - 1.0), of_one_cell()], axis=1))
+    ((key, total),) = added_up(rows).tolist()
+    return relative(total, fsum(of_one_cell().tolist())) if key == LARGEST_KEY - 1 else np.inf
+
+
+def one_cell_in_float32():
+    return relative(float(np.cumsum(of_one_cell(), dtype=np.float32)[-1]), fsum(of_one_cell().tolist()))
+
+
+@lru_cache
+def extreme_rows():
+    """(N, 3) rows of neighbouring keys at 0, 2^31, 2^32 and 2^53, in any order; the last column is for maxima."""
+    generator = np.random.default_rng(1)
+    keys = np.concatenate([end - np.arange(200) for end in (199, 2**31 + 100, 2**32 + 100, LARGEST_KEY)])
+    keys = generator.permutation(np.tile(keys, 5))
+    powers = generator.choice([-300.0, -8.0, 0.0, 8.0, 300.0], len(keys))
+    return np.stack([keys, generator.normal(size=len(keys)), -(10.0**powers)], axis=1)
+
+
+def unlike_dense(found):
+    """How many rows are not those of float64 sums and maxima over each place of a dense array, to the bit."""
+    rows = extreme_rows()
+    places = np.unique(rows[:, 0].astype(np.int64))
+    place = np.searchsorted(places, rows[:, 0].astype(np.int64))
+    sums, largest = np.zeros(len(places)), np.full(len(places), -np.inf)
+    np.add.at(sums, place, rows[:, 1])
+    np.maximum.at(largest, place, rows[:, 2])
+    dense = {int(key): own for key, *own in zip(places, sums, largest, strict=True)}
+    got = {int(key): own for key, *own in found.tolist()}
+    return sum(got.get(key) != own for key, own in dense.items()) + len(got.keys() - dense.keys())
+
+
+def keys_in_float32():
+    rows = torch.from_numpy(extreme_rows())
+    return added_up(torch.cat([rows[:, :1].float().double(), rows[:, 1:]], dim=1), 1)
+
+
+PAIRED_CELLS = 3 * 2**20 + 1
+
+
+@lru_cache
+def block_keys():
+    """(N,) the first and last cells of blocks, up to keys of 2^53."""
+    last = (LARGEST_KEY // PAIRED_CELLS) & ~1
+    blocks = np.concatenate([np.arange(20), last - 1 - np.arange(20)])
+    return np.unique(blocks[:, None] * PAIRED_CELLS + np.array([0, 1, PAIRED_CELLS - 1]))
+
+
+def unlike_pairs(found):
+    expected = {key // (2 * PAIRED_CELLS) * PAIRED_CELLS + key % PAIRED_CELLS for key in block_keys().tolist()}
+    return len(expected ^ {int(key) for key in found.tolist()})
+
+
+class Blocks(SumsInBlocks):
+    """A table of sums alone."""
+
+    def update(self):
+        """Of nothing."""
+
+    compute = update
+
+
+def pairs():
+    metric = Blocks(8, {})
+    metric.add_touched_sums("sums", PAIRED_CELLS, 1)
+    keys = torch.from_numpy(block_keys()).double()
+    state = {name: getattr(metric, name) for name in ("block_steps", "fine_steps", "block_length")}
+    state["sums"] = torch.stack([keys, torch.ones_like(keys)], dim=1)
+    metric._pair_up(state)
+    return unlike_pairs(state["sums"][:, 0])
+
+
+def pairs_in_float32():
+    keys = torch.from_numpy(block_keys()).float()
+    cells = float(PAIRED_CELLS)
+    return unlike_pairs((torch.floor(keys / (2 * cells)) * cells + torch.remainder(keys, cells)).unique())
+
+
+# Mixtures
+
+
+@lru_cache
+def strata(scales):
+    """Means over 16 worlds each, of numbers of these scales; 0 is 3 m in each world."""
+    metres = np.random.default_rng(2).uniform(1.0, 2.0, (len(scales), 16))
+    return np.where(np.array(scales)[:, None] == 0, 3.0, metres * np.array(scales)[:, None])
+
+
+def mixture(weights, scales):
+    ones = torch.ones(16, dtype=torch.float64)
+    each = [
+        Estimate.of_ratios((RADIUS,), ones, torch.from_numpy(worlds)[:, None], ones.long())
+        for worlds in strata(tuple(scales))
+    ]
+    return Estimate.mixed(list(zip(weights, each, strict=True)))
+
+
+def longdouble_error(weights, scales):
+    """The standard error and the degrees of freedom of a weighted mean, from the variances of its means."""
+    variances = strata(tuple(scales)).astype(np.longdouble).var(axis=1, ddof=1) / 16
+    shares = np.asarray(weights, dtype=np.longdouble) ** 2 * variances
+    return np.sqrt(shares.sum()), shares.sum() ** 2 / (shares**2 / 15).sum()
+
+
+TINY = (TINY_WEIGHT, 1 - TINY_WEIGHT), (1e12, 1.0)
+EXACT = (0.25, 0.75), (1.0, 0.0)
+SMALL = (0.5, 0.5), (1e-85, 1e-85)
+
+
+def error_of_a_mixture(case):
+    return relative(mixture(*case).error.item(), float(longdouble_error(*case)[0]))
+
+
+def error_without_squares(case):
+    weights, scales = case
+    variances = strata(tuple(scales)).var(axis=1, ddof=1) / 16
+    return relative(np.sqrt((np.array(weights) * variances).sum()), float(longdouble_error(*case)[0]))
+
+
+def freedom(case):
+    """As whole numbers, which a rounding just below must not make one less."""
+    return abs(mixture(*case).freedom[0] - int(longdouble_error(*case)[1] + 1e-9))
+
+
+def freedom_of_all_worlds(case):
+    return abs(2 * (16 - 1) - int(longdouble_error(*case)[1] + 1e-9))
+
+
+def freedom_by_fourth_powers(case):
+    """Squares of the variances vanish in float64."""
+    weights, scales = case
+    shares = np.array(weights) ** 2 * strata(tuple(scales)).var(axis=1, ddof=1) / 16
+    with np.errstate(invalid="ignore"):
+        return most(shares.sum() ** 2 / (shares**2 / 15).sum() - float(longdouble_error(*case)[1]))
+
+
+# The sort along a curve
+
+
+@lru_cache
+def clouds():
+    generator = np.random.default_rng(3)
+    anywhere = generator.uniform(-1.0, 1.0, (3000, 3))
+    line = anywhere[:, :1] * [1.0, 2.0, 3.0]
+    crowd = np.concatenate([anywhere * 1e-3, np.full((1, 3), 1e38)])
+    clouds = np.ones((3000, 3)), line, anywhere * 1e-40, anywhere * 1e38, crowd
+    return [cloud.astype(np.float32) for cloud in clouds]
+
+
+def cells_on_the_curve(cloud):
+    """(N,) int64 Morton keys, bit by bit."""
+    extent = (cloud.max(axis=0) - cloud.min(axis=0)).max()
+    with np.errstate(over="ignore"):
+        scale = np.float32(packets.AXIS_CELLS - 1) / extent if extent > 0 else np.float32(0.0)
+    cells = ((cloud - cloud.min(axis=0)) * (scale if scale <= packets.HUGE else np.float32(0.0))).astype(np.int64)
+    return sum((cells[:, axis] >> bit & 1) << (3 * bit + axis) for bit in range(11) for axis in range(3))
+
+
+def stable_order(keys_of, cloud):
+    """A stable sort, and again within cells that hold a crowd."""
+    keys = keys_of(cloud)
+    order = np.argsort(keys, kind="stable")
+    for key, count in zip(*np.unique(keys, return_counts=True), strict=True):
+        if packets.CROWD < count < len(cloud):
+            crowd = order[keys[order] == key]
+            order[keys[order] == key] = crowd[stable_order(keys_of, cloud[crowd])]
+    return order
+
+
+def out_of_place(sort):
+    return sum(int((sort(cloud) != stable_order(cells_on_the_curve, cloud)).sum()) for cloud in clouds())
+
+
+def float32_keys(cloud):
+    return cells_on_the_curve(cloud).astype(np.float32)
+
+
+CASES = [
+    Case("1,000,000 rows of one cell, of 1e-8 to 1e8", "math.fsum", "relative", 1e-11, one_cell,
+         "float32 running sum", one_cell_in_float32),
+    Case("sums and maxima of cells with keys up to 2^53", "a dense float64 array", "of 800 wrong", 0,
+         lambda: unlike_dense(added_up(torch.from_numpy(extreme_rows()), 1)),
+         "float32 keys", lambda: unlike_dense(keys_in_float32())),
+    Case("blocks added up in pairs, keys up to 2^53", "whole numbers", "of 60 wrong", 0, pairs,
+         "float32 keys", pairs_in_float32),
+    Case("error of a mixture with weights of 1e-12 and 1", "longdouble", "relative", 1e-12,
+         partial(error_of_a_mixture, TINY), "weights not squared", partial(error_without_squares, TINY)),
+    Case("degrees of freedom of the same", "longdouble", "freedom", 0, partial(freedom, TINY),
+         "worlds less strata", partial(freedom_of_all_worlds, TINY)),
+    Case("error of a mixture, one stratum exact", "longdouble", "relative", 1e-12,
+         partial(error_of_a_mixture, EXACT), "weights not squared", partial(error_without_squares, EXACT)),
+    Case("degrees of freedom, one stratum exact", "longdouble", "freedom", 0, partial(freedom, EXACT),
+         "worlds less strata", partial(freedom_of_all_worlds, EXACT)),
+    Case("degrees of freedom of numbers of 1e-85", "longdouble", "freedom", 0, partial(freedom, SMALL),
+         "squares of variances", partial(freedom_by_fourth_powers, SMALL)),
+]  # fmt: skip
+if find_spec(LIBRARIES["packets"]):
+    CASES.append(
+        Case("points equal, on a line, of 1e-40, of 1e38, and a crowd with one at 1e38", "a stable sort",
+             "of 15,001 wrong", 0, lambda: out_of_place(packets.along_the_curve),
+             "float32 keys", lambda: out_of_place(partial(stable_order, float32_keys)))
+    )  # fmt: skip
