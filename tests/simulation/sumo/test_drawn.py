@@ -10,11 +10,13 @@ from torch.utils.data import DataLoader
 
 from torchcover import Rig, Scenario
 from torchcover.data import SimulatedFrames
-from torchcover.files import BadFileError
+from torchcover.files import BadFileError, parse_xml
 from torchcover.simulation import PaperReference
 from torchcover.simulation.sumo import Sumo, simulating
+from torchcover.simulation.sumo.demand import write_routes
 from torchcover.simulation.sumo.network import read_network
 from torchcover.simulation.sumo.streets import DrawnStreets
+from torchcover.simulation.traffic.fleet import KIND_OF, Fleet, load_bodies
 
 from .towns import XODR, street, write_net
 
@@ -85,6 +87,19 @@ def test_drawn_streets_go_on_everywhere_and_have_all_that_was_asked_for(network,
     assert all(follow.values())
     # Nobody has to turn round.
     assert all({after.strip("-") for after in found} != {edge.strip("-")} for edge, found in follow.items())
+
+
+def test_drawn_traffic_has_bodies_of_all_sizes_and_lorries_and_buses_among_them(tmp_path):
+    generator, streets = np.random.default_rng(0), DrawnStreets(network="grid", buses_per_km=5.0)
+    town, routes = read_network(streets.build(tmp_path, generator)), tmp_path / "drawn.rou.xml"
+    fleet = Fleet(load_bodies(), None, generator)
+    write_routes(routes, town, streets, fleet, 20.0, generator)
+    told = parse_xml(routes)
+    lengths_m = {kind.get("id"): float(kind.get("length", "nan")) for kind in told.iter("vType")}
+    driven = [vehicle.get("type") for vehicle in told.iter("vehicle")]
+    assert {KIND_OF[kind] for kind in driven if kind != "ego"} > {"sedan", "suv", "hatchback", "van", "lorry", "bus"}
+    assert len({lengths_m[kind] for kind in driven}) > 12
+    assert all(abs(lengths_m[kind] - fleet.length_m(kind)) < 0.01 for kind in driven)
 
 
 def test_open_drive_brings_its_heights_and_sidewalks(tmp_path):

@@ -220,6 +220,7 @@ def test_extreme_parameters_still_make_a_world(model, options, bodies):
     [
         (Urban, {"lanes": 3}),
         (Urban, {"parked_share": 1.5}),
+        (Urban, {"cross_share": 1.5}),
         (Urban, {"traffic_per_km": -1}),
         (Urban, {"lane": 4}),
         (Highway, {"ego_lane": 4}),
@@ -253,3 +254,26 @@ def test_who_is_left_out_changes_nothing(monkeypatch, bodies):
     for one, other in zip((few.ego, *few.actors), (everybody.ego, *everybody.actors), strict=True):
         np.testing.assert_array_equal(one.trajectory.positions_m, other.trajectory.positions_m)
         np.testing.assert_array_equal(one.trajectory.angles_deg, other.trajectory.angles_deg)
+
+
+def test_nobody_is_where_the_street_is_not_built(monkeypatch, bodies):
+    # Farther on a street may come back, through what stands beside it here.
+    for name, way_m in {"BEHIND_M": 30.0, "AHEAD_M": 60.0, "ASIDE_M": 20.0}.items():
+        monkeypatch.setattr(urban, name, way_m)
+    city = Urban(bend_deg=0.5, turn_share=0.0, duration_s=4.0, time_step_s=0.5).world(0, bodies=bodies)
+    first_m, last_m = city.ego.trajectory.positions_m[[0, -1], 0]
+    along = [actor for actor in city.actors if abs(np.sin(np.deg2rad(actor.trajectory.angles_deg[0, 0]))) < 0.1]
+    x_m = np.concatenate([actor.trajectory.positions_m[:, 0] for actor in along])
+    assert len(x_m) > 20
+    assert first_m - 51.0 < x_m.min()
+    assert x_m.max() < last_m + 81.0
+
+
+def test_cross_streets_have_a_share_of_the_traffic(bodies):
+    def across(share):
+        city = Urban(bend_deg=0.0, turn_share=0.0, cross_share=share, duration_s=2.0, time_step_s=0.5)
+        drivers = [actor for actor in city.world(0, bodies=bodies).actors if actor.category != "pedestrian"]
+        return sum(abs(np.sin(np.deg2rad(actor.trajectory.angles_deg[0, 0]))) > 0.9 for actor in drivers)
+
+    assert across(0.0) == 0
+    assert 5 < across(0.5) < across(1.0)

@@ -22,7 +22,7 @@ MAX_AGENTS = 20_000
 
 
 # Weight by our kinds of bodies.
-TRAFFIC = {"sedan": 4.0, "hatchback": 4.0, "suv": 3.0, "pickup": 0.5, "van": 1.5, "lorry": 0.4, "truck": 0.1}
+TRAFFIC = {"sedan": 4.0, "hatchback": 4.0, "suv": 3.0, "pickup": 0.5, "van": 1.5, "lorry": 1.0, "truck": 0.2}
 TRAFFIC |= {"motorcycle": 0.6}
 PEOPLE = {"adult": 5.0, "child": 1.0}
 CLASSES = {"truck": "truck", "bus": "bus", "motorcycle": "motorcycle", "cyclist": "bicycle"}

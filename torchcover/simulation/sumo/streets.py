@@ -54,9 +54,9 @@ class DrawnStreets(Document):
     bend: Annotated[float, Field(ge=0.0, le=0.1)] = 0.06
     hills_m: Annotated[float, Field(ge=0.0, le=5.0)] = 0.5
     traffic_per_km: MostVehicles = 14.0
-    buses_per_km: MostVehicles = 0.6
+    buses_per_km: MostVehicles = 1.0
     cyclists_per_km: MostPeople = 1.5
-    people_per_km: MostPeople = 12.0
+    people_per_km: MostPeople = 16.0
 
     def build(self, folder: Path, generator: np.random.Generator) -> Path:
         """Draw a network, and write it into a folder."""

@@ -30,7 +30,7 @@ from torchcover.simulation.world import Actor
 Numbers = NDArray[np.float64]
 
 # Traffic that is drawn sets off everywhere at once, and needs some time to get into motion and to queue at lights.
-WARM_UP_S = 40.0
+WARM_UP_S = 30.0
 USUAL_BEGIN_S = 60.0
 
 
@@ -62,7 +62,7 @@ class Sumo(Procedural):
     begin_s: Annotated[float, Field(ge=0.0)] | None = None
     built_share: float = Field(default=0.8, ge=0.0, le=1.0)
     roadside: Times = 1.0
-    parked_share: float = Field(default=0.5, ge=0.0, le=1.0)
+    parked_share: float = Field(default=0.75, ge=0.0, le=1.0)
 
     @model_validator(mode="after")
     def _check_sources(self) -> Self:

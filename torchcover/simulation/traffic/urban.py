@@ -33,7 +33,7 @@ Numbers = NDArray[np.float64]
 WARM_UP_S = 20.0
 # What is built up or has traffic, behind and ahead of all places the ego gets to.
 BEHIND_M, AHEAD_M = 120.0, 260.0
-# Stretches of the street that lie farther along it than this do not come near.
+# Stretches of the street that lie farther along it than this are not built, even where they come near again.
 ASIDE_M = 320.0
 # Widths of the main street, and the share of cities with parking bays along it.
 LANE_M, BAY_M, SIDEWALK_M, WITH_BAYS = (3.25, 3.75), 2.3, (3.2, 5.0), 0.8
@@ -66,6 +66,7 @@ class Urban(Procedural):
             streets that cross it have two or four.
         speed_mps: What drivers want to drive, about.
         traffic_per_km: Vehicles to a kilometre of lane.
+        cross_share: Streets that cross the ego's have this share of that.
         cyclists_per_km: To a kilometre of bicycle lane.
         people_per_km: On foot, to a kilometre of sidewalk in each direction.
         parked_share: Share of the parking bays that are taken.
@@ -81,6 +82,7 @@ class Urban(Procedural):
     lanes: Literal[2, 4] | None = None
     speed_mps: float = Field(default=13.9, ge=5.0, le=20.0)
     traffic_per_km: MostVehicles = 20.0
+    cross_share: float = Field(default=0.75, ge=0.0, le=1.0)
     cyclists_per_km: MostPeople = 6.0
     people_per_km: MostPeople = 25.0
     parked_share: float = Field(default=0.45, ge=0.0, le=1.0)
@@ -110,8 +112,9 @@ class Urban(Procedural):
         assert isinstance(own_lane, Beside)  # as all lanes of a city are
         first_m, last_m = own_lane.stations(place_m[[0, -1], 0])
         seen = (float(first_m) - BEHIND_M, float(last_m) + AHEAD_M)
-        territory = Territory(streets.main, (seen[0] - ASIDE_M, seen[1] + ASIDE_M))
-        moving = _in_place(paths(lanes, agents, place_m), lanes, agents, place_m, streets, fleet)
+        built = (seen[0] - ASIDE_M, seen[1] + ASIDE_M)
+        territory = Territory(streets.main, built)
+        moving = _in_place(paths(lanes, agents, place_m), lanes, agents, place_m, streets, built, fleet)
         driver = ego_actor(times_s, moving, flow, 0, fleet.meshes[EGO], generator, hills)
         crossing = _crossers(streets, flow, times_s, seen, fleet, generator)
         city = City(
@@ -143,7 +146,7 @@ class Urban(Procedural):
             *[(self.traffic_per_km, turning)] * len(main),
             *[(self.cyclists_per_km, {"cyclist": (1.0, CYCLING)})] * len(bicycles),
             *[(self.people_per_km, {"adult": (5.0, WALKING), "child": (1.0, WALKING)})] * len(sidewalks),
-            *[(self.traffic_per_km / 2, driving)] * len(cross),
+            *[(self.cross_share * self.traffic_per_km, driving)] * len(cross),
         ]
         # Who has left a cross street's junction far behind does not come back.
         ends_m = [2 * streets.reach_m] * (len(lanes) - len(cross)) + [streets.reach_m + AHEAD_M] * len(cross)
@@ -190,25 +193,27 @@ def _in_place(
     agents: Sequence[Agent],
     place_m: Numbers,
     streets: Streets,
+    built_m: tuple[float, float],
     fleet: Fleet,
 ) -> Paths:
     """Lift those who walk along the main street onto the pavement, and let them step down at the cross streets.
 
-    And let nobody be where their cross street ends.
+    And let nobody be where their cross street ends, nor where the main street is not built.
     """
     junction = {id(street): index for index, street in enumerate(streets.crossing)}
     ends_m = streets.cross_ends_m()
+    if streets.main.is_straight:  # it never comes back
+        built_m = (-2 * streets.reach_m, 2 * streets.reach_m)
     radius_m = np.array([fleet.length_m(agent.kind) / 2 for agent in agents])
     lane_of = np.array([agent.lane for agent in agents])
     for lane in np.unique(lane_of):
         line, on_lane = lanes[lane].line, np.flatnonzero(lane_of == lane)
         places_m = place_m[:, on_lane]
         assert isinstance(line, Beside)
-        if line.street is not streets.main:
-            first_m, last_m = np.sort(line.places_at(ends_m[junction[id(line.street)]]))
-            step, agent = np.nonzero((places_m < first_m) | (places_m > last_m))
-            found.positions_m[step, on_lane[agent]] = np.nan
-        elif CATEGORIES.get(agents[on_lane[0]].kind) == "pedestrian":
+        of_main = line.street is streets.main
+        first_m, last_m = np.sort(line.places_at(built_m if of_main else ends_m[junction[id(line.street)]]))
+        step, agent = np.nonzero((places_m < first_m) | (places_m > last_m))
+        if of_main and CATEGORIES.get(agents[on_lane[0]].kind) == "pedestrian":
             # On the inside of a turn the pavement goes on.
             stop = streets.course.turns != np.sign(line.left_m)
             middles_m, halves_m = streets.junctions_m[stop][:: line.way], streets.cross_kerbs_m[stop][:: line.way]
@@ -216,6 +221,7 @@ def _in_place(
             next_one = np.minimum(np.searchsorted(last_m, np.ascontiguousarray(places_m.T)).T, len(last_m) - 1)
             beyond_kerb_m = np.minimum(places_m - first_m[next_one], last_m[next_one] - places_m)
             found.positions_m[:, on_lane, 2] = step_height(beyond_kerb_m, radius_m[on_lane])
+        found.positions_m[step, on_lane[agent]] = np.nan
     return found
 
 
