@@ -192,6 +192,15 @@ def test_steps_are_added_under_inference_mode_and_after_it(case, before):
 
 
 @EVERY
+def test_a_metric_that_was_made_under_inference_mode_takes_steps_after_it(case):
+    with torch.inference_mode():
+        metric = case.over(case.steps[:1])
+    metric.update(**case.steps[1])
+    metric.merge_state(case.over(case.steps[-1:]))
+    assert_same(metric.compute(), case.after(0, 1, -1))
+
+
+@EVERY
 def test_what_the_sums_start_from_takes_no_memory(case):
     """It is one number; torchmetrics would keep as many as there are sums."""
     metric = case.over(case.steps[:2])

@@ -1,5 +1,6 @@
 """The one loop: frames in order, and every observer is fed with each of them."""
 
+import multiprocessing
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -240,9 +241,10 @@ def killed_worker(error: BaseException, workers: int, steps: int) -> ChildProces
     cut_off = workers > 0 and isinstance(error, EOFError | ConnectionError) and not str(error).startswith("Caught ")
     if not (told or cut_off):
         return None
-    return ChildProcessError(
-        f"a worker was killed after step {steps:,}, perhaps for want of memory; use fewer workers ({error!r})"
-    )
+    # A process that is not forked imports the program, which then starts workers of its own, and may not.
+    forked = multiprocessing.get_start_method() == "fork"
+    why = "for want of memory" + ("" if forked else ', or of `if __name__ == "__main__":` around what the program runs')
+    return ChildProcessError(f"a worker was killed after step {steps:,}, perhaps {why}; use fewer workers ({error!r})")
 
 
 def _feed(seen: MeasuredFrame, observers: Sequence[AnyObserver], run: Run, device: torch.device | str) -> None:

@@ -89,10 +89,10 @@ class SumsInBlocks(MergeableMetric):
     """Sums in as many blocks of contiguous steps, or worlds.
 
     Blocks start with one step each; whenever a step comes that is past the last one, neighbours are added up in pairs
-    and blocks become twice as long. The state does not grow with the steps, and parts merge exactly, whatever the
-    lengths of their blocks. A metric adds its sums with `add_block_sum` and `add_touched_sums`, and asks `_block_of`
-    where those of a step belong. What is `fine` is in 16 times as many blocks, so that up to 256 worlds are known one
-    by one: `_fine_block_of`.
+    and blocks become twice as long. The state does not grow with the steps, but for tables until every cell of every
+    block is touched, and parts merge exactly, whatever the lengths of their blocks. A metric adds its sums with
+    `add_block_sum` and `add_touched_sums`, and asks `_block_of` where those of a step belong. What is `fine` is in 16
+    times as many blocks, so that up to 256 worlds are known one by one: `_fine_block_of`.
 
     Args:
         blocks: 1 for no errors, or an even number from 8 on: at least half as many are in use at the end of a long run.

@@ -75,12 +75,13 @@ class MergeableMetric(Metric):
         meaning = repr((type(self).__name__, sorted(self.meaning.items())))
         return torch.tensor(list(hashlib.sha256(meaning.encode()).digest()))
 
+    @torch.inference_mode(False)  # here and below: a tensor made under it could not be added to outside of it
     def add_state(self, name: str, default: Tensor | list[Any], *args: Any, **kwargs: Any) -> None:  # noqa: ANN401
         """Add a state, as torchmetrics does; of one number that is expanded it would keep a second copy."""
         if not isinstance(default, Tensor) or default.is_contiguous() or any(default.stride()):
-            super().add_state(name, default, *args, **kwargs)
+            super().add_state(name, default.clone() if isinstance(default, Tensor) else default, *args, **kwargs)
             return
-        number = default[(0,) * default.dim()]
+        number = default[(0,) * default.dim()].clone()
         super().add_state(name, number, *args, **kwargs)
         if default.device.type == "cpu" and not number:  # zeros that take memory once they are written to
             state = torch.from_numpy(np.zeros(default.shape, number.numpy().dtype))
@@ -89,7 +90,7 @@ class MergeableMetric(Metric):
             # The device `meta` keeps no numbers, and would import half of torch to fill in none.
             state = state if state.is_meta else state.fill_(number)
         setattr(self, name, state)
-        self._defaults[name] = default
+        self._defaults[name] = number.expand(default.shape)
 
     def add_sum(self, name: str, shape: tuple[int, ...], dtype: torch.dtype = torch.float64) -> None:
         """Add a state that starts at zero and adds up; float64 or int64, for sums grow."""
@@ -113,7 +114,7 @@ class MergeableMetric(Metric):
         none = torch.empty((0, columns), dtype=torch.float64)
         self.add_state(name, none, dist_reduce_fx=reduction or joined, persistent=True)
 
-    @torch.inference_mode(False)  # here and below: a tensor made under it could not be added to outside of it
+    @torch.inference_mode(False)
     def reset(self) -> None:
         """Forget every step."""
         super().reset()
