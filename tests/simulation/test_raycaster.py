@@ -1,5 +1,7 @@
 """The ray caster against closed forms and against a slow intersection test in float64."""
 
+import os
+
 import numpy as np
 import pytest
 
@@ -217,3 +219,12 @@ def test_no_rays_are_an_empty_result():
 def test_a_scene_without_bodies_is_refused():
     with pytest.raises(ValueError, match="at least one body"):
         RayCaster([])
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="the system does not tell its threads")
+def test_scenes_are_built_without_threads_that_a_forked_process_would_miss():
+    threads = len(os.listdir("/proc/self/task"))
+    cores = os.sched_getaffinity(0)
+    RayCaster([random_mesh(20_000)])
+    assert len(os.listdir("/proc/self/task")) == threads
+    assert os.sched_getaffinity(0) == cores

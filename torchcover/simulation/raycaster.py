@@ -3,10 +3,15 @@
 embreex computes in float32, so a scene is given in coordinates near the vehicle; it does not check that origins and
 directions are equal in number; it writes into the distances it is given, and answers a miss with them; it releases the
 interpreter lock, so that threads add up. An origin may lie on a face, as far as float32 can tell.
+
+Its threads build scenes, and nothing tells it to do without. A forked process, such as a worker of a DataLoader, has none
+of them but the locks that they held, and one in a thousand waits for ever. TBB counts the cores that it may use when
+it is first used: so that is done with one (`_have_no_threads`).
 """
 
+import os
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,6 +35,21 @@ CONTACTS_BEYOND = 2.0 ** np.arange(1, 13)
 CONTACT_ROUNDINGS = 4
 # Origins are rounded too, before they come here: in float64, as a share of the largest coordinate.
 MIN_CONTACT = 1e-12
+
+
+@cache
+def _have_no_threads() -> None:
+    """Use Embree for the first time, on one core of those that this thread may use."""
+    if not hasattr(os, "sched_setaffinity"):  # where processes are started anew, not forked
+        return
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(cores)})
+    try:
+        scene = EmbreeScene()
+        TriangleMesh(scene, np.eye(3, dtype=np.float32), np.arange(3, dtype=np.int32).reshape(1, 3))
+        scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
+    finally:
+        os.sched_setaffinity(0, cores)
 
 
 class Faces:
@@ -141,6 +161,7 @@ class RayCaster:
         self._bodies = bodies
         self._closed: dict[int, NDArray[np.bool_]] = {}  # asked of few: hardly any ray meets a face from behind
         self._last_asked: tuple[bytes, NDArray[np.int64]] = b"", np.empty(0, dtype=np.int64)
+        _have_no_threads()
         # Robust: a ray through a shared edge hits one of the two faces instead of slipping between them.
         self._scene = EmbreeScene(robust=True)
         for body in bodies:
