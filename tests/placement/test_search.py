@@ -85,6 +85,36 @@ def test_the_winner_is_better_on_fresh_worlds_and_so_is_what_random_search_found
     assert "Random search with the same budget: near: gained" in result.sentence
 
 
+def test_what_must_not_be_worse_is_not_sold():
+    """Near likes the nose down, far likes it up: what is best near loses far."""
+    free, kept = (searched(of=space(not_worse=not_worse), evaluations=24) for not_worse in ((), ({"region": "80m"},)))
+    assert free.best.evaluation.values["roof.pitch_deg"] > 2
+    assert kept.best.evaluation.values["roof.pitch_deg"] < 0.5
+    arm = kept.search.arms["optimiser"]
+    start, best = (one.prefixes[-1].estimate.value for one in (arm.evaluations[0], kept.best.evaluation))
+    assert best[0] >= start[0]
+    assert best[1] >= start[1]
+    assert [gain.objective for gain in kept.best.gains] == ["near", "not worse: 80m"] * 2
+    worse = [at for at in arm.complete if arm.lacks[at] > 0]
+    assert not set(worse) & set(arm.front)
+    for at in worse:
+        assert (arm.evaluations[at].prefixes[-1].estimate.value < start).any()
+    # What is clearly worse far is dropped, however good it is near.
+    assert any(one.instants < 18 and one.values["roof.pitch_deg"] > 4 for one in kept.search.evaluations)
+    assert "No candidate keeps" not in kept.sentence
+
+
+def only_x(rig):
+    mount = rig.sensors[0].mount
+    return np.full(2, 0.5 + 0.1 * mount.x_m - 1e-3 * (mount.pitch_deg - 3) ** 2)
+
+
+def test_numbers_that_ended_on_their_bounds_are_named():
+    result = searched(evaluations=20, worth=only_x)
+    assert "On the bounds of their ranges ended roof.x_m (0.8):" in result.sentence
+    assert "ended roof.pitch" not in result.sentence
+
+
 def test_a_candidate_is_dropped_only_two_errors_below_its_incumbent():
     result = searched(evaluations=24)
     for arm in result.search.arms.values():
@@ -169,7 +199,7 @@ class Clock:
     def __call__(self):
         return self.now
 
-    def makes(self, space, plan, seed, worlds):
+    def makes(self, space, plan, seed, worlds, more=()):
         clock = self
         clock.now += self.build_s * worlds / 6
 
@@ -183,10 +213,10 @@ class Clock:
                 clock.now += clock.instant_s * len(self)
                 return super().estimates(rig)
 
-            def anew(self, seed, worlds):
-                return clock.makes(space, plan, seed, worlds)
+            def anew(self, seed, worlds, more):
+                return clock.makes(space, plan, seed, worlds, more)
 
-        return Slow(seed, worlds, plan.per_world)
+        return Slow(seed, worlds, plan.per_world, objectives={**space.asked, **dict(more)})
 
 
 def timed(budget_s, monkeypatch):

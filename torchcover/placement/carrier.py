@@ -10,10 +10,16 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, BeforeValidator, Field, PlainValidator, ValidationInfo
 
 from torchcover.geometry import BoundingBox
+from torchcover.placement.objective import Name, Objective
 from torchcover.simulation import Rig, Scenario, with_ego
 from torchcover.simulation.bodies import mount_regions_of
 from torchcover.simulation.documents import NameOrFile, Readable, beside, is_file_name
 from torchcover.simulation.mount_regions import MountRegion, Skin
+
+# More of them make no front that anybody can look at.
+MAX_OBJECTIVES = 3
+# What begins the name of what must not be worse, among what rigs are scored by.
+NOT_WORSE = "not worse: "
 
 
 def _rig(given: Any, info: ValidationInfo) -> Rig:  # noqa: ANN401  (whatever stood in the file)
@@ -92,7 +98,7 @@ class Carrier(NamedTuple):
 
 
 class VehicleSpace(Readable):
-    """What a search and a choice have in common: the worlds, and the vehicle in them.
+    """What a search and a choice have in common: the worlds, the vehicle in them, and what a good rig is.
 
     Args:
         name: What files and pages call it.
@@ -100,17 +106,29 @@ class VehicleSpace(Readable):
         scenario: One or several, by name or file: they count alike.
         vehicle: What carries the sensors, by name or file; if not given, that of the rig that the space begins with, or
             the scenario's own.
+        objectives: One to three, by name. One is made as large as it gets; of several, what one gains is weighed
+            against what the others lose.
+        not_worse: What must not be worse than with the rig that is there today: names of usual regions, of which
+            detection within 0.4 m in both bands counts, or objectives.
     """
 
     name: str
     description: str = ""
     scenario: Names
     vehicle: NamedVehicle | None = None
+    objectives: dict[Name, Objective] = Field(min_length=1, max_length=MAX_OBJECTIVES)
+    not_worse: tuple[Name | Objective, ...] = ()
 
     @property
     def first_rig(self) -> Rig | None:
         """The rig that it begins with."""
         raise NotImplementedError
+
+    @cached_property
+    def asked(self) -> dict[str, Objective]:
+        """All that rigs are scored by: the objectives, and then what must not be worse, by its words."""
+        kept = [Objective(region=one) if isinstance(one, str) else one for one in self.not_worse]
+        return self.objectives | {f"{NOT_WORSE}{one.words}": one for one in kept}
 
     @cached_property
     def scenarios(self) -> tuple[Scenario, ...]:

@@ -15,7 +15,7 @@ from torchcover.placement.evaluation import OPTIMISER, RANDOM, START, Evaluation
 from torchcover.placement.optimisers import Cube, RandomSearch
 from torchcover.placement.optimisers.optimiser import Unit
 from torchcover.placement.plan import SearchPlan, levels_of
-from torchcover.placement.racing import Prefix, race
+from torchcover.placement.racing import ERRORS_BELOW, Prefix, race
 from torchcover.placement.space import SearchSpace
 
 # What is drawn by the control is nothing that the optimiser draws.
@@ -133,7 +133,7 @@ class PlacementSearch:
         began = time.perf_counter()
         incumbents = self.arms[candidate.arm].incumbents if candidate.number else []
         try:
-            prefixes = race(self._scored(candidate), incumbents)
+            prefixes = race(self._scored(candidate), incumbents, len(self.space.objectives))
         except ValueError as error:
             self.refuse(candidate, str(error), seconds=time.perf_counter() - began)
         else:
@@ -141,10 +141,14 @@ class PlacementSearch:
 
     def _scored(self, candidate: Evaluation) -> Iterator[Prefix]:
         assert candidate.rig is not None  # while it is asked for
+        known: list[Prefix] = []
         for prefix in self.instants.prefixes(candidate.rig):
             if candidate.number and (why := self._too_many_self_hits(prefix)):
                 raise ValueError(why)  # no need to look at more instants
+            known.append(prefix)
             yield prefix
+            if candidate.number and self.arms[candidate.arm].is_worse(known, ERRORS_BELOW):
+                return
 
     def state_dict(self) -> dict[str, Any]:
         """All that a checkpoint keeps: the evaluations."""
@@ -187,16 +191,16 @@ class PlacementSearch:
     def _begin(self, start: Evaluation) -> None:
         if start.instants != len(self.instants):
             raise ValueError(f"the start is to be scored at all {len(self.instants)} instants; got {start.instants}")
-        for name, value in zip(self.space.objectives, start.prefixes[-1].estimate.value.tolist(), strict=True):
+        for name, value in zip(self.space.asked, start.prefixes[-1].estimate.value.tolist(), strict=True):
             if math.isnan(value):
                 why = "one of its regions and bands is never seen; take larger ones, more worlds or more rays"
-                if metric := self.space.objectives[name].metric:
+                if metric := self.space.asked[name].metric:
                     why = f"what {metric} is about is never there; take another scenario, or more worlds"
                 raise ValueError(f"objectives.{name}: unknown at all {start.instants} instants: {why}")
         makes = {OPTIMISER: self._makes_optimiser, RANDOM: RandomSearch}
         for name, each in makes.items():
             seed = int(np.random.SeedSequence([self.plan.seed, SEEDS[name]]).generate_state(1)[0])
-            self.arms[name] = Arm(name, each, self._cube(start.infeasible), seed, start)
+            self.arms[name] = Arm(name, each, self._cube(start.infeasible), seed, start, len(self.space.objectives))
 
     def _cube(self, start_infeasible: str = "") -> Cube:
         return Cube(levels_of(self.space), None if start_infeasible else self._start_unit)
