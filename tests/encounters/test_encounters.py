@@ -16,6 +16,7 @@ from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, with
 from torchcover.simulation.bodies import called
 from torchcover.simulation.moving import Solid
 from torchcover.targets import Target
+from torchcover.targets.placing import overlapping
 
 torch.set_num_threads(1)
 
@@ -77,6 +78,24 @@ def test_outlines_touch_when_the_front_has_come_to_the_side():
     assert behind.vehicle_T_other(np.array([1.0]))[0, :2, 3] == pytest.approx([-2.0, 0.0])
     standing = crossing(0.0, {"body": BOX, "from_m": 3})
     assert Staged(standing, SOLID).contact_s == pytest.approx(2.0 - (1.0 + 1.0) / 1.5, abs=2e-6)
+
+
+def grazing(overlap_m, **ego):
+    """The end of the other passes the ego's corner, which goes straight, so far inside."""
+    box = {"type": "box", "size_m": [2.0, 1.009, 0.5]}
+    other = {"body": box, "speed_kmh": 36, "from_m": 15, "at_width": (1 - overlap_m + 0.5045 + 1 + 1) / 2}
+    return Encounter.model_validate({"name": "g", "ego": {"speed_kmh": 36} | ego, "other": other})
+
+
+def test_a_touch_of_less_than_a_millisecond_is_one():
+    staged = Staged(grazing(0.004), SOLID)
+    assert staged.contact_s == pytest.approx(1.5 - 0.05045, abs=1e-9)
+    whole_s = np.arange(2000) / 1000
+    assert not overlapping(staged.other.box, staged.vehicle_T_other(whole_s), SOLID.box.corners_m).any()
+    bent = Staged(grazing(0.4, radius_m=8), SOLID)
+    finely_s = np.linspace(bent.contact_s - 1e-3, bent.contact_s + 1e-3, 20_001)
+    touching = overlapping(bent.other.box, bent.vehicle_T_other(finely_s), SOLID.box.corners_m)
+    assert finely_s[touching.argmax()] == pytest.approx(bent.contact_s, abs=2e-7)
 
 
 @pytest.mark.parametrize("speed_kmh", [36.0, -36.0])
