@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from torchcover.cli import options
-from torchcover.cli.options import of_evaluate, with_options
+from torchcover.cli.options import of_criterion, of_evaluate, with_options
 from torchcover.evaluation.settings import OPTIONS
 
 UNITS_S = {"s": 1.0, "min": 60.0, "h": 3600.0}
@@ -218,20 +218,13 @@ def targets(
     raise typer.Exit(code)
 
 
-@with_options(of_evaluate("vehicle", "sensor_model", "seed"))
+@with_options([*of_criterion(), *of_evaluate("vehicle", "sensor_model", "seed")])
 def encounter(
     rigs: Annotated[list[str], typer.Argument(help="Rigs: built-in names (see `list`) or YAML files.")],
     encounters: Annotated[
         str, typer.Option("--set", help="Set of encounters: a built-in name or a YAML file.")
     ] = "crossing_like",
     phases: Annotated[int, typer.Option(min=1, help="At how many places of their period the looks begin.")] = 10,
-    points: Annotated[int, typer.Option(min=1, help="Points that are enough, of LiDARs with the same rate.")] = 5,
-    pixels: Annotated[int, typer.Option(min=1, help="Pixels of the full image that are enough, of a camera.")] = 200,
-    looks: Annotated[int, typer.Option(min=1, help="In so many looks in a row.")] = 3,
-    deceleration: Annotated[float, typer.Option(help="Of the brakes, in m/s2.")] = 9.0,
-    latency_s: Annotated[
-        float, typer.Option("--latency-s", help="Seconds from the last of these looks to the brakes.")
-    ] = 0.5,
     out: options.Out = Path("out/encounters"),
     files: options.Files = options.ALL_FILES,
     **settings: Any,  # noqa: ANN401
@@ -244,7 +237,7 @@ def encounter(
     from torchcover.evaluation import encounter, save_encounters
     from torchcover.files import claimed
 
-    criterion = Criterion(points, pixels, looks, deceleration, latency_s)
+    criterion = Criterion(**{name: settings.pop(name) for name in Criterion.__annotations__})
     with claimed(out):
         found = encounter(rigs, encounters, criterion, phases=phases, progress=True, **settings)
         written = save_encounters(found, out, files=files)

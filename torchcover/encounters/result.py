@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.encounters.sighting import Criterion, Sighting
+from torchcover.encounters.criterion import Criterion
+from torchcover.encounters.sighting import Sighting
 from torchcover.estimation import student_t95
 from torchcover.report import PageTable, Words
 
@@ -149,9 +150,7 @@ class Sightings:
             "The least and the most over the phases of the looks and what was drawn, of that the mean with its 95 % "
             "interval; - is not before the collision.",
             *(["> was seen as soon as the encounter began, and may have been before."] if unsure else []),
-            f"Detected: {self.criterion.points} points of LiDARs, {self.criterion.pixels} pixels of a camera, or a "
-            f"point of a radar, in {self.criterion.looks} looks in a row. Needed: to stop with "
-            f"{self.criterion.deceleration_mps2:g} m/s2, {self.criterion.latency_s:g} s after that.",
+            self.criterion.words,
         ]
         headings = ("encounter", "km/h", "needed\n(s)", *(f"{rig}\n(s)" for rig in rigs))
         return PageTable("Time to collision at detection", headings, cells, notes=notes)

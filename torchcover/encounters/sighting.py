@@ -3,13 +3,13 @@
 import math
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.encounters.criterion import Criterion
 from torchcover.encounters.encounter import Encounter
 from torchcover.encounters.staging import STEP_S, Staged
 from torchcover.simulation.camera_sensor import CameraSensor
@@ -33,46 +33,6 @@ WITHIN_M = 0.4
 RADAR_POINTS = 1
 # Later than any step.
 NEVER = np.iinfo(np.int64).max
-
-
-@dataclass(frozen=True)
-class Criterion:
-    """What is detected, and what is in time.
-
-    Args:
-        points: So many points on the other are enough, of all LiDARs with the same rate together; of a radar one is.
-        pixels: So many pixels of the full image are enough, of a camera alone.
-        looks: In so many looks in a row.
-        deceleration_mps2: Of the brakes.
-        latency_s: From the last of these looks to the brakes.
-
-    Raises:
-        ValueError: A number out of its bounds.
-    """
-
-    points: int = 5
-    pixels: int = 200
-    looks: int = 3
-    deceleration_mps2: float = 9.0
-    latency_s: float = 0.5
-
-    def __post_init__(self) -> None:
-        for name in ("points", "pixels", "looks"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: a number >= 1 is needed; got {getattr(self, name)}")
-        if not 0 < self.deceleration_mps2 < math.inf:
-            raise ValueError(f"deceleration: m/s2 above 0 are needed; got {self.deceleration_mps2}")
-        if not 0 <= self.latency_s < math.inf:
-            raise ValueError(f"latency: seconds of 0 or more are needed; got {self.latency_s}")
-
-    def needed_s(self, closing_mps: float) -> float:
-        """The time to collision at which braking still prevents it: v / (2 a) + latency.
-
-        Example:
-            >>> round(Criterion().needed_s(50 / 3.6), 2)
-            1.27
-        """
-        return closing_mps / (2 * self.deceleration_mps2) + self.latency_s
 
 
 class Sighting(NamedTuple):
