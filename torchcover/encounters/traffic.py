@@ -80,12 +80,15 @@ class Drive(NamedTuple):
         """That of a recording with poses, times and labelled objects.
 
         Raises:
-            ValueError: One of these is missing, or the size of the vehicle.
+            ValueError: One of these is missing, the size of the vehicle, or road users among the objects.
         """
         recorded = objects_of(recording)
         if recording.body is None:
             raise ValueError(f"{recording.path}: it does not say how large its vehicle is, so nobody can touch it")
         users = [track for track in recorded.tracks if track.vehicle_class is not None]
+        if not users:
+            count = len(recorded.tracks)
+            raise ValueError(f"{recording.path}: none of its {count} objects is a road user, by their categories")
         parked = [
             who(track) not in ("on foot", "on bicycles")
             and bool(np.linalg.norm(np.ptp(track.trajectory.positions_m[:, :2], axis=0)) < PARKED_M)
