@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from torchcover.cli import options
-from torchcover.cli.options import of_evaluate, with_options
+from torchcover.cli.options import of_criterion, of_evaluate, with_options
 from torchcover.evaluation.settings import OPTIONS
 
 UNITS_S = {"s": 1.0, "min": 60.0, "h": 3600.0}
@@ -239,20 +239,23 @@ def check(
     raise typer.Exit(found.exit_code)
 
 
-@with_options(of_evaluate("vehicle", "sensor_model", "seed"))
+@with_options([*of_criterion(), *of_evaluate("vehicle", "sensor_model", "seed")])
 def encounter(
-    rigs: Annotated[list[str], typer.Argument(help="Rigs: built-in names (see `list`) or YAML files.")],
+    rigs: Annotated[
+        list[str] | None,
+        typer.Argument(help="Rigs: built-in names (see `list`) or YAML files; with --frames those of the recording."),
+    ] = None,
     encounters: Annotated[
         str, typer.Option("--set", help="Set of encounters: a built-in name or a YAML file.")
     ] = "crossing_like",
-    phases: Annotated[int, typer.Option(min=1, help="At how many places of their period the looks begin.")] = 10,
-    points: Annotated[int, typer.Option(min=1, help="Points that are enough, of LiDARs with the same rate.")] = 5,
-    pixels: Annotated[int, typer.Option(min=1, help="Pixels of the full image that are enough, of a camera.")] = 200,
-    looks: Annotated[int, typer.Option(min=1, help="In so many looks in a row.")] = 3,
-    deceleration: Annotated[float, typer.Option(help="Of the brakes, in m/s2.")] = 9.0,
-    latency_s: Annotated[
-        float, typer.Option("--latency-s", help="Seconds from the last of these looks to the brakes.")
-    ] = 0.5,
+    scenario: Annotated[
+        str | None, typer.Option(help="Instead: whom the vehicle meets in the traffic of this scenario, as `urban`.")
+    ] = None,
+    frames: Annotated[
+        Path | None, typer.Option(help="Instead: whom it met in a recording with poses and labelled objects.")
+    ] = None,
+    phases: Annotated[int, typer.Option(min=1, help="Of a set: at how many places of their period looks begin.")] = 10,
+    worlds: Annotated[int, typer.Option(min=1, help="Of a scenario: how many of its worlds are driven through.")] = 16,
     out: options.Out = Path("out/encounters"),
     files: options.Files = options.ALL_FILES,
     **settings: Any,  # noqa: ANN401
@@ -262,12 +265,19 @@ def encounter(
 
     from torchcover.cli.printing import in_words, print_files, print_whole
     from torchcover.encounters import Criterion
-    from torchcover.evaluation import encounter, save_encounters
+    from torchcover.evaluation import encounter, met_in_recording, met_in_traffic, save_encounters
     from torchcover.files import claimed
 
-    criterion = Criterion(points, pixels, looks, deceleration, latency_s)
+    criterion = Criterion(**{name: settings.pop(name) for name in Criterion.__annotations__})
+    if frames is not None and (rigs or scenario is not None):
+        raise ValueError("--frames: a recording has its own rigs and traffic; leave out rigs and --scenario")
     with claimed(out):
-        found = encounter(rigs, encounters, criterion, phases=phases, progress=True, **settings)
+        if frames is not None:
+            found = met_in_recording(frames, criterion)
+        elif scenario is not None:
+            found = met_in_traffic(rigs or (), scenario, criterion, worlds=worlds, progress=True, **settings)
+        else:
+            found = encounter(rigs or (), encounters, criterion, phases=phases, progress=True, **settings)
         written = save_encounters(found, out, files=files)
     print_whole([in_words(table) for table in found.tables()])
     print_files(written, out, Console())

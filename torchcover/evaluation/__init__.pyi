@@ -7,6 +7,8 @@ from .checking import check as check
 from .checkpoint import Checkpoint as Checkpoint
 from .encountering import encounter as encounter
 from .encountering import encounter_picture as encounter_picture
+from .encountering import met_in_recording as met_in_recording
+from .encountering import met_in_traffic as met_in_traffic
 from .encountering import save_encounters as save_encounters
 from .evaluating import compare as compare
 from .evaluating import evaluate as evaluate
