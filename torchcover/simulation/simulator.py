@@ -213,10 +213,13 @@ class Simulator:
 
         Raises:
             ValueError: A sensor that is where none can be at the first step, an actor that overlaps the ego at any.
+            ImportError: What makes the traffic is not installed.
 
         Warns:
             UserWarning: Those that move do not stand on the ground.
         """
+        if self.scenario.traffic is not None:
+            self.scenario.traffic.check()
         if self.scenario.repeats:
             stage, _ = self._stage(0)
             world_steps = stage.scene.world.steps

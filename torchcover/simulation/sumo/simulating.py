@@ -39,7 +39,7 @@ def run(program: str, *options: str | Path) -> None:
 
 def output_of(program: str, *options: str | Path) -> Iterator[bytes]:
     """What a program writes to its standard output, piece by piece; whoever stops asking ends the program."""
-    home = _home()
+    home = installed()
     command = [str(home / "bin" / program), *ALWAYS, *map(str, options)]
     with TemporaryFile() as said:
         process = subprocess.Popen(
@@ -75,8 +75,8 @@ def _errors(lines: Sequence[str]) -> str:
     return " ".join(told or lines[-1:] or ["it says nothing"])[:MAX_TOLD_CHARS]
 
 
-def _home() -> Path:
-    """The folder of the installed package, else of the programs that the shell finds."""
+def installed() -> Path:
+    """The folder of the installed package, else of the programs that the shell finds; ImportError if neither is."""
     found = find_spec("sumo")
     if found is not None and found.origin is not None:
         return Path(found.origin).parent
