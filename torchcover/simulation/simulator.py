@@ -193,7 +193,7 @@ class Simulator:
         """
         stage, instant = self._placed(index)
         reference = self.reference_sensor.scan(self._surroundings(stage.scene, instant, index))
-        within = None if self.within_m is None else Balls(reference.points, self.within_m)
+        within = None if self.within_m is None else Balls.around(reference.points, self.within_m)
         scans = self._scans(stage, instant, index, within)
         of_all_rigs = [scan for of_rig in scans.values() for scan in of_rig]
         return Observation(
