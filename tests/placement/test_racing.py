@@ -168,7 +168,9 @@ def test_of_twenty_searches_that_change_nothing_at_most_one_says_that_something_
         shared = draws.normal(0.0, 1.0, (16, 4)) @ draws.normal(0.0, 1.0, (4, 33))  # regions overlap
         one, other = (estimate_of(shared + draws.normal(0.0, 0.5, (16, 33)), np.arange(16)) for _ in range(2))
         tests = list(one.differences(other).values())
-        changes = [SideEffect("a", test, p, {}) for test, p in zip(tests, holm([test.p for test in tests]), strict=True)]
+        changes = [
+            SideEffect("a", test, p, {}) for test, p in zip(tests, holm([test.p for test in tests]), strict=True)
+        ]
         alarms += any(change.is_worse for change in changes)
     assert alarms <= 10
 

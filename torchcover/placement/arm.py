@@ -28,18 +28,27 @@ class Arm:
         cube: What is free.
         seed: Of the optimiser, and of the weights.
         start: Evaluation 0, scored at all instants.
-        objectives: How many of the first numbers are made better; the others must not be worse than at the start.
+        objectives: How many of the first numbers are made better.
+        floors: What all of them must not be worse than; NaN for anything.
     """
 
     def __init__(
-        self, name: str, makes: MakesOptimiser, cube: Cube, seed: int, start: Evaluation, objectives: int
+        self,
+        name: str,
+        makes: MakesOptimiser,
+        cube: Cube,
+        seed: int,
+        start: Evaluation,
+        objectives: int,
+        floors: Float64,
     ) -> None:
-        self.name, self._objectives = name, objectives
+        self.name, self._objectives, self._floors = name, objectives, floors
+        self._lower = [quantity.lower_is_better for quantity in start.prefixes[-1].estimate.quantities]
         self._makes, self._cube, self._seed = makes, cube, seed
         self._optimiser: Optimiser = makes(cube, seed)
         self._scale = np.abs(start.prefixes[-1].estimate.value.numpy()).clip(ROUNDING)
         nothing = np.zeros(objectives)
-        self._gains, self._lefts, self._lacks = [nothing], [nothing], [0.0]
+        self._gains, self._lefts, self._lacks = [nothing], [nothing], [self._lacking(start)]
         self.evaluations: list[Evaluation] = [start]
 
     @property
@@ -59,7 +68,7 @@ class Arm:
 
     @property
     def lacks(self) -> Float64:
-        """(evaluations,) what numbers that must not be worse have lost, in all, as shares of those of the start."""
+        """(evaluations,) what numbers lack of what they must be, in all, each as a share of that."""
         return np.array(self._lacks)
 
     @property
@@ -96,8 +105,8 @@ class Arm:
 
     @property
     def incumbents(self) -> list[tuple[Prefix, ...]]:
-        """What the front scored."""
-        return [self.evaluations[at].prefixes for at in self.front]
+        """What the front scored; nothing if it lacks anything, as what lacks less may gain less."""
+        return [] if self.front and self._lacks[self.front[0]] else [self.evaluations[at].prefixes for at in self.front]
 
     def ask(self, number: int) -> Float64 | None:
         """Where to look next, (variables,); None when there is nothing left."""
@@ -122,9 +131,19 @@ class Arm:
         return found[0][: self._objectives], found[1][: self._objectives]
 
     def is_worse(self, prefixes: Sequence[Prefix], errors: float) -> bool:
-        """Whether a number that must not be worse is so by some errors, after as many instants as there are."""
-        gain, error = gains(prefixes[-1].estimate, self.evaluations[0].prefixes[len(prefixes) - 1].estimate)
-        return bool((gain < -errors * error)[self._objectives :].any())
+        """Whether a number that must not be worse than at the start is so by some errors, after as many instants."""
+        start = self.evaluations[0].prefixes
+        gain, error = gains(prefixes[-1].estimate, start[len(prefixes) - 1].estimate)
+        kept = start[-1].estimate.value.numpy() == self._floors
+        return bool((gain < -errors * error)[kept].any())
+
+    def may_lead(self, prefixes: Sequence[Prefix]) -> bool:
+        """Whether a rig that was scored at all instants is one that no other beats, or all others lack something."""
+        if prefixes[-1].instants < self.evaluations[0].instants:
+            return False
+        gain, front = gains(prefixes[-1].estimate, self.evaluations[0].prefixes[-1].estimate)[0], self.front
+        beaten = (self.gains[front] >= gain[: self._objectives]).all(axis=1).any()
+        return not beaten or bool(self._lacks[front[0]])
 
     def _told(self) -> Float64:
         """(evaluations, objectives) what optimisers are told of: gains, less what the lacks cost."""
@@ -132,11 +151,16 @@ class Arm:
 
     def _lacking(self, evaluation: Evaluation) -> float:
         prefixes = evaluation.prefixes
-        if evaluation.infeasible or not prefixes:
+        if not prefixes:
             return 0.0
-        gain, _ = gains(prefixes[-1].estimate, self.evaluations[0].prefixes[len(prefixes) - 1].estimate)
-        lost = (np.nan_to_num(-gain / self._scale, nan=1.0))[self._objectives :]  # unknown is all lost
-        return float(lost[lost > ROUNDING].sum())
+        value = prefixes[-1].estimate.value.numpy()
+        if evaluation.number and evaluation.instants < self.evaluations[0].instants:
+            # As good as its difference to the start promises.
+            value = value - self.evaluations[0].prefixes[len(prefixes) - 1].estimate.value.numpy()
+            value = value + self.evaluations[0].prefixes[-1].estimate.value.numpy()
+        lost = np.where(self._lower, value - self._floors, self._floors - value) / np.abs(self._floors).clip(ROUNDING)
+        lost = np.nan_to_num(lost[~np.isnan(self._floors)], nan=1.0)  # what is unknown is all lost
+        return float(lost[lost > ROUNDING].sum()) + evaluation.lacks
 
     def _estimated(self, evaluation: Evaluation) -> tuple[Float64, Float64]:
         """Gain over the start at all instants, and the error that those have left which it was not scored at.

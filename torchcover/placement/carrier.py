@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, BeforeValidator, Field, PlainValidator, ValidationInfo
 
+from torchcover.evaluation.requirements import RegionRequirement, Requirements
 from torchcover.geometry import BoundingBox
 from torchcover.placement.objective import Name, Objective
 from torchcover.simulation import Rig, Scenario, with_ego
@@ -18,8 +19,8 @@ from torchcover.simulation.mount_regions import MountRegion, Skin
 
 # More of them make no front that anybody can look at.
 MAX_OBJECTIVES = 3
-# What begins the name of what must not be worse, among what rigs are scored by.
-NOT_WORSE = "not worse: "
+# What begin the names of what must not be worse, or is required, among what rigs are scored by.
+NOT_WORSE, REQUIRED = "not worse: ", "required: "
 
 
 def _rig(given: Any, info: ValidationInfo) -> Rig:  # noqa: ANN401  (whatever stood in the file)
@@ -38,6 +39,16 @@ def _vehicle(given: str) -> str:
     if Path(given).suffix and not is_file_name(given):
         raise ValueError(f"the name of a vehicle, or the path of its YAML file, is needed; got {given!r}")
     return given
+
+
+def _requirements(given: Any, info: ValidationInfo) -> Requirements:  # noqa: ANN401
+    """Requirements, or a set of them by its name or its file."""
+    if isinstance(given, Requirements | dict):
+        return Requirements.model_validate(given, context=info.context)
+    try:
+        return Requirements.load(beside(Path(given), info) if is_file_name(given) else given)
+    except FileNotFoundError as error:
+        raise ValueError(str(error)) from error
 
 
 def _listed(given: Any) -> Any:  # noqa: ANN401  (whatever stood in the file)
@@ -110,6 +121,7 @@ class VehicleSpace(Readable):
             against what the others lose.
         not_worse: What must not be worse than with the rig that is there today: names of usual regions, of which
             detection within 0.4 m in both bands counts, or objectives.
+        requirements: What must be kept, by name or file, as of `torchcover check`.
     """
 
     name: str
@@ -118,6 +130,7 @@ class VehicleSpace(Readable):
     vehicle: NamedVehicle | None = None
     objectives: dict[Name, Objective] = Field(min_length=1, max_length=MAX_OBJECTIVES)
     not_worse: tuple[Name | Objective, ...] = ()
+    requirements: Annotated[Requirements, PlainValidator(_requirements)] | None = None
 
     @property
     def first_rig(self) -> Rig | None:
@@ -126,9 +139,37 @@ class VehicleSpace(Readable):
 
     @cached_property
     def asked(self) -> dict[str, Objective]:
-        """All that rigs are scored by: the objectives, and then what must not be worse, by its words."""
+        """All that rigs are scored by: the objectives, what must not be worse, by its words, what regions require."""
         kept = [Objective(region=one) if isinstance(one, str) else one for one in self.not_worse]
-        return self.objectives | {f"{NOT_WORSE}{one.words}": one for one in kept}
+        named = {f"{NOT_WORSE}{one.words}": one for one in kept}
+        return self.objectives | named | {name: one for name, (one, _) in self._required.items()}
+
+    @property
+    def floors(self) -> dict[str, float]:
+        """What numbers must be at least, or of lower ones at most, by their names in `asked`."""
+        return {name: floor for name, (_, floor) in self._required.items()}
+
+    @cached_property
+    def _required(self) -> dict[str, tuple[Objective, float]]:
+        """Of regions; what bodies and encounters require is measured on its own."""
+        asked, found = self.requirements, dict[str, tuple[Objective, float]]()
+        for one in asked.requirements if asked else ():
+            if not isinstance(one, RegionRequirement):
+                continue
+            own = (asked.regions or {}) if asked else {}
+            region = {one.region: own[one.region]} if one.region in own else one.region
+            lost = (one.without,) if isinstance(one.without, str) else one.without
+            for key in (one.number, *(f"{one.number}_without_{name}" for name in lost)):
+                each = Objective(number=key, region=region, band=one.height)
+                found |= {f"{REQUIRED}{each.words}, {bound.words}": (each, bound.value) for bound in one.bounds}
+        return found
+
+    @cached_property
+    def to_check(self) -> Requirements | None:
+        """What of the requirements is about bodies and encounters; None if nothing is."""
+        asked = self.requirements
+        others = tuple(one for one in asked.requirements if not isinstance(one, RegionRequirement)) if asked else ()
+        return asked.model_copy(update={"requirements": others}) if asked and others else None
 
     @cached_property
     def scenarios(self) -> tuple[Scenario, ...]:

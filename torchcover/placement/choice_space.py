@@ -205,6 +205,14 @@ class ChoiceSpace(VehicleSpace):
             raise ValueError(f"now: {', '.join(unknown)}: no candidate; they are {', '.join(candidates[:20])}")
         if twice := [name for name, count in now.items() if count > 1]:
             raise ValueError(f"now: {twice[0]} is there once at most; it is named twice")
+        return self
+
+    @model_validator(mode="after")
+    def _check_asked(self) -> Self:
+        if self.to_check is not None:
+            raise ValueError(
+                "requirements: candidates are chosen by regions; check the choice for bodies and encounters"
+            )
         if self.not_worse and not self.now:
             raise ValueError("not_worse: say what is there today, now, or there is nothing to be worse than")
         questions = Questions.around(self.carrier.outline_m, self.asked)

@@ -112,7 +112,8 @@ class SensorChoice:
             "the best there is" if len(self.found) == 1 else f"between the best of {', '.join(self.space.objectives)}"
         )
         if self.best.short:
-            kind = f"no choice keeps not_worse, and this one lacks the least: {100 * self.best.short:.2f} points in all"
+            short = f"{100 * self.best.short:.2f} points in all"
+            kind = f"no choice keeps all that must be kept, and this one lacks the least: {short}"
         elif not self.best.proven:
             gap = f"at most {100 * self.best.gap:.2f} points below" if len(self.found) == 1 else "not proven to be"
             kind = f"{gap} the best"
@@ -252,8 +253,9 @@ def choose(
     numbers = {sensor.name: number for number, sensor in enumerate(space.sensors)}
     limits = space.limits([numbers[sensor.name] for sensor in sensors])
     objectives = len(space.objectives)
-    if space.not_worse:
-        limits = replace(limits, least=np.append(np.full(objectives, -np.inf), candidates.values(now)[objectives:]))
+    kept = zip(space.asked, candidates.values(now).tolist(), strict=True)
+    least = [-np.inf if name in space.objectives else space.floors.get(name, own) for name, own in kept]
+    limits = replace(limits, least=least)
     found = best_of_several(candidates, limits, objectives)
     if not found[0].chosen:
         raise ValueError(

@@ -118,7 +118,7 @@ class SearchResult:
         else:
             yield f"{self._told(best, optimism=True)}."
         if best is not None and (lacks := search.arms[OPTIMISER].lacks[search.arms[OPTIMISER].best]) > 0:
-            yield f"No candidate keeps not_worse; this one lacks the least, {lacks:.2%} in all."
+            yield f"No candidate keeps all that must be kept; this one lacks the least, {lacks:.2%} in all."
         if self.test is not None:
             yield f"{self.test.sentence}."
         if best is not None and (bounds := self._on_bounds(best.evaluation)):
@@ -288,7 +288,7 @@ class SearchResult:
         if one.infeasible:
             return "infeasible", one.infeasible
         if lacks > 0:
-            return "worse", f"{lacks:.2%} less in all of what must not be worse"
+            return "lacking", f"{lacks:.2%} in all of what must be kept"
         if one.instants < len(self.search.instants):
             return "dropped", "two standard errors below the best so far"
         return "complete", ""
