@@ -156,7 +156,7 @@ def test_a_child_is_looked_for_around_the_vehicle_of_the_space():
 
 
 def test_requirements_that_contradict_each_other_are_refused_with_the_space():
-    with pytest.raises(ValueError, match=r"requirements contradict each other: 20m ground .* least 0.9 and at most 0.5"):
+    with pytest.raises(ValueError, match=r"contradict each other: 20m ground .* least 0.9 and at most 0.5"):
         space(requirements=required({"least": 0.9}, {"most": 0.5}))
 
 
