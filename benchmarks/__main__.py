@@ -31,6 +31,7 @@ BENCHMARKS = (
     "towns",
     "pairing",
     "placement",
+    "optimisers",
     "published",
     "voxels",
     "cities",

@@ -19,11 +19,11 @@ def surface(numbers, seed):
     draws = np.random.default_rng([seed, numbers])
     top, steep = draws.uniform(0.1, 0.9, numbers), draws.uniform(0.2, 3.0, numbers)
     turn = np.linalg.qr(draws.normal(size=(numbers, numbers)))[0]
-    waves, phase = draws.uniform(2.0, 6.0, numbers), draws.uniform(0.0, 2 * np.pi, numbers)
+    waves = draws.uniform(2.0, 6.0, numbers)
 
     def worth(unit):
         off = (np.asarray(unit) - top) @ turn
-        ripple = 0.02 * (1 - np.cos(waves * off + phase * 0)).sum()
+        ripple = 0.02 * (1 - np.cos(waves * off)).sum()
         return -float((steep * off**2).sum() + ripple) / numbers
 
     return worth
@@ -32,7 +32,13 @@ def surface(numbers, seed):
 def on_surface(name, numbers, seed, budget_s, candidate_s):
     """How far below the top the best is: a candidate costs so much, and a proposal what it takes this processor."""
     worth, middle = surface(numbers, seed), np.full(numbers, 0.5)
-    optimiser, zero, best, spent_s, asked = OPTIMISERS[name](Cube((0,) * numbers, middle), seed), worth(middle), 0.0, 0.0, 0
+    optimiser, zero, best, spent_s, asked = (
+        OPTIMISERS[name](Cube((0,) * numbers, middle), seed),
+        worth(middle),
+        0.0,
+        0.0,
+        0,
+    )
     while spent_s < budget_s:
         began = time.process_time()
         unit = optimiser.ask()
@@ -83,15 +89,17 @@ def main(arguments=()):
         found = {}
         for name in options.optimisers.split(","):
             if options.scenario:
-                runs = [on_rigs(name, numbers, seed, options.budget_s, options.scenario) for seed in range(options.seeds)]
+                runs = [
+                    on_rigs(name, numbers, seed, options.budget_s, options.scenario) for seed in range(options.seeds)
+                ]
             else:
                 costs = options.budget_s, options.candidate_s
                 runs = [on_surface(name, numbers, seed, *costs) for seed in range(options.seeds)]
             found[name], asked = np.array(runs).T
             against = found[name] - found["random"] if "random" in found else found[name] * np.nan
             error = against.std(ddof=1) / np.sqrt(len(against))
-            rows.append((numbers, name, f"{asked.mean():.0f}", f"{np.median(found[name]):.2f}", f"{found[name].mean():.2f}",
-                         f"{against.mean():+.2f} ± {error:.2f}"))  # fmt: skip
+            left = f"{np.median(found[name]):.2f}", f"{found[name].mean():.2f}"
+            rows.append((numbers, name, f"{asked.mean():.0f}", *left, f"{against.mean():+.2f} ± {error:.2f}"))
     table(("numbers", "optimiser", "candidates", "left below (median)", "mean", "more than random's ± error"), rows)
 
 
