@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.targets.worlds import lidar, rig, world
-from torchcover.evaluation import Places, Readings, Requirements, check, encounter, evaluate, verdicts
+from torchcover.evaluation import BodyPlaces, Readings, Requirements, check, encounter, evaluate, verdicts
 from torchcover.geometry import BoundingBox
 from torchcover.simulation import RegionsOfInterest, builtin_names
 from torchcover.targets import SIDES, Raster, Target, survey
@@ -66,21 +66,21 @@ def test_a_bound_is_kept_where_all_of_the_interval_is_known_to_keep_it(bound, va
 
 def test_bodies_are_put_where_a_place_says():
     """Areas are filled to their border in steps that are no longer than asked for; other forms are what they say."""
-    behind = Places(x_m=(-1.0, -0.2), relative_to="rear", step_m=0.3).positions_m(CAR)
+    behind = BodyPlaces(x_m=(-1.0, -0.2), relative_to="rear", step_m=0.3).positions_m(CAR)
     assert behind.min(0) == pytest.approx([-3.0, -1.0])
     assert behind.max(0) == pytest.approx([-2.2, 1.0])
     assert np.diff(np.unique(behind[:, 0].round(9))).max() <= 0.3
     assert len(np.unique(behind.round(9), axis=0)) == len(behind) == 4 * 8
-    beside = Places(y_m=(0.5, 1.0), relative_to="left", step_m=1.0).positions_m(CAR)
+    beside = BodyPlaces(y_m=(0.5, 1.0), relative_to="left", step_m=1.0).positions_m(CAR)
     assert beside.min(0).tolist() == [-2.0, 1.5]  # of the vehicle's length
-    triangle = Places(polygon_m=((0, 0), (4, 0), (0, 4)), step_m=1.0).positions_m(CAR)
+    triangle = BodyPlaces(polygon_m=((0, 0), (4, 0), (0, 4)), step_m=1.0).positions_m(CAR)
     assert len(triangle) == 15  # on its border, too
     assert (triangle.sum(axis=1) <= 4).all()
-    line = Places(line_m=((3, -1), (3, 1), (5, 1)), step_m=0.6).positions_m(CAR)
+    line = BodyPlaces(line_m=((3, -1), (3, 1), (5, 1)), step_m=0.6).positions_m(CAR)
     assert len(line) == 8
     assert np.linalg.norm(np.diff(line, axis=0), axis=1).max() <= 0.6
-    assert Places(points_m=((1, 2),), relative_to="front").positions_m(CAR).tolist() == [[3.0, 2.0]]
-    around = Places(within_m=1.0, step_m=0.5)
+    assert BodyPlaces(points_m=((1, 2),), relative_to="front").positions_m(CAR).tolist() == [[3.0, 2.0]]
+    around = BodyPlaces(within_m=1.0, step_m=0.5)
     each = [around.model_copy(update={"sides": (side,)}).positions_m(CAR) for side in SIDES]
     everywhere = around.positions_m(CAR)
     away = np.linalg.norm(everywhere - np.clip(everywhere, (-2, -1), (2, 1)), axis=1)

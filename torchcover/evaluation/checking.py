@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torchcover import __version__
 from torchcover.coverage import AGGREGATIONS, Coverage
 from torchcover.evaluation.encountering import encounter
-from torchcover.evaluation.evaluating import measured as measured_coverage
+from torchcover.evaluation.measuring import measured as measured_coverage
 from torchcover.evaluation.requirements import (
     PLAIN,
     EncounterRequirement,
@@ -31,6 +31,7 @@ from torchcover.evaluation.task import AnyRig, AnyScenario, as_called, spread_s,
 from torchcover.files import Publication
 from torchcover.report import Page, PageTable, Words, json_record, page_html
 from torchcover.simulation import Rig
+from torchcover.simulation.camera_sensor import CameraSensor
 from torchcover.targets import Target, survey_places
 
 Float64 = NDArray[np.float64]
@@ -81,7 +82,7 @@ class Checked:
         for rig, each in self.verdicts.items():
             states = [one.state for one in each]
             counts = {"tests": len(states), "failures": states.count("not kept"), "errors": states.count("not checked")}
-            suite = ElementTree.SubElement(root, "testsuite", name=rig, **{k: str(v) for k, v in counts.items()})
+            suite = ElementTree.SubElement(root, "testsuite", {"name": rig, **{k: str(v) for k, v in counts.items()}})
             for one in each:
                 name = f"{one.requirement}: {one.bound.words}"
                 case = ElementTree.SubElement(suite, "testcase", classname=rig, name=name)
@@ -186,8 +187,10 @@ def _coverage(asked: Requirements, rig: Rig, scenario: AnyScenario | None, **mor
     thresholds_m = sorted({float(match[1]) for key in keys if (match := PLAIN.fullmatch(key)) and match[1]})
     aggregations = [one for kind in AGGREGATIONS if (one := kind.of_keys(keys))]
     redundancy = any(one.without or one.number.startswith(("sensors", "seen")) for one in of_regions)
-    asking = {"ask": asked, "thresholds_m": thresholds_m or 0.4, "aggregations": aggregations, "redundancy": redundancy}
-    settings = Settings([rig], scenario, **asking, **more)
+    settings = Settings(
+        [rig], scenario, ask=asked, thresholds_m=thresholds_m or 0.4, aggregations=aggregations, redundancy=redundancy,
+        **more,
+    )  # fmt: skip
     result = measured_coverage(task_of(settings), settings)
     if result.run is not None:
         result.run.raise_failure()
@@ -203,18 +206,19 @@ def _of_region(one: RegionRequirement, coverage: Coverage, rig: Rig) -> Readings
         agreed = np.isnan(number.error) and estimate.has_intervals[0]  # all blocks say the same
         ends.append((number.value,) * 3 if agreed else (number.value, number.low, number.high))
         where.append(f"{one.region} {one.height}{words.replace('_', ' ')}")
-    return Readings(*np.array(ends).T, where)
+    value, low, high = np.array(ends).T
+    return Readings(value, low, high, where)
 
 
 def _of_encounters(one: EncounterRequirement, rig: Rig, **given: Any) -> dict[str, Readings]:  # noqa: ANN401
     """Of each encounter the latest detection of all phases."""
     found, names = encounter(rig, one.encounters, one.criterion, **given), [sensor.name for sensor in rig.sensors]
     times_s, where = [], []
-    for each in found.sightings:
+    for case, each in zip(one.encounters.encounters, found.sightings, strict=True):
         lost = {f", without {name}": each.without_ttc_s[names.index(name)] for name in one.failing(names)}
         for words, ttc_s in ({"": each.ttc_s} | lost).items():
-            times_s.append((ttc_s.min(), ttc_s.min() - one.criterion.needed_s(each.encounter.closing_mps)))
-            where.append(f"{each.encounter.words}{words}")
+            times_s.append((ttc_s.min(), ttc_s.min() - one.criterion.needed_s(case.closing_mps)))
+            where.append(f"{case.words}{words}")
     return {key: _exact(of_key, where) for key, of_key in zip(("ttc_s", "spare_s"), np.array(times_s).T, strict=True)}
 
 
@@ -242,7 +246,7 @@ def _of_target(
             angle = np.arctan2(target.solid.box.size_m[2] - z_m, away_m) + np.arctan2(z_m, away_m)
             angle_deg = np.where(points >= one.hits, np.rad2deg(angle), 0.0)
             numbers["visual_angle_deg"] = np.fmax(numbers["visual_angle_deg"], angle_deg)
-            if sensor.type == "camera":
+            if isinstance(sensor, CameraSensor):
                 numbers["pixels"] = np.fmax(numbers["pixels"], points)
         for key, of_key in values.items():
             of_key.append(numbers[key][there])
