@@ -186,31 +186,26 @@ class BodyPlaces(Document):
         Raises:
             ValueError: More than 1000 to a side.
         """
-        places_m: Float64
-        if self.within_m is not None:
-            around_m = Raster.around(vehicle, self.within_m, self.step_m).positions_m
-            near = np.linalg.norm(from_outline_m(vehicle, around_m), axis=1) <= self.within_m
-            places_m = around_m[
-                near & np.isin(side_of(vehicle, around_m), [-1, *map(SIDES.index, self.sides or SIDES)])
-            ]
-            return places_m
         low_m, high_m = np.array(vehicle.lower_m[:2]), np.array(vehicle.upper_m[:2])
         towards = {None: (0, 0), "front": (1, 0), "rear": (-1, 0), "left": (0, 1), "right": (0, -1)}[self.relative_to]
         middle_m = (low_m + high_m) / 2 if self.relative_to else np.zeros(2)
-        origin_m: Float64 = middle_m + (high_m - low_m) / 2 * towards
-        if self.points_m is not None:
-            return origin_m + np.array(self.points_m, dtype=np.float64)
-        if self.line_m is not None:
+        origin_m = middle_m + (high_m - low_m) / 2 * towards
+        places_m: Float64 = np.array(self.points_m or (), dtype=np.float64)
+        if self.within_m is not None:
+            around_m, sides = Raster.around(vehicle, self.within_m, self.step_m).positions_m, self.sides or SIDES
+            near = np.linalg.norm(from_outline_m(vehicle, around_m), axis=1) <= self.within_m
+            places_m = around_m[near & np.isin(side_of(vehicle, around_m), [-1, *map(SIDES.index, sides)])]
+        elif self.line_m is not None:
             line = shapely.LineString(self.line_m)
-            places_m = origin_m + shapely.get_coordinates(line.interpolate(self._between(0.0, line.length)))
-            return places_m
-        own_m = np.stack([low_m, high_m], axis=1) - origin_m[:, None]
-        (x0, x1), (y0, y1) = self.x_m or own_m[0], self.y_m or own_m[1]
-        area = shapely.Polygon(self.polygon_m) if self.polygon_m else shapely.box(x0, y0, x1, y1)
-        x0, y0, x1, y1 = area.bounds
-        there_m = np.stack(np.meshgrid(self._between(x0, x1), self._between(y0, y1)), axis=-1).reshape(-1, 2)
-        places_m = origin_m + there_m[shapely.intersects_xy(area, there_m)]
-        return places_m
+            places_m = shapely.get_coordinates(line.interpolate(self._between(0.0, line.length)))
+        elif self.points_m is None:
+            own_m = np.stack([low_m, high_m], axis=1) - origin_m[:, None]
+            (x0, x1), (y0, y1) = self.x_m or own_m[0], self.y_m or own_m[1]
+            area = shapely.Polygon(self.polygon_m) if self.polygon_m else shapely.box(x0, y0, x1, y1)
+            x0, y0, x1, y1 = area.bounds
+            there_m = np.stack(np.meshgrid(self._between(x0, x1), self._between(y0, y1)), axis=-1).reshape(-1, 2)
+            places_m = there_m[shapely.intersects_xy(area, there_m)]
+        return origin_m + places_m
 
     def _between(self, low_m: float, high_m: float) -> Float64:
         """Both ends, and as many steps in between as it takes."""
@@ -325,12 +320,11 @@ class TargetRequirement(_Requirement):
 
     def groups(self, sensors: Sequence[Sensor]) -> dict[str, list[int]]:
         """Numbers of the sensors that count, and of those without each that may fail; by what is then said of where."""
-        kinds = {
-            sensor.name: next(kind for kind, of in SENSORS.items() if isinstance(sensor, of)) for sensor in sensors
-        }
-        counts = [k for k, (name, kind) in enumerate(kinds.items()) if {name, kind}.intersection(self._by)]
-        lost = {f", without {name}": list(kinds).index(name) for name in self.failing(list(kinds))}
-        return {"": counts} | {words: [k for k in counts if k != failed] for words, failed in lost.items()}
+        of_kinds = tuple(of for kind, of in SENSORS.items() if kind in self._by)
+        counts = [k for k, one in enumerate(sensors) if one.name in self._by or isinstance(one, of_kinds)]
+        names = self.failing([one.name for one in sensors])
+        lost = [k for k in counts if sensors[k].name in names]  # the others change nothing
+        return {"": counts} | {f", without {sensors[k].name}": [each for each in counts if each != k] for k in lost}
 
 
 class RegionRequirement(_Requirement):
