@@ -305,7 +305,9 @@ def search(
     every_s: Annotated[float | None, typer.Option("--every-s", help="Seconds between two of them (20).")] = None,
     rays: Annotated[int | None, typer.Option(min=1, help="Rays of the reference at each instant (16384).")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the search and its worlds; fresh ones have the next.")] = 0,
-    workers: Annotated[int, typer.Option(min=0, help="Processes that score; 0 scores in this one.")] = 0,
+    workers: Annotated[
+        int | None, typer.Option(min=0, help="Processes that score; 0 scores in this one. Not given: as many as help.")
+    ] = None,
     resume: Annotated[
         bool,
         typer.Option(
@@ -323,7 +325,7 @@ def search(
     if budget is not None and evaluations is not None:
         raise ValueError("--budget, --evaluations: one of them; both are given")
     given = {"worlds": worlds, "fresh_worlds": fresh_worlds, "per_world": per_world, "every_s": every_s,
-             "rays": rays, **settings}  # fmt: skip
+             "rays": rays, "workers": workers, **settings}  # fmt: skip
     run(
         space,
         out,
@@ -334,7 +336,6 @@ def search(
         optimiser=optimiser,
         estimate=estimate,
         seed=seed,
-        workers=workers,
         **{name: value for name, value in given.items() if value is not None},
     )
 
