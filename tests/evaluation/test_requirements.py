@@ -113,6 +113,7 @@ def test_bodies_are_put_where_a_place_says():
             {"region": "20m", "height": "ground", "number": "radius_m", "most": 1, "least": 2},
             "at least 2 and at most 1",
         ),
+        ({"region": "20m", "height": "ground", "number": "radius_maximum_m", "most": 1, "without": "any"}, "without: "),
         ({"encounters": "crosing_like", "ttc_s": 1}, "is 'crossing_like' meant"),
         ({"encounters": "crossing_like"}, "nothing is required"),
     ],
@@ -192,6 +193,15 @@ def test_where_a_body_cannot_stand_a_point_is_unknown_and_an_area_goes_without()
     assert [(one.state, one.unknown) for one in found] == [("not checked", 1), ("kept", 0), ("not checked", 0)]
     assert found[0].where == ("x = 0.00, y = 0.00 m",)
     assert 0 < found[1].count < 2 * 26
+
+
+def test_a_kind_that_the_rig_has_not_sees_nothing_and_a_place_that_holds_nobody_is_not_checked():
+    tight = {**AHEAD, "at": {"within_m": 0.01}}
+    found = check(rig(), asked({**AHEAD, "by": "camera"}, tight), world()).verdicts["small"]
+    assert [(one.state, one.count) for one in found] == [("not kept", 1), ("not checked", 0)]
+    assert found[0].margin == -5.0
+    with pytest.raises(ValueError, match="at least one rig"):
+        check([], asked(AHEAD))
 
 
 def test_numbers_of_regions_are_those_of_evaluate():

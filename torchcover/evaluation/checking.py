@@ -1,5 +1,6 @@
 """Measure all that requirements are about, and judge it: names in, verdicts and their files out."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -24,13 +25,12 @@ from torchcover.evaluation.requirements import (
     Verdict,
     verdicts,
 )
-from torchcover.evaluation.result_page import words_of
 from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.target_survey import in_world
-from torchcover.evaluation.task import AnyRig, AnyScenario, as_called, spread_s, task_of
+from torchcover.evaluation.task import AnyRig, AnyScenario, distinct_names, loaded, spread_s, task_of
 from torchcover.files import Publication
-from torchcover.report import Page, PageTable, Words, json_record, page_html
-from torchcover.simulation import Rig
+from torchcover.report import PageTable, Words, json_record
+from torchcover.simulation import Rig, Scenario
 from torchcover.simulation.camera_sensor import CameraSensor
 from torchcover.targets import Target, survey_places
 
@@ -73,7 +73,13 @@ class Checked:
     def record(self) -> dict[str, Any]:
         """All of it, for JSON."""
         rigs = {rig: [json_record(_record(one)) for one in each] for rig, each in self.verdicts.items()}
-        return {"requirements": self.name, **self.settings, "exit_code": self.exit_code, "rigs": rigs}
+        return {
+            "requirements": self.name,
+            "torchcover": __version__,
+            **self.settings,
+            "exit_code": self.exit_code,
+            "rigs": rigs,
+        }
 
     @property
     def junit(self) -> str:
@@ -89,20 +95,17 @@ class Checked:
                 if one.state != "kept":
                     words = ", ".join(f"{key}: {value}" for key, value in _record(one).items())
                     ElementTree.SubElement(case, "failure" if one.state == "not kept" else "error", message=words)
-        return ElementTree.tostring(root, encoding="unicode", xml_declaration=True)
+        text = ElementTree.tostring(root, encoding="unicode", xml_declaration=True)
+        return "".join(letter if letter.isprintable() or letter == "\n" else " " for letter in text)
 
     def save(self, folder: str | Path) -> list[Path]:
-        """Write `junit.xml`, `report.html` and `summary.json`, into a folder that is made if it does not exist.
+        """Write `junit.xml` and `summary.json` into a folder, which is made if it does not exist.
 
         Returns:
             The files.
         """
-        facts = {"Settings": words_of(self.settings), "Run": {"torchcover": __version__}}
-        lead = f"The requirements of {self.name}, measured by torchcover."
-        page = Page(title=f"Is it enough? {', '.join(self.verdicts)}", lead=lead, tables=self.tables(), facts=facts)
         with Publication(Path(folder)) as written:
             written.add_text("junit.xml", self.junit)
-            written.add_text("report.html", page_html(page))
             written.publish(self.record)
         return written.paths
 
@@ -114,9 +117,10 @@ def _record(one: Verdict) -> dict[str, Any]:
 
 def _row(one: Verdict) -> tuple[Words, ...]:
     interval = f" ({one.low:.4g} to {one.high:.4g})" if one.low < one.high else ""
-    counts = (f"{count:,}" for count in (one.failed, one.unknown, one.count))
-    numbers = f"{one.value:.4g}{interval}", f"{one.margin:+.4g}", *counts
-    return tuple(map(Words, (one.requirement, one.bound.words, one.state, *numbers, *(one.where or ("nowhere",))[:1])))
+    numbers = ("-", "-") if math.isnan(one.margin) else (f"{one.value:.4g}{interval}", f"{one.margin:+.4g}")
+    counts = map(str, (one.failed, one.unknown, one.count))
+    words = one.requirement, one.bound.words, one.state, *numbers, *counts, one.where[0] if one.where else "nowhere"
+    return tuple(map(Words, words))
 
 
 def check(
@@ -155,7 +159,10 @@ def check(
         (['kept'], 0)
     """
     asked = requirements if isinstance(requirements, Requirements) else Requirements.load(requirements)
-    called = [as_called(rig) for rig in ([rigs] if isinstance(rigs, str | Path | Rig) else rigs)]
+    given = [rigs] if isinstance(rigs, str | Path | Rig) else rigs
+    called = [loaded(rig).model_copy(update={"name": n}) for rig, n in zip(given, distinct_names(given), strict=True)]
+    if not called:
+        raise ValueError("check: at least one rig is needed; got none")
     for one in asked.requirements:
         for rig in called:  # before the work, not after it
             one.failing([sensor.name for sensor in rig.sensors])
@@ -173,9 +180,8 @@ def check(
             else:
                 measured.append(_of_target(one, asked, rig, world, steps, **own))
         found[rig.name] = verdicts(asked, measured)
-    told = {"scenario": world, "steps": steps, **own}
-    settings = {key: value if value is None or isinstance(value, int) else str(value) for key, value in told.items()}
-    return Checked(asked.name, found, settings)
+    told = {"scenario": world.name if isinstance(world, Scenario) else world, "steps": steps, **own}
+    return Checked(asked.name, found, {k: str(v) if isinstance(v, Path) else v for k, v in told.items()})
 
 
 def _coverage(asked: Requirements, rig: Rig, scenario: AnyScenario | None, **more: Any) -> Coverage | None:  # noqa: ANN401
@@ -229,18 +235,19 @@ def _of_target(
     rig, world, usual_steps = in_world(given, scenario, vehicle, sensor_model)
     place, target = asked.places[one.at] if isinstance(one.at, str) else one.at, Target.load(one.target)
     at_m, groups = place.positions_m(world.ego_box()), one.groups(rig.sensors)
-    survey = partial(survey_places, rig, world, target, at_m, steps=steps or usual_steps, every_s=spread_s(world, None))
+    settings: dict[str, Any] = {"seed": seed, "hits": one.hits, "steps": (usual_steps > 1 and steps) or usual_steps}
+    survey = partial(survey_places, rig, world, target, at_m, every_s=spread_s(world, None), **settings)
     values: dict[str, list[Float64]] = {bound.key: [] for bound in one.bounds}
     where: list[str] = []
     for words, group in groups.items():
-        seen = survey(group, seed=seed, hits=one.hits)
+        seen = survey(group)
         numbers = {name: getattr(seen, JUDGED.get(name, name)) for name in ("points", "sensors", "seen", "share")}
         there = (seen.state == 0) | (place.points_m is not None)
         where += [f"x = {x:.2f}, y = {y:.2f} m{words}" for x, y in at_m[there].tolist()]
         for key in ("pixels", "visual_angle_deg"):
             numbers[key] = np.where(seen.state == 0, 0.0, np.nan)
         for k in group if one.pixels or one.visual_angle_deg else ():  # of each sensor alone
-            points, sensor = survey([k], seed=seed, hits=one.hits).least_points, rig.sensors[k]
+            points, sensor = survey([k]).least_points, rig.sensors[k]
             x_m, y_m, z_m = sensor.mount.matrix()[:3, 3]
             away_m = np.hypot(*(at_m - (x_m, y_m)).T)
             angle = np.arctan2(target.solid.box.size_m[2] - z_m, away_m) + np.arctan2(z_m, away_m)

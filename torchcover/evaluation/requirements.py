@@ -354,6 +354,8 @@ class RegionRequirement(_Requirement):
     def _check(self) -> Self:
         if not PLAIN.fullmatch(self.number) and not any(kind.of_keys({self.number}) for kind in AGGREGATIONS):
             check_called("number of a region", [self.number], LIKE)
+        if self.without and self.number != "radius_m" and not self.number.startswith("detection_"):
+            raise ValueError(f"without: radius_m and detections are known without a sensor; got {self.number}")
         return self
 
     @property
