@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.targets.worlds import lidar, rig, world
+from torchcover.encounters import Criterion
 from torchcover.evaluation import BodyPlaces, Readings, Requirements, check, encounter, evaluate, verdicts
 from torchcover.geometry import BoundingBox
 from torchcover.simulation import RegionsOfInterest, builtin_names
@@ -207,35 +208,43 @@ def test_a_kind_that_the_rig_has_not_sees_nothing_and_a_place_that_holds_nobody_
 def test_numbers_of_regions_are_those_of_evaluate():
     regions = {"near": {"x_m": [2.5, 8.0], "y_m": [-2.0, 2.0]}}
     keys = {"regions": regions, "grid": {"x_m": [-4, 9], "y_m": [-4, 4], "cell_m": 1.0}}
-    one = {"region": "near", "height": "ground", "without": ["top"]}
+    one = {"region": "near", "height": "ground", "without": ["front"]}
     found = check(
         THREE,
-        asked({**one, "number": "detection_0.3m", "least": 0.1}, {**one, "number": "radius_m", "most": 1e-6}, **keys),
+        asked({**one, "number": "detection_0.3m", "least": 0.001}, {**one, "number": "radius_m", "most": 1e-6}, **keys),
         world(), steps=12, workers=0,
     ).verdicts["small"]  # fmt: skip
     asking = RegionsOfInterest.model_validate(keys)
     result = evaluate(THREE, world(), steps=12, workers=0, thresholds_m=0.3, redundancy=True, ask=asking)
     (row,) = (row for row in result.summary if row["height"] == "ground")
     for verdict, key, worse in zip(found, ("detection_0.3m", "radius_m"), (min, max), strict=True):
-        assert verdict.value == worse(row[key], row[f"{key}_without_top"])
+        assert verdict.value == worse(row[key], row[f"{key}_without_front"]) != row[key]
         assert verdict.count == 2
-    assert [verdict.state for verdict in found] == ["kept", "not kept"]
+    assert found[0].where[0] == "near ground without front"
 
 
 def test_times_to_collision_are_the_latest_of_all_phases(tmp_path):
     box = tmp_path / "box.yaml"
     box.write_text("name: box\nparts: [{name: b, shape: {type: box, size_m: [4, 2, 1]}}]\n")
-    walker = {"body": "child", "speed_kmh": 5, "from_m": 2}
-    crossings = {"name": "two", "encounters": [{"name": "a", "ego": {"speed_kmh": [20, 60]}, "other": walker}]}
-    one = {"encounters": crossings, "ttc_s": 0.5, "in_time": {"deceleration": 4, "latency_s": 1.0}, "without": ["mast"]}
+    walker = {"body": "child", "speed_kmh": 5, "from_m": 4}
+    crossings = {"name": "two", "encounters": [{"name": "a", "ego": {"speed_kmh": [10, 30]}, "other": walker}]}
+    looks = {"points": 1, "pixels": 20, "looks": 2}
+    one = {
+        "encounters": crossings,
+        **looks,
+        "ttc_s": 0.5,
+        "in_time": {"deceleration": 4, "latency_s": 1.0},
+        "without": ["mast"],
+    }
     requirements = asked(one)
     ttc, spare = check(THREE, requirements, vehicle=box).verdicts["small"]
-    seen = encounter(THREE, requirements.requirements[0].encounters, vehicle=box).sightings
+    seen = encounter(THREE, requirements.requirements[0].encounters, Criterion(**looks), vehicle=box).sightings
     latest_s = [min(one.ttc_s.min(), one.without_ttc_s[1].min()) for one in seen]
     needed_s = [one.encounter.closing_mps / 8 + 1.0 for one in seen]
     assert (ttc.value, ttc.count) == (min(latest_s), 4)
+    assert 0.0 < ttc.value < min(one.ttc_s.max() for one in seen)
     assert spare.value == pytest.approx(min(np.subtract(latest_s, needed_s)))
-    assert "at 60 km/h" in spare.where[0]
+    assert "at 30 km/h" in spare.where[0]
 
 
 @pytest.mark.parametrize(

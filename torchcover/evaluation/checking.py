@@ -3,7 +3,6 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 from xml.etree import ElementTree
@@ -32,7 +31,7 @@ from torchcover.files import Publication
 from torchcover.report import PageTable, Words, json_record
 from torchcover.simulation import Rig, Scenario
 from torchcover.simulation.camera_sensor import CameraSensor
-from torchcover.targets import Target, survey_places
+from torchcover.targets import Spots, Target, survey_places
 
 Float64 = NDArray[np.float64]
 # What is judged where a mean would hide a step in which nothing is seen.
@@ -235,8 +234,13 @@ def _of_target(
     rig, world, usual_steps = in_world(given, scenario, vehicle, sensor_model)
     place, target = asked.places[one.at] if isinstance(one.at, str) else one.at, Target.load(one.target)
     at_m, groups = place.positions_m(world.ego_box()), one.groups(rig.sensors)
-    settings: dict[str, Any] = {"seed": seed, "hits": one.hits, "steps": (usual_steps > 1 and steps) or usual_steps}
-    survey = partial(survey_places, rig, world, target, at_m, every_s=spread_s(world, None), **settings)
+    every_s, own_steps = spread_s(world, None), (usual_steps > 1 and steps) or usual_steps
+
+    def survey(counting: Sequence[int]) -> Spots:
+        return survey_places(
+            rig, world, target, at_m, counting, steps=own_steps, every_s=every_s, seed=seed, hits=one.hits
+        )
+
     values: dict[str, list[Float64]] = {bound.key: [] for bound in one.bounds}
     where: list[str] = []
     for words, group in groups.items():
