@@ -205,8 +205,8 @@ class BodyPlaces(Document):
             x0, y0, x1, y1 = area.bounds
             there_m = np.stack(np.meshgrid(self._between(x0, x1), self._between(y0, y1)), axis=-1).reshape(-1, 2)
             places_m = there_m[shapely.intersects_xy(area, there_m)]
-        places_m = origin_m + places_m
-        return places_m
+        in_vehicle_m: Float64 = origin_m + places_m
+        return in_vehicle_m
 
     def _between(self, low_m: float, high_m: float) -> Float64:
         """Both ends, and as many steps in between as it takes."""
