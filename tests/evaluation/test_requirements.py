@@ -7,7 +7,8 @@ import pytest
 
 from tests.targets.worlds import lidar, rig, world
 from torchcover.encounters import Criterion
-from torchcover.evaluation import BodyPlaces, Readings, Requirements, check, encounter, evaluate, verdicts
+from torchcover.evaluation import Readings, Requirements, check, encounter, evaluate, verdicts
+from torchcover.evaluation.requirements import BodyPlaces
 from torchcover.geometry import BoundingBox
 from torchcover.simulation import RegionsOfInterest, builtin_names
 from torchcover.targets import SIDES, Raster, Target, survey
@@ -110,6 +111,10 @@ def test_bodies_are_put_where_a_place_says():
         ({"region": "20m", "height": "grund", "number": "radius_m", "most": 1}, "no height band .* is 'ground' meant"),
         ({"region": "20m", "height": "ground", "number": "radius", "most": 1}, "is 'radius_m' meant"),
         ({"region": "20m", "height": "ground", "number": "radius_m"}, "nothing is required"),
+        (
+            {"region": "20m", "height": "ground", "number": "detection_0.4m", "least": 90},
+            "a share of at most 1; got 90",
+        ),
         (
             {"region": "20m", "height": "ground", "number": "radius_m", "most": 1, "least": 2},
             "at least 2 and at most 1",

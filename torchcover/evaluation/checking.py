@@ -72,13 +72,8 @@ class Checked:
     def record(self) -> dict[str, Any]:
         """All of it, for JSON."""
         rigs = {rig: [json_record(_record(one)) for one in each] for rig, each in self.verdicts.items()}
-        return {
-            "requirements": self.name,
-            "torchcover": __version__,
-            **self.settings,
-            "exit_code": self.exit_code,
-            "rigs": rigs,
-        }
+        about = {"requirements": self.name, "torchcover": __version__, **self.settings}
+        return {**about, "exit_code": self.exit_code, "rigs": rigs}
 
     @property
     def junit(self) -> str:

@@ -355,6 +355,8 @@ class RegionRequirement(_Requirement):
     def _check(self) -> Self:
         if not PLAIN.fullmatch(self.number) and not any(kind.of_keys({self.number}) for kind in AGGREGATIONS):
             check_called("number of a region", [self.number], LIKE)
+        if self.least > 1.0 and ("detection_" in self.number or "seen_by" in self.number):
+            raise ValueError(f"least: {self.number} is a share of at most 1; got {self.least:g}")
         if self.without and self.number != "radius_m" and not self.number.startswith("detection_"):
             raise ValueError(f"without: radius_m and detections are known without a sensor; got {self.number}")
         return self
