@@ -262,5 +262,6 @@ def sight_approach(rig: str, drive: Drive, approach: Approach, eyes: Eyes, crite
     least_s[0] = criterion.within_s
     ttc_s, alone_s, without_s = (least_s[np.minimum(steps, end) - begin] for steps in found)
     seen = found.all_together - begin
-    in_time = ~(approach.ttc_s < approach.needed_s)[: min(int(seen[0]), end - begin)].any(keepdims=True)
+    until = min(int(seen[0]), end) + 1 if seen[0] else 0
+    in_time = ~(approach.ttc_s < approach.needed_s)[:until].any(keepdims=True)
     return Sighting(approach, rig, ttc_s, in_time, alone_s, without_s, seen == 0, drive.name)
