@@ -191,17 +191,14 @@ def targets(
     threshold_m: Annotated[
         float, typer.Option("--threshold-m", help="Detection threshold in metres, for the share of its surface.")
     ] = 0.4,
-    require: Annotated[
-        Path | None, typer.Option(help="YAML file of requirements: exit code 1 if one is not met.")
-    ] = None,
     out: options.Out = Path("out/targets"),
     files: options.Files = options.ALL_FILES,
     **settings: Any,  # noqa: ANN401
 ) -> None:
-    """Put a body at every place around the vehicle: how much of it is seen, where not, and whether that is enough."""
+    """Put a body at every place around the vehicle: how much of it is seen, and where not."""
     from torchcover.cli.target_run import run
 
-    code = run(
+    run(
         rig,
         target,
         scenario,
@@ -210,12 +207,36 @@ def targets(
         hits=hits,
         threshold_m=threshold_m,
         heading=heading,
-        require=require,
         out=out,
         files=files,
         **settings,
     )
-    raise typer.Exit(code)
+
+
+@with_options(of_evaluate("vehicle", "sensor_model", "steps", "seed", "workers"))
+def check(
+    rigs: Annotated[list[str], typer.Argument(help="Rigs: built-in names (see `list`) or YAML files.")],
+    requirements: Annotated[str, typer.Option(help="What they must see: a built-in set or a YAML file.")],
+    scenario: Annotated[
+        str | None,
+        typer.Option(help="World of requirements that name none (regions: courtyard; bodies: flat ground, no more)."),
+    ] = None,
+    out: options.Out = Path("out/check"),
+    **settings: Any,  # noqa: ANN401
+) -> None:
+    """Is it enough? Exit code 0: all is checked and kept; 1: something is not kept; 3: something is not checked."""
+    from rich.console import Console
+
+    from torchcover.cli.printing import in_words, print_files, print_whole
+    from torchcover.evaluation import check
+    from torchcover.files import claimed
+
+    with claimed(out):
+        found = check(rigs, requirements, scenario, progress=True, **settings)
+        written = found.save(out)
+    print_whole([in_words(table) for table in found.tables()])
+    print_files(written, out, Console())
+    raise typer.Exit(found.exit_code)
 
 
 @with_options([*of_criterion(), *of_evaluate("vehicle", "sensor_model", "seed")])
@@ -284,7 +305,9 @@ def search(
     every_s: Annotated[float | None, typer.Option("--every-s", help="Seconds between two of them (20).")] = None,
     rays: Annotated[int | None, typer.Option(min=1, help="Rays of the reference at each instant (16384).")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the search and its worlds; fresh ones have the next.")] = 0,
-    workers: Annotated[int, typer.Option(min=0, help="Processes that score; 0 scores in this one.")] = 0,
+    workers: Annotated[
+        int | None, typer.Option(min=0, help="Processes that score; 0 scores in this one. Not given: as many as help.")
+    ] = None,
     resume: Annotated[
         bool,
         typer.Option(
@@ -302,7 +325,7 @@ def search(
     if budget is not None and evaluations is not None:
         raise ValueError("--budget, --evaluations: one of them; both are given")
     given = {"worlds": worlds, "fresh_worlds": fresh_worlds, "per_world": per_world, "every_s": every_s,
-             "rays": rays, **settings}  # fmt: skip
+             "rays": rays, "workers": workers, **settings}  # fmt: skip
     run(
         space,
         out,
@@ -313,7 +336,6 @@ def search(
         optimiser=optimiser,
         estimate=estimate,
         seed=seed,
-        workers=workers,
         **{name: value for name, value in given.items() if value is not None},
     )
 
@@ -364,7 +386,7 @@ def list_builtin(
         str | None, typer.Argument(help="Only those with this word, with all that is said of them.")
     ] = None,
 ) -> None:
-    """List the built-in rigs, scenarios, LiDAR models, vehicles, materials, weather and encounters."""
+    """List the built-in rigs, scenarios, LiDAR models, vehicles, materials, weather, encounters and requirements."""
     from torchcover.cli.listing import run
 
     run(word)

@@ -2,6 +2,8 @@ from .agreeing import AgreementStudy as AgreementStudy
 from .agreeing import agree as agree
 from .agreeing import relation as relation
 from .agreeing import verdict as verdict
+from .checking import Checked as Checked
+from .checking import check as check
 from .checkpoint import Checkpoint as Checkpoint
 from .encountering import encounter as encounter
 from .encountering import encounter_picture as encounter_picture
@@ -23,6 +25,16 @@ from .progress import Progress as Progress
 from .ranks import Ranks as Ranks
 from .ranks import joined_ranks as joined_ranks
 from .ranks import rank_count as rank_count
+from .requirements import Bound as Bound
+from .requirements import EncounterRequirement as EncounterRequirement
+from .requirements import InTime as InTime
+from .requirements import Places as Places
+from .requirements import Readings as Readings
+from .requirements import RegionRequirement as RegionRequirement
+from .requirements import Requirements as Requirements
+from .requirements import TargetRequirement as TargetRequirement
+from .requirements import Verdict as Verdict
+from .requirements import verdicts as verdicts
 from .result import Result as Result
 from .result_page import Omission as Omission
 from .result_page import left_out as left_out
