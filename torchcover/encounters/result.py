@@ -164,7 +164,8 @@ class Sightings:
         """All of it, for JSON."""
         up_to = [{"encounter": name, "rig": rig, "in_time_up_to_kmh": v} for (name, rig), v in self.up_to_kmh().items()]
         rows = [row._asdict() for row in self.rows]
-        met = [{"rig": one.rig, "world": one.world, "who": one.encounter.name, **one.encounter.told,
+        met = [{"rig": one.rig, "world": one.world, "who": one.encounter.name, "name": one.encounter.track.name,
+                "step": one.encounter.step, "least_s": float(one.encounter.ttc_s.min()),
                 "ttc_s": float(one.ttc_s[0]), "in_time": bool(one.in_time[0])}
                for one in self.sightings if isinstance(one.encounter, Approach)]  # fmt: skip
         listed = {"rows": rows, "speeds": [] if self.hours else up_to, "met": met}

@@ -96,13 +96,13 @@ def met_in_traffic(
     seed: int = 0,
     progress: bool = False,
 ) -> Sightings:
-    """When rigs detected those who came near in the traffic of worlds; as `encounter`, but for these.
+    """When rigs detected those whom they met in the traffic of worlds: `Criterion.within_s` before a collision.
 
     Args:
-        rigs: A rig or several.
-        scenario: Their world: a scenario, a built-in name or a YAML file.
+        rigs: As for `encounter`, like all that is not named here.
+        scenario: Its worlds: a scenario, a built-in name or a YAML file.
         criterion: Who is met, what is detected, and what is in time.
-        worlds: How many of its worlds, each driven through once; 1 if it is always the same.
+        worlds: How many of them are driven through; 1 if it is always the same.
         vehicle: What carries the rigs.
         sensor_model: What sensors make of their hits.
         seed: Of the traffic, of noise and drop-out.
@@ -110,7 +110,7 @@ def met_in_traffic(
 
     Raises:
         FileNotFoundError: An unknown name or file.
-        ValueError: A file that cannot be used, a number out of its bounds, a scenario in which nothing ever moves.
+        ValueError: What cannot be used, a number out of its bounds, a scenario in which nothing ever moves.
     """
     if worlds < 1:
         raise ValueError(f"worlds: a number >= 1 is needed; got {worlds}")
@@ -136,15 +136,15 @@ def met_in_traffic(
 
 
 def met_in_recording(recording: Recording | str | Path, criterion: Criterion | None = None) -> Sightings:
-    """When the rigs of a recording with poses and labelled objects first had enough points on those who came near.
+    """When the rigs of a recording first had enough points on those whom it met; as `met_in_traffic`.
 
     Args:
-        recording: It, or its path.
+        recording: One with poses, times and labelled objects, or its path.
         criterion: Who is met, what is detected, and what is in time.
 
     Raises:
         FileNotFoundError: There is no such recording, or a part of it is missing.
-        ValueError: It has no poses, times or labelled objects, or does not say how large its vehicle is.
+        ValueError: It lacks one of these, or does not say how large its vehicle is.
     """
     criterion = Criterion() if criterion is None else criterion
     opened = open_recording(recording) if isinstance(recording, str | Path) else recording
