@@ -12,12 +12,11 @@ from tests.targets.worlds import EGO, FLOOR, lidar, on_target
 from torchcover.encounters import Criterion, Encounter, EncounterSet, Staged, sight_encounter
 from torchcover.encounters.sighting import NEVER, Looks, MountedRig, channels, first_run, kinds_of, look_steps
 from torchcover.evaluation import encounter, encounter_film, free_space
-from torchcover.geometry import euler_from_rotation
+from torchcover.geometry import euler_from_rotation, overlapping
 from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, with_ego
 from torchcover.simulation.bodies import called
 from torchcover.simulation.moving import Solid
 from torchcover.targets import Target
-from torchcover.targets.placing import overlapping
 
 torch.set_num_threads(1)
 

@@ -8,14 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.encounters.encounter import Encounter, Obstacle, Way
-from torchcover.geometry import BoundingBox, contact_s, invert, outlines_at
+from torchcover.geometry import BoundingBox, contact_s, invert, outlines_at, overlapping
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.bodies import Shape, called, mover_mesh
 from torchcover.simulation.moving import Solid, Solids
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.shapes import Plane
 from torchcover.simulation.world import Actor, World
-from torchcover.targets.placing import overlapping, poses
+from torchcover.targets.placing import poses
 
 Float64 = NDArray[np.float64]
 
