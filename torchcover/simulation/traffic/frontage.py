@@ -290,20 +290,20 @@ def _free(
     far_m, near_m = np.linalg.norm(sides[:, ::2], axis=2).T
     free &= (far_m > TAPERED * near_m) & (near_m > TAPERED * far_m)
     number = np.flatnonzero(free)
-    later, earlier = number[_meeting(outlines_m[number])]
-    apart = (kinds[earlier] != kinds[later]) | (run[earlier] != run[later])
-    order = np.lexsort((earlier[apart], later[apart]))
-    for one, other in zip(later[apart][order].tolist(), earlier[apart][order].tolist(), strict=True):
+    own = np.unique(np.stack([kinds[number], run[number]]), axis=1, return_inverse=True)[1]
+    later, earlier = number[_meeting(outlines_m[number], own)]
+    order = np.lexsort((earlier, later))
+    for one, other in zip(later[order].tolist(), earlier[order].tolist(), strict=True):
         if free[other]:
             free[one] = False
     return free, PAVEMENT_M * within
 
 
-def _meeting(outlines_m: Numbers) -> NDArray[np.int64]:
-    """(2, P) pairs of (N, 4, 2) convex outlines that no side of the one or the other separates."""
+def _meeting(outlines_m: Numbers, group: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(2, P) pairs of (N, 4, 2) convex outlines of two groups that no side of the one or the other separates."""
     boxes = shapely.box(*outlines_m.min(axis=1).T, *outlines_m.max(axis=1).T)
     pairs = shapely.STRtree(boxes).query(boxes)
-    pairs = pairs[:, pairs[0] > pairs[1]]
+    pairs = pairs[:, (pairs[0] > pairs[1]) & (group[pairs[0]] != group[pairs[1]])]
     for way in (1, -1):
         one, other = pairs[::way]
         normals = (np.roll(outlines_m, -1, axis=1) - outlines_m)[one][..., ::-1] * np.array([1.0, -1.0])
