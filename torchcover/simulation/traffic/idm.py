@@ -43,9 +43,8 @@ class Driver:
 
     def __post_init__(self) -> None:
         desired = self.desired_speed_mps
-        if not (
-            desired > 0.0 if isinstance(desired, float) else np.all(np.asarray(desired) > 0.0)
-        ):  # thousands a world
+        # There are thousands in a world.
+        if not (desired > 0.0 if isinstance(desired, float) else np.all(np.asarray(desired) > 0.0)):
             raise ValueError(f"a driver needs a desired speed above 0 m/s; got {self.desired_speed_mps}")
 
     @cached_property
