@@ -91,7 +91,9 @@ class RecordedTraffic(Traffic):
         """What stands beside streets, if it is drawn."""
         if self.built_share is None:
             return ""
-        return f"Drawn, not recorded: what stands beside the tracks, with houses on {self.built_share:.0%} of the sides."
+        return (
+            f"Drawn, not recorded: what stands beside the tracks, with houses on {self.built_share:.0%} of the sides."
+        )
 
     @property
     def steps(self) -> int:
