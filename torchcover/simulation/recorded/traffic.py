@@ -87,6 +87,15 @@ class RecordedTraffic(Traffic):
         return self
 
     @property
+    def drawn_words(self) -> str:
+        """What stands beside streets, if it is drawn."""
+        if self.built_share is None:
+            return ""
+        return (
+            f"Drawn, not recorded: what stands beside the tracks, with houses on {self.built_share:.0%} of the sides."
+        )
+
+    @property
     def steps(self) -> int:
         """Number of instants."""
         return steps_of(self._run.duration_s, self.time_step_s)
