@@ -170,3 +170,18 @@ def test_who_cannot_get_round_is_not_there(corner):
     assert possible([lorry]) == [lorry]  # the first is the ego
     (walker,) = motions([user(turn(5.0, 1.4), on_foot=True)], 40.0, ORIGIN, corner)
     assert walker.can_be
+
+
+def test_people_go_round_what_is_driven_on_where_sumo_leads_them_straight_across():
+    walked = shapely.Polygon([(0, 0), (20, 0), (20, 20), (16, 20), (16, 4), (0, 4)])
+    way_m = np.concatenate([straight(1.3, 10.0, y_m=3.0)[:20], [[5.2 + 0.2 * k, 3.0 + 0.26 * k] for k in range(61)]])
+    across = user(way_m, on_foot=True, kind="adult", size_m=(0.3, 0.5))
+    inside = user(straight(1.3, 8.0, x_m=1.0, y_m=2.0), on_foot=True, kind="adult", size_m=(0.3, 0.5))
+    free, led, same = (motions([who], 16.0, ORIGIN, None, area)[0] for who, area in
+                       ((across, None), (across, walked), (inside, walked)))  # fmt: skip
+    on = [shapely.contains_xy(walked, *motion.poses[:, :2].T) for motion in (free, led)]
+    assert on[0].mean() < 0.5
+    assert on[1].mean() > 0.9
+    assert shapely.distance(shapely.points(led.poses[:, :2]), walked).max() < 0.5
+    assert led.can_be
+    np.testing.assert_array_equal(same.poses, motions([inside], 16.0, ORIGIN)[0].poses)

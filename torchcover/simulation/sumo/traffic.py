@@ -108,7 +108,8 @@ class Sumo(Procedural):
         raised = few(pavement.meshes(), decks(vicinity))
         static = (ground.mesh(), *raised, *few(*stood))
         parked = park(vicinity, ground, fleet, self.parked_share, generator)
-        moved = motions([ego, *others], duration_s, origin_m, np.concatenate([pavement.parts, parked]))
+        obstacles = np.concatenate([pavement.parts, parked])
+        moved = motions([ego, *others], duration_s, origin_m, obstacles, pavement.walked)
         shown = possible(moved)
         fleet.left_out = len(moved) - len(shown)
         if fleet.left_out and self.random is None:
