@@ -83,7 +83,10 @@ class Highway(Procedural):
             [a.lane % LANES == SIDE_LANE - 1 for a in agents]
         )
         exits[0] = False
-        driving = Overtaking(agents, heavy, exits, side_m, generator)
+        stations = np.arange(*middle.stations_m[[0, -1]], CURVATURE_EVERY_M)
+        heights_m = hills.heights_m(middle.poses(stations, 0.0)[:, :2])
+        climb = np.stack([stations, np.gradient(heights_m, CURVATURE_EVERY_M)])
+        driving = Overtaking(agents, heavy, exits, side_m, generator, climb)
         flow = driving.run(times_s, WARM_UP_S)
         moving = _near(middle, sides, agents, driving, flow, fleet)
         driver = ego_actor(times_s, moving, flow, 0, fleet.meshes[EGO], generator, hills)
