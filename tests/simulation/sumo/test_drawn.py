@@ -12,7 +12,7 @@ from torchcover import Rig, Scenario
 from torchcover.data import SimulatedFrames
 from torchcover.files import BadFileError, parse_xml
 from torchcover.simulation import PaperReference
-from torchcover.simulation.sumo import Sumo, simulating
+from torchcover.simulation.sumo import Sumo, simulating, traffic
 from torchcover.simulation.sumo.demand import write_routes
 from torchcover.simulation.sumo.network import read_network
 from torchcover.simulation.sumo.streets import TURN_MPS2, DrawnStreets, turning_mps
@@ -167,6 +167,18 @@ def test_a_net_without_ways_and_too_much_traffic_are_refused(tmp_path):
         Sumo(net=net, random={}, duration_s=2.0).world(0)
     with pytest.raises(ValueError, match=r"traffic of about [\d,]+ vehicles and people; at most 20,000 are drawn"):
         drawn(traffic_per_km=200.0, people_per_km=1000.0, cyclists_per_km=1000.0, buses_per_km=200.0).world(0)
+
+
+def test_an_empty_town_is_a_world_a_hundred_times_as_much_is_refused_and_who_is_left_out_is_told(monkeypatch):
+    for key in LITTLE:
+        with pytest.raises(ValueError, match=rf"random\.{key}\s+Input should be less than or equal to"):
+            drawn(**{key: 1400.0})
+    monkeypatch.setattr(traffic, "possible", lambda bodies: bodies[:1])
+    bare = {"built_share": 0.0, "parked_share": 0.0, "roadside": 0.0}
+    with pytest.warns(UserWarning, match=r"the simulation has \d of \d road users where another one is"):
+        world = drawn(**dict.fromkeys(LITTLE, 0.0)).model_copy(update=bare).world(0)
+    assert not world.objects
+    assert world.left_out > 0  # who could have been the ego
 
 
 def test_a_turn_is_driven_as_slowly_as_its_tightest_piece_asks_for():

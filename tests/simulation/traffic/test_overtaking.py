@@ -21,7 +21,7 @@ def drive(*agents, heavy=(), exits=(), side_m=FAR_M, times_s=TIMES_S, kind="car"
     """What happened, and the (T, N) lanes, of agents (lane, place, driver)."""
     made = [Agent(kind, 5.0, lane, place, driver) for lane, place, driver in agents]
     marked = [np.isin(np.arange(len(made)), which) for which in (heavy, exits)]
-    traffic = Overtaking(made, *marked, side_m, np.random.default_rng(0), LEVEL + [[0.0], [slope]])
+    traffic = Overtaking(made, *marked, side_m, np.random.default_rng(0), LEVEL + np.array([[0.0], [slope]]))
     flow = traffic.run(times_s, 0.0)
     lanes = np.tile([agent.lane for agent in made], (len(times_s), 1))
     for change in traffic.changes:
@@ -83,7 +83,7 @@ def test_a_laden_lorry_goes_up_as_fast_as_its_power_lifts_it(lane, slope):
     # Down there, and on the level, it keeps to the limit as all do.
     for kind, down in (("truck", -slope), ("truck", 0.0), ("car", slope)):
         _, flow, _ = drive((lane, 0.0, limit), kind=kind, slope=down, times_s=np.arange(0.0, 200.0, 0.5))
-        assert 22.0 < flow.speed_mps[100:, 0].min()
+        assert flow.speed_mps[100:, 0].min() > 22.0
         assert flow.speed_mps.max() < 1.03 * 23.6
 
 

@@ -135,7 +135,7 @@ def _lead_m(user: RoadUser, times_s: Numbers, origin_m: Numbers, walked: shapely
     track = user.track
     told_m = (_without_jumps(track) if track.on_foot else track.places_m[:, :2]) - origin_m
     even_m = np.stack([np.interp(times_s, track.times_s, axis) for axis in told_m.T], axis=1)
-    if track.on_foot and walked is not None:
+    if track.on_foot and walked is not None and not walked.is_empty:
         even_m = _along_edges(even_m, times_s[1] - times_s[0], walked)
     half_s = max(SMOOTH_S, float(np.median(np.diff(track.times_s))))
     smooth_m = rounded(even_m, int(np.ceil(half_s / (times_s[1] - times_s[0]))))
