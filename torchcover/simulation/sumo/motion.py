@@ -8,7 +8,7 @@ import shapely
 from numpy.typing import NDArray
 
 from torchcover.simulation.sumo.floating import TIME_SLACK_S, SumoTrack
-from torchcover.simulation.traffic.articulated import Articulated, rears_of, together, tractrix
+from torchcover.simulation.traffic.articulated import DRAWS, rears_of, together, tractrix
 
 Numbers = NDArray[np.float64]
 
@@ -38,15 +38,13 @@ class RoadUser(NamedTuple):
         track: Where its front is.
         kind: Of its body.
         length_m: That the simulation takes it for.
-        sizes_m: Length and width of the body, or of its front and its rear.
-        both: Its parts, if it is in two.
+        sizes_m: Lengths and widths of the body, and of what it draws along.
     """
 
     track: SumoTrack
     kind: str
     length_m: float
     sizes_m: tuple[tuple[float, float], ...]
-    both: Articulated | None = None
 
     @property
     def ahead_m(self) -> float:
@@ -56,7 +54,7 @@ class RoadUser(NamedTuple):
     @property
     def lag_m(self) -> float:
         """How far the axles of what it draws along are behind the point that leads, on a straight."""
-        return 0.0 if self.both is None else self.ahead_m - self.both.hitch_m + self.both.rod_m
+        return self.ahead_m - DRAWS[self.kind].hitch_m + DRAWS[self.kind].rod_m if self.kind in DRAWS else 0.0
 
     @property
     def drawn_m(self) -> float:
@@ -139,7 +137,7 @@ def _lead_m(user: RoadUser, times_s: Numbers, origin_m: Numbers, walked: shapely
         even_m = _along_edges(even_m, times_s[1] - times_s[0], walked)
     half_s = max(SMOOTH_S, float(np.median(np.diff(track.times_s))))
     smooth_m = rounded(even_m, int(np.ceil(half_s / (times_s[1] - times_s[0]))))
-    before_middle_m = user.ahead_m + (0.0 if user.both is None else user.both.ahead_m)
+    before_middle_m = user.ahead_m + (DRAWS[user.kind].ahead_m if user.kind in DRAWS else 0.0)
     behind_m = 0.0 if track.on_foot else max(user.length_m / 2 - before_middle_m, 0.0)
     return _behind(smooth_m, behind_m, np.deg2rad(track.yaw_deg[0]))
 
@@ -156,8 +154,9 @@ def _poses(users: Sequence[RoadUser], ways_m: Sequence[Numbers]) -> list[Numbers
 
 def _rears(users: Sequence[RoadUser], poses: Sequence[Numbers]) -> dict[int, Numbers]:
     """(K, 3) poses of what some draw along, by their numbers, along those of fronts."""
-    both = {number: user.both for number, user in enumerate(users) if user.both is not None}
-    return rears_of(both, [poses[number] for number in both])
+    fronts = [number for number, user in enumerate(users) if user.kind in DRAWS]
+    rears = rears_of([users[number].kind for number in fronts], [poses[number] for number in fronts])
+    return dict(zip(fronts, rears, strict=True))
 
 
 def _keep_off(
@@ -173,8 +172,8 @@ def _keep_off(
         if not user.track.on_foot:
             astray_m = _lengths(2 * own[:, :2] - way_m - _behind(way_m, user.drawn_m, own[0, 2]))
             look[number, False] = np.flatnonzero(astray_m > ASTRAY_M)[::LOOKS_EVERY]
-        if user.both is not None:
-            astray_m = user.both.rod_m / 2 * np.abs(rears[number][:, 2] - own[:, 2])
+        if number in rears:
+            astray_m = DRAWS[user.kind].rod_m / 2 * np.abs(rears[number][:, 2] - own[:, 2])
             look[number, True] = np.flatnonzero(astray_m > ASTRAY_M)[::LOOKS_EVERY]
     for swing in range(SWINGS + 1):
         counts = [len(at) for at in look.values()]
