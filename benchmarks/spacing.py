@@ -36,16 +36,15 @@ def main():
     ]
     table(("length", "s", "s for each look, 10 s apart"), rows)
     sums, city_s, step_s = simulated()
-    print(
-        f"\nThe first step of a city of a minute takes {city_s:.2f} s, each other one {step_s:.3f} s. Detections and radii"
-    )
-    print("in front of the vehicle; time is what a run takes for the same error, that of looks every 10 s being 1:\n")
+    print(f"\nThe first step of a city of a minute takes {city_s:.2f} s, each other one {step_s:.3f} s. Detections and")
+    print("radii in front; time is what a run takes for the same error, that of looks every 10 s being 1:\n")
     each = [judged(sums[:, ::every], city_s - step_s, step_s) for every in (1, 2, 3, 4)]
     table(
         ("looks every", "cities of 64 steps", "design effect, mean", "largest", "time", "cities cover, mean", "least",
          "instants cover, mean", "least"),
-        [(f"{EVERY_S * every:g} s", one[0], *(f"{number:.2f}" for number in one[1:3]), f"{one[3] / each[1][3]:.2f}",
-          *("none" if np.isnan(number) else f"{number:.3f}" for number in one[4:])) for every, one in enumerate(each, 1)],
+        [(f"{EVERY_S * every:g} s", one[0], *(f"{number:.2f}" for number in (*one[1:3], one[3] / each[1][3])),
+          *("none" if np.isnan(number) else f"{number:.3f}" for number in one[4:]))
+         for every, one in enumerate(each, 1)],
     )  # fmt: skip
 
 
