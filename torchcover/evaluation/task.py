@@ -30,6 +30,7 @@ from torchcover.simulation.reference_sensor import DEFAULT_BAND_FRAME
 from torchcover.simulation.simulated_frames import DEFAULT_REFERENCE
 
 AnyRig = Rig | str | Path
+AnyScenario = Scenario | str | Path
 SourceT = TypeVar("SourceT", bound=FrameSource, covariant=True)
 
 # Steps that follow each other are alike (docs/measured/error_bars.md), and every minute is another city.

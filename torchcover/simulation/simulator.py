@@ -193,7 +193,7 @@ class Simulator:
         """
         stage, instant = self._placed(index)
         reference = self.reference_sensor.scan(self._surroundings(stage.scene, instant, index))
-        within = None if self.within_m is None else Balls(reference.points, self.within_m)
+        within = None if self.within_m is None else Balls.around(reference.points, self.within_m)
         scans = self._scans(stage, instant, index, within)
         of_all_rigs = [scan for of_rig in scans.values() for scan in of_rig]
         return Observation(
@@ -216,10 +216,13 @@ class Simulator:
 
         Raises:
             ValueError: A sensor that is where none can be at the first step, an actor that overlaps the ego at any.
+            ImportError: What makes the traffic is not installed.
 
         Warns:
             UserWarning: Those that move do not stand on the ground.
         """
+        if self.scenario.traffic is not None:
+            self.scenario.traffic.check()
         if self.scenario.repeats:
             stage, _ = self._stage(0)
             world_steps = stage.scene.world.steps
