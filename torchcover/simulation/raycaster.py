@@ -89,10 +89,12 @@ class Faces:
         if ((place_m < self._least_m) | (place_m > self._most_m)).any():
             return np.empty(0, dtype=np.int64)
         x, y, z = place_m
-        # One axis after the other: the first, which asks all faces, leaves few to the second.
-        near = np.flatnonzero((self._lower_m[2] <= z) & (z <= self._upper_m[2]))
-        for axis, coordinate_m in ((0, x), (1, y)):
+        # One axis after the other: the first, which asks all faces, leaves few to the second. Most are near the ground.
+        near = np.flatnonzero((self._lower_m[0] <= x) & (x <= self._upper_m[0]))
+        for axis, coordinate_m in ((1, y), (2, z)):
             near = near[(self._lower_m[axis, near] <= coordinate_m) & (coordinate_m <= self._upper_m[axis, near])]
+        if len(near) == 0:
+            return near
         held: NDArray[np.int64] = near[self.from_plane_m(place_m, near) <= 2 * self.contact_m[near]]
         return held
 
