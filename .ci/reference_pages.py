@@ -34,6 +34,7 @@ DOCUMENTS = (
     "torchcover.recordings",
     "torchcover.targets",
     "torchcover.encounters",
+    "torchcover.evaluation",
     "torchcover.coverage",
     "torchcover.placement",
 )

@@ -77,7 +77,37 @@ def test_marks_are_beyond_chance_in_the_mixture(mixed, yards):
     assert not any(row["detection_0.4m_best"] for row in few.summary)
     # Eight blocks in all are not eight in each.
     assert all(row["detection_0.4m_low"] is None for row in few.summary)
-    assert "Not enough steps" in repr(few)
+    assert "Not enough steps for errors in near: 4 blocks" in " ".join(repr(few).split())
+
+
+def test_redundancy_is_mixed_by_the_book(yards):
+    rig = RIGS[0].model_copy(
+        update={"sensors": tuple(of.sensors[0].model_copy(update={"name": of.name}) for of in RIGS)}
+    )
+    given = {str(yards / "near.yaml"): 3, str(yards / "far.yaml"): 1}
+    mixed = evaluate(rig, given, redundancy=True, **SMALL)
+    (row,), parts = mixed.summary, [(mixed.weights[name], world.summary[0]) for name, world in mixed.worlds.items()]
+    assert row["indispensable_sensor"] == "high"
+    for key in ("sensors_0.4m", "detection_0.4m_without_high", "detection_0.4m_without_high_change"):
+        assert row[key] == pytest.approx(sum(weight * part[key] for weight, part in parts))
+        error = math.sqrt(sum((weight * part[f"{key}_error"]) ** 2 for weight, part in parts))
+        assert row[f"{key}_error"] == pytest.approx(error)
+
+
+def test_what_kinds_of_world_agree_in_is_said_once_and_else_of_each(mixed, yards, tmp_path):
+    foggy = yards / "foggy.yaml"
+    foggy.write_text(YARD.format(name="foggy", wall_m=8, height_m=1.5) + "weather: {name: fog, visibility_m: 30}\n")
+    other = evaluate(RIGS[0], [yards / "near.yaml", foggy], **{**SMALL, "steps": 2})
+    assert other.source["weather"] == {"high": "near clear, foggy fog"}
+    assert {"foggy: Weather: fog.", "Vehicle: box.", "Sensor model: ideal, every hit is a point."} < set(
+        other.table.notes
+    )
+    (page,) = (
+        file for file in mixed.save(tmp_path, files="page") if file.parent == tmp_path and file.suffix == ".html"
+    )
+    text = page.read_text()
+    assert all(said in text for said in ("mixture: Mean blind spot radius", "far: Mean blind", "near 0.75, far 0.25"))
+    assert len(text) < 100_000
 
 
 def test_all_weight_on_one_is_that_one(yards):
@@ -103,6 +133,7 @@ def test_files_hold_every_world_and_the_mixture(mixed, tmp_path):
     assert all(file.is_file() for file in files)
     record = json.loads((tmp_path / "summary.json").read_text())
     assert record["rows"] == mixed.summary
+    assert record["sensor_model"] == {"high": "ideal", "low": "ideal"}
     assert {name: world["weight"] for name, world in record["worlds"].items()} == mixed.weights
     for name, world in mixed.worlds.items():
         assert json.loads((tmp_path / name / "summary.json").read_text())["rows"] == world.summary
@@ -110,6 +141,7 @@ def test_files_hold_every_world_and_the_mixture(mixed, tmp_path):
         rows = list(csv.DictReader(file))
     assert [row["world"] for row in rows] == ["near"] * 2 + ["far"] * 2 + ["mixture"] * 2
     assert [float(row["radius_m"]) for row in rows[4:]] == [row["radius_m"] for row in mixed.summary]
+    assert {(row["vehicle"], row["sensor_model"]) for row in rows} == {("box", "ideal")}
     assert [stem.split("/")[0] for stem, _ in mixed.maps()][:: len(list(mixed.maps())) - 1] == ["near", "far"]
     with pytest.raises(ValueError, match=r"worlds\[name\]"):
         _ = mixed.coverage
@@ -128,7 +160,8 @@ def test_each_world_has_a_checkpoint_of_its_own(mixed, yards, tmp_path):
     ("scenario", "says"),
     [
         ("urban,highway,urban", "given twice"),
-        (["urban", "Urban"], "called alike"),
+        (["near.yaml", "Near.yaml"], "called alike"),
+        ("urbn=0.5,highway", "'urbn' is neither a .yaml file nor .* is 'urban' meant"),
         ("urban=-1,highway=2", "0 or more are needed, not all 0; got urban=-1, highway=2"),
         ("urban=0,highway=0", "not all 0"),
         ("urban=nan,highway=1", "not all 0"),
@@ -162,6 +195,14 @@ def test_who_cannot_be_mixed_is_refused_before_anything_is_measured(yards, monke
         evaluate(RIGS[0], [near, "courtyard"], frames="recording", **SMALL)
     with pytest.raises(ValueError, match="one at a time here; got near, courtyard"):
         _ = Settings(RIGS[0], [near, "courtyard"]).one_scenario
+
+
+def test_who_needs_what_is_not_installed_is_refused_before_anything_is_measured(yards, monkeypatch):
+    monkeypatch.setattr("torchcover.evaluation.mixed.measured", None)
+    monkeypatch.setattr("torchcover.simulation.sumo.simulating.find_spec", lambda _: None)
+    monkeypatch.setattr("torchcover.simulation.sumo.simulating.which", lambda _: None)
+    with pytest.raises(ImportError, match=r"torchcover\[sumo\]"):
+        evaluate(RIGS[0], [str(yards / "near.yaml"), "sumo_random"], **SMALL)
 
 
 def test_a_file_whose_name_has_a_comma_is_one_scenario(yards, monkeypatch):

@@ -13,7 +13,7 @@ from torchcover.encounters.staging import _along
 from torchcover.simulation import Rig, Scenario
 from torchcover.simulation.moving import Solid
 from torchcover.simulation.shapes import Box
-from torchcover.simulation.sumo.motion import tractrix
+from torchcover.simulation.traffic.articulated import tractrix
 
 from .case import Case, most
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from torchcover.cli import options
-from torchcover.cli.options import of_evaluate, with_options
+from torchcover.cli.options import of_criterion, of_evaluate, with_options
 from torchcover.evaluation.settings import OPTIONS
 
 UNITS_S = {"s": 1.0, "min": 60.0, "h": 3600.0}
@@ -191,17 +191,14 @@ def targets(
     threshold_m: Annotated[
         float, typer.Option("--threshold-m", help="Detection threshold in metres, for the share of its surface.")
     ] = 0.4,
-    require: Annotated[
-        Path | None, typer.Option(help="YAML file of requirements: exit code 1 if one is not met.")
-    ] = None,
     out: options.Out = Path("out/targets"),
     files: options.Files = options.ALL_FILES,
     **settings: Any,  # noqa: ANN401
 ) -> None:
-    """Put a body at every place around the vehicle: how much of it is seen, where not, and whether that is enough."""
+    """Put a body at every place around the vehicle: how much of it is seen, and where not."""
     from torchcover.cli.target_run import run
 
-    code = run(
+    run(
         rig,
         target,
         scenario,
@@ -210,28 +207,55 @@ def targets(
         hits=hits,
         threshold_m=threshold_m,
         heading=heading,
-        require=require,
         out=out,
         files=files,
         **settings,
     )
-    raise typer.Exit(code)
 
 
-@with_options(of_evaluate("vehicle", "sensor_model", "seed"))
-def encounter(
+@with_options(of_evaluate("vehicle", "sensor_model", "steps", "seed", "workers"))
+def check(
     rigs: Annotated[list[str], typer.Argument(help="Rigs: built-in names (see `list`) or YAML files.")],
+    requirements: Annotated[str, typer.Option(help="What they must see: a built-in set or a YAML file.")],
+    scenario: Annotated[
+        str | None,
+        typer.Option(help="World of requirements that name none (regions: courtyard; bodies: flat ground, no more)."),
+    ] = None,
+    out: options.Out = Path("out/check"),
+    **settings: Any,  # noqa: ANN401
+) -> None:
+    """Is it enough? Exit code 0: all is checked and kept; 1: something is not kept; 3: something is not checked."""
+    from rich.console import Console
+
+    from torchcover.cli.printing import in_words, print_files, print_whole
+    from torchcover.evaluation import check
+    from torchcover.files import claimed
+
+    with claimed(out):
+        found = check(rigs, requirements, scenario, progress=True, **settings)
+        written = found.save(out)
+    print_whole([in_words(table) for table in found.tables()])
+    print_files(written, out, Console())
+    raise typer.Exit(found.exit_code)
+
+
+@with_options([*of_criterion(), *of_evaluate("vehicle", "sensor_model", "seed")])
+def encounter(
+    rigs: Annotated[
+        list[str] | None,
+        typer.Argument(help="Rigs: built-in names (see `list`) or YAML files; with --frames those of the recording."),
+    ] = None,
     encounters: Annotated[
         str, typer.Option("--set", help="Set of encounters: a built-in name or a YAML file.")
     ] = "crossing_like",
-    phases: Annotated[int, typer.Option(min=1, help="At how many places of their period the looks begin.")] = 10,
-    points: Annotated[int, typer.Option(min=1, help="Points that are enough, of LiDARs with the same rate.")] = 5,
-    pixels: Annotated[int, typer.Option(min=1, help="Pixels of the full image that are enough, of a camera.")] = 200,
-    looks: Annotated[int, typer.Option(min=1, help="In so many looks in a row.")] = 3,
-    deceleration: Annotated[float, typer.Option(help="Of the brakes, in m/s2.")] = 9.0,
-    latency_s: Annotated[
-        float, typer.Option("--latency-s", help="Seconds from the last of these looks to the brakes.")
-    ] = 0.5,
+    scenario: Annotated[
+        str | None, typer.Option(help="Instead: whom the vehicle meets in the traffic of this scenario, as `urban`.")
+    ] = None,
+    frames: Annotated[
+        Path | None, typer.Option(help="Instead: whom it met in a recording with poses and labelled objects.")
+    ] = None,
+    phases: Annotated[int, typer.Option(min=1, help="Of a set: at how many places of their period looks begin.")] = 10,
+    worlds: Annotated[int, typer.Option(min=1, help="Of a scenario: how many of its worlds are driven through.")] = 16,
     out: options.Out = Path("out/encounters"),
     files: options.Files = options.ALL_FILES,
     **settings: Any,  # noqa: ANN401
@@ -241,12 +265,19 @@ def encounter(
 
     from torchcover.cli.printing import in_words, print_files, print_whole
     from torchcover.encounters import Criterion
-    from torchcover.evaluation import encounter, save_encounters
+    from torchcover.evaluation import encounter, met_in_recording, met_in_traffic, save_encounters
     from torchcover.files import claimed
 
-    criterion = Criterion(points, pixels, looks, deceleration, latency_s)
+    criterion = Criterion(**{name: settings.pop(name) for name in Criterion.__annotations__})
+    if frames is not None and (rigs or scenario is not None):
+        raise ValueError("--frames: a recording has its own rigs and traffic; leave out rigs and --scenario")
     with claimed(out):
-        found = encounter(rigs, encounters, criterion, phases=phases, progress=True, **settings)
+        if frames is not None:
+            found = met_in_recording(frames, criterion)
+        elif scenario is not None:
+            found = met_in_traffic(rigs or (), scenario, criterion, worlds=worlds, progress=True, **settings)
+        else:
+            found = encounter(rigs or (), encounters, criterion, phases=phases, progress=True, **settings)
         written = save_encounters(found, out, files=files)
     print_whole([in_words(table) for table in found.tables()])
     print_files(written, out, Console())
@@ -355,7 +386,7 @@ def list_builtin(
         str | None, typer.Argument(help="Only those with this word, with all that is said of them.")
     ] = None,
 ) -> None:
-    """List the built-in rigs, scenarios, LiDAR models, vehicles, materials, weather and encounters."""
+    """List the built-in rigs, scenarios, LiDAR models, vehicles, materials, weather, encounters and requirements."""
     from torchcover.cli.listing import run
 
     run(word)

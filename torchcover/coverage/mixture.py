@@ -1,12 +1,12 @@
 """The numbers of one rig over several kinds of world, each with its share."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from torchcover.coverage.measures import Measure
+from torchcover.coverage.measures import Measure, estimate_redundancy
 from torchcover.coverage.regions import Region
 from torchcover.coverage.result import Coverage
-from torchcover.coverage.summary import RegionSummary
+from torchcover.coverage.summary import RegionSummary, region_redundancy
 from torchcover.estimation import Estimate
 
 SAME = ("band_frame", "grid", "thresholds", "max_radius", "measure", "regions")
@@ -18,14 +18,15 @@ class Mixture:
     The kinds are given, not drawn: errors are about what happens by chance within each (`Estimate.mixed`).
 
     Args:
-        parts: What was measured in each kind of world, with its weight: above 0, and they sum to 1.
+        kinds: What was measured in each kind of world, by its name, with its weight: above 0, and they sum to 1.
 
     Raises:
         ValueError: Two that were not asked about the same.
     """
 
-    def __init__(self, parts: Sequence[tuple[float, Coverage]]) -> None:
-        self.parts = tuple(parts)
+    def __init__(self, kinds: Mapping[str, tuple[float, Coverage]]) -> None:
+        self.kinds = tuple(kinds)
+        self.parts = tuple(kinds.values())
         (_, first), *others = self.parts
         for what in SAME:
             if any(getattr(coverage, what) != getattr(first, what) for _, coverage in others):
@@ -47,7 +48,7 @@ class Mixture:
         return {name: sum(part.counts[name] for _, part in self.parts) for name in Coverage.COUNTS}
 
     def summary(self, regions: Sequence[Region]) -> list[RegionSummary]:
-        """As `Coverage.summary`; of cells and square metres, means with the same weights."""
+        """As `Coverage.summary`; of cells and square metres, means with the same weights, redundancy's too."""
         places = [(region, height) for region in regions for height in self.grid.heights]
         rows = zip(*(part.summary(regions) for _, part in self.parts), strict=True)
         return [self._row(place, row) for place, row in zip(places, rows, strict=True)]
@@ -57,11 +58,15 @@ class Mixture:
         known_cells = round(sum(weight * row.known_cells for weight, row in zip(weights, rows, strict=True)))
         estimates = self.estimate(*place), self.estimate_aggregated(*place), self.estimate(*place, "known")
         numbers = [estimate.numbers(count=known_cells, count_of="known cells") for estimate in estimates]
+        redundancy = None
+        if sensors := rows[0].redundancy and tuple(rows[0].redundancy.without):
+            each = [(weight, estimate_redundancy(part, *place)) for weight, part in self.parts]
+            redundancy = region_redundancy(sensors, self.thresholds, Estimate.mixed(each))
         return replace(
             rows[0],
             known_cells=known_cells,
             numbers=numbers[0] | numbers[1],
             known=numbers[2],
             visible_m2=sum(weight * row.visible_m2 for weight, row in zip(weights, rows, strict=True)),
-            redundancy=None,
+            redundancy=redundancy,
         )

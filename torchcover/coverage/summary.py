@@ -1,7 +1,7 @@
 """The numbers of a region, as tables and loggers take them."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from torchcover.coverage.aggregations import MeanOfMeans
 from torchcover.coverage.measures import Measure, area_in_blocks, estimate_redundancy
 from torchcover.coverage.quantity import without
-from torchcover.coverage.redundancy import Redundancy, redundancy_quantities
+from torchcover.coverage.redundancy import redundancy_quantities
 from torchcover.coverage.regions import Region
 from torchcover.estimation import Difference, Estimate, Number
 
@@ -88,9 +88,10 @@ def summarise(coverage: "Coverage", region: Region, height: str) -> RegionSummar
     cells, known_cells = (int(each.sum()) for each in (coverage.cells_of(region), coverage.known_in(region, height)))
     numbers = partial(Estimate.numbers, count=known_cells, count_of="known cells")
     by_area, steps = coverage.measure == "area", coverage.counts["steps"]
-    redundancy = coverage.redundancy
-    if by_area and region not in coverage.regions:
-        redundancy = None  # which is known of the regions only that the metric was told of
+    redundancy = None  # by area it is known of the regions only that the metric was told of
+    if coverage.redundancy is not None and (not by_area or region in coverage.regions):
+        estimate = estimate_redundancy(coverage, region, height)
+        redundancy = region_redundancy(coverage.redundancy.sensors, coverage.thresholds, estimate)
     return RegionSummary(
         region=region.name,
         height=height,
@@ -102,17 +103,16 @@ def summarise(coverage: "Coverage", region: Region, height: str) -> RegionSummar
         visible_m2=float(area_in_blocks(coverage, region, height)[1][:, 0].sum()) / steps
         if by_area and steps
         else math.nan,
-        redundancy=None if redundancy is None else region_redundancy(redundancy, coverage, region, height),
+        redundancy=redundancy,
     )
 
 
-def region_redundancy(redundancy: Redundancy, coverage: "Coverage", region: Region, height: str) -> RegionRedundancy:
-    """The numbers of a region without each sensor; as `summarise`."""
-    thresholds, estimate = coverage.thresholds, estimate_redundancy(coverage, region, height)
+def region_redundancy(sensors: Sequence[str], thresholds: Sequence[float], estimate: Estimate) -> RegionRedundancy:
+    """The numbers of a region without each sensor, from what `estimate_redundancy` gives."""
     single, several = MeanOfMeans(thresholds).quantities, redundancy_quantities((), thresholds)
     numbers, count = estimate.numbers(), len(single)
     each, change = {}, {}
-    for at, sensor in enumerate(redundancy.sensors):
+    for at, sensor in enumerate(sensors):
         start = count + len(several) + at * count
         own = estimate[start : start + count]
         each[sensor] = {quantity.key: numbers[without(sensor, quantity).key] for quantity in single}

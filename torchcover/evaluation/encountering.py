@@ -1,23 +1,26 @@
 """In time or too late: names and defaults in, what rigs had of encounters and its files out."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from torchcover import __version__
 from torchcover.encounters import Criterion, EncounterSet, Sightings, sight_encounter
 from torchcover.encounters.sighting import MountedRig
+from torchcover.encounters.traffic import Drive, Eyes, approaches, sight_approach
 from torchcover.evaluation.progress import Progress, held_back
 from torchcover.evaluation.result_page import words_of
 from torchcover.evaluation.settings import FILES, wanted_files
 from torchcover.evaluation.target_survey import free_space
 from torchcover.evaluation.task import AnyRig, as_called
 from torchcover.files import Publication
-from torchcover.report import Page, PagePicture, draw_encounters, json_record, page_html
-from torchcover.simulation import Rig, with_ego
+from torchcover.recordings import Recording, open_recording
+from torchcover.report import Page, PagePicture, draw_encounters, page_html
+from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, with_ego
 
 
 def encounter(
@@ -58,10 +61,7 @@ def encounter(
     if seed < 0:
         raise ValueError(f"seed: a number >= 0 is needed; got {seed}")
     criterion = Criterion() if criterion is None else criterion
-    called = [as_called(rig) for rig in ([rigs] if isinstance(rigs, str | Path | Rig) else rigs)]
-    sensing = {rig.name: rig.sensing(sensor_model) for rig in called}
-    if len(sensing) < len(called):
-        raise ValueError(f"rigs need different names; got {', '.join(rig.name for rig in called)}")
+    sensing = _sensing(rigs, sensor_model)
     these = encounters if isinstance(encounters, EncounterSet) else EncounterSet.load(encounters)
     sightings = []
     with Progress(len(sensing) * len(these.encounters), "encounters", shown=progress) as bar:
@@ -70,8 +70,90 @@ def encounter(
             for one in these.encounters:
                 sightings.append(sight_encounter(mounted, one, criterion, phases=phases, seed=seed))
                 bar.advance(len(sensing) * len(these.encounters))
-    sensors = {name: tuple(sensor.name for sensor in rig.sensors) for name, rig in sensing.items()}
-    return Sightings(these.name, criterion, phases, seed, sensors, sightings)
+    return Sightings(these.name, criterion, phases, seed, _sensors(sensing), sightings)
+
+
+def _sensing(rigs: AnyRig | Sequence[AnyRig], sensor_model: Literal["ideal", "real"] | None) -> dict[str, Rig]:
+    called = [as_called(rig) for rig in ([rigs] if isinstance(rigs, str | Path | Rig) else rigs)]
+    sensing = {rig.name: rig.sensing(sensor_model) for rig in called}
+    if not called or len(sensing) < len(called):
+        raise ValueError(f"rigs with different names are needed; got {', '.join(rig.name for rig in called) or 'none'}")
+    return sensing
+
+
+def _sensors(rigs: Mapping[str, Rig]) -> dict[str, tuple[str, ...]]:
+    return {name: tuple(sensor.name for sensor in rig.sensors) for name, rig in rigs.items()}
+
+
+def met_in_traffic(
+    rigs: AnyRig | Sequence[AnyRig],
+    scenario: Scenario | str | Path = "urban",
+    criterion: Criterion | None = None,
+    *,
+    worlds: int = 16,
+    vehicle: str | Path | None = None,
+    sensor_model: Literal["ideal", "real"] | None = None,
+    seed: int = 0,
+    progress: bool = False,
+) -> Sightings:
+    """When rigs detected those who came near in the traffic of worlds; as `encounter`, but for these.
+
+    Args:
+        rigs: A rig or several.
+        scenario: Their world: a scenario, a built-in name or a YAML file.
+        criterion: Who is met, what is detected, and what is in time.
+        worlds: How many of its worlds, each driven through once; 1 if it is always the same.
+        vehicle: What carries the rigs.
+        sensor_model: What sensors make of their hits.
+        seed: Of the traffic, of noise and drop-out.
+        progress: Whether to show a bar.
+
+    Raises:
+        FileNotFoundError: An unknown name or file.
+        ValueError: A file that cannot be used, a number out of its bounds, a scenario in which nothing ever moves.
+    """
+    if worlds < 1:
+        raise ValueError(f"worlds: a number >= 1 is needed; got {worlds}")
+    criterion, sensing = Criterion() if criterion is None else criterion, _sensing(rigs, sensor_model)
+    world = with_ego(scenario if isinstance(scenario, Scenario) else Scenario.load(scenario), sensing, vehicle)
+    if world.instants == 1:
+        raise ValueError(f"scenario {world.name!r}: nothing ever moves in it, so nobody is met")
+    worlds = 1 if world.repeats else worlds
+    nobody = Simulator(world, {}, PaperReference(rows=2, columns=2), seed=seed)
+    alone = {name: nobody.with_rigs({name: rig}) for name, rig in sensing.items()}
+    sightings, hours = [], {}
+    with Progress(worlds, "worlds", shown=progress) as bar:
+        for number in range(worlds):
+            first = number * world.steps
+            drive = Drive.of_world(f"{world.name} {number}", nobody.scene_of(first)[0].world)
+            hours[drive.name] = world.steps * world.step_s / 3600
+            met = list(approaches(drive, criterion))
+            for name, simulator in alone.items():
+                eyes = Eyes.of_world(simulator, first, criterion)
+                sightings += [sight_approach(name, drive, one, eyes, criterion) for one in met]
+            bar.advance(worlds)
+    return Sightings(world.name, criterion, 1, seed, _sensors(sensing), sightings, hours)
+
+
+def met_in_recording(recording: Recording | str | Path, criterion: Criterion | None = None) -> Sightings:
+    """When the rigs of a recording with poses and labelled objects first had enough points on those who came near.
+
+    Args:
+        recording: It, or its path.
+        criterion: Who is met, what is detected, and what is in time.
+
+    Raises:
+        FileNotFoundError: There is no such recording, or a part of it is missing.
+        ValueError: It has no poses, times or labelled objects, or does not say how large its vehicle is.
+    """
+    criterion = Criterion() if criterion is None else criterion
+    opened = open_recording(recording) if isinstance(recording, str | Path) else recording
+    drive, sightings = Drive.of_recording(opened), []
+    for name, sensors in opened.rigs.items():
+        eyes = Eyes.of_recording(opened, sensors, criterion)
+        sightings += [sight_approach(name, drive, one, eyes, criterion) for one in approaches(drive, criterion)]
+    hours = {drive.name: float(np.ptp(drive.times_s)) / 3600}
+    return Sightings(drive.name, criterion, 1, 0, {n: tuple(of) for n, of in opened.rigs.items()}, sightings, hours)
 
 
 def encounter_picture(found: Sightings) -> Figure:
@@ -91,14 +173,7 @@ def save_encounters(found: Sightings, folder: str | Path, *, files: str | Iterab
         The files.
     """
     wanted = wanted_files(files)
-    up_to = [
-        {"encounter": name, "rig": rig, "in_time_up_to_kmh": kmh} for (name, rig), kmh in found.up_to_kmh().items()
-    ]
-    record = {
-        **found.settings(),
-        "rows": [json_record(row._asdict()) for row in found.rows],
-        "speeds": list(map(json_record, up_to)),
-    }
+    record = found.record()
     with Publication(Path(folder)) as written:
         with held_back():
             if "numbers" in wanted:
@@ -106,20 +181,23 @@ def save_encounters(found: Sightings, folder: str | Path, *, files: str | Iterab
             written.publish(record)
         if "page" in wanted:
             written.add_text("report.html", page_html(_page(found)))
-        if "maps" in wanted:
+        if "maps" in wanted and not found.hours:
             written.add_figure("encounters.png", encounter_picture(found))
         written.publish(record)
     return written.paths
 
 
 def _page(found: Sightings) -> Page:
-    png = BytesIO()
-    encounter_picture(found).savefig(png, format="png")
+    pictures = []
+    if not found.hours:
+        png = BytesIO()
+        encounter_picture(found).savefig(png, format="png")
+        pictures = [PagePicture("Time to collision at detection against the speed", png.getvalue())]
     return Page(
         title=f"In time? {', '.join(found.sensors)}",
         lead=f"The encounters of {found.name}, measured by torchcover. In time is geometry: what was seen when, with "
         "the brakes and the latency that were assumed.",
         tables=found.tables(),
-        pictures=[PagePicture("Time to collision at detection against the speed", png.getvalue())],
+        pictures=pictures,
         facts={"Settings": words_of(found.settings()), "Run": {"torchcover": __version__}},
     )

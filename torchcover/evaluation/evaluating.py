@@ -1,7 +1,8 @@
 """Evaluate rigs, or compare results: what a notebook calls, and the command line too."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from torchcover.coverage import Coverage
 from torchcover.evaluation.arguments import taking
@@ -79,28 +80,34 @@ def _compared(each: Sequence[Result | str | Path]) -> Result:
     names = distinct([name for name, *_ in measured_already])
     if len(names) < 2:
         raise ValueError(f"a comparison needs at least two measured rigs; got {', '.join(names) or 'none'} only")
-    coverages = {name: coverage for name, (_, coverage, _) in zip(names, measured_already, strict=True)}
-    given_as = [given for *_, given in measured_already]
+    coverages = {name: coverage for name, (_, coverage, *_) in zip(names, measured_already, strict=True)}
+    given_as, sources = [given for _, _, given, _ in measured_already], [source for *_, source in measured_already]
+    source = {key: sources[0].get(key) for key in ("scenario", "vehicle", "frames", "seed")}
+    source = {key: told if all(one.get(key) == told for one in sources) else None for key, told in source.items()}
+    for key in ("sensor_model", "weather"):
+        each = zip(names, measured_already, strict=True)
+        of_rigs = {name: (source.get(key) or {}).get(rig) for name, (rig, *_, source) in each}
+        source[key] = of_rigs if all(of_rigs.values()) else None
     return Result(
         coverages=coverages,
         regions=next(iter(coverages.values())).regions,
         run=None,
         rigs={name: str(given) for name, given in zip(names, given_as, strict=True)},
-        source={"scenario": None, "vehicle": None, "sensor_model": None, "weather": None, "frames": None, "seed": None},
+        source=source,
         reference_record=None,
         device=None,
         inputs=[given for given in given_as if isinstance(given, Path)],
     )
 
 
-def _coverages(given: Result | str | Path) -> list[tuple[str, Coverage, str | Path]]:
-    """Name, coverage and what it was called, of each rig."""
+def _coverages(given: Result | str | Path) -> list[tuple[str, Coverage, str | Path, Mapping[str, Any]]]:
+    """Name, coverage, what it was called, and where its frames came from, of each rig."""
     if isinstance(given, Result):
-        return [(name, coverage, given.rigs[name] or name) for name, coverage in given.coverages.items()]
+        return [(name, of, given.rigs[name] or name, given.source) for name, of in given.coverages.items()]
     if not isinstance(given, str | Path):
         raise TypeError(f"compare: results of `evaluate` or coverage files are needed; got {type(given).__name__}")
     file = Path(given)
     if file.suffix != SAVED:
         raise ValueError(f"{given}: not measured; compare takes results and .npz files, and `evaluate` several rigs")
     name = file.absolute().parent.name if file.stem == USUAL_STEM else file.stem
-    return [(name, Coverage.load(file), file)]
+    return [(name, Coverage.load(file), file, {})]

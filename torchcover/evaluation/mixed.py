@@ -13,10 +13,11 @@ from torchcover.coverage import Coverage, Mixture
 from torchcover.evaluation.checkpoint import Checkpoint
 from torchcover.evaluation.measuring import measured
 from torchcover.evaluation.result import Result
+from torchcover.evaluation.result_page import page_tables
 from torchcover.evaluation.settings import FILES, Settings, wanted_files
 from torchcover.evaluation.task import task_of
 from torchcover.files import Publication, csv_text
-from torchcover.report import RENDERERS, CoverageTable, file_stems, table_dict
+from torchcover.report import RENDERERS, CoverageTable, PageTable, file_stems, in_common_first, page_html
 from torchcover.report.renderers.records import records_of
 
 MIXTURE = "mixture"
@@ -26,7 +27,7 @@ MIXTURE = "mixture"
 class MixedResult(Result):
     """What `evaluate` and `compare` return of several scenarios: the numbers of their mixture.
 
-    Coverages, maps and pages are of one kind of world each: those of `worlds`.
+    Coverages, maps, and metrics of others are of one kind of world each: those of `worlds`.
 
     Args:
         worlds: By the name of the scenario, what was measured there: the same rigs in all of them.
@@ -44,15 +45,17 @@ class MixedResult(Result):
             ValueError: They were not asked about the same.
         """
         first = next(iter(worlds.values()))
-        source = {**dict.fromkeys(first.source), "scenario": dict(weights)}
+        told = {key: _agreed({name: world.source.get(key) for name, world in worlds.items()}) for key in first.source}
         mixed = cls(
             coverages={},
             regions=first.regions,
             run=None,
             rigs=first.rigs,
-            source=source,
+            source={**told, "scenario": dict(weights)},
             reference_record=None,
             device=first.device,
+            sensors=first.sensors,
+            ego_outline_m=first.ego_outline_m if told["vehicle"] == first.source["vehicle"] else None,
             worlds=worlds,
             weights=weights,
         )
@@ -71,9 +74,9 @@ class MixedResult(Result):
     @cached_property
     def mixtures(self) -> Mapping[str, Mixture]:
         """Name of each rig -> its numbers, for any region, with what they become without one block after the other."""
-        counted = [(weight, self.worlds[name]) for name, weight in self.weights.items() if weight > 0.0]
-        rigs = counted[0][1].coverages
-        return {rig: Mixture([(weight, world.coverages[rig]) for weight, world in counted]) for rig in rigs}
+        counted = [(name, weight, self.worlds[name]) for name, weight in self.weights.items() if weight > 0.0]
+        rigs = counted[0][2].coverages
+        return {rig: Mixture({name: (weight, of.coverages[rig]) for name, weight, of in counted}) for rig in rigs}
 
     @cached_property
     def table(self) -> CoverageTable:
@@ -81,16 +84,28 @@ class MixedResult(Result):
         shares = ", ".join(f"{name} {weight:.3g}" for name, weight in self.weights.items())
         note = (
             f"Weighted means over kinds of world: {shares}. These are given, not drawn: intervals are about chance "
-            "within each of them, and say nothing of other kinds or other weights."
+            "within each of them, and say nothing of other kinds or other weights. What is unknown in one of them is "
+            "unknown; maps are of one of them each."
         )
-        return CoverageTable.of(self.mixtures, self.regions, [note])
+        of_kinds = in_common_first({name: world.notes for name, world in self.worlds.items()})
+        return CoverageTable.of(self.mixtures, self.regions, [note, *of_kinds], self.source)
 
     @property
     def record(self) -> dict[str, Any]:
         """What stands in `summary.json`: the numbers of the mixture, and under `worlds` the record of each."""
-        complete = all(world.run is None or world.run.complete for world in self.worlds.values())
         worlds = {name: {"weight": self.weights[name], **world.record} for name, world in self.worlds.items()}
-        return {"complete": complete, "worlds": worlds, "measure": self.table.measure, **table_dict(self.table)}
+        runs = [world.run for world in self.worlds.values() if world.run]
+        seconds = round(sum(run.seconds for run in runs), 3) if runs else None
+        skipped = [line for run in runs for line in run.skipped]
+        complete = all(run.complete for run in runs)
+        run = {"seconds": seconds, "complete": complete, "skipped_frames": skipped}
+        return {**super().record, **run, "worlds": worlds}
+
+    @property
+    def tables(self) -> list[PageTable]:
+        """Those of the mixture, then those of each kind of world."""
+        each = {MIXTURE: page_tables(self.table), **{name: world.tables for name, world in self.worlds.items()}}
+        return [replace(one, title=f"{name}: {one.title}".rstrip(": ")) for name, of in each.items() for one in of]
 
     def maps(self, *, errors: bool = False) -> Iterator[tuple[str, Figure]]:
         """Those of each kind of world; its name is the first part of the stems."""
@@ -101,8 +116,8 @@ class MixedResult(Result):
         """Write the files of each kind of world to a folder of its own, as `Result.save`, and those of the mixture.
 
         Args:
-            folder: Where to write: `NAME/...`; `summary.csv`, with the rows of all worlds and of the mixture, and
-                `summary.json`.
+            folder: Where to write: `NAME/...`; `summary.csv`, with the rows of all worlds and of the mixture,
+                `report.html` and `summary.json`.
             files: As in `Result.save`.
             error_maps: Likewise.
 
@@ -115,6 +130,8 @@ class MixedResult(Result):
         with Publication(Path(folder)) as written:
             if "numbers" in wanted_files(files):
                 written.add_text("summary.csv", self._csv())
+            if "page" in wanted_files(files):
+                written.add_text("report.html", page_html(self.page))
             written.publish(record)
         return [*chain.from_iterable(parts), *written.paths]
 
@@ -127,6 +144,16 @@ class MixedResult(Result):
     def __repr__(self) -> str:
         tables = {**{name: world.table for name, world in self.worlds.items()}, MIXTURE: self.table}
         return "\n".join(f"{name}\n{RENDERERS['text'](table)}" for name, table in tables.items())
+
+
+def _agreed(each: Mapping[str, Any]) -> object:
+    """What all kinds of world say; else what each of them says."""
+    said = list(each.values())
+    if all(one == said[0] for one in said):
+        return said[0]
+    if isinstance(said[0], Mapping):  # of the rigs
+        return {rig: _agreed({name: of.get(rig) for name, of in each.items()}) for rig in said[0]}
+    return ", ".join(f"{name} {one}" for name, one in each.items())
 
 
 def measured_in_each(settings: Settings) -> MixedResult:

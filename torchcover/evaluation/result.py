@@ -22,6 +22,7 @@ from torchcover.evaluation.result_page import (
     region_line,
     rig_document,
     sensor_views,
+    words_of,
 )
 from torchcover.evaluation.settings import FILES, wanted_files
 from torchcover.evaluation.target_error import TargetError, outcome
@@ -33,6 +34,7 @@ from torchcover.report import (
     CoverageTable,
     Page,
     PageRig,
+    PageTable,
     file_stems,
     map_figures,
     maps_of,
@@ -105,12 +107,17 @@ class Result:
     @property
     def is_comparison(self) -> bool:
         """Whether it is about several rigs."""
-        return len(self.coverages) > 1
+        return len(self.rigs) > 1
 
     @cached_property
     def table(self) -> CoverageTable:
         """The numbers, with errors, differences and marks; `RENDERERS` write it down."""
-        return CoverageTable.of(self.coverages, self.regions, self._notes)
+        return CoverageTable.of(self.coverages, self.regions, self.notes, self.source)
+
+    @property
+    def tables(self) -> list[PageTable]:
+        """The tables of the page."""
+        return [*page_tables(self.table), *(metric_tables(self.metrics) if self.metrics else [])]
 
     @property
     def summary(self) -> list[dict[str, Any]]:
@@ -135,7 +142,7 @@ class Result:
             "device": self.device,
             **self._run_record,
             "target_error": self._outcome[0],
-            "measure": self._first.measure,
+            "measure": self.table.measure,
             **table_dict(self.table),
             **({} if self.metrics is None else {"metrics": record(self.metrics)}),
         }
@@ -143,18 +150,18 @@ class Result:
     @property
     def page(self) -> Page:
         """All that it knows, on one page: tables, maps and rigs, under which settings, and where they come from."""
-        rigs = {name: self.sensors.get(name, ()) for name in self.coverages}
+        rigs = {name: self.sensors.get(name, ()) for name in self.rigs}
         place = self.source.get("frames") or self.source.get("scenario") or "runs that were saved"
-        where = f"{place}, on {self.vehicle}" if self.vehicle else place
+        where = ", on ".join(words_of({"place": place, "vehicle": self.vehicle}).values())
         return Page(
             title=" against ".join(rigs) if len(rigs) == 2 else ", ".join(rigs),
             lead=f"Blind spots and coverage in {where}, measured by torchcover.",
-            tables=[*page_tables(self.table), *(metric_tables(self.metrics) if self.metrics else [])],
-            maps=list(maps_of(self.coverages)),
+            tables=self.tables,
+            maps=list(maps_of(self.coverages)) if self.coverages else [],
             rigs=[PageRig(name, sensor_views(of), rig_document(name, of)) for name, of in rigs.items()],
             ego_outline_m=self.ego_outline_m,
             outlines=[region_line(region) for region in self.regions],
-            facts=facts_of(self.record, self.rigs, self._first.counts["steps"]),
+            facts=facts_of(self.record, self.rigs, self.table.first.counts["steps"]),
             more_tables=[left_out_table(self.left_out)] if self.left_out else [],
         )
 
@@ -249,18 +256,18 @@ class Result:
         return {**record, "rays_per_step": rays} if "every_s" in record else record
 
     @property
-    def _notes(self) -> list[str]:
-        """What ended the run before its time, and the reference sensor in words, for a caption."""
-        record, on_failure = self._reference_used, [self.cut_short] if self.cut_short else []
+    def notes(self) -> list[str]:
+        """What ended the run before its time, what was measured, and the reference sensor in words, for a caption."""
+        record, told = self._reference_used, [self.cut_short] if self.cut_short else []
+        told += [f"Vehicle: {self.vehicle}."] if self.vehicle else []
+        told += sensor_model_words(self.source.get("sensor_model")) + weather_words(self.source.get("weather"))
         if record is None:
-            return on_failure
+            return told
         if "every_s" not in record:
-            return [*on_failure, *record["notes"]]
+            return [*told, *record["notes"]]
         rays, every_s = record["rays_per_step"], record["every_s"]
         sensor = f"Reference sensor: {record['sensor']}, {rays:,} rays a step; a step every {every_s:g} s."
-        carried = [f"Vehicle: {self.vehicle}."] if self.vehicle else []
-        carried += sensor_model_words(self.source.get("sensor_model")) + weather_words(self.source.get("weather"))
-        return [*on_failure, *carried, sensor, *record["notes"], *self._on_refused, *self._on_repetitions]
+        return [*told, sensor, *record["notes"], *self._on_refused, *self._on_repetitions]
 
     @property
     def _on_refused(self) -> list[str]:

@@ -71,6 +71,8 @@ def _mixture(given: object) -> "dict[str, tuple[AnyScenario, float]] | None":
     """
     if isinstance(given, str) and any(sign in given for sign in ",=") and not Path(given).exists():
         parts = [part.strip().partition("=") for part in given.split(",")]
+        for name, *_ in parts:
+            _named(name)
         if len({sign for _, sign, _ in parts}) > 1:
             raise ValueError(f"scenario {given}: every one needs a weight, or none")
         given = {name: weight or 1.0 for name, _, weight in parts} if parts[0][1] else [name for name, *_ in parts]
@@ -93,7 +95,7 @@ def _mixture(given: object) -> "dict[str, tuple[AnyScenario, float]] | None":
 
 
 def _named(scenario: object) -> str:
-    """What a kind of world is called."""
+    """What a kind of world is called; one that there is not is refused."""
     if not isinstance(scenario, str | Path):
         name: object = getattr(scenario, "name", None)
         if not isinstance(name, str):
@@ -103,7 +105,9 @@ def _named(scenario: object) -> str:
         raise ValueError("scenario: one of several has no name")
     if Path(scenario).is_dir():
         raise ValueError(f"scenario {scenario}: a folder; a recording is no scenario: measure it apart, by `frames`")
-    return Path(scenario).stem if Path(scenario).suffix in (".yaml", ".yml") else str(scenario)
+    from torchcover.simulation.documents import found
+
+    return found("scenarios", scenario).stem
 
 
 def _thresholds(given: "float | Iterable[float]") -> tuple[float, ...]:
@@ -333,6 +337,13 @@ class Settings:
             in_study="tried",
         ),
     ] = None
+    no_cache: Annotated[
+        bool,
+        Option(
+            "Build all worlds anew and keep none on disk. Else those that are drawn are read from ~/.cache/torchcover "
+            "where an earlier run has left them, which has room for TORCHCOVER_CACHE_GB gigabytes (1)."
+        ),
+    ] = False
     skip_bad_frames: Annotated[bool, Option("Skip and count frames that cannot be read, instead of stopping.")] = False
     observers: Annotated[
         "Mapping[str, AnyObserver]",

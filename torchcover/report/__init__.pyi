@@ -36,6 +36,7 @@ from .page.content import PageTable as PageTable
 from .page.maps_of import maps_of as maps_of
 from .page.writing import page_html as page_html
 from .remarks import Remark as Remark
+from .remarks import in_common_first as in_common_first
 from .remarks import marks_on as marks_on
 from .remarks import notes_on as notes_on
 from .remarks import remarks_on as remarks_on

@@ -1,7 +1,7 @@
 """What the reader of a table has to know about its numbers: as data, and as sentences."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from torchcover.estimation import MIN_BLOCKS
@@ -66,7 +66,8 @@ def _on_errors(table: CoverageTable, rig: str) -> Iterator[Remark]:
     if blocks is None:
         return
     if blocks < MIN_BLOCKS:
-        few = f"Not enough steps for errors: {blocks} block{'s' * (blocks != 1)}, {MIN_BLOCKS} are needed."
+        where = f" in {table.conditions[rig].fewest}" * bool(table.conditions[rig].fewest)
+        few = f"Not enough steps for errors{where}: {blocks} block{'s' * (blocks != 1)}, {MIN_BLOCKS} are needed."
         yield Remark("too_few_blocks", blocks, MIN_BLOCKS, few)
         return
     means = [quantity.key for quantity in table.means]  # of a largest radius no error is ever known
@@ -82,12 +83,21 @@ def _on_errors(table: CoverageTable, rig: str) -> Iterator[Remark]:
 
 def notes_on(table: CoverageTable) -> list[str]:
     """What the numbers hold under and what went wrong, a sentence each; what is about one rig only begins with it."""
-    by_rig = {rig: _of_rig(table, rig) for rig in table.rigs}
-    common = [note for note in by_rig[table.rigs[0]] if all(note in notes for notes in by_rig.values())]
-    own = [f"{rig}: {note}" for rig, notes in by_rig.items() for note in notes if note not in common]
+    of_rigs = in_common_first({rig: _of_rig(table, rig) for rig in table.rigs})
     shared = {"known": "they know the same cells", "area": "they are asked about the same square metres"}[table.measure]
     paired = [f"All rigs were measured against the same reference points, so {shared}."]
-    return [*(paired if len(table.rigs) > 1 else []), *common, *own, *table.notes]
+    return [*(paired if len(table.rigs) > 1 else []), *of_rigs, *table.notes]
+
+
+def in_common_first(notes: Mapping[str, Sequence[str]]) -> list[str]:
+    """What is said of all, then what is said of some, which begins with their names.
+
+    Example:
+        >>> in_common_first({"roof": ["8 steps.", "Blind."], "grille": ["8 steps."]})
+        ['8 steps.', 'roof: Blind.']
+    """
+    common = [note for note in next(iter(notes.values())) if all(note in each for each in notes.values())]
+    return [*common, *(f"{name}: {note}" for name, each in notes.items() for note in each if note not in common)]
 
 
 def marks_on(table: CoverageTable) -> dict[str, str]:

@@ -1,7 +1,7 @@
 """The table: regions, bands, quantities and rigs as data. How it is written down is the business of the renderers."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from torchcover.coverage import BevGrid, Coverage, Mixture, Region, RegionSummary, check_paired, differences
@@ -37,12 +37,14 @@ class Conditions(NamedTuple):
         blocks: How many blocks of contiguous steps the errors come from; None without errors.
         steps_per_block: Steps of a full one.
         points: Reference points within the grid.
+        fewest: Of a mixture with too few blocks, the kind of world that has the fewest.
     """
 
     counts: Mapping[str, int]
     blocks: int | None
     steps_per_block: int | None
     points: int
+    fewest: str = ""
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,7 @@ class CoverageTable:
         rows: Name of the rig -> its rows in the order of the regions, then of the bands.
         conditions: Name of the rig -> what its numbers hold under.
         notes: What else they hold under, in words of the caller.
+        source: What carried the rigs, `vehicle`, and what sensors make of their hits, `sensor_model` by rig; if known.
     """
 
     quantities: tuple[Quantity, ...]
@@ -68,6 +71,7 @@ class CoverageTable:
     rows: Mapping[str, tuple[Row, ...]]
     conditions: Mapping[str, Conditions]
     notes: tuple[str, ...]
+    source: Mapping[str, object] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -75,6 +79,7 @@ class CoverageTable:
         coverages: Mapping[str, Coverage | Mixture],
         regions: Sequence[Region],
         notes: Sequence[str] = (),
+        source: Mapping[str, object] | None = None,
     ) -> "CoverageTable":
         """Make the table of one rig, or of several that were measured together.
 
@@ -82,6 +87,7 @@ class CoverageTable:
             coverages: What `CoverageMetric.compute` returned, or mixtures of that, by the name of the rig.
             regions: Regions within the grid.
             notes: What else the numbers hold under.
+            source: Where they come from; see above.
 
         Raises:
             ValueError: No rig; several that are not paired, as in `check_paired`; regions that `Coverage.summary`
@@ -104,6 +110,7 @@ class CoverageTable:
             rows={rig: tuple(row[rig] for row in rows) for rig in coverages},
             conditions={rig: _conditions(coverage) for rig, coverage in coverages.items()},
             notes=tuple(notes),
+            source=source or {},
         )
 
     @property
@@ -158,5 +165,8 @@ def _conditions(coverage: Coverage | Mixture) -> Conditions:
     each = [part.blocks and (part.places or part.blocks) for part in _parts(coverage)]  # by area they are the fine ones
     used = [int((blocks.steps > 0).sum()) for blocks in each if blocks]
     longest = [int(blocks.steps.max()) for blocks in each if blocks]
-    together = sum(used) if min(used, default=0) >= MIN_BLOCKS else min(used, default=None)
-    return Conditions(dict(coverage.counts), together, max(longest, default=None), coverage.counts["inside_points"])
+    found = Conditions(dict(coverage.counts), sum(used), max(longest, default=None), coverage.counts["inside_points"])
+    if min(used, default=0) >= MIN_BLOCKS:
+        return found
+    fewest = coverage.kinds[used.index(min(used))] if used and isinstance(coverage, Mixture) else ""
+    return found._replace(blocks=min(used, default=None), fewest=fewest)

@@ -165,7 +165,7 @@ class BuiltIn(Document):
             BadFileError: Not YAML, or a key is unknown, missing, doubled or has a wrong value; the message names the
                 file and the key.
         """
-        return read_document(cls, _find(cls.folder, path_or_name))
+        return read_document(cls, found(cls.folder, path_or_name))
 
 
 @reads("a YAML document")
@@ -251,7 +251,12 @@ def is_file_name(path_or_name: str | Path) -> bool:
     return Path(path_or_name).suffix in (".yaml", ".yml")
 
 
-def _find(kind: str, path_or_name: str | Path) -> Path:
+def found(kind: str, path_or_name: str | Path) -> Path:
+    """Where a document is: a path that ends in .yaml or .yml, or a built-in one of a kind by its name.
+
+    Raises:
+        FileNotFoundError: No built-in one of this name; the message lists the names.
+    """
     path = Path(path_or_name)
     if is_file_name(path):
         return path

@@ -4,9 +4,9 @@ embreex computes in float32, so a scene is given in coordinates near the vehicle
 directions are equal in number; it writes into the distances it is given, and answers a miss with them; it releases the
 interpreter lock, so that threads add up. An origin may lie on a face, as far as float32 can tell.
 
-Its threads build scenes, and nothing tells it to do without. A forked process, such as a worker of a DataLoader, has none
-of them but the locks that they held, and one in a thousand waits for ever. TBB counts the cores that it may use when
-it is first used: so that is done with one (`_have_no_threads`).
+Its threads build scenes, and nothing tells it to do without. A forked process, such as a worker of a DataLoader, has
+none of them but the locks that they held, and one in a thousand waits for ever. TBB counts the cores that it may use
+when it is first used: so that is done with one (`_have_no_threads`).
 """
 
 import os

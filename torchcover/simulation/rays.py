@@ -314,7 +314,7 @@ def blocks_towards(outlines: Outlines, tile: Tile, vehicle_R_sensor: Float64, ra
     # No direction between the lower and the upper bounds of a block has a smaller product with a normal.
     bounds = np.vstack([tile.block_lower, tile.block_upper]).astype(np.float32)
     towards = np.hstack([np.maximum(normals, 0.0), np.minimum(normals, 0.0)]).astype(np.float32)
-    least = (towards @ bounds).reshape(-1, 4, bounds.shape[1])
+    least = (towards @ bounds).reshape(len(outlines.normals), 4, bounds.shape[1])
     reached: NDArray[np.bool_] = (least.max(axis=1) <= ROUNDING) & (outlines.nearest_m[:, None] <= ends_m)
     return reached
 

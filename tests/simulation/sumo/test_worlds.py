@@ -8,6 +8,7 @@ from scipy.sparse.csgraph import connected_components
 
 from torchcover import Scenario
 from torchcover.simulation.sumo import Sumo
+from torchcover.simulation.traffic.fleet import REAR_OF
 from torchcover.simulation.traffic.procedural import Procedural
 
 from .towns import drive, edge, fcd, street, together, vehicle, write_net
@@ -60,8 +61,8 @@ def test_types_have_bodies_by_class_and_length(tmp_path):
     routes = tmp_path / "r.xml"
     routes.write_text('<routes><vType id="passenger" length="6.2"/><vType id="truck" vClass="trailer"/></routes>')
     world = made(tmp_path, steps=together(*rows), ego_id="ego", routes=(routes,)).world(0)
-    found = {actor.name.split()[1]: actor.name.split()[0].partition("_")[0] for actor in world.actors}
-    assert found == {
+    words = [actor.name.removeprefix(REAR_OF).split() for actor in world.actors]
+    assert {name: kind.partition("_")[0] for kind, name, _ in words} == {
         "bus": "bus", "truck": "truck", "bicycle": "cyclist", "motorcycle": "motorcycle", "pedestrian": "adult",
         "passenger": "van",
     }  # fmt: skip

@@ -1,7 +1,7 @@
 """A table as records, one for each rig, region and band: what CSV and JSON have in common."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -36,6 +36,11 @@ class Column(NamedTuple):
     measure: Measure | None = None
 
 
+def _sensor_model(table: CoverageTable, row: Row) -> object:
+    of_rigs = table.source.get("sensor_model")
+    return of_rigs.get(row.rig) if isinstance(of_rigs, Mapping) else of_rigs
+
+
 COLUMNS = (
     Column("measure", "what the numbers are means over: `area` or `known`", lambda _, row: row.summary.measure),
     Column(
@@ -60,6 +65,8 @@ COLUMNS = (
     Column("steps", "how many were measured", lambda table, row: table.conditions[row.rig].counts["steps"]),
     Column("blocks", "how many the errors come from", lambda table, row: table.conditions[row.rig].blocks),
     Column("steps_per_block", "of a full one", lambda table, row: table.conditions[row.rig].steps_per_block),
+    Column("vehicle", "what carries the rig; empty if unknown", lambda table, _: table.source.get("vehicle")),
+    Column("sensor_model", "what sensors make of their hits: `ideal` or `real`; empty if unknown", _sensor_model),
     Column("x_min_m", "where the region begins", lambda _, row: row.region.x[0]),
     Column("x_max_m", "where it ends", lambda _, row: row.region.x[1]),
     Column("y_min_m", "its right border", lambda _, row: row.region.y[0]),

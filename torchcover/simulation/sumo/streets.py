@@ -14,6 +14,7 @@ from pydantic import Field
 from torchcover.files import parse_xml
 from torchcover.simulation.documents import Document
 from torchcover.simulation.sumo.simulating import run
+from torchcover.simulation.traffic.hills import Hills
 from torchcover.simulation.traffic.procedural import MostPeople, MostVehicles
 
 Numbers = NDArray[np.float64]
@@ -29,8 +30,6 @@ APART_M = 40.0
 BEND_PIECES = 10
 # Of kerbs at corners; nobody turns there with more than so much to the side, by much.
 CORNER_M, TURN_MPS2 = 6.0, 1.6
-HILL_WAVELENGTHS_M = (250.0, 700.0)
-HILL_WAVES = 4
 
 
 class DrawnStreets(Document):
@@ -69,12 +68,12 @@ class DrawnStreets(Document):
             for node in parse_xml(prefix.with_suffix(".nod.xml")).iter("node")
         }
         edges = list(parse_xml(prefix.with_suffix(".edg.xml")).iter("edge"))
-        hills = _Hills(self.hills_m, generator)
+        hills = Hills(self.hills_m, generator)
         node_file, edge_file, network = folder / "nodes.xml", folder / "edges.xml", folder / "drawn.net.xml"
         edge_file.write_text(self._edges(nodes, edges, hills, generator), encoding="utf-8")
         rows = [
             f'<node id={quoteattr(name)} x="{x:.3f}" y="{y:.3f}" z="{z:.3f}"/>'
-            for (name, (x, y)), z in zip(nodes.items(), hills.at(np.array(list(nodes.values()))), strict=True)
+            for (name, (x, y)), z in zip(nodes.items(), hills.heights_m(np.array(list(nodes.values()))), strict=True)
         ]
         node_file.write_text(f"<nodes>{''.join(rows)}</nodes>", encoding="utf-8")
         run(
@@ -89,7 +88,7 @@ class DrawnStreets(Document):
         self,
         nodes: dict[str, tuple[float, float]],
         edges: list[ElementTree.Element],
-        hills: "_Hills",
+        hills: Hills,
         generator: np.random.Generator,
     ) -> str:
         streets: dict[tuple[str, str], list[tuple[str, str, str]]] = {}
@@ -107,7 +106,7 @@ class DrawnStreets(Document):
             way_m, lanes = shapely.get_coordinates(ways[ends]), self._lanes(generator)
             # Junctions are level: so are the ends of all that meet there.
             share = np.linspace(0.0, 1.0, BEND_PIECES + 1)
-            from_m, to_m = hills.at(way_m[[0, -1]])
+            from_m, to_m = hills.heights_m(way_m[[0, -1]])
             climb_m = from_m + (to_m - from_m) * share**2 * (3 - 2 * share)
             places = [f"{x:.3f},{y:.3f},{z:.3f}" for (x, y), z in zip(way_m, climb_m, strict=True)]
             for name, start, end in streets[ends]:
@@ -137,22 +136,6 @@ class DrawnStreets(Document):
         if generator.random() < WITH_MEDIAN:
             lanes.append(('type="median" disallow="all"', generator.uniform(*MEDIAN_M)))
         return "".join(f'<lane index="{k}" {who} width="{width:.2f}"/>' for k, (who, width) in enumerate(lanes))
-
-
-class _Hills:
-    """A height for each place: a few long waves."""
-
-    def __init__(self, height_m: float, generator: np.random.Generator) -> None:
-        towards, phase = generator.uniform(0.0, 2 * np.pi, (2, HILL_WAVES))
-        waves = 2 * np.pi / generator.uniform(*HILL_WAVELENGTHS_M, HILL_WAVES)
-        self._waves_per_m = waves * np.array([np.cos(towards), np.sin(towards)])
-        self._phase = phase
-        self._height_m = height_m * np.sqrt(2 / HILL_WAVES)
-
-    def at(self, places_m: Numbers) -> Numbers:
-        """(N,) heights at (N, 2) places."""
-        heights_m: Numbers = self._height_m * np.sin(places_m @ self._waves_per_m + self._phase).sum(axis=1)
-        return heights_m
 
 
 def _without_dead_ends(streets: list[tuple[str, str]]) -> list[tuple[str, str]]:

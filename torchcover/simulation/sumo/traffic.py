@@ -18,7 +18,7 @@ from torchcover.simulation.sumo.ground import Pavement, decks, ground_of
 from torchcover.simulation.sumo.motion import motions, possible
 from torchcover.simulation.sumo.network import SAME_PLACE_M, Network, read_network
 from torchcover.simulation.sumo.placing import Placing, park
-from torchcover.simulation.sumo.simulating import from_opendrive, simulate
+from torchcover.simulation.sumo.simulating import from_opendrive, home, simulate
 from torchcover.simulation.sumo.streets import DrawnStreets
 from torchcover.simulation.sumo.vicinity import OFF_STREET_M, Vicinity
 from torchcover.simulation.traffic.fleet import EGO, Fleet
@@ -76,6 +76,11 @@ class Sumo(Procedural):
             if self.net is not None and of_streets:
                 raise ValueError(f"random: {', '.join(of_streets)} are for streets that are drawn; there is a net")
         return self
+
+    def check(self) -> None:
+        """Refuse where SUMO is needed, but not installed."""
+        if self.fcd is None or (self.net is not None and self.net.suffix == ".xodr"):
+            home()  # or an ImportError
 
     def _build(
         self, fleet: Fleet, times_s: Numbers, generator: np.random.Generator

@@ -1,6 +1,7 @@
 """From places on lanes to a world, and how the ego's body tilts: with braking and starting, curves, and the road."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -8,7 +9,8 @@ from numpy.typing import NDArray
 
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.traffic.fleet import CATEGORIES, EGO, Fleet
+from torchcover.simulation.traffic.articulated import rears_of
+from torchcover.simulation.traffic.fleet import CATEGORIES, EGO, REAR_OF, Fleet
 from torchcover.simulation.traffic.flow import Agent, Flow, Lane
 from torchcover.simulation.traffic.hills import Hills
 from torchcover.simulation.world import Actor
@@ -17,8 +19,8 @@ Numbers = NDArray[np.float64]
 
 # Beyond the farthest range of a sensor: who never comes this close to the ego is left out of the world.
 HORIZON_M = 250.0
-# Feet on a pavement, and rounding, where it is found out at first who may come so close.
-SLACK_M = 1.0
+# Where it is found out at first who may come so close, those in two parts are looked for between them.
+SLACK_M = 6.0
 LOOKS_EVERY = 20
 # A soft-sprung passenger car: it dives by some 3 degrees at 1 g, and leans a little more in a curve.
 PITCH_DEG_PER_MPS2 = 0.3
@@ -33,22 +35,38 @@ ROLL_WAVES_DEG = np.array([0.06, 0.08, 0.10, 0.14])
 
 
 class Paths(NamedTuple):
-    """Where N bodies are at T times: `positions_m` (T, N, 3), `yaw_deg` (T, N), and the N `kinds`."""
+    """Where N bodies are at T times, those in two parts with their fronts.
+
+    Args:
+        positions_m: (T, N, 3).
+        yaw_deg: (T, N).
+        kinds: (N,) which bodies.
+        rears: (T, 3) x, y and heading in radians of what some draw along, by their numbers.
+    """
 
     positions_m: Numbers
     yaw_deg: Numbers
     kinds: tuple[str, ...]
+    rears: Mapping[int, Numbers] = MappingProxyType({})
 
 
-def paths(lanes: Sequence[Lane], agents: Sequence[Agent], place_m: Numbers) -> Paths:
-    """Follow the lanes, on the ground, to (T, N) places on them."""
+def paths(lanes: Sequence[Lane], agents: Sequence[Agent], place_m: Numbers, fleet: Fleet | None = None) -> Paths:
+    """Follow the lanes, on the ground, to (T, N) places on them; in one part all, if no fleet is given."""
     positions_m, yaw_deg = np.zeros((*place_m.shape, 3)), np.empty(place_m.shape)
     lane_of = np.array([agent.lane for agent in agents])
+    of = {} if fleet is None else fleet.articulated
+    parts = {number: of[agent.kind] for number, agent in enumerate(agents) if agent.kind in of}
+    ahead_m = np.array([parts[number].ahead_m if number in parts else 0.0 for number in range(len(agents))])
     for lane in np.unique(lane_of):
         on_lane = np.flatnonzero(lane_of == lane)
-        poses = lanes[lane].line.poses(place_m[:, on_lane])
+        poses = lanes[lane].line.poses(place_m[:, on_lane] + ahead_m[on_lane])
         positions_m[:, on_lane, :2], yaw_deg[:, on_lane] = poses[..., :2], poses[..., 2]
-    return Paths(positions_m, yaw_deg, tuple(agent.kind for agent in agents))
+    # At first the axles that are drawn along are on the lane, too.
+    axles_m = [lanes[agents[number].lane].line.poses(place_m[0, number] - p.back_m)[:2] for number, p in parts.items()]
+    rods_m = positions_m[0, list(parts), :2] - np.array(axles_m).reshape(-1, 2)
+    fronts = [np.column_stack([positions_m[:, k, :2], np.deg2rad(yaw_deg[:, k])]) for k in parts]
+    rears = rears_of(parts, fronts, np.arctan2(rods_m[:, 1], rods_m[:, 0]).tolist())
+    return Paths(positions_m, yaw_deg, tuple(agent.kind for agent in agents), rears)
 
 
 def come_near(lanes: Sequence[Lane], agents: Sequence[Agent], place_m: Numbers) -> NDArray[np.int64]:
@@ -105,20 +123,30 @@ def actors(
         positions_m = np.ascontiguousarray(group.positions_m[:, numbers].swapaxes(0, 1))
         angles_deg = np.zeros_like(positions_m)
         angles_deg[..., 0] = group.yaw_deg[:, numbers].T
+        there = ~np.isnan(positions_m[..., 0])
+        on_foot = np.array([CATEGORIES[group.kinds[number]] == "pedestrian" for number in numbers], dtype=bool)
+        rows = [row for row, number in enumerate(numbers.tolist()) if number in group.rears]
+        if rows:
+            rears = np.stack([group.rears[int(numbers[row])] for row in rows])
+            rears[~there[rows]] = np.nan
+            lie_m = np.concatenate([rears[..., :2], np.zeros((*rears.shape[:2], 1))], axis=2)
+            turned_deg = np.concatenate([np.rad2deg(rears[..., 2:]), np.zeros((*rears.shape[:2], 2))], axis=2)
+            positions_m, angles_deg = np.concatenate([positions_m, lie_m]), np.concatenate([angles_deg, turned_deg])
+            there, on_foot = np.append(there, there[rows], axis=0), np.append(on_foot, [False] * len(rows))
         if hills is not None:
-            on_foot = np.array([CATEGORIES[group.kinds[number]] == "pedestrian" for number in numbers], dtype=bool)
             positions_m[on_foot, :, 2] += hills.heights_m(positions_m[on_foot, :, :2])
             stances = hills.stances(positions_m[~on_foot, :, :2], angles_deg[~on_foot, :, 0])
             positions_m[~on_foot, :, 2] += stances[..., 0]
             angles_deg[~on_foot, :, 1:] = stances[..., 1:]
-        there = ~np.isnan(positions_m[..., 0])
         always = np.array([all_along.all() for all_along in there], dtype=bool)
-        for row, number in enumerate(numbers):
-            kind, some = group.kinds[number], slice(None) if always[row] else there[row]
+        names = dict[int, str]()
+        for row, number in enumerate(np.append(numbers, numbers[rows]).tolist()):
+            kind, some, is_rear = group.kinds[number], slice(None) if always[row] else there[row], number in names
             if np.count_nonzero(there[row]) < 2:
                 continue
+            names[number] = REAR_OF + names[number] if is_rear else f"{kind} {len(near)}"
             trajectory = Trajectory(times_s[some], positions_m[row, some], angles_deg[row, some], not always[row])
-            near.append(Actor(f"{kind} {len(near)}", CATEGORIES[kind], fleet.meshes[kind], trajectory))
+            near.append(fleet.actor(names[number], kind, trajectory, is_rear=is_rear))
     return tuple(near)
 
 

@@ -11,6 +11,7 @@ from torchcover.geometry import BoundingBox
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.bodies import Vehicle
 from torchcover.simulation.shapes import Mesh
+from torchcover.simulation.traffic.articulated import HITCHES_M, Articulated
 from torchcover.simulation.traffic.flow import Agent
 from torchcover.simulation.traffic.idm import Driver
 from torchcover.simulation.traffic.signals import Gate
@@ -49,6 +50,8 @@ KIND_OF |= {kind: kind for kind in BODIES}
 CATEGORIES = {name: BODIES[kind] for name, kind in sorted(KIND_OF.items())}
 EGO = "ego"
 HEAVY = ("truck", "lorry", "bus")
+# What is drawn along has a box and a category of its own, as in nuScenes.
+TRAILER, REAR_OF = "trailer", "rear of "
 
 WALKING = Driver(
     desired_speed_mps=1.4, headway_s=0.4, standstill_gap_m=0.5, acceleration_mps2=1.0, deceleration_mps2=1.5
@@ -59,8 +62,14 @@ CYCLING = Driver(
 
 
 @cache
+def load_articulated() -> Mapping[str, Articulated]:
+    """Those of the built-in bodies that are in two parts."""
+    return {kind: Articulated.load(kind) for kind in HITCHES_M}
+
+
+@cache
 def load_bodies() -> Mapping[str, Mesh]:
-    """The built-in bodies, in all their sizes."""
+    """The built-in bodies, in all their sizes, and in one part each."""
     meshes = {kind: Vehicle.load(kind).mesh() for kind in BODIES}
     for kind, sizes in SIZES.items():
         for number, shares in enumerate(sizes, 2):
@@ -71,16 +80,24 @@ def load_bodies() -> Mapping[str, Mesh]:
 class Fleet:
     """The bodies of a world, and the drivers drawn for them.
 
+    Of those in two parts, `articulated`, the mesh is that of the front; their length is that of both.
+
     Raises:
         ValueError: A kind has no body.
     """
 
-    def __init__(self, bodies: Mapping[str, Mesh], ego: Mesh | None, generator: np.random.Generator) -> None:
+    def __init__(
+        self, bodies: Mapping[str, Mesh | Articulated], ego: Mesh | None, generator: np.random.Generator
+    ) -> None:
         missing = sorted(CATEGORIES.keys() - bodies.keys())
         if missing:
             raise ValueError(f"traffic needs a body for each kind; there is none for {', '.join(missing)}")
-        self.meshes = {EGO: bodies["suv"] if ego is None else ego, **{kind: bodies[kind] for kind in CATEGORIES}}
+        self.articulated = {kind: body for kind, body in bodies.items() if isinstance(body, Articulated)}
+        self.meshes = {kind: body for kind, body in bodies.items() if not isinstance(body, Articulated)}
+        self.meshes |= {kind: body.front for kind, body in self.articulated.items()}
+        self.meshes[EGO] = self.meshes["suv"] if ego is None else ego
         self._sizes = {kind: BoundingBox.around(mesh.vertices_m).size_m for kind, mesh in self.meshes.items()}
+        self._sizes |= {kind: body.size_m for kind, body in self.articulated.items()}
         self._generator = generator
         self.parked: list[Actor] = []
         self.left_out = 0
@@ -118,6 +135,11 @@ class Fleet:
         x_m, y_m, yaw_deg = pose
         place = Trajectory.resting((x_m, y_m, height_m), (yaw_deg, *tilt_deg))
         self.parked.append(Actor(f"parked {kind} {len(self.parked)}", CATEGORIES[kind], self.meshes[kind], place))
+
+    def actor(self, name: str, kind: str, trajectory: Trajectory, *, is_rear: bool = False) -> Actor:
+        """A body of a kind, or the front or rear of one in two parts, on its way."""
+        mesh = self.articulated[kind].rear if is_rear else self.meshes[kind]
+        return Actor(name, TRAILER if is_rear else CATEGORIES[kind], mesh, trajectory)
 
     def fill(
         self,

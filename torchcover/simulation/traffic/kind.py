@@ -29,6 +29,9 @@ class Traffic(Document):
     def steps(self) -> int:
         """Number of instants of a run."""
 
+    def check(self) -> None:
+        """Find out before a run whether a world can be built; ImportError if something is not installed."""
+
     @abstractmethod
     def world(self, seed: int, ego: Mesh | None = None) -> World:
         """Build the world; the same for the same arguments.

@@ -114,7 +114,7 @@ class Urban(Procedural):
         seen = (float(first_m) - BEHIND_M, float(last_m) + AHEAD_M)
         built = (seen[0] - ASIDE_M, seen[1] + ASIDE_M)
         territory = Territory(streets.main, built)
-        moving = _in_place(paths(lanes, agents, place_m), lanes, agents, place_m, streets, built, fleet)
+        moving = _in_place(paths(lanes, agents, place_m, fleet), lanes, agents, place_m, streets, built, fleet)
         driver = ego_actor(times_s, moving, flow, 0, fleet.meshes[EGO], generator, hills)
         crossing = _crossers(streets, flow, times_s, seen, fleet, generator)
         city = City(
