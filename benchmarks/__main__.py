@@ -6,7 +6,7 @@ import sys
 from torchcover.evaluation.cores import set_threads
 
 # Of speed and memory, which docs/measured/performance.md is made of; the others have pages of their own.
-PERFORMANCE = ("run", "crossover", "raycasting", "reading", "omissions")
+PERFORMANCE = ("run", "raycasting", "reading", "omissions")
 BENCHMARKS = (
     *PERFORMANCE,
     "search",
