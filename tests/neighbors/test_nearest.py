@@ -303,11 +303,13 @@ def test_backends_agree_under_autocast():
 @pytest.mark.parametrize(
     ("counts", "dtype", "chosen"),
     [
+        ((1, 10_000), torch.float32, "kdtree"),
         ((17_000, 100), torch.float32, "packets"),
         ((100, 700_000), torch.float32, "packets"),
         ((17_000, 100), torch.float64, "kdtree"),
         ((6_000, 300_000), torch.float32, "kdtree"),
         ((1, 1), torch.float32, "kdtree"),
+        ((16, 700_000), torch.float32, "packets"),
     ],
 )
 def test_auto_takes_packets_in_float32_where_a_call_gains_its_share_of_loading_them(counts, dtype, chosen, monkeypatch):
