@@ -6,6 +6,7 @@ from .checking import Checked as Checked
 from .checking import check as check
 from .checkpoint import Checkpoint as Checkpoint
 from .encountering import encounter as encounter
+from .encountering import encounter_film as encounter_film
 from .encountering import encounter_picture as encounter_picture
 from .encountering import met_in_recording as met_in_recording
 from .encountering import met_in_traffic as met_in_traffic

@@ -7,11 +7,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.geometry import overlapping
 from torchcover.simulation.memory import check_fits
 from torchcover.simulation.rig import Rig, with_ego
 from torchcover.simulation.scenario import Scenario
 from torchcover.targets.counting import count
-from torchcover.targets.placing import Heading, holding, overlapping, poses, yaws
+from torchcover.targets.placing import Heading, holding, poses, yaws
 from torchcover.targets.raster import Raster
 from torchcover.targets.result import FREE, OCCUPIED, OUTSIDE, TargetMap
 from torchcover.targets.steps import PLACES, Steps
