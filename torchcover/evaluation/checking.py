@@ -38,7 +38,8 @@ Float64 = NDArray[np.float64]
 JUDGED = {"points": "least_points", "sensors": "least_sensors"}
 NOTE = (
     "A number with an error keeps a bound if all of its 95 % interval does, and does not if none of it does; else it "
-    "is not checked, until more steps decide it. What is unknown is never kept. Keeping all is geometry, and no homologation."
+    "is not checked, until more steps decide it. What is unknown is never kept. "
+    "Keeping all is geometry, and no homologation."
 )
 
 
