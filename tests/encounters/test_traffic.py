@@ -16,7 +16,7 @@ from torchcover.encounters import Criterion
 from torchcover.encounters.sighting import NEVER
 from torchcover.encounters.traffic import Approach, Drive, Eyes, Watch, approaches, sight_approach
 from torchcover.evaluation import met_in_recording, met_in_traffic
-from torchcover.geometry import rigid
+from torchcover.geometry import BoundingBox, rigid
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings import open_recording
 from torchcover.recordings.objects import Track
@@ -123,6 +123,21 @@ def test_the_answer_is_that_of_looking_all_the_time(driven):
             for step in detected:
                 some["before" if step == one.step else "never" if step == NEVER else "later"] += 1
     assert all(some.values())
+
+
+def test_a_lorry_and_its_trailer_are_one_road_user():
+    times_s = STEP_S * np.arange(30)
+    ego = np.tile(np.eye(4), (30, 1, 1))
+    ego[:, 0, 3] = 20 * times_s
+    way = {at_m: Trajectory.from_arrays(times_s, np.column_stack([at_m + 15 * times_s, 0 * times_s, 0 * times_s]),
+                                        np.zeros((30, 3))) for at_m in (36.0, 30.0)}  # fmt: skip
+    parts = [Track("truck 1", "truck", "truck", (5.0, 2.5, 3.0), way[36.0]),
+             Track("rear of truck 1", "trailer", None, (12.0, 2.5, 4.0), way[30.0])]  # fmt: skip
+    there = Drive("w", times_s, ego, BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5)), parts)
+    for tracks in (parts, parts[::-1]):
+        (one,) = approaches(there._replace(tracks=tracks), Criterion())
+        assert (one.track, one.name) == (parts[1], "lorries and buses")
+        assert 3.88 < one.ttc_s[0] <= 4.0
 
 
 @pytest.mark.parametrize(

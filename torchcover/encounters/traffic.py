@@ -1,6 +1,6 @@
 """Encounters that happen in traffic: who comes within a time to collision, and when sensors first had enough of him."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import NamedTuple, Self
 
@@ -17,6 +17,7 @@ from torchcover.recordings.objects import Track, class_of, objects_of
 from torchcover.recordings.recording import Recording
 from torchcover.simulation.rays import Balls
 from torchcover.simulation.simulator import Simulator
+from torchcover.simulation.traffic.fleet import REAR_OF
 from torchcover.simulation.world import World
 
 Float64 = NDArray[np.float64]
@@ -114,8 +115,9 @@ class Approach(NamedTuple):
     speed_is_swept: bool = False
 
 
-def approaches(drive: Drive, criterion: Criterion) -> Iterator[Approach]:
-    """All that happen in a drive, in the order of its tracks."""
+def approaches(drive: Drive, criterion: Criterion) -> list[Approach]:
+    """All that happen in a drive; of one in two parts, such as a lorry, that of the part which comes near first."""
+    found: dict[str, Approach] = {}
     ego_mps = _velocities_mps(drive.times_s, drive.world_T_ego[:, :2, 3])
     speed_mps = np.linalg.norm(ego_mps, axis=1)
     ahead = ego_mps / np.where(speed_mps > 0, speed_mps, 1.0)[:, None]
@@ -140,8 +142,10 @@ def approaches(drive: Drive, criterion: Criterion) -> Iterator[Approach]:
             needed_s = np.array([criterion.needed_s(mps) for mps in closing_mps.tolist()])
             behind = there[np.searchsorted(near, first), 0, 3] < drive.ego.lower_m[0]
             name = "from behind" if behind else who(track)
-            kmh = 3.6 * float(speed_mps[first])
-            yield Approach(track, first, ttc_s[some], needed_s, name, kmh, float(closing_mps[0]))
+            kmh, owner = 3.6 * float(speed_mps[first]), track.name.removeprefix(REAR_OF)
+            if owner not in found or first < found[owner].step:
+                found[owner] = Approach(track, first, ttc_s[some], needed_s, name, kmh, float(closing_mps[0]))
+    return list(found.values())
 
 
 def _velocities_mps(times_s: Float64, places_m: Float64) -> Float64:
