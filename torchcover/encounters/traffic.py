@@ -116,7 +116,10 @@ class Approach(NamedTuple):
 
 
 def approaches(drive: Drive, criterion: Criterion) -> list[Approach]:
-    """All that happen in a drive; of one in two parts, such as a lorry, that of the part which comes near first."""
+    """All that happen in a drive; of one in two parts, such as a lorry, that of the part which comes near first.
+
+    Not those that began before there were looks enough to detect anybody: nobody knows how late they were.
+    """
     found: dict[str, Approach] = {}
     ego_mps = _velocities_mps(drive.times_s, drive.world_T_ego[:, :2, 3])
     speed_mps = np.linalg.norm(ego_mps, axis=1)
@@ -135,7 +138,7 @@ def approaches(drive: Drive, criterion: Criterion) -> list[Approach]:
         ttc_s = np.full(len(drive.times_s), np.inf)
         ttc_s[near] = contact_s(drive.ego.outline_m, outlines_at(outline_m, there), in_ego_mps)
         met = np.flatnonzero(ttc_s <= criterion.within_s)
-        if len(met):
+        if len(met) and met[0] >= criterion.looks - 1:
             some, first = slice(met[0], met[-1] + 1), int(met[0])
             along_mps = np.maximum((own_mps[some] * ahead[some]).sum(axis=1), 0.0)
             closing_mps = np.maximum(speed_mps[some] - along_mps, 0.0)
