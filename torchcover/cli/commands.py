@@ -219,7 +219,9 @@ def check(
     requirements: Annotated[str, typer.Option(help="What they must see: a built-in set or a YAML file.")],
     scenario: Annotated[
         str | None,
-        typer.Option(help="World of requirements that name none (regions: courtyard; bodies: flat ground, no more)."),
+        typer.Option(
+            help="World in place of the file's (which has for regions the courtyard, for bodies flat ground)."
+        ),
     ] = None,
     out: options.Out = Path("out/check"),
     **settings: Any,  # noqa: ANN401

@@ -26,14 +26,8 @@ from .progress import Progress as Progress
 from .ranks import Ranks as Ranks
 from .ranks import joined_ranks as joined_ranks
 from .ranks import rank_count as rank_count
-from .requirements import Bound as Bound
-from .requirements import EncounterRequirement as EncounterRequirement
-from .requirements import InTime as InTime
-from .requirements import Places as Places
 from .requirements import Readings as Readings
-from .requirements import RegionRequirement as RegionRequirement
 from .requirements import Requirements as Requirements
-from .requirements import TargetRequirement as TargetRequirement
 from .requirements import Verdict as Verdict
 from .requirements import verdicts as verdicts
 from .result import Result as Result

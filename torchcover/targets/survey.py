@@ -156,7 +156,8 @@ def survey_places(
     around = vehicle_T_target[elsewhere]
     run = Steps(rig, scenario, target, surface, around, steps=steps, every_steps=every_steps, seed=seed)
     some = range(len(rig.sensors)) if counting is None else counting
-    mounted = [run.mounted[k] for k in some]
+    every = run.mounted
+    mounted = [every[k] for k in some]
     taken = [step._replace(sensors=[step.sensors[k] for k in some]) for step in run]
     sums = count(target, surface, around, mounted, taken, hits=hits, threshold_m=threshold_m)
 
