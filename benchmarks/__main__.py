@@ -33,7 +33,6 @@ BENCHMARKS = (
     "placement",
     "published",
     "voxels",
-    "cities",
     "streets",
 )
 
