@@ -8,6 +8,7 @@ from torchcover.geometry import BoundingBox, transform
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.material import material_number
 from torchcover.simulation.scene import Scene as Scenery
+from torchcover.simulation.traffic.fleet import REAR_OF
 from torchcover.simulation.world import World
 
 # Recorded categories and those of bodies, as kinds that can be compared.
@@ -114,7 +115,8 @@ def met(scene, deeper_m=0.05, within_m=80.0):
         near = np.flatnonzero(away_m < within_m)
         pairs, depths_m = overlaps_m(outline_m[near])
         for (i, j), depth_m in zip(near[pairs], depths_m, strict=True):
-            if depth_m > deeper_m and abs(height_m[i, column] - height_m[j, column]) < 1.5:
+            in_two = everybody[j].name == REAR_OF + everybody[i].name
+            if not in_two and depth_m > deeper_m and abs(height_m[i, column] - height_m[j, column]) < 1.5:
                 pair = everybody[i].name, everybody[j].name
                 found[pair] = max(found.get(pair, 0.0), float(depth_m))
     return found
@@ -193,7 +195,11 @@ def near(scene, within_m=75.0):
 
 def gaps_m(scene, within_m=60.0, lane_m=1.5):
     """Bumper to bumper, from each vehicle that moves to the next on its way, at all times; and the first's speed."""
-    movers = [body for body in (scene.ego, *scene.others) if body.ever_moves and body.kind in ("car", "lorry or bus")]
+    movers = [
+        body
+        for body in (scene.ego, *scene.others)
+        if body.ever_moves and body.kind in ("car", "lorry or bus") and not body.name.startswith(REAR_OF)
+    ]
     gaps, speeds = [], []
     if not movers:
         return np.empty(0), np.empty(0)

@@ -4,6 +4,7 @@ import os
 import signal
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch is loaded: threads that wait are to leave the cores
+os.environ["TORCHCOVER_CACHE_GB"] = "0"  # what tests draw does not go to the user's disk
 
 import pytest
 from matplotlib.figure import Figure

@@ -22,11 +22,11 @@ from torchcover import BevGrid
 from torchcover.cli.app import app
 from torchcover.data import RegionsOfInterest, SimulatedFrames, collate_frames
 from torchcover.encounters import EncounterSet
+from torchcover.evaluation import Requirements
 from torchcover.placement import ChoiceSpace, SearchSpace
 from torchcover.recordings.formats.folder_settings import read_folder_settings
 from torchcover.simulation import Rig, Scenario
 from torchcover.simulation.bodies import Vehicle
-from torchcover.targets import Requirements
 
 ROOT = Path(__file__).parent.parent
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))

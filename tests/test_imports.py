@@ -124,7 +124,7 @@ def test_every_public_name_is_there():
 def test_the_public_names_are_those_of_the_contract():
     assert set(torchcover.__all__) == {
         "BevGrid", "Camera", "Coverage", "CoverageMetric", "Region", "RegionsOfInterest", "Rig", "Scenario",
-        "blind_spot_radius", "cameras", "compare", "coverage", "data", "detection", "estimation", "evaluate",
+        "blind_spot_radius", "cameras", "check", "compare", "coverage", "data", "detection", "estimation", "evaluate",
         "encounter", "encounters", "evaluation", "forward_regions", "geometry", "metrics",
         "nearest", "neighbors", "placement", "report", "simulation", "survey_target", "targets", "training",
     }  # fmt: skip

@@ -19,6 +19,7 @@ from .coverage import Coverage as Coverage
 from .coverage import CoverageMetric as CoverageMetric
 from .coverage import Region as Region
 from .coverage import forward_regions as forward_regions
+from .evaluation import check as check
 from .evaluation import compare as compare
 from .evaluation import encounter as encounter
 from .evaluation import evaluate as evaluate

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from matplotlib.text import Text
 
 from tests.targets.worlds import EGO, FLOOR, lidar, on_target
 from torchcover.encounters import Criterion, Encounter, EncounterSet, Staged, sight_encounter
-from torchcover.encounters.sighting import NEVER, Looks, MountedRig, channels, first_run, look_steps
-from torchcover.evaluation import encounter, free_space
-from torchcover.geometry import euler_from_rotation
+from torchcover.encounters.sighting import NEVER, Looks, MountedRig, channels, first_run, kinds_of, look_steps
+from torchcover.evaluation import encounter, encounter_film, free_space
+from torchcover.geometry import euler_from_rotation, overlapping
 from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, with_ego
 from torchcover.simulation.bodies import called
 from torchcover.simulation.moving import Solid
@@ -77,6 +78,24 @@ def test_outlines_touch_when_the_front_has_come_to_the_side():
     assert behind.vehicle_T_other(np.array([1.0]))[0, :2, 3] == pytest.approx([-2.0, 0.0])
     standing = crossing(0.0, {"body": BOX, "from_m": 3})
     assert Staged(standing, SOLID).contact_s == pytest.approx(2.0 - (1.0 + 1.0) / 1.5, abs=2e-6)
+
+
+def grazing(overlap_m, **ego):
+    """The end of the other passes the ego's corner, which goes straight, so far inside."""
+    box = {"type": "box", "size_m": [2.0, 1.009, 0.5]}
+    other = {"body": box, "speed_kmh": 36, "from_m": 15, "at_width": (1 - overlap_m + 0.5045 + 1 + 1) / 2}
+    return Encounter.model_validate({"name": "g", "ego": {"speed_kmh": 36} | ego, "other": other})
+
+
+def test_a_touch_of_less_than_a_millisecond_is_one():
+    staged = Staged(grazing(0.004), SOLID)
+    assert staged.contact_s == pytest.approx(1.5 - 0.05045, abs=1e-9)
+    whole_s = np.arange(2000) / 1000
+    assert not overlapping(staged.other.box, staged.vehicle_T_other(whole_s), SOLID.box.corners_m).any()
+    bent = Staged(grazing(0.4, radius_m=8), SOLID)
+    finely_s = np.linspace(bent.contact_s - 1e-3, bent.contact_s + 1e-3, 20_001)
+    touching = overlapping(bent.other.box, bent.vehicle_T_other(finely_s), SOLID.box.corners_m)
+    assert finely_s[touching.argmax()] == pytest.approx(bent.contact_s, abs=2e-7)
 
 
 @pytest.mark.parametrize("speed_kmh", [36.0, -36.0])
@@ -195,7 +214,7 @@ def test_the_answer_is_that_of_looking_all_the_time():
 
 def test_lidars_of_one_rate_count_together_and_a_loss_is_never_a_gain():
     sensors = rig(lidar("a"), lidar("b"), lidar("c", rate_hz=20), CAMERA, RADAR).sensors
-    assert channels(sensors, range(5)) == [(0, 1), (2,), (3,), (4,)]
+    assert channels(kinds_of(sensors), range(5)) == [(0, 1), (2,), (3,), (4,)]
     few = lidar("few", columns=180, channels=8, vertical_fov_deg=[-20, 0])
     found = sight_encounter(mounted(few, few | {"name": "same"}), crossing(), Criterion(points=6), phases=3)
     assert (found.without_ttc_s <= found.ttc_s).all()
@@ -239,14 +258,14 @@ def test_lists_are_combined_and_ranges_drawn_evenly_for_each_combination():
 
 
 def test_rows_are_of_speeds_with_intervals_over_draws():
-    these = EncounterSet.model_validate({"name": "s", "draws": 4, "encounters": [FAMILY | {"obstacles": []}]})
+    these = EncounterSet.model_validate({"name": "s", "draws": 8, "encounters": [FAMILY | {"obstacles": []}]})
     two = rig(high("ahead"), high("top", columns=40))
     found = encounter([two], these, Criterion(points=3), phases=3, vehicle="suv")
     rows = found.rows
-    assert [(row.speed_kmh, row.draws, row.first) for row in rows] == [(20, 4, "ahead"), (40, 4, "ahead")]
+    assert [(row.speed_kmh, row.draws, row.first) for row in rows] == [(20, 8, "ahead"), (40, 8, "ahead")]
     for row in rows:
         of_draws_s = [one.ttc_s.mean() for one in found.sightings if one.encounter.ego.speed_kmh == row.speed_kmh]
-        margin_s = 3.18245 * np.std(of_draws_s, ddof=1) / 2
+        margin_s = 2.36462 * np.std(of_draws_s, ddof=1) / math.sqrt(8)
         assert (row.ttc_s, row.interval_high) == pytest.approx((np.mean(of_draws_s), row.ttc_s + margin_s), rel=1e-5)
         assert row.ttc_s_low <= row.ttc_s <= row.ttc_s_high
         assert row.needed_s == pytest.approx(row.speed_kmh / 3.6 / 18 + 0.5)
@@ -274,6 +293,17 @@ def test_in_time_up_to_a_speed_is_in_time_at_all_that_are_slower():
     for brakes, expected in ((1e6, 50.0), (1.0, 0.0)):
         found = encounter(rig(high("ahead")), these, Criterion(deceleration_mps2=brakes, latency_s=0.1), phases=5)
         assert list(found.up_to_kmh().values()) == [expected]
+
+
+def test_a_film_shows_where_everybody_is_and_what_is_on_the_other():
+    other = {"body": "child", "speed_kmh": 5, "from_m": 1.5}
+    these = EncounterSet.model_validate({"name": "s", "encounters": [FAMILY | {"other": other}]})
+    two = rig(high("ahead"), high("top", columns=40))
+    picture = next(encounter_film(two, encounter([two], these, phases=2, vehicle="suv"), vehicle="suv"))
+    words = " ".join(text.get_text() for text in picture.findobj(Text))
+    assert "s to the collision; points on it: ahead 10, top 0" in words
+    for told in ("at 40 km/h: detected", "first ahead, without ahead", "in time up to", "child (1)", "hatchback (1)"):
+        assert told in words
 
 
 MISTAKES = [

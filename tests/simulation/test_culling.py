@@ -115,6 +115,13 @@ def boxes_around(generator, count):
     return np.array([(corners * s) @ p[:3, :3].T + p[:3, 3] for s, p in zip(sizes, poses, strict=True)]), sizes, poses
 
 
+def test_a_tile_of_which_no_ray_is_cast_meets_no_box_around_the_sensor():
+    none = SPHERE[0].some(np.zeros(SPHERE[0].directions.shape[1], dtype=bool))
+    around = outlines(EGO.corners_m[None], ROOF[:3, 3] / 2)
+    assert boxes_in_cone(around, none.axis, none.half_angle, 0.0).tolist() == [0]
+    assert blocks_towards(around, none, np.eye(3), np.empty(0, dtype=np.float32)).shape == (1, 0)
+
+
 def test_no_ray_that_meets_a_box_is_left_out():
     """Directions to points inside boxes, the corners included, pass every test for those boxes."""
     generator = np.random.default_rng(0)

@@ -5,10 +5,10 @@ import pytest
 
 from torchcover.simulation import CameraSensor, Draws, Lidar, Pose, Radar, Scenario
 from torchcover.simulation.camera_sensor import Stereo
-from torchcover.simulation.rays import Balls, into_tiles, pixels_in_tiles, unit_directions
+from torchcover.simulation.rays import FEW, Balls, into_tiles, pixels_in_tiles, unit_directions
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.sensor import ScanTimes
-from torchcover.simulation.sight import FEW, MountedSensor
+from torchcover.simulation.sight import MountedSensor
 
 ROOF = Pose(x_m=0.45, z_m=1.73, yaw_deg=20, pitch_deg=3)
 ERRS = {"range_noise_m": 0.05, "dropout": 0.1}
@@ -83,9 +83,34 @@ def test_a_ray_is_met_exactly_if_it_passes_through_a_ball():
             assert not met[(away_m > np.hypot(radius_m + 5e-3, 1.5e-3 * np.sqrt(squared_m2))).all(axis=1)].any()
 
 
-def test_of_many_places_all_rays_are_cast(scene):
-    sensor = SENSORS["exact lidar"]
-    mounted, instant = MountedSensor(sensor, scene, 90.0), scene.at(0, within_m=90.0)
-    for count, spares in ((FEW, True), (FEW + 1, False)):
-        balls = Balls(np.tile(np.float32([20, 0, 0]), (count, 1)), 0.4)
-        assert (mounted.scan(instant, Draws(None), within=balls).rays_spared > 0) == spares
+@pytest.mark.parametrize("name", ["lidar", "camera"])
+def test_of_many_places_neighbours_are_looked_at_together(scene, name):
+    """All rays of their own are among those of balls that hold them; where nearly all are, none is spared."""
+    sensor, instant = SENSORS[name], scene.at(0, within_m=90.0)
+    mounted, generator = MountedSensor(sensor, scene, 90.0), np.random.default_rng(9)
+    full = mounted.scan(instant, Draws(np.random.default_rng(7), rays=len(mounted.pixel_of_ray)))
+    ahead = full.points[(full.points[:, 0] > 2) & (np.abs(full.points[:, 1]) < 4)]
+    ahead_m = ahead[generator.integers(0, len(ahead), FEW + 1)] + generator.normal(0, 0.3, (FEW + 1, 3))
+    around, each = Balls.around(ahead_m, 0.4), Balls(ahead_m, 0.4)
+    assert 1 < len(around.centres_m) < FEW
+    assert (
+        (np.linalg.norm(ahead_m[:, None] - around.centres_m, axis=2) + 0.4 <= around.radius_m + 1e-9).any(axis=1).all()
+    )
+    for tile in mounted.tiles:
+        own = each.met_by(tile, mounted.vehicle_T_sensor)
+        assert around.met_by(tile, mounted.vehicle_T_sensor)[own].all()
+    spared = mounted.scan(instant, Draws(np.random.default_rng(7), rays=len(mounted.pixel_of_ray)), within=around)
+    of_full, of_spared = is_near(full, each), is_near(spared, each)
+    np.testing.assert_array_equal(full.points[of_full], spared.points[of_spared])
+    assert 0.2 * full.rays < spared.rays_spared
+    everywhere = Balls.around(generator.normal(0, 9, (FEW + 1, 3)), 4.0)
+    assert mounted.scan(instant, Draws(None), within=everywhere).rays_spared == 0
+
+
+def test_an_instant_is_placed_once_for_several_rigs_and_few_are_kept(scene):
+    first = scene.at(0, within_m=90.0)
+    assert scene.at(0, within_m=90.0) is first
+    assert scene.at(0, within_m=80.0) is not first
+    for step in range(1, 9):
+        scene.at(step, within_m=90.0)
+    assert scene.at(0, within_m=90.0) is not first

@@ -62,7 +62,7 @@ def test_no_more_worlds_are_kept_than_the_budget_has_room_for(monkeypatch, built
 
 
 def test_worlds_share_what_is_the_same_in_all():
-    stages = stage.Stages(SHORT, {"roof": Rig.load("front_roof_128")}, seed=0)
+    stages = stage.Stages(stage.Scenes(SHORT, seed=0), {"roof": Rig.load("front_roof_128")})
     one, other = stages.of_run(0), stages.of_run(1)
     casters = [set(stage.scene.at(0).moving.casters) for stage in (one, other)]
     assert casters[0] & casters[1]

@@ -14,6 +14,7 @@ SIZES_M = {
     "child_110cm": (0.1917, 0.33, 1.10),
     "chrysler_pacifica": (5.176, 2.022, 1.777),
     "cyclist": (1.80, 0.60, 1.75),
+    "cylinder_80cm": (0.30, 0.30, 0.80),
     "dog_57cm": (0.98, 0.22, 0.69),
     "ford_fusion": (4.869, 1.852, 1.476),
     "hatchback": (4.28, 1.79, 1.46),
@@ -38,7 +39,7 @@ AXLES_M = {
     "volkswagen_passat_estate": (1.337, 2.709),
 }
 CARS = ("hatchback", "pickup", "sedan", "suv", "van", *AXLES_M)
-WITH_WHEELS = tuple(sorted(set(SIZES_M) - {"adult", "child", "child_110cm", "dog_57cm", "pole_100cm"}))
+WITH_WHEELS = tuple(sorted(set(SIZES_M) - {"adult", "child", "child_110cm", "cylinder_80cm", "dog_57cm", "pole_100cm"}))
 
 
 def load(name):

@@ -1,4 +1,4 @@
-"""What is read off a map: sides, the nearest seen place, the worst; requirements; files; the picture."""
+"""What is read off a map: sides, the nearest seen place, the worst; files; the picture."""
 
 import csv
 import json
@@ -12,7 +12,7 @@ from torchcover.evaluation import free_space, save_targets, survey_target, targe
 from torchcover.geometry import BoundingBox
 from torchcover.report.drawings.targets import UNSEEN
 from torchcover.simulation import with_ego
-from torchcover.targets import Raster, Requirements, Target, TargetMap, check
+from torchcover.targets import Raster, Target, TargetMap
 
 CAR = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))
 OUTLINE = np.array([[-2.0, -1.0], [2.0, -1.0], [2.0, 1.0], [-2.0, 1.0]])
@@ -55,10 +55,6 @@ def seen_where(points, *, raster=None, state=None, share=None, hits=5, least=Non
     )
 
 
-def judged(seen, *requirements):
-    return check(Requirements.model_validate({"requirements": list(requirements)}), seen)
-
-
 def test_the_first_seen_place_is_where_the_way_out_meets_enough_points():
     """Seen from 3.5 m ahead of the middle on; to the left from 2 m on, less a gap that comes later; never behind."""
     seen = seen_where(lambda x, y: np.where((x > 3.5) | ((y > 2) & ~((y > 3) & (y < 4))), 9, 0))
@@ -96,9 +92,6 @@ def test_what_is_seen_in_some_steps_only_is_not_seen():
     """Eighty points in one of sixteen steps are five in the mean."""
     seen = seen_where(lambda x, y: 80 / 16, least=0)
     assert not seen.enough.any()
-    (verdict,) = judged(seen, {"within_m": 1, "points": 5})
-    assert (verdict.passed, verdict.failed) == (False, verdict.cells)
-    assert judged(seen_where(lambda x, y: 80 / 16), {"within_m": 1, "points": 5})[0].passed
 
 
 def test_the_worst_places_have_the_fewest_points_and_keep_apart():
@@ -111,73 +104,9 @@ def test_the_worst_places_have_the_fewest_points_and_keep_apart():
     assert len(seen.worst(10_000, apart_m=0.1)) == seen.counts["free"]
 
 
-def test_a_requirement_is_met_where_every_free_place_in_reach_meets_it():
-    seen = seen_where(lambda x, y: np.where(x > 1, 9, 4))
-    passed, failed = judged(
-        seen,
-        {"target": "child", "within_m": 2, "sides": ["front"], "points": 9, "sensors": 0, "share": 1.0, "seen": 1},
-        {"within_m": 1, "points": 5},
-    )
-    assert (passed.passed, passed.failed, passed.worst) == (True, 0, ())
-    assert passed.cells == ((seen.side == 0) & (seen.distance_m <= 2)).sum()
-    assert (failed.passed, failed.unknown) == (False, 0)
-    assert failed.failed == (seen.free & (seen.distance_m <= 1) & (seen.points < 5)).sum()
-    assert all(place.points == 4 for place in failed.worst)
-    assert failed.worst[0].distance_m == 0.25
-    assert not judged(seen, {"within_m": 2, "sides": ["front"], "sensors": 1})[0].passed
-
-
-def test_what_is_unknown_is_not_met():
-    share = seen_where(lambda x, y: 9).share.copy()
-    share[0, 0] = np.nan
-    verdict = judged(seen_where(lambda x, y: 9, share=share), {"within_m": 4, "share": 0.1})[0]
-    assert verdict.passed  # the corner is farther away
-    share[10, 0] = np.nan
-    verdict = judged(seen_where(lambda x, y: 9, share=share), {"within_m": 4, "share": 0.01})[0]
-    assert (verdict.passed, verdict.failed, verdict.unknown) == (False, 1, 1)
-
-
-@pytest.mark.parametrize(
-    ("requirement", "message"),
-    [
-        ({"target": "dog", "within_m": 1, "points": 1}, "no requirement is about the target 'child_110cm'.* about dog"),
-        ({"within_m": 5, "points": 1}, "the front within 5 m spans x = 2 to 7 m, and the raster -6 to 6 m"),
-        ({"within_m": 0.1, "points": 1}, "there is no free cell"),
-        ({"within_m": 1}, "nothing is required: give points"),
-        ({"within_m": 1, "points": 0, "share": 0}, "nothing is required: give points"),
-        ({"within_m": 1, "sides": [], "points": 1}, "sides"),
-        ({"within_m": 0, "points": 1}, "within_m"),
-        ({"within_m": 1, "points": 1, "pionts": 2}, "pionts"),
-    ],
-)
-def test_a_requirement_that_says_nothing_is_an_error(requirement, message):
-    with pytest.raises(ValueError, match=message):
-        judged(seen_where(lambda x, y: 9), requirement)
-
-
-@pytest.mark.parametrize("side", ["front", "rear", "left", "right"])
-def test_a_side_that_the_raster_holds_in_part_is_not_judged(side):
-    """Within 2 m of the front, the side spans x = 2 to 4 m and 1.41 m beyond both flanks; likewise the others."""
-    need = {"within_m": 2, "sides": [side], "points": 5}
-    turned = {"front": (1, 0), "rear": (-1, 0), "left": (0, 1), "right": (0, -1)}[side]
-    along = 0 if turned[0] else 1
-    forward = turned[along] > 0
-
-    def raster(near, far, aside):
-        ahead = (near, far) if forward else (-far, -near)
-        return Raster(*((ahead, (-aside, aside)) if along == 0 else ((-aside, aside), ahead)), 0.5)
-
-    edge, flank = ((2.0, 1.0), (1.0, 2.0))[along]
-    assert judged(seen_where(lambda x, y: 9, raster=raster(edge, edge + 2, flank + 1.5)), need)[0].passed
-    for near, far, aside in ((edge + 0.5, edge + 2, flank + 1.5), (edge, edge + 1.5, 9), (edge, edge + 2, flank + 1)):
-        with pytest.raises(ValueError, match="take a larger one"):
-            judged(seen_where(lambda x, y: 9, raster=raster(near, far, aside)), need)
-
-
 def test_the_files_hold_what_the_map_holds(tmp_path):
     seen = seen_where(lambda x, y: np.abs(x) + 0.5, raster=Raster((-3.0, 3.0), (-2.0, 2.0), 1.0))
-    verdicts = judged(seen, {"within_m": 1, "points": 1})
-    names = [path.name for path in save_targets(seen, tmp_path, verdicts)]
+    names = [path.name for path in save_targets(seen, tmp_path)]
     assert names == ["targets.csv", "targets.npz", "report.html", "targets.png", "summary.json"]
     with np.load(tmp_path / "targets.npz") as arrays:
         np.testing.assert_array_equal(arrays["points"], seen.points)
@@ -190,7 +119,6 @@ def test_the_files_hold_what_the_map_holds(tmp_path):
     assert (rows[8]["state"], rows[8]["points"], rows[8]["side"]) == ("occupied", "", "")
     record = json.loads((tmp_path / "summary.json").read_text())
     assert record["cells"] == {"free": 16, "occupied": 8, "outside": 0, "share_unknown": 0}
-    assert record["requirements"][0]["passed"] is True
     assert target_record(replace(seen, state=np.ones_like(seen.state)))["sides"][0]["seen"] is None
 
 

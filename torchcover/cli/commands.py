@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from torchcover.cli import options
-from torchcover.cli.options import of_evaluate, with_options
+from torchcover.cli.options import of_criterion, of_evaluate, with_options
 from torchcover.evaluation.settings import OPTIONS
 
 UNITS_S = {"s": 1.0, "min": 60.0, "h": 3600.0}
@@ -191,17 +191,14 @@ def targets(
     threshold_m: Annotated[
         float, typer.Option("--threshold-m", help="Detection threshold in metres, for the share of its surface.")
     ] = 0.4,
-    require: Annotated[
-        Path | None, typer.Option(help="YAML file of requirements: exit code 1 if one is not met.")
-    ] = None,
     out: options.Out = Path("out/targets"),
     files: options.Files = options.ALL_FILES,
     **settings: Any,  # noqa: ANN401
 ) -> None:
-    """Put a body at every place around the vehicle: how much of it is seen, where not, and whether that is enough."""
+    """Put a body at every place around the vehicle: how much of it is seen, and where not."""
     from torchcover.cli.target_run import run
 
-    code = run(
+    run(
         rig,
         target,
         scenario,
@@ -210,28 +207,60 @@ def targets(
         hits=hits,
         threshold_m=threshold_m,
         heading=heading,
-        require=require,
         out=out,
         files=files,
         **settings,
     )
-    raise typer.Exit(code)
 
 
-@with_options(of_evaluate("vehicle", "sensor_model", "seed"))
-def encounter(
+@with_options(of_evaluate("vehicle", "sensor_model", "steps", "seed", "workers"))
+def check(
     rigs: Annotated[list[str], typer.Argument(help="Rigs: built-in names (see `list`) or YAML files.")],
+    requirements: Annotated[str, typer.Option(help="What they must see: a built-in set or a YAML file.")],
+    scenario: Annotated[
+        str | None,
+        typer.Option(
+            help="World in place of the file's (which has for regions the courtyard, for bodies flat ground)."
+        ),
+    ] = None,
+    out: options.Out = Path("out/check"),
+    **settings: Any,  # noqa: ANN401
+) -> None:
+    """Is it enough? Exit code 0: all is checked and kept; 1: something is not kept; 3: something is not checked."""
+    from rich.console import Console
+
+    from torchcover.cli.printing import in_words, print_files, print_whole
+    from torchcover.evaluation import check
+    from torchcover.files import claimed
+
+    with claimed(out):
+        found = check(rigs, requirements, scenario, progress=True, **settings)
+        written = found.save(out)
+    print_whole([in_words(table) for table in found.tables()])
+    print_files(written, out, Console())
+    raise typer.Exit(found.exit_code)
+
+
+@with_options([*of_criterion(), *of_evaluate("vehicle", "sensor_model", "seed")])
+def encounter(
+    rigs: Annotated[
+        list[str] | None,
+        typer.Argument(help="Rigs: built-in names (see `list`) or YAML files; with --frames those of the recording."),
+    ] = None,
     encounters: Annotated[
         str, typer.Option("--set", help="Set of encounters: a built-in name or a YAML file.")
     ] = "crossing_like",
-    phases: Annotated[int, typer.Option(min=1, help="At how many places of their period the looks begin.")] = 10,
-    points: Annotated[int, typer.Option(min=1, help="Points that are enough, of LiDARs with the same rate.")] = 5,
-    pixels: Annotated[int, typer.Option(min=1, help="Pixels of the full image that are enough, of a camera.")] = 200,
-    looks: Annotated[int, typer.Option(min=1, help="In so many looks in a row.")] = 3,
-    deceleration: Annotated[float, typer.Option(help="Of the brakes, in m/s2.")] = 9.0,
-    latency_s: Annotated[
-        float, typer.Option("--latency-s", help="Seconds from the last of these looks to the brakes.")
-    ] = 0.5,
+    scenario: Annotated[
+        str | None, typer.Option(help="Instead: whom the vehicle meets in the traffic of this scenario, as `urban`.")
+    ] = None,
+    frames: Annotated[
+        Path | None, typer.Option(help="Instead: whom it met in a recording with poses and labelled objects.")
+    ] = None,
+    phases: Annotated[int, typer.Option(min=1, help="Of a set: at how many places of their period looks begin.")] = 10,
+    worlds: Annotated[int, typer.Option(min=1, help="Of a scenario: how many of its worlds are driven through.")] = 16,
+    film: Annotated[
+        Path | None, typer.Option(help="Of a set: film what the first rig detects latest, as a .gif or .mp4 file.")
+    ] = None,
     out: options.Out = Path("out/encounters"),
     files: options.Files = options.ALL_FILES,
     **settings: Any,  # noqa: ANN401
@@ -241,13 +270,28 @@ def encounter(
 
     from torchcover.cli.printing import in_words, print_files, print_whole
     from torchcover.encounters import Criterion
-    from torchcover.evaluation import encounter, save_encounters
+    from torchcover.evaluation import encounter, encounter_film, met_in_recording, met_in_traffic, save_encounters
     from torchcover.files import claimed
+    from torchcover.report import check_film, write_film
 
-    criterion = Criterion(points, pixels, looks, deceleration, latency_s)
+    criterion = Criterion(**{name: settings.pop(name) for name in Criterion.__annotations__})
+    if frames is not None and (rigs or scenario is not None):
+        raise ValueError("--frames: a recording has its own rigs and traffic; leave out rigs and --scenario")
+    if film is not None:
+        check_film(film)
+        if frames is not None or scenario is not None:
+            raise ValueError("--film: of a set only; leave out --frames and --scenario")
     with claimed(out):
-        found = encounter(rigs, encounters, criterion, phases=phases, progress=True, **settings)
+        if frames is not None:
+            found = met_in_recording(frames, criterion)
+        elif scenario is not None:
+            found = met_in_traffic(rigs or (), scenario, criterion, worlds=worlds, progress=True, **settings)
+        else:
+            found = encounter(rigs or (), encounters, criterion, phases=phases, progress=True, **settings)
         written = save_encounters(found, out, files=files)
+    if film is not None:
+        told = {name: settings.get(name) for name in ("vehicle", "sensor_model")}
+        write_film(film, encounter_film((rigs or [])[0], found, **told), per_s=10)
     print_whole([in_words(table) for table in found.tables()])
     print_files(written, out, Console())
 
@@ -274,7 +318,9 @@ def search(
     every_s: Annotated[float | None, typer.Option("--every-s", help="Seconds between two of them (20).")] = None,
     rays: Annotated[int | None, typer.Option(min=1, help="Rays of the reference at each instant (16384).")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the search and its worlds; fresh ones have the next.")] = 0,
-    workers: Annotated[int, typer.Option(min=0, help="Processes that score; 0 scores in this one.")] = 0,
+    workers: Annotated[
+        int | None, typer.Option(min=0, help="Processes that score; 0 scores in this one. Not given: as many as help.")
+    ] = None,
     resume: Annotated[
         bool,
         typer.Option(
@@ -292,7 +338,7 @@ def search(
     if budget is not None and evaluations is not None:
         raise ValueError("--budget, --evaluations: one of them; both are given")
     given = {"worlds": worlds, "fresh_worlds": fresh_worlds, "per_world": per_world, "every_s": every_s,
-             "rays": rays, **settings}  # fmt: skip
+             "rays": rays, "workers": workers, **settings}  # fmt: skip
     run(
         space,
         out,
@@ -303,7 +349,6 @@ def search(
         optimiser=optimiser,
         estimate=estimate,
         seed=seed,
-        workers=workers,
         **{name: value for name, value in given.items() if value is not None},
     )
 
@@ -354,7 +399,7 @@ def list_builtin(
         str | None, typer.Argument(help="Only those with this word, with all that is said of them.")
     ] = None,
 ) -> None:
-    """List the built-in rigs, scenarios, LiDAR models, vehicles, materials, weather and encounters."""
+    """List the built-in rigs, scenarios, LiDAR models, vehicles, materials, weather, encounters and requirements."""
     from torchcover.cli.listing import run
 
     run(word)

@@ -32,6 +32,7 @@ def run(word: str | None) -> None:
         ("materials", _reflectivity),
         ("weather", None),
         ("encounters", None),
+        ("requirements", None),
     ):
         rows = []
         for name, document in builtin_documents(kind).items():

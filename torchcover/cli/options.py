@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
 
 import typer
 
+from torchcover.encounters.criterion import Criterion
 from torchcover.evaluation.settings import FILES, OPTIONS, Settings, wanted_files
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ def with_options(parameters: Sequence[inspect.Parameter]) -> Callable[[Command],
     """A decorator: the command has these options, too, and gets those that were given as keywords.
 
     Args:
-        parameters: From `of_evaluate` or `parameters_of`.
+        parameters: From `of_evaluate`, `of_criterion` or `parameters_of`.
     """
     shared = {each.name for each in parameters}
 
@@ -47,6 +48,17 @@ def of_evaluate(*names: str, several: bool = False) -> list[inspect.Parameter]:
         several: Whether each may be given several times.
     """
     return [_parameter(name, several=several) for name in names]
+
+
+def of_criterion() -> list[inspect.Parameter]:
+    """What `Criterion` declares."""
+    found = []
+    for name, said in Criterion.__annotations__.items():
+        kind, words = get_args(said)
+        annotation = Annotated[kind, typer.Option(f"--{name.replace('_', '-')}", help=words)]
+        usual = getattr(Criterion, name)
+        found.append(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=usual, annotation=annotation))
+    return found
 
 
 def parameters_of(command: Command) -> list[inspect.Parameter]:

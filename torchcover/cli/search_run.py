@@ -8,6 +8,7 @@ import typer
 from rich.console import Console
 
 from torchcover.cli.printing import in_words, print_files, print_whole
+from torchcover.evaluation.cores import usual_workers
 from torchcover.files import SUMMARY, claimed
 from torchcover.placement import (
     ChoiceSpace,
@@ -19,6 +20,7 @@ from torchcover.placement import (
     choose,
     run_search,
 )
+from torchcover.placement.common_instants import WORLDS
 from torchcover.placement.plan import common_instants
 from torchcover.placement.running import CHECKPOINT
 from torchcover.simulation.documents import read_mapping
@@ -26,6 +28,8 @@ from torchcover.simulation.documents import read_mapping
 CHOICE_KEY = "candidates"
 # Of a search, if nothing is given.
 BUDGET_S = 30 * 60.0
+# As many as a search looks at, about: each of its instants a hundred times or more.
+FRAMES = 1000
 
 
 def run(
@@ -43,12 +47,13 @@ def run(
         FileNotFoundError: An unknown name or file.
     """
     find = _chosen if CHOICE_KEY in read_mapping(path) else _searched
+    settings = {"workers": usual_workers(FRAMES, settings.get("worlds", WORLDS), whole=False), **settings}
     with claimed(out):
         report = find(path, out, resume=resume, **settings).report
         written = report.save(out, files=files)
         if not resume:
             (out / CHECKPOINT).unlink(missing_ok=True)  # there is nothing left that would go on from it
-    print_whole([in_words(report.tables[0])])
+    print_whole([in_words(table) for table in report.tables[:2]])
     console = Console()
     print_files(written, out, console)
     console.print(report.sentence, markup=False, soft_wrap=True)
@@ -77,4 +82,4 @@ def _chosen(path: Path, out: Path, *, resume: bool, **settings: Any) -> SensorCh
         raise ValueError(f"{', '.join(useless)}: the {CHOICE_KEY} of this file are all looked at; leave it out")
     space, plan = ChoiceSpace.load(path), SearchPlan(**settings | {"budget_s": math.inf})
     with common_instants(space, plan, plan.seed, plan.worlds) as instants:
-        return choose(space, instants, test_seed=plan.seed_of_test, fresh_worlds=plan.fresh_worlds)
+        return choose(space, instants, test_seed=plan.seed_of_test, fresh_worlds=plan.fresh_worlds, progress=True)

@@ -1,6 +1,5 @@
 """What `torchcover targets` does and prints."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +10,7 @@ from torchcover.evaluation import save_targets, survey_target
 from torchcover.evaluation.target_survey import places_table, sides_table
 from torchcover.files import claimed
 from torchcover.simulation import Rig
-from torchcover.targets import Heading, Raster, Requirements, TargetMap, Verdict, check
-
-FAILED = 1
+from torchcover.targets import Heading, Raster, TargetMap
 
 
 def run(
@@ -23,21 +20,16 @@ def run(
     *,
     raster: str | None,
     heading: str,
-    require: Path | None,
     out: Path,
     files: str,
     **settings: Any,  # noqa: ANN401  (those of `survey_target`)
-) -> int:
-    """Survey a target, write and print what is seen, judge it.
-
-    Returns:
-        1 if a requirement is not met, else 0.
+) -> None:
+    """Survey a target, write and print what is seen.
 
     Raises:
         ValueError: An option or a file that cannot be used.
         FileNotFoundError: An unknown name or file.
     """
-    requirements = None if require is None else Requirements.load(require)  # before the work, not after it
     with claimed(out):
         seen = survey_target(
             rig,
@@ -47,14 +39,9 @@ def run(
             heading=parsed_heading(heading),
             **settings,
         )
-        verdicts = [] if requirements is None else check(requirements, seen)
-        sensors = Rig.load(rig).sensors
-        others = () if requirements is None else requirements.requirements
-        not_checked = [other.words for other in others if not other.is_about(seen.target)]
-        written = save_targets(seen, out, verdicts, sensors, not_checked=not_checked, files=files)
-    _print(seen, verdicts, not_checked)
+        written = save_targets(seen, out, Rig.load(rig).sensors, files=files)
+    _print(seen)
     print_files(written, out, Console())
-    return 0 if all(verdict.passed for verdict in verdicts) else FAILED
 
 
 def parsed_raster(text: str) -> Raster:
@@ -88,7 +75,7 @@ def parsed_heading(text: str) -> Heading:
         raise ValueError(f"--heading: narrow, wide or degrees are needed; got {text!r}") from error
 
 
-def _print(seen: TargetMap, verdicts: Sequence[Verdict], not_checked: Sequence[str]) -> None:
+def _print(seen: TargetMap) -> None:
     console = Console()
     length, width, height = seen.target_size_m
     size = f"{length:.2f} x {width:.2f} x {height:.2f} m"
@@ -101,17 +88,3 @@ def _print(seen: TargetMap, verdicts: Sequence[Verdict], not_checked: Sequence[s
     print_whole([in_words(sides_table(seen)), in_words(worst)])
     if unknown := seen.counts["share_unknown"]:
         console.print(f"{unknown:,} places show no surface to any random place: their share is unknown.")
-    for verdict in verdicts:
-        console.print(_sentence(verdict), markup=False, soft_wrap=True)
-        if verdict.worst:
-            print_whole([in_words(places_table(verdict.worst, "where not, the nearest first"))])
-    for words in not_checked:
-        console.print(f"not checked, as it is not about {seen.target}: {words}", markup=False, soft_wrap=True)
-
-
-def _sentence(verdict: Verdict) -> str:
-    words = f"{'PASS' if verdict.passed else 'FAIL'} {verdict.requirement.words}"
-    if verdict.passed:
-        return f"{words}: at all of {verdict.cells:,} places"
-    unknown = f", of which {verdict.unknown:,} are unknown" if verdict.unknown else ""
-    return f"{words}: not at {verdict.failed:,} of {verdict.cells:,} places{unknown}"

@@ -1,3 +1,4 @@
+from .criterion import Criterion as Criterion
 from .encounter import Encounter as Encounter
 from .encounter import EncounterSet as EncounterSet
 from .encounter import Obstacle as Obstacle
@@ -5,7 +6,6 @@ from .encounter import Other as Other
 from .encounter import Way as Way
 from .result import EncounterRow as EncounterRow
 from .result import Sightings as Sightings
-from .sighting import Criterion as Criterion
 from .sighting import Sighting as Sighting
 from .sighting import sight_encounter as sight_encounter
 from .staging import Staged as Staged

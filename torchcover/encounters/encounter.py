@@ -154,9 +154,14 @@ class Encounter(Document):
         return self
 
     @property
+    def speed_kmh(self) -> float:
+        """Of the ego."""
+        return self.ego.speed_kmh
+
+    @property
     def words(self) -> str:
         """Which one of its set."""
-        return f"encounter {self.name!r} at {self.ego.speed_kmh:g} km/h"
+        return f"encounter {self.name!r} at {self.speed_kmh:g} km/h"
 
     @property
     def closing_mps(self) -> float:

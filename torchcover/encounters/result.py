@@ -2,30 +2,39 @@
 
 import csv
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+import torch
 
-from torchcover.encounters.sighting import Criterion, Sighting
-from torchcover.estimation import student_t95
-from torchcover.report import PageTable, Words
+from torchcover.encounters.criterion import Criterion
+from torchcover.encounters.sighting import Sighting
+from torchcover.encounters.traffic import WHO, Approach
+from torchcover.estimation import Estimate, Number, Quantity
+from torchcover.report import PageTable, Words, json_record, percent
 
-Float64 = NDArray[np.float64]
+NUMBERS = (
+    Quantity("ttc_s", "time to collision at detection", "s", lower_is_better=False),
+    Quantity("from_the_beginning", "seen from the beginning", "share", lower_is_better=False),
+    Quantity("per_hour", "met an hour", "1/h", lower_is_better=True),
+)
+ALL = "all"
 
 
 class EncounterRow(NamedTuple):
-    """A rig in one encounter at one speed, or in all that were drawn; times to collision are 0 if it was too late.
+    """A rig in one encounter at one speed, or in all that were drawn or met; 0 s if it was too late.
 
-    `ttc_s_low` and `ttc_s_high` are the least and the most over phases and draws; `ttc_s` is their mean, and
-    `interval_low` and `interval_high` its 95 % interval over the draws, NaN without. `needed_s` is the most of any
-    draw, `in_time` the share of phases and draws, `from_the_beginning` that in which it was seen as soon as it began,
-    and may have been before. `first` is the sensor that alone is first in the mean; of the sensors that may fail, one
-    at a time, `worst` is that without which the least time is left, `without_worst_s`.
+    `ttc_s` is the mean time to collision at detection over phases and draws, of which `ttc_s_low` is the least and
+    `ttc_s_high` the most. `needed_s` is the most of any draw, `in_time` the share of phases and draws, `never` that
+    without detection, `from_the_beginning` that in which it was seen as soon as it began, and may have been before.
+    `first` is the sensor that alone is first in the mean; of the sensors that may fail, one at a time, `worst` is that
+    without which the least time is left, `without_worst_s`: the least of all, of traffic the mean. Of traffic,
+    `per_hour` says how many were met. Intervals of 95 % are over draws or worlds, NaN of fewer than 8: `interval_low`
+    and `interval_high` that of `ttc_s`.
     """
 
     rig: str
@@ -40,7 +49,13 @@ class EncounterRow(NamedTuple):
     interval_low: float
     interval_high: float
     in_time: float
+    never: float
     from_the_beginning: float
+    from_the_beginning_low: float
+    from_the_beginning_high: float
+    per_hour: float
+    per_hour_low: float
+    per_hour_high: float
     first: str
     worst: str
     without_worst_s: float
@@ -48,15 +63,16 @@ class EncounterRow(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Sightings:
-    """What some rigs had of a set of encounters.
+    """What some rigs had of a set of encounters, or of those that happened in traffic.
 
     Args:
-        name: Of the set.
+        name: Of the set, of the scenario, or of the recording.
         criterion: What is detected, and what is in time.
         phases: Of the looks.
-        seed: Of noise and drop-out.
+        seed: Of noise and drop-out, and of traffic.
         sensors: Name of each rig -> those of its sensors.
         sightings: Of each rig in each encounter; the encounters of one rig follow each other.
+        hours: Name of each world of the traffic -> how long it was; none of a set.
     """
 
     name: str
@@ -65,48 +81,67 @@ class Sightings:
     seed: int
     sensors: dict[str, tuple[str, ...]]
     sightings: Sequence[Sighting]
+    hours: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def rows(self) -> list[EncounterRow]:
-        """By encounter, then speed, then rig."""
-        order = {name: k for k, name in enumerate(dict.fromkeys(one.encounter.name for one in self.sightings))}
-        rigs = list(self.sensors)
+        """By encounter, then speed, then rig; of traffic also of all together, whoever was met."""
+        names = dict.fromkeys(one.encounter.name for one in self.sightings)
+        order = {name: k for k, name in enumerate((*(WHO if self.hours else names), ALL))}
+        groups: dict[tuple[int, float, int], list[Sighting]] = {}
+        rigs = {name: k for k, name in enumerate(self.sensors)}
+        for one in self.sightings:
+            speed_kmh = one.encounter.speed_kmh if one.encounter.speed_is_swept else -math.inf
+            groups.setdefault((order[one.encounter.name], speed_kmh, rigs[one.rig]), []).append(one)
+        if self.hours:
+            together = [[one for one in self.sightings if one.rig == rig] for rig in rigs]
+            groups |= {(order[ALL], -math.inf, k): of_rig for k, of_rig in enumerate(together)}
+        return [self._row(list(order)[key[0]], list(rigs)[key[2]], groups[key]) for key in sorted(groups)]
 
-        def key(one: Sighting) -> tuple[int, float, int]:
-            swept = one.encounter.speed_is_swept
-            speed_kmh = one.encounter.ego.speed_kmh if swept else -math.inf
-            return order[one.encounter.name], speed_kmh, rigs.index(one.rig)
-
-        return [self._row(list(group)) for _, group in groupby(sorted(self.sightings, key=key), key)]
-
-    def _row(self, draws: list[Sighting]) -> EncounterRow:
-        first, criterion = draws[0], self.criterion
-        ttc_s = np.stack([one.ttc_s for one in draws])
-        needed_s = np.array([criterion.needed_s(one.encounter.closing_mps) for one in draws])
-        alone_s = np.mean([one.sensor_ttc_s for one in draws], axis=(0, 2))
-        without_s = np.min([one.without_ttc_s for one in draws], axis=(0, 2))
-        of_draws_s, sensors = ttc_s.mean(axis=1), self.sensors[first.rig]
-        error_s = of_draws_s.std(ddof=1) / math.sqrt(len(draws)) if len(draws) > 1 else math.nan
-        margin_s = student_t95(len(draws) - 1) * error_s if error_s > 0 else math.nan
-        mean_s, swept = float(of_draws_s.mean()), first.encounter.speed_is_swept
+    def _row(self, name: str, rig: str, draws: list[Sighting]) -> EncounterRow:
+        sensors = self.sensors[rig]
+        none = np.zeros((1, len(sensors), self.phases))
+        ttc_s = np.stack([one.ttc_s for one in draws] or none[:, 0])
+        alone_s = np.mean([one.sensor_ttc_s for one in draws] or none, axis=(0, 2))
+        least = np.mean if self.hours else np.min
+        without_s = least([one.without_ttc_s for one in draws] or none, axis=(0, 2))
+        numbers = self._numbers(draws)
+        swept = bool(draws) and draws[0].encounter.speed_is_swept
         return EncounterRow(
-            rig=first.rig,
-            encounter=first.encounter.name,
-            speed_kmh=first.encounter.ego.speed_kmh if swept else math.nan,
+            rig=rig,
+            encounter=name,
+            speed_kmh=draws[0].encounter.speed_kmh if swept else math.nan,
             draws=len(draws),
             phases=self.phases,
-            needed_s=float(needed_s.max()),
-            ttc_s=mean_s,
+            needed_s=max((self.criterion.needed_s(one.encounter.closing_mps) for one in draws), default=math.nan),
+            ttc_s=numbers["ttc_s"].value,
             ttc_s_low=float(ttc_s.min()),
             ttc_s_high=float(ttc_s.max()),
-            interval_low=mean_s - margin_s,
-            interval_high=mean_s + margin_s,
-            in_time=float((ttc_s >= needed_s[:, None]).mean()),
-            from_the_beginning=float(np.mean([one.from_the_beginning for one in draws])),
+            interval_low=numbers["ttc_s"].low,
+            interval_high=numbers["ttc_s"].high,
+            in_time=float(np.mean([one.in_time for one in draws])) if draws else math.nan,
+            never=float((ttc_s == 0).mean()),
+            from_the_beginning=numbers["from_the_beginning"].value,
+            from_the_beginning_low=numbers["from_the_beginning"].low,
+            from_the_beginning_high=numbers["from_the_beginning"].high,
+            per_hour=numbers["per_hour"].value,
+            per_hour_low=numbers["per_hour"].low,
+            per_hour_high=numbers["per_hour"].high,
             first=sensors[int(alone_s.argmax())] if alone_s.any() else "",
             worst=sensors[int(without_s.argmin())],
             without_worst_s=float(without_s.min()),
         )
+
+    def _numbers(self, draws: Sequence[Sighting]) -> dict[str, Number]:
+        """Those of `NUMBERS`, of which each world is a block, or each draw."""
+        blocks = {name: k for k, name in enumerate(self.hours or map(str, range(len(draws))))}
+        sums = torch.zeros(len(blocks), len(NUMBERS), dtype=torch.float64)
+        for k, one in enumerate(draws):
+            of_one = [one.ttc_s.mean(), one.from_the_beginning.mean(), 1.0]
+            sums[blocks[one.world if self.hours else str(k)]] += torch.tensor(of_one, dtype=torch.float64)
+        base = sums[:, [2, 2, 2]]
+        base[:, 2] = torch.tensor(list(self.hours.values()) or [math.nan] * len(blocks))
+        return Estimate.of_ratios(NUMBERS, base, sums, torch.ones(len(blocks), dtype=torch.int64)).numbers()
 
     def up_to_kmh(self) -> dict[tuple[str, str], float]:
         """Encounter and rig -> the speed up to which it is in time in every phase and draw, of those that were swept.
@@ -127,12 +162,24 @@ class Sightings:
     def settings(self) -> dict[str, Any]:
         """What it is of, for JSON."""
         rigs = {name: list(sensors) for name, sensors in self.sensors.items()}
-        return {"set": self.name, **asdict(self.criterion), "phases": self.phases, "seed": self.seed, "rigs": rigs}
+        what = {"traffic": self.name, "hours": sum(self.hours.values())} if self.hours else {"set": self.name}
+        return {**what, **asdict(self.criterion), "phases": self.phases, "seed": self.seed, "rigs": rigs}
+
+    def record(self) -> dict[str, Any]:
+        """All of it, for JSON."""
+        up_to = [{"encounter": name, "rig": rig, "in_time_up_to_kmh": v} for (name, rig), v in self.up_to_kmh().items()]
+        rows = [row._asdict() for row in self.rows]
+        met = [{"rig": one.rig, "world": one.world, "who": one.encounter.name, "name": one.encounter.track.name,
+                "step": one.encounter.step, "least_s": float(one.encounter.ttc_s.min()),
+                "ttc_s": float(one.ttc_s[0]), "in_time": bool(one.in_time[0])}
+               for one in self.sightings if isinstance(one.encounter, Approach)]  # fmt: skip
+        listed = {"rows": rows, "speeds": [] if self.hours else up_to, "met": met}
+        return self.settings() | {name: list(map(json_record, each)) for name, each in listed.items()}
 
     def tables(self) -> list[PageTable]:
         """Up to which speed, when, and by which sensor."""
         rows, rigs = self.rows, list(self.sensors)
-        tables = [self._times(rows, rigs)]
+        tables = [self._met(rows, rigs) if self.hours else self._times(rows, rigs)]
         if any(one.encounter.speed_is_swept for one in self.sightings):
             tables.insert(0, _speeds(self.up_to_kmh(), rigs))
         several = [row for row in rows if len(self.sensors[row.rig]) > 1]
@@ -149,12 +196,25 @@ class Sightings:
             "The least and the most over the phases of the looks and what was drawn, of that the mean with its 95 % "
             "interval; - is not before the collision.",
             *(["> was seen as soon as the encounter began, and may have been before."] if unsure else []),
-            f"Detected: {self.criterion.points} points of LiDARs, {self.criterion.pixels} pixels of a camera, or a "
-            f"point of a radar, in {self.criterion.looks} looks in a row. Needed: to stop with "
-            f"{self.criterion.deceleration_mps2:g} m/s2, {self.criterion.latency_s:g} s after that.",
+            self.criterion.words,
         ]
         headings = ("encounter", "km/h", "needed\n(s)", *(f"{rig}\n(s)" for rig in rigs))
         return PageTable("Time to collision at detection", headings, cells, notes=notes)
+
+    def _met(self, rows: Sequence[EncounterRow], rigs: Sequence[str]) -> PageTable:
+        within_s, cells = self.criterion.within_s, []
+        for first in range(0, len(rows), len(rigs)):
+            of_rigs = rows[first : first + len(rigs)]
+            often = _with_interval(of_rigs[0], "per_hour", "{:.0f}".format)
+            cells.append(tuple(map(Words, (of_rigs[0].encounter, str(of_rigs[0].draws), often, *map(_met, of_rigs)))))
+        notes = [
+            f"Met: came within {within_s:g} s of a collision, if both had gone straight on, in "
+            f"{60 * sum(self.hours.values()):.0f} minutes. Detected before that, with a 95 % interval over "
+            f"{len(self.hours)} worlds (of 8 or more), or at the least time to collision, or never.",
+            f"{self.criterion.words} Too late: it was needed before.",
+            *([] if self.sightings else ["Nobody was met: drive longer (--worlds), or elsewhere."]),
+        ]
+        return PageTable("Met, and detected before", ("who", "met", "an hour", *rigs), cells, notes=notes)
 
     def write_csv(self, path: Path) -> None:
         """Rows as of `rows`; empty where nothing is known."""
@@ -173,9 +233,9 @@ class Sightings:
                 times: dict[float, list[float]] = {}
                 for one in of_names[name]:
                     if one.rig == rig:
-                        times.setdefault(abs(one.encounter.ego.speed_kmh), []).extend(one.ttc_s.tolist())
+                        times.setdefault(abs(one.encounter.speed_kmh), []).extend(one.ttc_s.tolist())
                 bands[rig] = [(speed, min(each), max(each)) for speed, each in sorted(times.items())]
-            cases = {abs(one.encounter.ego.speed_kmh): one.encounter.closing_mps for one in of_names[name]}
+            cases = {abs(one.encounter.speed_kmh): one.encounter.closing_mps for one in of_names[name]}
             yield name, bands, [(speed, self.criterion.needed_s(mps)) for speed, mps in sorted(cases.items())]
 
 
@@ -184,7 +244,7 @@ def _cells(row: EncounterRow) -> list[str]:
 
 
 def _speed(row: EncounterRow) -> str:
-    return "drawn" if math.isnan(row.speed_kmh) else f"{row.speed_kmh:g}"
+    return f"{row.speed_kmh:g}" if row.speed_kmh == row.speed_kmh else "drawn" if math.isnan(row.per_hour) else "any"
 
 
 def _time(row: EncounterRow) -> str:
@@ -195,6 +255,20 @@ def _time(row: EncounterRow) -> str:
     mean = f", mean {row.ttc_s:.2f}" if row.draws > 1 else ""
     interval = f" ({row.interval_low:.2f} to {row.interval_high:.2f})" if row.interval_high > row.interval_low else ""
     return f"{'>' if row.from_the_beginning else ''}{low if low == high else f'{low} to {high}'}{mean}{interval}{late}"
+
+
+def _with_interval(row: EncounterRow, key: str, words: Callable[[float], str]) -> str:
+    value, low, high = (getattr(row, f"{key}{end}") for end in ("", "_low", "_high"))
+    return words(value) + ("" if math.isnan(low) else f" ({words(max(low, 0.0))} to {words(high)})")
+
+
+def _met(row: EncounterRow) -> str:
+    if row.draws == 0:
+        return "-"
+    least = f", least {row.ttc_s_low:.2f} s" if row.from_the_beginning < 1 and row.never == 0 else ""
+    counts = ((row.never, "never"), (1 - row.in_time, "too late"))
+    told = [f", {round(share * row.draws)} {word}" for share, word in counts if share]
+    return f"{_with_interval(row, 'from_the_beginning', percent)} %{least}{''.join(told)}"
 
 
 def _speeds(up_to_kmh: dict[tuple[str, str], float], rigs: Sequence[str]) -> PageTable:
@@ -213,5 +287,5 @@ def _sensors(rows: Sequence[EncounterRow]) -> PageTable:
                           f"{row.without_worst_s:.2f}" if row.without_worst_s else "-", f"{row.needed_s:.2f}")))
         for row in rows
     ]  # fmt: skip
-    headings = ("rig", "encounter", "km/h", "first", "worst to lose", "least without\n(s)", "needed\n(s)")
+    headings = ("rig", "encounter", "km/h", "first", "worst to lose", "without\n(s)", "needed\n(s)")
     return PageTable("Sensors: which alone is first, and what is left without one", headings, cells, words_first=2)

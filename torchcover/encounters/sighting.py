@@ -3,13 +3,13 @@
 import math
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.encounters.criterion import Criterion
 from torchcover.encounters.encounter import Encounter
 from torchcover.encounters.staging import STEP_S, Staged
 from torchcover.simulation.camera_sensor import CameraSensor
@@ -21,11 +21,17 @@ from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.sensor import Draws, Sensor
 from torchcover.simulation.sight import Ends, MountedSensor, sight
+from torchcover.simulation.stage import mounted_on
 from torchcover.targets.counting import Beams, Met, measured_points, meetings
 from torchcover.targets.steps import SensorStep
 
+if TYPE_CHECKING:
+    from torchcover.encounters.traffic import Approach
+
 Float64 = NDArray[np.float64]
 Numbers = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+IsEnough = Callable[[Numbers], Bools]
 
 # A point that is measured farther from where it is than this is none on the other.
 WITHIN_M = 0.4
@@ -35,61 +41,22 @@ RADAR_POINTS = 1
 NEVER = np.iinfo(np.int64).max
 
 
-@dataclass(frozen=True)
-class Criterion:
-    """What is detected, and what is in time.
-
-    Args:
-        points: So many points on the other are enough, of all LiDARs with the same rate together; of a radar one is.
-        pixels: So many pixels of the full image are enough, of a camera alone.
-        looks: In so many looks in a row.
-        deceleration_mps2: Of the brakes.
-        latency_s: From the last of these looks to the brakes.
-
-    Raises:
-        ValueError: A number out of its bounds.
-    """
-
-    points: int = 5
-    pixels: int = 200
-    looks: int = 3
-    deceleration_mps2: float = 9.0
-    latency_s: float = 0.5
-
-    def __post_init__(self) -> None:
-        for name in ("points", "pixels", "looks"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: a number >= 1 is needed; got {getattr(self, name)}")
-        if not 0 < self.deceleration_mps2 < math.inf:
-            raise ValueError(f"deceleration: m/s2 above 0 are needed; got {self.deceleration_mps2}")
-        if not 0 <= self.latency_s < math.inf:
-            raise ValueError(f"latency: seconds of 0 or more are needed; got {self.latency_s}")
-
-    def needed_s(self, closing_mps: float) -> float:
-        """The time to collision at which braking still prevents it: v / (2 a) + latency.
-
-        Example:
-            >>> round(Criterion().needed_s(50 / 3.6), 2)
-            1.27
-        """
-        return closing_mps / (2 * self.deceleration_mps2) + self.latency_s
-
-
 class Sighting(NamedTuple):
     """What a rig had of an encounter, for P phases of its looks and S sensors; 0 is not before the collision.
 
-    `ttc_s` (P,) time to collision at detection; `sensor_ttc_s` (S, P) of each sensor alone, `without_ttc_s` (S, P)
-    of all others; `from_the_beginning` (P,) whether it was seen as soon as the encounter began, and the other may
-    have been there before.
+    `ttc_s` (P,) time to collision at detection, `in_time` (P,) whether that was in time; `sensor_ttc_s` (S, P) of each
+    sensor alone, `without_ttc_s` (S, P) of all others; `from_the_beginning` (P,) whether it was seen as soon as the
+    encounter began, and the other may have been there before.
     """
 
-    encounter: Encounter
+    encounter: "Encounter | Approach"
     rig: str
-    contact_s: float
     ttc_s: Float64
+    in_time: Bools
     sensor_ttc_s: Float64
     without_ttc_s: Float64
-    from_the_beginning: NDArray[np.bool_]
+    from_the_beginning: Bools
+    world: str = ""
 
 
 class MountedRig:
@@ -115,23 +82,9 @@ class MountedRig:
         weather = self.rig.weather or encounter.weather
         key = weather.model_dump_json()
         if key not in self._mounted:
-            sensors = [_at_once(sensor) for sensor in self.rig.sensors]
-            for sensor in sensors:
-                if scene.encloses(sensor.mount.matrix()[:3, 3]):
-                    raise ValueError(
-                        f"rig {self.rig.name!r}: sensor {sensor.name!r} lies inside the vehicle "
-                        f"{self._scenario.ego_name!r}; move its mount, or use its own vehicle (--vehicle)"
-                    )
-            self._mounted[key] = [
-                MountedSensor(
-                    sensor,
-                    scene,
-                    self._scenario.reach_m(sensor, weather),
-                    weather,
-                    [other for other in sensors if other is not sensor],
-                )
-                for sensor in sensors
-            ]
+            at_once = [_at_once(sensor) for sensor in self.rig.sensors]
+            here = self.rig.model_copy(update={"sensors": at_once, "weather": weather})
+            self._mounted[key] = mounted_on(scene, self._scenario, self.rig.name, here)
         return self._mounted[key]
 
     def check_rates(self, looks: int, staged: Staged) -> None:
@@ -179,47 +132,68 @@ def sight_encounter(
     looks = Looks(mounted_rig, staged, seed)
     sensors = mounted_rig.rig.sensors
     mounted_rig.check_rates(criterion.looks, staged)
-    found = dict[tuple[int, ...], NDArray[np.int64]]()
-
-    def steps_of(together: tuple[int, ...]) -> NDArray[np.int64]:
-        if together not in found:
-            rate_hz = sensors[together[0]].rate_hz
-            enough = _enough(criterion, sensors[together[0]])
-            at = look_steps(rate_hz, phases, staged.contact_s)
-            found[together] = first_run(lambda steps: looks.points(together, steps) >= enough, at, criterion.looks)
-        return found[together]
-
-    def ttc_s(numbers: Sequence[int]) -> Float64:
-        detected = [steps_of(channel) for channel in channels(sensors, numbers)]
-        steps = np.min([np.full(phases, NEVER), *detected], axis=0)
-        return np.where(steps < NEVER, staged.contact_s - STEP_S * steps, 0.0)
-
-    everything = range(len(sensors))
-    times_s = ttc_s(everything)
-    longest_s = max((criterion.looks / sensor.rate_hz for sensor in sensors), default=0.0)
-    return Sighting(
-        encounter,
-        mounted_rig.rig.name,
-        staged.contact_s,
-        times_s,
-        np.stack([ttc_s([k]) for k in everything]),
-        np.stack([ttc_s([other for other in everything if other != k]) for k in everything]),
-        (times_s > staged.contact_s - longest_s) & (encounter.before_s == encounter.seconds),
+    found = detections(
+        kinds_of(sensors),
+        [enough_of(criterion, sensor) for sensor in sensors],
+        looks.points,
+        lambda is_enough, k: first_run(
+            is_enough, look_steps(sensors[k].rate_hz, phases, staged.contact_s), criterion.looks
+        ),
     )
+    ttc_s = [np.where(steps < NEVER, staged.contact_s - STEP_S * steps, 0.0) for steps in found]
+    longest_s = max((criterion.looks / sensor.rate_hz for sensor in sensors), default=0.0)
+    from_the_beginning = (ttc_s[0] > staged.contact_s - longest_s) & (encounter.before_s == encounter.seconds)
+    in_time = ttc_s[0] >= criterion.needed_s(encounter.closing_mps)
+    return Sighting(encounter, mounted_rig.rig.name, ttc_s[0], in_time, *ttc_s[1:], from_the_beginning)
 
 
-def _enough(criterion: Criterion, sensor: Sensor) -> int:
+def detections(
+    kinds: Sequence[object],
+    enough: Sequence[int],
+    points: Callable[[Sequence[int], Numbers], Numbers],
+    first: Callable[[IsEnough, int], Numbers],
+) -> tuple[Numbers, Numbers, Numbers]:
+    """At which step S sensors detect somebody, or `NEVER`: together (P,), each alone (S, P), and without each (S, P).
+
+    Args:
+        kinds: Of each sensor: those of one kind count together.
+        enough: How many points are, of each sensor's kind.
+        points: What some sensors have together at (N,) steps.
+        first: (P,) the steps at which looks in a row were enough first, by what is enough and who looks.
+    """
+    everything, known = range(len(kinds)), dict[tuple[int, ...], Numbers]()
+
+    def first_of(channel: tuple[int, ...]) -> Numbers:
+        if channel not in known:
+            known[channel] = first(lambda steps: points(channel, steps) >= enough[channel[0]], channel[0])
+        return known[channel]
+
+    def of(sensors: Sequence[int]) -> Numbers:
+        each = [first_of(channel) for channel in channels(kinds, sensors)]
+        return np.min(each, axis=0) if each else np.full_like(together, NEVER)
+
+    together = of(everything)
+    without = [of([other for other in everything if other != k]) for k in everything]
+    return together, np.stack([of([k]) for k in everything]), np.stack(without)
+
+
+def enough_of(criterion: Criterion, sensor: Sensor) -> int:
+    """How many points of a sensor, and those that count with it."""
     if isinstance(sensor, CameraSensor):
         return criterion.pixels
     return RADAR_POINTS if isinstance(sensor, Radar) else criterion.points
 
 
-def channels(sensors: Sequence[Sensor], numbers: Sequence[int]) -> list[tuple[int, ...]]:
-    """Whose points count together, among some sensors: LiDARs of one rate do; each other sensor is alone."""
+def kinds_of(sensors: Sequence[Sensor]) -> list[object]:
+    """Which sensors count together: LiDARs of one rate do; each other sensor is alone."""
+    return [one.rate_hz if isinstance(one, Lidar) else ("alone", k) for k, one in enumerate(sensors)]
+
+
+def channels(kinds: Sequence[object], numbers: Sequence[int]) -> list[tuple[int, ...]]:
+    """Those of some sensors that count together."""
     found: dict[object, list[int]] = {}
     for k in numbers:
-        key = sensors[k].rate_hz if isinstance(sensors[k], Lidar) else ("alone", k)
-        found.setdefault(key, []).append(k)
+        found.setdefault(kinds[k], []).append(k)
     return [tuple(channel) for channel in found.values()]
 
 
@@ -231,7 +205,7 @@ def look_steps(rate_hz: float, phases: int, contact_s: float) -> Numbers:
     return np.where(steps * STEP_S < contact_s, steps, NEVER)
 
 
-def first_run(is_enough: Callable[[Numbers], NDArray[np.bool_]], steps: Numbers, looks: int) -> Numbers:
+def first_run(is_enough: IsEnough, steps: Numbers, looks: int) -> Numbers:
     """When so many looks in a row were enough for the first time: (P,) the step of the last of them, or `NEVER`.
 
     A look that is not enough rules out all runs that it is in, so the last look of a run is asked first: before

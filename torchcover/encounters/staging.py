@@ -8,20 +8,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.encounters.encounter import Encounter, Obstacle, Way
-from torchcover.geometry import BoundingBox, invert
+from torchcover.geometry import BoundingBox, contact_s, invert, outlines_at, overlapping
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.bodies import Shape, called, mover_mesh
 from torchcover.simulation.moving import Solid, Solids
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.shapes import Plane
 from torchcover.simulation.world import Actor, World
-from torchcover.targets.placing import overlapping, poses
+from torchcover.targets.placing import poses
 
-Bools = NDArray[np.bool_]
 Float64 = NDArray[np.float64]
 
 # Looks are at whole ones of these.
 STEP_S = 0.001
+# Where they touch in a bend is found by so many steps in a millisecond.
+FINELY = 1000
 # A bend is straight in between.
 BEND_S = 0.01
 # The meeting is of middles: outlines may touch later, as where one drives into the side of the other's end.
@@ -72,8 +73,8 @@ class Staged:
         pose: Float64 = invert(self.world_T_ego(times_s)) @ self.world_T_other(times_s)
         return pose
 
-    def scene(self, solids: Solids) -> Scene:
-        """All but the other, with a time step of a millisecond."""
+    def scene(self, solids: Solids, *, whole: bool = False) -> Scene:
+        """All but the other, or the `whole`, with a time step of a millisecond."""
         steps = math.ceil(self.contact_s / STEP_S)
         times_s = np.linspace(0.0, steps * STEP_S, 1 + math.ceil(steps * STEP_S / BEND_S))
         along = Trajectory.from_poses(times_s, self.world_T_ego(times_s))
@@ -82,7 +83,9 @@ class Staged:
         ground = Plane(type="plane", size_m=(GROUND_M, GROUND_M)).mesh().made_of("road")
         static = (ground, *(solid_of(one.body).mesh.moved(pose) for one, pose in self.obstacles))
         ego = Actor("ego", "ego", self.ego.mesh, drive)
-        return Scene(World(static, ego, time_step_s=STEP_S, duration_s=steps * STEP_S, ground=(0,)), solids)
+        way = Trajectory.from_poses(times_s, self.world_T_other(times_s))
+        others = (Actor("other", called(self.encounter.other.body), self.other.mesh, way),) if whole else ()
+        return Scene(World(static, ego, others, STEP_S, steps * STEP_S, ground=(0,)), solids)
 
     def _placed_obstacles(self) -> list[tuple[Obstacle, Float64]]:
         """Each and its (4, 4) pose: rows on either side of the ego's way, before and beyond the other."""
@@ -107,25 +110,33 @@ class Staged:
         return found
 
     def _contact_s(self) -> float:
-        def touching(times_s: Float64) -> Bools:
-            return overlapping(self.other.box, self.vehicle_T_other(times_s), self.ego.box.corners_m)
-
         end_s, words = self.encounter.before_s + AFTER_S, self.encounter.words
         times_s = STEP_S * np.arange(math.ceil(end_s / STEP_S) + 1, dtype=np.float64)
-        touches = touching(times_s)
-        if not touches.any():
-            raise ValueError(
-                f"{words}: the two never touch, up to {AFTER_S:g} s after the meeting; change other.at_width, yaw_deg "
-                "or a speed"
-            )
-        first = int(touches.argmax())
-        if first == 0:
-            raise ValueError(
-                f"{words}: the outlines of the two overlap from the beginning; let it begin earlier (seconds, from_m), "
-                "or give them other speeds"
-            )
-        finely_s = times_s[first] - STEP_S * np.linspace(1.0, 0.0, 1001)
-        return float(finely_s[touching(finely_s).argmax()])
+        # Within a step neither turns, but for one in a bend: there it is found out more finely.
+        for step in np.flatnonzero(self._touch_s(times_s) < STEP_S).tolist():
+            about_s = times_s[max(step - 1, 0) : step + 3]
+            finely_s = np.linspace(about_s[0], about_s[-1], FINELY * (len(about_s) - 1) + 1)
+            touch_s = self._touch_s(finely_s)
+            touches = np.flatnonzero(touch_s < np.diff(finely_s))
+            if len(touches) == 0:
+                continue
+            found_s = float(finely_s[touches[0]] + touch_s[touches[0]])
+            if found_s == 0:
+                raise ValueError(
+                    f"{words}: the outlines of the two overlap from the beginning; let it begin earlier (seconds, "
+                    "from_m), or give them other speeds"
+                )
+            return found_s
+        raise ValueError(
+            f"{words}: the two never touch, up to {AFTER_S:g} s after the meeting; change other.at_width, yaw_deg "
+            "or a speed"
+        )
+
+    def _touch_s(self, times_s: Float64) -> Float64:
+        """(T - 1,) how long after each time they would touch, if they went on as until the next one."""
+        there = self.vehicle_T_other(times_s)
+        velocity_mps = np.diff(there[:, :2, 3], axis=0) / np.diff(times_s)[:, None]
+        return contact_s(self.ego.box.outline_m, outlines_at(self.other.box.outline_m, there[:-1]), velocity_mps)
 
     def _check_ways(self) -> None:
         """Until they touch, nobody drives or walks through an obstacle."""

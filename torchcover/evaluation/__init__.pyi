@@ -2,9 +2,14 @@ from .agreeing import AgreementStudy as AgreementStudy
 from .agreeing import agree as agree
 from .agreeing import relation as relation
 from .agreeing import verdict as verdict
+from .checking import Checked as Checked
+from .checking import check as check
 from .checkpoint import Checkpoint as Checkpoint
 from .encountering import encounter as encounter
+from .encountering import encounter_film as encounter_film
 from .encountering import encounter_picture as encounter_picture
+from .encountering import met_in_recording as met_in_recording
+from .encountering import met_in_traffic as met_in_traffic
 from .encountering import save_encounters as save_encounters
 from .evaluating import compare as compare
 from .evaluating import evaluate as evaluate
@@ -21,6 +26,10 @@ from .progress import Progress as Progress
 from .ranks import Ranks as Ranks
 from .ranks import joined_ranks as joined_ranks
 from .ranks import rank_count as rank_count
+from .requirements import Readings as Readings
+from .requirements import Requirements as Requirements
+from .requirements import Verdict as Verdict
+from .requirements import verdicts as verdicts
 from .result import Result as Result
 from .result_page import Omission as Omission
 from .result_page import left_out as left_out

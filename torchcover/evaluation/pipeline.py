@@ -67,13 +67,13 @@ class MeasuredFrame(NamedTuple):
     Args:
         frame: The frame, if an observer needs it; what travels between processes is small without it.
         counts: `Frame.counts`.
-        sums: Number of an observer -> what it is to add.
+        sums: Which observer -> what it is to add.
         measuring_s: How long that took, in this process.
     """
 
     frame: Frame | None
     counts: Mapping[str, int]
-    sums: Mapping[int, Any]
+    sums: Mapping[Any, Any]
     measuring_s: float
 
 

@@ -337,6 +337,13 @@ class Settings:
             in_study="tried",
         ),
     ] = None
+    no_cache: Annotated[
+        bool,
+        Option(
+            "Build all worlds anew and keep none on disk. Else those that are drawn are read from ~/.cache/torchcover "
+            "where an earlier run has left them, which has room for TORCHCOVER_CACHE_GB gigabytes (1)."
+        ),
+    ] = False
     skip_bad_frames: Annotated[bool, Option("Skip and count frames that cannot be read, instead of stopping.")] = False
     observers: Annotated[
         "Mapping[str, AnyObserver]",

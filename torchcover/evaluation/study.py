@@ -82,7 +82,8 @@ class StudyPlan:
     @property
     def each(self) -> dict[str, Settings]:
         """Options -> settings of every trial, that without any first."""
-        first = replace(self.settings, steps=self.settings.steps or DEFAULT_STEPS)
+        # What it takes to build worlds counts: who uses what is found has others.
+        first = replace(self.settings, steps=self.settings.steps or DEFAULT_STEPS, no_cache=True)
         return {"": first} | {" ".join(_options(other)): replace(first, **other) for other in self.others}
 
     @property

@@ -12,7 +12,7 @@ from torchcover.coverage import BevGrid
 from torchcover.evaluation.progress import held_back
 from torchcover.evaluation.result_page import rig_document, sensor_views, words_of
 from torchcover.evaluation.settings import FILES, wanted_files
-from torchcover.evaluation.task import AnyRig, as_called, spread_s
+from torchcover.evaluation.task import AnyRig, AnyScenario, as_called, spread_s
 from torchcover.files import Publication
 from torchcover.report import (
     ColourScale,
@@ -27,11 +27,11 @@ from torchcover.report import (
     page_html,
     percent,
 )
-from torchcover.simulation import Scenario, Sensor, with_ego
+from torchcover.simulation import Rig, Scenario, Sensor, with_ego
 from torchcover.simulation.bodies import Body
 from torchcover.simulation.scenario import Mover
 from torchcover.simulation.shapes import Plane
-from torchcover.targets import Place, Target, TargetMap, Verdict, survey, write_arrays, write_csv
+from torchcover.targets import Place, Target, TargetMap, survey, write_arrays, write_csv
 
 # Steps of a world in which something moves, or a sensor is noisy; else they are all alike.
 DEFAULT_STEPS = 16
@@ -77,18 +77,33 @@ def survey_target(
         >>> seen.target, seen.counts["free"]
         ('dog_57cm', 8)
     """
-    rig = as_called(rig).sensing(sensor_model)
-    world = free_space() if scenario is None else scenario
-    world = with_ego(world if isinstance(world, Scenario) else Scenario.load(world), {rig.name: rig}, vehicle)
-    alike = world.instants == 1 and all(sensor.is_exact for sensor in rig.sensors)
+    rig, world, usual_steps = in_world(rig, scenario, vehicle, sensor_model)
     return survey(
         rig,
         world,
         target if isinstance(target, Target) else Target.load(target),
-        steps=(1 if alike else DEFAULT_STEPS) if steps is None else steps,
+        steps=usual_steps if steps is None else steps,
         every_s=spread_s(world, every_s),
         **settings,
     )
+
+
+def in_world(
+    rig: AnyRig,
+    scenario: AnyScenario | None,
+    vehicle: str | Path | None,
+    sensor_model: Literal["ideal", "real"] | None,
+) -> tuple[Rig, Scenario, int]:
+    """The rig, the world whose ego carries it, and how many steps are usual; as `survey_target` is asked.
+
+    Raises:
+        FileNotFoundError, ValueError: As there.
+    """
+    rig = as_called(rig).sensing(sensor_model)
+    world = free_space() if scenario is None else scenario
+    world = with_ego(world if isinstance(world, Scenario) else Scenario.load(world), {rig.name: rig}, vehicle)
+    alike = world.instants == 1 and all(sensor.is_exact for sensor in rig.sensors)
+    return rig, world, 1 if alike else DEFAULT_STEPS
 
 
 def free_space() -> Scenario:
@@ -127,10 +142,8 @@ def target_picture(seen: TargetMap) -> Figure:
 def save_targets(
     seen: TargetMap,
     folder: str | Path,
-    verdicts: Sequence[Verdict] = (),
     sensors: Sequence[Sensor] = (),
     *,
-    not_checked: Sequence[str] = (),
     files: str | Iterable[str] = FILES,
 ) -> list[Path]:
     """Write the files of the command line: the numbers first, then the page and the picture.
@@ -139,16 +152,14 @@ def save_targets(
         seen: From `survey_target`.
         folder: Where to write `targets.csv`, `targets.npz`, `report.html`, `targets.png` and `summary.json`. Made if it
             does not exist; files of an earlier run that its `summary.json` lists are deleted.
-        verdicts: From `torchcover.targets.check`, for `summary.json` and the page.
         sensors: Those of the rig, for the page.
-        not_checked: Requirements that are about other targets, in words.
         files: What to write beside `summary.json`, as in `Result.save`; "maps" is the picture.
 
     Returns:
         The files.
     """
     wanted = wanted_files(files)
-    record = {**target_record(seen, verdicts), "not_checked": list(not_checked)}
+    record = target_record(seen)
     with Publication(Path(folder)) as written:
         with held_back():  # the numbers are safe before anything ends this
             if "numbers" in wanted:
@@ -156,53 +167,35 @@ def save_targets(
                 written.add("targets.npz", lambda path: write_arrays(seen, path))
             written.publish(record)
         if "page" in wanted:
-            written.add_text("report.html", page_html(target_page(seen, verdicts, sensors, not_checked)))
+            written.add_text("report.html", page_html(target_page(seen, sensors)))
         if "maps" in wanted:
             written.add_figure("targets.png", target_picture(seen))
         written.publish(record)
     return written.paths
 
 
-def target_record(seen: TargetMap, verdicts: Sequence[Verdict] = ()) -> dict[str, Any]:
-    """Settings, counts, shares of the sides, worst places and verdicts, for JSON; None for what is unknown."""
+def target_record(seen: TargetMap) -> dict[str, Any]:
+    """Settings, counts, shares of the sides and worst places, for JSON; None for what is unknown."""
     return {
         **seen.settings(),
         "cells": seen.counts,
         "sides": [json_record(side._asdict()) for side in seen.sides()],
         "unseen_to_m": json_record(seen.unseen_to_m()),
         "worst": [json_record(place._asdict()) for place in seen.worst()],
-        "requirements": [_judged(verdict) for verdict in verdicts],
     }
 
 
-def _judged(verdict: Verdict) -> dict[str, Any]:
-    worst = [json_record(place._asdict()) for place in verdict.worst]
-    return {**verdict._asdict(), "requirement": verdict.requirement.words, "worst": worst}
-
-
-def target_page(
-    seen: TargetMap,
-    verdicts: Sequence[Verdict] = (),
-    sensors: Sequence[Sensor] = (),
-    not_checked: Sequence[str] = (),
-) -> Page:
+def target_page(seen: TargetMap, sensors: Sequence[Sensor] = ()) -> Page:
     """All that is known of a target, on one page.
 
     Args:
         seen: From `survey_target`.
-        verdicts: From `torchcover.targets.check`.
         sensors: Those of the rig.
-        not_checked: Requirements that are about other targets, in words.
     """
-    failed = [verdict for verdict in verdicts if not verdict.passed]
-    tables = [_verdicts(verdicts)] if verdicts else []
-    tables += [sides_table(seen), places_table(seen.worst(), "The worst places")]
-    tables += [places_table(verdict.worst, f"Not met: {verdict.requirement.words}") for verdict in failed]
     return Page(
         title=f"{seen.rig}: would it see {seen.target}?",
-        lead=f"In {seen.scenario}, sensor model {seen.sensor_model}, measured by torchcover."
-        + "".join(f" Not checked, as it is not about {seen.target}: {words}." for words in not_checked),
-        tables=tables,
+        lead=f"In {seen.scenario}, sensor model {seen.sensor_model}, measured by torchcover.",
+        tables=[sides_table(seen), places_table(seen.worst(), "The worst places")],
         maps=_maps(seen),
         rigs=[PageRig(seen.rig, sensor_views(sensors), rig_document(seen.rig, sensors))],
         ego_outline_m=seen.vehicle_outline_m,
@@ -269,16 +262,3 @@ def places_table(places: Sequence[Place], title: str) -> PageTable:
 def _place(place: Place) -> tuple[str, ...]:
     lengths = (f"{value:.2f}" for value in (place.x_m, place.y_m, place.distance_m))
     return place.side, *lengths, f"{place.points:.4g}", f"{place.sensors:.3g}", percent(place.share)
-
-
-def _verdicts(verdicts: Sequence[Verdict]) -> PageTable:
-    rows = []
-    for verdict in verdicts:
-        words = (
-            "pass" if verdict.passed else "FAIL",
-            f"{verdict.failed:,}",
-            f"{verdict.unknown:,}",
-            f"{verdict.cells:,}",
-        )
-        rows.append((Words(verdict.requirement.words), *map(Words, words)))
-    return PageTable("Requirements", ("requirement", "", "places where not", "of them unknown", "of"), rows)

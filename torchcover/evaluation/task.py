@@ -30,6 +30,7 @@ from torchcover.simulation.reference_sensor import DEFAULT_BAND_FRAME
 from torchcover.simulation.simulated_frames import DEFAULT_REFERENCE
 
 AnyRig = Rig | str | Path
+AnyScenario = Scenario | str | Path
 SourceT = TypeVar("SourceT", bound=FrameSource, covariant=True)
 
 # Steps that follow each other are alike (docs/measured/error_bars.md), and every minute is another city.
@@ -40,7 +41,7 @@ FEW_RAYS = 2048
 CALLER = 4
 # Options that frames, what is asked and observers say by what they are, and those that change no result.
 TOLD_OTHERWISE = {"scenario", "seed", "vehicle", "reference", "rays", "every_s", "ask", "cell_m", "band_frame"}
-TOLD_OTHERWISE |= {"sensor_model", "weather", "metrics", "steps", "device", "workers", "skip_bad_frames"}
+TOLD_OTHERWISE |= {"sensor_model", "weather", "metrics", "steps", "device", "workers", "no_cache", "skip_bad_frames"}
 # Of an identity, what is longer is told by its hash.
 MAX_TOLD = 40
 
@@ -150,6 +151,7 @@ def simulation(settings: Settings, *, boxes: bool = False) -> Task[SimulatedFram
         boxes=boxes or settings.needs_boxes,
         within_m=max(settings.thresholds_m) if settings.only_detection else None,
         kept_bytes=0.0,  # steps come in order: no world is needed again
+        no_cache=settings.no_cache,
     )
     frames.simulator.check_run(frames.steps)
     # A path says more than the name within the file.

@@ -1,6 +1,15 @@
 """What the system gives: the door of all readers, its error, files that are whole, NumPy's, tables, processes."""
 
-from torchcover.files.bad_file import BadFileError, TooLargeError, check_memory, decode, naming, read_short_text, reads
+from torchcover.files.bad_file import (
+    BadFileError,
+    TooLargeError,
+    check_memory,
+    decode,
+    naming,
+    read_short_text,
+    reads,
+    said_gb,
+)
 from torchcover.files.csv_tables import csv_text, read_csv
 from torchcover.files.feather import read_feather
 from torchcover.files.json_tables import read_json_table
@@ -46,6 +55,7 @@ __all__ = [
     "read_npz",
     "read_short_text",
     "reads",
+    "said_gb",
     "settled",
     "write_durably",
     "write_npz",

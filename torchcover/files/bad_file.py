@@ -141,7 +141,7 @@ def check_memory(needed_bytes: int) -> None:
     Example:
         >>> check_memory(16 * 100_000)  # a scan
     """
-    allowed_gb = _allowed_gb()
+    allowed_gb = said_gb(VARIABLE, DEFAULT_GB)
     if needed_bytes > allowed_gb * 1e9:
         needed_gb = f"{needed_bytes / 1e9:.3g}" if needed_bytes < 10**300 else "endless"
         raise TooLargeError(
@@ -150,15 +150,20 @@ def check_memory(needed_bytes: int) -> None:
         )
 
 
-def _allowed_gb() -> float:
-    given = os.environ.get(VARIABLE)
+def said_gb(variable: str, usual_gb: float) -> float:
+    """Gigabytes that an environment variable says, or what is usual without it.
+
+    Raises:
+        ValueError: It is no number of at least 0.
+    """
+    given = os.environ.get(variable)
     try:
-        allowed_gb = DEFAULT_GB if given is None else float(given)
+        said = usual_gb if given is None else float(given)
     except ValueError:
-        allowed_gb = math.nan
-    if not allowed_gb > 0:
-        raise ValueError(f"the environment variable {VARIABLE} has to be a number of gigabytes; got {given!r}")
-    return allowed_gb
+        said = math.nan
+    if not said >= 0:
+        raise ValueError(f"the environment variable {variable} has to be a number of gigabytes; got {given!r}")
+    return said
 
 
 def decode(data: bytes) -> str:

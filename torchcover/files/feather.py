@@ -26,7 +26,8 @@ def read_feather(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
     except ImportError as error:
         raise ImportError(f"{path}: a feather table needs pyarrow: pip install 'torchcover[av2]'") from error
     check_memory(4 * path.stat().st_size)
-    table = feather.read_table(path, columns=None)
+    table = feather.read_table(path)
+    table.validate(full=True)  # pyarrow believes the lengths and places in the file, and reads there
     missing = [name for name in names if name not in table.column_names]
     if missing:
         raise ValueError(f"the columns {', '.join(names)} are needed; {', '.join(missing)} are missing")

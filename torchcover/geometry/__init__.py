@@ -1,6 +1,7 @@
 """Rigid transforms, boxes, height fields, and rays through voxels. Knows no other part of the house."""
 
-from torchcover.geometry.bounding_box import BoundingBox, overlap
+from torchcover.geometry.bounding_box import BoundingBox, overlapping
+from torchcover.geometry.contact import contact_s, outlines_at
 from torchcover.geometry.height_field import HeightField, fitted, spread
 from torchcover.geometry.rigid import (
     check_rigid,
@@ -20,11 +21,13 @@ __all__ = [
     "HeightField",
     "VoxelGrid",
     "check_rigid",
+    "contact_s",
     "crossed_voxels",
     "euler_from_rotation",
     "fitted",
     "invert",
-    "overlap",
+    "outlines_at",
+    "overlapping",
     "quaternion_from_rotation",
     "rigid",
     "rotation_from_euler",

@@ -9,7 +9,8 @@ from torch.utils.data import DataLoader, Dataset
 
 from torchcover.coverage import Measure
 from torchcover.estimation import Estimate
-from torchcover.evaluation.pipeline import FramesOrErrors, killed_worker
+from torchcover.evaluation import CoverageObserver
+from torchcover.evaluation.pipeline import FramesOrErrors, MeasuredFrame, killed_worker
 from torchcover.frames import Frame
 from torchcover.placement.carrier import Carrier
 from torchcover.placement.objective import Objective
@@ -39,8 +40,24 @@ class HeldInstant(NamedTuple):
     world: int
 
 
-class HeldWorlds(Dataset[Frame]):
-    """Frames of any rig at some instants, whose worlds and references are kept in the process that is asked.
+class Asked(NamedTuple):
+    """What is asked of an instant.
+
+    Args:
+        rig: Whose frame; of no rig: the reference, and in the counts the bytes of its world.
+        number: Of the instant.
+        measures: What its coverage is summed up by, where the frame is made; the frame itself if by none.
+    """
+
+    rig: Rig | None
+    number: int
+    measures: tuple[Measure, ...] = ()
+
+
+class HeldWorlds(Dataset[Frame | MeasuredFrame]):
+    """What any rig sees at some instants, whose worlds and references are kept in the process that is asked.
+
+    Frames are measured there, too, so that sums travel and not clouds; published metrics need the frame itself.
 
     Args:
         simulations: Of the scenarios, without rigs.
@@ -52,21 +69,32 @@ class HeldWorlds(Dataset[Frame]):
         self, simulations: Sequence[SimulatedFrames], instants: Sequence[HeldInstant], questions: Questions
     ) -> None:
         self._simulations, self._instants, self._questions = simulations, instants, questions
-        self._held: dict[int, Frame] = {}
+        self._held: dict[int, tuple[Frame, Balls | None]] = {}
         self._rig: Rig | None = None
         self._mounted: dict[int, Simulator] = {}
+        self._observers: dict[tuple[Measure, ...], Mapping[CoverageObserver, Measure]] = {}
 
-    def __getitem__(self, asked: tuple[Rig | None, int]) -> Frame:
-        """What a rig sees at an instant; of no rig: the reference, and in the counts the bytes of its world."""
-        rig, number = asked
+    def __getitem__(self, asked: Asked) -> Frame | MeasuredFrame:
+        frame, measures = self._frame(asked.rig, asked.number), asked.measures
+        if asked.rig is None or not measures:
+            return frame
+        if measures not in self._observers:
+            coverage = self._questions.coverage_of(asked.rig, measures)
+            self._observers[measures] = {observer: measure for measure, observer in coverage.items()}
+        sums = {measure: observer.sums_of(frame) for observer, measure in self._observers[measures].items()}
+        return MeasuredFrame(frame if self._questions.metrics else None, frame.counts, sums, 0.0)
+
+    def _frame(self, rig: Rig | None, number: int) -> Frame:
         instant = self._instants[number]
         if number not in self._held:
-            self._held[number] = self._built(instant, number)
-        held = self._held[number]
+            built, within_m = self._built(instant, number), self._questions.within_m
+            points = (
+                built.reference.numpy().copy()
+            )  # the memory of a tensor that travels to another process is given up
+            self._held[number] = built, None if within_m is None else Balls.around(points, within_m)
+        held, within = self._held[number]
         if rig is None:
             return held
-        within_m = self._questions.within_m
-        within = None if within_m is None else Balls(held.reference.numpy(), within_m)
         scans = self._with(rig, instant.scenario).scans(instant.step, within)[rig.name]
         counts = {"rays": sum(scan.rays for scan in scans), "self_hits": sum(scan.self_hits for scan in scans)}
         frame = replace(held, **of_rigs({rig.name: rig}, {rig.name: scans}), counts=counts)
@@ -91,7 +119,7 @@ class HeldWorlds(Dataset[Frame]):
     def _with(self, rig: Rig, scenario: int) -> Simulator:
         """A scenario with the rig, which is kept until another one comes: a race asks about it again and again."""
         if rig != self._rig:
-            self._rig, self._mounted = rig, {}
+            self._rig, self._mounted, self._observers = rig, {}, {}
         if scenario not in self._mounted:
             self._mounted[scenario] = self._simulations[scenario].simulator.with_rigs({rig.name: rig})
         return self._mounted[scenario]
@@ -187,7 +215,7 @@ class CommonInstants:
         ]
         self.instants = _instants_of([one.simulator for one in simulations], worlds, per_world)
         self.order = racing_order([instant.world for instant in self.instants], seed)
-        self._batches: list[list[tuple[Rig | None, int]]] = []
+        self._batches: list[list[Asked]] = []
         self._processes = min(workers, self.instants[-1].world + 1)
         self._loader = DataLoader(
             FramesOrErrors(HeldWorlds(simulations, self.instants, self.questions)),
@@ -218,12 +246,13 @@ class CommonInstants:
     def __len__(self) -> int:
         return len(self.instants)
 
-    def anew(self, seed: int, worlds: int) -> "CommonInstants":
-        """The same questions at as many instants in each of other worlds.
+    def anew(self, seed: int, worlds: int, more: Mapping[str, Objective]) -> "CommonInstants":
+        """The same questions, and more, at as many instants in each of other worlds.
 
         Args:
             seed: Another one, so that no world is the same.
             worlds: Worlds of each scenario with traffic; others are the same world for any seed, and are left out.
+            more: Other objectives, by name.
 
         Raises:
             ValueError: The seed that these have; no scenario with traffic.
@@ -233,7 +262,7 @@ class CommonInstants:
         if not (fresh := [one for one in self.scenarios if not one.repeats]):
             names = ", ".join(repr(one.name) for one in self.scenarios)
             raise ValueError(f"scenarios: one whose worlds are drawn is needed; {names} is the same for any seed")
-        return CommonInstants(fresh, self.objectives, worlds=worlds, seed=seed, **self._settings)
+        return CommonInstants(fresh, {**self.objectives, **more}, worlds=worlds, seed=seed, **self._settings)
 
     def prefixes(self, rig: Rig) -> Iterator[Prefix]:
         """What is known of a rig after three instants more at a time; nothing is scored before it is asked for.
@@ -244,24 +273,29 @@ class CommonInstants:
         Raises:
             ValueError: The rig cannot be mounted: a sensor inside the vehicle or another body, or below the ground.
         """
-        numbers, rays, self_hits = self._observers(rig, [self.estimate]), 0, 0
+        numbers, rays, self_hits = self._numbers(rig, [self.estimate]), 0, 0
         for start in range(0, len(self), TOGETHER):
-            for frame in self.frames(rig, self.order[start : start + TOGETHER].tolist()):
-                numbers.update(frame)
-                rays, self_hits = rays + frame.counts["rays"], self_hits + frame.counts["self_hits"]
+            for seen in self._measured(rig, self.order[start : start + TOGETHER].tolist(), numbers):
+                rays, self_hits = rays + seen.counts["rays"], self_hits + seen.counts["self_hits"]
             done = min(start + TOGETHER, len(self))
             yield Prefix(done, numbers.estimate(self.estimate), self_hits / rays)
 
     def estimates(self, rig: Rig) -> dict[Measure, Estimate]:
         """What is known of a rig after all instants, by either measure; ValueError as `prefixes`."""
-        numbers = self._observers(rig, MEASURES)
-        for frame in self.frames(rig, self.order.tolist()):
-            numbers.update(frame)
+        numbers = self._numbers(rig, MEASURES)
+        for _ in self._measured(rig, self.order.tolist(), numbers):
+            pass
         return {measure: numbers.estimate(measure) for measure in MEASURES}
 
-    def _observers(self, rig: Rig, measures: Sequence[Measure]) -> RigNumbers:
+    def _numbers(self, rig: Rig, measures: Sequence[Measure]) -> RigNumbers:
         ego = self._worlds[0].ego_mesh() if self.questions.metrics else None
         return self.questions.numbers_of(rig, ego, measures)
+
+    def _measured(self, rig: Rig, numbers: Sequence[int], observed: RigNumbers) -> Iterator[MeasuredFrame]:
+        """What is left of a rig's frames at some instants, in their order, each once it is added."""
+        for seen in self._made(self._as_asked(rig), numbers, tuple(observed.coverage)):
+            observed.add(seen)
+            yield seen
 
     def frames(self, rig: Rig | None = None, numbers: Sequence[int] | None = None) -> Iterator[Frame]:
         """What a rig sees at some instants, in their order, with the points of the reference that are asked about.
@@ -273,20 +307,21 @@ class CommonInstants:
         Raises:
             ValueError: As `prefixes`.
         """
-        if rig is not None:
-            self._check_vehicle(rig)
-            rig = rig.sensing("ideal") if self.sensor_model == "ideal" else rig
-        wanted = range(len(self)) if numbers is None else numbers
+        rig, wanted = rig and self._as_asked(rig), range(len(self)) if numbers is None else numbers
         for start in range(0, len(wanted), TOGETHER):
             yield from self._made(rig, wanted[start : start + TOGETHER])
 
-    def _made(self, rig: Rig | None, numbers: Sequence[int]) -> list[Frame]:
+    def _as_asked(self, rig: Rig) -> Rig:
+        self._check_vehicle(rig)
+        return rig.sensing("ideal") if self.sensor_model == "ideal" else rig
+
+    def _made(self, rig: Rig | None, numbers: Sequence[int], measures: tuple[Measure, ...] = ()) -> list[Any]:
         shares: list[list[int]] = [[] for _ in range(max(self._processes, 1))]
         for number in numbers:
             shares[self.instants[number].world % len(shares)].append(number)
         # The k-th batch goes to the k-th process, which has built these worlds.
-        self._batches[:] = [[(rig, number) for number in share] for share in shares]
-        made: dict[int, Frame | ValueError] = {}
+        self._batches[:] = [[Asked(rig, number, measures) for number in share] for share in shares]
+        made: dict[int, Frame | MeasuredFrame | ValueError] = {}
         try:
             for share, batch in zip(shares, self._loader, strict=True):
                 made |= zip(share, batch, strict=True)

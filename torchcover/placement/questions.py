@@ -19,7 +19,7 @@ from torchcover.coverage.quantity import RADIUS, detection, without
 from torchcover.estimation import Estimate
 from torchcover.evaluation import CoverageObserver
 from torchcover.evaluation.measuring import BLOCKS
-from torchcover.frames import Frame
+from torchcover.evaluation.pipeline import MeasuredFrame
 from torchcover.placement.objective import THRESHOLD_M, Objective, published_numbers
 from torchcover.published import PUBLISHED, FrameMetric, Setup, Sights
 from torchcover.simulation import Areas, RegionsOfInterest, Rig, SurfaceReference
@@ -169,6 +169,22 @@ class Questions(NamedTuple):
             ego: The body that carries it.
             measures: What numbers of the coverage are means over.
         """
+        setup = Setup(
+            rig=rig.name,
+            sensors=rig.sensors,
+            ego=ego,
+            grid=self.grid,
+            regions=tuple(self.regions.values()),
+            square_metres=True,
+            threshold_m=max(self.thresholds_m, default=THRESHOLD_M),
+            sights=Sights(),
+            sync_on_compute=False,
+        )
+        others = {name: PUBLISHED[name].make(setup) for name in self.metrics}
+        return RigNumbers(self, rig, self.coverage_of(rig, measures), others)
+
+    def coverage_of(self, rig: Rig, measures: Sequence[Measure]) -> dict[Measure, CoverageObserver]:
+        """What observes the coverage of a rig: the same for both measures where that knows both."""
         keys = [one.key for one in self.objectives.values() if one.metric is None]
         failures = any(map(_of_failures, keys))
         regions = tuple(self.regions.values())
@@ -189,19 +205,7 @@ class Questions(NamedTuple):
                 sync_on_compute=False,
             )
             observers[measure] = CoverageObserver(coverage, rig.name)
-        setup = Setup(
-            rig=rig.name,
-            sensors=rig.sensors,
-            ego=ego,
-            grid=self.grid,
-            regions=regions,
-            square_metres=True,
-            threshold_m=max(self.thresholds_m, default=THRESHOLD_M),
-            sights=Sights(),
-            sync_on_compute=False,
-        )
-        others = {name: PUBLISHED[name].make(setup) for name in self.metrics}
-        return RigNumbers(self, rig, observers, others)
+        return observers
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,12 +224,13 @@ class RigNumbers:
     coverage: Mapping[Measure, CoverageObserver]
     others: Mapping[str, FrameMetric]
 
-    def update(self, frame: Frame) -> None:
-        """Add a frame."""
-        for observer in dict.fromkeys(self.coverage.values()):
-            observer.update(frame)
+    def add(self, seen: MeasuredFrame) -> None:
+        """Add what is left of a frame where it was made and measured: its sums by measure."""
+        for observer, measure in {observer: measure for measure, observer in self.coverage.items()}.items():
+            observer.add(seen.sums[measure])
         for metric in self.others.values():
-            metric.update(frame)
+            assert seen.frame is not None  # published metrics need it
+            metric.update(seen.frame)
 
     def estimate(self, measure: Measure) -> Estimate:
         """The objectives so far, each a quantity under its own name.

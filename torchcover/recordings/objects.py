@@ -153,7 +153,11 @@ def objects_of(recording: Recording) -> RecordedObjects:
             raise ValueError("its vehicle has no poses with times, without which its objects have no way")
         times_s = recording.times_s - recording.times_s[0]
         seen = by_name(_labelled(recording, times_s, world_T_vehicle))
-        tracks = tuple(track_of(of, class_of(of[0].category)) for of in seen.values())
+        known = getattr(recording, "classes", None)  # of formats whose words mean other things
+        tracks = tuple(
+            track_of(of, class_of(of[0].category) if known is None else known.get(of[0].category.lower()))
+            for of in seen.values()
+        )
     body = recording.body
     size_m = None if body is None else (*body.size_m[:2], body.upper_m[2])
     return RecordedObjects(tracks, (Ego("ego", times_s, world_T_vehicle, np.eye(4), size_m),))

@@ -16,7 +16,7 @@ def builtin_documents(kind: str) -> dict[str, dict[str, Any]]:
     """The built-in documents of a kind as they are written, by name.
 
     Args:
-        kind: "rigs", "scenarios", "vehicles", "lidars", "materials", "weather" or "encounters".
+        kind: "rigs", "scenarios", "vehicles", "lidars", "materials", "weather", "encounters" or "requirements".
 
     Example:
         >>> builtin_documents("scenarios")["courtyard"]["description"].split(",")[0]

@@ -4,9 +4,9 @@ embreex computes in float32, so a scene is given in coordinates near the vehicle
 directions are equal in number; it writes into the distances it is given, and answers a miss with them; it releases the
 interpreter lock, so that threads add up. An origin may lie on a face, as far as float32 can tell.
 
-Its threads build scenes, and nothing tells it to do without. A forked process, such as a worker of a DataLoader, has none
-of them but the locks that they held, and one in a thousand waits for ever. TBB counts the cores that it may use when
-it is first used: so that is done with one (`_have_no_threads`).
+Its threads build scenes, and nothing tells it to do without. A forked process, such as a worker of a DataLoader, has
+none of them but the locks that they held, and one in a thousand waits for ever. TBB counts the cores that it may use
+when it is first used: so that is done with one (`_have_no_threads`).
 """
 
 import os
@@ -89,10 +89,12 @@ class Faces:
         if ((place_m < self._least_m) | (place_m > self._most_m)).any():
             return np.empty(0, dtype=np.int64)
         x, y, z = place_m
-        # One axis after the other: the first, which asks all faces, leaves few to the second.
-        near = np.flatnonzero((self._lower_m[2] <= z) & (z <= self._upper_m[2]))
-        for axis, coordinate_m in ((0, x), (1, y)):
+        # One axis after the other: the first, which asks all faces, leaves few to the second. Most are near the ground.
+        near = np.flatnonzero((self._lower_m[0] <= x) & (x <= self._upper_m[0]))
+        for axis, coordinate_m in ((1, y), (2, z)):
             near = near[(self._lower_m[axis, near] <= coordinate_m) & (coordinate_m <= self._upper_m[axis, near])]
+        if len(near) == 0:
+            return near
         held: NDArray[np.int64] = near[self.from_plane_m(place_m, near) <= 2 * self.contact_m[near]]
         return held
 

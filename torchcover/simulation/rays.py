@@ -7,7 +7,7 @@ Nothing is left out that could be hit.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,10 @@ RANGE_SLACK_M = 0.01
 COSINE_ROUNDING = 5e-7
 # So many pairs of a ball and a block are looked at together.
 PAIRS_AT_ONCE = 1 << 20
+# Of so many places or less it is found out of each which rays may meet it; of more, those within such an angle of each
+# other, as seen from the vehicle, are looked at together.
+FEW = 800
+TOGETHER_RAD = 0.2
 
 Float64 = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -72,10 +76,34 @@ class Tile:
 
 
 class Balls(NamedTuple):
-    """(K, 3) `centres_m` of balls in the vehicle frame, all with one `radius_m`."""
+    """Balls in the vehicle frame: (K, 3) `centres_m`, and one `radius_m` of all or (K,) of each, if each holds many."""
 
     centres_m: NDArray[np.floating]
-    radius_m: float
+    radius_m: float | Float64
+
+    @classmethod
+    def around(cls, points_m: NDArray[np.floating], radius_m: float) -> Self:
+        """One around each of (N, 3) points; of more than a few, larger ones that hold those of neighbours.
+
+        Example:
+            >>> points_m = np.random.default_rng(0).normal(0, 30, (5000, 3))
+            >>> len(Balls.around(points_m[:800], 0.4).centres_m), len(Balls.around(points_m, 0.4).centres_m) < 1500
+            (800, True)
+        """
+        if len(points_m) <= FEW:
+            return cls(points_m, radius_m)
+        points = points_m.astype(np.float64)
+        away_m = np.maximum(np.hypot(points[:, 0], points[:, 1]), 1.0)
+        # About as wide as they are high and deep, seen from the vehicle.
+        shells, towards = np.log(away_m) / TOGETHER_RAD, np.arctan2(points[:, 1], points[:, 0]) / TOGETHER_RAD
+        cells = np.floor([shells, towards, points[:, 2] / (away_m * TOGETHER_RAD)]).astype(np.int64)
+        cells -= cells.min(axis=1, keepdims=True)
+        key = np.ravel_multi_index(tuple(cells), tuple(cells.max(axis=1) + 1))
+        order = np.argsort(key, kind="stable")
+        first, points = np.flatnonzero(np.diff(key[order], prepend=-1)), points[order]
+        centres_m = (np.minimum.reduceat(points, first) + np.maximum.reduceat(points, first)) / 2
+        of_each = np.repeat(centres_m, np.diff(first, append=len(points)), axis=0)
+        return cls(centres_m, np.maximum.reduceat(np.linalg.norm(points - of_each, axis=1), first) + radius_m)
 
     def met_by(self, tile: Tile, vehicle_T_sensor: Float64) -> NDArray[np.bool_]:
         """(n,) whether each ray of a tile may pass through one of them, and of the others some."""
@@ -92,7 +120,11 @@ class Balls(NamedTuple):
         for some in np.array_split(near, len(near) * len(tile.blocks) // PAIRS_AT_ONCE + 1):
             # By the chords between directions: those of a block are within half of its diagonal of its middle.
             chord = 2 * np.sin(angle[some] / 2)[:, None] + np.linalg.norm(half, axis=0)
-            ball, block = np.nonzero(1 + (middle**2).sum(axis=0) - 2 * towards[some] @ middle <= chord**2 + ROUNDING**2)
+            touched = 1 + (middle**2).sum(axis=0) - 2 * towards[some] @ middle <= chord**2 + ROUNDING**2
+            if isinstance(self.radius_m, np.ndarray):  # wide ones, next to which a block is small
+                met[tile.blocks[touched.any(axis=0)]] = True
+                continue
+            ball, block = np.nonzero(touched)
             rays = tile.blocks[block]
             x, y, z = towards[some].astype(np.float32).T[:, ball, None]
             along = x * tile.directions[0][rays] + y * tile.directions[1][rays] + z * tile.directions[2][rays]
@@ -282,7 +314,7 @@ def blocks_towards(outlines: Outlines, tile: Tile, vehicle_R_sensor: Float64, ra
     # No direction between the lower and the upper bounds of a block has a smaller product with a normal.
     bounds = np.vstack([tile.block_lower, tile.block_upper]).astype(np.float32)
     towards = np.hstack([np.maximum(normals, 0.0), np.minimum(normals, 0.0)]).astype(np.float32)
-    least = (towards @ bounds).reshape(-1, 4, bounds.shape[1])
+    least = (towards @ bounds).reshape(len(outlines.normals), 4, bounds.shape[1])
     reached: NDArray[np.bool_] = (least.max(axis=1) <= ROUNDING) & (outlines.nearest_m[:, None] <= ends_m)
     return reached
 

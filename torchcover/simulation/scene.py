@@ -6,7 +6,7 @@ from functools import cached_property, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.geometry import BoundingBox, invert, overlap
+from torchcover.geometry import BoundingBox, invert, overlapping
 from torchcover.geometry.trajectory import poses_at
 from torchcover.simulation.instant import ALL_AROUND_RAYS, Instant
 from torchcover.simulation.local_ground import LocalGround, ground_under, level_faces, looks_down
@@ -29,6 +29,8 @@ BYTES_PER_POSITION = 96
 BYTES_PER_FACE = 300
 # Of the ground, so many places under the ego are looked at.
 GROUND_LOOKS = 64
+# About as many as a search looks at in a world.
+INSTANTS_KEPT = 4
 
 
 class Scene:
@@ -71,6 +73,7 @@ class Scene:
         self._static = RayCaster(resting + scenery)
         self._faces = sum(len(mesh.faces) for mesh in resting + scenery)
         self._surfaces: dict[tuple[float, ...], SceneSurface] = {}
+        self._instants: dict[tuple[int, float], Instant] = {}
 
     def _scenery(self) -> list[Mesh]:
         return [mesh.moved(invert(self._world_T_local)) for mesh in self.world.static]
@@ -150,7 +153,7 @@ class Scene:
         return AboveGround(self.ground.squares, squares_T_static, self.is_ground, down, lowest_m, highest_m)
 
     def at(self, step: int, within_m: float = np.inf) -> "Instant":
-        """Place everything for one step.
+        """Place everything for one step; the last few are kept, for other rigs that look at them.
 
         Args:
             step: Number of time steps since the start of the world.
@@ -159,6 +162,13 @@ class Scene:
         Raises:
             ValueError: The bounding box of an actor overlaps that of the ego.
         """
+        if (step, within_m) not in self._instants:
+            if len(self._instants) == INSTANTS_KEPT:
+                del self._instants[next(iter(self._instants))]
+            self._instants[step, within_m] = self._at(step, within_m)
+        return self._instants[step, within_m]
+
+    def _at(self, step: int, within_m: float) -> "Instant":
         time_s = step * self.world.time_step_s
         world_T_vehicle = self.world.ego.trajectory.at(time_s)
         vehicle_T_world = invert(world_T_vehicle)
@@ -250,7 +260,8 @@ class Scene:
             if bodies[k] is self.world.ego:
                 continue
             vehicle_T_actor = vehicle_T_world @ bodies[k].trajectory.at(time_s)
-            if overlap(self.ego_box, vehicle_T_actor, self._solids.of(bodies[k].mesh).box):
+            box = self._solids.of(bodies[k].mesh).box
+            if overlapping(box, vehicle_T_actor[None], self.ego_box.corners_m)[0]:
                 raise ValueError(
                     f"actor {bodies[k].name!r} overlaps the ego at t = {time_s:g} s (their bounding boxes do); "
                     "change one of the trajectories"

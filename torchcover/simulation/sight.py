@@ -18,8 +18,8 @@ from torchcover.simulation.weather import CLEAR, Weather
 
 # Rays in a tile: of neighbours all, so that a tile is narrow. A constant, so that nothing depends on threads.
 TILE_RAYS = 8192
-# Of so many places or less it is found out which rays can hit something there; of more, nearly all can.
-FEW = 800
+# If more of the rays than this have to be cast, all are, for which they need not be sorted out.
+MOST_RAYS = 0.9
 # A ray ends before its target by this share of its length, which float32 leaves open.
 SHORTER = 1e-6
 
@@ -111,8 +111,8 @@ class MountedSensor:
         tiles, own_m, cast = self.tiles, self.own_m, None
         # A ray that is cast at another time than that of the frame starts elsewhere.
         may_spare = bool(own_m) and self._times is None and not self._at_rest
-        if within is not None and len(within.centres_m) <= FEW and may_spare:
-            met = self._met(within)
+        met = self._met(within) if within is not None and may_spare else []
+        if met and np.count_nonzero(np.concatenate(met)) <= MOST_RAYS * len(self.pixel_of_ray):
             tiles = tuple(tile.some(some) for tile, some in zip(tiles, met, strict=True))
             own_m, cast = tuple(ends_m[some] for ends_m, some in zip(own_m, met, strict=True)), np.concatenate(met)
         scan = instant.scan(

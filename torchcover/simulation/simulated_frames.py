@@ -64,6 +64,7 @@ class SimulatedFrames(FrameDataset):
             scenario's own ego, else the vehicle that the rigs name, else an SUV.
         kept_bytes: As in `Simulator`.
         within_m: As in `Simulator`: the clouds have the points near the reference, and hardly any others.
+        no_cache: As in `Simulator`.
 
     Raises:
         FileNotFoundError: An unknown name or file.
@@ -91,6 +92,7 @@ class SimulatedFrames(FrameDataset):
         vehicle: str | Path | None = None,
         kept_bytes: float | None = None,
         within_m: float | None = None,
+        no_cache: bool = False,
     ) -> None:
         if not 1 <= steps <= MAX_STEPS:
             raise ValueError(f"steps: a number from 1 to {MAX_STEPS:,} is needed; got {steps}")
@@ -107,6 +109,7 @@ class SimulatedFrames(FrameDataset):
             every_s=every_s,
             kept_bytes=kept_bytes,
             within_m=within_m,
+            no_cache=no_cache,
         )
         self.steps = steps
         self.boxes = boxes

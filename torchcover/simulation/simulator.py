@@ -21,7 +21,7 @@ from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.sensor import Draws
 from torchcover.simulation.sight import MountedSensor
-from torchcover.simulation.stage import Stage, Stages
+from torchcover.simulation.stage import Scenes, Stage, Stages
 from torchcover.simulation.standing import warn_of_floating
 from torchcover.simulation.world import Label, labels
 
@@ -75,6 +75,8 @@ class Simulator:
             machine's memory if not given.
         within_m: Only points of the rigs that lie so near to one of the reference are asked for, as detections up to
             this threshold do: rays that hit nothing there are not cast. Those points are the same to the bit.
+        no_cache: Whether worlds that are drawn are built though they lie on disk from an earlier run, and are not kept
+            there either; frames are the same to the bit.
 
     Raises:
         ValueError: Rigs that name different vehicles, a negative seed, a time that is no multiple of the time step,
@@ -99,6 +101,7 @@ class Simulator:
         every_s: float | None = None,
         kept_bytes: float | None = None,
         within_m: float | None = None,
+        no_cache: bool = False,
     ) -> None:
         if seed < 0:
             raise ValueError(f"seed: a number >= 0 is needed; got {seed}")
@@ -108,7 +111,7 @@ class Simulator:
         self.seed = seed
         self.within_m = within_m
         self._every_steps = 1 if every_s is None else scenario.steps_in(every_s)
-        self._stages = Stages(scenario, rigs, seed, kept_bytes)
+        self._stages = Stages(Scenes(scenario, seed, kept_bytes, no_cache=no_cache), rigs)
         self._check_size()
 
     @property
@@ -190,7 +193,7 @@ class Simulator:
         """
         stage, instant = self._placed(index)
         reference = self.reference_sensor.scan(self._surroundings(stage.scene, instant, index))
-        within = None if self.within_m is None else Balls(reference.points, self.within_m)
+        within = None if self.within_m is None else Balls.around(reference.points, self.within_m)
         scans = self._scans(stage, instant, index, within)
         of_all_rigs = [scan for of_rig in scans.values() for scan in of_rig]
         return Observation(

@@ -19,6 +19,7 @@ from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.sight import MountedSensor
+from torchcover.simulation.stored_worlds import StoredWorlds
 
 # A sensor on the ground is asked about a place this far above it: whether it is inside of something else.
 LIFT_M = np.array([0.0, 0.0, 0.01])
@@ -84,11 +85,14 @@ class Scenes:
         scenario: What plays.
         seed: Seed of procedural traffic.
         kept_bytes: What all that are kept may take; a small share of the machine's memory if not given.
+        no_cache: As in `StoredWorlds`.
     """
 
-    def __init__(self, scenario: Scenario, seed: int, kept_bytes: float | None = None) -> None:
+    def __init__(
+        self, scenario: Scenario, seed: int, kept_bytes: float | None = None, *, no_cache: bool = False
+    ) -> None:
         self.scenario = scenario
-        self._seed = seed
+        self._worlds = StoredWorlds(scenario, seed, no_cache=no_cache)
         self._kept_bytes = kept_bytes
         self._kept: dict[int, Scene] = {}
         self._solids = Solids()
@@ -102,7 +106,7 @@ class Scenes:
             self._make_room()
             if self._ego is None and self.scenario.traffic is not None:
                 self._ego = self.scenario.ego_mesh()
-            scene = Scene(self.scenario.world(self._seed, run, self._ego), self._solids)
+            scene = Scene(self._worlds.world(run, self._ego), self._solids)
         self._kept[run] = scene  # at the end: the first is the one that was asked for longest ago
         return scene
 
@@ -117,14 +121,14 @@ class Scenes:
             del self._kept[next(iter(self._kept))], sizes[0]
 
     def __getstate__(self) -> dict[str, Any]:
-        return Scenes(self.scenario, self._seed, self._kept_bytes).__dict__
+        return {**self.__dict__, "_kept": {}, "_solids": Solids(), "_ego": None}
 
 
 class Stages:
     """The stages of a scenario's runs: rigs in its scenes. In traffic the sensors on the ego are the same in all."""
 
-    def __init__(self, scenario: Scenario, rigs: Mapping[str, Rig], seed: int, kept_bytes: float | None = None) -> None:
-        self._put(Scenes(scenario, seed, kept_bytes), rigs)
+    def __init__(self, scenes: Scenes, rigs: Mapping[str, Rig]) -> None:
+        self._put(scenes, rigs)
 
     def _put(self, scenes: Scenes, rigs: Mapping[str, Rig]) -> None:
         self._scenes = scenes
@@ -155,37 +159,36 @@ class Stages:
 
     def _on(self, scene: Scene) -> Mapping[str, Sequence[MountedSensor]]:
         """The rigs' sensors on the ego of a scene."""
-        self._check_mounts(scene)
-        scenario = self._scenes.scenario
-        return {
-            name: [
-                MountedSensor(
-                    one,
-                    scene,
-                    scenario.reach_m(one, rig.weather),
-                    rig.weather or scenario.weather,
-                    [other for other in rig.sensors if other is not one],
-                )
-                for one in rig.sensors
-            ]
-            for name, rig in self._rigs.items()
-        }
-
-    def _check_mounts(self, scene: Scene) -> None:
-        scenario = self._scenes.scenario
-        for name, rig in self._rigs.items():
-            for sensor in rig.sensors:
-                place = sensor.mount.matrix()[:3, 3]
-                if scene.encloses(place):
-                    other = f", or use its own vehicle (--vehicle {rig.vehicle})" if rig.vehicle else ""
-                    raise ValueError(
-                        f"rig {name!r}: sensor {sensor.name!r} at {place.round(3).tolist()} m lies inside the ego of "
-                        f"{scenario.name!r}, {scenario.ego_name}, so that all its rays start blocked; move its "
-                        f"mount{other}"
-                    )
+        return {name: mounted_on(scene, self._scenes.scenario, name, rig) for name, rig in self._rigs.items()}
 
     def __getstate__(self) -> dict[str, Any]:
         return {"_scenes": self._scenes, "_rigs": self._rigs}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self._put(state["_scenes"], state["_rigs"])
+
+
+def mounted_on(scene: Scene, scenario: Scenario, name: str, rig: Rig) -> list[MountedSensor]:
+    """The sensors of a rig on the ego of a scene.
+
+    Raises:
+        ValueError: One is inside the ego's body.
+    """
+    for sensor in rig.sensors:
+        place = sensor.mount.matrix()[:3, 3]
+        if scene.encloses(place):
+            other = f", or use its own vehicle (--vehicle {rig.vehicle})" if rig.vehicle else ""
+            raise ValueError(
+                f"rig {name!r}: sensor {sensor.name!r} at {place.round(3).tolist()} m lies inside the ego of "
+                f"{scenario.name!r}, {scenario.ego_name}, so that all its rays start blocked; move its mount{other}"
+            )
+    return [
+        MountedSensor(
+            one,
+            scene,
+            scenario.reach_m(one, rig.weather),
+            rig.weather or scenario.weather,
+            [other for other in rig.sensors if other is not one],
+        )
+        for one in rig.sensors
+    ]

@@ -221,7 +221,7 @@ def _count_step(
 ) -> None:
     count = len(there.placed)
     points = np.zeros_like(sums.points)
-    near = np.zeros((count, there.near[0].shape[1]), dtype=np.uint8)
+    near = np.zeros((count, step.visible.shape[2]), dtype=np.uint8)
     for k, (sensor, one, seen) in enumerate(zip(mounted, there.met, step.sensors, strict=True)):
         measured = measured_points(sensor, beams[k], one, seen, there.placed, threshold_m)
         points[k] = sensor.sensor.counts_as * np.bincount(one.position[measured], minlength=count)

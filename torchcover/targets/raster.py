@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torchcover.geometry import BoundingBox
 
 MARGIN_M = 5.0
+SIDES = ("front", "rear", "left", "right")
 STEP_M = 0.2
 # Takes minutes, and less than 1 GB.
 MAX_POSITIONS = 1_000_000
@@ -99,6 +100,22 @@ def _middles_m(low_m: float, step_m: float, count: int) -> NDArray[np.float64]:
     middles_m: NDArray[np.float64] = low_m + step_m * (np.arange(count, dtype=np.float64) + 0.5)
     # A cell that was meant to be at 0.1 is not at 0.09999999999999998.
     return middles_m.round(9)
+
+
+def side_of(box: BoundingBox, positions_m: NDArray[np.float64]) -> NDArray[np.int64]:
+    """(P,) number in `SIDES` of the side of a box that each of (P, 2) places is on; -1 within it.
+
+    Sides meet at 45 degrees from the corners.
+
+    Example:
+        >>> box = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))
+        >>> [SIDES[k] for k in side_of(box, np.array([[3.0, 1.5], [0.0, -2.0]]))]
+        ['front', 'right']
+    """
+    x, y = from_outline_m(box, positions_m).T
+    side = np.where(np.abs(x) >= np.abs(y), np.where(x > 0, 0, 1), np.where(y > 0, 2, 3))
+    side[(x == 0) & (y == 0)] = -1
+    return side
 
 
 def from_outline_m(box: BoundingBox, positions_m: NDArray[np.float64]) -> NDArray[np.float64]:

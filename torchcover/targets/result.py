@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from torchcover.geometry import BoundingBox
 from torchcover.targets.placing import Heading
-from torchcover.targets.raster import Raster, from_outline_m
+from torchcover.targets.raster import SIDES, Raster, from_outline_m, side_of
 
 Float64 = NDArray[np.float64]
 Numbers = NDArray[np.int64]
@@ -17,7 +17,6 @@ Numbers = NDArray[np.int64]
 # What a cell is: there is room for the target in a step at least; the vehicle is there; there is none in any step.
 STATES = ("free", "occupied", "outside")
 FREE, OCCUPIED, OUTSIDE = range(3)
-SIDES = ("front", "rear", "left", "right")
 DIRECTIONS = 360
 WITHIN_M = (1.0, 2.0, 3.0)
 
@@ -136,11 +135,7 @@ class TargetMap:
     @property
     def side(self) -> NDArray[np.int64]:
         """(Y, X) number in `SIDES` of the side that each cell is on, from corners at 45 degrees; -1 within the box."""
-        x, y = from_outline_m(self.vehicle, self.raster.positions_m).T
-        ahead = np.abs(x) >= np.abs(y)
-        side = np.where(ahead, np.where(x > 0, 0, 1), np.where(y > 0, 2, 3))
-        side[(x == 0) & (y == 0)] = -1
-        return side.reshape(self.raster.shape)
+        return side_of(self.vehicle, self.raster.positions_m).reshape(self.raster.shape)
 
     def sides(self, within_m: tuple[float, ...] = WITHIN_M) -> list[SideShare]:
         """Where it is seen, side by side: for each side, within each distance; NaN where no cell is free."""

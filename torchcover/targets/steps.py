@@ -15,7 +15,7 @@ from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.sensor import Draws
 from torchcover.simulation.sight import Ends, MountedSensor
-from torchcover.simulation.stage import Stages
+from torchcover.simulation.stage import Scenes, Stages
 from torchcover.targets.placing import blocked, ground_under, standing
 from torchcover.targets.surface import SAMPLES, Surface
 from torchcover.targets.target import Target
@@ -80,7 +80,7 @@ class Steps:
         self._scenario, self._target, self._surface, self._poses = scenario, target, surface, vehicle_T_target
         self._steps, self._every_steps, self._seed = steps, every_steps, seed
         self.places = max(1, -(-PLACES // steps))
-        self._stages = Stages(scenario, {RIG: rig}, seed)
+        self._stages = Stages(Scenes(scenario, seed), {RIG: rig})
         sensor_reach_m = [float(np.linalg.norm(s.mount.matrix()[:3, 3])) + scenario.reach_m(s) for s in rig.sensors]
         raster_reach_m = float(np.linalg.norm(vehicle_T_target[:, :3, 3], axis=1).max(initial=0.0))
         self._within_m = max([raster_reach_m + target.solid.reach_m, *sensor_reach_m])

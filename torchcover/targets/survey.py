@@ -1,16 +1,18 @@
 """Put a target at every place around a vehicle, and see what its rig gets of it."""
 
 import math
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.geometry import overlapping
 from torchcover.simulation.memory import check_fits
 from torchcover.simulation.rig import Rig, with_ego
 from torchcover.simulation.scenario import Scenario
-from torchcover.targets.counting import Sums, count
-from torchcover.targets.placing import Heading, holding, overlapping, poses, yaws
+from torchcover.targets.counting import count
+from torchcover.targets.placing import Heading, holding, poses, yaws
 from torchcover.targets.raster import Raster
 from torchcover.targets.result import FREE, OCCUPIED, OUTSIDE, TargetMap
 from torchcover.targets.steps import PLACES, Steps
@@ -70,29 +72,19 @@ def survey(
         >>> seen.points.shape, bool((seen.points > 0).any())
         ((2, 4), True)
     """
-    _check(steps, seed, hits, threshold_m)
     scenario = with_ego(scenario, {rig.name: rig})
     vehicle = scenario.ego_box()
     raster = Raster.around(vehicle) if raster is None else raster
     _check_size(target, raster)
-    _check_memory(rig, raster, steps)
-    positions_m, box = raster.positions_m, target.solid.box
-    vehicle_T_target = poses(positions_m, yaws(heading, box, vehicle, positions_m))
-    occupied = overlapping(box, vehicle_T_target, vehicle.corners_m)
-    for sensor in rig.sensors:
-        occupied |= holding(box, vehicle_T_target, sensor.mount.matrix()[:3, 3])
-    surface, elsewhere = Surface.of(target), np.flatnonzero(~occupied)
-    every_steps = 1 if every_s is None else scenario.steps_in(every_s)
-    around = vehicle_T_target[elsewhere]
-    run = Steps(rig, scenario, target, surface, around, steps=steps, every_steps=every_steps, seed=seed)
-    sums = count(target, surface, around, run.mounted, list(run), hits=hits, threshold_m=threshold_m)
-    state = np.full(len(positions_m), OCCUPIED, dtype=np.uint8)
-    state[elsewhere] = np.where(sums.steps > 0, FREE, OUTSIDE)
+    spots = survey_places(
+        rig, scenario, target, raster.positions_m,
+        steps=steps, every_s=every_s, seed=seed, hits=hits, threshold_m=threshold_m, heading=heading,
+    )  # fmt: skip
     return TargetMap(
         rig=rig.name,
         scenario=scenario.name,
         target=target.name,
-        target_size_m=box.size_m,
+        target_size_m=target.solid.box.size_m,
         heading=heading,
         raster=raster,
         vehicle=vehicle,
@@ -104,31 +96,89 @@ def survey(
         threshold_m=threshold_m,
         seed=seed,
         step_count=steps,
-        state=state.reshape(raster.shape),
-        **_means(sums, elsewhere, raster, surface.m2_each / run.places),
+        **{name: array.reshape(*array.shape[:-1], *raster.shape) for name, array in spots._asdict().items()},
     )
 
 
-def _means(sums: Sums, at: NDArray[np.intp], raster: Raster, m2_each: float) -> dict[str, NDArray[Any]]:
-    """The arrays of `TargetMap`: over the steps in which there was room."""
+class Spots(NamedTuple):
+    """What some sensors get of a target at P places: the arrays of `TargetMap` that are called so, of one row."""
 
-    def spread(values: NDArray[Any], empty: float) -> NDArray[Any]:
-        everywhere = np.full((*values.shape[:-1], raster.shape[0] * raster.shape[1]), empty, dtype=values.dtype)
-        everywhere[..., at] = values
-        return everywhere.reshape(*values.shape[:-1], *raster.shape)
+    state: NDArray[np.uint8]
+    steps: NDArray[np.int64]
+    sensor_points: Float64
+    sensors: Float64
+    seen: Float64
+    least_points: Float64
+    least_sensors: Float64
+    share: Float64
+    visible_m2: Float64
 
-    steps = np.where(sums.steps > 0, sums.steps, np.nan)
+
+def survey_places(
+    rig: Rig,
+    scenario: Scenario,
+    target: Target,
+    positions_m: Float64,
+    counting: Sequence[int] | None = None,
+    *,
+    steps: int = 1,
+    every_s: float | None = None,
+    seed: int = 0,
+    hits: int = HITS,
+    threshold_m: float = THRESHOLD_M,
+    heading: Heading = "narrow",
+) -> Spots:
+    """What some sensors see of a target at places; all that is not said here is as in `survey`.
+
+    Args:
+        rig: All sensors.
+        scenario: The world.
+        target: What is placed.
+        positions_m: (P, 2) where, in the vehicle frame.
+        counting: Numbers of the sensors that count, all if not given; the others are in the way as ever.
+        steps: As all that follows, as there.
+        every_s: As there.
+        seed: As there.
+        hits: As there.
+        threshold_m: As there.
+        heading: As there.
+    """
+    _check(steps, seed, hits, threshold_m)
+    scenario = with_ego(scenario, {rig.name: rig})
+    vehicle, box = scenario.ego_box(), target.solid.box
+    _check_memory(rig, len(positions_m), steps)
+    vehicle_T_target = poses(positions_m, yaws(heading, box, vehicle, positions_m))
+    occupied = overlapping(box, vehicle_T_target, vehicle.corners_m)
+    for sensor in rig.sensors:
+        occupied |= holding(box, vehicle_T_target, sensor.mount.matrix()[:3, 3])
+    surface, elsewhere = Surface.of(target), np.flatnonzero(~occupied)
+    every_steps = 1 if every_s is None else scenario.steps_in(every_s)
+    around = vehicle_T_target[elsewhere]
+    run = Steps(rig, scenario, target, surface, around, steps=steps, every_steps=every_steps, seed=seed)
+    some = range(len(rig.sensors)) if counting is None else counting
+    every = run.mounted
+    mounted = [every[k] for k in some]
+    taken = [step._replace(sensors=[step.sensors[k] for k in some]) for step in run]
+    sums = count(target, surface, around, mounted, taken, hits=hits, threshold_m=threshold_m)
+
+    def spread(values: NDArray[Any], empty: float = np.nan) -> NDArray[Any]:
+        everywhere = np.full((*values.shape[:-1], len(positions_m)), empty, dtype=values.dtype)
+        everywhere[..., elsewhere] = values
+        return everywhere
+
+    steps_with = np.where(sums.steps > 0, sums.steps, np.nan)
     visible = np.where(sums.visible > 0, sums.visible, np.nan)
-    return {
-        "steps": spread(sums.steps, 0),
-        "sensor_points": spread(sums.points / steps, np.nan),
-        "sensors": spread(sums.sensors / steps, np.nan),
-        "seen": spread(sums.seen / steps, np.nan),
-        "least_points": spread(np.where(sums.steps > 0, sums.least_points, np.nan), np.nan),
-        "least_sensors": spread(np.where(sums.steps > 0, sums.least_sensors, np.nan), np.nan),
-        "share": spread(sums.near / visible, np.nan),
-        "visible_m2": spread(sums.visible / steps * m2_each, np.nan),
-    }
+    return Spots(
+        state=spread(np.where(sums.steps > 0, FREE, OUTSIDE).astype(np.uint8), OCCUPIED),
+        steps=spread(sums.steps, 0),
+        sensor_points=spread(sums.points / steps_with),
+        sensors=spread(sums.sensors / steps_with),
+        seen=spread(sums.seen / steps_with),
+        least_points=spread(np.where(sums.steps > 0, sums.least_points, np.nan)),
+        least_sensors=spread(np.where(sums.steps > 0, sums.least_sensors, np.nan)),
+        share=spread(sums.near / visible),
+        visible_m2=spread(sums.visible / steps_with * surface.m2_each / run.places),
+    )
 
 
 def _outline_m(scenario: Scenario) -> Float64:
@@ -159,8 +209,8 @@ def _check_size(target: Target, raster: Raster) -> None:
         )
 
 
-def _check_memory(rig: Rig, raster: Raster, steps: int) -> None:
-    rays, cells = sum(sensor.rays for sensor in rig.sensors), raster.shape[0] * raster.shape[1]
+def _check_memory(rig: Rig, cells: int, steps: int) -> None:
+    rays = sum(sensor.rays for sensor in rig.sensors)
     places = max(PLACES, steps)
     needed_bytes = BYTES_PER_RAY * rays * steps + cells * (
         BYTES_PER_CELL + places * SAMPLES // 8 + 8 * len(rig.sensors)

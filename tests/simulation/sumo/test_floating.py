@@ -23,7 +23,7 @@ def test_places_are_those_of_the_front_and_angles_run_clockwise_from_north(angle
     row = vehicle("a", 10.0, 20.0, angle, z=3.0)
     track = recorded({0.0: [row], 1.0: [row]}).tracks[0]
     assert (track.yaw_deg[0] - yaw) % 360 == 0
-    (body,) = motions([RoadUser(track, "van", 6.0, (5.0, 2.0))], 1.0, np.zeros(2))
+    (body,) = motions([RoadUser(track, "van", 6.0, ((5.0, 2.0),))], 1.0, np.zeros(2))
     np.testing.assert_allclose(body.poses[0, :2], np.array([10.0, 20.0]) - 3.0 * np.array(ahead), atol=1e-12)
     assert track.places_m[0, 2] == 3.0
 

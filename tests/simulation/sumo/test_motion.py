@@ -6,9 +6,10 @@ import shapely
 
 from torchcover.simulation.sumo.floating import SumoTrack
 from torchcover.simulation.sumo.ground import Pavement, ground_of
-from torchcover.simulation.sumo.motion import CATCH_UP_MPS, RoadUser, corners_m, motions, possible, tractrix
+from torchcover.simulation.sumo.motion import CATCH_UP_MPS, RoadUser, corners_m, motions, possible
 from torchcover.simulation.sumo.network import read_network
 from torchcover.simulation.sumo.vicinity import Vicinity
+from torchcover.simulation.traffic.articulated import DRAWS, tractrix
 
 from .towns import DRIVE, WALK, edge, write_net
 
@@ -21,7 +22,7 @@ def user(places_m, *, step_s=0.2, begin_s=0.0, kind="sedan", size_m=(5.0, 2.0), 
     track = SumoTrack(
         kind, kind, on_foot, times_s, np.column_stack([places_m, zeros]), np.full(len(places_m), yaw_deg), zeros
     )
-    return RoadUser(track, kind, size_m[0], size_m)
+    return RoadUser(track, kind, size_m[0], (size_m,))
 
 
 def straight(speed_mps=10.0, seconds=10.0, x_m=0.0, y_m=0.0, step_s=0.2):
@@ -45,23 +46,6 @@ def turn(radius_m, speed_mps=5.0, begin_m=(0.0, 0.0), lead_in_m=30.0):
     x = radius_m * np.sin(bend) + np.where(more < 0, more, 0.0)
     y = radius_m * (1 - np.cos(bend)) + np.where(more > 0, more, 0.0)
     return np.column_stack([x, y]) + begin_m
-
-
-def test_on_a_circle_the_rear_follows_a_smaller_one():
-    radius_m, length_m = 10.0, 3.0
-    angle = np.linspace(0.0, 4 * np.pi, 2000)
-    lead_m = radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    (yaw,) = tractrix(lead_m[:, None], np.array([length_m]), np.array([np.pi / 2])).T
-    rear_m = lead_m - length_m * np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
-    assert np.linalg.norm(rear_m[-1]) == pytest.approx(np.sqrt(radius_m**2 - length_m**2), abs=1e-4)
-    assert np.abs(np.diff(yaw)).max() < 0.02
-
-
-def test_along_a_line_the_angle_falls_as_in_the_closed_form_whatever_the_steps():
-    ways_m = np.array([0.0, 0.1, 3.0, 3.5, 9.0])
-    lead_m = np.stack([ways_m, np.zeros(5)], axis=1)[:, None]
-    (yaw,) = tractrix(lead_m, np.array([4.0]), np.array([2.5])).T
-    np.testing.assert_allclose(np.tan(yaw / 2), np.tan(1.25) * np.exp(-ways_m / 4.0), rtol=1e-12)
 
 
 def test_straight_on_nothing_changes_and_bodies_are_as_long_as_told():
@@ -140,7 +124,7 @@ def test_long_vehicles_swing_out_and_none_comes_over_a_kerb(corner):
     (cuts,), (swings,) = (motions([bus], 22.0, ORIGIN, kerbs) for kerbs in (None, corner))
     over = [
         shapely.intersection(
-            shapely.polygons(corners_m(m.poses, np.tile(bus.size_m, (len(m.poses), 1)))),
+            shapely.polygons(corners_m(m.poses, np.tile(bus.sizes_m[0], (len(m.poses), 1)))),
             shapely.union_all(corner),
         )
         for m in (cuts, swings)
@@ -151,6 +135,31 @@ def test_long_vehicles_swing_out_and_none_comes_over_a_kerb(corner):
     assert accelerations(swings).max() < 3.5
 
 
+def semi_trailer(places_m):
+    return user(places_m, kind="truck")._replace(length_m=16.5, sizes_m=((6.65, 2.55), (13.6, 2.55)))
+
+
+def test_a_trailer_follows_its_kingpin_and_both_parts_count(corner):
+    truck = semi_trailer(turn(14.0, 5.0, lead_in_m=40.0))
+    (motion,) = motions([truck], 20.0, ORIGIN)
+    (front, _), (rear, size_m) = motion.parts
+    assert rear[0] == pytest.approx([*(front[0, :2] - [6.375, 0.0]), 0.0], abs=1e-9)
+    assert [front[0, 0] + 6.65 / 2, rear[0, 0] - 13.6 / 2] == pytest.approx([-40.0, -56.5])
+    hitches_m = DRAWS["truck"].hitches_m(front)[:, None]
+    np.testing.assert_allclose(tractrix(hitches_m, np.array([8.41]), np.zeros(1))[:, 0], rear[:, 2], atol=1e-12)
+    # Only the trailer comes over the place where that one stands.
+    where = len(rear) // 2
+    inside_m = rear[where, :2] + (size_m[1] / 2 - 0.2) * np.array([-np.sin(rear[where, 2]), np.cos(rear[where, 2])])
+    alone = motion._replace(user=truck._replace(kind="van", sizes_m=truck.sizes_m[:1]), rear=None)
+    (rests,) = motions([user(np.tile(inside_m, (101, 1)), on_foot=True, size_m=(0.3, 0.5))], 20.0, ORIGIN)
+    (far,) = motions([user(straight(0.1, 20.0, y_m=-50.0))], 20.0, ORIGIN)
+    assert possible([far, motion]) == [far, motion]
+    assert possible([motion, rests]) == [motion]
+    assert possible([alone, rests]) == [alone, rests]
+    wide = motions([semi_trailer(turn(5.0, 3.0, (3.5, 4.5)))], 22.0, ORIGIN, corner)[0]
+    assert not wide.can_be
+
+
 def test_who_cannot_get_round_is_not_there(corner):
     (lorry,) = motions([user(turn(5.0, 5.0, (3.5, 4.5)), size_m=(16.5, 2.55))], 15.0, ORIGIN, corner)
     assert lorry.over_kerb_m > 0.05
@@ -158,3 +167,18 @@ def test_who_cannot_get_round_is_not_there(corner):
     assert possible([lorry]) == [lorry]  # the first is the ego
     (walker,) = motions([user(turn(5.0, 1.4), on_foot=True)], 40.0, ORIGIN, corner)
     assert walker.can_be
+
+
+def test_people_go_round_what_is_driven_on_where_sumo_leads_them_straight_across():
+    walked = shapely.Polygon([(0, 0), (20, 0), (20, 20), (16, 20), (16, 4), (0, 4)])
+    way_m = np.concatenate([straight(1.3, 10.0, y_m=3.0)[:20], [[5.2 + 0.2 * k, 3.0 + 0.26 * k] for k in range(61)]])
+    across = user(way_m, on_foot=True, kind="adult", size_m=(0.3, 0.5))
+    inside = user(straight(1.3, 8.0, x_m=1.0, y_m=2.0), on_foot=True, kind="adult", size_m=(0.3, 0.5))
+    free, led, same = (motions([who], 16.0, ORIGIN, None, area)[0] for who, area in
+                       ((across, None), (across, walked), (inside, walked)))  # fmt: skip
+    on = [shapely.contains_xy(walked, *motion.poses[:, :2].T) for motion in (free, led)]
+    assert on[0].mean() < 0.5
+    assert on[1].mean() > 0.9
+    assert shapely.distance(shapely.points(led.poses[:, :2]), walked).max() < 0.5
+    assert led.can_be
+    np.testing.assert_array_equal(same.poses, motions([inside], 16.0, ORIGIN)[0].poses)

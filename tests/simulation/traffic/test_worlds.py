@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from torchcover.simulation.patches import outward_faces
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic import Highway, Parking, Urban, urban
@@ -75,6 +76,13 @@ def test_the_ego_stays_on_the_road_and_tilts_a_little(kind, world):
         < 0.1
     )
     assert np.abs(np.diff(ego.angles_deg[:, 1:], axis=0)).max() < 0.4
+
+
+def test_what_is_known_of_faces_is_what_would_be_found(world):
+    static = [mesh for mesh in world("winding", 0).static if mesh.outward is not None]
+    assert len(static) == 2  # houses, and what is smaller
+    for mesh in static:
+        np.testing.assert_array_equal(mesh.outward, outward_faces(mesh._replace(outward=None)))
 
 
 @pytest.mark.parametrize("kind", WORLDS)

@@ -71,6 +71,8 @@ class Argoverse2(Layout):
     layout: ClassVar[str] = "sensors/lidar/TIME.feather, city_SE3_egovehicle.feather"
     sensors = tuple(LASERS)
     body = BODY
+    classes = CLASSES
+    classes = CLASSES
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)

@@ -8,6 +8,7 @@ import shapely
 from numpy.typing import NDArray
 
 from torchcover.simulation.sumo.floating import TIME_SLACK_S, SumoTrack
+from torchcover.simulation.traffic.articulated import DRAWS, rears_of, together, tractrix
 
 Numbers = NDArray[np.float64]
 
@@ -18,7 +19,9 @@ CORNER_M, ALONG_M = 3.0, 0.5
 # The axles of vehicles lie so far from their middle, as a share of the length; people turn about a point behind them.
 AXLE_SHARE, HEELS_M = 0.3, 0.4
 # Nobody walks faster: SUMO lets people jump where ways meet, which they walk off with so much more speed instead.
-FASTEST_ON_FOOT_MPS, CATCH_UP_MPS = 4.0, 0.8
+FASTEST_ON_FOOT_MPS, CATCH_UP_MPS, HURRIES_MPS = 4.0, 0.8, 3.5
+# People go so far within the edges of pavements and crossings, to which those come back who were no farther from them.
+OFF_EDGE_M, BESIDE_M = 0.25, 2.0
 # Whose rear axle follows its own way so closely is off the kerbs, as its lane is; poses are looked at this often.
 ASTRAY_M, LOOKS_EVERY = 0.25, 2
 # How often a way is moved aside, over which length before and after, and the room that is left; to rub is to be off.
@@ -35,18 +38,23 @@ class RoadUser(NamedTuple):
         track: Where its front is.
         kind: Of its body.
         length_m: That the simulation takes it for.
-        size_m: Length and width of the body.
+        sizes_m: Lengths and widths of the body, and of what it draws along.
     """
 
     track: SumoTrack
     kind: str
     length_m: float
-    size_m: tuple[float, float]
+    sizes_m: tuple[tuple[float, float], ...]
 
     @property
     def ahead_m(self) -> float:
         """How far the point that leads is before the middle."""
-        return 0.0 if self.track.on_foot else AXLE_SHARE * self.size_m[0]
+        return 0.0 if self.track.on_foot else AXLE_SHARE * self.sizes_m[0][0]
+
+    @property
+    def lag_m(self) -> float:
+        """How far the axles of what it draws along are behind the point that leads, on a straight."""
+        return self.ahead_m - DRAWS[self.kind].hitch_m + DRAWS[self.kind].rod_m if self.kind in DRAWS else 0.0
 
     @property
     def drawn_m(self) -> float:
@@ -60,14 +68,23 @@ class Motion(NamedTuple):
     Args:
         user: Whose.
         times_s: (K,) evenly spaced; those who are there all the time share them.
-        poses: (K, 3) x and y of its middle, and its heading in radians, without leaps.
+        poses: (K, 3) x and y of its middle, and its heading in radians, without leaps; of its front, if it is in two
+            parts.
         over_kerb_m: How far its outline reaches over a kerb at the worst.
+        rear: (K, 3) likewise what it draws along.
     """
 
     user: RoadUser
     times_s: Numbers
     poses: Numbers
     over_kerb_m: float = 0.0
+    rear: Numbers | None = None
+
+    @property
+    def parts(self) -> list[tuple[Numbers, tuple[float, float]]]:
+        """Poses of its parts, one or two, and their lengths and widths."""
+        poses = [self.poses] if self.rear is None else [self.poses, self.rear]
+        return list(zip(poses, self.user.sizes_m, strict=True))
 
     @property
     def can_be(self) -> bool:
@@ -78,7 +95,11 @@ class Motion(NamedTuple):
 
 
 def motions(
-    users: Sequence[RoadUser], duration_s: float, origin_m: Numbers, obstacles: NDArray[np.object_] | None = None
+    users: Sequence[RoadUser],
+    duration_s: float,
+    origin_m: Numbers,
+    obstacles: NDArray[np.object_] | None = None,
+    walked: shapely.Geometry | None = None,
 ) -> list[Motion]:
     """Move bodies along their tracks, without those who are there for no time.
 
@@ -87,7 +108,9 @@ def motions(
         duration_s: Of the run, from 0 on.
         origin_m: (2,) what is subtracted of all places.
         obstacles: Polygons in plan, of pavements and what is parked: vehicles swing out for them where they can.
+        walked: Likewise what people walk on: who is beside it goes along its edge instead, where there is time to.
     """
+    shapely.prepare(walked)
     times_s = np.linspace(0.0, duration_s, int(np.ceil(duration_s / FINE_S - TIME_SLACK_S)) + 1)
     there: list[tuple[RoadUser, Numbers]] = []
     for user in users:
@@ -97,33 +120,43 @@ def motions(
     found: list[Motion] = []
     for start in range(0, len(there), BODIES_AT_ONCE):
         some, own_s = zip(*there[start : start + BODIES_AT_ONCE], strict=True)
-        ways_m = [_lead_m(user, at_s, origin_m) for user, at_s in zip(some, own_s, strict=True)]
+        ways_m = [_lead_m(user, at_s, origin_m, walked) for user, at_s in zip(some, own_s, strict=True)]
         poses = _poses(some, ways_m)
         over_m = np.zeros(len(some)) if obstacles is None else _keep_off(some, ways_m, poses, obstacles)
-        found += map(Motion, some, own_s, poses, over_m.tolist())
+        rears = _rears(some, poses)
+        found += map(Motion, some, own_s, poses, over_m.tolist(), map(rears.get, range(len(some))))
     return found
 
 
-def _lead_m(user: RoadUser, times_s: Numbers, origin_m: Numbers) -> Numbers:
+def _lead_m(user: RoadUser, times_s: Numbers, origin_m: Numbers, walked: shapely.Geometry | None) -> Numbers:
     """(K, 2) where the point goes that leads, at (K,) times."""
     track = user.track
     told_m = (_without_jumps(track) if track.on_foot else track.places_m[:, :2]) - origin_m
     even_m = np.stack([np.interp(times_s, track.times_s, axis) for axis in told_m.T], axis=1)
+    if track.on_foot and walked is not None and not walked.is_empty:
+        even_m = _along_edges(even_m, times_s[1] - times_s[0], walked)
     half_s = max(SMOOTH_S, float(np.median(np.diff(track.times_s))))
     smooth_m = rounded(even_m, int(np.ceil(half_s / (times_s[1] - times_s[0]))))
-    behind_m = 0.0 if track.on_foot else max(user.length_m / 2 - user.ahead_m, 0.0)
+    before_middle_m = user.ahead_m + (DRAWS[user.kind].ahead_m if user.kind in DRAWS else 0.0)
+    behind_m = 0.0 if track.on_foot else max(user.length_m / 2 - before_middle_m, 0.0)
     return _behind(smooth_m, behind_m, np.deg2rad(track.yaw_deg[0]))
 
 
 def _poses(users: Sequence[RoadUser], ways_m: Sequence[Numbers]) -> list[Numbers]:
     """(K, 3) of each, along the (K, 2) way of its point that leads."""
-    longest = max(map(len, ways_m))
-    lead_m = np.stack([np.pad(way_m, ((0, longest - len(way_m)), (0, 0)), "edge") for way_m in ways_m], axis=1)
+    lead_m = together(ways_m)
     start = np.deg2rad([user.track.yaw_deg[0] for user in users])
     yaw = tractrix(lead_m, np.array([user.drawn_m for user in users]), start)
     ahead_m = np.array([user.ahead_m for user in users])[:, None] * np.stack([np.cos(yaw), np.sin(yaw)], axis=2)
     poses = np.concatenate([lead_m - ahead_m, yaw[..., None]], axis=2)
     return [poses[: len(way_m), number].copy() for number, way_m in enumerate(ways_m)]
+
+
+def _rears(users: Sequence[RoadUser], poses: Sequence[Numbers]) -> dict[int, Numbers]:
+    """(K, 3) poses of what some draw along, by their numbers, along those of fronts."""
+    fronts = [number for number, user in enumerate(users) if user.kind in DRAWS]
+    rears = rears_of([users[number].kind for number in fronts], [poses[number] for number in fronts])
+    return dict(zip(fronts, rears, strict=True))
 
 
 def _keep_off(
@@ -132,34 +165,49 @@ def _keep_off(
     """Let vehicles swing out where the inner side of a turn would come over a kerb; (N,) how far they still do."""
     over_m, moved_m, aside_m = np.zeros(len(users)), list(ways_m), [np.zeros(len(way_m)) for way_m in ways_m]
     left = [np.stack([-np.sin(own[:, 2]), np.cos(own[:, 2])], axis=1) for own in poses]
-    look: dict[int, NDArray[np.int64]] = {}
+    rears = _rears(users, poses)
+    # When bodies are looked at, and what they draw along.
+    look: dict[tuple[int, bool], NDArray[np.int64]] = {}
     for number, (user, way_m, own) in enumerate(zip(users, ways_m, poses, strict=True)):
         if not user.track.on_foot:
             astray_m = _lengths(2 * own[:, :2] - way_m - _behind(way_m, user.drawn_m, own[0, 2]))
-            look[number] = np.flatnonzero(astray_m > ASTRAY_M)[::LOOKS_EVERY]
+            look[number, False] = np.flatnonzero(astray_m > ASTRAY_M)[::LOOKS_EVERY]
+        if number in rears:
+            astray_m = DRAWS[user.kind].rod_m / 2 * np.abs(rears[number][:, 2] - own[:, 2])
+            look[number, True] = np.flatnonzero(astray_m > ASTRAY_M)[::LOOKS_EVERY]
     for swing in range(SWINGS + 1):
-        of = np.repeat(np.array(list(look), dtype=np.int64), [len(at) for at in look.values()])
-        size_m = np.array([user.size_m for user in users])[of]
-        looked_at = [poses[number][at] for number, at in look.items()]
+        counts = [len(at) for at in look.values()]
+        of = np.repeat(np.array([number for number, _ in look], dtype=np.int64), counts)
+        rear = np.repeat(np.array([is_rear for _, is_rear in look], dtype=bool), counts)
+        when = np.concatenate([np.empty(0, dtype=np.int64), *look.values()])
+        size_m = np.repeat(
+            np.array([users[number].sizes_m[is_rear] for number, is_rear in look]).reshape(-1, 2), counts, axis=0
+        )
+        looked_at = [(rears if is_rear else poses)[number][at] for (number, is_rear), at in look.items()]
         push_m = _push_m(obstacles, np.concatenate([np.empty((0, 3)), *looked_at]), size_m)
-        over_m[list(look)] = 0.0
+        over_m[[number for number, _ in look]] = 0.0
         np.maximum.at(over_m, of, np.abs(push_m))
-        met = [number for number in look if over_m[number] > 0.0]
+        met = np.unique(of[push_m != 0.0]).tolist()
         if not met or swing == SWINGS:
             break
+        turned, look = look, {}
         for number in met:
-            pushed_m = push_m[of == number]
-            at, wanted_m = look[number][pushed_m != 0.0], pushed_m[pushed_m != 0.0]
-            wanted_m += np.copysign(ROOM_M, wanted_m)
-            along_m = _along_m(ways_m[number])
-            away = np.abs(along_m[:, None] - along_m[at]) / (SWING_M + SWING_LENGTHS * users[number].size_m[0])
+            pushed = (of == number) & (push_m != 0.0)
+            wanted_m = push_m[pushed] + np.copysign(ROOM_M, push_m[pushed])
+            along_m, lag_m = _along_m(ways_m[number]), users[number].lag_m
+            middle_m = along_m[when[pushed]] - np.where(rear[pushed], lag_m, 0.0)
+            away = np.abs(along_m[:, None] - middle_m) / (SWING_M + SWING_LENGTHS * users[number].sizes_m[0][0])
             bumps_m = wanted_m * np.where(away < 1, (1 + np.cos(np.pi * away)) / 2, 0.0)
             aside_m[number] += bumps_m.max(axis=1).clip(min=0.0) + bumps_m.min(axis=1).clip(max=0.0)
             moved_m[number] = ways_m[number] + aside_m[number][:, None] * left[number]
+            look[number, False] = np.flatnonzero(aside_m[number])[::LOOKS_EVERY]
+            if number in rears:
+                moved = np.interp(along_m - lag_m, along_m, aside_m[number]) != 0.0
+                look[number, True] = np.union1d(turned[number, True], np.flatnonzero(moved)[::LOOKS_EVERY])
         again = _poses([users[number] for number in met], [moved_m[number] for number in met])
         for number, own in zip(met, again, strict=True):
             poses[number] = own
-        look = {number: np.flatnonzero(aside_m[number])[::LOOKS_EVERY] for number in met}
+        rears = _rears(users, poses)
     return over_m
 
 
@@ -172,14 +220,16 @@ def possible(bodies: Sequence[Motion]) -> list[Motion]:
     bodies = [bodies[0], *(body for body in bodies[1:] if body.can_be)]
     meets = np.zeros((len(bodies), len(bodies)), dtype=bool)
     step_s = float(bodies[0].times_s[1])
-    first = [round(float(body.times_s[0]) / step_s) for body in bodies]
-    size_m = np.array([body.user.size_m for body in bodies]) + APART_M
+    parts = [(number, *part) for number, body in enumerate(bodies) for part in body.parts]
+    of = np.array([number for number, _, _ in parts])
+    first = [round(float(bodies[number].times_s[0]) / step_s) for number in of.tolist()]
+    size_m = np.array([size_m for _, _, size_m in parts]) + APART_M
     reach_m = np.linalg.norm(size_m, axis=1)[:, None] / 2
     for begin in range(0, len(bodies[0].times_s), PIECE_STEPS):
-        poses = np.full((PIECE_STEPS, len(bodies), 3), np.nan)
-        for number, body in enumerate(bodies):
+        poses = np.full((PIECE_STEPS, len(parts), 3), np.nan)
+        for number, (_, own, _) in enumerate(parts):
             start = begin - first[number]
-            piece = body.poses[max(start, 0) : max(start + PIECE_STEPS, 0)]
+            piece = own[max(start, 0) : max(start + PIECE_STEPS, 0)]
             poses[max(-start, 0) :, number][: len(piece)] = piece
         there = np.flatnonzero(np.isfinite(poses[..., 0]).any(axis=0))
         places_m = poses[:, there, :2]
@@ -187,9 +237,10 @@ def possible(bodies: Sequence[Motion]) -> list[Motion]:
         high_m = np.fmax.reduce(places_m) + reach_m[there]
         boxes = shapely.box(*low_m.T, *high_m.T)
         one, other = there[shapely.STRtree(boxes).query(boxes)]
-        one, other = one[one < other], other[one < other]
+        one, other = (pair[of[one] < of[other]] for pair in (one, other))
         met = _overlap(poses[:, one], size_m[one], poses[:, other], size_m[other]).any(axis=0)
-        meets[one[met], other[met]] = meets[other[met], one[met]] = True
+        one, other = of[one[met]], of[other[met]]
+        meets[one, other] = meets[other, one] = True
     number_met = meets.sum(axis=1)
     number_met[0] = -1
     stays = np.ones(len(bodies), dtype=bool)
@@ -210,28 +261,6 @@ def _overlap(one: Numbers, size_m: Numbers, other: Numbers, other_size_m: Number
         meet &= 2 * np.abs(forward_m) < own[:, 0] + its[:, 0] * cos + its[:, 1] * sin
         meet &= 2 * np.abs(left_m) < own[:, 1] + its[:, 0] * sin + its[:, 1] * cos
     return meet
-
-
-def tractrix(lead_m: Numbers, length_m: Numbers, yaw: Numbers) -> Numbers:
-    """Headings of rods that are drawn along at their front end, exactly for ways of straight pieces.
-
-    Args:
-        lead_m: (T, N, 2) where the front ends go.
-        length_m: (N,) of the rods; their rear ends never slip sideways.
-        yaw: (N,) headings at first, in radians.
-
-    Returns:
-        (T, N) headings, without leaps: with the angle a between rod and way, tan(a / 2) falls by exp(-way / length).
-    """
-    ways_m = np.diff(lead_m, axis=0)
-    towards = np.arctan2(ways_m[..., 1], ways_m[..., 0])
-    falls = np.exp(-_lengths(ways_m) / length_m)
-    found = np.empty(lead_m.shape[:2])
-    found[0] = yaw
-    for k, (toward, fall) in enumerate(zip(towards, falls, strict=True)):
-        half = np.tan((toward - found[k]) / 2)
-        found[k + 1] = found[k] + 2 * (np.arctan(half) - np.arctan(half * fall))
-    return found
 
 
 def _push_m(obstacles: NDArray[np.object_], poses: Numbers, size_m: Numbers) -> Numbers:
@@ -307,3 +336,25 @@ def _without_jumps(track: SumoTrack) -> Numbers:
         share = ((times_s - begin_s) / takes_s).clip(0.0, 1.0) - (np.arange(len(times_s)) > at)
         walked_m += share[:, None] * steps_m[at]
     return walked_m
+
+
+def _along_edges(way_m: Numbers, step_s: float, walked: shapely.Geometry) -> Numbers:
+    """(K, 2) places of somebody on foot, who goes along the edge of what is walked on instead of beside it.
+
+    SUMO lets people walk straight through places where streets meet, even those that bend around a carriageway.
+    """
+    off = ~shapely.contains_xy(walked, *way_m.T)
+    if not off.any():
+        return way_m
+    found_m, rings = way_m.copy(), shapely.get_rings(shapely.get_parts(walked.buffer(-OFF_EDGE_M)))
+    for first, end in np.flatnonzero(np.diff(np.pad(off, 1).astype(np.int8))).reshape(-1, 2).tolist():
+        ends = shapely.points(way_m[[max(first - 1, 0), min(end, len(way_m) - 1)]])
+        nearest = rings[int(shapely.distance(rings[:, None], ends).sum(axis=1).argmin())]
+        begin_m, end_m = shapely.line_locate_point(nearest, ends)
+        length_m = shapely.length(nearest)
+        along_m = (end_m - begin_m + length_m / 2) % length_m - length_m / 2
+        if shapely.distance(nearest, ends).max() < BESIDE_M and abs(along_m) < HURRIES_MPS * step_s * (end - first + 1):
+            share = np.arange(1, end - first + 1) / (end - first + 1)
+            at = shapely.line_interpolate_point(nearest, (begin_m + share * along_m) % length_m)
+            found_m[first:end] = shapely.get_coordinates(at)
+    return found_m

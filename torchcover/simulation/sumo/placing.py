@@ -15,7 +15,7 @@ from torchcover.simulation.sumo.motion import Motion, corners_m, rounded
 from torchcover.simulation.sumo.vicinity import Vicinity
 from torchcover.simulation.traffic.assemble import attitude
 from torchcover.simulation.traffic.city import FREE_AT_CORNERS_M, PARKED, PARKED_GAP_M
-from torchcover.simulation.traffic.fleet import CATEGORIES, EGO, Fleet
+from torchcover.simulation.traffic.fleet import CATEGORIES, EGO, REAR_OF, Fleet, parts_of
 from torchcover.simulation.traffic.roads import Polyline
 from torchcover.simulation.traffic.scenery import PAVEMENT_M
 from torchcover.simulation.world import Actor
@@ -37,30 +37,31 @@ class Placing:
 
     def actors(self, others: Sequence[Motion], fleet: Fleet, duration_s: float) -> tuple[Actor, ...]:
         """The others as actors, there for as long as they were in the simulation."""
-        return tuple(
-            Actor(
-                f"{motion.user.kind} {motion.user.track.name} {number}",
-                CATEGORIES[motion.user.kind],
-                fleet.meshes[motion.user.kind],
-                Trajectory(motion.times_s, *self._poses(motion), not motion.user.track.covers(duration_s)),
-            )
-            for number, motion in enumerate(others)
-        )
+        found = []
+        for number, motion in enumerate(others):
+            name = f"{motion.user.kind} {motion.user.track.name} {number}"
+            for kind, part in zip(parts_of(motion.user.kind), motion.parts, strict=True):
+                poses = self._poses(motion, *part)
+                trajectory = Trajectory(motion.times_s, *poses, not motion.user.track.covers(duration_s))
+                found.append(Actor(name, CATEGORIES[kind], fleet.meshes[kind], trajectory))
+                name = REAR_OF + name
+        return tuple(found)
 
     def ego(self, ego: Motion, times_s: Numbers, mesh: Mesh, generator: np.random.Generator) -> Actor:
         """The ego, with a body that tilts with braking and curves, too, at evenly spaced times."""
-        columns = np.concatenate(self._poses(ego), axis=1).T
+        columns = np.concatenate(self._poses(ego, *ego.parts[0]), axis=1).T
         x_m, y_m, z_m, yaw, pitch, roll = (np.interp(times_s, ego.times_s, column) for column in columns)
         way_m = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x_m), np.diff(y_m)))])
         angles = attitude(times_s, way_m, np.gradient(way_m, times_s), yaw, generator)
         angles[:, 1:] += np.stack([pitch, roll], axis=1)
         return Actor(EGO, "car", mesh, Trajectory(times_s, np.stack([x_m, y_m, z_m], axis=1), angles))
 
-    def _poses(self, motion: Motion) -> tuple[Numbers, Numbers]:
-        """(K, 3) places and (K, 3) angles of a body."""
-        middle_m, yaw_deg = motion.poses[:, :2], np.rad2deg(motion.poses[:, 2])
-        track, size_m = motion.user.track, motion.user.size_m
-        back_m = 0.0 if track.on_foot else size_m[0] / 2
+    def _poses(self, motion: Motion, poses: Numbers, size_m: tuple[float, float]) -> tuple[Numbers, Numbers]:
+        """(K, 3) places and (K, 3) angles of a part of a body."""
+        middle_m, yaw_deg, track = poses[:, :2], np.rad2deg(poses[:, 2]), motion.user.track
+        back_m = 0.0 if track.on_foot else motion.user.sizes_m[0][0] / 2
+        # What is drawn along is behind.
+        back_m = back_m + np.linalg.norm(middle_m - motion.poses[:, :2], axis=1)
         heights_m = self._ground.heights_m(middle_m)
         told_m, slope_deg = (
             np.interp(motion.times_s, track.times_s, told) for told in (track.places_m[:, 2], track.slope_deg)

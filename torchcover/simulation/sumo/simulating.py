@@ -39,15 +39,15 @@ def run(program: str, *options: str | Path) -> None:
 
 def output_of(program: str, *options: str | Path) -> Iterator[bytes]:
     """What a program writes to its standard output, piece by piece; whoever stops asking ends the program."""
-    home = installed()
-    command = [str(home / "bin" / program), *ALWAYS, *map(str, options)]
+    folder = home()
+    command = [str(folder / "bin" / program), *ALWAYS, *map(str, options)]
     with TemporaryFile() as said:
         process = subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=said,
-            env=_environment(home),
+            env=_environment(folder),
             preexec_fn=end_with_parent(),  # noqa: PLW1509  (one call of the system, no lock)
         )
         assert process.stdout is not None  # as asked for
@@ -75,7 +75,16 @@ def _errors(lines: Sequence[str]) -> str:
     return " ".join(told or lines[-1:] or ["it says nothing"])[:MAX_TOLD_CHARS]
 
 
-def installed() -> Path:
+def installed() -> list[object]:
+    """Which SUMO there is: its program, how large that is and when it was written; nothing if there is none."""
+    try:
+        program = home() / "bin" / "sumo"
+        return [str(program), program.stat().st_size, program.stat().st_mtime_ns]
+    except (ImportError, OSError):
+        return []
+
+
+def home() -> Path:
     """The folder of the installed package, else of the programs that the shell finds; ImportError if neither is."""
     found = find_spec("sumo")
     if found is not None and found.origin is not None:
@@ -86,8 +95,8 @@ def installed() -> Path:
     return Path(program).resolve().parent.parent
 
 
-def _environment(home: Path) -> dict[str, str]:
-    return {**os.environ, "SUMO_HOME": str(home)}
+def _environment(folder: Path) -> dict[str, str]:
+    return {**os.environ, "SUMO_HOME": str(folder)}
 
 
 def simulate(

@@ -14,6 +14,7 @@ from pydantic import Field
 from torchcover.files import parse_xml
 from torchcover.simulation.documents import Document
 from torchcover.simulation.sumo.simulating import run
+from torchcover.simulation.traffic.hills import Hills
 from torchcover.simulation.traffic.procedural import MostPeople, MostVehicles
 
 Numbers = NDArray[np.float64]
@@ -27,10 +28,9 @@ WITH_BAYS, WITH_BICYCLE_LANES, WITH_MEDIAN = 0.7, 0.5, 0.3
 # Two streets that do not meet keep so far apart, middle to middle: the plan knows no widths.
 APART_M = 40.0
 BEND_PIECES = 10
-# Of kerbs at corners; nobody turns there with more than so much to the side, by much.
-CORNER_M, TURN_MPS2 = 6.0, 1.6
-HILL_WAVELENGTHS_M = (250.0, 700.0)
-HILL_WAVES = 4
+# Of kerbs at corners; nobody turns there with more than so much to the side, by much. Curves are judged over a length
+# within which drivers round them.
+CORNER_M, TURN_MPS2, CURVE_M = 6.0, 2.0, 5.0
 
 
 class DrawnStreets(Document):
@@ -69,27 +69,32 @@ class DrawnStreets(Document):
             for node in parse_xml(prefix.with_suffix(".nod.xml")).iter("node")
         }
         edges = list(parse_xml(prefix.with_suffix(".edg.xml")).iter("edge"))
-        hills = _Hills(self.hills_m, generator)
+        hills = Hills(self.hills_m, generator)
         node_file, edge_file, network = folder / "nodes.xml", folder / "edges.xml", folder / "drawn.net.xml"
         edge_file.write_text(self._edges(nodes, edges, hills, generator), encoding="utf-8")
         rows = [
             f'<node id={quoteattr(name)} x="{x:.3f}" y="{y:.3f}" z="{z:.3f}"/>'
-            for (name, (x, y)), z in zip(nodes.items(), hills.at(np.array(list(nodes.values()))), strict=True)
+            for (name, (x, y)), z in zip(nodes.items(), hills.heights_m(np.array(list(nodes.values()))), strict=True)
         ]
         node_file.write_text(f"<nodes>{''.join(rows)}</nodes>", encoding="utf-8")
         run(
             "netconvert", "--node-files", node_file, "--edge-files", edge_file, "--output-file", network,
-            "--precision", "3", "--tls.guess", "--walkingareas", "--crossings.guess", "--no-turnarounds.except-deadend",
-            "--junctions.limit-turn-speed", str(TURN_MPS2), "--default.junctions.radius", str(CORNER_M),
-            "--junctions.internal-link-detail", "12",
+            "--precision", "3", "--tls.guess", "--walkingareas", "--crossings.guess",
+            "--no-turnarounds.except-deadend",
+            "--default.junctions.radius", str(CORNER_M), "--junctions.internal-link-detail", "12",
         )  # fmt: skip
+        drawn = parse_xml(network)
+        for lane in drawn.iterfind("edge[@function='internal']/lane"):
+            line_m = np.array([place.split(",")[:2] for place in lane.get("shape", "").split()], dtype=np.float64)
+            lane.set("speed", f"{min(self.speed_mps, turning_mps(line_m)):.2f}")
+        ElementTree.ElementTree(drawn).write(network)
         return network
 
     def _edges(
         self,
         nodes: dict[str, tuple[float, float]],
         edges: list[ElementTree.Element],
-        hills: "_Hills",
+        hills: Hills,
         generator: np.random.Generator,
     ) -> str:
         streets: dict[tuple[str, str], list[tuple[str, str, str]]] = {}
@@ -107,7 +112,7 @@ class DrawnStreets(Document):
             way_m, lanes = shapely.get_coordinates(ways[ends]), self._lanes(generator)
             # Junctions are level: so are the ends of all that meet there.
             share = np.linspace(0.0, 1.0, BEND_PIECES + 1)
-            from_m, to_m = hills.at(way_m[[0, -1]])
+            from_m, to_m = hills.heights_m(way_m[[0, -1]])
             climb_m = from_m + (to_m - from_m) * share**2 * (3 - 2 * share)
             places = [f"{x:.3f},{y:.3f},{z:.3f}" for (x, y), z in zip(way_m, climb_m, strict=True)]
             for name, start, end in streets[ends]:
@@ -139,20 +144,20 @@ class DrawnStreets(Document):
         return "".join(f'<lane index="{k}" {who} width="{width:.2f}"/>' for k, (who, width) in enumerate(lanes))
 
 
-class _Hills:
-    """A height for each place: a few long waves."""
+def turning_mps(line_m: Numbers) -> float:
+    """How fast a turn, (K, 2) places of its lane, may be driven: where it is tightest, not on its average.
 
-    def __init__(self, height_m: float, generator: np.random.Generator) -> None:
-        towards, phase = generator.uniform(0.0, 2 * np.pi, (2, HILL_WAVES))
-        waves = 2 * np.pi / generator.uniform(*HILL_WAVELENGTHS_M, HILL_WAVES)
-        self._waves_per_m = waves * np.array([np.cos(towards), np.sin(towards)])
-        self._phase = phase
-        self._height_m = height_m * np.sqrt(2 / HILL_WAVES)
-
-    def at(self, places_m: Numbers) -> Numbers:
-        """(N,) heights at (N, 2) places."""
-        heights_m: Numbers = self._height_m * np.sin(places_m @ self._waves_per_m + self._phase).sum(axis=1)
-        return heights_m
+    Example:
+        >>> quarter = np.linspace(0.0, np.pi / 2, 30)
+        >>> round(turning_mps(8.0 * np.stack([np.cos(quarter), np.sin(quarter)], axis=1)), 1)
+        4.0
+    """
+    steps_m = np.diff(line_m, axis=0)
+    lengths_m = np.hypot(*steps_m.T)
+    turned = np.unwrap(np.arctan2(steps_m[:, 1], steps_m[:, 0]))
+    middles_m = np.cumsum(lengths_m) - lengths_m / 2
+    further = np.abs(np.interp(middles_m + CURVE_M, middles_m, turned) - turned)
+    return float(np.sqrt(TURN_MPS2 * CURVE_M / max(further.max(), 1e-6)))
 
 
 def _without_dead_ends(streets: list[tuple[str, str]]) -> list[tuple[str, str]]:

@@ -10,6 +10,7 @@ from torchcover.geometry import BoundingBox
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.bodies import Vehicle
 from torchcover.simulation.shapes import Mesh
+from torchcover.simulation.traffic.articulated import DRAWS
 from torchcover.simulation.traffic.flow import Agent
 from torchcover.simulation.traffic.idm import Driver
 from torchcover.simulation.traffic.signals import Gate
@@ -24,6 +25,8 @@ BODIES = {
     "van": "car",
     "lorry": "truck",
     "truck": "truck",
+    # It has a box and a category of its own, as in nuScenes.
+    "trailer": "trailer",
     "bus": "bus",
     "motorcycle": "motorcycle",
     "cyclist": "cyclist",
@@ -48,6 +51,7 @@ KIND_OF |= {kind: kind for kind in BODIES}
 CATEGORIES = {name: BODIES[kind] for name, kind in sorted(KIND_OF.items())}
 EGO = "ego"
 HEAVY = ("truck", "lorry", "bus")
+REAR_OF = "rear of "
 
 WALKING = Driver(
     desired_speed_mps=1.4, headway_s=0.4, standstill_gap_m=0.5, acceleration_mps2=1.0, deceleration_mps2=1.5
@@ -60,7 +64,12 @@ CYCLING = Driver(
 @cache
 def load_bodies() -> Mapping[str, Mesh]:
     """The built-in bodies, in all their sizes."""
-    meshes = {kind: Vehicle.load(kind).mesh() for kind in BODIES}
+    truck = Vehicle.load("truck")
+    behind = [part.name.startswith("trailer") for part in truck.parts]
+    meshes = {kind: Vehicle.load(kind).mesh() for kind in BODIES if kind not in ("truck", "trailer")}
+    for kind, is_rear in (("truck", False), ("trailer", True)):
+        parts = tuple(part for part, at_rear in zip(truck.parts, behind, strict=True) if at_rear is is_rear)
+        meshes[kind] = truck.model_copy(update={"parts": parts}).mesh()
     for kind, sizes in SIZES.items():
         for number, shares in enumerate(sizes, 2):
             meshes[f"{kind}_{number}"] = meshes[kind]._replace(vertices_m=meshes[kind].vertices_m * np.array(shares))
@@ -85,8 +94,13 @@ class Fleet:
         self.left_out = 0
 
     def length_m(self, kind: str) -> float:
-        """Extent along x."""
-        return self._sizes[kind][0]
+        """Extent along x, on a straight with all that it draws along."""
+        parts_m = [length_m for length_m, _ in self.sizes_m(kind)]
+        return sum(parts_m) / 2 - DRAWS[kind].hitch_m + DRAWS[kind].middle_m if kind in DRAWS else parts_m[0]
+
+    def sizes_m(self, kind: str) -> tuple[tuple[float, float], ...]:
+        """Lengths and widths of the body and of what it draws along."""
+        return tuple(self._sizes[part][:2] for part in parts_of(kind))
 
     def width_m(self, kind: str) -> float:
         """Extent along y."""
@@ -159,6 +173,11 @@ class Fleet:
                 agents.append(agent)
             rear += length
         return agents
+
+
+def parts_of(kind: str) -> tuple[str, ...]:
+    """A kind, and that of what it draws along."""
+    return (kind, DRAWS[kind].rear) if kind in DRAWS else (kind,)
 
 
 @lru_cache(maxsize=64)

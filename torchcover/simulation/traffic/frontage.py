@@ -326,6 +326,7 @@ def _copies(form: Mesh, outlines_m: Numbers, bottom_m: Numbers, base_m: Numbers,
         np.concatenate([places_m, heights_m[..., None]], axis=2).reshape(-1, 3),
         faces.reshape(-1, 3),
         np.tile(form.materials, count),
+        np.ones(len(faces) * len(form.faces), dtype=bool),  # as all forms are closed
     )
 
 

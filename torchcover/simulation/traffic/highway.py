@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from torchcover.simulation.traffic.alignment import Alignment
-from torchcover.simulation.traffic.assemble import HORIZON_M, Paths, actors, ego_actor
+from torchcover.simulation.traffic.assemble import HORIZON_M, Paths, actors, ahead_of, ego_actor
 from torchcover.simulation.traffic.fleet import EGO, HEAVY, KIND_OF, Fleet
 from torchcover.simulation.traffic.flow import Agent, Flow, check_crowd
 from torchcover.simulation.traffic.hills import Hills
@@ -82,7 +82,10 @@ class Highway(Procedural):
             [a.lane % LANES == SIDE_LANE - 1 for a in agents]
         )
         exits[0] = False
-        driving = Overtaking(agents, heavy, exits, side_m, generator)
+        stations = np.arange(*middle.stations_m[[0, -1]], CURVATURE_EVERY_M)
+        heights_m = hills.heights_m(middle.poses(stations, 0.0)[:, :2])
+        climb = np.stack([stations, np.gradient(heights_m, CURVATURE_EVERY_M)])
+        driving = Overtaking(agents, heavy, exits, side_m, generator, climb)
         flow = driving.run(times_s, WARM_UP_S)
         moving = _near(middle, sides, agents, driving, flow)
         driver = ego_actor(times_s, moving, flow, 0, fleet.meshes[EGO], generator, hills)
@@ -149,7 +152,8 @@ def _near(middle: Alignment, sides: list[SideLane], agents: list[Agent], driving
     way = np.array([1.0 if agent.lane < LANES else -1.0 for agent in agents])
     stations = flow.place_m * way
     near = np.flatnonzero((np.abs(stations - stations[:, :1]) < HORIZON_M + SLACK_M).any(axis=0))
-    stations, way = stations[:, near], way[near]
+    way, kinds = way[near], tuple(agents[agent].kind for agent in near)
+    stations = stations[:, near] + way * ahead_of(kinds)
     # How far to the right of the middle they are in their own direction, and how much more after each metre.
     right_m, slope = np.empty((2, *stations.shape))
     for column, agent in enumerate(near.tolist()):
@@ -169,7 +173,7 @@ def _near(middle: Alignment, sides: list[SideLane], agents: list[Agent], driving
     positions_m[..., 0] = poses[..., 0] + way * right_m * np.sin(yaw)
     positions_m[..., 1] = poses[..., 1] - way * right_m * np.cos(yaw)
     yaw_deg = poses[..., 2] + np.where(way > 0, 0.0, 180.0) - np.rad2deg(np.arctan(slope))
-    return Paths(positions_m, yaw_deg, tuple(agents[agent].kind for agent in near))
+    return Paths(positions_m, yaw_deg, kinds).with_rears()
 
 
 def _lane_at(stations: Numbers, lane: int, sides: list[SideLane]) -> tuple[Numbers | float, Numbers | float]:

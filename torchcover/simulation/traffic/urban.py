@@ -222,6 +222,8 @@ def _in_place(
             beyond_kerb_m = np.minimum(places_m - first_m[next_one], last_m[next_one] - places_m)
             found.positions_m[:, on_lane, 2] = step_height(beyond_kerb_m, radius_m[on_lane])
         found.positions_m[step, on_lane[agent]] = np.nan
+    rears = found.positions_m[:, len(agents) :]
+    rears[np.isnan(found.positions_m[:, list(found.fronts), 0])] = np.nan
     return found
 
 

@@ -1,0 +1,56 @@
+"""`torchcover check`: all requirements of a file in one run; the exit code is the verdict."""
+
+import json
+from xml.etree import ElementTree
+
+import pytest
+
+AHEAD = "{target: adult, at: {points_m: [[5, 0]]}, points: 5, name: '<a> & b'}"
+MUCH = "{target: adult, at: {points_m: [[5, 0]]}, points: 99999}"
+INSIDE = "{target: dog, at: {points_m: [[0, 0]]}, points: 5}"
+
+
+@pytest.mark.parametrize(
+    ("requirements", "code", "states"),
+    [
+        ([AHEAD], 0, ["kept"]),
+        ([AHEAD, INSIDE], 3, ["kept", "not checked"]),
+        ([AHEAD, INSIDE, MUCH], 1, ["kept", "not checked", "not kept"]),
+    ],
+)
+def test_the_exit_code_is_the_verdict_on_all(torchcover, worlds, requirements, code, states):
+    (worlds / "need.yaml").write_text(f"name: needs\nscenario: yard.yaml\nrequirements: [{', '.join(requirements)}]\n")
+    ended, printed, error = torchcover("check", worlds / "low.yaml", "--requirements", worlds / "need.yaml")
+    assert (ended, error) == (code, "")
+    assert all(state in printed for state in states)
+    out = worlds / "out" / "check"
+    record = json.loads((out / "summary.json").read_text())
+    assert (record["exit_code"], record["files"]) == (code, ["junit.xml"])
+    assert [one["state"] for one in record["rigs"]["low"]] == states
+    assert record["rigs"]["low"][0]["margin"] == record["rigs"]["low"][0]["value"] - 5
+    (suite,) = ElementTree.parse(out / "junit.xml").getroot()
+    tags = {"kept": [], "not kept": ["failure"], "not checked": ["error"]}
+    assert [[child.tag for child in case] for case in suite] == [tags[state] for state in states]
+    assert suite[0].get("name") == "<a> & b: adult, points_m [[5.0, 0.0]]: points >= 5"
+    assert suite.get("failures") == str(states.count("not kept"))
+    assert "no homologation" in " ".join(printed.split())
+
+
+@pytest.mark.parametrize(
+    ("text", "arguments", "message"),
+    [
+        ("requirements: [{target: moon, at: {within_m: 1}, points: 5}]", [], "no target is called 'moon'"),
+        ("requirements: [{target: dog, at: {within_m: 1}, pionts: 5}]", [], "pionts: Extra inputs are not permitted"),
+        ("requirements: [{target: dog, at: {within_m: 1}, points: 5, by: rof}]", [], "no sensor is called 'rof'"),
+        ("{}", [], "requirements: Field required"),
+        (f"requirements: [{AHEAD}]", ["--requirements", "crosing_like"], "is 'crossing_like' meant?"),
+        (f"requirements: [{AHEAD}]", ["--requirements", "none.yaml"], "none.yaml: no such file"),
+    ],
+)
+def test_a_mistake_is_one_line_and_exit_code_2(torchcover, worlds, text, arguments, message):
+    (worlds / "need.yaml").write_text(text)
+    ended, printed, error = torchcover("check", worlds / "low.yaml", "--requirements", worlds / "need.yaml", *arguments)
+    assert (ended, printed) == (2, "")
+    assert message in error
+    assert error.count("\n") == 1
+    assert not (worlds / "out" / "check").exists()

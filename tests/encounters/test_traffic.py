@@ -1,0 +1,218 @@
+"""Who comes near in traffic, and when he is detected: geometry, and the same as looking all the time."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from tests.recordings.drives import CAR_SIZE_M
+from tests.recordings.drives import Drive as SyntheticDrive
+from tests.recordings.layouts import LAYOUTS
+from tests.targets.worlds import FLOOR, drive, lidar, rig, world
+from torchcover.data import SimulatedFrames
+from torchcover.detection import Boxes
+from torchcover.encounters import Criterion
+from torchcover.encounters.sighting import NEVER
+from torchcover.encounters.traffic import Approach, Drive, Eyes, Watch, approaches, sight_approach
+from torchcover.evaluation import met_in_recording, met_in_traffic
+from torchcover.geometry import rigid
+from torchcover.geometry.trajectory import Trajectory
+from torchcover.recordings import open_recording
+from torchcover.recordings.objects import Track
+from torchcover.simulation import PaperReference, Scenario, Simulator, write_recording
+
+torch.set_num_threads(1)
+
+STEP_S = 0.1
+CHILD = {"type": "box", "size_m": [0.4, 0.4, 1.1]}
+CAR = {"type": "box", "size_m": [4.0, 2.0, 1.5]}
+WALL = {"name": "wall", "shape": {"type": "box", "size_m": [6.0, 0.2, 3.0]}, "poses": [{"x_m": 34.0, "y_m": -2.5}]}
+
+
+@pytest.fixture(scope="module")
+def scenario(tmp_path_factory):
+    """At 10 m/s past a wall, from behind which a child walks; somebody comes from behind, and one stands aside."""
+    folder = tmp_path_factory.mktemp("drives")
+
+    def actor(name, category, shape, *rows):
+        way = drive(folder, *rows, name=f"{name}.csv")
+        return {"name": name, "category": category, "shape": shape, "trajectory": str(way)}
+
+    return Scenario.model_validate({
+        "name": "s", "bodies": [FLOOR, WALL], "time_step_s": STEP_S, "duration_s": 3.0,
+        "ego": {"shape": CAR, "trajectory": str(drive(folder, (0, 0, 0, 0), (3, 30, 0, 0), name="ego.csv"))},
+        "actors": [
+            actor("child", "pedestrian", CHILD, (0, 38, -5.4, 90), (3, 38, -0.9, 90)),
+            actor("faster", "car", CAR, (0, -20, 0, 0), (3, 25, 0, 0)),
+            actor("aside", "car", CAR, (0, 30, 8, 0), (3, 31, 8, 0)),
+        ],
+    })  # fmt: skip
+
+
+AHEAD = {"mount": {"x_m": 1.0, "z_m": 1.8}, "channels": 40, "columns": 240, "horizontal_fov_deg": 80,
+         "vertical_fov_deg": [-12, 4], "max_range_m": 60}  # fmt: skip
+AROUND = AHEAD | {"channels": 16, "columns": 720, "horizontal_fov_deg": 360}
+CAMERA = {"type": "camera", "name": "cam", "mount": {"x_m": 2.05, "z_m": 0.9}, "width": 240, "height": 160,
+          "fov_deg": 90, "stride": 2, "max_range_m": 60, "rate_hz": 10}  # fmt: skip
+SENSORS = lidar("noisy", **AHEAD, range_noise_m=0.2), lidar("slow", **AROUND, dropout=0.4, rate_hz=5), CAMERA
+TOP = lidar(**AHEAD)
+
+
+@pytest.fixture(scope="module")
+def driven(scenario):
+    simulator = Simulator(scenario, {"small": rig(*SENSORS)}, PaperReference(rows=2, columns=2), seed=3)
+    return simulator, Drive.of_world("w", simulator.scene_of(0)[0].world)
+
+
+def test_who_is_met_and_how_near_in_time_is_geometry(driven):
+    child, faster = approaches(driven[1], Criterion())
+    # The child's side is 1.8 - 0.2 m from that of the ego's way 2 s after 1.6 s; the front has 36 - 0.2 m to go.
+    times_s = STEP_S * np.arange(child.step, child.step + len(child.ttc_s))
+    ahead_s, aside_s = (38 - 0.2 - 2 - 10 * times_s) / 10, (5.4 - 1.5 * times_s - 1.0 - 0.2) / 1.5
+    assert child.ttc_s == pytest.approx(np.maximum(ahead_s, aside_s), abs=1e-9)
+    assert (child.name, child.track.name, child.closing_mps) == ("on foot", "child", pytest.approx(10.0))
+    assert child.needed_s == pytest.approx(10 / 18 + 0.5)
+    assert (faster.name, faster.step, faster.closing_mps) == ("from behind", 0, pytest.approx(0.0))
+    assert faster.ttc_s == pytest.approx((20 - 4 - 5 * STEP_S * np.arange(31)) / 5)
+    assert [one.track.name for one in approaches(driven[1], Criterion(within_s=2.5))] == ["child", "faster"]
+
+
+def test_points_are_those_of_frames(scenario, driven):
+    simulator, there = driven
+    frames = SimulatedFrames(
+        scenario, rigs=simulator.rigs, steps=31, seed=3, boxes=True, reference_sensor=PaperReference(rows=2, columns=2)
+    )
+    eyes, counted = Eyes.of_world(simulator, 0, Criterion()), 0
+    for track in there.tracks:
+        watch = Watch(there, track, eyes)
+        for step in (0, 9, 21, 30):
+            boxes = frames[step].boxes
+            expected = int(boxes.hits["small"][boxes.ids.index(track.name)])
+            assert watch.points(range(3), np.array([step])) == [expected]
+            counted += expected
+    assert counted > 1000
+
+
+def test_the_answer_is_that_of_looking_all_the_time(driven):
+    simulator, there = driven
+    some = {"before": 0, "later": 0, "never": 0}
+    for criterion in (Criterion(points=4, pixels=60), Criterion(points=1, pixels=4, looks=2, within_s=2.0)):
+        eyes = Eyes.of_world(simulator, 0, criterion)
+        for one in approaches(there, criterion):
+            found, watch = sight_approach("small", there, one, eyes, criterion), Watch(there, one.track, eyes)
+            first = max(one.step - round(criterion.within_s / STEP_S), 0)
+            detected = []
+            for k, need in enumerate((criterion.points, criterion.points, criterion.pixels)):
+                steps = [s for s in range(first, one.step + len(one.ttc_s)) if s % eyes.every[k] == 0]
+                enough = watch.points([k], np.array(steps)) >= need
+                ends = [steps[j] for j in range(criterion.looks - 1, len(steps))
+                        if enough[j - criterion.looks + 1 : j + 1].all()]  # fmt: skip
+                detected.append(max(ends[0], one.step) if ends else NEVER)
+
+            def ttc_s(step, one=one, within_s=criterion.within_s):
+                past = step - one.step
+                return within_s if past == 0 else 0.0 if step == NEVER else one.ttc_s[: past + 1].min()
+
+            assert found.sensor_ttc_s[:, 0].tolist() == [ttc_s(step) for step in detected]
+            assert found.ttc_s[0] == ttc_s(min(detected))  # of three rates or kinds: none counts with another
+            assert found.without_ttc_s[1, 0] == ttc_s(min(detected[0], detected[2]))
+            assert found.from_the_beginning[0] == (min(detected) == one.step)
+            until = min(min(detected) - one.step + 1, len(one.ttc_s)) if min(detected) > one.step else 0
+            assert found.in_time[0] == (one.ttc_s[:until] >= one.needed_s[:until]).all()
+            for step in detected:
+                some["before" if step == one.step else "never" if step == NEVER else "later"] += 1
+    assert all(some.values())
+
+
+@pytest.mark.parametrize(
+    ("seen_from", "ttc_s", "in_time"), [(0, 4.0, True), (6, 2.0, True), (7, 1.0, False), (9, 0.0, False)]
+)
+def test_the_nearest_time_until_detection_counts_though_it_grew_again(seen_from, ttc_s, in_time):
+    track = Track("t", "car", "passenger", (4.0, 2.0, 1.5), Trajectory.resting([10.0, 0.0, 0.0]))
+    there = Drive("w", STEP_S * np.arange(9), np.tile(np.eye(4), (9, 1, 1)), None, [track])
+    one = Approach(track, 5, np.array([3.0, 2.0, 1.0, 3.5]), np.array([0.5, 0.5, 1.1, 0.5]), "cars and vans", 0.0, 0.0)
+    eyes = Eyes([1], [1], [1], [1], lambda step, _: [np.array([[9.0, 0.0, 1.0]])[: step >= seen_from]])
+    found = sight_approach("r", there, one, eyes, Criterion(points=1, looks=1))
+    assert (found.ttc_s[0], found.in_time[0], found.from_the_beginning[0]) == (ttc_s, in_time, seen_from == 0)
+    assert found.without_ttc_s[0, 0] == 0
+
+
+def test_who_is_hidden_until_braking_is_needed_is_too_late(scenario):
+    soft, hard = (
+        met_in_traffic([rig(TOP)], scenario, Criterion(points=4, deceleration_mps2=brakes, latency_s=0.3), worlds=9)
+        for brakes in (1.5, 9.0)
+    )
+    child = {name: next(row for row in found.rows if row.encounter == "on foot") for name, found in
+             (("soft", soft), ("hard", hard))}  # fmt: skip
+    assert child["soft"].in_time == 0.0
+    assert child["hard"].in_time == 1.0
+    assert 3.0 < child["hard"].ttc_s == child["hard"].ttc_s_low < 3.6
+    assert [(row.encounter, row.draws) for row in hard.rows] == [("on foot", 1), ("from behind", 1), ("all", 2)]
+    assert child["hard"].per_hour == pytest.approx(3600 / 3.1)
+    assert math.isnan(child["hard"].interval_low)  # a world that repeats is one world
+    (table,) = soft.tables()
+    assert table.rows[0][3].text.endswith("too late")
+
+
+def test_a_recording_of_a_world_says_the_same(scenario, tmp_path):
+    frames = SimulatedFrames(
+        scenario, rig(TOP), steps=31, boxes=True, reference_sensor=PaperReference(rows=2, columns=2)
+    )
+    write_recording(frames, tmp_path / "drive")
+    found, expected = met_in_recording(tmp_path / "drive"), met_in_traffic([rig(TOP)], scenario)
+    assert [one.encounter.track.name for one in found.sightings] == ["child", "faster"]
+    for one, other in zip(found.sightings, expected.sightings, strict=True):
+        assert one.encounter.ttc_s == pytest.approx(other.encounter.ttc_s, abs=1e-5)
+        assert one.ttc_s == pytest.approx(other.ttc_s, abs=1e-5)
+        assert (one.in_time, one.from_the_beginning) == (other.in_time, other.from_the_beginning)
+    assert 0 < found.sightings[0].ttc_s[0] < 4
+
+
+class Closing(SyntheticDrive):
+    """At 15 m/s behind a car with 5 m/s, on which there are points from the ninth instant on."""
+
+    def world_T_vehicle(self, index):
+        return rigid(np.eye(3), [1.5 * index, 0.0, 0.0])
+
+    def world_T_car(self, index):
+        return rigid(np.eye(3), [40.0 + 0.5 * index, 0.0, 0.75])
+
+    def scan(self, sensor, index):
+        back_m, self.back_m = self.back_m, self.back_m[: None if index >= 8 else 0]
+        found = super().scan(sensor, index)
+        self.back_m = back_m
+        return found
+
+    def boxes(self, index):
+        box = super().boxes(index)
+        return Boxes.from_rows(box.rows, ids=box.ids, categories=("car",))
+
+
+@pytest.mark.parametrize("layout", ["kitti_raw", "nuscenes", "argoverse2"])
+def test_real_road_users_are_first_hit_as_their_layout_says(layout, tmp_path):
+    recording = open_recording(LAYOUTS[layout](Closing(steps=15), tmp_path))
+    (one,) = met_in_recording(recording).sightings
+    gap_m = 40.0 - CAR_SIZE_M[0] / 2 - recording.body.upper_m[0]
+    assert one.encounter.name == "cars and vans"
+    assert one.encounter.ttc_s[0] == pytest.approx((gap_m - one.encounter.step) / 10, abs=0.02)
+    assert one.ttc_s[0] == pytest.approx((gap_m - 10) / 10, abs=0.02)
+    assert one.encounter.closing_mps == pytest.approx(10.0, abs=0.1)
+
+
+def test_what_cannot_be_asked_is_told(tmp_path):
+    with pytest.raises(ValueError, match="nothing ever moves in it"):
+        met_in_traffic([rig()], world())
+    with pytest.raises(ValueError, match="worlds: a number >= 1"):
+        met_in_traffic([rig()], worlds=0)
+    with pytest.raises(ValueError, match="how large its vehicle is"):
+        met_in_recording(Closing(steps=5))
+    with pytest.raises(ValueError, match="none of its 1 objects is a road user, by their categories"):
+        met_in_recording(open_recording(LAYOUTS["folder"](Closing(steps=5), tmp_path)))
+    way = drive(tmp_path, (0, 0, 0, 0), (1, 9, 0, 0))
+    alone = world(ego={"shape": CAR, "trajectory": str(way)}, duration_s=1.0)
+    far = met_in_traffic([rig(TOP)], alone)
+    assert [(row.encounter, row.draws, row.ttc_s_high) for row in far.rows] == [("all", 0, 0.0)]
+    (table,) = far.tables()
+    assert table.rows[0][3].text == "-"
+    assert "Nobody was met" in table.notes[-1]

@@ -1,0 +1,270 @@
+"""Requirements: what keeps a bound, where bodies are put, what is measured there, and what says nothing."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.targets.worlds import lidar, rig, world
+from torchcover.encounters import Criterion
+from torchcover.evaluation import Readings, Requirements, check, encounter, evaluate, verdicts
+from torchcover.evaluation.requirements import BodyPlaces
+from torchcover.geometry import BoundingBox
+from torchcover.simulation import RegionsOfInterest, builtin_names
+from torchcover.targets import SIDES, Raster, Target, survey
+
+CAR = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))
+AHEAD = {"target": "child", "at": {"points_m": [[5.0, 0.0]]}, "points": 5}
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+def asked(*requirements, **keys):
+    return Requirements.model_validate({"requirements": list(requirements), **keys})
+
+
+def judged(bound, value, low=None, high=None):
+    """The verdict on (N,) numbers, called by their places in the list."""
+    value = np.array(value, dtype=np.float64)
+    ends = (np.array(value if end is None else end, dtype=np.float64) for end in (low, high))
+    numbers = Readings(value, *ends, [str(k) for k in range(len(value))])
+    key, least, most = bound
+    one = {"region": "20m", "height": "ground", "number": key} | {
+        k: v for k, v in (("least", least), ("most", most)) if v
+    }
+    (found,) = verdicts(asked(one), [{key: numbers}])
+    return found
+
+
+LEAST, MOST = ("detection_0.4m", 0.9, None), ("radius_m", None, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("bound", "value", "low", "high", "state", "worst", "where"),
+    [
+        (LEAST, [0.9, 0.95], None, None, "kept", 0, ("0", "1")),
+        (LEAST, [0.95, 0.89], None, None, "not kept", 1, ("1",)),
+        (LEAST, [0.95], [0.91], [0.97], "kept", 0, ("0",)),
+        (LEAST, [0.95], [0.89], [0.97], "not checked", 0, ("0",)),
+        (LEAST, [0.85], [0.80], [0.91], "not checked", 0, ("0",)),
+        (LEAST, [0.85], [0.80], [0.89], "not kept", 0, ("0",)),
+        (LEAST, [0.95], [np.nan], [np.nan], "not checked", 0, ("0",)),
+        (LEAST, [np.nan, 0.95], None, None, "not checked", 1, ("0",)),
+        (LEAST, [np.nan, 0.1], None, None, "not kept", 1, ("1",)),
+        (LEAST, [], None, None, "not checked", None, ()),
+        (MOST, [0.4], [0.3], [0.49], "kept", 0, ("0",)),
+        (MOST, [0.4, 0.45], [0.3, 0.4], [0.49, 0.51], "not checked", 1, ("1",)),
+        (MOST, [0.4, 0.7, np.inf], None, None, "not kept", 2, ("2", "1")),
+    ],
+)
+def test_a_bound_is_kept_where_all_of_the_interval_is_known_to_keep_it(bound, value, low, high, state, worst, where):
+    found = judged(bound, value, low, high)
+    assert (found.state, found.where, found.count) == (state, where, len(value))
+    if worst is None:
+        assert np.isnan([found.value, found.margin]).all()
+    else:
+        sign, limit = (1, bound[1]) if bound[1] else (-1, bound[2])
+        np.testing.assert_allclose([found.value, found.margin], [value[worst], sign * (value[worst] - limit)])
+
+
+def test_bodies_are_put_where_a_place_says():
+    """Areas are filled to their border in steps that are no longer than asked for; other forms are what they say."""
+    behind = BodyPlaces(x_m=(-1.0, -0.2), relative_to="rear", step_m=0.3).positions_m(CAR)
+    assert behind.min(0) == pytest.approx([-3.0, -1.0])
+    assert behind.max(0) == pytest.approx([-2.2, 1.0])
+    assert np.diff(np.unique(behind[:, 0].round(9))).max() <= 0.3
+    assert len(np.unique(behind.round(9), axis=0)) == len(behind) == 4 * 8
+    beside = BodyPlaces(y_m=(0.5, 1.0), relative_to="left", step_m=1.0).positions_m(CAR)
+    assert beside.min(0).tolist() == [-2.0, 1.5]  # of the vehicle's length
+    triangle = BodyPlaces(polygon_m=((0, 0), (4, 0), (0, 4)), step_m=1.0).positions_m(CAR)
+    assert len(triangle) == 15  # on its border, too
+    assert (triangle.sum(axis=1) <= 4).all()
+    line = BodyPlaces(line_m=((3, -1), (3, 1), (5, 1)), step_m=0.6).positions_m(CAR)
+    assert len(line) == 8
+    assert np.linalg.norm(np.diff(line, axis=0), axis=1).max() <= 0.6
+    assert BodyPlaces(points_m=((1, 2),), relative_to="front").positions_m(CAR).tolist() == [[3.0, 2.0]]
+    around = BodyPlaces(within_m=1.0, step_m=0.5)
+    each = [around.model_copy(update={"sides": (side,)}).positions_m(CAR) for side in SIDES]
+    everywhere = around.positions_m(CAR)
+    away = np.linalg.norm(everywhere - np.clip(everywhere, (-2, -1), (2, 1)), axis=1)
+    assert away.max() <= 1.0
+    inside = int((away == 0).sum())
+    assert sum(map(len, each)) - 4 * inside == len(everywhere) - inside
+
+
+@pytest.mark.parametrize(
+    ("requirement", "message"),
+    [
+        ({**AHEAD, "target": "chlid"}, "no target is called 'chlid'; is 'child' meant?"),
+        ({**AHEAD, "at": "kreb"}, "no place is called 'kreb'; is 'kerb' meant?"),
+        ({**AHEAD, "pionts": 2}, "pionts"),
+        ({**AHEAD, "points": None}, "nothing is required"),
+        ({**AHEAD, "at": {"within_m": 1, "points_m": [[1, 2]]}}, "give one of within_m"),
+        ({**AHEAD, "at": {"points_m": [[1, 2]], "sides": ["front"]}}, "sides are of within_m"),
+        ({**AHEAD, "at": {"polygon_m": [[0, 0], [1, 1], [1, 0], [0, 1]]}}, "its sides cross"),
+        (
+            {**AHEAD, "by": ["a", "b"], "sensors": 3},
+            "contradict each other: child, .*, by a, b: .* sensors >= 3",
+        ),
+        ({**AHEAD, "by": "lidar", "pixels": 3}, "contradict each other"),
+        ({"within_m": 1}, "give target, region or encounters"),
+        ({"region": "front_3", "height": "ground", "number": "radius_m", "most": 1}, "is 'front_3m' meant"),
+        ({"region": "20m", "height": "grund", "number": "radius_m", "most": 1}, "no height band .* is 'ground' meant"),
+        ({"region": "20m", "height": "ground", "number": "radius", "most": 1}, "is 'radius_m' meant"),
+        ({"region": "20m", "height": "ground", "number": "radius_m"}, "nothing is required"),
+        (
+            {"region": "20m", "height": "ground", "number": "detection_0.4m", "least": 90},
+            "a share of at most 1; got 90",
+        ),
+        (
+            {"region": "20m", "height": "ground", "number": "radius_m", "most": 1, "least": 2},
+            "at least 2 and at most 1",
+        ),
+        ({"region": "20m", "height": "ground", "number": "radius_maximum_m", "most": 1, "without": "any"}, "without: "),
+        ({"encounters": "crosing_like", "ttc_s": 1}, "is 'crossing_like' meant"),
+        ({"encounters": "crossing_like"}, "nothing is required"),
+    ],
+)
+def test_a_requirement_that_says_nothing_is_an_error(requirement, message):
+    with pytest.raises(ValueError, match=message):
+        asked(requirement, places={"kerb": {"points_m": [[3, 0]]}})
+
+
+def test_requirements_that_contradict_each_other_are_an_error():
+    one = {"region": "20m", "height": "ground", "number": "radius_m"}
+    asked({**one, "least": 0.1}, {**one, "most": 0.2}, {**one, "height": "obstacle", "most": 0.05})
+    with pytest.raises(ValueError, match=r"20m ground radius_m is to be at least 0\.3 and at most 0\.2"):
+        asked({**one, "least": 0.1}, {**one, "most": 0.2}, {**one, "least": 0.3})
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ({"by": "lidra"}, "no sensor is called 'lidra'; is 'lidar' meant?"),
+        ({"without": ["tpo"]}, "no sensor is called 'tpo'; is 'top' meant?"),
+        ({"at": {"x_m": [0, 9000], "y_m": [0, 1]}}, "take a larger step_m"),
+    ],
+)
+def test_what_the_rig_has_not_or_nobody_can_wait_for_is_an_error(keys, message):
+    with pytest.raises(ValueError, match=message):
+        check(rig(), asked({**AHEAD, **keys}), world())
+
+
+CAMERA = {"type": "camera", "name": "front", "width": 80, "height": 60, "fov_deg": 90, "stride": 2, "max_range_m": 50}
+POST = {"name": "post", "shape": {"type": "box", "size_m": [0.2, 3.0, 3.0]}, "poses": [{"x_m": 0.5}]}
+THREE = rig(
+    lidar(mount={"x_m": -1.0, "z_m": 1.4}),
+    lidar("mast", mount={"z_m": 1.2}, housing=[POST]),
+    {**CAMERA, "mount": {"x_m": 1.8, "z_m": 1.3}},
+)
+
+
+def test_what_is_judged_is_what_a_survey_sees():
+    """Of all, of each sensor, without one that hangs there still, at the same places."""
+    raster, child = Raster((3.5, 6.5), (-1.0, 1.0), 1.0), Target.load("child")
+    at = {"points_m": raster.positions_m.tolist()}
+    seen = survey(THREE, world(), child, raster, hits=1)
+    one = {
+        "target": "child",
+        "at": at,
+        "points": 5,
+        "sensors": 1,
+        "share": 0.1,
+        "pixels": 4,
+        "visual_angle_deg": 1,
+        "hits": 1,
+    }
+    requirements = asked(
+        one, {**one, "by": ["lidar"], "pixels": None}, {**one, "by": "top", "pixels": None, "without": "any"}
+    )
+    found = check(THREE, requirements, world()).verdicts["small"]
+    all_of, lidars, top = found[:5], found[5:9], found[9:]
+    worst = {v.bound.key: v.value for v in all_of}
+    assert worst["points"] == seen.least_points.min() > 0
+    assert worst["sensors"] == seen.least_sensors.min()
+    assert worst["share"] == seen.share.min()
+    assert worst["pixels"] == seen.sensor_points[2].min()  # one step: least and mean are one
+    away_m = np.hypot(*(raster.positions_m - (1.8, 0.0)).T)  # none is nearer than the camera
+    angle = np.rad2deg(np.arctan(1.3 / away_m) - np.arctan((1.3 - child.solid.box.size_m[2]) / away_m))
+    assert worst["visual_angle_deg"] == pytest.approx(angle.min())
+    assert {v.bound.key: v.value for v in lidars}["points"] == seen.sensor_points[:2].sum(axis=0).min()
+    # The mast hides all of it from the LiDAR behind it: whether or not what stands on it has failed.
+    assert {v.bound.key: v.value for v in top}["points"] == seen.sensor_points[0].min() == 0
+    assert [v.count for v in top] == [2 * len(raster.positions_m)] * 4  # without it, and without nothing
+
+
+def test_where_a_body_cannot_stand_a_point_is_unknown_and_an_area_goes_without():
+    inside, near = {**AHEAD, "at": {"points_m": [[0, 0], [5, 0]]}}, {**AHEAD, "at": {"x_m": [0, 5], "y_m": [0, 0.1]}}
+    nowhere = {**AHEAD, "at": {"x_m": [-1, 1], "y_m": [0, 0.1]}}
+    found = check(rig(lidar(channels=61)), asked(inside, near, nowhere), world()).verdicts["small"]
+    assert [(one.state, one.unknown) for one in found] == [("not checked", 1), ("kept", 0), ("not checked", 0)]
+    assert found[0].where == ("x = 0.00, y = 0.00 m",)
+    assert 0 < found[1].count < 2 * 26
+
+
+def test_a_kind_that_the_rig_has_not_sees_nothing_and_a_place_that_holds_nobody_is_not_checked():
+    tight = {**AHEAD, "at": {"within_m": 0.01}}
+    found = check(rig(), asked({**AHEAD, "by": "camera"}, tight), world()).verdicts["small"]
+    assert [(one.state, one.count) for one in found] == [("not kept", 1), ("not checked", 0)]
+    assert found[0].margin == -5.0
+    with pytest.raises(ValueError, match="at least one rig"):
+        check([], asked(AHEAD))
+
+
+def test_numbers_of_regions_are_those_of_evaluate():
+    regions = {"near": {"x_m": [2.5, 8.0], "y_m": [-2.0, 2.0]}}
+    keys = {"regions": regions, "grid": {"x_m": [-4, 9], "y_m": [-4, 4], "cell_m": 1.0}}
+    one = {"region": "near", "height": "ground", "without": ["front"]}
+    found = check(
+        THREE,
+        asked({**one, "number": "detection_0.3m", "least": 0.001}, {**one, "number": "radius_m", "most": 1e-6}, **keys),
+        world(), steps=12, workers=0,
+    ).verdicts["small"]  # fmt: skip
+    asking = RegionsOfInterest.model_validate(keys)
+    result = evaluate(THREE, world(), steps=12, workers=0, thresholds_m=0.3, redundancy=True, ask=asking)
+    (row,) = (row for row in result.summary if row["height"] == "ground")
+    for verdict, key, worse in zip(found, ("detection_0.3m", "radius_m"), (min, max), strict=True):
+        assert verdict.value == worse(row[key], row[f"{key}_without_front"]) != row[key]
+        assert verdict.count == 2
+    assert found[0].where[0] == "near ground without front"
+
+
+def test_times_to_collision_are_the_latest_of_all_phases(tmp_path):
+    box = tmp_path / "box.yaml"
+    box.write_text("name: box\nparts: [{name: b, shape: {type: box, size_m: [4, 2, 1]}}]\n")
+    walker = {"body": "child", "speed_kmh": 5, "from_m": 4}
+    crossings = {"name": "two", "encounters": [{"name": "a", "ego": {"speed_kmh": [10, 30]}, "other": walker}]}
+    looks = {"points": 1, "pixels": 20, "looks": 2}
+    one = {
+        "encounters": crossings,
+        **looks,
+        "ttc_s": 0.5,
+        "in_time": {"deceleration": 4, "latency_s": 1.0},
+        "without": ["mast"],
+    }
+    requirements = asked(one)
+    ttc, spare = check(THREE, requirements, vehicle=box).verdicts["small"]
+    seen = encounter(THREE, requirements.requirements[0].encounters, Criterion(**looks), vehicle=box).sightings
+    latest_s = [min(one.ttc_s.min(), one.without_ttc_s[1].min()) for one in seen]
+    needed_s = [one.encounter.closing_mps / 8 + 1.0 for one in seen]
+    assert (ttc.value, ttc.count) == (min(latest_s), 4)
+    assert 0.0 < ttc.value < min(one.ttc_s.max() for one in seen)
+    assert spare.value == pytest.approx(min(np.subtract(latest_s, needed_s)))
+    assert "at 30 km/h" in spare.where[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "rig_name", "keys"),
+    [("robot", EXAMPLES / "robot" / "delivery_robot.yaml", {"vehicle": EXAMPLES / "robot" / "body.ply"}),
+     ("car", "kitti", {"steps": 16, "workers": 0})],
+)  # fmt: skip
+def test_the_examples_keep_what_they_require(name, rig_name, keys):
+    found = check(rig_name, EXAMPLES / name / "needs.yaml", **keys)
+    assert found.exit_code == 0, found.tables()
+
+
+@pytest.mark.parametrize("name", builtin_names("requirements"))
+def test_built_in_sets_say_where_they_are_from_and_that_they_are_no_homologation(name):
+    found = Requirements.load(name)
+    assert found.name == name
+    assert "geometry, no homologation" in found.description
+    assert "memory" not in found.description

@@ -1,0 +1,22 @@
+"""A feather table's lengths and places are not believed."""
+
+import numpy as np
+import pytest
+
+from torchcover.files.bad_file import BadFileError
+from torchcover.files.feather import read_feather
+
+pa = pytest.importorskip("pyarrow")
+
+
+def test_texts_that_would_lie_beyond_the_file_are_refused(tmp_path):
+    from pyarrow import feather
+
+    path = tmp_path / "table.feather"
+    feather.write_feather(pa.table({"category": ["car", "bus"]}), path, compression="uncompressed")
+    ends = np.array([0, 3, 6], dtype="<i4").tobytes()
+    written = path.read_bytes()
+    assert written.count(ends) == 1
+    path.write_bytes(written.replace(ends, np.array([0, 3, 1 << 30], dtype="<i4").tobytes()))
+    with pytest.raises(BadFileError, match=r"table.feather"):
+        read_feather(path, ["category"])

@@ -1,0 +1,73 @@
+"""When two outlines that move straight on touch."""
+
+import numpy as np
+import pytest
+import shapely
+
+from torchcover.geometry import BoundingBox, contact_s, outlines_at
+from torchcover.targets.placing import poses
+
+
+def by_differences(a_m, b_m, velocity_mps):
+    """The slow way: where the way of b enters the hull of all differences of corners."""
+    hull = shapely.MultiPoint((a_m[:, None] - b_m[None]).reshape(-1, 2)).convex_hull
+    way = shapely.LineString([(0.0, 0.0), 1e4 * velocity_mps])
+    inside = way.intersection(hull)
+    return np.inf if inside.length == 0 else shapely.Point(0, 0).distance(inside) / np.linalg.norm(velocity_mps)
+
+
+@pytest.fixture(scope="module")
+def pairs():
+    generator = np.random.default_rng(3)
+    count = 300
+    a_m, b_m = (
+        outlines_at(BoundingBox((-length, -width, 0.0), (length, width, 1.0)).outline_m,
+                    poses(generator.uniform(-far_m, far_m, (count, 2)), generator.uniform(-4, 4, count)))
+        for length, width, far_m in ((2.0, 1.0, 1.0), (0.4, 0.3, 20.0))
+    )  # fmt: skip
+    towards_m = a_m.mean(axis=1) - b_m.mean(axis=1) + generator.normal(0.0, 2.0, (count, 2))
+    return a_m, b_m, towards_m / generator.uniform(0.5, 5.0, (count, 1))
+
+
+def test_contact_is_where_the_way_enters_the_hull_of_all_differences(pairs):
+    expected_s = np.array([by_differences(*pair) for pair in zip(*pairs, strict=True)])
+    found_s = contact_s(*pairs)
+    assert found_s == pytest.approx(expected_s, abs=1e-9)
+    assert 0.2 < np.isfinite(found_s).mean() < 0.95
+    a_m, b_m, velocity_mps = pairs
+    assert contact_s(b_m, a_m, -velocity_mps) == pytest.approx(found_s, abs=1e-9)
+    utm_m = np.array([5e5, 4e6])
+    assert contact_s(a_m + utm_m, b_m + utm_m, velocity_mps) == pytest.approx(found_s, abs=1e-7)
+
+
+def test_at_contact_they_are_as_near_as_rounding(pairs):
+    a_m, b_m, velocity_mps = pairs
+    found_s = contact_s(a_m, b_m, velocity_mps)
+    for k in np.flatnonzero(np.isfinite(found_s)).tolist():
+        there = shapely.Polygon(b_m[k] + found_s[k] * velocity_mps[k])
+        assert shapely.Polygon(a_m[k]).distance(there) < 1e-9
+        before = shapely.Polygon(b_m[k] + max(found_s[k] - 1e-3, 0.0) * velocity_mps[k])
+        assert found_s[k] == 0 or shapely.Polygon(a_m[k]).distance(before) > 0
+
+
+SQUARE_M = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+
+
+@pytest.mark.parametrize(
+    ("offset_m", "velocity_mps", "expected_s"),
+    [
+        ([5, 0], [-1e-9, 0], 3e9),
+        ([5, 0], [0, 0], np.inf),
+        ([0.5, 0.5], [0, 0], 0),
+        ([2, 0], [0, 3], np.inf),  # one side along the other
+        ([2, 0], [-1, 0], 0),
+        ([2, 0], [1, 0], np.inf),
+        ([2, 5], [0, -1], np.inf),
+        ([4, 8], [-1, -1], np.inf),  # corner past corner
+        ([2 - 1e-9, 5], [0, -1], 3),
+        ([5, 0], [-3e8, 1e-300], 1e-8),
+    ],
+)  # fmt: skip
+def test_squares_that_touch_slide_or_hardly_move(offset_m, velocity_mps, expected_s):
+    found_s = contact_s(SQUARE_M, SQUARE_M + offset_m, np.array(velocity_mps, dtype=float))
+    assert found_s == pytest.approx(expected_s, rel=1e-6)

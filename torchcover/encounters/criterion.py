@@ -1,0 +1,49 @@
+"""What is detected, and what is in time; nothing heavy is imported, as the command line takes its options from it."""
+
+import math
+from dataclasses import dataclass
+from typing import Annotated
+
+
+@dataclass(frozen=True)
+class Criterion:
+    """What is detected, and what is in time. Its fields are the options of `torchcover encounter`.
+
+    Raises:
+        ValueError: A number out of its bounds.
+    """
+
+    points: Annotated[int, "Points that are enough, of all LiDARs with the same rate together; of a radar one is."] = 5
+    pixels: Annotated[int, "Pixels of the full image that are enough, of a camera alone."] = 200
+    looks: Annotated[int, "In so many looks in a row."] = 3
+    deceleration_mps2: Annotated[float, "Of the brakes, in m/s2."] = 9.0
+    latency_s: Annotated[float, "Seconds from the last of these looks to the brakes."] = 0.5
+    within_s: Annotated[float, "In traffic: who comes within this time to collision, in seconds, is met."] = 4.0
+
+    def __post_init__(self) -> None:
+        for name in ("points", "pixels", "looks"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: a number >= 1 is needed; got {getattr(self, name)}")
+        for name, unit in (("deceleration_mps2", "m/s2"), ("within_s", "seconds")):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name}: {unit} above 0 are needed; got {getattr(self, name)}")
+        if not 0 <= self.latency_s < math.inf:
+            raise ValueError(f"latency_s: seconds of 0 or more are needed; got {self.latency_s}")
+
+    def needed_s(self, closing_mps: float) -> float:
+        """The time to collision at which braking still prevents it: v / (2 a) + latency.
+
+        Example:
+            >>> round(Criterion().needed_s(50 / 3.6), 2)
+            1.27
+        """
+        return closing_mps / (2 * self.deceleration_mps2) + self.latency_s
+
+    @property
+    def words(self) -> str:
+        """It, for below a table."""
+        return (
+            f"Detected: {self.points} points of LiDARs, {self.pixels} pixels of a camera, or a point of a radar, in "
+            f"{self.looks} looks in a row. Needed: to stop with {self.deceleration_mps2:g} m/s2, {self.latency_s:g} s "
+            "after that."
+        )

@@ -1,0 +1,258 @@
+"""Encounters that happen in traffic: who comes within a time to collision, and when sensors first had enough of him."""
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.coverage.quantity import MEASURED_WITHIN_M
+from torchcover.detection.inside import SKIN_M
+from torchcover.encounters.criterion import Criterion
+from torchcover.encounters.sighting import NEVER, IsEnough, Sighting, detections, enough_of, first_run, kinds_of
+from torchcover.geometry import BoundingBox, contact_s, invert, outlines_at
+from torchcover.recordings.in_vehicle import in_vehicle
+from torchcover.recordings.objects import Track, class_of, objects_of
+from torchcover.recordings.recording import Recording
+from torchcover.simulation.rays import Balls
+from torchcover.simulation.simulator import Simulator
+from torchcover.simulation.world import World
+
+Float64 = NDArray[np.float64]
+Numbers = NDArray[np.int64]
+Clouds = Sequence[NDArray[np.floating]]
+
+# What tables call road users, in their order; by SUMO's names of classes.
+WHO = {
+    "on foot": ("pedestrian", "child"),
+    "on bicycles": ("bicycle",),
+    "on motorcycles": ("motorcycle",),
+    "cars and vans": ("passenger", "delivery", "emergency"),
+    "lorries and buses": ("truck", "bus"),
+    "others": (None,),
+    "from behind": (),
+}
+# A vehicle of which all labels lie so near to each other was parked.
+PARKED_M = 2.0
+# Scans that are kept: of those who are met at the same time.
+SCANS = 8
+
+
+def who(track: Track) -> str:
+    """What tables call a road user; a rider who has a box of his own by what he rides, as in Argoverse 2."""
+    word = track.category.lower().split(".")[-1]
+    kind = {"bicyclist": "bicycle", "motorcyclist": "motorcycle", "trailer": "truck"}.get(word, track.vehicle_class)
+    return next((name for name, kinds in WHO.items() if kind in kinds), "others")
+
+
+class Drive(NamedTuple):
+    """Who is where over time, in a world or a recording.
+
+    Args:
+        name: Of the world.
+        times_s: (T,) the instants.
+        world_T_ego: (T, 4, 4) the vehicle frame at each.
+        ego: The box of the vehicle in it.
+        tracks: The other road users.
+    """
+
+    name: str
+    times_s: Float64
+    world_T_ego: Float64
+    ego: BoundingBox
+    tracks: Sequence[Track]
+
+    @classmethod
+    def of_world(cls, name: str, world: World) -> Self:
+        """That of a world: all of its actors, who are no parked vehicles."""
+        times_s = world.time_step_s * np.arange(world.steps, dtype=np.float64)
+        tracks = []
+        for actor in world.actors:
+            size_m = BoundingBox.around(actor.mesh.vertices_m).size_m
+            tracks.append(Track(actor.name, actor.category, class_of(actor.category), size_m, actor.trajectory))
+        ego = BoundingBox.around(world.ego.mesh.vertices_m)
+        return cls(name, times_s, world.ego.trajectory.at_each(times_s), ego, tracks)
+
+    @classmethod
+    def of_recording(cls, recording: Recording) -> Self:
+        """That of a recording with poses, times and labelled objects.
+
+        Raises:
+            ValueError: One of these is missing, the size of the vehicle, or road users among the objects.
+        """
+        recorded = objects_of(recording)
+        if recording.body is None:
+            raise ValueError(f"{recording.path}: it does not say how large its vehicle is, so nobody can touch it")
+        users = [track for track in recorded.tracks if track.vehicle_class is not None]
+        if not users:
+            count = len(recorded.tracks)
+            raise ValueError(f"{recording.path}: none of its {count} objects is a road user, by their categories")
+        ways_m = [np.linalg.norm(np.ptp(track.trajectory.positions_m[:, :2], axis=0)) for track in users]
+        users = [
+            track
+            for track, way_m in zip(users, ways_m, strict=True)
+            if way_m >= PARKED_M or who(track) in ("on foot", "on bicycles")
+        ]
+        return cls(recording.path.name, recorded.egos[0].times_s, recorded.egos[0].world_T_ego, recording.body, users)
+
+
+class Approach(NamedTuple):
+    """A road user who comes within a time to collision, from the first such step to the last.
+
+    `ttc_s` and `needed_s` (K,) are those of each of these steps, which begin with `step`: both outlines go straight on
+    as they do, and nobody brakes; and what the brakes need then. The rest as an `Encounter` has it.
+    """
+
+    track: Track
+    step: int
+    ttc_s: Float64
+    needed_s: Float64
+    name: str
+    speed_kmh: float
+    closing_mps: float
+    speed_is_swept: bool = False
+
+
+def approaches(drive: Drive, criterion: Criterion) -> Iterator[Approach]:
+    """All that happen in a drive, in the order of its tracks."""
+    ego_mps = _velocities_mps(drive.times_s, drive.world_T_ego[:, :2, 3])
+    speed_mps = np.linalg.norm(ego_mps, axis=1)
+    ahead = ego_mps / np.where(speed_mps > 0, speed_mps, 1.0)[:, None]
+    for track in drive.tracks:
+        places_m = track.trajectory.positions_at(drive.times_s)
+        own_mps = _velocities_mps(drive.times_s, places_m[:, :2])
+        towards_mps = own_mps - ego_mps
+        reach_m = np.linalg.norm(drive.ego.outline_m, axis=1).max() + np.linalg.norm(track.size_m[:2]) / 2
+        away_m = np.linalg.norm(places_m[:, :2] - drive.world_T_ego[:, :2, 3], axis=1) - reach_m
+        near = np.flatnonzero(away_m <= criterion.within_s * np.linalg.norm(towards_mps, axis=1))
+        world_T_ego = drive.world_T_ego[near]
+        there = invert(world_T_ego) @ track.trajectory.at_each(drive.times_s[near])
+        outline_m = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * track.size_m[:2] / 2
+        in_ego_mps = np.einsum("tji,tj->ti", world_T_ego[:, :2, :2], towards_mps[near])
+        ttc_s = np.full(len(drive.times_s), np.inf)
+        ttc_s[near] = contact_s(drive.ego.outline_m, outlines_at(outline_m, there), in_ego_mps)
+        met = np.flatnonzero(ttc_s <= criterion.within_s)
+        if len(met):
+            some, first = slice(met[0], met[-1] + 1), int(met[0])
+            along_mps = np.maximum((own_mps[some] * ahead[some]).sum(axis=1), 0.0)
+            closing_mps = np.maximum(speed_mps[some] - along_mps, 0.0)
+            needed_s = np.array([criterion.needed_s(mps) for mps in closing_mps.tolist()])
+            behind = there[np.searchsorted(near, first), 0, 3] < drive.ego.lower_m[0]
+            name = "from behind" if behind else who(track)
+            kmh = 3.6 * float(speed_mps[first])
+            yield Approach(track, first, ttc_s[some], needed_s, name, kmh, float(closing_mps[0]))
+
+
+def _velocities_mps(times_s: Float64, places_m: Float64) -> Float64:
+    """(T, 2) velocities, the mean of before and after; NaN where nobody is."""
+    pace_mps, unknown = np.diff(places_m, axis=0) / np.diff(times_s)[:, None], np.full((1, 2), np.nan)
+    before, after = np.concatenate([unknown, pace_mps]), np.concatenate([pace_mps, unknown])
+    before, after = np.where(np.isnan(before), after, before), np.where(np.isnan(after), before, after)
+    velocities: Float64 = (before + after) / 2
+    return velocities
+
+
+class Eyes(NamedTuple):
+    """The S sensors of a rig in one drive.
+
+    Args:
+        kinds: As `detections` has them.
+        enough: How many points are.
+        counts_as: How many points each of their points is.
+        every: They look at every so-manieth step.
+        clouds: Of a step, the points (N, 3) of each in the vehicle frame that lie in some balls, and maybe others.
+    """
+
+    kinds: Sequence[object]
+    enough: Sequence[int]
+    counts_as: Sequence[int]
+    every: Sequence[int]
+    clouds: Callable[[int, Balls], Clouds]
+
+    @classmethod
+    def of_world(cls, simulator: Simulator, first: int, criterion: Criterion) -> Self:
+        """Those of a simulator's only rig, whose frames of a world begin with one; its points are those of frames."""
+        (rig,) = simulator.rigs.values()
+
+        def clouds(step: int, balls: Balls) -> Clouds:
+            (scans,) = simulator.scans(first + step, balls).values()
+            return [
+                scan.points if scan.error_m is None else scan.points[np.abs(scan.error_m) <= MEASURED_WITHIN_M]
+                for scan in scans
+            ]
+
+        sensors = rig.sensors
+        every = [max(1, round(1 / (one.rate_hz * simulator.every_s))) for one in sensors]
+        enough, counts_as = [enough_of(criterion, one) for one in sensors], [one.counts_as for one in sensors]
+        return cls(kinds_of(sensors), enough, counts_as, every, clouds)
+
+    @classmethod
+    def of_recording(cls, recording: Recording, sensors: Sequence[str], criterion: Criterion) -> Self:
+        """Those of a recording, which are LiDARs that count together."""
+
+        @lru_cache(maxsize=SCANS)
+        def read(step: int) -> Clouds:
+            return [in_vehicle(recording.scan(sensor, step), recording.body).points_m for sensor in sensors]
+
+        each = [1] * len(sensors)
+        return cls(each, [criterion.points] * len(sensors), each, each, lambda step, _: read(step))
+
+
+class Watch:
+    """How many points each sensor has on one road user, at any step; each is found once."""
+
+    def __init__(self, drive: Drive, track: Track, eyes: Eyes) -> None:
+        self._drive, self._track, self._eyes = drive, track, eyes
+        self._known: dict[int, Numbers] = {}
+
+    def points(self, sensors: Sequence[int], steps: Numbers) -> Numbers:
+        """(N,) points of some sensors together at (N,) steps."""
+        new = [step for step in steps.tolist() if step not in self._known]
+        self._known.update({step: self._look(step) for step in new})
+        return np.array([self._known[step][list(sensors)].sum() for step in steps.tolist()])
+
+    def _look(self, step: int) -> Numbers:
+        """(S,) the points in his box, which stands as he does; sides and top as `points_in_boxes` has them."""
+        time_s, way, size_m = self._drive.times_s[step], self._track.trajectory, np.array(self._track.size_m)
+        if np.isnan(way.positions_at(np.array([time_s]))).any():
+            return np.zeros(len(self._eyes.kinds), dtype=np.int64)
+        pose = invert(self._drive.world_T_ego[step]) @ way.at(time_s)
+        middle_m = pose[:3, 3] + size_m[2] / 2 * pose[:3, 2]
+        clouds = self._eyes.clouds(step, Balls(middle_m[None], float(np.linalg.norm(size_m / 2 + SKIN_M))))
+        counts = []
+        for cloud_m, counts_as in zip(clouds, self._eyes.counts_as, strict=True):
+            off_m = (cloud_m - pose[:3, 3]) @ pose[:3, :3]
+            inside = (np.abs(off_m[:, :2]) <= size_m[:2] / 2 + SKIN_M).all(axis=1)
+            inside &= (off_m[:, 2] > SKIN_M) & (off_m[:, 2] <= size_m[2] + SKIN_M)
+            counts.append(counts_as * np.count_nonzero(inside))
+        return np.array(counts, dtype=np.int64)
+
+
+def sight_approach(rig: str, drive: Drive, approach: Approach, eyes: Eyes, criterion: Criterion) -> Sighting:
+    """When a rig had enough of somebody, of looks that begin as long before as the time that is asked about.
+
+    The time to collision is the least until he is detected, and that asked about if he is by then. Whether he is, is
+    asked first, and more only of those sensors that this leaves open.
+    """
+    begin, end = approach.step, approach.step + len(approach.ttc_s)
+    first = int(np.searchsorted(drive.times_s, drive.times_s[begin] - criterion.within_s))
+    watch = Watch(drive, approach.track, eyes)
+
+    def first_run_of(is_enough: IsEnough, k: int) -> Numbers:
+        steps = np.arange(first, end)
+        steps = steps[steps % eyes.every[k] == 0]
+        latest = steps[steps <= begin][-criterion.looks :]
+        if first_run(is_enough, latest[None], criterion.looks)[0] < NEVER:
+            return np.array([begin])
+        return np.maximum(first_run(is_enough, steps[None], criterion.looks), begin)
+
+    found = detections(eyes.kinds, eyes.enough, watch.points, first_run_of)
+    # By the steps of the approach; last for who was never detected.
+    least_s = np.append(np.minimum.accumulate(approach.ttc_s), 0.0)
+    least_s[0] = criterion.within_s
+    ttc_s, alone_s, without_s = (least_s[np.minimum(steps, end) - begin] for steps in found)
+    seen = found[0] - begin
+    until = int(min(seen[0], end)) + 1 if seen[0] else 0
+    in_time = (approach.ttc_s >= approach.needed_s)[:until].all(keepdims=True)
+    return Sighting(approach, rig, ttc_s, in_time, alone_s, without_s, seen == 0, drive.name)

@@ -1,0 +1,263 @@
+"""Measure all that requirements are about, and judge it: names in, verdicts and their files out."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover import __version__
+from torchcover.coverage import AGGREGATIONS, Coverage
+from torchcover.evaluation.encountering import encounter
+from torchcover.evaluation.measuring import measured as measured_coverage
+from torchcover.evaluation.requirements import (
+    PLAIN,
+    EncounterRequirement,
+    Readings,
+    RegionRequirement,
+    Requirements,
+    TargetRequirement,
+    Verdict,
+    verdicts,
+)
+from torchcover.evaluation.settings import Settings
+from torchcover.evaluation.target_survey import in_world
+from torchcover.evaluation.task import AnyRig, AnyScenario, distinct_names, loaded, spread_s, task_of
+from torchcover.files import Publication
+from torchcover.report import PageTable, Words, json_record
+from torchcover.simulation import Rig, Scenario
+from torchcover.simulation.camera_sensor import CameraSensor
+from torchcover.targets import Spots, Target, survey_places
+
+Float64 = NDArray[np.float64]
+# What is judged where a mean would hide a step in which nothing is seen.
+JUDGED = {"points": "least_points", "sensors": "least_sensors"}
+NOTE = (
+    "A number with an error keeps a bound if all of its 95 % interval does, and does not if none of it does; else, and "
+    "where something is unknown, it is not checked. Keeping all is geometry, and no homologation."
+)
+
+
+@dataclass(frozen=True)
+class Checked:
+    """What `check` returns.
+
+    Args:
+        name: Of the requirements.
+        verdicts: By rig, in the order of the file.
+        settings: They were measured with.
+    """
+
+    name: str
+    verdicts: Mapping[str, Sequence[Verdict]]
+    settings: Mapping[str, object]
+
+    @property
+    def exit_code(self) -> int:
+        """0: all is checked and kept; 1: something is not kept; 3: something is not checked."""
+        states = {one.state for each in self.verdicts.values() for one in each}
+        return 1 if "not kept" in states else 3 if "not checked" in states else 0
+
+    def tables(self) -> list[PageTable]:
+        """One for each rig."""
+        headings = ("requirement", "", "", "worst", "margin", "not kept", "not checked", "of", "the worst is")
+        found = self.verdicts.items()
+        return [PageTable(f"{rig}: {self.name}", headings, list(map(_row, each)), notes=[NOTE]) for rig, each in found]
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """All of it, for JSON."""
+        rigs = {rig: [json_record(_record(one)) for one in each] for rig, each in self.verdicts.items()}
+        about = {"requirements": self.name, "torchcover": __version__, **self.settings}
+        return {**about, "exit_code": self.exit_code, "rigs": rigs}
+
+    @property
+    def junit(self) -> str:
+        """For CI: a suite a rig, a case a bound; what is not kept is a failure, and what is not checked an error."""
+        root = ElementTree.Element("testsuites", name=self.name)
+        for rig, each in self.verdicts.items():
+            states = [one.state for one in each]
+            counts = {"tests": len(states), "failures": states.count("not kept"), "errors": states.count("not checked")}
+            suite = ElementTree.SubElement(root, "testsuite", {"name": rig, **{k: str(v) for k, v in counts.items()}})
+            for one in each:
+                name = f"{one.requirement}: {one.bound.words}"
+                case = ElementTree.SubElement(suite, "testcase", classname=rig, name=name)
+                if one.state != "kept":
+                    words = ", ".join(f"{key}: {value}" for key, value in _record(one).items())
+                    ElementTree.SubElement(case, "failure" if one.state == "not kept" else "error", message=words)
+        text = ElementTree.tostring(root, encoding="unicode", xml_declaration=True)
+        return "".join(letter if letter.isprintable() or letter == "\n" else " " for letter in text)
+
+    def save(self, folder: str | Path) -> list[Path]:
+        """Write `junit.xml` and `summary.json` into a folder, which is made if it does not exist.
+
+        Returns:
+            The files.
+        """
+        with Publication(Path(folder)) as written:
+            written.add_text("junit.xml", self.junit)
+            written.publish(self.record)
+        return written.paths
+
+
+def _record(one: Verdict) -> dict[str, Any]:
+    bound = {"number": one.bound.key, "least" if one.bound.is_least else "most": one.bound.value}
+    return {"requirement": one.requirement, **bound, **dict(zip(one._fields[2:], one[2:], strict=True))}
+
+
+def _row(one: Verdict) -> tuple[Words, ...]:
+    interval = f" ({one.low:.4g} to {one.high:.4g})" if one.low < one.high else ""
+    numbers = ("-", "-") if math.isnan(one.margin) else (f"{one.value:.4g}{interval}", f"{one.margin:+.4g}")
+    counts = map(str, (one.failed, one.unknown, one.count))
+    words = one.requirement, one.bound.words, one.state, *numbers, *counts, one.where[0] if one.where else "nowhere"
+    return tuple(map(Words, words))
+
+
+def check(
+    rigs: AnyRig | Sequence[AnyRig],
+    requirements: Requirements | str | Path,
+    scenario: AnyScenario | None = None,
+    *,
+    vehicle: str | Path | None = None,
+    sensor_model: Literal["ideal", "real"] | None = None,
+    steps: int | None = None,
+    seed: int = 0,
+    workers: int | None = None,
+    progress: bool = False,
+) -> Checked:
+    """Whether rigs see what they must.
+
+    Args:
+        rigs: A rig or several: each one itself, its built-in name, or its YAML file.
+        requirements: What they must see: themselves, the name of a built-in set, or a YAML file.
+        scenario: The world in place of the file's.
+        vehicle: What carries the rigs, as for `evaluate`; else each is on its own vehicle.
+        sensor_model: What sensors make of their hits; as for `evaluate`.
+        steps: Steps that are looked at, as for `evaluate` and `survey_target`.
+        seed: Of the simulation.
+        workers: As of `evaluate`.
+        progress: Whether to show bars.
+
+    Raises:
+        FileNotFoundError: An unknown name or file.
+        ValueError: A file that cannot be used, or a requirement that names what there is not.
+
+    Example:
+        >>> child = {"target": "child", "at": {"points_m": [[5.0, 0.0]]}, "points": 5}
+        >>> found = check("front_roof_128", Requirements.model_validate({"requirements": [child]}))
+        >>> [one.state for one in found.verdicts["front_roof_128"]], found.exit_code
+        (['kept'], 0)
+    """
+    asked = requirements if isinstance(requirements, Requirements) else Requirements.load(requirements)
+    given = [rigs] if isinstance(rigs, str | Path | Rig) else rigs
+    called = [loaded(rig).model_copy(update={"name": n}) for rig, n in zip(given, distinct_names(given), strict=True)]
+    if not called:
+        raise ValueError("check: at least one rig is needed; got none")
+    for one in asked.requirements:
+        for rig in called:  # before the work, not after it
+            one.failing([sensor.name for sensor in rig.sensors])
+    own: dict[str, Any] = {"vehicle": vehicle, "sensor_model": sensor_model, "seed": seed}
+    world, found = scenario or asked.scenario, dict[str, list[Verdict]]()
+    for rig in called:
+        coverage = _coverage(asked, rig, world, steps=steps, workers=workers, progress=progress, **own)
+        measured = []
+        for one in asked.requirements:
+            if isinstance(one, RegionRequirement):
+                assert coverage is not None  # as there is such a requirement
+                measured.append({one.number: _of_region(one, coverage, rig)})
+            elif isinstance(one, EncounterRequirement):
+                measured.append(_of_encounters(one, rig, progress=progress, **own))
+            else:
+                measured.append(_of_target(one, asked, rig, world, steps, **own))
+        found[rig.name] = verdicts(asked, measured)
+    told = {"scenario": world.name if isinstance(world, Scenario) else world, "steps": steps, **own}
+    return Checked(asked.name, found, {k: str(v) if isinstance(v, Path) else v for k, v in told.items()})
+
+
+def _coverage(asked: Requirements, rig: Rig, scenario: AnyScenario | None, **more: Any) -> Coverage | None:  # noqa: ANN401
+    """With all numbers of regions that are required; None if none is."""
+    of_regions = [one for one in asked.requirements if isinstance(one, RegionRequirement)]
+    if not of_regions:
+        return None
+    keys = {one.number for one in of_regions}
+    thresholds_m = sorted({float(match[1]) for key in keys if (match := PLAIN.fullmatch(key)) and match[1]})
+    aggregations = [one for kind in AGGREGATIONS if (one := kind.of_keys(keys))]
+    redundancy = any(one.without or one.number.startswith(("sensors", "seen")) for one in of_regions)
+    settings = Settings(
+        [rig], scenario, ask=asked, thresholds_m=thresholds_m or 0.4, aggregations=aggregations, redundancy=redundancy,
+        **more,
+    )  # fmt: skip
+    result = measured_coverage(task_of(settings), settings)
+    if result.run is not None:
+        result.run.raise_failure()
+    return result.coverage
+
+
+def _of_region(one: RegionRequirement, coverage: Coverage, rig: Rig) -> Readings:
+    (region,) = (region for region in coverage.regions if region.name == one.region)
+    ends, where = [], []
+    for words in ("", *(f"_without_{name}" for name in one.failing([sensor.name for sensor in rig.sensors]))):
+        estimate = coverage.estimate_of(one.number + words, region, one.height)
+        (number,) = estimate.numbers().values()
+        agreed = np.isnan(number.error) and estimate.has_intervals[0]  # all blocks say the same
+        ends.append((number.value,) * 3 if agreed else (number.value, number.low, number.high))
+        where.append(f"{one.region} {one.height}{words.replace('_', ' ')}")
+    value, low, high = np.array(ends).T
+    return Readings(value, low, high, where)
+
+
+def _of_encounters(one: EncounterRequirement, rig: Rig, **given: Any) -> dict[str, Readings]:  # noqa: ANN401
+    """Of each encounter the latest detection of all phases."""
+    found, names = encounter(rig, one.encounters, one.criterion, **given), [sensor.name for sensor in rig.sensors]
+    times_s, where = [], []
+    for case, each in zip(one.encounters.encounters, found.sightings, strict=True):
+        lost = {f", without {name}": each.without_ttc_s[names.index(name)] for name in one.failing(names)}
+        for words, ttc_s in ({"": each.ttc_s} | lost).items():
+            times_s.append((ttc_s.min(), ttc_s.min() - one.criterion.needed_s(case.closing_mps)))
+            where.append(f"{case.words}{words}")
+    return {key: _exact(of_key, where) for key, of_key in zip(("ttc_s", "spare_s"), np.array(times_s).T, strict=True)}
+
+
+def _of_target(
+    one: TargetRequirement, asked: Requirements, given: Rig, scenario: AnyScenario | None, steps: int | None, *,
+    vehicle: str | Path | None, sensor_model: Literal["ideal", "real"] | None, seed: int,
+) -> dict[str, Readings]:  # fmt: skip
+    rig, world, usual_steps = in_world(given, scenario, vehicle, sensor_model)
+    place, target = asked.places[one.at] if isinstance(one.at, str) else one.at, Target.load(one.target)
+    at_m, groups = place.positions_m(world.ego_box()), one.groups(rig.sensors)
+    every_s, own_steps = spread_s(world, None), (usual_steps > 1 and steps) or usual_steps
+
+    def survey(counting: Sequence[int]) -> Spots:
+        return survey_places(
+            rig, world, target, at_m, counting, steps=own_steps, every_s=every_s, seed=seed, hits=one.hits
+        )
+
+    values: dict[str, list[Float64]] = {bound.key: [] for bound in one.bounds}
+    where: list[str] = []
+    for words, group in groups.items():
+        seen = survey(group)
+        numbers = {name: getattr(seen, JUDGED.get(name, name)) for name in ("points", "sensors", "seen", "share")}
+        there = (seen.state == 0) | (place.points_m is not None)
+        where += [f"x = {x:.2f}, y = {y:.2f} m{words}" for x, y in at_m[there].tolist()]
+        for key in ("pixels", "visual_angle_deg"):
+            numbers[key] = np.where(seen.state == 0, 0.0, np.nan)
+        for k in group if one.pixels or one.visual_angle_deg else ():  # of each sensor alone
+            points, sensor = survey([k]).least_points, rig.sensors[k]
+            x_m, y_m, z_m = sensor.mount.matrix()[:3, 3]
+            away_m = np.hypot(*(at_m - (x_m, y_m)).T)
+            angle = np.arctan2(target.solid.box.size_m[2] - z_m, away_m) + np.arctan2(z_m, away_m)
+            angle_deg = np.where(points >= one.hits, np.rad2deg(angle), 0.0)
+            numbers["visual_angle_deg"] = np.fmax(numbers["visual_angle_deg"], angle_deg)
+            if isinstance(sensor, CameraSensor):
+                numbers["pixels"] = np.fmax(numbers["pixels"], points)
+        for key, of_key in values.items():
+            of_key.append(numbers[key][there])
+    return {key: _exact(np.concatenate(of_key), where) for key, of_key in values.items()}
+
+
+def _exact(value: Float64, where: Sequence[str]) -> Readings:
+    return Readings(value, value, value, where)
