@@ -34,7 +34,6 @@ BENCHMARKS = (
     "placement",
     "published",
     "voxels",
-    "cities",
     "streets",
 )
 
