@@ -14,10 +14,12 @@ from torchcover.data import SimulatedFrames
 from torchcover.detection import Boxes
 from torchcover.encounters import Criterion
 from torchcover.encounters.sighting import NEVER
-from torchcover.encounters.traffic import Drive, Eyes, Watch, approaches, sight_approach
+from torchcover.encounters.traffic import Approach, Drive, Eyes, Watch, approaches, sight_approach
 from torchcover.evaluation import met_in_recording, met_in_traffic
 from torchcover.geometry import rigid
+from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings import open_recording
+from torchcover.recordings.objects import Track
 from torchcover.simulation import PaperReference, Scenario, Simulator, write_recording
 
 torch.set_num_threads(1)
@@ -116,11 +118,24 @@ def test_the_answer_is_that_of_looking_all_the_time(driven):
             assert found.ttc_s[0] == ttc_s(min(detected))  # of three rates or kinds: none counts with another
             assert found.without_ttc_s[1, 0] == ttc_s(min(detected[0], detected[2]))
             assert found.from_the_beginning[0] == (min(detected) == one.step)
-            late = one.ttc_s[: min(min(detected) - one.step, len(one.ttc_s))] < one.needed_s[0]
-            assert found.in_time[0] == (not late.any())
+            until = min(min(detected) - one.step + 1, len(one.ttc_s)) if min(detected) > one.step else 0
+            assert found.in_time[0] == (one.ttc_s[:until] >= one.needed_s[:until]).all()
             for step in detected:
                 some["before" if step == one.step else "never" if step == NEVER else "later"] += 1
     assert all(some.values())
+
+
+@pytest.mark.parametrize(
+    ("seen_from", "ttc_s", "in_time"), [(0, 4.0, True), (6, 2.0, True), (7, 1.0, False), (9, 0.0, False)]
+)
+def test_the_nearest_time_until_detection_counts_though_it_grew_again(seen_from, ttc_s, in_time):
+    track = Track("t", "car", "passenger", (4.0, 2.0, 1.5), Trajectory.resting([10.0, 0.0, 0.0]))
+    there = Drive("w", STEP_S * np.arange(9), np.tile(np.eye(4), (9, 1, 1)), None, [track])
+    one = Approach(track, 5, np.array([3.0, 2.0, 1.0, 3.5]), np.array([0.5, 0.5, 1.1, 0.5]), "cars and vans", 0.0, 0.0)
+    eyes = Eyes([1], [1], [1], [1], lambda step, _: [np.array([[9.0, 0.0, 1.0]])[: step >= seen_from]])
+    found = sight_approach("r", there, one, eyes, Criterion(points=1, looks=1))
+    assert (found.ttc_s[0], found.in_time[0], found.from_the_beginning[0]) == (ttc_s, in_time, seen_from == 0)
+    assert found.without_ttc_s[0, 0] == 0
 
 
 def test_who_is_hidden_until_braking_is_needed_is_too_late(scenario):

@@ -246,12 +246,13 @@ class CommonInstants:
     def __len__(self) -> int:
         return len(self.instants)
 
-    def anew(self, seed: int, worlds: int) -> "CommonInstants":
-        """The same questions at as many instants in each of other worlds.
+    def anew(self, seed: int, worlds: int, more: Mapping[str, Objective]) -> "CommonInstants":
+        """The same questions, and more, at as many instants in each of other worlds.
 
         Args:
             seed: Another one, so that no world is the same.
             worlds: Worlds of each scenario with traffic; others are the same world for any seed, and are left out.
+            more: Other objectives, by name.
 
         Raises:
             ValueError: The seed that these have; no scenario with traffic.
@@ -261,7 +262,7 @@ class CommonInstants:
         if not (fresh := [one for one in self.scenarios if not one.repeats]):
             names = ", ".join(repr(one.name) for one in self.scenarios)
             raise ValueError(f"scenarios: one whose worlds are drawn is needed; {names} is the same for any seed")
-        return CommonInstants(fresh, self.objectives, worlds=worlds, seed=seed, **self._settings)
+        return CommonInstants(fresh, {**self.objectives, **more}, worlds=worlds, seed=seed, **self._settings)
 
     def prefixes(self, rig: Rig) -> Iterator[Prefix]:
         """What is known of a rig after three instants more at a time; nothing is scored before it is asked for.

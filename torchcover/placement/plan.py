@@ -25,7 +25,7 @@ def common_instants(space: SearchSpace | ChoiceSpace, plan: "SearchPlan", seed: 
     """Instants of the worlds of a seed."""
     return CommonInstants(
         space.scenarios,
-        space.objectives,
+        space.asked,
         worlds=worlds,
         per_world=plan.per_world,
         every_s=plan.every_s,

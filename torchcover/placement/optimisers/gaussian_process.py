@@ -17,6 +17,8 @@ FIRST = 3
 HIGHEST, LAST = 200, 600
 SCATTERED, KEPT, AROUND, ROUNDS = 1024, 8, 64, 6
 FIRST_WIDTH, OTHER_OPTION = 0.1, 0.2
+# From the median down, in units of what the best is above it.
+FAR_DOWN = 2.0
 # Below, φ(z) + z Φ(z) is φ(z) / z² to five digits, and a difference of the two has none left.
 FAR_BELOW = -500.0
 
@@ -68,6 +70,8 @@ class GaussianProcessSearch:
         if not np.isfinite(values).any():
             return None
         values = np.where(np.isnan(values), np.nanmin(values), values)
+        # How bad the worst are tells nothing of where the best is, but would be most of what is learnt.
+        values = values.clip(np.median(values) - FAR_DOWN * (values.max() - np.median(values)))
         kept = np.union1d(np.argsort(-values, kind="stable")[:HIGHEST], np.arange(len(values))[-LAST:])
         each = (torch.from_numpy(np.array(told)[kept]) for told in (self._places, values, self._errors))
         with _one_thread():

@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
-from torchcover.geometry import BoundingBox, invert, overlap
+from torchcover.geometry import BoundingBox, invert, overlapping
 from torchcover.geometry.rigid import Matrix
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings.formats import read_objects
@@ -85,6 +85,15 @@ class RecordedTraffic(Traffic):
                 "built_share is for tracks without a ground of their own; leave out ground, or built_share"
             )
         return self
+
+    @property
+    def drawn_words(self) -> str:
+        """What stands beside streets, if it is drawn."""
+        if self.built_share is None:
+            return ""
+        return (
+            f"Drawn, not recorded: what stands beside the tracks, with houses on {self.built_share:.0%} of the sides."
+        )
 
     @property
     def steps(self) -> int:
@@ -181,11 +190,10 @@ class RecordedTraffic(Traffic):
         for other in others:
             its_box = BoundingBox.around(other.mesh.vertices_m)
             away_m = np.linalg.norm(other.trajectory.positions_at(times_s) - ego_m, axis=1)
-            near = np.flatnonzero(away_m < reach_m + np.linalg.norm(its_box.corners_m, axis=1).max())
-            for time_s in times_s[near].tolist():
-                if overlap(box, invert(ego.trajectory.at(time_s)) @ other.trajectory.at(time_s), its_box):
-                    met.append(other.name)
-                    break
+            near_s = times_s[away_m < reach_m + np.linalg.norm(its_box.corners_m, axis=1).max()]
+            there = invert(ego.trajectory.at_each(near_s)) @ other.trajectory.at_each(near_s)
+            if overlapping(its_box, there, box.corners_m).any():
+                met.append(other.name)
         if met:
             warnings.warn(
                 f"{self.path}: {len(met)} of {len(others)} tracks are where the ego is at some time "

@@ -2,7 +2,6 @@
 
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import cache, lru_cache
 
 import numpy as np
@@ -115,7 +114,8 @@ class Fleet:
     def draw_driver(self, typical: Driver, spread: float) -> Driver:
         """A driver whose desired speed differs from the typical one by up to `spread`, a share of it."""
         desired_mps = float(typical.desired_speed_mps * self._generator.uniform(1 - spread, 1 + spread))
-        return replace(typical, desired_speed_mps=desired_mps)
+        rest = typical.headway_s, typical.standstill_gap_m, typical.acceleration_mps2, typical.deceleration_mps2
+        return Driver(desired_mps, *rest)  # by hand: there are thousands of them in a world
 
     def agent(self, kind: str, lane: int, place_m: float, driver: Driver) -> Agent:
         """Somebody of a kind on a lane."""

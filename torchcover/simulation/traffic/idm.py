@@ -45,7 +45,9 @@ class Driver:
     deceleration_mps2: Quantity = 2.0
 
     def __post_init__(self) -> None:
-        if not np.all(np.asarray(self.desired_speed_mps) > 0.0):
+        desired = self.desired_speed_mps
+        # There are thousands in a world.
+        if not (desired > 0.0 if isinstance(desired, float) else np.all(np.asarray(desired) > 0.0)):
             raise ValueError(f"a driver needs a desired speed above 0 m/s; got {self.desired_speed_mps}")
 
     @cached_property
