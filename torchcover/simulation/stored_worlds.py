@@ -29,7 +29,7 @@ from torchcover.simulation.builtin import builtin_names
 from torchcover.simulation.scenario import Mover, Scenario
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.sumo.simulating import installed
-from torchcover.simulation.traffic.fleet import load_bodies
+from torchcover.simulation.traffic.fleet import load_articulated, load_bodies
 from torchcover.simulation.world import Actor, World
 
 # What all worlds on disk may take: the environment variable, and gigabytes without it. 0: there are none.
@@ -40,6 +40,8 @@ LEAST_FREE_BYTES = 100e6
 CLOCKS_DIFFER_S = 1.0
 # What a world is made of.
 KINDS: dict[str, Callable[..., Any]] = {kind.__name__: kind for kind in (World, Actor, Trajectory, Mesh)}
+# Of bodies in two parts.
+PARTS = ("front", "rear")
 # Whose code draws worlds.
 ROOMS = ("files", "geometry", "simulation")
 
@@ -78,7 +80,7 @@ class StoredWorlds:
             return self._scenario.world(self._seed, run, ego)
         self._drawn_from = self._drawn_from or _drawn_from(self._scenario)
         key = hashlib.sha256(f"{self._drawn_from} {self._seed} {run}".encode()).hexdigest()
-        path, bodies = self._folder / f"{key}.world", {**load_bodies(), "ego": ego}
+        path, bodies = self._folder / f"{key}.world", {**_bodies(), "ego": ego}
         try:
             world = _read(path, key, bodies)
         except (FileNotFoundError, BadFileError) as error:
@@ -109,6 +111,13 @@ class StoredWorlds:
                 aside.unlink()
             self._folder = None
             _say_not_kept(error)
+
+
+@cache
+def _bodies() -> Mapping[str, Mesh]:
+    """The meshes that all worlds share."""
+    parts = [(f"{part} of {kind}", getattr(body, part)) for kind, body in load_articulated().items() for part in PARTS]
+    return {**load_bodies(), **dict(parts)}
 
 
 def _own_folder() -> Path | None:
@@ -210,7 +219,7 @@ def _read(path: Path, key: str, bodies: Mapping[str, Mesh]) -> World:
     check_memory(2 * path.stat().st_size)
     content = np.fromfile(path, np.uint8)
     content.flags.writeable = False
-    if zlib.crc32(content[8:], zlib.crc32(key.encode())) != int.from_bytes(content[:8].tobytes(), "little"):
+    if zlib.crc32(content[8:].data, zlib.crc32(key.encode())) != int.from_bytes(content[:8].tobytes(), "little"):
         raise ValueError("its checksum is wrong")
     first = 16 + int.from_bytes(content[8:16].tobytes(), "little")
     told, parts = json.loads(content[16:first].tobytes())
@@ -219,7 +228,7 @@ def _read(path: Path, key: str, bodies: Mapping[str, Mesh]) -> World:
         size = np.dtype(kind).itemsize * int(np.prod(shape, dtype=np.int64))
         arrays.append(content[first : first + size].view(kind).reshape(shape))
         first += size + -size % 8
-    known = {"array": arrays, "part": made, "body": bodies}
+    known: dict[str, Any] = {"array": arrays, "part": made, "body": bodies}
 
     def meant(value: Any) -> Any:  # noqa: ANN401  (whatever a world is made of)
         if isinstance(value, dict):
