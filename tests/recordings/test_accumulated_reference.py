@@ -53,12 +53,6 @@ def test_what_sticks_out_of_its_box_moves_with_it():
     assert distances_m(reference, np.concatenate([standing(drive, 2), moving(drive, 2)])).max() < 1e-4
 
 
-def test_nothing_says_that_it_moves_so_it_is_smeared():
-    drive = Drive(labelled=False)
-    reference = RecordedFrames(drive, reference=AccumulatedReference(10.0, voxel_m=0.05))[2].reference
-    assert distances_m(reference, np.concatenate([standing(drive, 2), moving(drive, 2)])).max() > 0.5
-
-
 def test_objects_without_a_name_are_left_out_and_counted():
     drive = Drive(named=False)
     frame = RecordedFrames(drive, reference=AccumulatedReference(10.0, voxel_m=0.05))[2]
@@ -93,7 +87,7 @@ def test_a_frame_does_not_depend_on_those_read_before():
     copied = [pickle.loads(pickle.dumps(one))[index].reference for index in range(8)]
     for others in zip(forward, backward, fresh, copied, strict=True):
         assert all(torch.equal(others[0], other) for other in others[1:])
-    assert len(one.reference.sweeps._kept) <= 2 * 5
+    assert len(one.reference.sweeps._kept) <= 2 * 8
 
 
 def test_one_reference_serves_several_recordings():
