@@ -89,7 +89,7 @@ def test_loops_do_what_arrays_do():
     image = RangeImage.of(generator.normal(0.0, 30.0, (40_000, 3)), sensor_T_local)
     one, other = np.zeros((2, 5000), np.int16)
     for kernel, votes in ((loops.vote_by_loop, one), (seen_past.vote_by_arrays, other)):
-        kernel(points_m, sensor_T_local, image.free_m, image.first_row, votes, 2)
+        kernel(points_m, *image, votes, 2)
     np.testing.assert_array_equal(one, other)
     assert 0 < one.sum() < 2 * len(one)
 

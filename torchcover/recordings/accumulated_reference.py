@@ -21,8 +21,8 @@ VOTES = 2
 # What stands is seen for at least so long, or half of the time that was looked at; what is no higher is the ground.
 STANDS_S, ON_GROUND_M = 1.0, 0.3
 SEEN_AGAIN = 0.2
-# What is slower stands.
-MOVES_MPS = 0.5
+# What is slower stands; of fewer points, its velocity is a guess.
+MOVES_MPS, KNOWN_POINTS = 0.5, 50
 # Where a recording does not say how large its vehicle is.
 USUAL_BODY = BoundingBox((-2.4, -0.95, 0.0), (2.4, 0.95, 1.7))
 
@@ -103,7 +103,8 @@ class AccumulatedReference:
         boxes, dropped = _by_name(recording.boxes(index)), Counter[str]()
         used = [key for key in scans if key[1] in within]
         dropped["sweeps"] = len(used)
-        dropped["sweeps_skipped"] = len(sensors) * sweeps.skipped(recording, index)
+        if skipped := sweeps.skipped(recording, index):
+            dropped["sweeps_skipped"] = len(sensors) * skipped
         of_box: dict[str, list[NDArray[np.float64]]] = {}
         for key in used:
             dropped += scans[key].dropped
@@ -123,7 +124,10 @@ class AccumulatedReference:
         dropped["seen_past"] = sum(int((votes[key] >= VOTES).sum()) for key in used)
         dropped["passing"] = sum(int((passing[key] & (votes[key] < VOTES)).sum()) for key in used)
         found = self._movers(recording, index, {key: scan.still_m[loose[key]] for key, scan in scans.items()})
-        dropped["movers"] = sum(bool(np.linalg.norm(mover.velocity_mps) > MOVES_MPS) for mover in found)
+        dropped["movers"] = sum(
+            len(mover.points_m) >= KNOWN_POINTS and bool(np.linalg.norm(mover.velocity_mps) > MOVES_MPS)
+            for mover in found
+        )
         local_m = np.concatenate(
             [np.empty((0, 3)), *(scans[key].still_m[~loose[key]] for key in used), *(mover.points_m for mover in found)]
         )

@@ -9,17 +9,12 @@ from torchcover.recordings.seen_past import COLUMNS, ROWS
 from torchcover.recordings.visible import BEHIND, BEHIND_M
 
 
-@compiled("void(f8[:, ::1], f8[:, ::1], f4[:, ::1], i8, i2[::1], i8)")
+@compiled("void(f8[:, ::1], f4[:, ::1], i8, f8[:, ::1], f8, i2[::1], i8)")
 def vote_by_loop(
-    points_m: Array, sensor_T_local: Array, free_m: Array, first_row: int, votes: Array, vote: int
+    points_m: Array, free_m: Array, first_row: int, sensor_T_local: Array, farthest_m: float, votes: Array, vote: int
 ) -> None:
     """Count the places that lie in free space: `vote_by_arrays`."""
-    T, rows = sensor_T_local, free_m.shape[0]
-    times = COLUMNS // free_m.shape[1]
-    farthest_m = 0.0
-    for row in range(rows):
-        for column in range(free_m.shape[1]):
-            farthest_m = max(farthest_m, free_m[row, column])
+    T, rows, times = sensor_T_local, free_m.shape[0], COLUMNS // free_m.shape[1]
     for i in range(points_m.shape[0]):
         px, py, pz = points_m[i, 0], points_m[i, 1], points_m[i, 2]
         x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]

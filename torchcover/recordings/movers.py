@@ -18,10 +18,10 @@ Cells = NDArray[np.int64]
 # Seen from above; parts of a thing are at most so many cells apart.
 CELL_M, GAP = 0.3, 3
 # Of fewer points nothing is known; of more, about so many are moved.
-FEWEST, MOST = 5, 120
-# Scans that a cluster is compared with; velocities that are tried, first by a coarse step; of several that fit as well
+FEWEST, MOST = 5, 60
+# Scans that a cluster is compared with; velocities that are tried, first by coarse steps; of several that fit as well
 # the slower one: so much overlap is worth a metre a second. With less overlap nothing is found.
-COMPARED, FASTEST_MPS, STEPS_MPS, SLOWER, OVERLAP = 6, 45.0, (1.0, 0.25), 2e-3, 0.5
+COMPARED, FASTEST_MPS, STEPS_MPS, SLOWER, OVERLAP = 6, 45.0, (1.5, 0.5, 0.25), 2e-3, 0.5
 # What scans within this time have of it is put together; those within the longer one are compared.
 TOGETHER_S, COMPARED_S = 0.31, 0.61
 # Nothing is looked for farther away.

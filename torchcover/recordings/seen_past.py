@@ -35,11 +35,13 @@ class RangeImage(NamedTuple):
         free_m: (rows, columns) float32 range up to which a direction is free; 0 where nothing came back.
         first_row: How many rows there are below, which nothing hit.
         sensor_T_local: (4, 4) from the frame in which places are given.
+        farthest_m: The largest of `free_m`.
     """
 
     free_m: NDArray[np.float32]
     first_row: int
     sensor_T_local: Matrix
+    farthest_m: float
 
     @classmethod
     def of(cls, points_m: NDArray[np.floating], sensor_T_local: Matrix) -> "RangeImage":
@@ -54,7 +56,7 @@ class RangeImage(NamedTuple):
         """
         row, column, range_m = _bins(points_m.astype(np.float64), 1)
         if not len(row):
-            return cls(np.zeros((0, COLUMNS), np.float32), 0, sensor_T_local)
+            return cls(np.zeros((0, COLUMNS), np.float32), 0, sensor_T_local, 0.0)
         for times in COARSER:
             low, rows, columns = row.min() // times, row.max() // times - row.min() // times + 1, COLUMNS // times
             nearest_m = np.full((rows + 2, columns + 2), np.inf)
@@ -66,11 +68,11 @@ class RangeImage(NamedTuple):
         around_m = np.minimum(np.minimum(nearest_m[:-2], nearest_m[1:-1]), nearest_m[2:])
         around_m = np.minimum(np.minimum(around_m[:, :-2], around_m[:, 1:-1]), around_m[:, 2:])
         free_m = np.where(hit[1:-1, 1:-1], np.maximum((around_m - BEYOND_M) / (1 + BEYOND), 0.0), 0.0)
-        return cls(free_m.astype(np.float32), int(low), sensor_T_local)
+        return cls(free_m.astype(np.float32), int(low), sensor_T_local, float(free_m.max()))
 
     def vote(self, points_m: Float64, votes: NDArray[np.int16], vote: int = 1) -> None:
         """Add to the (N,) votes of the (N, 3) places that lie in free space."""
-        compiled_or(vote_by_arrays)(points_m, self.sensor_T_local, self.free_m, self.first_row, votes, vote)
+        compiled_or(vote_by_arrays)(points_m, *self, votes, vote)
 
 
 class Votes:
@@ -112,15 +114,16 @@ def _bins(points_m: Float64, times: int) -> tuple[NDArray[np.int64], NDArray[np.
 
 def vote_by_arrays(
     points_m: Float64,
-    sensor_T_local: Matrix,
     free_m: NDArray[np.float32],
     first_row: int,
+    sensor_T_local: Matrix,
+    farthest_m: float,
     votes: NDArray[np.int16],
     vote: int,
 ) -> None:
     """`RangeImage.vote` where numba is missing."""
     row, column, range_m = _bins(transform(sensor_T_local, points_m), COLUMNS // free_m.shape[1])
-    inside = np.flatnonzero((row >= first_row) & (row < first_row + len(free_m)))
+    inside = np.flatnonzero((range_m < farthest_m) & (row >= first_row) & (row < first_row + len(free_m)))
     votes[inside[range_m[inside] < free_m[row[inside] - first_row, column[inside]]]] += vote
 
 

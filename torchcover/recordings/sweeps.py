@@ -24,6 +24,8 @@ VOXEL_BITS = 21
 BESIDE_BOX_M = 0.1
 # What lies in the window is judged by scans so much before and after it, too; by the rays of one in so much time.
 MARGIN_S, RAYS_EVERY_S = 1.0, 0.2
+# Of a drive with so few instants, those of all.
+SHORT = 20
 # Cells in which a thing that stands is seen again.
 CELL_M = 0.6
 # A vehicle that is so much faster or slower between two instants than between most has not moved: its pose has.
@@ -213,7 +215,7 @@ def pose_of(boxes: Boxes, number: int) -> Matrix:
 def _casts_rays(recording: Recording, index: int) -> bool:
     """Whether it is the first instant of its time, so that it does not depend on which one is asked about."""
     times_s = recording.times_s
-    if times_s is None or index == 0:
+    if times_s is None or index == 0 or len(times_s) <= SHORT:
         return True
     return bool(np.diff(np.floor((times_s[index - 1 : index + 1] - times_s[0]) / RAYS_EVERY_S + 1e-6))[0])
 
