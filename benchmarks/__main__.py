@@ -32,6 +32,7 @@ BENCHMARKS = (
     "towns",
     "pairing",
     "placement",
+    "optimisers",
     "published",
     "voxels",
     "streets",
