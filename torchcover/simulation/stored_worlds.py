@@ -91,7 +91,7 @@ class StoredWorlds:
             world = self._scenario.world(self._seed, run, ego)
         for doubt in doubts:
             warnings.warn_explicit(doubt.message, doubt.category, doubt.filename, doubt.lineno)
-        if not doubts:  # else whoever reads it would not be warned
+        if not any(issubclass(doubt.category, UserWarning) for doubt in doubts):  # whoever reads it would not be told
             self._keep(path, _packed(world, key, bodies))
         return world
 
