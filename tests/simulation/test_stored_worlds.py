@@ -11,6 +11,7 @@ import pytest
 from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, stored_worlds
 from torchcover.simulation.stored_worlds import BUDGET, StoredWorlds
 from torchcover.simulation.traffic import Highway, Parking, Urban
+from torchcover.simulation.traffic.fleet import load_bodies
 
 EGO = {"shape": {"type": "box", "size_m": [4, 2, 1.5]}}
 LOT = {"type": "parking", "duration_s": 1.0, "time_step_s": 0.2, "crossings": 0, "parked_share": 0.1}
@@ -64,7 +65,7 @@ def test_a_world_from_disk_is_the_one_that_was_built_and_shares_its_bodies(disk,
     assert built == [2]
     assert len(files()) == 1
     assert same(first, again)
-    bodies = {id(mesh) for mesh in stored_worlds._bodies().values()} | {id(ego)}
+    bodies = {id(mesh) for mesh in load_bodies().values()} | {id(ego)}
     assert {id(actor.mesh) for actor in (again.ego, *again.objects)} <= bodies
     shared = [{id(actor.trajectory.times_s) for actor in world.actors} for world in (first, again)]
     assert len(shared[1]) <= len(shared[0])

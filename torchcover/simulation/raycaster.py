@@ -63,10 +63,9 @@ class Faces:
     def __init__(self, bodies: Sequence[Mesh], reach_m: float) -> None:
         self._bodies = bodies
         count = sum(len(body.faces) for body in bodies)
-        self.contact_m, self.normals = np.empty(count, dtype=np.float32), np.empty((3, count), dtype=np.float32)
+        self.contact_m = np.empty(count, dtype=np.float32)
         self._lower_m, self._upper_m = (np.empty((3, count), dtype=np.float32) for _ in range(2))
         for faces, corners_m in parts_of(bodies):
-            self.normals[:, faces] = normals_of(corners_m)
             self.contact_m[faces] = contact_m = np.maximum(_contact_m(corners_m), MIN_CONTACT * reach_m)
             # Rounded outwards.
             lower_m, upper_m = corners_m.min(axis=0) - 2 * contact_m, corners_m.max(axis=0) + 2 * contact_m
@@ -76,6 +75,14 @@ class Faces:
             self._lower_m.min(axis=1, initial=np.inf),
             self._upper_m.max(axis=1, initial=-np.inf),
         )
+
+    @cached_property
+    def normals(self) -> Float32:
+        """Asked where light returns."""
+        normals = np.empty((3, len(self.contact_m)), dtype=np.float32)
+        for faces, corners_m in parts_of(self._bodies):
+            normals[:, faces] = normals_of(corners_m)
+        return normals
 
     def holding(self, place_m: NDArray[np.floating]) -> NDArray[np.int64]:
         """Numbers of those that a (3,) place lies on."""

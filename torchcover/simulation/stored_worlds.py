@@ -29,7 +29,7 @@ from torchcover.simulation.builtin import builtin_names
 from torchcover.simulation.scenario import Mover, Scenario
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.sumo.simulating import home
-from torchcover.simulation.traffic.fleet import load_articulated, load_bodies
+from torchcover.simulation.traffic.fleet import load_bodies
 from torchcover.simulation.world import Actor, World
 
 # What all worlds on disk may take: the environment variable, and gigabytes without it. 0: there are none.
@@ -77,7 +77,7 @@ class StoredWorlds:
             return self._scenario.world(self._seed, run, ego)
         self._drawn_from = self._drawn_from or _drawn_from(self._scenario)
         key = hashlib.sha256(f"{self._drawn_from} {self._seed} {run}".encode()).hexdigest()
-        path, bodies = self._folder / f"{key}.world", {**_bodies(), "ego": ego}
+        path, bodies = self._folder / f"{key}.world", {**load_bodies(), "ego": ego}
         try:
             with suppress(FileNotFoundError):
                 world = _read(path, key, bodies)
@@ -108,13 +108,6 @@ class StoredWorlds:
                 aside.unlink()
             self._folder = None
             _say(NOT_KEPT, error)
-
-
-@cache
-def _bodies() -> Mapping[str, Mesh]:
-    """The meshes that all worlds share."""
-    two = [(kind, part, body) for kind, body in load_articulated().items() for part in ("front", "rear")]
-    return {**load_bodies(), **{f"{part} of {kind}": getattr(body, part) for kind, part, body in two}}
 
 
 def _own_folder() -> Path | None:
@@ -151,7 +144,7 @@ def _has_room(folder: Path, most_bytes: float, began_s: float) -> bool:
 def _drawn_from(scenario: Scenario) -> str:
     """All that its worlds follow from, but the seed and the run: no sensors, weather or names are among it."""
     assert scenario.traffic is not None  # it draws
-    told = [__version__, _code(), np.__version__, np.show_config(mode="dicts")["SIMD Extensions"]]
+    told: list[object] = [__version__, _code(), np.__version__, np.show_config(mode="dicts")["SIMD Extensions"]]
     told += [shapely.__version__, shapely.geos_version_string, builtin_names("materials")]
     told += [type(scenario.traffic).__name__, scenario.traffic.content(), (scenario.ego or Mover()).content()]
     with suppress(ImportError, OSError):  # there is no SUMO

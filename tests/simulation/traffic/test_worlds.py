@@ -205,6 +205,20 @@ def test_people_cross_the_aisles_of_the_lot_and_cars_are_slow(world):
     assert speeds(w.ego).min() > 1.0
 
 
+def test_a_lot_is_surrounded_by_what_stands_beside_streets_and_that_keeps_off_it(bodies):
+    full, bare = (
+        Parking(duration_s=1.0, **keys).world(0, bodies=bodies) for keys in ({}, {"built_share": 0, "roadside": 0})
+    )
+    *same, houses, others = full.static
+    assert len(bare.static) == len(same)
+    places_m = np.concatenate([houses.vertices_m, others.vertices_m])[:, :2]
+    # Crowns hang over its edge, by less than half their width.
+    least_m = np.abs(places_m / np.array([62.0, 36.0])).max(axis=1)[places_m[:, 1] > 0.0].min()
+    assert 0.95 < least_m < 1.05
+    sides = [(places_m[:, axis] * sign > 40.0).any() for axis in (0, 1) for sign in (1, -1)]
+    assert all(sides)
+
+
 @pytest.mark.parametrize(
     ("model", "options"),
     [
