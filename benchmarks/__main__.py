@@ -32,9 +32,9 @@ BENCHMARKS = (
     "towns",
     "pairing",
     "placement",
+    "optimisers",
     "published",
     "voxels",
-    "cities",
     "streets",
 )
 
