@@ -36,7 +36,6 @@ BENCHMARKS = (
     "choices",
     "published",
     "voxels",
-    "cities",
     "streets",
 )
 
