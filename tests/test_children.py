@@ -116,6 +116,6 @@ def test_what_makes_traffic_ends(alive, tmp_path, monkeypatch):
     (tmp_path / "bin").mkdir()
     (tmp_path / "bin" / "sumo").write_text(f"#!/bin/sh\n{script(alive, LIVES_S)}\n")
     (tmp_path / "bin" / "sumo").chmod(0o755)
-    monkeypatch.setattr(simulating, "installed", lambda: tmp_path)
+    monkeypatch.setattr(simulating, "home", lambda: tmp_path)
     is_killed(lambda: simulating.run("sumo"), alive)
     assert alive.has_ended(within_s=LIVES_S / 3)

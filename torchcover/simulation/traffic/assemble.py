@@ -69,7 +69,7 @@ def paths(lanes: Sequence[Lane], agents: Sequence[Agent], place_m: Numbers) -> P
     for number in [number for number, kind in enumerate(kinds) if kind in DRAWS]:
         # At first the axles are on the lane, too.
         back_m = DRAWS[kinds[number]].rod_m - DRAWS[kinds[number]].hitch_m
-        axles_m = lanes[lane_of[number]].line.poses(place_m[0, number] - back_m)[:2]
+        (axles_m,) = lanes[lane_of[number]].line.poses(place_m[:1, number] - back_m)[:, :2]
         start.append(float(np.arctan2(*(positions_m[0, number, :2] - axles_m)[::-1])))
     return Paths(positions_m, yaw_deg, kinds).with_rears(start)
 
