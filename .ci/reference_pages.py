@@ -127,7 +127,10 @@ def document_classes():
         if each.__module__.startswith("torchcover") and each.model_fields and not each.__name__.startswith("_"):
             found.append(each)
     whole = [each for each in found if hasattr(each, "load")]
-    return [*whole, *sorted((each for each in found if each not in whole), key=lambda each: each.__name__)]
+    return [
+        *dict.fromkeys(whole),
+        *sorted((each for each in found if each not in whole), key=lambda each: each.__name__),
+    ]
 
 
 def default_words(value):

@@ -6,10 +6,11 @@ import sys
 from torchcover.evaluation.cores import set_threads
 
 # Of speed and memory, which docs/measured/performance.md is made of; the others have pages of their own.
-PERFORMANCE = ("run", "nearest", "crossover", "raycasting", "moving_actors", "reading", "omissions")
+PERFORMANCE = ("run", "raycasting", "reading", "omissions")
 BENCHMARKS = (
     *PERFORMANCE,
     "search",
+    "afternoon",
     "stability",
     "trade_offs",
     "heights",
@@ -31,9 +32,9 @@ BENCHMARKS = (
     "towns",
     "pairing",
     "placement",
+    "optimisers",
     "published",
     "voxels",
-    "cities",
     "streets",
 )
 

@@ -67,11 +67,14 @@ def main():
 
 
 def scenario_of(given, folder):
-    """A scenario by its name or its document; the plain drive is written down first."""
+    """A scenario by its name or its document; of tracks only what was recorded, and the plain drive is written down."""
     if given == "plain":
         drives.write_argoverse2(Path(folder) / "log", heights=drives.flat_m)
         given = {"name": "plain", "traffic": {"type": "tracks", "path": str(Path(folder) / "log")}}
-    return Scenario.model_validate(given) if isinstance(given, dict) else Scenario.load(given)
+    found = Scenario.model_validate(given) if isinstance(given, dict) else Scenario.load(given)
+    recorded = found.traffic is not None and found.traffic.type == "tracks"
+    bare = {"traffic": found.traffic.model_copy(update={"built_share": None})} if recorded else {}
+    return found.model_copy(update=bare)
 
 
 def of_world(world):

@@ -22,7 +22,6 @@ def main():
     urban = Scene(Scenario.load("urban").world())
     roof, kitti = (Rig.load(rig).sensing("ideal").sensors[0] for rig in ("front_roof_128", "kitti"))
     rows = [
-        row("bodies out of range, 120 m", *bodies_out_of_range(urban, roof)),
         row("bodies that a ray cannot meet", *rays_that_pass_by(urban)),
         row("the ego, seen by `front_roof_128`", *ego_again(urban, roof)),
         row("the ego, seen by the LiDAR of `kitti`", *ego_again(urban, kitti)),
@@ -40,15 +39,6 @@ def row(what, off, on):
     same = np.array_equal(without.points, left_out.points) and without.self_hits == left_out.self_hits
     seconds, ratios = compare(on, off, rounds=9)
     return what, 1000 * seconds[1], 1000 * seconds[0], ratios[1], "yes" if same else "NO"
-
-
-def bodies_out_of_range(scene, sensor):
-    """With a range that leaves out about half of them; what is placed also has to be looked at by every tile."""
-    pose, tiles = sensor.mount.matrix(), into_tiles(sensor.directions())
-    return (
-        lambda: scene.at(STEP).scan(pose, tiles, max_range_m=RANGE_M),
-        lambda: scene.at(STEP, within_m=RANGE_M).scan(pose, tiles, max_range_m=RANGE_M),
-    )
 
 
 def rays_that_pass_by(scene):

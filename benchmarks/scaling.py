@@ -23,7 +23,7 @@ from torchcover.data import RegionsOfInterest, SimulatedFrames, reference_called
 from torchcover.evaluation import CoverageObserver, Settings
 from torchcover.evaluation.checkpoint import write_checkpoint
 from torchcover.evaluation.measuring import metric_of
-from torchcover.evaluation.transport import packed
+from torchcover.evaluation.ranks import packed
 from torchcover.simulation import Scenario
 
 RIG, SCENARIO, EVERY_S, STEPS_A_WORLD = "front_roof_128", "urban", 10.0, 6

@@ -21,10 +21,7 @@ from torchcover.data import SimulatedFrames
 from torchcover.neighbors.choice import choose_search
 from torchcover.simulation import PaperReference
 
-RIGS = (
-    "front_roof_128", "front_roof_32", "front_grille_128", "kitti", "nuscenes", "argoverse2", "edgar", "hu2022_center",
-    "place3d_line", "kitti_cameras",
-)  # fmt: skip
+RIGS = ("front_roof_128", "nuscenes", "edgar", "kitti_cameras")
 SIZES = (10**3, 10**4, 10**5, 10**6, 10**7)
 MOST_QUERIES = 100_000
 SLOW = 500_000  # queries and points together: only pykdtree is compared, and fewer times

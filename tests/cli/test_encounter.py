@@ -48,6 +48,10 @@ def test_rigs_side_by_side_in_words_and_files(torchcover, worlds):
         (SET, ["--deceleration-mps2", "0"], "deceleration_mps2: m/s2 above 0"),
         (SET, ["--latency-s", "-1"], "latency_s: seconds of 0 or more"),
         (SET, ["--set", "crosing_like"], "is 'crossing_like' meant?"),
+        (SET, ["--film", "a.png"], "a film is a .gif or .mp4 file"),
+        (SET, ["--film", "a.gif", "--scenario", "urban"], "--film: of a set only"),
+        (SET, ["--frames", "drive"], "a recording has its own rigs"),
+        (SET, ["--scenario", "courtyard"], "nothing ever moves in it"),
     ],
 )
 def test_a_mistake_is_one_line(torchcover, worlds, text, arguments, message):

@@ -7,6 +7,8 @@ import torch
 
 from torchcover import BevGrid, CoverageMetric
 from torchcover.coverage import Maximum, PooledMean
+from torchcover.metrics import added_up
+from torchcover.metrics.blocks import merged
 
 ONE_CELL = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)})
 STEP = (torch.tensor([[1.0, 0.0, 0.0]]), torch.zeros(1, 3))
@@ -70,3 +72,16 @@ def test_no_step_holds_on_to_its_graph():
     assert not any(value.requires_grad for value in metric.metric_state.values())
     assert not result.radius.requires_grad
     assert copy.deepcopy(metric).compute().counts["steps"] == 2
+
+
+@pytest.mark.parametrize("maxima", [0, 2])
+@pytest.mark.parametrize("sizes", [(40, 60), (60, 1), (0, 9), (9, 0), (1, 1)])
+def test_tables_merge_into_what_their_rows_add_up_to(sizes, maxima):
+    generator = torch.Generator().manual_seed(3)
+    keys = [torch.randint(0, 90, (size, 1), generator=generator) for size in sizes]
+    values = [torch.randn(size, 4, generator=generator) for size in sizes]
+    one, other = (added_up(torch.cat(each, dim=1).double(), maxima) for each in zip(keys, values, strict=True))
+    given = one.clone(), other.clone()
+    assert torch.equal(merged(one, other, maxima), added_up(torch.cat([one, other]), maxima))
+    assert torch.equal(one, given[0])
+    assert torch.equal(other, given[1])

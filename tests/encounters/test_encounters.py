@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from matplotlib.text import Text
 
 from tests.targets.worlds import EGO, FLOOR, lidar, on_target
 from torchcover.encounters import Criterion, Encounter, EncounterSet, Staged, sight_encounter
 from torchcover.encounters.sighting import NEVER, Looks, MountedRig, channels, first_run, kinds_of, look_steps
-from torchcover.evaluation import encounter, free_space
-from torchcover.geometry import euler_from_rotation
+from torchcover.evaluation import encounter, encounter_film, free_space
+from torchcover.geometry import euler_from_rotation, overlapping
 from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, with_ego
 from torchcover.simulation.bodies import called
 from torchcover.simulation.moving import Solid
 from torchcover.targets import Target
-from torchcover.targets.placing import overlapping
 
 torch.set_num_threads(1)
 
@@ -293,6 +293,17 @@ def test_in_time_up_to_a_speed_is_in_time_at_all_that_are_slower():
     for brakes, expected in ((1e6, 50.0), (1.0, 0.0)):
         found = encounter(rig(high("ahead")), these, Criterion(deceleration_mps2=brakes, latency_s=0.1), phases=5)
         assert list(found.up_to_kmh().values()) == [expected]
+
+
+def test_a_film_shows_where_everybody_is_and_what_is_on_the_other():
+    other = {"body": "child", "speed_kmh": 5, "from_m": 1.5}
+    these = EncounterSet.model_validate({"name": "s", "encounters": [FAMILY | {"other": other}]})
+    two = rig(high("ahead"), high("top", columns=40))
+    picture = next(encounter_film(two, encounter([two], these, phases=2, vehicle="suv"), vehicle="suv"))
+    words = " ".join(text.get_text() for text in picture.findobj(Text))
+    assert "s to the collision; points on it: ahead 10, top 0" in words
+    for told in ("at 40 km/h: detected", "first ahead, without ahead", "in time up to", "child (1)", "hatchback (1)"):
+        assert told in words
 
 
 MISTAKES = [

@@ -7,6 +7,7 @@ import sys
 import warnings
 
 import pytest
+import torch
 
 from torchcover.data import SimulatedFrames
 from torchcover.evaluation import cores as module
@@ -72,11 +73,19 @@ def test_it_is_said_before_torch_and_numpy_are_loaded():
 
 
 def test_who_lets_threads_spin_is_told_once(nothing_said):
-    with pytest.warns(UserWarning, match="OMP_WAIT_POLICY"):
+    with pytest.warns(UserWarning, match="OMP_WAIT_POLICY") as said:
         warn_of_spinning(2)
+    assert said[0].filename == __file__
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warn_of_spinning(2)
+
+
+def test_it_points_at_the_line_of_the_user(nothing_said, monkeypatch):
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    with pytest.warns(UserWarning, match="OMP_WAIT_POLICY") as said:
+        evaluate("front_roof_128", "courtyard", steps=1, rays=64)
+    assert [one.filename for one in said] == [__file__]
 
 
 @pytest.mark.parametrize("said", [None, *module.WAITING])

@@ -6,7 +6,6 @@ import pickle
 import signal
 import threading
 import time
-import warnings
 from concurrent.futures import ThreadPoolExecutor
 from queue import SimpleQueue
 
@@ -17,7 +16,6 @@ from torch.distributed import FileStore
 import torchcover
 from torchcover.data import BadFrameError, FrameDataset, SimulatedFrames
 from torchcover.evaluation import Ranks, joined_ranks
-from torchcover.evaluation.transport import packed, unpacked
 
 LONGEST_S = 60.0
 
@@ -231,19 +229,3 @@ def test_without_torchrun_there_are_no_ranks(monkeypatch):
             monkeypatch.setenv("WORLD_SIZE", size)
         with joined_ranks() as ranks:
             assert ranks is None
-
-
-def test_what_travels_arrives_to_the_last_bit_and_without_its_zeros():
-    sparse = torch.zeros(1000, 100, dtype=torch.float64)
-    sparse[3, 7], sparse[999, 99] = -0.0, torch.nan
-    half = torch.tensor([1.5], dtype=torch.bfloat16)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        data = packed(
-            {"sparse": sparse, "dense": torch.arange(9), "half": half, "scalar": torch.tensor(3), "text": "a"}
-        )
-        back = unpacked(data)
-    assert len(data) < 10_000
-    assert back["sparse"].numpy().tobytes() == sparse.numpy().tobytes()
-    assert back["dense"].equal(torch.arange(9))
-    assert (back["half"].equal(half), back["scalar"].shape, back["text"]) == (True, (), "a")

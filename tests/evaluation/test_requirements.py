@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from tests.targets.worlds import lidar, rig, world
-from torchcover.evaluation import Places, Readings, Requirements, check, encounter, evaluate, verdicts
+from torchcover.encounters import Criterion
+from torchcover.evaluation import Readings, Requirements, check, encounter, evaluate, verdicts
+from torchcover.evaluation.requirements import BodyPlaces
 from torchcover.geometry import BoundingBox
 from torchcover.simulation import RegionsOfInterest, builtin_names
 from torchcover.targets import SIDES, Raster, Target, survey
@@ -66,21 +68,21 @@ def test_a_bound_is_kept_where_all_of_the_interval_is_known_to_keep_it(bound, va
 
 def test_bodies_are_put_where_a_place_says():
     """Areas are filled to their border in steps that are no longer than asked for; other forms are what they say."""
-    behind = Places(x_m=(-1.0, -0.2), relative_to="rear", step_m=0.3).positions_m(CAR)
+    behind = BodyPlaces(x_m=(-1.0, -0.2), relative_to="rear", step_m=0.3).positions_m(CAR)
     assert behind.min(0) == pytest.approx([-3.0, -1.0])
     assert behind.max(0) == pytest.approx([-2.2, 1.0])
     assert np.diff(np.unique(behind[:, 0].round(9))).max() <= 0.3
     assert len(np.unique(behind.round(9), axis=0)) == len(behind) == 4 * 8
-    beside = Places(y_m=(0.5, 1.0), relative_to="left", step_m=1.0).positions_m(CAR)
+    beside = BodyPlaces(y_m=(0.5, 1.0), relative_to="left", step_m=1.0).positions_m(CAR)
     assert beside.min(0).tolist() == [-2.0, 1.5]  # of the vehicle's length
-    triangle = Places(polygon_m=((0, 0), (4, 0), (0, 4)), step_m=1.0).positions_m(CAR)
+    triangle = BodyPlaces(polygon_m=((0, 0), (4, 0), (0, 4)), step_m=1.0).positions_m(CAR)
     assert len(triangle) == 15  # on its border, too
     assert (triangle.sum(axis=1) <= 4).all()
-    line = Places(line_m=((3, -1), (3, 1), (5, 1)), step_m=0.6).positions_m(CAR)
+    line = BodyPlaces(line_m=((3, -1), (3, 1), (5, 1)), step_m=0.6).positions_m(CAR)
     assert len(line) == 8
     assert np.linalg.norm(np.diff(line, axis=0), axis=1).max() <= 0.6
-    assert Places(points_m=((1, 2),), relative_to="front").positions_m(CAR).tolist() == [[3.0, 2.0]]
-    around = Places(within_m=1.0, step_m=0.5)
+    assert BodyPlaces(points_m=((1, 2),), relative_to="front").positions_m(CAR).tolist() == [[3.0, 2.0]]
+    around = BodyPlaces(within_m=1.0, step_m=0.5)
     each = [around.model_copy(update={"sides": (side,)}).positions_m(CAR) for side in SIDES]
     everywhere = around.positions_m(CAR)
     away = np.linalg.norm(everywhere - np.clip(everywhere, (-2, -1), (2, 1)), axis=1)
@@ -110,9 +112,14 @@ def test_bodies_are_put_where_a_place_says():
         ({"region": "20m", "height": "ground", "number": "radius", "most": 1}, "is 'radius_m' meant"),
         ({"region": "20m", "height": "ground", "number": "radius_m"}, "nothing is required"),
         (
+            {"region": "20m", "height": "ground", "number": "detection_0.4m", "least": 90},
+            "a share of at most 1; got 90",
+        ),
+        (
             {"region": "20m", "height": "ground", "number": "radius_m", "most": 1, "least": 2},
             "at least 2 and at most 1",
         ),
+        ({"region": "20m", "height": "ground", "number": "radius_maximum_m", "most": 1, "without": "any"}, "without: "),
         ({"encounters": "crosing_like", "ttc_s": 1}, "is 'crossing_like' meant"),
         ({"encounters": "crossing_like"}, "nothing is required"),
     ],
@@ -182,7 +189,7 @@ def test_what_is_judged_is_what_a_survey_sees():
     assert {v.bound.key: v.value for v in lidars}["points"] == seen.sensor_points[:2].sum(axis=0).min()
     # The mast hides all of it from the LiDAR behind it: whether or not what stands on it has failed.
     assert {v.bound.key: v.value for v in top}["points"] == seen.sensor_points[0].min() == 0
-    assert [v.count for v in top] == [4 * len(raster.positions_m)] * 4
+    assert [v.count for v in top] == [2 * len(raster.positions_m)] * 4  # without it, and without nothing
 
 
 def test_where_a_body_cannot_stand_a_point_is_unknown_and_an_area_goes_without():
@@ -194,38 +201,55 @@ def test_where_a_body_cannot_stand_a_point_is_unknown_and_an_area_goes_without()
     assert 0 < found[1].count < 2 * 26
 
 
+def test_a_kind_that_the_rig_has_not_sees_nothing_and_a_place_that_holds_nobody_is_not_checked():
+    tight = {**AHEAD, "at": {"within_m": 0.01}}
+    found = check(rig(), asked({**AHEAD, "by": "camera"}, tight), world()).verdicts["small"]
+    assert [(one.state, one.count) for one in found] == [("not kept", 1), ("not checked", 0)]
+    assert found[0].margin == -5.0
+    with pytest.raises(ValueError, match="at least one rig"):
+        check([], asked(AHEAD))
+
+
 def test_numbers_of_regions_are_those_of_evaluate():
     regions = {"near": {"x_m": [2.5, 8.0], "y_m": [-2.0, 2.0]}}
     keys = {"regions": regions, "grid": {"x_m": [-4, 9], "y_m": [-4, 4], "cell_m": 1.0}}
-    one = {"region": "near", "height": "ground", "without": ["top"]}
+    one = {"region": "near", "height": "ground", "without": ["front"]}
     found = check(
         THREE,
-        asked({**one, "number": "detection_0.3m", "least": 0.1}, {**one, "number": "radius_m", "most": 1e-6}, **keys),
+        asked({**one, "number": "detection_0.3m", "least": 0.001}, {**one, "number": "radius_m", "most": 1e-6}, **keys),
         world(), steps=12, workers=0,
     ).verdicts["small"]  # fmt: skip
     asking = RegionsOfInterest.model_validate(keys)
     result = evaluate(THREE, world(), steps=12, workers=0, thresholds_m=0.3, redundancy=True, ask=asking)
     (row,) = (row for row in result.summary if row["height"] == "ground")
     for verdict, key, worse in zip(found, ("detection_0.3m", "radius_m"), (min, max), strict=True):
-        assert verdict.value == worse(row[key], row[f"{key}_without_top"])
+        assert verdict.value == worse(row[key], row[f"{key}_without_front"]) != row[key]
         assert verdict.count == 2
-    assert [verdict.state for verdict in found] == ["kept", "not kept"]
+    assert found[0].where[0] == "near ground without front"
 
 
 def test_times_to_collision_are_the_latest_of_all_phases(tmp_path):
     box = tmp_path / "box.yaml"
     box.write_text("name: box\nparts: [{name: b, shape: {type: box, size_m: [4, 2, 1]}}]\n")
-    walker = {"body": "child", "speed_kmh": 5, "from_m": 2}
-    crossings = {"name": "two", "encounters": [{"name": "a", "ego": {"speed_kmh": [20, 60]}, "other": walker}]}
-    one = {"encounters": crossings, "ttc_s": 0.5, "in_time": {"deceleration": 4, "latency_s": 1.0}, "without": ["mast"]}
+    walker = {"body": "child", "speed_kmh": 5, "from_m": 4}
+    crossings = {"name": "two", "encounters": [{"name": "a", "ego": {"speed_kmh": [10, 30]}, "other": walker}]}
+    looks = {"points": 1, "pixels": 20, "looks": 2}
+    one = {
+        "encounters": crossings,
+        **looks,
+        "ttc_s": 0.5,
+        "in_time": {"deceleration": 4, "latency_s": 1.0},
+        "without": ["mast"],
+    }
     requirements = asked(one)
     ttc, spare = check(THREE, requirements, vehicle=box).verdicts["small"]
-    seen = encounter(THREE, requirements.requirements[0].encounters, vehicle=box).sightings
+    seen = encounter(THREE, requirements.requirements[0].encounters, Criterion(**looks), vehicle=box).sightings
     latest_s = [min(one.ttc_s.min(), one.without_ttc_s[1].min()) for one in seen]
     needed_s = [one.encounter.closing_mps / 8 + 1.0 for one in seen]
     assert (ttc.value, ttc.count) == (min(latest_s), 4)
+    assert 0.0 < ttc.value < min(one.ttc_s.max() for one in seen)
     assert spare.value == pytest.approx(min(np.subtract(latest_s, needed_s)))
-    assert "at 60 km/h" in spare.where[0]
+    assert "at 30 km/h" in spare.where[0]
 
 
 @pytest.mark.parametrize(

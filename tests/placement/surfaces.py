@@ -50,7 +50,8 @@ class Surface:
         offset = self.tilt[numbers] @ np.array([mount.x_m, mount.pitch_deg / 10])
         share = self.worth(rig)[None] + self.level[numbers] + offset + shift
         share = np.where(self.blind, np.nan, share)
-        found = estimate_of(share[:, : len(self.objectives)], self.world_of[numbers])
+        share = share[:, np.arange(len(self.objectives)) % QUESTIONS]  # what nobody asked for is near or far, too
+        found = estimate_of(share, self.world_of[numbers])
         named = [one._replace(key=name) for one, name in zip(found.quantities, self.objectives, strict=True)]
         return type(found)(tuple(named), found.value, found.left_out, found.steps)
 
@@ -65,8 +66,8 @@ class Surface:
         self.scored += self.order.tolist()
         return {"area": self._estimate(rig, self.order), "known": self._estimate(rig, self.order, shift=-0.1)}
 
-    def anew(self, seed, worlds):
-        return Surface(seed, worlds, 3, self.worth, self.noise, self.objectives, estimate=self.estimate)
+    def anew(self, seed, worlds, more):
+        return Surface(seed, worlds, 3, self.worth, self.noise, {**self.objectives, **more}, estimate=self.estimate)
 
     def close(self):
         self.closed = True
@@ -89,7 +90,7 @@ def plan(**settings):
     worth = settings.pop("worth", near_far)
     blind = settings.pop("blind", False)
     makes = lambda space, plan, seed, worlds: Surface(  # noqa: E731
-        seed, worlds, plan.per_world, worth, objectives=space.objectives, blind=blind, estimate=plan.estimate
+        seed, worlds, plan.per_world, worth, objectives=space.asked, blind=blind, estimate=plan.estimate
     )
     budget = {} if "budget_s" in settings else {"evaluations": 20}
     return SearchPlan(**{**budget, "instants": makes, **settings})

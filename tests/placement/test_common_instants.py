@@ -50,7 +50,7 @@ def test_ideal_sensors_have_a_point_for_every_hit():
     points = [[len(frame.sensor) for frame in of.frames(short)] for of in (ideal, real)]
     assert points[0] == [len(frame.sensor) for frame in real.frames(rig(name=short.name))]
     assert points[1][0] < points[0][0]
-    assert ideal.anew(1, 1).sensor_model == "ideal"
+    assert ideal.anew(1, 1, {}).sensor_model == "ideal"
 
 
 def test_rays_that_change_no_objective_are_not_cast_and_change_none(monkeypatch):
@@ -261,4 +261,4 @@ def test_a_recording_is_one_world_for_any_seed_and_none_of_it_is_fresh():
     with held(["tracks_table"], {"near": Objective(region="20m", band="ground")}, worlds=3, every_s=0.5) as recorded:
         assert [instant.world for instant in recorded.instants] == [0, 0]
         with pytest.raises(ValueError, match="one whose worlds are drawn is needed; 'tracks_table' is the same"):
-            recorded.anew(9, 3)
+            recorded.anew(9, 3, {})

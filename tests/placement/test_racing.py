@@ -5,7 +5,8 @@ import pytest
 from scipy import stats
 
 from tests.placement.worlds import estimate_of, held, lidar, prefixes_of, rig, yard
-from torchcover.placement import Objective, fresh_test, race, racing_order
+from torchcover.placement import Objective, fresh, fresh_test, race, racing_order
+from torchcover.placement.fresh import SideEffect, _others, holm
 from torchcover.placement.racing import gains
 
 WORLDS, PER_WORLD = 6, 3
@@ -127,27 +128,57 @@ def test_a_number_that_is_by_no_choice_of_estimate_is_tested_once():
     keys = {"near": "radius_m", "largest": "radius_maximum_m", "cells": "known_radius_m"}
     objectives = {name: Objective(number=key, region="20m") for name, key in keys.items()}
     with held(objectives=objectives, estimate="known", worlds=2) as searched:
-        found = fresh_test({"higher": high}, low, searched, test_seed=1, worlds=2)["higher"]
+        found = fresh_test({"higher": high}, low, searched, test_seed=1, worlds=2).gains["higher"]
     said = [("near", "known"), ("largest", "-"), ("cells", "known"), ("near", "area")]
     assert [(gain.objective, gain.estimate) for gain in found] == said
 
 
 def test_the_fresh_test_is_about_other_worlds_and_says_what_was_optimism(instants):
     low, high = rig(lidar(mount={"z_m": 1.6}), name="low"), rig(lidar(mount={"z_m": 2.4}), name="high")
-    found = fresh_test({"higher": high}, low, instants, test_seed=1, worlds=8)["higher"]
-    fresh = held(seed=1, worlds=8)
+    test = fresh_test({"higher": high}, low, instants, test_seed=1, worlds=8)
+    found, others = test.gains["higher"], _others(instants.objectives, failures=False)[0]
+    anew = held(seed=1, worlds=8, objectives={**instants.objectives, **others})
     assert [(gain.objective, gain.estimate) for gain in found] == [
         (name, measure) for measure in ("area", "known") for name in ("near", "far", "bay")
     ]
+    by_test, by_search = ([of.estimates(one) for one in (high, low)] for of in (anew, instants))
     for gain in found:
-        expected = fresh.estimates(high)[gain.estimate].differences(fresh.estimates(low)[gain.estimate])
-        in_search = instants.estimates(high)[gain.estimate].minus(instants.estimates(low)[gain.estimate])
+        expected = by_test[0][gain.estimate].differences(by_test[1][gain.estimate])
+        in_search = by_search[0][gain.estimate].minus(by_search[1][gain.estimate])
         column = ["near", "far", "bay"].index(gain.objective)
         np.testing.assert_equal(gain.test, expected[gain.objective])
         assert gain.search_gain == float(in_search.value[column])
         np.testing.assert_equal(gain.optimism, gain.search_gain - expected[gain.objective].value)
     assert found[1].test.p < 0.5
+    assert {change.what for change in test.changes} == others.keys()
+    # What an objective is made of sums up to it, whatever else the parts are.
+    for name in ("near", "far", "bay"):
+        shares = [change.shares[name] for change in test.changes if name in change.shares]
+        assert len(shares) == len(instants.objectives[name].places)
+        assert sum(shares) == pytest.approx(1)
     with pytest.raises(ValueError, match="seed: another one than that of these worlds is needed; got 0 for both"):
-        instants.anew(0, worlds=4)
+        instants.anew(0, 4, {})
     with pytest.raises(ValueError, match="one whose worlds are drawn is needed; 'yard' is the same for any seed"):
-        held([yard()], {"far": instants.objectives["far"]}).anew(1, worlds=4)
+        held([yard()], {"far": instants.objectives["far"]}).anew(1, 4, {})
+
+
+def test_of_twenty_searches_that_change_nothing_at_most_one_says_that_something_got_worse():
+    draws, alarms = np.random.default_rng(0), 0
+    for _ in range(200):
+        shared = draws.normal(0.0, 1.0, (16, 4)) @ draws.normal(0.0, 1.0, (4, 33))  # regions overlap
+        one, other = (estimate_of(shared + draws.normal(0.0, 0.5, (16, 33)), np.arange(16)) for _ in range(2))
+        tests = list(one.differences(other).values())
+        changes = [
+            SideEffect("a", test, p, {}) for test, p in zip(tests, holm([test.p for test in tests]), strict=True)
+        ]
+        alarms += any(change.is_worse for change in changes)
+    assert alarms <= 10
+
+
+def test_targets_are_counted_around_the_vehicle(instants, monkeypatch):
+    monkeypatch.setattr(fresh, "TARGETS", ("child",))
+    low, high = rig(lidar(mount={"z_m": 1.6}), name="low"), rig(lidar(mount={"z_m": 2.4}), name="high")
+    (change,) = fresh._of_targets(high, low, instants).values()
+    assert change.gain > 0
+    assert change.p < 0.05
+    assert change.blocks == 16

@@ -149,7 +149,8 @@ def test_an_object_that_turns_only_its_inner_side_to_a_place_hides_itself():
     mesh = Box(type="box", size_m=(20.0, 20.0, 20.0)).mesh()
     place_m = np.array([1.0, 2.0, 3.0])
     away = Bounds(np.full((1, 3), 90.0), np.full((1, 3), 99.0))
-    strata = SurfaceStrata(Patches.of(mesh).given_to(0), away)
+    patches = Patches.of(mesh)
+    strata = SurfaceStrata(patches._replace(of_object=np.zeros_like(patches.of_object)), away)
     drawn = strata.draw(place_m, 5.0, np.random.default_rng(0), on_objects=50)
     assert drawn.of_object.tolist() == [0] * 50
     instant = Scene(World((mesh,), EGO)).at(0)

@@ -35,7 +35,7 @@ def disk(monkeypatch, tmp_path):
         return world(self, seed, episode, ego)
 
     monkeypatch.setattr(Scenario, "world", counted)
-    return lambda: sorted((tmp_path / "cache" / "torchcover").glob("*")), built
+    return lambda: sorted((tmp_path / "cache" / "torchcover" / "worlds").glob("*")), built
 
 
 def world_of(scenario, run=0, seed=0, **keys):
@@ -232,8 +232,8 @@ def full_at_once(monkeypatch, tmp_path):
 
 
 def of_others(monkeypatch, tmp_path):
-    (tmp_path / "cache" / "torchcover").mkdir(parents=True)
-    (tmp_path / "cache" / "torchcover").chmod(0o777)
+    (tmp_path / "cache" / "torchcover" / "worlds").mkdir(parents=True)
+    (tmp_path / "cache" / "torchcover" / "worlds").chmod(0o777)
 
 
 @pytest.mark.parametrize("lacks", [no_home, a_file, read_only, full_from_the_start, full_at_once, of_others])

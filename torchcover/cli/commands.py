@@ -219,7 +219,9 @@ def check(
     requirements: Annotated[str, typer.Option(help="What they must see: a built-in set or a YAML file.")],
     scenario: Annotated[
         str | None,
-        typer.Option(help="World of requirements that name none (regions: courtyard; bodies: flat ground, no more)."),
+        typer.Option(
+            help="World in place of the file's (which has for regions the courtyard, for bodies flat ground)."
+        ),
     ] = None,
     out: options.Out = Path("out/check"),
     **settings: Any,  # noqa: ANN401
@@ -256,6 +258,9 @@ def encounter(
     ] = None,
     phases: Annotated[int, typer.Option(min=1, help="Of a set: at how many places of their period looks begin.")] = 10,
     worlds: Annotated[int, typer.Option(min=1, help="Of a scenario: how many of its worlds are driven through.")] = 16,
+    film: Annotated[
+        Path | None, typer.Option(help="Of a set: film what the first rig detects latest, as a .gif or .mp4 file.")
+    ] = None,
     out: options.Out = Path("out/encounters"),
     files: options.Files = options.ALL_FILES,
     **settings: Any,  # noqa: ANN401
@@ -265,12 +270,17 @@ def encounter(
 
     from torchcover.cli.printing import in_words, print_files, print_whole
     from torchcover.encounters import Criterion
-    from torchcover.evaluation import encounter, met_in_recording, met_in_traffic, save_encounters
+    from torchcover.evaluation import encounter, encounter_film, met_in_recording, met_in_traffic, save_encounters
     from torchcover.files import claimed
+    from torchcover.report import check_film, write_film
 
     criterion = Criterion(**{name: settings.pop(name) for name in Criterion.__annotations__})
     if frames is not None and (rigs or scenario is not None):
         raise ValueError("--frames: a recording has its own rigs and traffic; leave out rigs and --scenario")
+    if film is not None:
+        check_film(film)
+        if frames is not None or scenario is not None:
+            raise ValueError("--film: of a set only; leave out --frames and --scenario")
     with claimed(out):
         if frames is not None:
             found = met_in_recording(frames, criterion)
@@ -279,6 +289,9 @@ def encounter(
         else:
             found = encounter(rigs or (), encounters, criterion, phases=phases, progress=True, **settings)
         written = save_encounters(found, out, files=files)
+    if film is not None:
+        told = {name: settings.get(name) for name in ("vehicle", "sensor_model")}
+        write_film(film, encounter_film((rigs or [])[0], found, **told), per_s=10)
     print_whole([in_words(table) for table in found.tables()])
     print_files(written, out, Console())
 
@@ -293,7 +306,7 @@ def search(
         int | None, typer.Option(min=1, help="Candidates instead of a time: the same ones whatever the machine.")
     ] = None,
     optimiser: Annotated[
-        str, typer.Option(help="auto, gp (Gaussian process), cmaes (extra `search`), enumerate (choices) or random.")
+        str, typer.Option(help="auto, gp (Gaussian process), enumerate (choices) or random.")
     ] = "auto",
     estimate: Annotated[
         Literal["area", "known"],

@@ -53,7 +53,7 @@ def run(
         written = report.save(out, files=files)
         if not resume:
             (out / CHECKPOINT).unlink(missing_ok=True)  # there is nothing left that would go on from it
-    print_whole([in_words(report.tables[0])])
+    print_whole([in_words(table) for table in report.tables[:2]])
     console = Console()
     print_files(written, out, console)
     console.print(report.sentence, markup=False, soft_wrap=True)
@@ -82,4 +82,4 @@ def _chosen(path: Path, out: Path, *, resume: bool, **settings: Any) -> SensorCh
         raise ValueError(f"{', '.join(useless)}: the {CHOICE_KEY} of this file are all looked at; leave it out")
     space, plan = ChoiceSpace.load(path), SearchPlan(**settings | {"budget_s": math.inf})
     with common_instants(space, plan, plan.seed, plan.worlds) as instants:
-        return choose(space, instants, test_seed=plan.seed_of_test, fresh_worlds=plan.fresh_worlds)
+        return choose(space, instants, test_seed=plan.seed_of_test, fresh_worlds=plan.fresh_worlds, progress=True)

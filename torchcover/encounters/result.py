@@ -29,11 +29,12 @@ class EncounterRow(NamedTuple):
     """A rig in one encounter at one speed, or in all that were drawn or met; 0 s if it was too late.
 
     `ttc_s` is the mean time to collision at detection over phases and draws, of which `ttc_s_low` is the least and
-    `ttc_s_high` the most. `needed_s` is the most of any draw, `in_time` the share of phases and draws,
-    `from_the_beginning` that in which it was seen as soon as it began, and may have been before. `first` is the sensor
-    that alone is first in the mean; of the sensors that may fail, one at a time, `worst` is that without which the
-    least time is left, `without_worst_s`. Of traffic, `per_hour` says how many were met. Intervals of 95 % are over
-    draws or worlds, NaN of fewer than 8: `interval_low` and `interval_high` that of `ttc_s`.
+    `ttc_s_high` the most. `needed_s` is the most of any draw, `in_time` the share of phases and draws, `never` that
+    without detection, `from_the_beginning` that in which it was seen as soon as it began, and may have been before.
+    `first` is the sensor that alone is first in the mean; of the sensors that may fail, one at a time, `worst` is that
+    without which the least time is left, `without_worst_s`: the least of all, of traffic the mean. Of traffic,
+    `per_hour` says how many were met. Intervals of 95 % are over draws or worlds, NaN of fewer than 8: `interval_low`
+    and `interval_high` that of `ttc_s`.
     """
 
     rig: str
@@ -48,6 +49,7 @@ class EncounterRow(NamedTuple):
     interval_low: float
     interval_high: float
     in_time: float
+    never: float
     from_the_beginning: float
     from_the_beginning_low: float
     from_the_beginning_high: float
@@ -97,10 +99,12 @@ class Sightings:
         return [self._row(list(order)[key[0]], list(rigs)[key[2]], groups[key]) for key in sorted(groups)]
 
     def _row(self, name: str, rig: str, draws: list[Sighting]) -> EncounterRow:
-        sensors, none = self.sensors[rig], [np.zeros(self.phases)]
-        ttc_s = np.stack([one.ttc_s for one in draws] or none)
-        alone_s = np.mean([one.sensor_ttc_s for one in draws] or [none * len(sensors)], axis=(0, 2))
-        without_s = np.min([one.without_ttc_s for one in draws] or [none * len(sensors)], axis=(0, 2))
+        sensors = self.sensors[rig]
+        none = np.zeros((1, len(sensors), self.phases))
+        ttc_s = np.stack([one.ttc_s for one in draws] or [none[0, 0]])
+        alone_s = np.mean([one.sensor_ttc_s for one in draws] or none, axis=(0, 2))
+        least = np.mean if self.hours else np.min
+        without_s = least([one.without_ttc_s for one in draws] or none, axis=(0, 2))
         numbers = self._numbers(draws)
         swept = bool(draws) and draws[0].encounter.speed_is_swept
         return EncounterRow(
@@ -116,6 +120,7 @@ class Sightings:
             interval_low=numbers["ttc_s"].low,
             interval_high=numbers["ttc_s"].high,
             in_time=float(np.mean([one.in_time for one in draws])) if draws else math.nan,
+            never=float((ttc_s == 0).mean()),
             from_the_beginning=numbers["from_the_beginning"].value,
             from_the_beginning_low=numbers["from_the_beginning"].low,
             from_the_beginning_high=numbers["from_the_beginning"].high,
@@ -164,7 +169,8 @@ class Sightings:
         """All of it, for JSON."""
         up_to = [{"encounter": name, "rig": rig, "in_time_up_to_kmh": v} for (name, rig), v in self.up_to_kmh().items()]
         rows = [row._asdict() for row in self.rows]
-        met = [{"rig": one.rig, "world": one.world, "who": one.encounter.name, **one.encounter.told,
+        met = [{"rig": one.rig, "world": one.world, "who": one.encounter.name, "name": one.encounter.track.name,
+                "step": one.encounter.step, "least_s": float(one.encounter.ttc_s.min()),
                 "ttc_s": float(one.ttc_s[0]), "in_time": bool(one.in_time[0])}
                for one in self.sightings if isinstance(one.encounter, Approach)]  # fmt: skip
         listed = {"rows": rows, "speeds": [] if self.hours else up_to, "met": met}
@@ -204,7 +210,7 @@ class Sightings:
         notes = [
             f"Met: came within {within_s:g} s of a collision, if both had gone straight on, in "
             f"{60 * sum(self.hours.values()):.0f} minutes. Detected before that, with a 95 % interval over "
-            f"{len(self.hours)} worlds (of 8 or more); the least time to collision at detection; - is never.",
+            f"{len(self.hours)} worlds (of 8 or more), or at the least time to collision, or never.",
             f"{self.criterion.words} Too late: it was needed before.",
             *([] if self.sightings else ["Nobody was met: drive longer (--worlds), or elsewhere."]),
         ]
@@ -238,7 +244,7 @@ def _cells(row: EncounterRow) -> list[str]:
 
 
 def _speed(row: EncounterRow) -> str:
-    return "drawn" if math.isnan(row.speed_kmh) else f"{row.speed_kmh:g}"
+    return f"{row.speed_kmh:g}" if row.speed_kmh == row.speed_kmh else "drawn" if math.isnan(row.per_hour) else "any"
 
 
 def _time(row: EncounterRow) -> str:
@@ -259,9 +265,10 @@ def _with_interval(row: EncounterRow, key: str, words: Callable[[float], str]) -
 def _met(row: EncounterRow) -> str:
     if row.draws == 0:
         return "-"
-    least = "" if row.from_the_beginning == 1 else f", least {row.ttc_s_low:.2f} s" if row.ttc_s_low else ", least -"
-    late = "" if row.in_time == 1 else f", {round((1 - row.in_time) * row.draws)} too late"
-    return f"{_with_interval(row, 'from_the_beginning', percent)} %{least}{late}"
+    least = f", least {row.ttc_s_low:.2f} s" if row.from_the_beginning < 1 and row.never == 0 else ""
+    counts = ((row.never, "never"), (1 - row.in_time, "too late"))
+    told = [f", {round(share * row.draws)} {word}" for share, word in counts if share]
+    return f"{_with_interval(row, 'from_the_beginning', percent)} %{least}{''.join(told)}"
 
 
 def _speeds(up_to_kmh: dict[tuple[str, str], float], rigs: Sequence[str]) -> PageTable:
@@ -280,5 +287,5 @@ def _sensors(rows: Sequence[EncounterRow]) -> PageTable:
                           f"{row.without_worst_s:.2f}" if row.without_worst_s else "-", f"{row.needed_s:.2f}")))
         for row in rows
     ]  # fmt: skip
-    headings = ("rig", "encounter", "km/h", "first", "worst to lose", "least without\n(s)", "needed\n(s)")
+    headings = ("rig", "encounter", "km/h", "first", "worst to lose", "without\n(s)", "needed\n(s)")
     return PageTable("Sensors: which alone is first, and what is left without one", headings, cells, words_first=2)

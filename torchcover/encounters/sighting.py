@@ -4,7 +4,7 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +21,12 @@ from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.sensor import Draws, Sensor
 from torchcover.simulation.sight import Ends, MountedSensor, sight
+from torchcover.simulation.stage import mounted_on
 from torchcover.targets.counting import Beams, Met, measured_points, meetings
 from torchcover.targets.steps import SensorStep
+
+if TYPE_CHECKING:
+    from torchcover.encounters.traffic import Approach
 
 Float64 = NDArray[np.float64]
 Numbers = NDArray[np.int64]
@@ -37,30 +41,6 @@ RADAR_POINTS = 1
 NEVER = np.iinfo(np.int64).max
 
 
-class AnyEncounter(Protocol):
-    """One of a set, or one that happened."""
-
-    @property
-    def name(self) -> str:
-        """What tables call it, or whom the ego met."""
-        ...
-
-    @property
-    def speed_kmh(self) -> float:
-        """Of the ego."""
-        ...
-
-    @property
-    def speed_is_swept(self) -> bool:
-        """Whether tables have a row for this speed."""
-        ...
-
-    @property
-    def closing_mps(self) -> float:
-        """What the brakes must take away."""
-        ...
-
-
 class Sighting(NamedTuple):
     """What a rig had of an encounter, for P phases of its looks and S sensors; 0 is not before the collision.
 
@@ -69,7 +49,7 @@ class Sighting(NamedTuple):
     encounter began, and the other may have been there before.
     """
 
-    encounter: AnyEncounter
+    encounter: "Encounter | Approach"
     rig: str
     ttc_s: Float64
     in_time: Bools
@@ -102,23 +82,9 @@ class MountedRig:
         weather = self.rig.weather or encounter.weather
         key = weather.model_dump_json()
         if key not in self._mounted:
-            sensors = [_at_once(sensor) for sensor in self.rig.sensors]
-            for sensor in sensors:
-                if scene.encloses(sensor.mount.matrix()[:3, 3]):
-                    raise ValueError(
-                        f"rig {self.rig.name!r}: sensor {sensor.name!r} lies inside the vehicle "
-                        f"{self._scenario.ego_name!r}; move its mount, or use its own vehicle (--vehicle)"
-                    )
-            self._mounted[key] = [
-                MountedSensor(
-                    sensor,
-                    scene,
-                    self._scenario.reach_m(sensor, weather),
-                    weather,
-                    [other for other in sensors if other is not sensor],
-                )
-                for sensor in sensors
-            ]
+            at_once = [_at_once(sensor) for sensor in self.rig.sensors]
+            here = self.rig.model_copy(update={"sensors": at_once, "weather": weather})
+            self._mounted[key] = mounted_on(scene, self._scenario, self.rig.name, here)
         return self._mounted[key]
 
     def check_rates(self, looks: int, staged: Staged) -> None:
@@ -174,22 +140,11 @@ def sight_encounter(
             is_enough, look_steps(sensors[k].rate_hz, phases, staged.contact_s), criterion.looks
         ),
     )
-    ttc_s = [np.where(steps < NEVER, staged.contact_s - STEP_S * steps, 0.0) for steps in found]
+    ttc_s, alone_s, without_s = (np.where(steps < NEVER, staged.contact_s - STEP_S * steps, 0.0) for steps in found)
     longest_s = max((criterion.looks / sensor.rate_hz for sensor in sensors), default=0.0)
-    from_the_beginning = (ttc_s[0] > staged.contact_s - longest_s) & (encounter.before_s == encounter.seconds)
-    in_time = ttc_s[0] >= criterion.needed_s(encounter.closing_mps)
-    return Sighting(encounter, mounted_rig.rig.name, ttc_s[0], in_time, *ttc_s[1:], from_the_beginning)
-
-
-class Detections(NamedTuple):
-    """The step of the look at which it is detected, or `NEVER`, for P phases and S sensors.
-
-    By `all_together` (P,), each `alone` (S, P), and all but each, `without` (S, P).
-    """
-
-    all_together: Numbers
-    alone: Numbers
-    without: Numbers
+    from_the_beginning = (ttc_s > staged.contact_s - longest_s) & (encounter.before_s == encounter.seconds)
+    in_time = ttc_s >= criterion.needed_s(encounter.closing_mps)
+    return Sighting(encounter, mounted_rig.rig.name, ttc_s, in_time, alone_s, without_s, from_the_beginning)
 
 
 def detections(
@@ -197,8 +152,8 @@ def detections(
     enough: Sequence[int],
     points: Callable[[Sequence[int], Numbers], Numbers],
     first: Callable[[IsEnough, int], Numbers],
-) -> Detections:
-    """When sensors detect somebody: together, alone, and without each.
+) -> tuple[Numbers, Numbers, Numbers]:
+    """At which step S sensors detect somebody, or `NEVER`: together (P,), each alone (S, P), and without each (S, P).
 
     Args:
         kinds: Of each sensor: those of one kind count together.
@@ -219,7 +174,7 @@ def detections(
 
     together = of(everything)
     without = [of([other for other in everything if other != k]) for k in everything]
-    return Detections(together, np.stack([of([k]) for k in everything]), np.stack(without))
+    return together, np.stack([of([k]) for k in everything]), np.stack(without)
 
 
 def enough_of(criterion: Criterion, sensor: Sensor) -> int:

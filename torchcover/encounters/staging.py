@@ -8,14 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.encounters.encounter import Encounter, Obstacle, Way
-from torchcover.geometry import BoundingBox, contact_s, invert, outlines_at
+from torchcover.geometry import BoundingBox, contact_s, invert, outlines_at, overlapping
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.bodies import Shape, called, mover_mesh
 from torchcover.simulation.moving import Solid, Solids
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.shapes import Plane
 from torchcover.simulation.world import Actor, World
-from torchcover.targets.placing import overlapping, poses
+from torchcover.targets.placing import poses
 
 Float64 = NDArray[np.float64]
 
@@ -73,8 +73,8 @@ class Staged:
         pose: Float64 = invert(self.world_T_ego(times_s)) @ self.world_T_other(times_s)
         return pose
 
-    def scene(self, solids: Solids) -> Scene:
-        """All but the other, with a time step of a millisecond."""
+    def scene(self, solids: Solids, *, whole: bool = False) -> Scene:
+        """All but the other, or the `whole`, with a time step of a millisecond."""
         steps = math.ceil(self.contact_s / STEP_S)
         times_s = np.linspace(0.0, steps * STEP_S, 1 + math.ceil(steps * STEP_S / BEND_S))
         along = Trajectory.from_poses(times_s, self.world_T_ego(times_s))
@@ -83,7 +83,9 @@ class Staged:
         ground = Plane(type="plane", size_m=(GROUND_M, GROUND_M)).mesh().made_of("road")
         static = (ground, *(solid_of(one.body).mesh.moved(pose) for one, pose in self.obstacles))
         ego = Actor("ego", "ego", self.ego.mesh, drive)
-        return Scene(World(static, ego, time_step_s=STEP_S, duration_s=steps * STEP_S, ground=(0,)), solids)
+        way = Trajectory.from_poses(times_s, self.world_T_other(times_s))
+        others = (Actor("other", called(self.encounter.other.body), self.other.mesh, way),) if whole else ()
+        return Scene(World(static, ego, others, STEP_S, steps * STEP_S, ground=(0,)), solids)
 
     def _placed_obstacles(self) -> list[tuple[Obstacle, Float64]]:
         """Each and its (4, 4) pose: rows on either side of the ego's way, before and beyond the other."""

@@ -1,6 +1,6 @@
 """Encounters that happen in traffic: who comes within a time to collision, and when sensors first had enough of him."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import NamedTuple, Self
 
@@ -17,6 +17,7 @@ from torchcover.recordings.objects import Track, class_of, objects_of
 from torchcover.recordings.recording import Recording
 from torchcover.simulation.rays import Balls
 from torchcover.simulation.simulator import Simulator
+from torchcover.simulation.traffic.fleet import REAR_OF
 from torchcover.simulation.world import World
 
 Float64 = NDArray[np.float64]
@@ -41,8 +42,9 @@ SCANS = 8
 
 def who(track: Track) -> str:
     """What tables call a road user; a rider who has a box of his own by what he rides, as in Argoverse 2."""
-    rides = {"bicyclist": "bicycle", "motorcyclist": "motorcycle"}.get(track.category.lower(), track.vehicle_class)
-    return next((name for name, classes in WHO.items() if rides in classes), "others")
+    word = track.category.lower().split(".")[-1]
+    kind = {"bicyclist": "bicycle", "motorcyclist": "motorcycle", "trailer": "truck"}.get(word, track.vehicle_class)
+    return next((name for name, kinds in WHO.items() if kind in kinds), "others")
 
 
 class Drive(NamedTuple):
@@ -54,7 +56,6 @@ class Drive(NamedTuple):
         world_T_ego: (T, 4, 4) the vehicle frame at each.
         ego: The box of the vehicle in it.
         tracks: The other road users.
-        parked: How many vehicles were left out, for they never moved.
     """
 
     name: str
@@ -62,7 +63,6 @@ class Drive(NamedTuple):
     world_T_ego: Float64
     ego: BoundingBox
     tracks: Sequence[Track]
-    parked: int = 0
 
     @classmethod
     def of_world(cls, name: str, world: World) -> Self:
@@ -73,7 +73,7 @@ class Drive(NamedTuple):
             size_m = BoundingBox.around(actor.mesh.vertices_m).size_m
             tracks.append(Track(actor.name, actor.category, class_of(actor.category), size_m, actor.trajectory))
         ego = BoundingBox.around(world.ego.mesh.vertices_m)
-        return cls(name, times_s, world.ego.trajectory.at_each(times_s), ego, tracks, len(world.parked))
+        return cls(name, times_s, world.ego.trajectory.at_each(times_s), ego, tracks)
 
     @classmethod
     def of_recording(cls, recording: Recording) -> Self:
@@ -89,14 +89,13 @@ class Drive(NamedTuple):
         if not users:
             count = len(recorded.tracks)
             raise ValueError(f"{recording.path}: none of its {count} objects is a road user, by their categories")
-        parked = [
-            who(track) not in ("on foot", "on bicycles")
-            and bool(np.linalg.norm(np.ptp(track.trajectory.positions_m[:, :2], axis=0)) < PARKED_M)
-            for track in users
+        ways_m = [np.linalg.norm(np.ptp(track.trajectory.positions_m[:, :2], axis=0)) for track in users]
+        users = [
+            track
+            for track, way_m in zip(users, ways_m, strict=True)
+            if way_m >= PARKED_M or who(track) in ("on foot", "on bicycles")
         ]
-        moving = [track for track, still in zip(users, parked, strict=True) if not still]
-        ego = recorded.egos[0]
-        return cls(recording.path.name, ego.times_s, ego.world_T_ego, recording.body, moving, sum(parked))
+        return cls(recording.path.name, recorded.egos[0].times_s, recorded.egos[0].world_T_ego, recording.body, users)
 
 
 class Approach(NamedTuple):
@@ -115,15 +114,13 @@ class Approach(NamedTuple):
     closing_mps: float
     speed_is_swept: bool = False
 
-    @property
-    def told(self) -> dict[str, object]:
-        """Who it was, and when, for JSON."""
-        least_s = float(self.ttc_s.min())
-        return {"name": self.track.name, "category": self.track.category, "step": self.step, "least_s": least_s}
 
+def approaches(drive: Drive, criterion: Criterion) -> list[Approach]:
+    """All that happen in a drive; of one in two parts, such as a lorry, that of the part which comes near first.
 
-def approaches(drive: Drive, criterion: Criterion) -> Iterator[Approach]:
-    """All that happen in a drive, in the order of its tracks."""
+    Not those that began before there were looks enough to detect anybody: nobody knows how late they were.
+    """
+    found: dict[str, Approach] = {}
     ego_mps = _velocities_mps(drive.times_s, drive.world_T_ego[:, :2, 3])
     speed_mps = np.linalg.norm(ego_mps, axis=1)
     ahead = ego_mps / np.where(speed_mps > 0, speed_mps, 1.0)[:, None]
@@ -136,21 +133,22 @@ def approaches(drive: Drive, criterion: Criterion) -> Iterator[Approach]:
         near = np.flatnonzero(away_m <= criterion.within_s * np.linalg.norm(towards_mps, axis=1))
         world_T_ego = drive.world_T_ego[near]
         there = invert(world_T_ego) @ track.trajectory.at_each(drive.times_s[near])
-        half = np.array(track.size_m) / 2
-        outline_m = BoundingBox((-half[0], -half[1], 0.0), (half[0], half[1], 1.0)).outline_m
+        outline_m = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * track.size_m[:2] / 2
         in_ego_mps = np.einsum("tji,tj->ti", world_T_ego[:, :2, :2], towards_mps[near])
         ttc_s = np.full(len(drive.times_s), np.inf)
         ttc_s[near] = contact_s(drive.ego.outline_m, outlines_at(outline_m, there), in_ego_mps)
         met = np.flatnonzero(ttc_s <= criterion.within_s)
-        if len(met):
+        if len(met) and met[0] >= criterion.looks - 1:
             some, first = slice(met[0], met[-1] + 1), int(met[0])
             along_mps = np.maximum((own_mps[some] * ahead[some]).sum(axis=1), 0.0)
             closing_mps = np.maximum(speed_mps[some] - along_mps, 0.0)
             needed_s = np.array([criterion.needed_s(mps) for mps in closing_mps.tolist()])
             behind = there[np.searchsorted(near, first), 0, 3] < drive.ego.lower_m[0]
             name = "from behind" if behind else who(track)
-            kmh = 3.6 * float(speed_mps[first])
-            yield Approach(track, first, ttc_s[some], needed_s, name, kmh, float(closing_mps[0]))
+            kmh, owner = 3.6 * float(speed_mps[first]), track.name.removeprefix(REAR_OF)
+            if owner not in found or first < found[owner].step:
+                found[owner] = Approach(track, first, ttc_s[some], needed_s, name, kmh, float(closing_mps[0]))
+    return list(found.values())
 
 
 def _velocities_mps(times_s: Float64, places_m: Float64) -> Float64:
@@ -261,6 +259,7 @@ def sight_approach(rig: str, drive: Drive, approach: Approach, eyes: Eyes, crite
     least_s = np.append(np.minimum.accumulate(approach.ttc_s), 0.0)
     least_s[0] = criterion.within_s
     ttc_s, alone_s, without_s = (least_s[np.minimum(steps, end) - begin] for steps in found)
-    seen = found.all_together - begin
-    in_time = ~(approach.ttc_s < approach.needed_s)[: min(int(seen[0]), end - begin)].any(keepdims=True)
+    seen = found[0] - begin
+    until = int(min(seen[0], end)) + 1 if seen[0] else 0
+    in_time = np.array([(approach.ttc_s >= approach.needed_s)[:until].all()])
     return Sighting(approach, rig, ttc_s, in_time, alone_s, without_s, seen == 0, drive.name)

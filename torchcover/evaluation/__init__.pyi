@@ -6,6 +6,7 @@ from .checking import Checked as Checked
 from .checking import check as check
 from .checkpoint import Checkpoint as Checkpoint
 from .encountering import encounter as encounter
+from .encountering import encounter_film as encounter_film
 from .encountering import encounter_picture as encounter_picture
 from .encountering import met_in_recording as met_in_recording
 from .encountering import met_in_traffic as met_in_traffic
@@ -25,14 +26,8 @@ from .progress import Progress as Progress
 from .ranks import Ranks as Ranks
 from .ranks import joined_ranks as joined_ranks
 from .ranks import rank_count as rank_count
-from .requirements import Bound as Bound
-from .requirements import EncounterRequirement as EncounterRequirement
-from .requirements import InTime as InTime
-from .requirements import Places as Places
 from .requirements import Readings as Readings
-from .requirements import RegionRequirement as RegionRequirement
 from .requirements import Requirements as Requirements
-from .requirements import TargetRequirement as TargetRequirement
 from .requirements import Verdict as Verdict
 from .requirements import verdicts as verdicts
 from .result import Result as Result

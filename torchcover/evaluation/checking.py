@@ -1,8 +1,8 @@
 """Measure all that requirements are about, and judge it: names in, verdicts and their files out."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 from xml.etree import ElementTree
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torchcover import __version__
 from torchcover.coverage import AGGREGATIONS, Coverage
 from torchcover.evaluation.encountering import encounter
-from torchcover.evaluation.evaluating import measured as measured_coverage
+from torchcover.evaluation.measuring import measured as measured_coverage
 from torchcover.evaluation.requirements import (
     PLAIN,
     EncounterRequirement,
@@ -24,21 +24,22 @@ from torchcover.evaluation.requirements import (
     Verdict,
     verdicts,
 )
-from torchcover.evaluation.result_page import words_of
 from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.target_survey import in_world
-from torchcover.evaluation.task import AnyRig, AnyScenario, as_called, spread_s, task_of
+from torchcover.evaluation.task import AnyRig, AnyScenario, distinct_names, loaded, spread_s, task_of
 from torchcover.files import Publication
-from torchcover.report import Page, PageTable, Words, json_record, page_html
-from torchcover.simulation import Rig
-from torchcover.targets import Target, survey_places
+from torchcover.report import PageTable, Words, json_record
+from torchcover.simulation import Rig, Scenario
+from torchcover.simulation.camera_sensor import CameraSensor
+from torchcover.targets import Spots, Target, survey_places
 
 Float64 = NDArray[np.float64]
 # What is judged where a mean would hide a step in which nothing is seen.
 JUDGED = {"points": "least_points", "sensors": "least_sensors"}
 NOTE = (
-    "A number with an error keeps a bound if all of its 95 % interval does, and does not if none of it does; else, and "
-    "where something is unknown, it is not checked. Keeping all is geometry, and no homologation."
+    "A number with an error keeps a bound if all of its 95 % interval does, and does not if none of it does; else it "
+    "is not checked, until more steps decide it. What is unknown is never kept. "
+    "Keeping all is geometry, and no homologation."
 )
 
 
@@ -72,7 +73,8 @@ class Checked:
     def record(self) -> dict[str, Any]:
         """All of it, for JSON."""
         rigs = {rig: [json_record(_record(one)) for one in each] for rig, each in self.verdicts.items()}
-        return {"requirements": self.name, **self.settings, "exit_code": self.exit_code, "rigs": rigs}
+        about = {"requirements": self.name, "torchcover": __version__, **self.settings}
+        return {**about, "exit_code": self.exit_code, "rigs": rigs}
 
     @property
     def junit(self) -> str:
@@ -81,27 +83,24 @@ class Checked:
         for rig, each in self.verdicts.items():
             states = [one.state for one in each]
             counts = {"tests": len(states), "failures": states.count("not kept"), "errors": states.count("not checked")}
-            suite = ElementTree.SubElement(root, "testsuite", name=rig, **{k: str(v) for k, v in counts.items()})
+            suite = ElementTree.SubElement(root, "testsuite", {"name": rig, **{k: str(v) for k, v in counts.items()}})
             for one in each:
                 name = f"{one.requirement}: {one.bound.words}"
                 case = ElementTree.SubElement(suite, "testcase", classname=rig, name=name)
                 if one.state != "kept":
                     words = ", ".join(f"{key}: {value}" for key, value in _record(one).items())
                     ElementTree.SubElement(case, "failure" if one.state == "not kept" else "error", message=words)
-        return ElementTree.tostring(root, encoding="unicode", xml_declaration=True)
+        text = ElementTree.tostring(root, encoding="unicode", xml_declaration=True)
+        return "".join(letter if letter.isprintable() or letter == "\n" else " " for letter in text)
 
     def save(self, folder: str | Path) -> list[Path]:
-        """Write `junit.xml`, `report.html` and `summary.json`, into a folder that is made if it does not exist.
+        """Write `junit.xml` and `summary.json` into a folder, which is made if it does not exist.
 
         Returns:
             The files.
         """
-        facts = {"Settings": words_of(self.settings), "Run": {"torchcover": __version__}}
-        lead = f"The requirements of {self.name}, measured by torchcover."
-        page = Page(title=f"Is it enough? {', '.join(self.verdicts)}", lead=lead, tables=self.tables(), facts=facts)
         with Publication(Path(folder)) as written:
             written.add_text("junit.xml", self.junit)
-            written.add_text("report.html", page_html(page))
             written.publish(self.record)
         return written.paths
 
@@ -113,9 +112,10 @@ def _record(one: Verdict) -> dict[str, Any]:
 
 def _row(one: Verdict) -> tuple[Words, ...]:
     interval = f" ({one.low:.4g} to {one.high:.4g})" if one.low < one.high else ""
-    counts = (f"{count:,}" for count in (one.failed, one.unknown, one.count))
-    numbers = f"{one.value:.4g}{interval}", f"{one.margin:+.4g}", *counts
-    return tuple(map(Words, (one.requirement, one.bound.words, one.state, *numbers, *(one.where or ("nowhere",))[:1])))
+    numbers = ("-", "-") if math.isnan(one.margin) else (f"{one.value:.4g}{interval}", f"{one.margin:+.4g}")
+    counts = map(str, (one.failed, one.unknown, one.count))
+    words = one.requirement, one.bound.words, one.state, *numbers, *counts, one.where[0] if one.where else "nowhere"
+    return tuple(map(Words, words))
 
 
 def check(
@@ -154,7 +154,10 @@ def check(
         (['kept'], 0)
     """
     asked = requirements if isinstance(requirements, Requirements) else Requirements.load(requirements)
-    called = [as_called(rig) for rig in ([rigs] if isinstance(rigs, str | Path | Rig) else rigs)]
+    given = [rigs] if isinstance(rigs, str | Path | Rig) else rigs
+    called = [loaded(rig).model_copy(update={"name": n}) for rig, n in zip(given, distinct_names(given), strict=True)]
+    if not called:
+        raise ValueError("check: at least one rig is needed; got none")
     for one in asked.requirements:
         for rig in called:  # before the work, not after it
             one.failing([sensor.name for sensor in rig.sensors])
@@ -172,9 +175,8 @@ def check(
             else:
                 measured.append(_of_target(one, asked, rig, world, steps, **own))
         found[rig.name] = verdicts(asked, measured)
-    told = {"scenario": world, "steps": steps, **own}
-    settings = {key: value if value is None or isinstance(value, int) else str(value) for key, value in told.items()}
-    return Checked(asked.name, found, settings)
+    told = {"scenario": world.name if isinstance(world, Scenario) else world, "steps": steps, **own}
+    return Checked(asked.name, found, {k: str(v) if isinstance(v, Path) else v for k, v in told.items()})
 
 
 def _coverage(asked: Requirements, rig: Rig, scenario: AnyScenario | None, **more: Any) -> Coverage | None:  # noqa: ANN401
@@ -186,8 +188,10 @@ def _coverage(asked: Requirements, rig: Rig, scenario: AnyScenario | None, **mor
     thresholds_m = sorted({float(match[1]) for key in keys if (match := PLAIN.fullmatch(key)) and match[1]})
     aggregations = [one for kind in AGGREGATIONS if (one := kind.of_keys(keys))]
     redundancy = any(one.without or one.number.startswith(("sensors", "seen")) for one in of_regions)
-    asking = {"ask": asked, "thresholds_m": thresholds_m or 0.4, "aggregations": aggregations, "redundancy": redundancy}
-    settings = Settings([rig], scenario, **asking, **more)
+    settings = Settings(
+        [rig], scenario, ask=asked, thresholds_m=thresholds_m or 0.4, aggregations=aggregations, redundancy=redundancy,
+        **more,
+    )  # fmt: skip
     result = measured_coverage(task_of(settings), settings)
     if result.run is not None:
         result.run.raise_failure()
@@ -203,18 +207,19 @@ def _of_region(one: RegionRequirement, coverage: Coverage, rig: Rig) -> Readings
         agreed = np.isnan(number.error) and estimate.has_intervals[0]  # all blocks say the same
         ends.append((number.value,) * 3 if agreed else (number.value, number.low, number.high))
         where.append(f"{one.region} {one.height}{words.replace('_', ' ')}")
-    return Readings(*np.array(ends).T, where)
+    value, low, high = np.array(ends).T
+    return Readings(value, low, high, where)
 
 
 def _of_encounters(one: EncounterRequirement, rig: Rig, **given: Any) -> dict[str, Readings]:  # noqa: ANN401
     """Of each encounter the latest detection of all phases."""
     found, names = encounter(rig, one.encounters, one.criterion, **given), [sensor.name for sensor in rig.sensors]
     times_s, where = [], []
-    for each in found.sightings:
+    for case, each in zip(one.encounters.encounters, found.sightings, strict=True):
         lost = {f", without {name}": each.without_ttc_s[names.index(name)] for name in one.failing(names)}
         for words, ttc_s in ({"": each.ttc_s} | lost).items():
-            times_s.append((ttc_s.min(), ttc_s.min() - one.criterion.needed_s(each.encounter.closing_mps)))
-            where.append(f"{each.encounter.words}{words}")
+            times_s.append((ttc_s.min(), ttc_s.min() - one.criterion.needed_s(case.closing_mps)))
+            where.append(f"{case.words}{words}")
     return {key: _exact(of_key, where) for key, of_key in zip(("ttc_s", "spare_s"), np.array(times_s).T, strict=True)}
 
 
@@ -225,24 +230,30 @@ def _of_target(
     rig, world, usual_steps = in_world(given, scenario, vehicle, sensor_model)
     place, target = asked.places[one.at] if isinstance(one.at, str) else one.at, Target.load(one.target)
     at_m, groups = place.positions_m(world.ego_box()), one.groups(rig.sensors)
-    survey = partial(survey_places, rig, world, target, at_m, steps=steps or usual_steps, every_s=spread_s(world, None))
+    every_s, own_steps = spread_s(world, None), (usual_steps > 1 and steps) or usual_steps
+
+    def survey(counting: Sequence[int]) -> Spots:
+        return survey_places(
+            rig, world, target, at_m, counting, steps=own_steps, every_s=every_s, seed=seed, hits=one.hits
+        )
+
     values: dict[str, list[Float64]] = {bound.key: [] for bound in one.bounds}
     where: list[str] = []
     for words, group in groups.items():
-        seen = survey(group, seed=seed, hits=one.hits)
+        seen = survey(group)
         numbers = {name: getattr(seen, JUDGED.get(name, name)) for name in ("points", "sensors", "seen", "share")}
         there = (seen.state == 0) | (place.points_m is not None)
         where += [f"x = {x:.2f}, y = {y:.2f} m{words}" for x, y in at_m[there].tolist()]
         for key in ("pixels", "visual_angle_deg"):
             numbers[key] = np.where(seen.state == 0, 0.0, np.nan)
         for k in group if one.pixels or one.visual_angle_deg else ():  # of each sensor alone
-            points, sensor = survey([k], seed=seed, hits=one.hits).least_points, rig.sensors[k]
+            points, sensor = survey([k]).least_points, rig.sensors[k]
             x_m, y_m, z_m = sensor.mount.matrix()[:3, 3]
             away_m = np.hypot(*(at_m - (x_m, y_m)).T)
             angle = np.arctan2(target.solid.box.size_m[2] - z_m, away_m) + np.arctan2(z_m, away_m)
             angle_deg = np.where(points >= one.hits, np.rad2deg(angle), 0.0)
             numbers["visual_angle_deg"] = np.fmax(numbers["visual_angle_deg"], angle_deg)
-            if sensor.type == "camera":
+            if isinstance(sensor, CameraSensor):
                 numbers["pixels"] = np.fmax(numbers["pixels"], points)
         for key, of_key in values.items():
             of_key.append(numbers[key][there])

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.evaluation.observers import CoverageObserver, Stateful
-from torchcover.evaluation.transport import Bits, spread, words_of
 from torchcover.files import NpyHeader, check_memory, read_npz, reads, write_durably
 
 EVERY_S = 60.0
@@ -244,11 +243,9 @@ def _add_tensor(tensor: Tensor, archive: zipfile.ZipFile, name: str) -> dict[str
     array = tensor.detach().cpu().numpy()
     if array.dtype.kind not in KINDS:
         raise TypeError(f"a state of real numbers is needed; got a tensor of {tensor.dtype}")
-    words, at = words_of(array)
-    _add(archive, name, words)
-    if at is not None:
-        _add(archive, f"{name}.at", at)
-    return {"name": name, "dtype": array.dtype.str, "shape": list(tensor.shape), "places": at is not None}
+    # As bits: of a number that is none there are several, and all are kept.
+    _add(archive, name, np.ascontiguousarray(array).reshape(-1).view(np.uint8))
+    return {"name": name, "dtype": array.dtype.str, "shape": list(tensor.shape)}
 
 
 def _unpacked(node: Any, path: Path) -> Any:  # noqa: ANN401  (a tree)
@@ -267,8 +264,8 @@ def _array(content: Mapping[str, Any], path: Path) -> Array:
     if dtype.kind not in KINDS or min(shape, default=0) < 0:
         raise ValueError(f"an array of {dtype} and the shape {shape}")
     check_memory(math.prod(shape) * dtype.itemsize)
-    words = _read(path, name)
-    return spread(Bits(words, _read(path, f"{name}.at") if content["places"] else None), dtype, shape)
+    array: Array = _read(path, name).view(dtype).reshape(shape)
+    return array
 
 
 def _read(path: Path, name: str) -> Array:
@@ -276,6 +273,6 @@ def _read(path: Path, name: str) -> Array:
 
 
 def _check_kind(header: NpyHeader) -> None:
-    """Words of bits and where they are, and one text: the header."""
+    """Bytes, and one text: the header."""
     if header.dtype.kind not in "uU":
         raise ValueError(f"an array of {header.dtype}")

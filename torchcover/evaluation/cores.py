@@ -1,5 +1,6 @@
 """The cores of a run: how many there are, how their threads wait, and how many processes are to make frames."""
 
+import inspect
 import multiprocessing
 import os
 import warnings
@@ -97,8 +98,11 @@ def _is_said() -> bool:
 
 @cache
 def _warn_once() -> None:
+    frame, level = inspect.currentframe(), 1
+    while frame and frame.f_globals.get("__name__", "").partition(".")[0] in ("torchcover", "contextlib"):
+        frame, level = frame.f_back, level + 1  # to the user's line
     warnings.warn(
         "threads of OpenMP keep their cores busy while they wait, for a third of a run's processor time: set "
         'os.environ["OMP_WAIT_POLICY"] = "passive" before torch is imported',
-        stacklevel=2,
+        stacklevel=level,
     )

@@ -1,16 +1,17 @@
 """In time or too late: names and defaults in, what rigs had of encounters and its files out."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from torchcover import __version__
-from torchcover.encounters import Criterion, EncounterSet, Sightings, sight_encounter
-from torchcover.encounters.sighting import MountedRig
+from torchcover.encounters import Criterion, Encounter, EncounterSet, Sightings, Staged, sight_encounter
+from torchcover.encounters.sighting import Looks, MountedRig
+from torchcover.encounters.staging import STEP_S, solid_of
 from torchcover.encounters.traffic import Drive, Eyes, approaches, sight_approach
 from torchcover.evaluation.progress import Progress, held_back
 from torchcover.evaluation.result_page import words_of
@@ -18,9 +19,22 @@ from torchcover.evaluation.settings import FILES, wanted_files
 from torchcover.evaluation.target_survey import free_space
 from torchcover.evaluation.task import AnyRig, as_called
 from torchcover.files import Publication
+from torchcover.geometry import invert, outlines_at
 from torchcover.recordings import Recording, open_recording
-from torchcover.report import Page, PagePicture, draw_encounters, page_html
-from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, with_ego
+from torchcover.report import (
+    ActorMark,
+    Page,
+    PagePicture,
+    StandingFaces,
+    draw_encounters,
+    draw_scene,
+    page_html,
+)
+from torchcover.simulation import Draws, PaperReference, Rig, Scenario, Simulator, with_ego
+from torchcover.simulation.bodies import called
+
+# Of a film: seconds, steps between two pictures, and what they show.
+FILM_S, FILM_STEPS, FILM_M = 3.0, 100, ((-30.0, 30.0), (-15.0, 15.0))
 
 
 def encounter(
@@ -96,13 +110,13 @@ def met_in_traffic(
     seed: int = 0,
     progress: bool = False,
 ) -> Sightings:
-    """When rigs detected those who came near in the traffic of worlds; as `encounter`, but for these.
+    """When rigs detected those whom they met in the traffic of worlds: `Criterion.within_s` before a collision.
 
     Args:
-        rigs: A rig or several.
-        scenario: Their world: a scenario, a built-in name or a YAML file.
+        rigs: As for `encounter`, like all that is not named here.
+        scenario: Its worlds: a scenario, a built-in name or a YAML file.
         criterion: Who is met, what is detected, and what is in time.
-        worlds: How many of its worlds, each driven through once; 1 if it is always the same.
+        worlds: How many of them are driven through; 1 if it is always the same.
         vehicle: What carries the rigs.
         sensor_model: What sensors make of their hits.
         seed: Of the traffic, of noise and drop-out.
@@ -110,7 +124,7 @@ def met_in_traffic(
 
     Raises:
         FileNotFoundError: An unknown name or file.
-        ValueError: A file that cannot be used, a number out of its bounds, a scenario in which nothing ever moves.
+        ValueError: What cannot be used, a number out of its bounds, a scenario in which nothing ever moves.
     """
     if worlds < 1:
         raise ValueError(f"worlds: a number >= 1 is needed; got {worlds}")
@@ -127,7 +141,7 @@ def met_in_traffic(
             first = number * world.steps
             drive = Drive.of_world(f"{world.name} {number}", nobody.scene_of(first)[0].world)
             hours[drive.name] = world.steps * world.step_s / 3600
-            met = list(approaches(drive, criterion))
+            met = approaches(drive, criterion)
             for name, simulator in alone.items():
                 eyes = Eyes.of_world(simulator, first, criterion)
                 sightings += [sight_approach(name, drive, one, eyes, criterion) for one in met]
@@ -136,15 +150,15 @@ def met_in_traffic(
 
 
 def met_in_recording(recording: Recording | str | Path, criterion: Criterion | None = None) -> Sightings:
-    """When the rigs of a recording with poses and labelled objects first had enough points on those who came near.
+    """When the rigs of a recording first had enough points on those whom it met; as `met_in_traffic`.
 
     Args:
-        recording: It, or its path.
+        recording: One with poses, times and labelled objects, or its path.
         criterion: Who is met, what is detected, and what is in time.
 
     Raises:
         FileNotFoundError: There is no such recording, or a part of it is missing.
-        ValueError: It has no poses, times or labelled objects, or does not say how large its vehicle is.
+        ValueError: It lacks one of these, or does not say how large its vehicle is.
     """
     criterion = Criterion() if criterion is None else criterion
     opened = open_recording(recording) if isinstance(recording, str | Path) else recording
@@ -154,6 +168,53 @@ def met_in_recording(recording: Recording | str | Path, criterion: Criterion | N
         sightings += [sight_approach(name, drive, one, eyes, criterion) for one in approaches(drive, criterion)]
     hours = {drive.name: float(np.ptp(drive.times_s)) / 3600}
     return Sightings(drive.name, criterion, 1, 0, {n: tuple(of) for n, of in opened.rigs.items()}, sightings, hours)
+
+
+def encounter_film(
+    rig: AnyRig,
+    found: Sightings,
+    *,
+    vehicle: str | Path | None = None,
+    sensor_model: Literal["ideal", "real"] | None = None,
+) -> Iterator[Figure]:
+    """The last seconds of that encounter of a set in which a rig is latest, for what is needed: ten pictures a second.
+
+    Args:
+        rig: One of those that were asked about.
+        found: What they had, of a set.
+        vehicle: What carries the rig, as it was told.
+        sensor_model: As it was told.
+    """
+    ((name, sensing),) = _sensing(rig, sensor_model).items()
+    needed_s = {id(one): found.criterion.needed_s(one.encounter.closing_mps) for one in found.sightings}
+    latest = min((one for one in found.sightings if one.rig == name), key=lambda o: o.ttc_s.min() - needed_s[id(o)])
+    case, without_s = cast(Encounter, latest.encounter), latest.without_ttc_s.min(axis=1)
+    mounted = MountedRig(sensing, with_ego(free_space(), {name: sensing}, vehicle))
+    staged = Staged(case, mounted.ego)
+    scene, looks = staged.scene(mounted.solids, whole=True), Looks(mounted, staged, found.seed)
+    sensors, names = mounted.mounted(case, scene), found.sensors[name]
+    first, worst, up_to_kmh = latest.sensor_ttc_s.mean(axis=1).argmax(), without_s.argmin(), found.up_to_kmh()
+    told = f"{case.words}: detected {latest.ttc_s.min():.2f} s before, needed {needed_s[id(latest)]:.2f} s"
+    told += f"; first {names[first]}, without {names[worst]} {without_s[worst]:.2f} s" if len(names) > 1 else ""
+    told += f"; in time up to {up_to_kmh[case.name, name]:g} km/h" if case.speed_is_swept else ""
+    for step in range(max(int((staged.contact_s - FILM_S) / STEP_S), 0), int(staged.contact_s / STEP_S), FILM_STEPS):
+        instant, at = scene.at(step), np.array([step])
+        scans = [one.scan(instant, Draws(np.random.default_rng(step), one.sensor.rays)) for one in sensors]
+        seen = ", ".join(f"{sensor} {looks.points([k], at)[0]}" for k, sensor in enumerate(names))
+        bodies = [(one.body, pose) for one, pose in staged.obstacles]
+        bodies.append((case.other.body, staged.world_T_other(STEP_S * at)[0]))
+        vehicle_T_world = invert(staged.world_T_ego(STEP_S * at)[0])
+        outlines_m = [outlines_at(solid_of(body).box.outline_m, vehicle_T_world @ pose) for body, pose in bodies]
+        yield draw_scene(
+            *FILM_M,
+            standing=StandingFaces(np.empty((0, 3, 2)), np.empty(0)),
+            ego_outline_m=mounted.ego.box.outline_m,
+            actors=[ActorMark(called(body), there) for (body, _), there in zip(bodies, outlines_m, strict=True)],
+            sensor=np.concatenate([scan.points for scan in scans]),
+            reference=np.empty((0, 3)),
+            title=f"{staged.contact_s - STEP_S * step:.2f} s to the collision; points on it: {seen}",
+            subtitle=told,
+        )
 
 
 def encounter_picture(found: Sightings) -> Figure:

@@ -1,7 +1,9 @@
 """Several processes, on one machine or many, share a run: each makes the frames of its share, and all are added up."""
 
+import io
 import json
 import os
+import pickle
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -10,13 +12,12 @@ from itertools import groupby
 from typing import Any, TypeVar
 
 import torch
-from torch import distributed
+from torch import Tensor, distributed
 from torch.distributed.distributed_c10d import PrefixStore, Store
 from torch.distributed.rendezvous import rendezvous
 
 from torchcover.evaluation.checkpoint import differences
 from torchcover.evaluation.observers import AnyObserver
-from torchcover.evaluation.transport import packed, unpacked
 
 Payload = TypeVar("Payload")
 
@@ -165,12 +166,12 @@ class Ranks:
             time.sleep(LOOK_EVERY_S)
 
     def _from_first(self, value: Payload) -> Payload:
-        data = packed(value if self.rank == 0 else None)
+        data = packed(value) if self.rank == 0 else torch.empty(0, dtype=torch.uint8)
         length = torch.tensor([len(data)])
         distributed.broadcast(length, 0)
         data = data if self.rank == 0 else torch.empty(int(length), dtype=torch.uint8)
         distributed.broadcast(data, 0)
-        received: Payload = value if self.rank == 0 else unpacked(data)
+        received: Payload = value if self.rank == 0 else pickle.loads(data.numpy().data)
         return received
 
     def _send(self, value: object, rank: int) -> None:
@@ -183,7 +184,21 @@ class Ranks:
         distributed.recv(length, rank)
         data = torch.empty(int(length), dtype=torch.uint8)
         distributed.recv(data, rank)
-        return unpacked(data)
+        return pickle.loads(data.numpy().data)  # as a process of the same run has packed it; nobody else's
+
+
+def packed(value: object) -> Tensor:
+    """(N,) uint8: any object that can be pickled, its tensors on the CPU."""
+    stream = io.BytesIO()
+    _OnTheCpu(stream, protocol=pickle.HIGHEST_PROTOCOL).dump(value)
+    return torch.frombuffer(stream.getbuffer(), dtype=torch.uint8)
+
+
+class _OnTheCpu(pickle.Pickler):
+    def reducer_override(self, value: Any) -> Any:  # noqa: ANN401  (as pickle has it)
+        if type(value) is Tensor and value.device.type != "cpu":
+            return value.cpu().__reduce_ex__(pickle.HIGHEST_PROTOCOL)  # type: ignore[no-untyped-call]
+        return NotImplemented
 
 
 def rank_count() -> int:

@@ -27,15 +27,17 @@ from torchcover.encounters import Criterion, EncounterSet
 from torchcover.geometry import BoundingBox
 from torchcover.simulation import RegionsOfInterest, Sensor, builtin_names
 from torchcover.simulation.documents import Bounds, BuiltIn, Coordinate, Document, NameOrFile, beside, is_file_name
+from torchcover.simulation.kinds import SENSORS
 from torchcover.targets import SIDES, TARGETS, Raster
 from torchcover.targets.raster import from_outline_m, side_of
 
 Float64 = NDArray[np.float64]
 Share = Annotated[float, Field(gt=0.0, le=1.0)]
 Side = Literal["front", "rear", "left", "right"]
+State = Literal["kept", "not kept", "not checked"]
 Corners = tuple[tuple[Coordinate, Coordinate], ...]
 
-KINDS = ("lidar", "camera", "radar")
+KINDS = tuple(SENSORS)
 # Of a mean over steps, what rounding makes of it.
 ROUNDING = 1e-9
 MOST_STEPS = 1000
@@ -81,7 +83,7 @@ class Verdict(NamedTuple):
 
     requirement: str
     bound: Bound
-    state: Literal["kept", "not kept", "not checked"]
+    state: State
     value: float
     low: float
     high: float
@@ -118,9 +120,9 @@ def _judged(words: str, bound: Bound, measured: Readings, tell: int) -> Verdict:
     unknown, order = ~(kept | failed), np.argsort(margin, kind="stable")  # NaN is last
     told = order[(failed if failed.any() else unknown if unknown.any() else kept)[order]][:tell].tolist()
     worst = [float(each[order[0]]) if len(order) else np.nan for each in (*measured[:3], margin)]
-    state = "not kept" if failed.any() else "kept" if len(kept) and kept.all() else "not checked"
-    counts, where = map(int, (len(kept), failed.sum(), unknown.sum())), tuple(measured.where[k] for k in told)
-    return Verdict(words, bound, state, *worst, *counts, where)
+    state: State = "not kept" if failed.any() else "kept" if len(kept) and kept.all() else "not checked"
+    counts, where = (len(kept), int(failed.sum()), int(unknown.sum())), tuple(measured.where[k] for k in told)
+    return Verdict(words, bound, state, *worst, *counts, where)  # type: ignore[call-arg, arg-type]  # of these lengths
 
 
 def check_called(what: str, given: Iterable[str], known: Iterable[str]) -> None:
@@ -137,7 +139,7 @@ def check_called(what: str, given: Iterable[str], known: Iterable[str]) -> None:
             raise ValueError(f"no {what} is called {name!r}; {meant}")
 
 
-class Places(Document):
+class BodyPlaces(Document):
     """Where the middle of a body is put: one of five, in metres.
 
     Args:
@@ -153,7 +155,7 @@ class Places(Document):
 
     Example:
         >>> car = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))
-        >>> Places(x_m=(-1.0, -0.2), relative_to="rear", step_m=2.0).positions_m(car).tolist()
+        >>> BodyPlaces(x_m=(-1.0, -0.2), relative_to="rear", step_m=2.0).positions_m(car).tolist()
         [[-3.0, -1.0], [-2.2, -1.0], [-3.0, 1.0], [-2.2, 1.0]]
     """
 
@@ -184,25 +186,27 @@ class Places(Document):
         Raises:
             ValueError: More than 1000 to a side.
         """
-        if self.within_m is not None:
-            around_m = Raster.around(vehicle, self.within_m, self.step_m).positions_m
-            near = np.linalg.norm(from_outline_m(vehicle, around_m), axis=1) <= self.within_m
-            return around_m[near & np.isin(side_of(vehicle, around_m), [-1, *map(SIDES.index, self.sides or SIDES)])]
         low_m, high_m = np.array(vehicle.lower_m[:2]), np.array(vehicle.upper_m[:2])
         towards = {None: (0, 0), "front": (1, 0), "rear": (-1, 0), "left": (0, 1), "right": (0, -1)}[self.relative_to]
         middle_m = (low_m + high_m) / 2 if self.relative_to else np.zeros(2)
-        origin_m: Float64 = middle_m + (high_m - low_m) / 2 * towards
-        if self.points_m is not None:
-            return origin_m + np.array(self.points_m)
-        if self.line_m is not None:
+        origin_m = middle_m + (high_m - low_m) / 2 * towards
+        places_m: Float64 = np.array(self.points_m or (), dtype=np.float64)
+        if self.within_m is not None:
+            around_m, sides = Raster.around(vehicle, self.within_m, self.step_m).positions_m, self.sides or SIDES
+            near = np.linalg.norm(from_outline_m(vehicle, around_m), axis=1) <= self.within_m
+            places_m = around_m[near & np.isin(side_of(vehicle, around_m), [-1, *map(SIDES.index, sides)])]
+        elif self.line_m is not None:
             line = shapely.LineString(self.line_m)
-            return origin_m + shapely.get_coordinates(line.interpolate(self._between(0.0, line.length)))
-        own_m = np.stack([low_m, high_m], axis=1) - origin_m[:, None]
-        (x0, x1), (y0, y1) = self.x_m or own_m[0], self.y_m or own_m[1]
-        area = shapely.Polygon(self.polygon_m) if self.polygon_m else shapely.box(x0, y0, x1, y1)
-        x0, y0, x1, y1 = area.bounds
-        there_m = np.stack(np.meshgrid(self._between(x0, x1), self._between(y0, y1)), axis=-1).reshape(-1, 2)
-        return origin_m + there_m[shapely.intersects_xy(area, there_m)]
+            places_m = shapely.get_coordinates(line.interpolate(self._between(0.0, line.length)))
+        elif self.points_m is None:
+            own_m = np.stack([low_m, high_m], axis=1) - origin_m[:, None]
+            (x0, x1), (y0, y1) = self.x_m or own_m[0], self.y_m or own_m[1]
+            area = shapely.Polygon(self.polygon_m) if self.polygon_m else shapely.box(x0, y0, x1, y1)
+            x0, y0, x1, y1 = area.bounds
+            there_m = np.stack(np.meshgrid(self._between(x0, x1), self._between(y0, y1)), axis=-1).reshape(-1, 2)
+            places_m = there_m[shapely.intersects_xy(area, there_m)]
+        in_vehicle_m: Float64 = origin_m + places_m
+        return in_vehicle_m
 
     def _between(self, low_m: float, high_m: float) -> Float64:
         """Both ends, and as many steps in between as it takes."""
@@ -275,7 +279,7 @@ class TargetRequirement(_Requirement):
     """
 
     target: Annotated[str, BeforeValidator(_target)]
-    at: str | Places
+    at: str | BodyPlaces
     by: str | Annotated[tuple[str, ...], Field(min_length=1)] = KINDS
     hits: PositiveInt = 5
     points: PositiveFloat | None = None
@@ -317,10 +321,11 @@ class TargetRequirement(_Requirement):
 
     def groups(self, sensors: Sequence[Sensor]) -> dict[str, list[int]]:
         """Numbers of the sensors that count, and of those without each that may fail; by what is then said of where."""
-        kinds = {sensor.name: sensor.type for sensor in sensors}
-        counts = [k for k, (name, kind) in enumerate(kinds.items()) if {name, kind}.intersection(self._by)]
-        lost = {f", without {name}": list(kinds).index(name) for name in self.failing(list(kinds))}
-        return {"": counts} | {words: [k for k in counts if k != failed] for words, failed in lost.items()}
+        of_kinds = tuple(of for kind, of in SENSORS.items() if kind in self._by)
+        counts = [k for k, one in enumerate(sensors) if one.name in self._by or isinstance(one, of_kinds)]
+        names = self.failing([one.name for one in sensors])
+        lost = [k for k in counts if sensors[k].name in names]  # the others change nothing
+        return {"": counts} | {f", without {sensors[k].name}": [each for each in counts if each != k] for k in lost}
 
 
 class RegionRequirement(_Requirement):
@@ -350,6 +355,10 @@ class RegionRequirement(_Requirement):
     def _check(self) -> Self:
         if not PLAIN.fullmatch(self.number) and not any(kind.of_keys({self.number}) for kind in AGGREGATIONS):
             check_called("number of a region", [self.number], LIKE)
+        if self.least > 1.0 and ("detection_" in self.number or "seen_by" in self.number):
+            raise ValueError(f"least: {self.number} is a share of at most 1; got {self.least:g}")
+        if self.without and self.number != "radius_m" and not self.number.startswith("detection_"):
+            raise ValueError(f"without: radius_m and detections are known without a sensor; got {self.number}")
         return self
 
     @property
@@ -445,7 +454,7 @@ class Requirements(BuiltIn, RegionsOfInterest):
     name: str = "requirements"
     description: str = ""
     scenario: NameOrFile | None = None
-    places: dict[str, Places] = Field(default_factory=dict)
+    places: dict[str, BodyPlaces] = Field(default_factory=dict)
     requirements: Annotated[tuple[AnyRequirement, ...], Field(min_length=1)]
 
     @model_validator(mode="after")

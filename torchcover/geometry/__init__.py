@@ -1,6 +1,6 @@
 """Rigid transforms, boxes, height fields, and rays through voxels. Knows no other part of the house."""
 
-from torchcover.geometry.bounding_box import BoundingBox, overlap
+from torchcover.geometry.bounding_box import BoundingBox, overlapping
 from torchcover.geometry.contact import contact_s, outlines_at
 from torchcover.geometry.height_field import HeightField, fitted, spread
 from torchcover.geometry.rigid import (
@@ -27,7 +27,7 @@ __all__ = [
     "fitted",
     "invert",
     "outlines_at",
-    "overlap",
+    "overlapping",
     "quaternion_from_rotation",
     "rigid",
     "rotation_from_euler",

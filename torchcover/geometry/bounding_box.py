@@ -55,26 +55,28 @@ class BoundingBox:
         return (x1 - x0, y1 - y0, z1 - z0)
 
 
-def overlap(a: BoundingBox, a_T_b: NDArray[np.float64], b: BoundingBox) -> bool:
-    """Whether two boxes that stand on about the same ground share space; touching is not sharing.
+def overlapping(
+    box: BoundingBox, there_T_box: NDArray[np.float64], corners_m: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """(P,) whether a box at (P, 4, 4) poses shares space with another one that stands on about the same ground.
+
+    By separating axes, of their outlines from above and of heights; touching is not sharing.
 
     Args:
-        a: A box in its frame.
-        a_T_b: (4, 4) pose of the other box's frame in that of `a`, turned mainly about z.
-        b: The other box, in its own frame.
-
-    Returns:
-        True if their heights overlap, and so do their outlines seen from above (separating axes).
+        box: In its frame.
+        there_T_box: Where it is, turned mainly about z.
+        corners_m: (8, 3) of the other one there, in the order of `BoundingBox.corners_m`.
 
     Example:
         >>> car, away = BoundingBox((-2, -1, 0), (2, 1, 1.5)), np.eye(4)
         >>> away[:3, 3] = [3.0, 2.1, 0.0]
-        >>> overlap(car, np.eye(4), car), overlap(car, away, car)
-        (True, False)
+        >>> overlapping(car, np.stack([np.eye(4), away]), car.corners_m).tolist()
+        [True, False]
     """
-    ours = a.corners_m
-    theirs = b.corners_m @ a_T_b[:3, :3].T + a_T_b[:3, 3]
-    axes = [np.eye(3)[0], np.eye(3)[1], np.eye(3)[2], a_T_b[:3, 0], a_T_b[:3, 1]]
-    return all(
-        (theirs @ axis).min() < (ours @ axis).max() and (ours @ axis).min() < (theirs @ axis).max() for axis in axes
-    )
+    ours_m = box.corners_m @ there_T_box[:, :3, :3].swapaxes(1, 2) + there_T_box[:, None, :3, 3]
+    sides = np.stack([corners_m[4] - corners_m[0], corners_m[2] - corners_m[0], [0.0, 0.0, 1.0]])
+    axes = np.concatenate([np.broadcast_to(sides, (len(ours_m), 3, 3)), there_T_box[:, :3, :2].swapaxes(1, 2)], 1)
+    ours_m, theirs_m = np.einsum("pak,pck->pac", axes, ours_m), np.einsum("pak,ck->pac", axes, corners_m)
+    apart = (ours_m.min(axis=2) >= theirs_m.max(axis=2)) | (theirs_m.min(axis=2) >= ours_m.max(axis=2))
+    overlaps: NDArray[np.bool_] = ~apart.any(axis=1)
+    return overlaps

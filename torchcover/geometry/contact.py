@@ -16,7 +16,7 @@ def contact_s(a_m: Float64, b_m: Float64, velocity_mps: Float64) -> Float64:
     """Time until two rectangles share area, if one passes the other straight on and neither turns.
 
     By separating axes: along each side of either, both have shadows, which overlap between two times; the rectangles do
-    where all shadows do. Touching is not sharing, as for `overlap`.
+    where all shadows do. Touching is not sharing, as for `overlapping`.
 
     Args:
         a_m: (..., 4, 2) corners, one after the other around it.

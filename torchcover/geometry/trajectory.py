@@ -135,11 +135,14 @@ def poses_at(trajectories: Sequence[Trajectory], time_s: float) -> Matrix:
         >>> poses_at([Trajectory.resting((x, 0.0, 0.0)) for x in (1.0, 2.0)], 0.5)[:, 0, 3]
         array([1., 2.])
     """
-    # Bodies of one world share their times: they are looked up once.
-    moments = {id(each.times_s): _moment(each.times_s, time_s) for each in trajectories}
-    ends, shares = [], []
+    # Bodies of one world share their times, or have views of them: they are looked up once.
+    moments, ends, shares = dict[int, tuple[int, int, float]](), [], []
     for each in trajectories:
-        before, after, share = moments[id(each.times_s)]
+        times_s = each.times_s if each.times_s.base is None else each.times_s.base
+        times_s = times_s if np.shape(times_s) == each.times_s.shape else each.times_s  # all of them ascend
+        if id(times_s) not in moments:
+            moments[id(times_s)] = _moment(times_s, time_s)
+        before, after, share = moments[id(times_s)]
         ends += [each.positions_m[before], each.positions_m[after], each.angles_deg[before], each.angles_deg[after]]
         shares.append(share)
     from_m, to_m, from_deg, to_deg = np.array(ends).reshape(-1, 4, 3).swapaxes(0, 1)

@@ -2,7 +2,8 @@
 
 import hashlib
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 # What fills a table up to the length of another one; no row holds it.
 FILLER = math.inf
 
+Reduction = Callable[[Sequence[Tensor]], Tensor]
+
 
 class MergeableMetric(Metric):
     """Base of the metrics: sums over steps, and the parameters that say what they are sums of.
@@ -30,8 +33,8 @@ class MergeableMetric(Metric):
     * `.to(torch.float16)` moves the sums but does not round them.
     * Under `torch.inference_mode` everything works as outside of it, and steps may be added outside afterwards.
 
-    A metric passes its parameters to `__init__`, adds its states with `add_sum` and `add_maximum`, and counts `steps`.
-    Their size is fixed; only a table (`add_table`) grows.
+    A metric passes its parameters to `__init__`, adds its states with `add_sum`, and counts `steps`. Their size is
+    fixed; only a table (`add_table`) grows.
 
     Args:
         meaning: What the sums depend on, by the name of the parameter; compared by `==` and `repr`.
@@ -66,7 +69,7 @@ class MergeableMetric(Metric):
     def __init__(self, meaning: Mapping[str, object], **kwargs: Any) -> None:  # noqa: ANN401  (whatever torchmetrics takes)
         super().__init__(**kwargs)
         self.meaning = dict(meaning)
-        self._tables: tuple[str, ...] = ()
+        self._tables: dict[str, Reduction] = {}
         self.add_state("fingerprint", self._fingerprint(), dist_reduce_fx="max", persistent=True)
         self.add_sum("steps", (), torch.int64)
 
@@ -96,23 +99,19 @@ class MergeableMetric(Metric):
         """Add a state that starts at zero and adds up; float64 or int64, for sums grow."""
         self.add_state(name, torch.zeros((), dtype=dtype).expand(shape), dist_reduce_fx="sum", persistent=True)
 
-    def add_maximum(self, name: str, shape: tuple[int, ...]) -> None:
-        """Add a float64 state that starts at minus infinity and keeps the largest."""
-        lowest = torch.tensor(-math.inf, dtype=torch.float64).expand(shape)
-        self.add_state(name, lowest, dist_reduce_fx="max", persistent=True)
-
-    def add_table(self, name: str, columns: int, reduction: Callable[[Tensor], Tensor] | None = None) -> None:
+    def add_table(self, name: str, columns: int, reduction: Reduction | None = None) -> None:
         """Add a float64 state of rows that begin with a finite number, none at first.
 
         Args:
             name: Of the state.
             columns: Numbers in a row.
-            reduction: How (parts, N, columns) become one table again. Not given: all rows are kept, in the order of
+            reduction: How several tables become one. Not given: all rows are kept, in the order of
                 `torchcover.metrics.with_rows`.
         """
-        self._tables = (*self._tables, name)
+        self._tables[name] = reduction or joined
         none = torch.empty((0, columns), dtype=torch.float64)
-        self.add_state(name, none, dist_reduce_fx=reduction or joined, persistent=True)
+        of_ranks = partial(_of_filled, reduction=self._tables[name])
+        self.add_state(name, none, dist_reduce_fx=of_ranks, persistent=True)
 
     @torch.inference_mode(False)
     def reset(self) -> None:
@@ -147,12 +146,13 @@ class MergeableMetric(Metric):
     def _reduce_states(self, incoming_state: dict[str, Any]) -> None:
         # A copy already, here and in torchmetrics' `forward`.
         self._align_with(incoming_state)
-        for name in self._tables:
-            mine, other = getattr(self, name), incoming_state[name]
-            length = max(len(mine), len(other))
-            setattr(self, name, filled(mine, length))
-            incoming_state[name] = filled(other, length)
+        both = {name: reduced([getattr(self, name), incoming_state[name]]) for name, reduced in self._tables.items()}
+        for name, table in both.items():  # torchmetrics would want them of one length
+            setattr(self, name, table[:0])
+            incoming_state[name] = table[:0]
         super()._reduce_states(incoming_state)
+        for name, table in both.items():
+            setattr(self, name, table)
 
     def _align_with(self, incoming: dict[str, Any]) -> None:
         """Bring this state and another one, a copy, into a form in which they can be added up."""
@@ -250,10 +250,14 @@ def filled(table: Tensor, length: int) -> Tensor:
     return torch.nn.functional.pad(table, (0, 0, 0, length - len(table)), value=FILLER)
 
 
-def joined(tables: Tensor) -> Tensor:
-    """One table from several, (parts, K, C), that were filled up to the same length."""
-    rows = tables.flatten(0, 1)
-    return with_rows(rows[:0], rows[rows[:, 0] != FILLER])
+def joined(tables: Sequence[Tensor]) -> Tensor:
+    """One table with the rows of several."""
+    return with_rows(tables[0][:0], torch.cat(list(tables)))
+
+
+def _of_filled(tables: Tensor, reduction: Reduction) -> Tensor:
+    """One table of several, (parts, N, C), that were filled up to the same length."""
+    return reduction([rows[rows[:, 0] != FILLER] for rows in tables])
 
 
 def figure_of(ax: "Axes | None") -> "tuple[Figure, Axes]":

@@ -19,10 +19,6 @@ BACKENDS = {
 # The kinds of devices that each runs on; "cdist" on any.
 DEVICES = {"kdtree": ("cpu",), "packets": ("cpu",), "warp": ("cpu", "cuda")}
 
-# On the CPU brute force beats the tree only for few queries against many points, where building it does not pay
-# (python -m benchmarks crossover).
-MAX_QUERIES_COMPARED = 16
-MANY_POINTS = 10_000
 # Once loaded, packets are faster than the KD-tree for any clouds, by at least so much (docs/measured/performance.md,
 # search). Loading numba takes each process half a second, which a hundred calls should earn. By sizes alone: a choice
 # that depended on what was searched before would change the last bits of a run with its workers.
@@ -87,8 +83,6 @@ def _search_of(backend: str) -> Search:
 
 
 def _on_the_cpu(query: Tensor, points: Tensor) -> Search:
-    if len(query) <= MAX_QUERIES_COMPARED and len(points) >= MANY_POINTS:
-        return _search_of("cdist")
     return _search_of("packets" if _packets_pay(query, [points]) else "kdtree")
 
 

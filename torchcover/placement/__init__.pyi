@@ -30,9 +30,8 @@ from .space import SearchSpace as SearchSpace
 from .subsets import Candidates as Candidates
 from .subsets import Limits as Limits
 from .subsets import Subset as Subset
-from .subsets import Worth as Worth
-from .subsets import exact as exact
-from .subsets import greedy as greedy
+from .subsets import best as best
+from .subsets import best_of_several as best_of_several
 from .variables import FreeChoice as FreeChoice
 from .variables import FreeNumber as FreeNumber
 from .variables import Variable as Variable

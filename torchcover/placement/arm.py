@@ -1,11 +1,19 @@
 """An arm of a search: an optimiser, what it was told, and the candidates that others have to beat."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from torchcover.placement.evaluation import Evaluation
 from torchcover.placement.optimisers import Cube, MakesOptimiser, Optimiser
 from torchcover.placement.pareto import chebyshev, non_dominated
 from torchcover.placement.racing import Float64, Prefix, gains
+
+# Of an objective's value at the start, for each such share that a number which must not be worse has lost: so much more
+# than could be gained by it that an optimiser turns away, and no more than it can learn from.
+PENALTY = 3.0
+# What rounding makes of a difference.
+ROUNDING = 1e-9
 
 
 class Arm:
@@ -20,14 +28,27 @@ class Arm:
         cube: What is free.
         seed: Of the optimiser, and of the weights.
         start: Evaluation 0, scored at all instants.
+        objectives: How many of the first numbers are made better.
+        floors: What all of them must not be worse than; NaN for anything.
     """
 
-    def __init__(self, name: str, makes: MakesOptimiser, cube: Cube, seed: int, start: Evaluation) -> None:
-        self.name = name
+    def __init__(
+        self,
+        name: str,
+        makes: MakesOptimiser,
+        cube: Cube,
+        seed: int,
+        start: Evaluation,
+        objectives: int,
+        floors: Float64,
+    ) -> None:
+        self.name, self._objectives, self._floors = name, objectives, floors
+        self._lower = [quantity.lower_is_better for quantity in start.prefixes[-1].estimate.quantities]
         self._makes, self._cube, self._seed = makes, cube, seed
         self._optimiser: Optimiser = makes(cube, seed)
-        nothing = np.zeros(len(start.prefixes[-1].estimate.quantities))
-        self._gains, self._lefts = [nothing], [nothing]
+        self._scale = np.abs(start.prefixes[-1].estimate.value.numpy()).clip(ROUNDING)
+        nothing = np.zeros(objectives)
+        self._gains, self._lefts, self._lacks = [nothing], [nothing], [self._lacking(start)]
         self.evaluations: list[Evaluation] = [start]
 
     @property
@@ -46,6 +67,11 @@ class Arm:
         return np.array(self._lefts)
 
     @property
+    def lacks(self) -> Float64:
+        """(evaluations,) what numbers lack of what they must be, in all, each as a share of that."""
+        return np.array(self._lacks)
+
+    @property
     def complete(self) -> list[int]:
         """Positions of the candidates that can be, and were scored at all instants."""
         count = self.evaluations[0].instants
@@ -53,8 +79,12 @@ class Arm:
 
     @property
     def front(self) -> list[int]:
-        """Positions of those among them that no other beats, in order; with one objective the best, and its equals."""
-        complete = self.complete
+        """Positions of those among them that no other beats, in order; with one objective the best, and its equals.
+
+        Only of those that lack nothing; if there is none, of those that lack the least.
+        """
+        least = self.lacks[self.complete].min(initial=np.inf)
+        complete = [at for at in self.complete if self._lacks[at] <= least]
         return [at for at, on in zip(complete, non_dominated(self.gains[complete]).tolist(), strict=True) if on]
 
     @property
@@ -75,8 +105,8 @@ class Arm:
 
     @property
     def incumbents(self) -> list[tuple[Prefix, ...]]:
-        """What the front scored."""
-        return [self.evaluations[at].prefixes for at in self.front]
+        """What the front scored; nothing if it lacks anything, as what lacks less may gain less."""
+        return [] if self.front and self._lacks[self.front[0]] else [self.evaluations[at].prefixes for at in self.front]
 
     def ask(self, number: int) -> Float64 | None:
         """Where to look next, (variables,); None when there is nothing left."""
@@ -85,18 +115,52 @@ class Arm:
     def tell(self, evaluation: Evaluation) -> None:
         """What became of it."""
         gain, left = self._estimated(evaluation)
+        self._lacks.append(self._lacking(evaluation))
         self.evaluations.append(evaluation)
         self._gains.append(gain)
         self._lefts.append(left)
         if len(gain) == 1 and evaluation.unit is not None:
-            self._optimiser.tell(evaluation.unit, float(gain[0]), float(left[0]))
+            self._optimiser.tell(evaluation.unit, float(self._told()[-1, 0]), float(left[0]))
 
     def against_start(self, at: int) -> tuple[Float64, Float64] | None:
         """Gains of a candidate over the start after the instants that it was given, and errors; None if it has none."""
         prefixes = self.evaluations[at].prefixes
         if not prefixes:
             return None
-        return gains(prefixes[-1].estimate, self.evaluations[0].prefixes[len(prefixes) - 1].estimate)
+        found = gains(prefixes[-1].estimate, self.evaluations[0].prefixes[len(prefixes) - 1].estimate)
+        return found[0][: self._objectives], found[1][: self._objectives]
+
+    def is_worse(self, prefixes: Sequence[Prefix], errors: float) -> bool:
+        """Whether a number that must not be worse than at the start is so by some errors, after as many instants."""
+        start = self.evaluations[0].prefixes
+        gain, error = gains(prefixes[-1].estimate, start[len(prefixes) - 1].estimate)
+        kept = start[-1].estimate.value.numpy() == self._floors
+        return bool((gain < -errors * error)[kept].any())
+
+    def may_lead(self, prefixes: Sequence[Prefix]) -> bool:
+        """Whether a rig that was scored at all instants is one that no other beats, or all others lack something."""
+        if prefixes[-1].instants < self.evaluations[0].instants:
+            return False
+        gain, front = gains(prefixes[-1].estimate, self.evaluations[0].prefixes[-1].estimate)[0], self.front
+        beaten = (self.gains[front] >= gain[: self._objectives]).all(axis=1).any()
+        return not beaten or bool(self._lacks[front[0]])
+
+    def _told(self) -> Float64:
+        """(evaluations, objectives) what optimisers are told of: gains, less what the lacks cost."""
+        return self.gains - PENALTY * self._scale[: self._objectives] * self.lacks[:, None]
+
+    def _lacking(self, evaluation: Evaluation) -> float:
+        prefixes = evaluation.prefixes
+        if not prefixes:
+            return 0.0
+        value = prefixes[-1].estimate.value.numpy()
+        if evaluation.number and evaluation.instants < self.evaluations[0].instants:
+            # As good as its difference to the start promises.
+            value = value - self.evaluations[0].prefixes[len(prefixes) - 1].estimate.value.numpy()
+            value = value + self.evaluations[0].prefixes[-1].estimate.value.numpy()
+        lost = np.where(self._lower, value - self._floors, self._floors - value) / np.abs(self._floors).clip(ROUNDING)
+        lost = np.nan_to_num(lost[~np.isnan(self._floors)], nan=1.0)  # what is unknown is all lost
+        return float(lost[lost > ROUNDING].sum()) + evaluation.lacks
 
     def _estimated(self, evaluation: Evaluation) -> tuple[Float64, Float64]:
         """Gain over the start at all instants, and the error that those have left which it was not scored at.
@@ -105,15 +169,16 @@ class Arm:
         """
         prefixes = evaluation.prefixes
         if evaluation.infeasible or not prefixes:
-            return np.full(len(self._gains[0]), np.nan), np.zeros(len(self._gains[0]))
+            return np.full(self._objectives, np.nan), np.zeros(self._objectives)
         best = 0 if self.best is None else self.best
         gain, error = gains(prefixes[-1].estimate, self.evaluations[best].prefixes[len(prefixes) - 1].estimate)
+        gain, error = gain[: self._objectives], error[: self._objectives]
         left = 1.0 - evaluation.instants / self.evaluations[0].instants
         return gain + self._gains[best], np.nan_to_num(error * np.sqrt(left))
 
     def _scalarised(self, number: int) -> Optimiser:
         """A new one, that was told all there is in one number."""
-        gains, left = self.gains, self.left
+        gains, left = self._told(), self.left
         weights = np.random.default_rng([self._seed, number]).dirichlet(np.ones(gains.shape[1]))
         extent = np.ptp(gains[~np.isnan(gains).any(axis=1)], axis=0)
         scale = np.where(extent > 0, extent, 1.0)

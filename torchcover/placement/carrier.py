@@ -9,11 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, BeforeValidator, Field, PlainValidator, ValidationInfo
 
+from torchcover.evaluation.requirements import RegionRequirement, Requirements
 from torchcover.geometry import BoundingBox
+from torchcover.placement.objective import Name, Objective
 from torchcover.simulation import Rig, Scenario, with_ego
 from torchcover.simulation.bodies import mount_regions_of
 from torchcover.simulation.documents import NameOrFile, Readable, beside, is_file_name
 from torchcover.simulation.mount_regions import MountRegion, Skin
+
+# More of them make no front that anybody can look at.
+MAX_OBJECTIVES = 3
+# What begin the names of what must not be worse, or is required, among what rigs are scored by.
+NOT_WORSE, REQUIRED = "not worse: ", "required: "
 
 
 def _rig(given: Any, info: ValidationInfo) -> Rig:  # noqa: ANN401  (whatever stood in the file)
@@ -32,6 +39,16 @@ def _vehicle(given: str) -> str:
     if Path(given).suffix and not is_file_name(given):
         raise ValueError(f"the name of a vehicle, or the path of its YAML file, is needed; got {given!r}")
     return given
+
+
+def _requirements(given: Any, info: ValidationInfo) -> Requirements:  # noqa: ANN401
+    """Requirements, or a set of them by its name or its file."""
+    if isinstance(given, Requirements | dict):
+        return Requirements.model_validate(given, context=info.context)
+    try:
+        return Requirements.load(beside(Path(given), info) if is_file_name(given) else given)
+    except FileNotFoundError as error:
+        raise ValueError(str(error)) from error
 
 
 def _listed(given: Any) -> Any:  # noqa: ANN401  (whatever stood in the file)
@@ -92,7 +109,7 @@ class Carrier(NamedTuple):
 
 
 class VehicleSpace(Readable):
-    """What a search and a choice have in common: the worlds, and the vehicle in them.
+    """What a search and a choice have in common: the worlds, the vehicle in them, and what a good rig is.
 
     Args:
         name: What files and pages call it.
@@ -100,17 +117,59 @@ class VehicleSpace(Readable):
         scenario: One or several, by name or file: they count alike.
         vehicle: What carries the sensors, by name or file; if not given, that of the rig that the space begins with, or
             the scenario's own.
+        objectives: One to three, by name. One is made as large as it gets; of several, what one gains is weighed
+            against what the others lose.
+        not_worse: What must not be worse than with the rig that is there today: names of usual regions, of which
+            detection within 0.4 m in both bands counts, or objectives.
+        requirements: What must be kept, by name or file, as of `torchcover check`.
     """
 
     name: str
     description: str = ""
     scenario: Names
     vehicle: NamedVehicle | None = None
+    objectives: dict[Name, Objective] = Field(min_length=1, max_length=MAX_OBJECTIVES)
+    not_worse: tuple[Name | Objective, ...] = ()
+    requirements: Annotated[Requirements, PlainValidator(_requirements)] | None = None
 
     @property
     def first_rig(self) -> Rig | None:
         """The rig that it begins with."""
         raise NotImplementedError
+
+    @cached_property
+    def asked(self) -> dict[str, Objective]:
+        """All that rigs are scored by: the objectives, what must not be worse, by its words, what regions require."""
+        kept = [Objective(region=one) if isinstance(one, str) else one for one in self.not_worse]
+        named = {f"{NOT_WORSE}{one.words}": one for one in kept}
+        return self.objectives | named | {name: one for name, (one, _) in self._required.items()}
+
+    @property
+    def floors(self) -> dict[str, float]:
+        """What numbers must be at least, or of lower ones at most, by their names in `asked`."""
+        return {name: floor for name, (_, floor) in self._required.items()}
+
+    @cached_property
+    def _required(self) -> dict[str, tuple[Objective, float]]:
+        """Of regions; what bodies and encounters require is measured on its own."""
+        asked, found = self.requirements, dict[str, tuple[Objective, float]]()
+        for one in asked.requirements if asked else ():
+            if not isinstance(one, RegionRequirement):
+                continue
+            own = (asked.regions or {}) if asked else {}
+            region = {one.region: own[one.region]} if one.region in own else one.region
+            lost = (one.without,) if isinstance(one.without, str) else one.without
+            for key in (one.number, *(f"{one.number}_without_{name}" for name in lost)):
+                each = Objective(number=key, region=region, band=one.height)
+                found |= {f"{REQUIRED}{each.words}, {bound.words}": (each, bound.value) for bound in one.bounds}
+        return found
+
+    @cached_property
+    def to_check(self) -> Requirements | None:
+        """What of the requirements is about bodies and encounters; None if nothing is."""
+        asked = self.requirements
+        others = tuple(one for one in asked.requirements if not isinstance(one, RegionRequirement)) if asked else ()
+        return asked.model_copy(update={"requirements": others}) if asked and others else None
 
     @cached_property
     def scenarios(self) -> tuple[Scenario, ...]:

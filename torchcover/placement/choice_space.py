@@ -21,7 +21,6 @@ from pydantic import (
 from torchcover.placement.carrier import Carrier, NamedRig, VehicleSpace
 from torchcover.placement.constraints import APART_M, MOUNT
 from torchcover.placement.free_sensor import HEIGHT_M, pose_of
-from torchcover.placement.objective import Objective
 from torchcover.placement.questions import Questions
 from torchcover.placement.subsets import Limits
 from torchcover.simulation import Document, Pose, Rig, Sensor
@@ -131,11 +130,13 @@ class ChoiceLimits(Document):
     Args:
         at_most: Sensors that are chosen; all candidates if not given.
         max_cost_eur: What they may cost; see `cost` of the choice.
+        max_self_hits: Share of its rays that may end on the vehicle, of each of them.
         min_distance_m: Between any two sensors.
     """
 
     at_most: PositiveInt | None = None
     max_cost_eur: NonNegativeFloat | None = None
+    max_self_hits: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
     min_distance_m: NonNegativeFloat = APART_M
 
     @model_validator(mode="after")
@@ -159,7 +160,9 @@ class ChoiceSpace(VehicleSpace):
         cost: Prices in euros, by group, and of `mount`, which each sensor needs.
         now: Names of the candidates that are there today, as `GROUP_PLACE`: the choice is compared with them; if not
             given, with a choice that is drawn, the middle one of many.
-        objective: What is made as large as it gets.
+        objectives: One to three detections, by name. One is made as large as it gets; of several there is the best of
+            each, and one between.
+        not_worse: Detections of which `now` has no more: names of usual regions, or objectives.
 
     Raises:
         ValueError: Nothing in it can be chosen, for a reason that the message tells.
@@ -171,7 +174,7 @@ class ChoiceSpace(VehicleSpace):
         ...     scenario="courtyard",
         ...     candidates={"end": {"sensor": {"type": "lidar", "model": "velodyne_vlp16"}, "places": corners}},
         ...     choose={"at_most": 1},
-        ...     objective={"band": "ground", "region": "front_3m"},
+        ...     objectives={"near": {"band": "ground", "region": "front_3m"}},
         ... )
         >>> [sensor.name for sensor in choice.sensors]
         ['end_front', 'end_rear']
@@ -182,7 +185,6 @@ class ChoiceSpace(VehicleSpace):
     choose: ChoiceLimits
     cost: dict[str, NonNegativeFloat] = Field(default_factory=dict)
     now: tuple[str, ...] | None = Field(default=None, min_length=1)
-    objective: Objective
 
     @model_validator(mode="after")
     def _check_candidates(self) -> Self:
@@ -203,10 +205,21 @@ class ChoiceSpace(VehicleSpace):
             raise ValueError(f"now: {', '.join(unknown)}: no candidate; they are {', '.join(candidates[:20])}")
         if twice := [name for name, count in now.items() if count > 1]:
             raise ValueError(f"now: {twice[0]} is there once at most; it is named twice")
-        questions = Questions.around(self.carrier.outline_m, self.objectives)
-        if not self.objective.key.startswith("detection_") or "_without_" in self.objective.key:
-            wanted = f"a detection, as in detection: 0.4; got {self.objective.key!r}"
-            raise ValueError(f"objective: candidates are chosen by {wanted}")
+        return self
+
+    @model_validator(mode="after")
+    def _check_asked(self) -> Self:
+        if self.to_check is not None:
+            raise ValueError(
+                "requirements: candidates are chosen by regions; check the choice for bodies and encounters"
+            )
+        if self.not_worse and not self.now:
+            raise ValueError("not_worse: say what is there today, now, or there is nothing to be worse than")
+        questions = Questions.around(self.carrier.outline_m, self.asked)
+        for name, one in self.asked.items():
+            if not one.key.startswith("detection_") or "_without_" in one.key:
+                wanted = f"a detection, as in detection: 0.4; got {one.key!r}"
+                raise ValueError(f"objective {name!r}: candidates are chosen by {wanted}")
         questions.check(self.rig(self.sensors[:1], self.name))
         return self
 
@@ -228,11 +241,6 @@ class ChoiceSpace(VehicleSpace):
     def first_rig(self) -> Rig | None:
         """Sensors that are there in any case."""
         return self.always
-
-    @property
-    def objectives(self) -> dict[str, Objective]:
-        """The only one, by the name that it has where a search has several."""
-        return {"objective": self.objective}
 
     @cached_property
     def sensors(self) -> tuple[Sensor, ...]:

@@ -9,34 +9,27 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from torchcover import __version__
 from torchcover.coverage import Measure
+from torchcover.coverage.quantity import detection
 from torchcover.coverage.regions import Places
 from torchcover.estimation import Number
+from torchcover.evaluation.progress import Progress
 from torchcover.evaluation.result import sensor_model_words
 from torchcover.evaluation.settings import FILES
+from torchcover.frames import Frame
 from torchcover.neighbors import nearest
 from torchcover.placement.choice_space import ChoiceSpace
 from torchcover.placement.common_instants import CommonInstants
-from torchcover.placement.fresh import FreshGain, fresh_test, told
+from torchcover.placement.fresh import FreshGain, FreshTest, fresh_test, told
 from torchcover.placement.report_files import PlacementReport
-from torchcover.placement.subsets import (
-    Bytes,
-    Candidates,
-    Limits,
-    Subset,
-    Worth,
-    exact,
-    greedy,
-    marginal_values,
-    random_subsets,
-)
-from torchcover.report import ChoiceSize, PageTable, Words, draw_choice
+from torchcover.placement.subsets import Bools, Candidates, Limits, Subset, best, best_of_several, random_subsets
+from torchcover.report import ChoiceSize, PageTable, Words, draw_choice, file_stems
 from torchcover.simulation import Rig, Sensor
 from torchcover.simulation.reference_sensor import DEFAULT_BAND_FRAME
 
-OBJECTIVE = "objective"
 # Random choices that keep to the limits, as a control.
 DRAWN = 1000
 HEADINGS = ("sensor", "alone (%)", "lost without it\n(points)", "cost (EUR)")
@@ -56,12 +49,11 @@ class SensorChoice:
         refused: Name of each of the others, and why it cannot be.
         candidates: What each of `sensors` sees.
         limits: What the choice keeps to.
-        greedy: The greedy choice.
-        best: The best that was found.
-        number: What its rig scores, from the same observers as `evaluate`.
-        drawn: Random choices, by value, ascending.
+        found: The best of the objective; of several, what lies between, and then the best of each.
+        numbers: What the rig of the first of them scores, from the same observers as `evaluate`.
+        drawn: Random choices, by the first objective, ascending.
         now: What it is compared with.
-        gain: On fresh worlds; None if the two are the same, or there are no fresh worlds.
+        test: On fresh worlds; None if the two are the same, or there are no fresh worlds.
         untested: Why there is no test.
     """
 
@@ -72,13 +64,17 @@ class SensorChoice:
     refused: dict[str, str]
     candidates: Candidates
     limits: Limits
-    greedy: Subset
-    best: Subset
-    number: Number
+    found: tuple[Subset, ...]
+    numbers: dict[str, Number]
     drawn: tuple[Subset, ...]
     now: tuple[int, ...]
-    gain: FreshGain | None
-    untested: str
+    test: FreshTest | None = None
+    untested: str = ""
+
+    @property
+    def best(self) -> Subset:
+        """The choice."""
+        return self.found[0]
 
     @cached_property
     def rig(self) -> Rig:
@@ -94,39 +90,56 @@ class SensorChoice:
         return tuple(self.sensors[one].name for one in chosen)
 
     @cached_property
-    def marginal_values(self) -> list[float]:
-        """What is lost when each of the chosen sensors fails."""
-        return marginal_values(self.candidates, self.best.chosen)
+    def lost(self) -> dict[int, float]:
+        """Number of each chosen sensor -> what is lost of the first objective when it fails."""
+        return dict(zip(self.best.chosen, self.candidates.lost_without(self.best.chosen)[:, 0].tolist(), strict=True))
 
     @property
     def better_than_drawn(self) -> float:
-        """The share of random choices that are worth less."""
-        return float(np.mean([one.value < self.best.value for one in self.drawn]))
+        """The share of random choices that are worth less, by the first objective."""
+        return float(np.mean([one.values[0] < self.best.values[0] for one in self.drawn]))
+
+    @property
+    def gains(self) -> tuple[FreshGain, ...]:
+        """Of the best on fresh worlds."""
+        return self.test.gains["best"] if self.test else ()
 
     @property
     def sentence(self) -> str:
         """What it comes to."""
-        gap = self.best.upper_bound - self.best.value
-        kind = "the best there is" if self.best.proven else f"at most {100 * gap:.2f} points below the best"
-        found = f"{', '.join(self.names(self.best.chosen))}: {100 * self.number.value:.2f} %, {kind}"
+        values = ", ".join(f"{100 * self.numbers[name].value:.2f} %" for name in self.space.objectives)
+        kind = (
+            "the best there is" if len(self.found) == 1 else f"between the best of {', '.join(self.space.objectives)}"
+        )
+        if self.best.short:
+            short = f"{100 * self.best.short:.2f} points in all"
+            kind = f"no choice keeps all that must be kept, and this one lacks the least: {short}"
+        elif not self.best.proven:
+            gap = f"at most {100 * self.best.gap:.2f} points below" if len(self.found) == 1 else "not proven to be"
+            kind = f"{gap} the best"
+        found = f"{', '.join(self.names(self.best.chosen))}: {values}, {kind}"
         (model,) = sensor_model_words({self.rig.name: self.sensor_model})
-        if self.gain is None:
+        if self.test is None:
             return f"{found}; not tested in fresh worlds: {self.untested}. {model}"
-        return f"{found}. Against {', '.join(self.names(self.now))}: {told(self.gain, optimism=True)}. {model}"
+        asked = self.gains[: len(self.space.objectives)]
+        gains = "; ".join(f"{gain.objective}: {told(gain, optimism=True)}" for gain in asked)
+        return f"{found}. Against {', '.join(self.names(self.now))}: {gains}. {self.test.sentence}. {model}"
 
     @property
     def report(self) -> PlacementReport:
         """For its files, its page, and the terminal."""
         table = PageTable(f"{self.space.name}: {len(self.sensors)} candidates", HEADINGS, self._chosen_rows(), 1)
         record = self._record
+        ends = zip(file_stems(list(self.space.objectives)), self.found[1:], strict=False)
+        rigs = {f"best_{stem}.yaml": self.rig_of(end.chosen, f"{self.space.name}_{stem}") for stem, end in ends}
         return PlacementReport(
             title=f"{self.space.name}: which sensors, and how many?",
             sentence=self.sentence,
             record=record,
             settings=[name for name in record if name != "torchcover"],
-            rigs={"best.yaml": self.rig},
+            rigs={"best.yaml": self.rig} | rigs,
             shown={"best": self.rig, "now": self.rig_of(self.now, f"{self.space.name}_now")},
-            tables=[table],
+            tables=[table, *([self.test.table] if self.test else ())],
             rows={"candidates.csv": self._candidate_rows(), "sizes.csv": [ChoiceSize._fields, *self._sizes]},
             pictures=self._pictures,
             ego_outline_m=self.space.scenarios[0].ego_box().outline_m,
@@ -135,7 +148,8 @@ class SensorChoice:
     def save(self, folder: str | Path, *, files: str | Iterable[str] = FILES) -> list[Path]:
         """Write the files of the command line; see `PlacementReport.save`.
 
-        They are `best.yaml`, `candidates.csv`, `sizes.csv`, `search.json`, `sizes.png`, `report.html`, `summary.json`.
+        They are `best.yaml` (of several objectives also `best_OBJECTIVE.yaml`), `candidates.csv`,
+        `sizes.csv`, `search.json`, `sizes.png`, `report.html`, `summary.json`.
         """
         return self.report.save(folder, files=files)
 
@@ -147,42 +161,46 @@ class SensorChoice:
             "estimate": self.estimate,
             "sensor_model": self.sensor_model,
             "band_frame": DEFAULT_BAND_FRAME,
-            "best": {
-                "sensors": self.names(self.best.chosen),
-                "value": self.number.value,
-                "error": self.number.error,
-                "upper_bound": self.best.upper_bound,
-                "proven": self.best.proven,
-                "cost_eur": self.limits.price(self.best.chosen) if self.space.cost else None,
-                "lost_without": dict(zip(self.names(self.best.chosen), self.marginal_values, strict=True)),
-            },
-            "greedy": {"sensors": self.names(self.greedy.chosen), "value": self.greedy.value},
+            "found": [
+                {
+                    "sensors": self.names(one.chosen),
+                    "values": dict(zip(self.space.asked, one.values, strict=True)),
+                    "gap": one.gap,
+                    "proven": one.proven,
+                    "lacks": one.short,
+                    "cost_eur": self.limits.price(one.chosen) if self.space.cost else None,
+                }
+                for one in self.found
+            ],
+            "errors": {name: number.error for name, number in self.numbers.items()},
+            "lost_without": {self.sensors[one].name: lost for one, lost in self.lost.items()},
             "drawn": {
                 "count": len(self.drawn),
-                "median": self.drawn[len(self.drawn) // 2].value,
-                "best": self.drawn[-1].value,
+                "median": self.drawn[len(self.drawn) // 2].values[0],
+                "best": self.drawn[-1].values[0],
                 "share_below_best": self.better_than_drawn,
             },
-            "now": {"sensors": self.names(self.now), "value": self.candidates.value(self.now)},
-            "fresh": self.gain and self.gain.record,
+            "now": {"sensors": self.names(self.now), "values": self.candidates.values(self.now).tolist()},
+            "fresh": {f"{gain.objective}, {gain.estimate}": gain.record for gain in self.gains} or None,
+            "changes": self.test and self.test.record,
             "refused": self.refused,
         }
 
     def _candidate_rows(self) -> Iterator[Sequence[object]]:
         """A row for each candidate, with a heading: values are shares, with what is always there."""
-        lost = dict(zip(self.best.chosen, self.marginal_values, strict=True))
         yield ["name", "value_alone", "cost_eur", "chosen", "lost_without", "why_not"]
         for at, sensor in enumerate(self.sensors):
-            yield [sensor.name, self.candidates.value([at]), self._price(at), at in lost, lost.get(at), ""]
+            alone = float(self.candidates.values([at])[0])
+            yield [sensor.name, alone, self._price(at), at in self.lost, self.lost.get(at), ""]
         for name, why in self.refused.items():
             yield [name, "", "", False, "", why]
 
     def _chosen_rows(self) -> list[tuple[Words, ...]]:
-        """Cells below `HEADINGS`, in the order in which the sensors were chosen."""
+        """Cells below `HEADINGS`, what is lost the most first."""
         rows = []
-        for at, lost in zip(self.best.chosen, self.marginal_values, strict=True):
+        for at, lost in sorted(self.lost.items(), key=lambda one: -one[1]):
             price = self._price(at)
-            numbers = f"{100 * self.candidates.value([at]):.2f}", f"{100 * lost:.2f}"
+            numbers = f"{100 * self.candidates.values([at])[0]:.2f}", f"{100 * lost:.2f}"
             rows.append(tuple(map(Words, (self.sensors[at].name, *numbers, "-" if price is None else f"{price:g}"))))
         return rows
 
@@ -191,27 +209,22 @@ class SensorChoice:
 
     @cached_property
     def _sizes(self) -> list[ChoiceSize]:
-        """The best choices of so many sensors."""
+        """The best choices of so many sensors, by the first objective."""
         found = []
         for size in range(1, min(self.limits.most, MOST_SIZES) + 1):
-            same = size == len(self.best.chosen)
-            best = self.best if same else greedy(self.candidates, replace(self.limits, most=size))
-            if len(best.chosen) == size:
-                found.append(ChoiceSize(size, best.value, best.upper_bound))
+            one = best(self.candidates, replace(self.limits, most=size))
+            if len(one.chosen) == size and not one.short:
+                found.append(ChoiceSize(size, one.values[0], one.values[0] + one.gap))
         return found
 
     def _pictures(self) -> Iterator[tuple[str, str, Figure]]:
-        drawn = [one.value for one in self.drawn]
-        figure = draw_choice(self._sizes, drawn, len(self.best.chosen), self.best.value, title=self.space.name)
+        drawn = [one.values[0] for one in self.drawn]
+        figure = draw_choice(self._sizes, drawn, len(self.best.chosen), self.best.values[0], title=self.space.name)
         yield "sizes", "What more sensors bring, and what random choices are worth", figure
 
 
 def choose(
-    space: ChoiceSpace,
-    instants: CommonInstants,
-    *,
-    test_seed: int,
-    fresh_worlds: int,
+    space: ChoiceSpace, instants: CommonInstants, *, test_seed: int, fresh_worlds: int, progress: bool = False
 ) -> SensorChoice:
     """Find the best choice of candidates, and compare it with today's in worlds that it was not chosen by.
 
@@ -221,119 +234,147 @@ def choose(
 
     Args:
         space: The candidates and the limits.
-        instants: Of the scenarios of the space, for the objective "objective".
+        instants: Of the scenarios of the space, for what it asks.
         test_seed: Seed of the fresh worlds.
         fresh_worlds: How many.
+        progress: Whether to show a bar.
 
     Raises:
         ValueError: No candidate can be mounted, or sees anything that counts; one of `now` cannot be mounted; the
             sensor model is to be real, and of none of the chosen sensors that is known.
     """
-    sensors, bits, refused = _mounted(space, instants)
-    always = seen_by(space.always, instants) if space.always else np.zeros_like(bits[0])
-    candidates = Candidates(worth_of(instants), bits, always)
+    sensors, seen, refused = _mounted(space, instants, progress=progress)
+    always = seen_by(space.always, instants)[0] if space.always else np.zeros_like(seen[0])
+    candidates = Candidates.grouped(worth_of(instants), seen, always)
+    places = {sensor.name: at for at, sensor in enumerate(sensors)}
+    if lost := [name for name in space.now or () if name not in places]:
+        raise ValueError(f"now: {lost[0]} cannot be there: {refused[lost[0]]}")
+    now = tuple(places[name] for name in space.now or ())
     numbers = {sensor.name: number for number, sensor in enumerate(space.sensors)}
     limits = space.limits([numbers[sensor.name] for sensor in sensors])
-    best = exact(candidates, limits)
-    if not best.chosen:
+    objectives = len(space.objectives)
+    kept = zip(space.asked, candidates.values(now).tolist(), strict=True)
+    least = [-np.inf if name in space.objectives else space.floors.get(name, own) for name, own in kept]
+    limits = replace(limits, least=least)
+    found = best_of_several(candidates, limits, objectives)
+    if not found[0].chosen:
         raise ValueError(
             f"candidates: none of the {len(sensors)} that can be there adds anything to the objective; move or turn "
             "them, or ask about places that they see"
         )
-    drawn = sorted(random_subsets(candidates, limits, DRAWN, instants.seed), key=lambda one: one.value)
-    now = drawn[len(drawn) // 2].chosen
-    if space.now is not None:
-        places = {sensor.name: at for at, sensor in enumerate(sensors)}
-        if lost := [name for name in space.now if name not in places]:
-            raise ValueError(f"now: {lost[0]} cannot be there: {refused[lost[0]]}")
-        now = tuple(places[name] for name in space.now)
-    rig = space.rig(tuple(sensors[one] for one in best.chosen), f"{space.name}_best")
-    number = instants.estimates(rig)[instants.estimate].numbers()[OBJECTIVE]
-    control = greedy(candidates, limits), best, number, tuple(drawn), now
+    drawn = sorted(random_subsets(candidates, limits, DRAWN, instants.seed), key=lambda one: one.values[0])
+    now = now or drawn[len(drawn) // 2].chosen
+    rig = space.rig(tuple(sensors[one] for one in found[0].chosen), f"{space.name}_best")
+    scored = instants.estimates(rig)[instants.estimate].numbers()
     model = rig.sensing(instants.sensor_model).sensor_model
-    found = SensorChoice(space, instants.estimate, model, sensors, refused, candidates, limits, *control, None, "")
-    return _tested(found, instants, test_seed, fresh_worlds)
+    choice = tuple(found), scored, tuple(drawn), now
+    return _tested(
+        SensorChoice(space, instants.estimate, model, sensors, refused, candidates, limits, *choice),
+        instants,
+        test_seed,
+        fresh_worlds,
+    )
 
 
-def seen_by(rig: Rig, instants: CommonInstants) -> Bytes:
-    """(B,) uint8: which reference points have a point of a rig within the threshold, eight a byte, instant by instant.
-
-    Each instant begins a byte of its own.
+def seen_by(rig: Rig, instants: CommonInstants) -> tuple[Bools, float]:
+    """(T P,) which reference points have a point of a rig within each threshold; the share of rays on the vehicle.
 
     Raises:
         ValueError: The rig cannot be mounted.
     """
-    (threshold,) = instants.questions.thresholds_m
-    found = []
+    questions, rays, self_hits = instants.questions, 0, 0
+    near: list[list[Bools]] = [[] for _ in questions.thresholds_m]
     for frame in instants.frames(rig):
-        points = frame.cloud_of(within_m=threshold)
-        distance = nearest(frame.reference, points, max_distance=instants.questions.max_radius_m).distance
-        found.append(np.packbits((distance <= threshold).numpy()))
-    return np.concatenate(found)
+        for threshold, found in zip(questions.thresholds_m, near, strict=True):
+            points = frame.cloud_of(within_m=threshold)
+            distance = nearest(frame.reference, points, max_distance=questions.max_radius_m).distance
+            found.append((distance <= threshold).numpy())
+        rays, self_hits = rays + frame.counts["rays"], self_hits + frame.counts["self_hits"]
+    return np.concatenate([np.concatenate(found) for found in near]), self_hits / rays
 
 
-def worth_of(instants: CommonInstants) -> Worth:
-    """What each reference point adds to the objective: the same numbers as those of `CoverageMetric`.
+def worth_of(instants: CommonInstants) -> NDArray[np.float64]:
+    """(Q, T P) what each reference point adds to each number: the same numbers as those of `CoverageMetric`.
 
     By area, a point is worth its share of the square metres that are seen. Over known cells it is worth its share of
     the square metres in its cell at its instant, which share the cell with its other instants, and that the mean with
-    all known cells.
+    all known cells. For a threshold that is not that of the number it is worth nothing.
 
     Raises:
         ValueError: A region and band that no instant shows.
     """
-    questions, grid = instants.questions, instants.questions.grid
-    frames = list(instants.frames())
-    of_bits = [torch.zeros(-(-len(frame.reference) // 8) * 8, dtype=torch.float64) for frame in frames]
-    places = questions.objectives[OBJECTIVE].places
-    for region, band in places:
-        where = Places([questions.regions[region]], grid)
-        cells = torch.zeros(grid.shape, dtype=torch.bool)
-        cells[list(grid.heights).index(band)] = where.regions[0].mask(grid)
-        of_places, m2, probed = [], torch.zeros(0), torch.zeros(grid.cells, dtype=torch.int64)
-        for frame in frames:
-            inside, of, cell = grid.bins(frame.reference, frame.heights_in(grid.band_frame))
-            if instants.estimate == "area":
-                place, point = where.of_points(frame.reference[inside[of]], cell)
-                own = point[place == where.number_of(where.regions[0], band)]
-            else:
-                own = cells.view(-1)[cell].nonzero().squeeze(1)
-            points, cell = inside[of[own]], cell[own]
-            assert frame.reference_weights is not None  # square metres
-            weight = frame.reference_weights[points].double()
-            of_places.append((points, weight, cell))
-            m2, probed = torch.cat([m2, weight]), probed + torch.bincount(cell, minlength=grid.cells).bool()
-        if not len(m2):
-            raise ValueError(f"objective: no instant shows any surface of {band} in {region}; use more worlds")
-        for worth, (points, weight, cell) in zip(of_bits, of_places, strict=True):
-            share = weight / m2.sum()
-            if instants.estimate == "known":
-                of_cell = torch.bincount(cell, weights=weight, minlength=grid.cells)
-                share = weight / of_cell[cell] / probed[cell] / (probed > 0).sum()
-            worth.index_add_(0, points, share / len(places))
-    return Worth(torch.cat(of_bits).numpy())
+    questions, frames = instants.questions, list(instants.frames())
+    keys = [detection(threshold).key for threshold in questions.thresholds_m]
+    points = sum(len(frame.reference) for frame in frames)
+    worth = np.zeros((len(questions.objectives), len(keys), points))
+    for row, (name, asked) in zip(worth, questions.objectives.items(), strict=True):
+        for place in asked.places:
+            row[keys.index(asked.key)] += _worth_in(place, name, instants, frames) / len(asked.places)
+    return worth.reshape(len(worth), -1)
 
 
-def _mounted(space: ChoiceSpace, instants: CommonInstants) -> tuple[tuple[Sensor, ...], list[Bytes], dict[str, str]]:
+def _worth_in(
+    place: tuple[str, str], name: str, instants: CommonInstants, frames: Sequence[Frame]
+) -> NDArray[np.float64]:
+    """(P,) what each point is worth in a region and band."""
+    (region, band), questions, grid = place, instants.questions, instants.questions.grid
+    where = Places([questions.regions[region]], grid)
+    cells = torch.zeros(grid.shape, dtype=torch.bool)
+    cells[list(grid.heights).index(band)] = where.regions[0].mask(grid)
+    of_frames, m2, probed = [], torch.zeros(0), torch.zeros(grid.cells, dtype=torch.int64)
+    for frame in frames:
+        inside, of, cell = grid.bins(frame.reference, frame.heights_in(grid.band_frame))
+        if instants.estimate == "area":
+            at, point = where.of_points(frame.reference[inside[of]], cell)
+            own = point[at == where.number_of(where.regions[0], band)]
+        else:
+            own = cells.view(-1)[cell].nonzero().squeeze(1)
+        points, cell = inside[of[own]], cell[own]
+        assert frame.reference_weights is not None  # square metres
+        weight = frame.reference_weights[points].double()
+        of_frames.append((points, weight, cell))
+        m2, probed = torch.cat([m2, weight]), probed + torch.bincount(cell, minlength=grid.cells).bool()
+    if not len(m2):
+        raise ValueError(f"{name}: no instant shows any surface of {band} in {region}; use more worlds")
+    found = []
+    for frame, (points, weight, cell) in zip(frames, of_frames, strict=True):
+        share = weight / m2.sum()
+        if instants.estimate == "known":
+            of_cell = torch.bincount(cell, weights=weight, minlength=grid.cells)
+            share = weight / of_cell[cell] / probed[cell] / (probed > 0).sum()
+        found.append(torch.zeros(len(frame.reference), dtype=torch.float64).index_add_(0, points, share))
+    return torch.cat(found).numpy()
+
+
+def _mounted(
+    space: ChoiceSpace, instants: CommonInstants, *, progress: bool
+) -> tuple[tuple[Sensor, ...], list[Bools], dict[str, str]]:
     """The candidates that can be mounted, what they see, and why the others cannot."""
     sensors: list[Sensor] = []
-    bits: list[Bytes] = []
+    seen: list[Bools] = []
     refused: dict[str, str] = {}
-    for sensor in space.sensors:
-        if space.too_close(sensor):
-            refused[sensor.name] = "a sensor that is always there is too close"
-            continue
-        alone = Rig(name=sensor.name, vehicle=space.rig((sensor,), "any").vehicle, sensors=(sensor,))
-        try:
-            bits.append(seen_by(alone, instants))
-        except ValueError as error:
-            refused[sensor.name] = str(error)
-            continue
-        sensors.append(sensor)
+    most = space.choose.max_self_hits
+    with Progress(len(space.sensors), space.name, shown=progress) as bar:
+        for sensor in space.sensors:
+            bar.advance(len(space.sensors), sensor.name)
+            if space.too_close(sensor):
+                refused[sensor.name] = "a sensor that is always there is too close"
+                continue
+            alone = Rig(name=sensor.name, vehicle=space.rig((sensor,), "any").vehicle, sensors=(sensor,))
+            try:
+                points, own = seen_by(alone, instants)
+            except ValueError as error:
+                refused[sensor.name] = str(error)
+                continue
+            if most is not None and own > most:
+                refused[sensor.name] = f"{own:.1%} of its rays end on the vehicle; max_self_hits is {most:.1%}"
+                continue
+            sensors.append(sensor)
+            seen.append(points)
     if not sensors:
         name, why = next(iter(refused.items()))
         raise ValueError(f"candidates: none of {len(refused)} can be there; of {name}: {why}")
-    return tuple(sensors), bits, refused
+    return tuple(sensors), seen, refused
 
 
 def _tested(found: SensorChoice, instants: CommonInstants, test_seed: int, worlds: int) -> SensorChoice:
@@ -341,7 +382,6 @@ def _tested(found: SensorChoice, instants: CommonInstants, test_seed: int, world
         return replace(found, untested="it is what is there today")
     now = found.rig_of(found.now, f"{found.space.name}_now")
     try:
-        tests = fresh_test({"best": found.rig}, now, instants, test_seed=test_seed, worlds=worlds)
+        return replace(found, test=fresh_test({"best": found.rig}, now, instants, test_seed=test_seed, worlds=worlds))
     except ValueError as error:
         return replace(found, untested=str(error))
-    return replace(found, gain=tests["best"][0])

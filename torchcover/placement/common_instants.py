@@ -40,7 +40,7 @@ class HeldInstant(NamedTuple):
     world: int
 
 
-class Asked(NamedTuple):
+class AskedInstant(NamedTuple):
     """What is asked of an instant.
 
     Args:
@@ -74,7 +74,7 @@ class HeldWorlds(Dataset[Frame | MeasuredFrame]):
         self._mounted: dict[int, Simulator] = {}
         self._observers: dict[tuple[Measure, ...], Mapping[CoverageObserver, Measure]] = {}
 
-    def __getitem__(self, asked: Asked) -> Frame | MeasuredFrame:
+    def __getitem__(self, asked: AskedInstant) -> Frame | MeasuredFrame:
         frame, measures = self._frame(asked.rig, asked.number), asked.measures
         if asked.rig is None or not measures:
             return frame
@@ -215,7 +215,7 @@ class CommonInstants:
         ]
         self.instants = _instants_of([one.simulator for one in simulations], worlds, per_world)
         self.order = racing_order([instant.world for instant in self.instants], seed)
-        self._batches: list[list[Asked]] = []
+        self._batches: list[list[AskedInstant]] = []
         self._processes = min(workers, self.instants[-1].world + 1)
         self._loader = DataLoader(
             FramesOrErrors(HeldWorlds(simulations, self.instants, self.questions)),
@@ -246,12 +246,13 @@ class CommonInstants:
     def __len__(self) -> int:
         return len(self.instants)
 
-    def anew(self, seed: int, worlds: int) -> "CommonInstants":
-        """The same questions at as many instants in each of other worlds.
+    def anew(self, seed: int, worlds: int, more: Mapping[str, Objective]) -> "CommonInstants":
+        """The same questions, and more, at as many instants in each of other worlds.
 
         Args:
             seed: Another one, so that no world is the same.
             worlds: Worlds of each scenario with traffic; others are the same world for any seed, and are left out.
+            more: Other objectives, by name.
 
         Raises:
             ValueError: The seed that these have; no scenario with traffic.
@@ -261,7 +262,7 @@ class CommonInstants:
         if not (fresh := [one for one in self.scenarios if not one.repeats]):
             names = ", ".join(repr(one.name) for one in self.scenarios)
             raise ValueError(f"scenarios: one whose worlds are drawn is needed; {names} is the same for any seed")
-        return CommonInstants(fresh, self.objectives, worlds=worlds, seed=seed, **self._settings)
+        return CommonInstants(fresh, {**self.objectives, **more}, worlds=worlds, seed=seed, **self._settings)
 
     def prefixes(self, rig: Rig) -> Iterator[Prefix]:
         """What is known of a rig after three instants more at a time; nothing is scored before it is asked for.
@@ -319,7 +320,7 @@ class CommonInstants:
         for number in numbers:
             shares[self.instants[number].world % len(shares)].append(number)
         # The k-th batch goes to the k-th process, which has built these worlds.
-        self._batches[:] = [[Asked(rig, number, measures) for number in share] for share in shares]
+        self._batches[:] = [[AskedInstant(rig, number, measures) for number in share] for share in shares]
         made: dict[int, Frame | MeasuredFrame | ValueError] = {}
         try:
             for share, batch in zip(shares, self._loader, strict=True):

@@ -27,6 +27,7 @@ class Evaluation:
         rig: It, while it is asked for.
         prefixes: What it scored after more and more instants; empty if it was not scored.
         infeasible: Why it cannot be; empty if it can.
+        lacks: Of what is required of bodies and in encounters, as shares of it, in all; 0 too where others are better.
         seconds: What it took.
     """
 
@@ -37,6 +38,7 @@ class Evaluation:
     rig: Rig | None = None
     prefixes: tuple[Prefix, ...] = ()
     infeasible: str = ""
+    lacks: float = 0.0
     seconds: float = 0.0
 
     @property
@@ -52,7 +54,7 @@ class Evaluation:
     def record(self) -> dict[str, Any]:
         """All of it, for a checkpoint."""
         return {
-            **{name: getattr(self, name) for name in ("number", "arm", "values", "infeasible", "seconds")},
+            **{name: getattr(self, name) for name in ("number", "arm", "values", "infeasible", "lacks", "seconds")},
             "unit": None if self.unit is None else self.unit.tolist(),
             "quantities": [list(one) for one in self.prefixes[-1].estimate.quantities] if self.prefixes else [],
             "prefixes": [

@@ -1,14 +1,32 @@
 """The winner of a search against its start, in worlds that the search has never seen, in numbers and words."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from typing import Any, NamedTuple
 
-from torchcover.estimation import Difference
+import numpy as np
+import torch
+
+from torchcover.coverage.grid import PAPER_HEIGHTS
+from torchcover.coverage.quantity import detection
+from torchcover.estimation import Difference, Estimate, Quantity
+from torchcover.evaluation.target_survey import free_space
+from torchcover.placement.carrier import NOT_WORSE
 from torchcover.placement.common_instants import CommonInstants
+from torchcover.placement.objective import THRESHOLD_M, Objective
+from torchcover.report import PageTable, Words
 from torchcover.report.wording import difference_words, shown_unit
-from torchcover.simulation import Rig
+from torchcover.simulation import RegionsOfInterest, Rig, with_ego
+from torchcover.targets import TARGETS, Raster, Target, survey
+
+# Changes that a sentence names.
+MOST_TOLD = 4
+# Of a target around the vehicle.
+WITHIN_M = 3.0
+# Usual regions have the same names around any vehicle.
+ANY_OUTLINE_M = np.array([[-2.0, -1.0], [2.0, -1.0], [2.0, 1.0], [-2.0, 1.0]])
+CHANGE_HEADINGS = ("what", "gain on\nfresh worlds", "unit", "p (Holm)", "share of\nthe gain")
 
 
 class FreshGain(NamedTuple):
@@ -29,10 +47,7 @@ class FreshGain(NamedTuple):
     @property
     def words(self) -> str:
         """The gain on fresh worlds with its interval, without its unit: shares in percentage points."""
-        test = self.test
-        if test.quantity.lower_is_better:
-            test = test._replace(value=-test.value, low=-test.high, high=-test.low)
-        return difference_words(test)
+        return signed_words(self.test)
 
     @property
     def optimism(self) -> float:
@@ -62,9 +77,82 @@ class FreshGain(NamedTuple):
         }
 
 
+class SideEffect(NamedTuple):
+    """What else the winner has better or worse than the start, whether anybody asked for it or not.
+
+    Args:
+        what: Which number.
+        test: The difference on fresh worlds, paired; of a target over the cells around the vehicle.
+        p: Probability of a difference as large to either side by chance, with all other changes looked at (Holm 1979).
+        shares: Name of an objective -> what share of its gain on fresh worlds this is, if it is a part of it.
+    """
+
+    what: str
+    test: Difference
+    p: float
+    shares: Mapping[str, float]
+
+    @property
+    def is_worse(self) -> bool:
+        """Whether it got worse beyond chance."""
+        return self.p <= 0.05 and self.test.gain < 0
+
+    @property
+    def words(self) -> str:
+        """It with its interval and unit."""
+        unit = self.test.quantity.unit
+        return f"{self.what} {signed_words(self.test)} {unit_words(unit)}"
+
+
+class FreshTest(NamedTuple):
+    """Winners of a search in worlds that it has never seen.
+
+    Args:
+        gains: By the names of the winners: in each objective by the estimate of the search, then by the other one where
+            that is a choice.
+        changes: What else the first of them changed, what got worse beyond chance first.
+    """
+
+    gains: Mapping[str, tuple[FreshGain, ...]]
+    changes: tuple[SideEffect, ...]
+
+    @property
+    def sentence(self) -> str:
+        """What got worse."""
+        worse = [change.words for change in self.changes if change.is_worse]
+        told = [*worse[:MOST_TOLD], *([f"{len(worse) - MOST_TOLD} more"] if len(worse) > MOST_TOLD else [])]
+        number = f"of {len(self.changes)} numbers around the vehicle"
+        if not worse:
+            return f"None {number} got worse beyond chance"
+        return f"Worse beyond chance, {number}: {'; '.join(told)}"
+
+    @property
+    def table(self) -> PageTable:
+        """All changes."""
+        rows = [
+            (
+                Words(change.what),
+                Words(signed_words(change.test), "significant" if change.p <= 0.05 else ""),
+                Words(unit_words(change.test.quantity.unit)),
+                Words("-" if math.isnan(change.p) else f"{change.p:.2g}"),
+                Words(", ".join(f"{name} {share:.0%}" for name, share in change.shares.items())),
+            )
+            for change in self.changes
+        ]
+        return PageTable("What else changed", CHANGE_HEADINGS, rows, 1)
+
+    @property
+    def record(self) -> list[dict[str, Any]]:
+        """The changes, for JSON."""
+        return [
+            {"what": one.what, "gain": one.test.gain, "error": one.test.error, "p_holm": one.p, "shares": one.shares}
+            for one in self.changes
+        ]
+
+
 def fresh_test(
     winners: Mapping[str, Rig], start: Rig, searched: CommonInstants, *, test_seed: int, worlds: int
-) -> dict[str, tuple[FreshGain, ...]]:
+) -> FreshTest:
     """Score rigs in worlds of another seed, instant by instant against the same reference.
 
     Args:
@@ -75,29 +163,100 @@ def fresh_test(
         worlds: Fresh worlds of each scenario with traffic; a scenario without is the same world for any seed, and is
             left out.
 
-    Returns:
-        The gains by the names of the winners: in each objective by the estimate of the search, then by the other one
-        where that is a choice.
-
     Raises:
         ValueError: The seed of the search; no scenario with traffic; a rig that cannot be mounted in a fresh world.
     """
-    with closing(searched.anew(test_seed, worlds)) as fresh:
+    first = next(iter(winners))
+    others, parts = _others(searched.objectives, failures=max(len(start.sensors), len(winners[first].sensors)) > 1)
+    with closing(searched.anew(test_seed, worlds, others)) as fresh:
         start_by_test = fresh.estimates(start)
         by_test = {name: fresh.estimates(winner) for name, winner in winners.items()}
     start_by_search = searched.estimates(start)
     own = {objective: asked.own_estimate for objective, asked in searched.objectives.items()}
-    tests = {}
+    gains = {}
     for name, winner in winners.items():
         by_search = searched.estimates(winner)
-        tests[name] = tuple(
+        gains[name] = tuple(
             FreshGain(objective, own[objective] or estimate, test, in_search[objective].gain)
             for estimate in sorted(start_by_search, key=lambda one: one != searched.estimate)
             for in_search in [by_search[estimate].differences(start_by_search[estimate])]
             for objective, test in by_test[name][estimate].differences(start_by_test[estimate]).items()
-            if estimate == searched.estimate or not own[objective]
+            if objective in own and (estimate == searched.estimate or not own[objective])
         )
-    return tests
+    found = by_test[first][searched.estimate].differences(start_by_test[searched.estimate])
+    tests = {name: test for name, test in found.items() if name in others or name.startswith(NOT_WORSE)}
+    tests |= _of_targets(winners[first], start, searched)
+    shares: dict[str, dict[str, float]] = {name: {} for name in tests}
+    for objective, each in parts.items():
+        whole = sum(found[part].gain for part in each)
+        for part in each:
+            shares[part][objective] = found[part].gain / whole if whole else math.nan
+    changes = [
+        SideEffect(name, test, p, shares[name])
+        for (name, test), p in zip(tests.items(), holm([test.p for test in tests.values()]), strict=True)
+    ]
+    return FreshTest(gains, tuple(sorted(changes, key=lambda one: (not one.is_worse, one.p, one.test.gain))))
+
+
+def holm(p: Sequence[float]) -> list[float]:
+    """Of each probability, what it is with all others looked at (Holm 1979); what is unknown stays so, and counts not.
+
+    Example:
+        >>> holm([0.02, 0.001, math.nan, 0.9])
+        [0.04, 0.003, nan, 0.9]
+    """
+    known = sorted((one, at) for at, one in enumerate(p) if not math.isnan(one))
+    adjusted, least = [math.nan] * len(p), 0.0
+    for rank, (one, at) in enumerate(known):
+        least = adjusted[at] = max(least, min((len(known) - rank) * one, 1.0))
+    return adjusted
+
+
+def _others(asked: Mapping[str, Objective], *, failures: bool) -> tuple[dict[str, Objective], dict[str, list[str]]]:
+    """What is asked in fresh worlds beside what is asked for, by its words; and which of it objectives are made of."""
+    found, parts = dict[str, Objective](), dict[str, list[str]]()
+    for name, objective in asked.items():
+        if name.startswith(NOT_WORSE) or len(objective.places) < 2:
+            continue
+        each = {one.words: one for one in objective.parts}
+        found, parts[name] = found | each, list(each)
+    own = {region for objective in asked.values() if isinstance(objective.region, dict) for region in objective.region}
+    plain = detection(THRESHOLD_M).key
+    for region in RegionsOfInterest().around(ANY_OUTLINE_M).regions:
+        for band in PAPER_HEIGHTS if region.name not in own else ():
+            one = Objective(region=region.name, band=band)
+            found[one.words] = one
+            if failures:
+                found[f"{one.words}, any one sensor failed"] = one.model_copy(update={"number": f"{plain}_without_any"})
+    return {name: one for name, one in found.items() if name not in asked}, parts
+
+
+def _of_targets(rig: Rig, start: Rig, searched: CommonInstants) -> dict[str, Difference]:
+    """Places within a few metres of the vehicle at which targets are seen, on empty ground."""
+    found = {}
+    for target in TARGETS:
+        ends = []
+        for one in (rig, start):
+            empty = with_ego(free_space().model_copy(update={"ego": searched.scenarios[0].ego}), {one.name: one})
+            raster = Raster.around(empty.ego_box(), WITHIN_M)
+            seen = survey(one.sensing("ideal"), empty, Target.load(target), raster)
+            there = seen.free & (seen.distance_m <= WITHIN_M)
+            # Every fourth cell along each axis is a block of its own: by them it is known what the raster leaves open.
+            row, column = np.indices(there.shape) % 4
+            of = torch.from_numpy((4 * row + column)[there])
+            cells = torch.bincount(of, minlength=16)
+            enough = torch.bincount(of, torch.from_numpy(seen.enough[there]).double(), minlength=16)
+            quantity = Quantity(target, f"{target} seen", "share", lower_is_better=False)
+            ends.append(Estimate.of_ratios((quantity,), cells.double(), enough[:, None], cells))
+        found[f"{target} within {WITHIN_M:g} m"] = ends[0].differences(ends[1])[target]
+    return found
+
+
+def signed_words(test: Difference) -> str:
+    """A difference with its interval and no unit, its sign turned so that more is better."""
+    if test.quantity.lower_is_better:
+        test = test._replace(value=-test.value, low=-test.high, high=-test.low)
+    return difference_words(test)
 
 
 def amount(value: float, unit: str) -> str:

@@ -84,6 +84,28 @@ class Objective(Document):
         return self.number or f"detection_{THRESHOLD_M if self.detection is None else self.detection:g}m"
 
     @property
+    def words(self) -> str:
+        """In one line.
+
+        Example:
+            >>> Objective(region="80m").words, Objective(number="radius_m", region="20m", band="ground").words
+            ('80m', 'radius_m, 20m, ground')
+        """
+        plain = self.key == f"detection_{THRESHOLD_M:g}m"
+        bands = (self.band,) if isinstance(self.band, str) else self.band or ()
+        regions = (self.region,) if isinstance(self.region, str) else self.region or ()
+        return ", ".join([*([] if plain else [self.key]), *regions, *bands])
+
+    @property
+    def parts(self) -> "tuple[Objective, ...]":
+        """What it is the mean of: an objective for each region and band."""
+        each = ((region, band, self.region) for region, band in self.places)
+        return tuple(
+            Objective(number=self.key, band=band, region={name: own[name]} if isinstance(own, dict) else name)
+            for name, band, own in each
+        )
+
+    @property
     def metric(self) -> str | None:
         """The published metric that gives it; None where the coverage does."""
         return max((name for name in PUBLISHED if self.key.startswith(name)), key=len, default=None)

@@ -68,7 +68,9 @@ def racing_order(world_of: Sequence[int] | Numbers, seed: int) -> Numbers:
     return order
 
 
-def race(prefixes: Iterable[Prefix], incumbents: Sequence[Sequence[Prefix]] = ()) -> tuple[Prefix, ...]:
+def race(
+    prefixes: Iterable[Prefix], incumbents: Sequence[Sequence[Prefix]] = (), objectives: int | None = None
+) -> tuple[Prefix, ...]:
     """Score a rig on until it is clearly below an incumbent after the same instants, or was scored at all of them.
 
     Clearly is two standard errors of their paired difference, over worlds, in every objective.
@@ -76,6 +78,7 @@ def race(prefixes: Iterable[Prefix], incumbents: Sequence[Sequence[Prefix]] = ()
     Args:
         prefixes: What is known of it after more and more instants; no more of them is asked for than is needed.
         incumbents: The best so far, at all instants; of several objectives there may be several.
+        objectives: How many of the first numbers these are; all if not given.
 
     Returns:
         What was asked for.
@@ -83,11 +86,11 @@ def race(prefixes: Iterable[Prefix], incumbents: Sequence[Sequence[Prefix]] = ()
     known: list[Prefix] = []
     for prefix in prefixes:
         known.append(prefix)
-        if any(_is_below(prefix.estimate, other[len(known) - 1].estimate) for other in incumbents):
+        if any(_is_below(prefix.estimate, other[len(known) - 1].estimate, objectives) for other in incumbents):
             break
     return tuple(known)
 
 
-def _is_below(estimate: Estimate, other: Estimate) -> bool:
+def _is_below(estimate: Estimate, other: Estimate, objectives: int | None) -> bool:
     gain, error = gains(estimate, other)
-    return bool((gain < -ERRORS_BELOW * error).all())
+    return bool((gain < -ERRORS_BELOW * error)[:objectives].all())

@@ -12,15 +12,18 @@ from torchcover.evaluation.result import sensor_model_words
 from torchcover.evaluation.settings import FILES
 from torchcover.placement.arm import Arm
 from torchcover.placement.evaluation import OPTIMISER, RANDOM, START, Evaluation
-from torchcover.placement.fresh import FreshGain, amount, told, unit_words
+from torchcover.placement.fresh import FreshGain, FreshTest, amount, told, unit_words
 from torchcover.placement.pareto import hypervolume
 from torchcover.placement.report_files import OF_THE_RUN, PlacementReport
 from torchcover.placement.result_pictures import search_pictures
 from torchcover.placement.search import PlacementSearch
+from torchcover.placement.variables import FreeNumber
 from torchcover.report import PageTable, Words, file_stems
 from torchcover.report.wording import UNKNOWN
 from torchcover.simulation import Rig
 
+# Of a range: nearer to its end, a number is on it.
+BOUND = 0.005
 HEADINGS = ("found by", "objective", "estimate", "gain in\nthe search", "gain on\nfresh worlds", "t",
             "better in\n(worlds)", "optimism")  # fmt: skip
 
@@ -61,12 +64,14 @@ class SearchResult:
     Args:
         search: With all its evaluations.
         picks: What was found, the optimiser's first, of several objectives the middle of its front.
+        test: Of them, on fresh worlds: what else the first that is not the start has changed.
         untested: Why there is no test on fresh worlds; empty if there is one.
         seconds: What it took, with what was spent before it was resumed.
     """
 
     search: PlacementSearch
     picks: Sequence[Pick]
+    test: FreshTest | None
     untested: str
     seconds: float
 
@@ -112,11 +117,25 @@ class SearchResult:
             yield f"Found in {self._spent(OPTIMISER)}, but not tested, so that no gain is shown: {self.untested}."
         else:
             yield f"{self._told(best, optimism=True)}."
+        if best is not None and (lacks := search.arms[OPTIMISER].lacks[search.arms[OPTIMISER].best]) > 0:
+            yield f"No candidate keeps all that must be kept; this one lacks the least, {lacks:.2%} in all."
+        if self.test is not None:
+            yield f"{self.test.sentence}."
+        if best is not None and (bounds := self._on_bounds(best.evaluation)):
+            yield f"On the bounds of their ranges ended {', '.join(bounds)}: more room may be worth more."
         yield self._control()
         yield f"Racing saved {search.share_saved:.0%} of the instants."
         asked = {"start": search.space.start, **{pick.name: pick.rig for pick in self.picks}}
         ideal = search.plan.sensor_model == "ideal"
         yield from sensor_model_words({name: "ideal" if ideal else rig.sensor_model for name, rig in asked.items()})
+
+    def _on_bounds(self, found: Evaluation) -> list[str]:
+        """Numbers that are at an end of their range."""
+        if found.unit is None or found.number == 0:
+            return []
+        pairs = zip(self.search.space.variables, found.unit.tolist(), strict=True)
+        ends = ((one.name, min(share, 1 - share)) for one, share in pairs if isinstance(one, FreeNumber))
+        return [f"{name} ({found.values[name]:g})" for name, away in ends if away < BOUND]
 
     def _control(self) -> str:
         """What random search got."""
@@ -159,6 +178,7 @@ class SearchResult:
                 "arms": {name: _arm_record(arm) for name, arm in search.arms.items()},
                 "share_of_instants_saved": search.share_saved,
                 "hypervolume": volumes,
+                "changes": self.test and self.test.record,
                 "found": [self._pick_record(pick) for pick in self.picks],
                 "untested": self.untested or None,
             },
@@ -167,6 +187,7 @@ class SearchResult:
             shown={"start": search.space.start, **{pick.name: pick.rig for pick in self.picks}},
             tables=[
                 PageTable(f"{search.space.name}: against {search.space.start.name}", HEADINGS, self._gain_rows(), 3),
+                *([self.test.table] if self.test else ()),
                 self._values(),
                 _spent_table(search, volumes),
             ],
@@ -219,7 +240,7 @@ class SearchResult:
                 arm = self.search.arms[pick.arm]
                 gained = arm.gains[arm.evaluations.index(pick.evaluation)].tolist()
                 name = pick.name + " (the start)" * pick.is_start
-                for (objective, asked), unit, each in zip(objectives.items(), self.units, gained, strict=True):
+                for (objective, asked), unit, each in zip(objectives.items(), self.units, gained, strict=False):
                     estimate = asked.own_estimate or self.search.plan.estimate
                     cells = (name, f"{objective} ({unit_words(unit)})", estimate, amount(each, unit), *"----")
                     rows.append(tuple(map(Words, cells)))
@@ -243,10 +264,10 @@ class SearchResult:
         for one in search.evaluations:
             arm, at = places[one.number]
             pair, unknown = arm.against_start(at), [None] * len(names)
-            values = one.prefixes[-1].estimate.value.tolist() if one.prefixes else unknown
+            values = one.prefixes[-1].estimate.value.tolist()[: len(names)] if one.prefixes else unknown
             errors = unknown if pair is None else pair[1].tolist()
             each = [value for triple in zip(values, arm.gains[at].tolist(), errors, strict=True) for value in triple]
-            state, why = self._state(one)
+            state, why = self._state(one, float(arm.lacks[at]))
             hits = one.prefixes[-1].self_hit_share if one.prefixes else None
             own = [one.values.get(name) for name in variables]
             costs = self._cost(one), round(one.seconds, 3)
@@ -263,9 +284,11 @@ class SearchResult:
                 values = [one.values.get(variable) for variable in variables]
                 yield [name, one.number, *arm.gains[at].tolist(), self._cost(one), *values]
 
-    def _state(self, one: Evaluation) -> tuple[str, str]:
+    def _state(self, one: Evaluation, lacks: float) -> tuple[str, str]:
         if one.infeasible:
             return "infeasible", one.infeasible
+        if lacks > 0:
+            return "lacking", f"{lacks:.2%} in all of what must be kept"
         if one.instants < len(self.search.instants):
             return "dropped", "two standard errors below the best so far"
         return "complete", ""

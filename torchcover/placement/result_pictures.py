@@ -32,7 +32,7 @@ def search_pictures(search: PlacementSearch, best: Evaluation | None) -> Iterato
         Stem of the file, what it shows, and a figure of its own, outside pyplot.
     """
     names, title = list(search.space.objectives), search.space.name
-    quantities = search.evaluations[0].prefixes[-1].estimate.quantities
+    quantities = search.evaluations[0].prefixes[-1].estimate.quantities[: len(names)]
     factors = np.array([shown_unit(each.unit).factor for each in quantities])
     labels = [f"gain in {each.key} ({unit_words(each.unit)})" for each in quantities]
     lines = {name: _progress(arm, search, factors) for name, arm in search.arms.items()}

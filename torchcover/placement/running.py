@@ -17,7 +17,7 @@ from torchcover.evaluation.pipeline import Run
 from torchcover.evaluation.progress import Progress, held_back
 from torchcover.files import BadFileError, claimed
 from torchcover.placement.evaluation import OPTIMISER, RANDOM
-from torchcover.placement.fresh import amount, fresh_test
+from torchcover.placement.fresh import FreshTest, amount, fresh_test
 from torchcover.placement.result import Pick, SearchResult
 from torchcover.placement.search import PlacementSearch
 
@@ -75,8 +75,8 @@ def _run(search: PlacementSearch, out: Path | None, resume: bool, progress: bool
     budget.check()
     with Progress(budget.expected, search.space.name, done=len(search.evaluations), shown=progress) as bar:
         _spend(search, budget, journal, bar.advance)
-    picks, untested = _tested(search, _picks(search))
-    return SearchResult(search, picks, untested, clock() - began + earlier_s)
+    picks, test, untested = _tested(search, _picks(search))
+    return SearchResult(search, picks, test, untested, clock() - began + earlier_s)
 
 
 class _Journal:
@@ -181,7 +181,7 @@ def _standing(search: PlacementSearch) -> str:
     if arm.best is None:
         return "nothing that can be yet"
     quantities = search.evaluations[0].prefixes[-1].estimate.quantities
-    gains = zip(quantities, arm.gains[arm.best].tolist(), strict=True)
+    gains = zip(quantities, arm.gains[arm.best].tolist(), strict=False)  # of the objectives alone
     return "  ".join(f"{quantity.key} {amount(gain, quantity.unit)}" for quantity, gain in gains)
 
 
@@ -207,16 +207,16 @@ def _picks(search: PlacementSearch) -> list[Pick]:
     return picks
 
 
-def _tested(search: PlacementSearch, picks: Sequence[Pick]) -> tuple[Sequence[Pick], str]:
+def _tested(search: PlacementSearch, picks: Sequence[Pick]) -> tuple[Sequence[Pick], FreshTest | None, str]:
     """Those that are not the start, on fresh worlds; and why not, if not."""
     moved = {f"{at}": pick.rig for at, pick in enumerate(picks) if not pick.is_start}
     if not moved:
-        return picks, ""
+        return picks, None, ""
     plan = search.plan
     try:
-        tests = fresh_test(
+        test = fresh_test(
             moved, search.space.start, search.instants, test_seed=plan.seed_of_test, worlds=plan.fresh_worlds
         )
     except ValueError as error:
-        return picks, str(error)
-    return [replace(pick, gains=tests.get(f"{at}", ())) for at, pick in enumerate(picks)], ""
+        return picks, None, str(error)
+    return [replace(pick, gains=test.gains.get(f"{at}", ())) for at, pick in enumerate(picks)], test, ""

@@ -2,20 +2,22 @@
 
 import math
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from torchcover.evaluation.checking import check
+from torchcover.evaluation.target_survey import free_space
 from torchcover.placement.arm import Arm
 from torchcover.placement.common_instants import CommonInstants
 from torchcover.placement.evaluation import OPTIMISER, RANDOM, START, Evaluation
 from torchcover.placement.optimisers import Cube, RandomSearch
 from torchcover.placement.optimisers.optimiser import Unit
 from torchcover.placement.plan import SearchPlan, levels_of
-from torchcover.placement.racing import Prefix, race
+from torchcover.placement.racing import ERRORS_BELOW, Float64, Prefix, race
 from torchcover.placement.space import SearchSpace
 
 # What is drawn by the control is nothing that the optimiser draws.
@@ -101,12 +103,15 @@ class PlacementSearch:
             self._note(Evaluation(number, arm.name, unit, values, infeasible=why))
         return None
 
-    def tell(self, candidate: Evaluation, prefixes: tuple[Prefix, ...], *, seconds: float = 0.0) -> None:
+    def tell(
+        self, candidate: Evaluation, prefixes: tuple[Prefix, ...], *, lacks: float = 0.0, seconds: float = 0.0
+    ) -> None:
         """What a candidate scored; with too many rays on the vehicle, it cannot be.
 
         Args:
             candidate: The last that was asked for.
             prefixes: From `instants.prefixes`, all or the first of them; of the start all.
+            lacks: Of what is required of bodies and in encounters, which `evaluate` finds out.
             seconds: What it took.
 
         Raises:
@@ -115,7 +120,8 @@ class PlacementSearch:
         self._check_turn(candidate)
         wrong = [] if candidate.number else list(self.space.violations(self.space.start))
         wrong += [why] if (why := self._too_many_self_hits(prefixes[-1])) else []
-        self._note(replace(candidate, rig=None, prefixes=prefixes, infeasible="; ".join(wrong), seconds=seconds))
+        found = {"prefixes": prefixes, "infeasible": "; ".join(wrong), "lacks": lacks, "seconds": seconds}
+        self._note(replace(candidate, rig=None, **found))
 
     def refuse(self, candidate: Evaluation, why: str, *, seconds: float = 0.0) -> None:
         """Say that a candidate cannot be.
@@ -133,18 +139,40 @@ class PlacementSearch:
         began = time.perf_counter()
         incumbents = self.arms[candidate.arm].incumbents if candidate.number else []
         try:
-            prefixes = race(self._scored(candidate), incumbents)
+            prefixes = race(self._scored(candidate), incumbents, len(self.space.objectives))
         except ValueError as error:
             self.refuse(candidate, str(error), seconds=time.perf_counter() - began)
         else:
-            self.tell(candidate, prefixes, seconds=time.perf_counter() - began)
+            lacks = self._lacks(candidate, prefixes)
+            self.tell(candidate, prefixes, lacks=lacks, seconds=time.perf_counter() - began)
 
     def _scored(self, candidate: Evaluation) -> Iterator[Prefix]:
         assert candidate.rig is not None  # while it is asked for
+        known: list[Prefix] = []
         for prefix in self.instants.prefixes(candidate.rig):
             if candidate.number and (why := self._too_many_self_hits(prefix)):
                 raise ValueError(why)  # no need to look at more instants
+            known.append(prefix)
             yield prefix
+            if candidate.number and self.arms[candidate.arm].is_worse(known, ERRORS_BELOW):
+                return
+
+    def _lacks(self, candidate: Evaluation, prefixes: Sequence[Prefix]) -> float:
+        """Of what bodies and encounters require; looked at where it decides, as it takes as long as the rest.
+
+        Of each bound that is not kept, the mean of the share of places that do not keep it and of what the worst lacks.
+        """
+        required = self.space.to_check
+        if required is None or (candidate.number and not self.arms[candidate.arm].may_lead(prefixes)):
+            return 0.0
+        assert candidate.rig is not None  # while it is asked for
+        ego = self.space.scenarios[0].ego
+        world = required.scenario or free_space().model_copy(update={"ego": ego})
+        (found,) = check(candidate.rig, required, world, sensor_model=self.plan.sensor_model).verdicts.values()
+        broken = [one for one in found if one.state != "kept"]
+        worst = (-one.margin / (abs(one.bound.value) or 1.0) for one in broken)
+        at_worst = sum(1.0 if math.isnan(one) else max(one, 0.0) for one in worst)
+        return float(at_worst + sum((one.failed + one.unknown) / max(one.count, 1) for one in broken)) / 2
 
     def state_dict(self) -> dict[str, Any]:
         """All that a checkpoint keeps: the evaluations."""
@@ -187,16 +215,23 @@ class PlacementSearch:
     def _begin(self, start: Evaluation) -> None:
         if start.instants != len(self.instants):
             raise ValueError(f"the start is to be scored at all {len(self.instants)} instants; got {start.instants}")
-        for name, value in zip(self.space.objectives, start.prefixes[-1].estimate.value.tolist(), strict=True):
+        for name, value in zip(self.space.asked, start.prefixes[-1].estimate.value.tolist(), strict=True):
             if math.isnan(value):
                 why = "one of its regions and bands is never seen; take larger ones, more worlds or more rays"
-                if metric := self.space.objectives[name].metric:
+                if metric := self.space.asked[name].metric:
                     why = f"what {metric} is about is never there; take another scenario, or more worlds"
                 raise ValueError(f"objectives.{name}: unknown at all {start.instants} instants: {why}")
         makes = {OPTIMISER: self._makes_optimiser, RANDOM: RandomSearch}
         for name, each in makes.items():
             seed = int(np.random.SeedSequence([self.plan.seed, SEEDS[name]]).generate_state(1)[0])
-            self.arms[name] = Arm(name, each, self._cube(start.infeasible), seed, start)
+            cube = self._cube(start.infeasible)
+            self.arms[name] = Arm(name, each, cube, seed, start, len(self.space.objectives), self._floors(start))
+
+    def _floors(self, start: Evaluation) -> Float64:
+        """(numbers,) what each must not be worse than: what is required, what it is at the start; NaN of objectives."""
+        value, kept = start.prefixes[-1].estimate.value.tolist(), self.space.floors
+        pairs = zip(self.space.asked, value, strict=True)
+        return np.array([math.nan if name in self.space.objectives else kept.get(name, own) for name, own in pairs])
 
     def _cube(self, start_infeasible: str = "") -> Cube:
         return Cube(levels_of(self.space), None if start_infeasible else self._start_unit)

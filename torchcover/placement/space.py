@@ -4,7 +4,7 @@ import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from functools import cached_property
-from typing import Annotated, Self
+from typing import Self
 
 import numpy as np
 from pydantic import Field, NonNegativeFloat, model_validator
@@ -12,13 +12,11 @@ from pydantic import Field, NonNegativeFloat, model_validator
 from torchcover.placement.carrier import NamedRig, VehicleSpace
 from torchcover.placement.constraints import Constraints, check_prices, misplaced, price_eur
 from torchcover.placement.free_sensor import FreeSensor, mirrored
-from torchcover.placement.objective import Objective
 from torchcover.placement.questions import Questions
 from torchcover.placement.variables import Value, Variable
 from torchcover.simulation import Lidar, LidarModel, Rig, Sensor
 from torchcover.simulation.documents import NameOrFile
 
-MAX_OBJECTIVES = 3
 # How many candidates are looked at before a space is refused as one without any that can be.
 TRIES = 256
 
@@ -37,6 +35,8 @@ class SearchSpace(VehicleSpace):
         cost: Prices in euros, by model, by the name of a sensor that has none, and of `mount`, which each sensor needs.
         objectives: One to three, by name. One is made as large as it gets; of several, what one gains is weighed
             against what the others lose.
+        not_worse: What must not be worse than with `start`: names of usual regions, of which detection within 0.4 m in
+            both bands counts, or objectives.
 
     Raises:
         ValueError: Nothing in it can be searched, for a reason that the message tells.
@@ -62,7 +62,6 @@ class SearchSpace(VehicleSpace):
     free: dict[str, FreeSensor] = Field(min_length=1)
     constraints: Constraints = Constraints()
     cost: dict[NameOrFile, NonNegativeFloat] = Field(default_factory=dict)
-    objectives: dict[Annotated[str, Field(min_length=1)], Objective] = Field(min_length=1, max_length=MAX_OBJECTIVES)
 
     @model_validator(mode="after")
     def _check_sensors(self) -> Self:
@@ -102,7 +101,7 @@ class SearchSpace(VehicleSpace):
                     raise ValueError(f"free.{name}.{error}") from error
         for name in self.free:
             self._check_place(name)
-        questions = Questions.around(carrier.outline_m, self.objectives)
+        questions = Questions.around(carrier.outline_m, self.asked)
         questions.check(self.start, carrier.skin.mesh if questions.metrics else None)
         self._check_constraints()
         outside = self._outside()

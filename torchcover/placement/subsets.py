@@ -1,55 +1,35 @@
-"""Which and how many: the best subset of candidates whose bits are known.
+"""Which and how many: the best subset of candidates, from what each of them sees.
 
-What a subset is worth is monotone and submodular: another sensor never harms, and adds the less the more there are. So
-the greedy choice of k is worth at least 1 - 1/e of the best (Nemhauser, Wolsey and Fisher 1978); with prices the better
-of two greedy choices at least half of that (Leskovec et al. 2007); neither holds where some may not stand side by side.
-What is added at most also bounds the best from above, whatever was chosen, and lets a search leave out the rest.
+What a subset sees is worth the sum over all points that one of it sees, at least. So another sensor adds the less the
+more there are (Nemhauser, Wolsey and Fisher 1978): what each adds alone bounds what all may still add, and a branch and
+bound leaves out most subsets. Where it gives up, HiGHS goes on, if scipy is installed: as a mixed-integer linear
+programme every group of points that the same candidates see is a variable, at most the number of these that are chosen.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from functools import reduce
-from typing import NamedTuple
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Float64 = NDArray[np.float64]
-Bytes = NDArray[np.uint8]
+Bools = NDArray[np.bool_]
 
-# Sets whose value is looked up before the exact search gives up; deterministic, other than a time.
-MOST_LOOKS = 50_000
-# Values of sums of many thousand weights that agree to this are equal.
-SAME = 1e-12
-LOW_HALF = np.uint8(15)
-# Row k has the bits of k, the highest first, as `numpy.packbits` has them.
-BITS_OF_HALF = np.unpackbits(np.arange(16, dtype=np.uint8)[:, None], axis=1)[:, 4:].astype(np.float64)
-
-
-class Worth:
-    """Sums of what points are worth, from their bits.
-
-    An objective that is a detection is a sum of weights over the points that the rig sees, by either measure, since it
-    has the same denominators for every rig: so it is monotone and submodular in the set of its sensors.
-
-    Args:
-        of_bits: (8 B,) float64 weight of each bit; of padding 0.
-
-    Example:
-        >>> worth = Worth(np.array([0.5, 0.25, 0.125, 0, 0, 0, 0, 0]))
-        >>> worth.of(np.array([0b1010_0000], dtype=np.uint8)), worth.total
-        (0.625, 0.875)
-    """
-
-    def __init__(self, of_bits: Float64) -> None:
-        self.total = float(of_bits.sum())
-        halves = of_bits.reshape(-1, 2, 4) @ BITS_OF_HALF.T
-        self._high, self._low = halves[:, 0].copy(), halves[:, 1].copy()
-        self._at = np.arange(len(halves))
-
-    def of(self, seen: Bytes) -> float:
-        """The sum over the points that are seen, (B,) uint8, eight points a byte."""
-        return float(self._high[self._at, seen >> 4].sum() + self._low[self._at, seen & LOW_HALF].sum())
+# Shares closer than this are equal: a ten-thousandth of a percentage point. Then the price decides.
+SAME = 1e-6
+# In euros. What a sensor costs beside its price, so that of equal choices the one with fewer is taken; rounding.
+EACH, CENT = 1.0, 0.01
+# What must be there weighs so much more than what is made better: one is not sold for a hundredth point of the other.
+FIRST = 1e4
+# Of the other objectives, where one is made best: they decide between equals.
+LAST = 1e-5
+# Subsets that are looked at, within a second or so, before HiGHS goes on, and how long that may take.
+MOST_SETS, LONGEST_S = 5000, 60.0
+# HiGHS stops at a millionth; in these units a price is more than that.
+FINE = 1e3
+# Steps to the subset between the best of several objectives, each of which halves what is left.
+HALVINGS = 7
 
 
 @dataclass(frozen=True)
@@ -61,159 +41,264 @@ class Limits:
         prices: Of each candidate.
         most_to_pay: In all.
         apart: (C, C) bool whether two candidates may both be there; all may if not given.
+        least: What the numbers of `Candidates.worth` must be at least; anything, -inf, if not given.
     """
 
     most: int
     prices: Sequence[float] = ()
     most_to_pay: float = np.inf
-    apart: NDArray[np.bool_] | None = None
+    apart: Bools | None = None
+    least: Sequence[float] | Float64 | None = None
 
     def price(self, chosen: Sequence[int]) -> float:
         """What a subset costs."""
         return float(sum(self.prices[one] for one in chosen)) if self.prices else 0.0
 
     def allow(self, chosen: Sequence[int], other: int) -> bool:
-        """Whether another candidate may be added to a subset."""
+        """Whether another candidate may be added to a subset, whatever `least` is."""
         if len(chosen) >= self.most or other in chosen:
             return False
         if self.apart is not None and not all(self.apart[other, one] for one in chosen):
             return False
-        return self.price([*chosen, other]) <= self.most_to_pay + SAME
+        return self.price([*chosen, other]) <= self.most_to_pay + CENT / 2
 
 
 class Subset(NamedTuple):
     """A choice of candidates.
 
     Args:
-        chosen: Their numbers, in the order in which they were chosen.
-        value: What they are worth together with what is always there.
-        upper_bound: No subset that keeps to the limits is worth more.
-        proven: Whether this is the best of all.
+        chosen: Their numbers.
+        values: What they are worth together with what is always there: the numbers of `Candidates.worth`.
+        gap: No subset that keeps to the limits is better by more, in what was made better.
+        short: How much it lacks of `Limits.least`, in all; unless there is a gap, no subset lacks less.
     """
 
     chosen: tuple[int, ...]
-    value: float
-    upper_bound: float
-    proven: bool
+    values: tuple[float, ...]
+    gap: float = np.inf
+    short: float = 0.0
+
+    @property
+    def proven(self) -> bool:
+        """Whether it is the best of all."""
+        return self.gap <= SAME
 
 
-@dataclass
+@dataclass(frozen=True, eq=False)
 class Candidates:
-    """Candidates by what they see.
+    """Candidates by what they see, of points that are grouped by who sees them.
 
     Args:
-        worth: What points are worth.
-        seen: One (B,) array of bits for each.
-        always: Bits of what is always there.
+        sees: (G, C) bool which candidates see a group; no two rows are the same.
+        worth: (Q, G) float64 what the points of each group are worth, one row for each number that counts.
+        always: (Q,) what is seen without any of them.
     """
 
-    worth: Worth
-    seen: Sequence[Bytes]
-    always: Bytes
-    looks: int = field(default=0, init=False)
+    sees: Bools
+    worth: Float64
+    always: Float64
 
-    def value(self, chosen: Sequence[int]) -> float:
-        """What a subset is worth, with what is always there."""
-        return self.worth.of(self.covered(chosen))
+    @classmethod
+    def grouped(cls, worth: ArrayLike, seen: Sequence[Bools], always: Bools) -> Self:
+        """Group points.
 
-    def covered(self, chosen: Sequence[int]) -> Bytes:
-        """What a subset sees, with what is always there."""
-        return reduce(np.bitwise_or, (self.seen[one] for one in chosen), self.always)
+        Args:
+            worth: (Q, P) what each point is worth.
+            seen: (P,) which of them each candidate sees.
+            always: (P,) which are seen anyway.
 
-    def gain(self, covered: Bytes, other: int) -> float:
-        """What another candidate adds."""
-        self.looks += 1
-        return self.worth.of(self.seen[other] & ~covered)
+        Example:
+            >>> seen = [np.array(each, dtype=bool) for each in ([1, 1, 0, 0], [1, 1, 1, 0])]
+            >>> two = Candidates.grouped([[0.1, 0.2, 0.3, 0.4]], seen, np.zeros(4, dtype=bool))
+            >>> two.sees.astype(int).tolist(), two.worth.round(3).tolist(), two.values([0, 1]).round(3).tolist()
+            ([[0, 1], [1, 1]], [[0.3, 0.3]], [0.6])
+        """
+        worth = np.asarray(worth, dtype=np.float64)
+        rows = np.packbits(np.stack(seen), axis=0)  # eight candidates a byte
+        counts = ~always & rows.any(axis=0) & worth.any(axis=0)
+        groups, of = np.unique(rows[:, counts].T, axis=0, return_inverse=True)
+        sums = np.stack([np.bincount(of.reshape(-1), row, len(groups)) for row in worth[:, counts]])
+        sees = np.unpackbits(groups, axis=1, count=len(seen)).astype(bool)
+        return cls(sees, sums, worth[:, always].sum(axis=1))
 
+    def values(self, chosen: Sequence[int]) -> Float64:
+        """(Q,) what a subset is worth, with what is always there."""
+        return self.always + self.worth @ self.sees[:, list(chosen)].any(axis=1)
 
-def greedy(candidates: Candidates, limits: Limits) -> Subset:
-    """Add what adds the most, as long as something may be added; with prices, for its price, if that is better.
-
-    Args:
-        candidates: What there is.
-        limits: What to keep to.
-    """
-    ways = [_greedily(candidates, limits, by_price=False)]
-    if limits.prices and np.isfinite(limits.most_to_pay):
-        ways.append(_greedily(candidates, limits, by_price=True))
-    chosen, value, _ = max(ways, key=lambda way: way[1])
-    upper = min(bound for _, _, bound in ways)
-    return Subset(chosen, value, upper, proven=upper <= value + SAME)
-
-
-def _greedily(candidates: Candidates, limits: Limits, *, by_price: bool) -> tuple[tuple[int, ...], float, float]:
-    """The choice, its value, and the lowest of the bounds that its steps give."""
-    chosen: list[int] = []
-    covered, everyone = candidates.always, range(len(candidates.seen))
-    value, upper = candidates.worth.of(covered), np.inf
-    while True:
-        gains = {one: candidates.gain(covered, one) for one in everyone if one not in chosen}
-        upper = min(upper, value + _most_to_add(gains, limits, limits.most, limits.most_to_pay))
-        allowed = {one: gain for one, gain in gains.items() if gain > 0 and limits.allow(chosen, one)}
-        if not allowed:
-            return tuple(chosen), value, upper
-        per = {one: gain / max(limits.prices[one], SAME) if by_price else gain for one, gain in allowed.items()}
-        best = max(per, key=lambda one: (per[one], -one))
-        chosen.append(best)
-        covered = covered | candidates.seen[best]
-        value += gains[best]
+    def lost_without(self, chosen: Sequence[int]) -> Float64:
+        """(chosen, Q) what is lost when each of them fails."""
+        rest = [[other for other in chosen if other != one] for one in chosen]
+        return np.array([self.values(chosen) - self.values(some) for some in rest])
 
 
-def exact(candidates: Candidates, limits: Limits) -> Subset:
-    """The best subset, by branch and bound from the greedy choice on; or what was found after `MOST_LOOKS`.
+def best(candidates: Candidates, limits: Limits, weights: Sequence[float] = (1.0,)) -> Subset:
+    """The best subset, and of equal ones the cheapest.
 
     Args:
         candidates: What there is.
-        limits: What to keep to.
-    """
-    best = greedy(candidates, limits)
-    first = {one: candidates.gain(candidates.always, one) for one in range(len(candidates.seen))}
-    order = sorted(first, key=lambda one: (-first[one], one))
-    last = candidates.looks + MOST_LOOKS
+        limits: What to keep to. Where no subset is worth `least`, what lacks the least in all.
+        weights: Of the first numbers of `Candidates.worth`, whose sum is made as large as it gets.
 
-    def search(chosen: tuple[int, ...], covered: Bytes, value: float, later: Sequence[int]) -> bool:
-        """Look at all subsets of some candidates that may be added; whether none was left out for want of looks."""
-        nonlocal best
-        if candidates.looks >= last:
-            return False
-        gains = {one: candidates.gain(covered, one) for one in later if limits.allow(chosen, one)}
-        complete = True
-        for at, one in enumerate(ranked := sorted(gains, key=lambda each: (-gains[each], each))):
-            left = {each: gains[each] for each in ranked[at:]}
-            to_pay = limits.most_to_pay - limits.price(chosen)
-            if value + _most_to_add(left, limits, limits.most - len(chosen), to_pay) <= best.value + SAME:
+    Example:
+        >>> seen = [np.array(each, dtype=bool) for each in ([1, 1, 0, 0], [0, 1, 1, 1], [1, 0, 0, 0])]
+        >>> three = Candidates.grouped([[0.1, 0.2, 0.3, 0.4]], seen, np.zeros(4, dtype=bool))
+        >>> best(three, Limits(2, [500.0, 900.0, 100.0])).chosen
+        (1, 2)
+    """
+    goal = _Goal.of(candidates, limits, weights)
+    chosen, gap = _searched(goal)
+    if gap > SAME:
+        chosen, gap = _proven(goal, chosen, gap)
+    values = candidates.values(chosen)
+    return Subset(chosen, tuple(values.tolist()), gap, float((goal.least - values).clip(0.0).sum()))
+
+
+def best_of_several(candidates: Candidates, limits: Limits, objectives: int) -> list[Subset]:
+    """The best of each of the first numbers of `Candidates.worth`; and before them, of several, what lies between.
+
+    That is as near to the best of all of them as the farthest allows, measured from the worst that the others leave.
+    """
+    if objectives == 1:
+        return [best(candidates, limits)]
+    ends = [best(candidates, limits, np.where(np.arange(objectives) == one, 1.0, LAST)) for one in range(objectives)]
+    values = np.array([end.values[:objectives] for end in ends])
+    low, extent = values.min(axis=0), np.ptp(values, axis=0)
+    weights = 1.0 / np.where(extent > SAME, extent, 1.0)
+    least = np.resize(-np.inf if limits.least is None else limits.least, len(candidates.worth)).astype(float)
+    between, share, step = best(candidates, limits, weights), 0.0, 0.5
+    for _ in range(HALVINGS):
+        asked = least.copy()
+        asked[:objectives] = np.maximum(asked[:objectives], low + (share + step) * extent - SAME)
+        found = best(candidates, replace(limits, least=asked), weights)
+        if found.short <= between.short + SAME:
+            between, share = found, share + step
+        step /= 2
+    return [between, *ends]
+
+
+@dataclass(frozen=True, eq=False)
+class _Goal:
+    """What is made large: numbers by their weights, less what lacks of the least, less a little of the price."""
+
+    candidates: Candidates
+    limits: Limits
+    weights: Float64
+    least: Float64
+    ties: Float64
+
+    @classmethod
+    def of(cls, candidates: Candidates, limits: Limits, weights: Sequence[float]) -> Self:
+        numbers, count = len(candidates.worth), candidates.sees.shape[1]
+        prices = np.array(limits.prices or np.zeros(count)) + EACH
+        every = np.zeros(numbers)
+        every[: len(weights)] = weights
+        least = np.resize(-np.inf if limits.least is None else limits.least, numbers)
+        # No difference in price weighs as much as what is not the same.
+        dearest = min(float(np.sort(prices)[-limits.most :].sum()), limits.most_to_pay + EACH * count)
+        return cls(candidates, limits, every, least, SAME * prices / dearest)
+
+    def of_values(self, values: Float64) -> Float64:
+        """Of (Q, ...) values, without the price."""
+        lacks = np.minimum(values.T - self.least, 0.0)
+        worth: Float64 = values.T @ self.weights + FIRST * lacks.sum(axis=-1)
+        return worth
+
+
+def _searched(goal: _Goal) -> tuple[tuple[int, ...], float]:
+    """By branch and bound, what adds the most first: the best, and by how much others may be better at most."""
+    candidates, limits, sees = goal.candidates, goal.limits, goal.candidates.sees.astype(np.float64)
+    found: tuple[int, ...] = ()
+    most, left, looks = float(goal.of_values(candidates.always)), -np.inf, 0
+
+    def grow(chosen: tuple[int, ...], covered: Bools, cost: float, later: Sequence[int]) -> None:
+        """Look at all subsets of some candidates that may be added."""
+        nonlocal found, most, left, looks
+        looks += 1
+        values = candidates.always + candidates.worth @ covered
+        now = float(goal.of_values(values))
+        gains = goal.of_values(values[:, None] + (candidates.worth * ~covered) @ sees) - now - goal.ties
+        allowed = [one for one in later if gains[one] > 0 and limits.allow(chosen, one)]
+        ranked = sorted(allowed, key=lambda one: (-gains[one], one))
+        for at, one in enumerate(ranked):
+            bound = now - cost + _most_to_add(gains, ranked[at:], limits, chosen)
+            if bound <= most:
                 break
-            grown = (*chosen, one)
-            if value + gains[one] > best.value + SAME:
-                best = best._replace(chosen=grown, value=value + gains[one])
-            if len(grown) < limits.most and at + 1 < len(ranked):
-                complete &= search(grown, covered | candidates.seen[one], value + gains[one], ranked[at + 1 :])
-        return complete
+            if looks >= MOST_SETS:
+                left = max(left, bound)
+                break
+            grown, more = (*chosen, one), now - cost + float(gains[one])
+            if more > most:
+                found, most = grown, more
+            grow(grown, covered | candidates.sees[:, one], cost + float(goal.ties[one]), ranked[at + 1 :])
 
-    proven = search((), candidates.always, candidates.worth.of(candidates.always), order)
-    value = candidates.value(best.chosen)
-    return best._replace(value=value, upper_bound=value if proven else best.upper_bound, proven=proven)
+    grow((), np.zeros(len(sees), dtype=bool), 0.0, range(sees.shape[1]))
+    return tuple(sorted(found)), max(left - most, 0.0)
 
 
-def _most_to_add(gains: dict[int, float], limits: Limits, count: int, to_pay: float) -> float:
+def _most_to_add(gains: Float64, those: Sequence[int], limits: Limits, chosen: Sequence[int]) -> float:
     """What the best of some candidates add at most: as if they saw nothing in common, and one could be cut in two."""
-    ranked = sorted(gains, key=lambda one: -gains[one])
-    most = float(sum(gains[one] for one in ranked[:count]))
-    if not limits.prices or not np.isfinite(to_pay):
+    each = gains[those]
+    most = float(each[: limits.most - len(chosen)].sum())  # the best come first
+    if not limits.prices or not np.isfinite(limits.most_to_pay):
         return most
-    added = 0.0
-    for one in sorted(gains, key=lambda one: -gains[one] / max(limits.prices[one], SAME)):
-        price = limits.prices[one]
-        share = min(max(to_pay, 0.0) / price, 1.0) if price > 0 else 1.0
-        added += share * gains[one]
-        to_pay -= share * price
-    return min(most, added)
+    prices = np.maximum(np.array(limits.prices)[those], CENT)
+    order = np.argsort(-each / prices, kind="stable")
+    left = limits.most_to_pay + CENT / 2 - limits.price(chosen) - np.cumsum(prices[order]) + prices[order]
+    return min(most, float((each[order] * (left / prices[order]).clip(0.0, 1.0)).sum()))
 
 
-def marginal_values(candidates: Candidates, chosen: Sequence[int]) -> list[float]:
-    """What is lost when each of the chosen fails."""
-    whole = candidates.value(chosen)
-    return [whole - candidates.value([other for other in chosen if other != one]) for one in chosen]
+def _proven(goal: _Goal, chosen: tuple[int, ...], gap: float) -> tuple[tuple[int, ...], float]:
+    """The same by HiGHS, from a choice on: whether each candidate is there, what is seen of each group, what lacks."""
+    try:
+        from scipy.optimize import Bounds, LinearConstraint, milp
+        from scipy.sparse import csr_array, eye, hstack
+    except ImportError:
+        return chosen, gap
+    candidates, limits = goal.candidates, goal.limits
+    (groups, count), asked = candidates.sees.shape, np.flatnonzero(np.isfinite(goal.least))
+
+    def row(there: ArrayLike, seen: ArrayLike = 0.0, lacks: ArrayLike = 0.0) -> Float64:
+        sizes = (there, count), (seen, groups), (lacks, len(asked))
+        return np.concatenate([np.broadcast_to(np.asarray(each, dtype=np.float64), size) for each, size in sizes])
+
+    rows, most = [row(1.0)], [float(limits.most)]
+    if limits.prices and np.isfinite(limits.most_to_pay):
+        rows, most = [*rows, row(limits.prices)], [*most, limits.most_to_pay + CENT / 2]
+    for one in () if limits.apart is None else _cliques(limits.apart):
+        rows, most = [*rows, row(np.isin(range(count), one))], [*most, 1.0]
+    for at, number in enumerate(asked):
+        rows.append(row(0.0, -candidates.worth[number], -np.eye(len(asked))[at]))
+        most.append(candidates.always[number] - goal.least[number])
+    large = row(-goal.ties, goal.weights @ candidates.worth, -FIRST)
+    begun = float(goal.of_values(candidates.values(chosen)) - goal.weights @ candidates.always)
+    begun -= float(goal.ties[list(chosen)].sum())
+    seen = hstack([csr_array(-candidates.sees.astype(float)), eye(groups), csr_array((groups, len(asked)))])
+    found = milp(
+        -FINE * large,
+        integrality=row(1.0),
+        bounds=Bounds(0.0, row(1.0, 1.0, np.inf)),
+        constraints=[
+            LinearConstraint(seen, ub=0.0),
+            LinearConstraint(csr_array(np.array([*rows, -large])), ub=[*most, SAME / 2 - begun]),
+        ],
+        options={"mip_rel_gap": 0.0, "time_limit": LONGEST_S},
+    )
+    bound = begun + gap if found.mip_dual_bound is None else min(-found.mip_dual_bound / FINE, begun + gap)
+    if found.x is None or -found.fun / FINE <= begun:
+        return chosen, max(bound - begun, 0.0)
+    return tuple(np.flatnonzero(found.x[:count] > 0.5).tolist()), max(bound + found.fun / FINE, 0.0)
+
+
+def _cliques(apart: Bools) -> Iterable[list[int]]:
+    """Sets of candidates of which one may be there, which together have all pairs of them that may not."""
+    left = np.triu(~apart, 1)
+    while left.any():
+        clique = np.argwhere(left)[0].tolist()
+        for one in range(len(apart)):
+            if one not in clique and not apart[one, clique].any():
+                clique.append(one)
+        left[np.ix_(clique, clique)] = False
+        yield clique
 
 
 def random_subsets(candidates: Candidates, limits: Limits, count: int, seed: int) -> list[Subset]:
@@ -228,8 +313,8 @@ def random_subsets(candidates: Candidates, limits: Limits, count: int, seed: int
     generator, found = np.random.default_rng(seed), []
     for _ in range(count):
         chosen: list[int] = []
-        for one in generator.permutation(len(candidates.seen)).tolist():
+        for one in generator.permutation(candidates.sees.shape[1]).tolist():
             if limits.allow(chosen, one):
                 chosen.append(one)
-        found.append(Subset(tuple(chosen), candidates.value(chosen), np.inf, proven=False))
+        found.append(Subset(tuple(chosen), tuple(candidates.values(chosen).tolist())))
     return found

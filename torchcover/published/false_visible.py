@@ -3,7 +3,6 @@
 import hashlib
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from torch import Tensor
 
 from torchcover.coverage import BevGrid
 from torchcover.frames import Frame
+from torchcover.geometry import BoundingBox, VoxelGrid, crossed_voxels
 from torchcover.published.frame_metric import WorldRatios, said
 from torchcover.published.sights import rig_of
 from torchcover.simulation import Sensor
@@ -113,7 +113,7 @@ def coarse_grid(grid: BevGrid, cell_m: float) -> BevGrid:
 def field_of_view(sensors: Sequence[Sensor], grid: BevGrid, ego: Mesh | None = None) -> Tensor:
     """Which cells the rays of a rig cross, down to the plane z = 0, up to their range or the vehicle's own body.
 
-    Rays are looked at every half cell over ground.
+    Exactly: a cell is crossed in a height band if a piece of a ray lies in both; see `crossed_voxels`.
 
     Args:
         sensors: With mounts, rays and ranges.
@@ -130,8 +130,9 @@ def field_of_view(sensors: Sequence[Sensor], grid: BevGrid, ego: Mesh | None = N
         >>> [bool(seen[0, 5, x]) for x in (0, 6, 30)]           # behind it, too close, and ahead
         [False, False, True]
     """
-    grid = replace(grid, band_frame="vehicle")  # of a ground that is level, which both are the same for
-    seen = np.zeros(grid.cells, dtype=bool)
+    # Each band is one layer of cubes: rays are cut off at its ends and seen from above. Level ground is at z = 0.
+    flat = VoxelGrid(BoundingBox((grid.x[0], grid.y[0], 0.0), (grid.x[1], grid.y[1], grid.cell)), grid.cell)
+    seen = np.zeros((len(grid.heights), *flat.shape), dtype=bool)
     caster = None if ego is None else RayCaster([ego])
     for sensor in sensors:
         vehicle_T_sensor = sensor.mount.matrix()
@@ -139,8 +140,25 @@ def field_of_view(sensors: Sequence[Sensor], grid: BevGrid, ego: Mesh | None = N
         directions = vehicle_T_sensor[:3, :3] @ directions[:, ~np.isnan(directions[0])]
         origin_m = vehicle_T_sensor[:3, 3]
         ends_m = _ends_m(origin_m, directions, min(sensor.max_range_m, FARTHEST_M), caster)
-        _mark(seen, grid, origin_m, directions, sensor.min_range_m, ends_m)
-    return torch.from_numpy(seen).view(grid.shape)
+        for band, crossed in zip(grid.heights.values(), seen, strict=True):
+            begin_m, end_m = _within(band, origin_m[2], directions[2], sensor.min_range_m, ends_m)
+            there = (begin_m < end_m) & directions[:2].any(axis=0)
+            level = directions[:, there].T * [1.0, 1.0, 0.0]
+            starts_m = origin_m * [1.0, 1.0, 0.0] + level * begin_m[there, None] + [0.0, 0.0, grid.cell / 2]
+            crossed_voxels(flat, starts_m, level, (end_m - begin_m)[there], crossed=crossed)
+    return torch.from_numpy(np.ascontiguousarray(seen[..., 0].transpose(0, 2, 1)))
+
+
+def _within(
+    band: tuple[float, float], height_m: float, up: NDArray[np.float64], begin_m: float, ends_m: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(n,) where rays enter a height band, and (n,) leave it; the end first where they do not."""
+    rises = np.where(up == 0, 1.0, up)
+    low, high = ((edge - height_m) / rises for edge in band)
+    inside = (up != 0) | (band[0] <= height_m < band[1])
+    first = np.where(up == 0, np.where(inside, -np.inf, np.inf), np.minimum(low, high))
+    last = np.where(up == 0, np.inf, np.maximum(low, high))
+    return np.maximum(first, begin_m), np.minimum(last, ends_m)
 
 
 def _ends_m(
@@ -156,37 +174,3 @@ def _ends_m(
     hits = ego.cast(origin_m, directions.astype(np.float32), ends_m.astype(np.float32))
     ends_m[hits.body >= 0] = 0.0  # what points at the vehicle sees the vehicle
     return ends_m
-
-
-def _mark(
-    seen: NDArray[np.bool_],
-    grid: BevGrid,
-    origin_m: NDArray[np.float64],
-    directions: NDArray[np.float64],
-    min_range_m: float,
-    ends_m: NDArray[np.float64],
-) -> None:
-    level = np.hypot(directions[0], directions[1])
-    # Ring by ring over ground: few rays are left in the far ones. The last point of each ray is looked at, too.
-    far_m = ends_m * level
-    order = np.argsort(-far_m)
-    directions, ends_m, level, far_m = directions[:, order], ends_m[order], level[order], far_m[order]
-    corner_m = np.abs(np.array([grid.x, grid.y])).max(axis=1) + np.abs(origin_m[:2])
-    step_m = grid.cell / 2
-    rings = np.arange(step_m, min(float(far_m[0]) if len(far_m) else 0.0, float(np.hypot(*corner_m))), step_m)
-    left = np.searchsorted(-far_m, -rings, side="right")
-    for ring_m, rays in zip(rings.tolist(), left.tolist(), strict=True):
-        along_m = ring_m / level[:rays]
-        _mark_points(seen, grid, origin_m, directions[:, :rays], np.where(along_m >= min_range_m, along_m, np.nan))
-    _mark_points(seen, grid, origin_m, directions, np.where(ends_m >= max(min_range_m, 1e-9), ends_m, np.nan))
-
-
-def _mark_points(
-    seen: NDArray[np.bool_],
-    grid: BevGrid,
-    origin_m: NDArray[np.float64],
-    directions: NDArray[np.float64],
-    along_m: NDArray[np.float64],
-) -> None:
-    points = torch.from_numpy((origin_m[:, None] + directions * along_m).T)
-    seen[grid.bins(points).cell.numpy()] = True

@@ -239,8 +239,11 @@ def body_called(name_or_path: str | Path) -> VehicleShape | shapes.MeshFile:
 def merge(meshes: list[Mesh]) -> Mesh:
     """One mesh with the vertices and faces of all."""
     offsets = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes[:-1])])
+    outward = [mesh.outward for mesh in meshes if mesh.outward is not None]
     return Mesh(
         np.concatenate([mesh.vertices_m for mesh in meshes]),
         np.concatenate([mesh.faces + offset for mesh, offset in zip(meshes, offsets, strict=True)]),
         np.concatenate([mesh.materials for mesh in meshes]),
+        # Those of surfaces that share edges, all of them closed and turned outwards, are one that is.
+        np.concatenate(outward) if len(outward) == len(meshes) and all(one.all() for one in outward) else None,
     )

@@ -210,10 +210,6 @@ class Patches(NamedTuple):
         first_m, second_m = rotate(rotation, self.first_m), rotate(rotation, self.second_m)
         return self._replace(corner_m=corner_m.astype(np.float32), first_m=first_m, second_m=second_m)
 
-    def given_to(self, number: int) -> Self:
-        """Them as those of an object."""
-        return self._replace(of_object=np.full_like(self.of_object, number))
-
     @property
     def corners_m(self) -> Float32:
         """(3, 3, N) corners, coordinates, patches."""

@@ -63,10 +63,9 @@ class Faces:
     def __init__(self, bodies: Sequence[Mesh], reach_m: float) -> None:
         self._bodies = bodies
         count = sum(len(body.faces) for body in bodies)
-        self.contact_m, self.normals = np.empty(count, dtype=np.float32), np.empty((3, count), dtype=np.float32)
+        self.contact_m = np.empty(count, dtype=np.float32)
         self._lower_m, self._upper_m = (np.empty((3, count), dtype=np.float32) for _ in range(2))
         for faces, corners_m in parts_of(bodies):
-            self.normals[:, faces] = normals_of(corners_m)
             self.contact_m[faces] = contact_m = np.maximum(_contact_m(corners_m), MIN_CONTACT * reach_m)
             # Rounded outwards.
             lower_m, upper_m = corners_m.min(axis=0) - 2 * contact_m, corners_m.max(axis=0) + 2 * contact_m
@@ -77,15 +76,25 @@ class Faces:
             self._upper_m.max(axis=1, initial=-np.inf),
         )
 
+    @cached_property
+    def normals(self) -> Float32:
+        """Asked where light returns."""
+        normals = np.empty((3, len(self.contact_m)), dtype=np.float32)
+        for faces, corners_m in parts_of(self._bodies):
+            normals[:, faces] = normals_of(corners_m)
+        return normals
+
     def holding(self, place_m: NDArray[np.floating]) -> NDArray[np.int64]:
         """Numbers of those that a (3,) place lies on."""
         if ((place_m < self._least_m) | (place_m > self._most_m)).any():
             return np.empty(0, dtype=np.int64)
         x, y, z = place_m
-        # One axis after the other: the first, which asks all faces, leaves few to the second.
-        near = np.flatnonzero((self._lower_m[2] <= z) & (z <= self._upper_m[2]))
-        for axis, coordinate_m in ((0, x), (1, y)):
+        # One axis after the other: the first, which asks all faces, leaves few to the second. Most are near the ground.
+        near = np.flatnonzero((self._lower_m[0] <= x) & (x <= self._upper_m[0]))
+        for axis, coordinate_m in ((1, y), (2, z)):
             near = near[(self._lower_m[axis, near] <= coordinate_m) & (coordinate_m <= self._upper_m[axis, near])]
+        if len(near) == 0:
+            return near
         held: NDArray[np.int64] = near[self.from_plane_m(place_m, near) <= 2 * self.contact_m[near]]
         return held
 

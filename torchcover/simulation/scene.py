@@ -6,7 +6,7 @@ from functools import cached_property, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.geometry import BoundingBox, invert, overlap
+from torchcover.geometry import BoundingBox, invert, overlapping
 from torchcover.geometry.trajectory import poses_at
 from torchcover.simulation.instant import ALL_AROUND_RAYS, Instant
 from torchcover.simulation.local_ground import LocalGround, ground_under, level_faces, looks_down
@@ -260,7 +260,8 @@ class Scene:
             if bodies[k] is self.world.ego:
                 continue
             vehicle_T_actor = vehicle_T_world @ bodies[k].trajectory.at(time_s)
-            if overlap(self.ego_box, vehicle_T_actor, self._solids.of(bodies[k].mesh).box):
+            box = self._solids.of(bodies[k].mesh).box
+            if overlapping(box, vehicle_T_actor[None], self.ego_box.corners_m)[0]:
                 raise ValueError(
                     f"actor {bodies[k].name!r} overlaps the ego at t = {time_s:g} s (their bounding boxes do); "
                     "change one of the trajectories"

@@ -189,9 +189,10 @@ class SimulatedFrames(FrameDataset):
 
     @property
     def reference_record(self) -> Mapping[str, object]:
-        """The name of the reference sensor, the time between two frames, and what was taken for the ground."""
-        words = self.simulator.ground_words
-        return {"sensor": self.reference_sensor.name, "every_s": self.every_s, "notes": [words] if words else []}
+        """The name of the reference sensor, the time between two frames, what was taken for the ground, what drawn."""
+        traffic = self.scenario.traffic
+        words = [self.simulator.ground_words, traffic.drawn_words if traffic else ""]
+        return {"sensor": self.reference_sensor.name, "every_s": self.every_s, "notes": list(filter(None, words))}
 
     @property
     def content(self) -> Mapping[str, object]:

@@ -159,37 +159,36 @@ class Stages:
 
     def _on(self, scene: Scene) -> Mapping[str, Sequence[MountedSensor]]:
         """The rigs' sensors on the ego of a scene."""
-        self._check_mounts(scene)
-        scenario = self._scenes.scenario
-        return {
-            name: [
-                MountedSensor(
-                    one,
-                    scene,
-                    scenario.reach_m(one, rig.weather),
-                    rig.weather or scenario.weather,
-                    [other for other in rig.sensors if other is not one],
-                )
-                for one in rig.sensors
-            ]
-            for name, rig in self._rigs.items()
-        }
-
-    def _check_mounts(self, scene: Scene) -> None:
-        scenario = self._scenes.scenario
-        for name, rig in self._rigs.items():
-            for sensor in rig.sensors:
-                place = sensor.mount.matrix()[:3, 3]
-                if scene.encloses(place):
-                    other = f", or use its own vehicle (--vehicle {rig.vehicle})" if rig.vehicle else ""
-                    raise ValueError(
-                        f"rig {name!r}: sensor {sensor.name!r} at {place.round(3).tolist()} m lies inside the ego of "
-                        f"{scenario.name!r}, {scenario.ego_name}, so that all its rays start blocked; move its "
-                        f"mount{other}"
-                    )
+        return {name: mounted_on(scene, self._scenes.scenario, name, rig) for name, rig in self._rigs.items()}
 
     def __getstate__(self) -> dict[str, Any]:
         return {"_scenes": self._scenes, "_rigs": self._rigs}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self._put(state["_scenes"], state["_rigs"])
+
+
+def mounted_on(scene: Scene, scenario: Scenario, name: str, rig: Rig) -> list[MountedSensor]:
+    """The sensors of a rig on the ego of a scene.
+
+    Raises:
+        ValueError: One is inside the ego's body.
+    """
+    for sensor in rig.sensors:
+        place = sensor.mount.matrix()[:3, 3]
+        if scene.encloses(place):
+            other = f", or use its own vehicle (--vehicle {rig.vehicle})" if rig.vehicle else ""
+            raise ValueError(
+                f"rig {name!r}: sensor {sensor.name!r} at {place.round(3).tolist()} m lies inside the ego of "
+                f"{scenario.name!r}, {scenario.ego_name}, so that all its rays start blocked; move its mount{other}"
+            )
+    return [
+        MountedSensor(
+            one,
+            scene,
+            scenario.reach_m(one, rig.weather),
+            rig.weather or scenario.weather,
+            [other for other in rig.sensors if other is not one],
+        )
+        for one in rig.sensors
+    ]

@@ -130,10 +130,11 @@ class SceneSurface:
     ) -> None:
         self._above = above
         self._moving = {body: (objects[number], number) for body, number in moving.items()}
-        placed = [objects[number].moved(pose).given_to(number) for number, pose in resting.items()]
+        poses = np.array(list(resting.values())).reshape(-1, 4, 4)
+        placed = placed_each([(objects[number], number) for number in resting], poses)
         if above is not None:
-            count = np.array([len(patches.outward) for patches in placed], dtype=np.int64)
-            placed = [above.of_objects(Patches.joined(placed), np.eye(4), _boxes_around(placed), count)]
+            count = np.array([len(objects[number].outward) for number in resting], dtype=np.int64)
+            placed = above.of_objects(placed, np.eye(4), _boxes_around(placed, count), count)
         cut = [
             Patches.cut(
                 mesh,
@@ -144,7 +145,7 @@ class SceneSurface:
             )
             for number, mesh in enumerate(scenery)
         ]
-        patches = Patches.joined(cut + placed)
+        patches = Patches.joined([*cut, placed])
         order, cell = _by_place(patches)
         self._static = patches.taken(order)
         self._cells = _groups(self._static, cell)
@@ -254,11 +255,12 @@ def _groups(patches: Patches, group: Numbers | NDArray[np.int32]) -> Groups:
     return Groups(np.append(first, len(group)), Bounds(lower_m - SLACK_M, upper_m + SLACK_M))
 
 
-def _boxes_around(parts: Sequence[Patches]) -> Float64:
-    """(J, 8, 3) corners of J upright boxes, each around all patches of one part."""
-    sides = [[patches.lower_m.min(axis=1), patches.upper_m.max(axis=1)] for patches in parts]
+def _boxes_around(patches: Patches, count: Numbers) -> Float64:
+    """(J, 8, 3) corners of J upright boxes, each around as many patches as (J,) say."""
+    first = np.cumsum(count) - count
+    lower_m, upper_m = np.minimum.reduceat(patches.lower_m, first, 1), np.maximum.reduceat(patches.upper_m, first, 1)
     corner = np.indices((2, 2, 2)).reshape(3, -1).T
-    return np.array(sides, dtype=np.float64).reshape(-1, 2, 3)[:, corner, np.arange(3)]
+    return np.stack([lower_m.T, upper_m.T], axis=1).astype(np.float64)[:, corner, np.arange(3)]
 
 
 def _moved_bounds(destination_T_source: Float64, bounds: Bounds) -> tuple[Float64, Float64]:

@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.geometry import BoundingBox
+from torchcover.geometry import BoundingBox, overlapping
 from torchcover.simulation.instant import Instant
 from torchcover.targets.raster import from_outline_m
 
@@ -84,26 +84,6 @@ def standing(vehicle_T_target: Float64, z_m: Float64) -> Float64:
     poses = vehicle_T_target.copy()
     poses[:, 2, 3] = z_m
     return poses
-
-
-def overlapping(box: BoundingBox, vehicle_T_target: Float64, corners_m: Float64) -> Bools:
-    """(P,) whether a target's box shares space with another box that stands upright; touching is not sharing.
-
-    Args:
-        box: The target's, in its frame.
-        vehicle_T_target: (P, 4, 4) where it stands.
-        corners_m: (8, 3) of the other box in the vehicle frame, in the order of `BoundingBox.corners_m`.
-    """
-    target_m = box.corners_m @ vehicle_T_target[:, :3, :3].swapaxes(1, 2) + vehicle_T_target[:, None, :3, 3]
-    sides = np.stack([corners_m[4] - corners_m[0], corners_m[2] - corners_m[0], [0.0, 0.0, 1.0]])
-    axes = np.concatenate(
-        [np.broadcast_to(sides, (len(target_m), 3, 3)), vehicle_T_target[:, :3, :2].swapaxes(1, 2)], 1
-    )
-    ours_m = np.einsum("pak,pck->pac", axes, target_m)
-    theirs_m = np.einsum("pak,ck->pac", axes, corners_m)
-    apart = (ours_m.min(axis=2) >= theirs_m.max(axis=2)) | (theirs_m.min(axis=2) >= ours_m.max(axis=2))
-    overlaps: Bools = ~apart.any(axis=1)
-    return overlaps
 
 
 def holding(box: BoundingBox, vehicle_T_target: Float64, place_m: Float64) -> Bools:

@@ -7,11 +7,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.geometry import overlapping
 from torchcover.simulation.memory import check_fits
 from torchcover.simulation.rig import Rig, with_ego
 from torchcover.simulation.scenario import Scenario
 from torchcover.targets.counting import count
-from torchcover.targets.placing import Heading, holding, overlapping, poses, yaws
+from torchcover.targets.placing import Heading, holding, poses, yaws
 from torchcover.targets.raster import Raster
 from torchcover.targets.result import FREE, OCCUPIED, OUTSIDE, TargetMap
 from torchcover.targets.steps import PLACES, Steps
@@ -155,7 +156,8 @@ def survey_places(
     around = vehicle_T_target[elsewhere]
     run = Steps(rig, scenario, target, surface, around, steps=steps, every_steps=every_steps, seed=seed)
     some = range(len(rig.sensors)) if counting is None else counting
-    mounted = [run.mounted[k] for k in some]
+    every = run.mounted
+    mounted = [every[k] for k in some]
     taken = [step._replace(sensors=[step.sensors[k] for k in some]) for step in run]
     sums = count(target, surface, around, mounted, taken, hits=hits, threshold_m=threshold_m)
 

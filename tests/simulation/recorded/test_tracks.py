@@ -26,7 +26,7 @@ from tests.simulation.recorded.drives import (
 from torchcover import Rig, Scenario
 from torchcover.evaluation.task import spread_s
 from torchcover.geometry import BoundingBox, invert, rigid
-from torchcover.simulation import PaperReference, Simulator
+from torchcover.simulation import PaperReference, SimulatedFrames, Simulator
 from torchcover.simulation.builtin import builtin_folder, builtin_names
 from torchcover.simulation.height_field import Slopes
 
@@ -386,6 +386,9 @@ def test_what_was_not_recorded_is_drawn_if_asked_for_and_stands_where_nobody_was
     for actor in (drawn.ego, *drawn.actors):
         for place_m in actor.trajectory.positions_m[:, :2]:
             assert np.linalg.norm(houses_m - place_m, axis=1).min() > 2.0
+    said = "Drawn, not recorded: what stands beside the tracks, with houses on 100% of the sides."
+    for traffic, notes in ((scenario(path), []), (scenario(path, built_share=1.0), [said])):
+        assert SimulatedFrames(traffic, RIG, steps=1, reference_sensor=FEW).reference_record["notes"] == notes
     # They begin on the ground: beside hills, below the highest of them.
     assert drawn.static[1].vertices_m[:, 2].min() < bare.static[0].vertices_m[:, 2].max()
 

@@ -12,10 +12,10 @@ from torchcover import Rig, Scenario
 from torchcover.data import SimulatedFrames
 from torchcover.files import BadFileError, parse_xml
 from torchcover.simulation import PaperReference
-from torchcover.simulation.sumo import Sumo, simulating
+from torchcover.simulation.sumo import Sumo, simulating, traffic
 from torchcover.simulation.sumo.demand import write_routes
 from torchcover.simulation.sumo.network import read_network
-from torchcover.simulation.sumo.streets import DrawnStreets
+from torchcover.simulation.sumo.streets import TURN_MPS2, DrawnStreets, turning_mps
 from torchcover.simulation.traffic.fleet import KIND_OF, Fleet, load_bodies
 
 from .towns import XODR, street, write_net
@@ -82,6 +82,8 @@ def test_drawn_streets_go_on_everywhere_and_have_all_that_was_asked_for(network,
     town = read_network(streets.build(tmp_path, np.random.default_rng(2)))
     assert not any(lane.line_m[:, 2].any() for lane in town.lanes)
     assert {lane.use for lane in town.lanes} == {"road", "turn", "bay", "sidewalk", "crossing", "corner"}
+    turns = [lane for lane in town.lanes if lane.use == "turn"]
+    assert all(lane.speed_mps <= turning_mps(lane.line_m[:, :2]) + 0.01 for lane in turns)
     follow = town.follow("passenger")
     assert len(follow) > 10
     assert all(follow.values())
@@ -165,3 +167,23 @@ def test_a_net_without_ways_and_too_much_traffic_are_refused(tmp_path):
         Sumo(net=net, random={}, duration_s=2.0).world(0)
     with pytest.raises(ValueError, match=r"traffic of about [\d,]+ vehicles and people; at most 20,000 are drawn"):
         drawn(traffic_per_km=200.0, people_per_km=1000.0, cyclists_per_km=1000.0, buses_per_km=200.0).world(0)
+
+
+def test_an_empty_town_is_a_world_a_hundred_times_as_much_is_refused_and_who_is_left_out_is_told(monkeypatch):
+    for key in LITTLE:
+        with pytest.raises(ValueError, match=rf"random\.{key}\s+Input should be less than or equal to"):
+            drawn(**{key: 1400.0})
+    monkeypatch.setattr(traffic, "possible", lambda bodies: bodies[:1])
+    bare = {"built_share": 0.0, "parked_share": 0.0, "roadside": 0.0}
+    with pytest.warns(UserWarning, match=r"the simulation has \d of \d road users where another one is"):
+        world = drawn(**dict.fromkeys(LITTLE, 0.0)).model_copy(update=bare).world(0)
+    assert not world.objects
+    assert world.left_out > 0  # who could have been the ego
+
+
+def test_a_turn_is_driven_as_slowly_as_its_tightest_piece_asks_for():
+    angle = np.linspace(0.0, np.pi / 2, 40)
+    arc_m = 6.0 * np.stack([np.sin(angle), 1 - np.cos(angle)], axis=1)
+    lead_m = np.column_stack([np.linspace(-30.0, -1.0, 30), np.zeros(30)])
+    assert turning_mps(np.concatenate([lead_m, arc_m])) == pytest.approx(np.sqrt(TURN_MPS2 * 6.0), rel=0.02)
+    assert turning_mps(lead_m) > 100.0

@@ -9,8 +9,7 @@ from torchcover.simulation.sumo.ground import Pavement, ground_of
 from torchcover.simulation.sumo.motion import CATCH_UP_MPS, RoadUser, corners_m, motions, possible
 from torchcover.simulation.sumo.network import read_network
 from torchcover.simulation.sumo.vicinity import Vicinity
-from torchcover.simulation.traffic.articulated import tractrix
-from torchcover.simulation.traffic.fleet import load_articulated
+from torchcover.simulation.traffic.articulated import DRAWS, tractrix
 
 from .towns import DRIVE, WALK, edge, write_net
 
@@ -137,9 +136,7 @@ def test_long_vehicles_swing_out_and_none_comes_over_a_kerb(corner):
 
 
 def semi_trailer(places_m):
-    both = load_articulated()["truck"]
-    sizes_m = tuple(map(tuple, both.sizes_m[:, :2].tolist()))
-    return user(places_m, kind="truck")._replace(length_m=16.5, sizes_m=sizes_m, both=both)
+    return user(places_m, kind="truck")._replace(length_m=16.5, sizes_m=((6.65, 2.55), (13.6, 2.55)))
 
 
 def test_a_trailer_follows_its_kingpin_and_both_parts_count(corner):
@@ -148,12 +145,12 @@ def test_a_trailer_follows_its_kingpin_and_both_parts_count(corner):
     (front, _), (rear, size_m) = motion.parts
     assert rear[0] == pytest.approx([*(front[0, :2] - [6.375, 0.0]), 0.0], abs=1e-9)
     assert [front[0, 0] + 6.65 / 2, rear[0, 0] - 13.6 / 2] == pytest.approx([-40.0, -56.5])
-    hitches_m = truck.both.hitches_m(front)[:, None]
+    hitches_m = DRAWS["truck"].hitches_m(front)[:, None]
     np.testing.assert_allclose(tractrix(hitches_m, np.array([8.41]), np.zeros(1))[:, 0], rear[:, 2], atol=1e-12)
     # Only the trailer comes over the place where that one stands.
     where = len(rear) // 2
     inside_m = rear[where, :2] + (size_m[1] / 2 - 0.2) * np.array([-np.sin(rear[where, 2]), np.cos(rear[where, 2])])
-    alone = motion._replace(user=truck._replace(both=None, sizes_m=truck.sizes_m[:1]), rear=None)
+    alone = motion._replace(user=truck._replace(kind="van", sizes_m=truck.sizes_m[:1]), rear=None)
     (rests,) = motions([user(np.tile(inside_m, (101, 1)), on_foot=True, size_m=(0.3, 0.5))], 20.0, ORIGIN)
     (far,) = motions([user(straight(0.1, 20.0, y_m=-50.0))], 20.0, ORIGIN)
     assert possible([far, motion]) == [far, motion]
@@ -170,3 +167,18 @@ def test_who_cannot_get_round_is_not_there(corner):
     assert possible([lorry]) == [lorry]  # the first is the ego
     (walker,) = motions([user(turn(5.0, 1.4), on_foot=True)], 40.0, ORIGIN, corner)
     assert walker.can_be
+
+
+def test_people_go_round_what_is_driven_on_where_sumo_leads_them_straight_across():
+    walked = shapely.Polygon([(0, 0), (20, 0), (20, 20), (16, 20), (16, 4), (0, 4)])
+    way_m = np.concatenate([straight(1.3, 10.0, y_m=3.0)[:20], [[5.2 + 0.2 * k, 3.0 + 0.26 * k] for k in range(61)]])
+    across = user(way_m, on_foot=True, kind="adult", size_m=(0.3, 0.5))
+    inside = user(straight(1.3, 8.0, x_m=1.0, y_m=2.0), on_foot=True, kind="adult", size_m=(0.3, 0.5))
+    free, led, same = (motions([who], 16.0, ORIGIN, None, area)[0] for who, area in
+                       ((across, None), (across, walked), (inside, walked)))  # fmt: skip
+    on = [shapely.contains_xy(walked, *motion.poses[:, :2].T) for motion in (free, led)]
+    assert on[0].mean() < 0.5
+    assert on[1].mean() > 0.9
+    assert shapely.distance(shapely.points(led.poses[:, :2]), walked).max() < 0.5
+    assert led.can_be
+    np.testing.assert_array_equal(same.poses, motions([inside], 16.0, ORIGIN)[0].poses)

@@ -11,7 +11,7 @@ from torchcover.simulation.sumo import Sumo
 from torchcover.simulation.traffic.fleet import REAR_OF
 from torchcover.simulation.traffic.procedural import Procedural
 
-from .towns import drive, edge, fcd, street, together, vehicle, write_net
+from .towns import DRIVE, drive, edge, fcd, street, together, vehicle, write_net
 
 UTM = (512_345.0, 5_405_678.0)
 
@@ -75,6 +75,25 @@ def test_whoever_is_where_another_one_is_is_left_out_with_a_count(tmp_path):
         world = made(tmp_path, steps=steps, ego_id="ego").world(0)
     assert [actor.name.split()[1] for actor in world.actors] == ["one", "free"]
     assert world.left_out == 2
+
+
+def test_one_street_without_sidewalks_is_a_world_and_people_walk_where_they_are_told(tmp_path):
+    bare = edge("east", (DRIVE, 3.5, [(0.0, 0.0, 0.0), (400.0, 0.0, 0.0)]))
+    walker = drive("walker", speed=1.0, start=60.0, y=3.0, tag="person")
+    rider = drive("rider", tag="person")  # and nothing else: where the ego is
+    world = made(tmp_path, bare, steps=together(drive(), walker, rider), ego_id="ego").world(0)
+    (person,) = world.actors
+    assert person.category == "pedestrian"
+    np.testing.assert_allclose(np.ptp(person.trajectory.positions_m, axis=0), [4.0, 0.0, 0.0], atol=1e-9)
+
+
+def test_a_vehicle_that_is_told_longer_than_its_street_is_as_long_as_the_longest_body(tmp_path):
+    (tmp_path / "r.xml").write_text('<routes><vType id="train" vClass="truck" length="900"/></routes>')
+    steps = together(drive(), drive("long", start=320.0, y=9.0, type="train"))
+    edges = street(), street("north", y=9.0)
+    world = made(tmp_path, *edges, steps=steps, ego_id="ego", routes=(tmp_path / "r.xml",)).world(0)
+    assert [actor.name for actor in world.actors] in ([], ["truck long 0", "rear of truck long 0"])
+    assert all(np.ptp(actor.mesh.vertices_m[:, 0]) < 14.0 for actor in world.actors)
 
 
 def test_people_walk_on_the_pavement_and_step_down(tmp_path):

@@ -7,7 +7,7 @@ import pytest
 from torchcover.geometry import BoundingBox
 from torchcover.simulation import shapes
 from torchcover.simulation.traffic import Highway, Parking, Urban
-from torchcover.simulation.traffic.fleet import load_articulated, load_bodies
+from torchcover.simulation.traffic.fleet import load_bodies
 
 # Hills lift and tilt, and change no place: what overlaps is found out on a plain.
 PLAIN = {"hills_m": 0.0}
@@ -26,15 +26,8 @@ KINDS = {
 
 @cache
 def boxes():
-    found = {kind: box_of(mesh) for kind, mesh in load_bodies().items()}
-    return found | {
-        kind: both._replace(front=box_of(both.front), rear=box_of(both.rear))
-        for kind, both in load_articulated().items()
-    }
-
-
-def box_of(mesh):
-    return shapes.Box(type="box", size_m=BoundingBox.around(mesh.vertices_m).size_m).mesh()
+    sizes = {kind: BoundingBox.around(mesh.vertices_m).size_m for kind, mesh in load_bodies().items()}
+    return {kind: shapes.Box(type="box", size_m=size).mesh() for kind, size in sizes.items()}
 
 
 @cache

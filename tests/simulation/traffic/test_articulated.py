@@ -5,13 +5,14 @@ import pytest
 
 from torchcover.geometry import rigid, rotation_from_euler
 from torchcover.geometry.trajectory import Trajectory
-from torchcover.simulation.traffic.articulated import rears_of, tractrix
-from torchcover.simulation.traffic.fleet import REAR_OF, load_articulated, load_bodies
+from torchcover.simulation.bodies import Vehicle
+from torchcover.simulation.traffic.articulated import DRAWS, rears_of, tractrix
+from torchcover.simulation.traffic.fleet import REAR_OF, Fleet, load_bodies
 from torchcover.simulation.world import Actor
 
 from .test_separation import Solids, among
 
-KINDS = sorted(load_articulated())
+KINDS = sorted(DRAWS)
 
 
 def test_on_a_circle_the_rear_follows_a_smaller_one():
@@ -33,27 +34,29 @@ def test_along_a_line_the_angle_falls_as_in_the_closed_form_whatever_the_steps()
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_on_a_straight_both_parts_are_the_whole_vehicle(kind):
-    both, whole = load_articulated()[kind], load_bodies()[kind]
-    rear = rears_of({7: both}, [np.array([[both.ahead_m, 0.0, 0.0]])])[7]
-    parts = [both.front.moved(at([both.ahead_m, 0.0, 0.0])), both.rear.moved(at(rear[0]))]
+    hitch, bodies, whole = DRAWS[kind], load_bodies(), Vehicle.load(kind).mesh()
+    front = np.array([[hitch.ahead_m, 0.0, 0.0]])
+    (rear,) = rears_of([kind], [front])
+    parts = [bodies[part].moved(at(pose[0])) for part, pose in ((kind, front), (hitch.rear, rear))]
     vertices_m = np.concatenate([mesh.vertices_m for mesh in parts])
     assert sorted(vertices_m.round(6).tolist()) == sorted(whole.vertices_m.round(6).tolist())
-    assert both.size_m == pytest.approx(np.ptp(vertices_m, axis=0), abs=1e-9)
+    assert Fleet(bodies, None, np.random.default_rng()).length_m(kind) == pytest.approx(np.ptp(vertices_m[:, 0]))
+    # The axles are where those of the vehicle are, and the hitch is before them.
+    wheels_m = [mesh for part in Vehicle.load(kind).parts if part.name == "trailer wheels" for mesh in part.meshes()]
+    middle_m = np.mean([mesh.vertices_m[:, 0].mean() for mesh in wheels_m])
+    assert hitch.ahead_m + hitch.hitch_m - hitch.rod_m == pytest.approx(middle_m, abs=1e-6)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("turned_deg", [-70.0, -25.0, 5.0, 50.0])
 def test_the_parts_of_a_vehicle_never_meet_however_it_turns(kind, turned_deg):
-    both = load_articulated()[kind]
-    (rear,) = both.rear_poses(np.zeros((1, 3)), np.deg2rad([turned_deg]))
-    found = [(Solids.of_static([mesh]), k) for k, mesh in enumerate((both.front, both.rear.moved(at(rear))))]
-    corners = max(solids.outline.shape[1] for solids, _ in found)
-    outline = np.concatenate(
-        [np.pad(s.outline, ((0, 0), (0, corners - s.outline.shape[1]), (0, 0)), "edge") for s, _ in found]
-    )
-    one = Solids(outline, *(np.concatenate([getattr(s, end) for s, _ in found]) for end in ("low", "high")))
-    part = np.repeat([0, 1], [len(s.low) for s, _ in found])
-    assert not [(i, j, d) for i, j, d in among(one) if part[i] != part[j]]
+    bodies = load_bodies()
+    (rear,) = rears_of([kind], [np.zeros((1, 3))], [np.deg2rad(turned_deg)])
+    meshes = bodies[kind], bodies[DRAWS[kind].rear].moved(at(rear[0]))
+    pieces = [Solids.of_static([mesh]) for mesh in meshes]
+    both = Solids.of_static(meshes)
+    part = np.repeat([0, 1], [len(solids.low) for solids in pieces])
+    assert not [(i, j, d) for i, j, d in among(both) if part[i] != part[j]]
 
 
 @pytest.mark.parametrize("kind", ["highway", "urban"])
@@ -64,7 +67,7 @@ def test_in_traffic_axles_do_not_slip_and_the_hitch_holds(kind, world):
     assert len(rears) > 3
     for rear in rears:
         front = fronts[rear.name.removeprefix(REAR_OF)]
-        both = load_articulated()[front.name.split()[0]]
+        both = DRAWS[front.name.split()[0]]
         assert (front.category, rear.category) == ("truck", "trailer")
         drawn, own = poses(rear), poses(front)
         back = np.stack([np.cos(drawn[:, 2]), np.sin(drawn[:, 2])], axis=1)

@@ -57,6 +57,18 @@ def test_nothing_stands_on_the_street_and_houses_stand_off_the_sidewalk(usual):
     assert min(shapely.MultiPoint(s.vertices[:, :2]).distance(STREET) for s in solids(houses)) > 1.8
 
 
+def test_around_a_corner_nothing_is_stretched():
+    turn = np.linspace(0.0, np.pi / 2, 8)
+    around_m = 3.0 * np.column_stack([np.cos(turn), np.sin(turn)])
+    line_m = np.concatenate([[[3.0, -80.0]], around_m, [[-80.0, 3.0]]])
+    houses, _ = stand([Side("built", line_m)], [], [], (), lambda at: np.zeros(len(at)), OFF, np.random.default_rng(0))
+    corners_m = np.concatenate([mesh.vertices_m.reshape(-1, 2, 4, 3)[:, 0, :, :2] for mesh in houses])
+    lengths_m = np.linalg.norm(np.roll(corners_m, -1, axis=1) - corners_m, axis=2)[:, ::2]
+    longest_m = max(KINDS[name].run_m[1] for name in HOUSES)
+    assert len(corners_m) > 5
+    assert lengths_m.max() < longest_m / 0.6
+
+
 def test_densities_are_times_as_much_down_to_none():
     few, usual, many = (sum(len(m.faces) for m in stood(times)[1]) for times in (0.25, 1.0, 3.0))
     assert 0 < few < usual < many

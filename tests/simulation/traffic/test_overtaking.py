@@ -14,11 +14,14 @@ FAR_M = np.array([[1e5, 2e5], [1e5, 2e5]])
 NEAR_M = np.array([[1500.0, 2000.0], [1500.0, 2000.0]])
 
 
-def drive(*agents, heavy=(), exits=(), side_m=FAR_M, times_s=TIMES_S):
+LEVEL = np.array([[0.0, 1.0], [0.0, 0.0]])
+
+
+def drive(*agents, heavy=(), exits=(), side_m=FAR_M, times_s=TIMES_S, kind="car", slope=0.0):
     """What happened, and the (T, N) lanes, of agents (lane, place, driver)."""
-    made = [Agent("car", 5.0, lane, place, driver) for lane, place, driver in agents]
+    made = [Agent(kind, 5.0, lane, place, driver) for lane, place, driver in agents]
     marked = [np.isin(np.arange(len(made)), which) for which in (heavy, exits)]
-    traffic = Overtaking(made, *marked, side_m, np.random.default_rng(0))
+    traffic = Overtaking(made, *marked, side_m, np.random.default_rng(0), LEVEL + np.array([[0.0], [slope]]))
     flow = traffic.run(times_s, 0.0)
     lanes = np.tile([agent.lane for agent in made], (len(times_s), 1))
     for change in traffic.changes:
@@ -68,6 +71,20 @@ def test_nobody_cuts_in_where_another_would_have_to_brake_hard():
     at = int(np.argmax(flow.place_m[:, 0] > first.place_m))
     assert flow.place_m[at, 2] > flow.place_m[at, 0]
     assert np.diff(flow.speed_mps[:, 2]).min() / 0.1 > -2.1
+
+
+@pytest.mark.parametrize(("lane", "slope"), [(2, 0.04), (6, -0.04), (2, 0.03)])
+def test_a_laden_lorry_goes_up_as_fast_as_its_power_lifts_it(lane, slope):
+    limit = Driver(23.6, 1.6, 3.0, 0.6)
+    _, flow, _ = drive((lane, 0.0, limit), kind="truck", slope=slope, times_s=np.arange(0.0, 400.0, 0.5))
+    speed = flow.speed_mps[-1, 0]
+    assert 9.81 * (abs(slope) + 0.006) * speed + 9e-5 * speed**3 == pytest.approx(1000 / 120, rel=0.01)
+    assert 15.0 < speed < 22.0
+    # Down there, and on the level, it keeps to the limit as all do.
+    for kind, down in (("truck", -slope), ("truck", 0.0), ("car", slope)):
+        _, flow, _ = drive((lane, 0.0, limit), kind=kind, slope=down, times_s=np.arange(0.0, 200.0, 0.5))
+        assert flow.speed_mps[100:, 0].min() > 22.0
+        assert flow.speed_mps.max() < 1.03 * 23.6
 
 
 def test_lorries_keep_out_of_the_lane_at_the_median():

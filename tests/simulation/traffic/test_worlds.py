@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from torchcover.simulation.patches import outward_faces
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic import Highway, Parking, Urban, urban
@@ -75,6 +76,13 @@ def test_the_ego_stays_on_the_road_and_tilts_a_little(kind, world):
         < 0.1
     )
     assert np.abs(np.diff(ego.angles_deg[:, 1:], axis=0)).max() < 0.4
+
+
+def test_what_is_known_of_faces_is_what_would_be_found(world):
+    static = [mesh for mesh in world("winding", 0).static if mesh.outward is not None]
+    assert len(static) == 2  # houses, and what is smaller
+    for mesh in static:
+        np.testing.assert_array_equal(mesh.outward, outward_faces(mesh._replace(outward=None)))
 
 
 @pytest.mark.parametrize("kind", WORLDS)
@@ -195,6 +203,20 @@ def test_people_cross_the_aisles_of_the_lot_and_cars_are_slow(world):
     assert sum(np.ptp(actor.trajectory.positions_m[:, 1]) > 5.0 for actor in people) > 4
     assert speeds(w.ego).max() < 4.0
     assert speeds(w.ego).min() > 1.0
+
+
+def test_a_lot_is_surrounded_by_what_stands_beside_streets_and_that_keeps_off_it(bodies):
+    full, bare = (
+        Parking(duration_s=1.0, **keys).world(0, bodies=bodies) for keys in ({}, {"built_share": 0, "roadside": 0})
+    )
+    *same, houses, others = full.static
+    assert len(bare.static) == len(same)
+    places_m = np.concatenate([houses.vertices_m, others.vertices_m])[:, :2]
+    # Crowns hang over its edge, by less than half their width.
+    least_m = np.abs(places_m / np.array([62.0, 36.0])).max(axis=1)[places_m[:, 1] > 0.0].min()
+    assert 0.95 < least_m < 1.05
+    sides = [(places_m[:, axis] * sign > 40.0).any() for axis in (0, 1) for sign in (1, -1)]
+    assert all(sides)
 
 
 @pytest.mark.parametrize(

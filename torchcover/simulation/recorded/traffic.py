@@ -9,13 +9,13 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
-from torchcover.geometry import BoundingBox, invert, overlap
+from torchcover.geometry import BoundingBox, invert, overlapping
 from torchcover.geometry.rigid import Matrix
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings.formats import read_objects
 from torchcover.recordings.formats.track_tables import read_trajectory
 from torchcover.recordings.objects import Ego, RecordedObjects
-from torchcover.simulation.bodies import sound_mesh
+from torchcover.simulation.bodies import Vehicle, sound_mesh
 from torchcover.simulation.documents import PathBeside, Pose, builtin_hashes
 from torchcover.simulation.height_field import Plain, Slopes
 from torchcover.simulation.recorded.bodies import Bodies
@@ -87,6 +87,15 @@ class RecordedTraffic(Traffic):
         return self
 
     @property
+    def drawn_words(self) -> str:
+        """What stands beside streets, if it is drawn."""
+        if self.built_share is None:
+            return ""
+        return (
+            f"Drawn, not recorded: what stands beside the tracks, with houses on {self.built_share:.0%} of the sides."
+        )
+
+    @property
     def steps(self) -> int:
         """Number of instants."""
         return steps_of(self._run.duration_s, self.time_step_s)
@@ -105,7 +114,8 @@ class RecordedTraffic(Traffic):
         Returns:
             The world, in the frame of the recording. Who is where the ego is at an instant is left out, with a warning.
         """
-        run, bodies = self._run, load_bodies()
+        # A box is all of a truck.
+        run, bodies = self._run, {**load_bodies(), "truck": Vehicle.load("truck").mesh()}
         drive = self._shown(run.drive)
         mesh = bodies["suv"] if ego is None else ego
         driver = Actor(EGO, "car", mesh, Trajectory(drive.times_s, drive.positions_m, drive.angles_deg))
@@ -180,11 +190,10 @@ class RecordedTraffic(Traffic):
         for other in others:
             its_box = BoundingBox.around(other.mesh.vertices_m)
             away_m = np.linalg.norm(other.trajectory.positions_at(times_s) - ego_m, axis=1)
-            near = np.flatnonzero(away_m < reach_m + np.linalg.norm(its_box.corners_m, axis=1).max())
-            for time_s in times_s[near].tolist():
-                if overlap(box, invert(ego.trajectory.at(time_s)) @ other.trajectory.at(time_s), its_box):
-                    met.append(other.name)
-                    break
+            near_s = times_s[away_m < reach_m + np.linalg.norm(its_box.corners_m, axis=1).max()]
+            there = invert(ego.trajectory.at_each(near_s)) @ other.trajectory.at_each(near_s)
+            if overlapping(its_box, there, box.corners_m).any():
+                met.append(other.name)
         if met:
             warnings.warn(
                 f"{self.path}: {len(met)} of {len(others)} tracks are where the ego is at some time "

@@ -109,14 +109,10 @@ def crowd(
             named = "child" if "child" in track.kind.lower() else "adult"
             kind = track.kind if CATEGORIES.get(track.kind) == "pedestrian" else named
         if kind is not None:
-            both = fleet.articulated.get(kind)
-            sizes_m = ((fleet.length_m(kind), fleet.width_m(kind)),)
-            if both is not None:
-                sizes_m = tuple((length_m, width_m) for length_m, width_m, _ in both.sizes_m.tolist())
-            users.append(RoadUser(track, kind, found.length_m, sizes_m, both))
+            users.append(RoadUser(track, kind, found.length_m, fleet.sizes_m(kind)))
     ego = _ego(users, recorded, ego_name, ego_type, duration_s, generator)
     others = [other for other in users if other is not ego and _comes_near(other.track, ego.track)]
-    return Crowd(ego._replace(sizes_m=((fleet.length_m(EGO), fleet.width_m(EGO)),), both=None), others)
+    return Crowd(ego._replace(kind=EGO, sizes_m=fleet.sizes_m(EGO)), others)
 
 
 def _ego(

@@ -17,6 +17,7 @@ Numbers = NDArray[np.float64]
 # Rounds of smoothing between the streets, at each scale; the streets' own heights stay.
 SMOOTHINGS = 4
 DECK_M = 0.8
+GAP_M, CROSSING_GAP_M = 0.3, 1.3
 # Slivers that are left where outlines nearly meet.
 SMALLEST_M2 = 0.05
 
@@ -78,6 +79,10 @@ class Pavement:
         parts = shapely.get_parts(shapely.difference(walked, driven))
         self.parts = parts[(shapely.get_type_id(parts) == 3) & (shapely.area(parts) > SMALLEST_M2)]
         self._tree = shapely.STRtree(self.parts)
+        # With crossings, and without the gaps that the drawing of a network leaves, most of all before these.
+        gaps = ((vicinity.surfaces("sidewalk", "corner"), GAP_M), (vicinity.surfaces("crossing"), CROSSING_GAP_M))
+        on_foot = [shapely.buffer(part, gap_m, join_style="mitre") for parts, gap_m in gaps for part in parts]
+        self.walked = shapely.union_all(on_foot).buffer(-GAP_M, join_style="mitre")
 
     def meshes(self) -> list[Mesh]:
         """One for each piece that is not connected to another."""

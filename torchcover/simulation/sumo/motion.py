@@ -8,7 +8,7 @@ import shapely
 from numpy.typing import NDArray
 
 from torchcover.simulation.sumo.floating import TIME_SLACK_S, SumoTrack
-from torchcover.simulation.traffic.articulated import Articulated, rears_of, together, tractrix
+from torchcover.simulation.traffic.articulated import DRAWS, rears_of, together, tractrix
 
 Numbers = NDArray[np.float64]
 
@@ -19,9 +19,12 @@ CORNER_M, ALONG_M = 3.0, 0.5
 # The axles of vehicles lie so far from their middle, as a share of the length; people turn about a point behind them.
 AXLE_SHARE, HEELS_M = 0.3, 0.4
 # Nobody walks faster: SUMO lets people jump where ways meet, which they walk off with so much more speed instead.
-FASTEST_ON_FOOT_MPS, CATCH_UP_MPS = 4.0, 0.8
+FASTEST_ON_FOOT_MPS, CATCH_UP_MPS, HURRIES_MPS = 4.0, 0.8, 3.5
+# People go so far within the edges of pavements and crossings, to which those come back who were no farther from them.
+OFF_EDGE_M, BESIDE_M = 0.25, 2.0
 # Whose rear axle follows its own way so closely is off the kerbs, as its lane is; poses are looked at this often.
-ASTRAY_M, LOOKS_EVERY = 0.25, 2
+# Riders go anywhere in a lane, and a little beyond.
+ASTRAY_M, LOOKS_EVERY, NARROW_M = 0.25, 2, 1.0
 # How often a way is moved aside, over which length before and after, and the room that is left; to rub is to be off.
 SWINGS, SWING_M, SWING_LENGTHS, ROOM_M, RUBS_M = 4, 8.0, 1.0, 0.1, 0.05
 # Outlines of bodies are that far apart. Who meets whom is looked for in pieces of ways of so many poses.
@@ -36,15 +39,13 @@ class RoadUser(NamedTuple):
         track: Where its front is.
         kind: Of its body.
         length_m: That the simulation takes it for.
-        sizes_m: Length and width of the body, or of its front and its rear.
-        both: Its parts, if it is in two.
+        sizes_m: Lengths and widths of the body, and of what it draws along.
     """
 
     track: SumoTrack
     kind: str
     length_m: float
     sizes_m: tuple[tuple[float, float], ...]
-    both: Articulated | None = None
 
     @property
     def ahead_m(self) -> float:
@@ -54,7 +55,7 @@ class RoadUser(NamedTuple):
     @property
     def lag_m(self) -> float:
         """How far the axles of what it draws along are behind the point that leads, on a straight."""
-        return 0.0 if self.both is None else self.ahead_m - self.both.hitch_m + self.both.rod_m
+        return self.ahead_m - DRAWS[self.kind].hitch_m + DRAWS[self.kind].rod_m if self.kind in DRAWS else 0.0
 
     @property
     def drawn_m(self) -> float:
@@ -95,7 +96,11 @@ class Motion(NamedTuple):
 
 
 def motions(
-    users: Sequence[RoadUser], duration_s: float, origin_m: Numbers, obstacles: NDArray[np.object_] | None = None
+    users: Sequence[RoadUser],
+    duration_s: float,
+    origin_m: Numbers,
+    obstacles: NDArray[np.object_] | None = None,
+    walked: shapely.Geometry | None = None,
 ) -> list[Motion]:
     """Move bodies along their tracks, without those who are there for no time.
 
@@ -104,7 +109,9 @@ def motions(
         duration_s: Of the run, from 0 on.
         origin_m: (2,) what is subtracted of all places.
         obstacles: Polygons in plan, of pavements and what is parked: vehicles swing out for them where they can.
+        walked: Likewise what people walk on: who is beside it goes along its edge instead, where there is time to.
     """
+    shapely.prepare(walked)
     times_s = np.linspace(0.0, duration_s, int(np.ceil(duration_s / FINE_S - TIME_SLACK_S)) + 1)
     there: list[tuple[RoadUser, Numbers]] = []
     for user in users:
@@ -114,7 +121,7 @@ def motions(
     found: list[Motion] = []
     for start in range(0, len(there), BODIES_AT_ONCE):
         some, own_s = zip(*there[start : start + BODIES_AT_ONCE], strict=True)
-        ways_m = [_lead_m(user, at_s, origin_m) for user, at_s in zip(some, own_s, strict=True)]
+        ways_m = [_lead_m(user, at_s, origin_m, walked) for user, at_s in zip(some, own_s, strict=True)]
         poses = _poses(some, ways_m)
         over_m = np.zeros(len(some)) if obstacles is None else _keep_off(some, ways_m, poses, obstacles)
         rears = _rears(some, poses)
@@ -122,14 +129,16 @@ def motions(
     return found
 
 
-def _lead_m(user: RoadUser, times_s: Numbers, origin_m: Numbers) -> Numbers:
+def _lead_m(user: RoadUser, times_s: Numbers, origin_m: Numbers, walked: shapely.Geometry | None) -> Numbers:
     """(K, 2) where the point goes that leads, at (K,) times."""
     track = user.track
     told_m = (_without_jumps(track) if track.on_foot else track.places_m[:, :2]) - origin_m
     even_m = np.stack([np.interp(times_s, track.times_s, axis) for axis in told_m.T], axis=1)
+    if track.on_foot and walked is not None and not walked.is_empty:
+        even_m = _along_edges(even_m, times_s[1] - times_s[0], walked)
     half_s = max(SMOOTH_S, float(np.median(np.diff(track.times_s))))
     smooth_m = rounded(even_m, int(np.ceil(half_s / (times_s[1] - times_s[0]))))
-    before_middle_m = user.ahead_m + (0.0 if user.both is None else user.both.ahead_m)
+    before_middle_m = user.ahead_m + (DRAWS[user.kind].ahead_m if user.kind in DRAWS else 0.0)
     behind_m = 0.0 if track.on_foot else max(user.length_m / 2 - before_middle_m, 0.0)
     return _behind(smooth_m, behind_m, np.deg2rad(track.yaw_deg[0]))
 
@@ -146,8 +155,9 @@ def _poses(users: Sequence[RoadUser], ways_m: Sequence[Numbers]) -> list[Numbers
 
 def _rears(users: Sequence[RoadUser], poses: Sequence[Numbers]) -> dict[int, Numbers]:
     """(K, 3) poses of what some draw along, by their numbers, along those of fronts."""
-    both = {number: user.both for number, user in enumerate(users) if user.both is not None}
-    return rears_of(both, [poses[number] for number in both])
+    fronts = [number for number, user in enumerate(users) if user.kind in DRAWS]
+    rears = rears_of([users[number].kind for number in fronts], [poses[number] for number in fronts])
+    return dict(zip(fronts, rears, strict=True))
 
 
 def _keep_off(
@@ -162,9 +172,10 @@ def _keep_off(
     for number, (user, way_m, own) in enumerate(zip(users, ways_m, poses, strict=True)):
         if not user.track.on_foot:
             astray_m = _lengths(2 * own[:, :2] - way_m - _behind(way_m, user.drawn_m, own[0, 2]))
-            look[number, False] = np.flatnonzero(astray_m > ASTRAY_M)[::LOOKS_EVERY]
-        if user.both is not None:
-            astray_m = user.both.rod_m / 2 * np.abs(rears[number][:, 2] - own[:, 2])
+            anywhere = user.sizes_m[0][1] < NARROW_M
+            look[number, False] = np.flatnonzero(anywhere | (astray_m > ASTRAY_M))[::LOOKS_EVERY]
+        if number in rears:
+            astray_m = DRAWS[user.kind].rod_m / 2 * np.abs(rears[number][:, 2] - own[:, 2])
             look[number, True] = np.flatnonzero(astray_m > ASTRAY_M)[::LOOKS_EVERY]
     for swing in range(SWINGS + 1):
         counts = [len(at) for at in look.values()]
@@ -327,3 +338,25 @@ def _without_jumps(track: SumoTrack) -> Numbers:
         share = ((times_s - begin_s) / takes_s).clip(0.0, 1.0) - (np.arange(len(times_s)) > at)
         walked_m += share[:, None] * steps_m[at]
     return walked_m
+
+
+def _along_edges(way_m: Numbers, step_s: float, walked: shapely.Geometry) -> Numbers:
+    """(K, 2) places of somebody on foot, who goes along the edge of what is walked on instead of beside it.
+
+    SUMO lets people walk straight through places where streets meet, even those that bend around a carriageway.
+    """
+    off = ~shapely.contains_xy(walked, *way_m.T)
+    if not off.any():
+        return way_m
+    found_m, rings = way_m.copy(), shapely.get_rings(shapely.get_parts(walked.buffer(-OFF_EDGE_M)))
+    for first, end in np.flatnonzero(np.diff(np.pad(off, 1).astype(np.int8))).reshape(-1, 2).tolist():
+        ends = shapely.points(way_m[[max(first - 1, 0), min(end, len(way_m) - 1)]])
+        nearest = rings[int(shapely.distance(rings[:, None], ends).sum(axis=1).argmin())]
+        begin_m, end_m = shapely.line_locate_point(nearest, ends)
+        length_m = shapely.length(nearest)
+        along_m = (end_m - begin_m + length_m / 2) % length_m - length_m / 2
+        if shapely.distance(nearest, ends).max() < BESIDE_M and abs(along_m) < HURRIES_MPS * step_s * (end - first + 1):
+            share = np.arange(1, end - first + 1) / (end - first + 1)
+            at = shapely.line_interpolate_point(nearest, (begin_m + share * along_m) % length_m)
+            found_m[first:end] = shapely.get_coordinates(at)
+    return found_m

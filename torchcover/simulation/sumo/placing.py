@@ -15,7 +15,7 @@ from torchcover.simulation.sumo.motion import Motion, corners_m, rounded
 from torchcover.simulation.sumo.vicinity import Vicinity
 from torchcover.simulation.traffic.assemble import attitude
 from torchcover.simulation.traffic.city import FREE_AT_CORNERS_M, PARKED, PARKED_GAP_M
-from torchcover.simulation.traffic.fleet import EGO, REAR_OF, Fleet
+from torchcover.simulation.traffic.fleet import CATEGORIES, EGO, REAR_OF, Fleet, parts_of
 from torchcover.simulation.traffic.roads import Polyline
 from torchcover.simulation.traffic.scenery import PAVEMENT_M
 from torchcover.simulation.world import Actor
@@ -40,11 +40,11 @@ class Placing:
         found = []
         for number, motion in enumerate(others):
             name = f"{motion.user.kind} {motion.user.track.name} {number}"
-            for is_rear, part in enumerate(motion.parts):
+            for kind, part in zip(parts_of(motion.user.kind), motion.parts, strict=True):
                 poses = self._poses(motion, *part)
                 trajectory = Trajectory(motion.times_s, *poses, not motion.user.track.covers(duration_s))
-                called = REAR_OF + name if is_rear else name
-                found.append(fleet.actor(called, motion.user.kind, trajectory, is_rear=bool(is_rear)))
+                found.append(Actor(name, CATEGORIES[kind], fleet.meshes[kind], trajectory))
+                name = REAR_OF + name
         return tuple(found)
 
     def ego(self, ego: Motion, times_s: Numbers, mesh: Mesh, generator: np.random.Generator) -> Actor:

@@ -28,8 +28,9 @@ WITH_BAYS, WITH_BICYCLE_LANES, WITH_MEDIAN = 0.7, 0.5, 0.3
 # Two streets that do not meet keep so far apart, middle to middle: the plan knows no widths.
 APART_M = 40.0
 BEND_PIECES = 10
-# Of kerbs at corners; nobody turns there with more than so much to the side, by much.
-CORNER_M, TURN_MPS2 = 6.0, 1.6
+# Of kerbs at corners; nobody turns there with more than so much to the side, by much. Curves are judged over a length
+# within which drivers round them.
+CORNER_M, TURN_MPS2, CURVE_M = 6.0, 2.0, 5.0
 
 
 class DrawnStreets(Document):
@@ -78,10 +79,15 @@ class DrawnStreets(Document):
         node_file.write_text(f"<nodes>{''.join(rows)}</nodes>", encoding="utf-8")
         run(
             "netconvert", "--node-files", node_file, "--edge-files", edge_file, "--output-file", network,
-            "--precision", "3", "--tls.guess", "--walkingareas", "--crossings.guess", "--no-turnarounds.except-deadend",
-            "--junctions.limit-turn-speed", str(TURN_MPS2), "--default.junctions.radius", str(CORNER_M),
-            "--junctions.internal-link-detail", "12",
+            "--precision", "3", "--tls.guess", "--walkingareas", "--crossings.guess",
+            "--no-turnarounds.except-deadend",
+            "--default.junctions.radius", str(CORNER_M), "--junctions.internal-link-detail", "12",
         )  # fmt: skip
+        drawn = parse_xml(network)
+        for lane in drawn.iterfind("edge[@function='internal']/lane"):
+            line_m = np.array([place.split(",")[:2] for place in lane.get("shape", "").split()], dtype=np.float64)
+            lane.set("speed", f"{min(self.speed_mps, turning_mps(line_m)):.2f}")
+        ElementTree.ElementTree(drawn).write(network)
         return network
 
     def _edges(
@@ -136,6 +142,22 @@ class DrawnStreets(Document):
         if generator.random() < WITH_MEDIAN:
             lanes.append(('type="median" disallow="all"', generator.uniform(*MEDIAN_M)))
         return "".join(f'<lane index="{k}" {who} width="{width:.2f}"/>' for k, (who, width) in enumerate(lanes))
+
+
+def turning_mps(line_m: Numbers) -> float:
+    """How fast a turn, (K, 2) places of its lane, may be driven: where it is tightest, not on its average.
+
+    Example:
+        >>> quarter = np.linspace(0.0, np.pi / 2, 30)
+        >>> round(turning_mps(8.0 * np.stack([np.cos(quarter), np.sin(quarter)], axis=1)), 1)
+        4.0
+    """
+    steps_m = np.diff(line_m, axis=0)
+    lengths_m = np.hypot(*steps_m.T)
+    turned = np.unwrap(np.arctan2(steps_m[:, 1], steps_m[:, 0]))
+    middles_m = np.cumsum(lengths_m) - lengths_m / 2
+    further = np.abs(np.interp(middles_m + CURVE_M, middles_m, turned) - turned)
+    return float(np.sqrt(TURN_MPS2 * CURVE_M / max(further.max(), 1e-6)))
 
 
 def _without_dead_ends(streets: list[tuple[str, str]]) -> list[tuple[str, str]]:

@@ -32,6 +32,8 @@ Numbers = NDArray[np.float64]
 # Traffic that is drawn sets off everywhere at once, and needs some time to get into motion and to queue at lights.
 WARM_UP_S = 30.0
 USUAL_BEGIN_S = 60.0
+# Of traffic that is drawn such a share may be where bodies cannot be: more, and it is thinner than was asked for.
+USUALLY_LEFT_OUT = 0.15
 
 
 class Sumo(Procedural):
@@ -113,10 +115,11 @@ class Sumo(Procedural):
         raised = few(pavement.meshes(), decks(vicinity))
         static = (ground.mesh(), *raised, *few(*stood))
         parked = park(vicinity, ground, fleet, self.parked_share, generator)
-        moved = motions([ego, *others], duration_s, origin_m, np.concatenate([pavement.parts, parked]))
+        obstacles = np.concatenate([pavement.parts, parked])
+        moved = motions([ego, *others], duration_s, origin_m, obstacles, pavement.walked)
         shown = possible(moved)
         fleet.left_out = len(moved) - len(shown)
-        if fleet.left_out and self.random is None:
+        if fleet.left_out > (0.0 if self.random is None else USUALLY_LEFT_OUT) * len(others):
             there = {motion.user.track.name for motion in shown}
             missing = sorted({motion.user.track.name for motion in moved} - there)
             warnings.warn(

@@ -1,7 +1,6 @@
 """From places on lanes to a world, and how the ego's body tilts: with braking and starting, curves, and the road."""
 
-from collections.abc import Mapping, Sequence
-from types import MappingProxyType
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -9,7 +8,7 @@ from numpy.typing import NDArray
 
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.traffic.articulated import rears_of
+from torchcover.simulation.traffic.articulated import DRAWS, rears_of
 from torchcover.simulation.traffic.fleet import CATEGORIES, EGO, REAR_OF, Fleet
 from torchcover.simulation.traffic.flow import Agent, Flow, Lane
 from torchcover.simulation.traffic.hills import Hills
@@ -19,8 +18,8 @@ Numbers = NDArray[np.float64]
 
 # Beyond the farthest range of a sensor: who never comes this close to the ego is left out of the world.
 HORIZON_M = 250.0
-# Where it is found out at first who may come so close, those in two parts are looked for between them.
-SLACK_M = 6.0
+# Where it is found out at first who may come so close, trailers are behind who draws them.
+SLACK_M = 12.0
 LOOKS_EVERY = 20
 # A soft-sprung passenger car: it dives by some 3 degrees at 1 g, and leans a little more in a curve.
 PITCH_DEG_PER_MPS2 = 0.3
@@ -35,45 +34,56 @@ ROLL_WAVES_DEG = np.array([0.06, 0.08, 0.10, 0.14])
 
 
 class Paths(NamedTuple):
-    """Where N bodies are at T times, those in two parts with their fronts.
+    """Where N bodies are at T times: `positions_m` (T, N, 3), `yaw_deg` (T, N), and the N `kinds`.
 
-    Args:
-        positions_m: (T, N, 3).
-        yaw_deg: (T, N).
-        kinds: (N,) which bodies.
-        rears: (T, 3) x, y and heading in radians of what some draw along, by their numbers.
+    The last of them are drawn along, by those whose numbers are `fronts`.
     """
 
     positions_m: Numbers
     yaw_deg: Numbers
     kinds: tuple[str, ...]
-    rears: Mapping[int, Numbers] = MappingProxyType({})
+    fronts: tuple[int, ...] = ()
+
+    def with_rears(self, start: Sequence[float] | None = None) -> "Paths":
+        """And all that these bodies draw along, with headings in radians at first; straight behind if not given."""
+        fronts = tuple(number for number, kind in enumerate(self.kinds) if kind in DRAWS)
+        own = [np.column_stack([self.positions_m[:, k, :2], np.deg2rad(self.yaw_deg[:, k])]) for k in fronts]
+        positions_m, yaw_deg, kinds = [self.positions_m], [self.yaw_deg], self.kinds
+        for front, poses in zip(fronts, rears_of([kinds[front] for front in fronts], own, start), strict=True):
+            positions_m.append((poses * [1.0, 1.0, 0.0])[:, None])
+            yaw_deg.append(np.rad2deg(poses[:, 2:]))
+            kinds += (DRAWS[kinds[front]].rear,)
+        return Paths(np.concatenate(positions_m, axis=1), np.concatenate(yaw_deg, axis=1), kinds, fronts)
 
 
-def paths(lanes: Sequence[Lane], agents: Sequence[Agent], place_m: Numbers, fleet: Fleet | None = None) -> Paths:
-    """Follow the lanes, on the ground, to (T, N) places on them; in one part all, if no fleet is given."""
+def paths(lanes: Sequence[Lane], agents: Sequence[Agent], place_m: Numbers) -> Paths:
+    """Follow the lanes, on the ground, to (T, N) places on them; what is drawn along comes behind."""
     positions_m, yaw_deg = np.zeros((*place_m.shape, 3)), np.empty(place_m.shape)
-    lane_of = np.array([agent.lane for agent in agents])
-    of = {} if fleet is None else fleet.articulated
-    parts = {number: of[agent.kind] for number, agent in enumerate(agents) if agent.kind in of}
-    ahead_m = np.array([parts[number].ahead_m if number in parts else 0.0 for number in range(len(agents))])
+    lane_of, kinds = np.array([agent.lane for agent in agents]), tuple(agent.kind for agent in agents)
+    place_m = place_m + ahead_of(kinds)
     for lane in np.unique(lane_of):
         on_lane = np.flatnonzero(lane_of == lane)
-        poses = lanes[lane].line.poses(place_m[:, on_lane] + ahead_m[on_lane])
+        poses = lanes[lane].line.poses(place_m[:, on_lane])
         positions_m[:, on_lane, :2], yaw_deg[:, on_lane] = poses[..., :2], poses[..., 2]
-    # At first the axles that are drawn along are on the lane, too.
-    axles_m = [lanes[agents[number].lane].line.poses(place_m[0, number] - p.back_m)[:2] for number, p in parts.items()]
-    rods_m = positions_m[0, list(parts), :2] - np.array(axles_m).reshape(-1, 2)
-    fronts = [np.column_stack([positions_m[:, k, :2], np.deg2rad(yaw_deg[:, k])]) for k in parts]
-    rears = rears_of(parts, fronts, np.arctan2(rods_m[:, 1], rods_m[:, 0]).tolist())
-    return Paths(positions_m, yaw_deg, tuple(agent.kind for agent in agents), rears)
+    start = []
+    for number in [number for number, kind in enumerate(kinds) if kind in DRAWS]:
+        # At first the axles are on the lane, too.
+        back_m = DRAWS[kinds[number]].rod_m - DRAWS[kinds[number]].hitch_m
+        axles_m = lanes[lane_of[number]].line.poses(place_m[0, number] - back_m)[:2]
+        start.append(float(np.arctan2(*(positions_m[0, number, :2] - axles_m)[::-1])))
+    return Paths(positions_m, yaw_deg, kinds).with_rears(start)
+
+
+def ahead_of(kinds: Sequence[str]) -> Numbers:
+    """(N,) how far the middles of bodies are before those of all that belongs to them."""
+    return np.array([DRAWS[kind].ahead_m if kind in DRAWS else 0.0 for kind in kinds])
 
 
 def come_near(lanes: Sequence[Lane], agents: Sequence[Agent], place_m: Numbers) -> NDArray[np.int64]:
     """Numbers of those who may come near the first one, who is among them; they are looked at now and then only."""
     looks = np.unique(np.append(np.arange(0, len(place_m), LOOKS_EVERY), len(place_m) - 1))
     seen_m = place_m[looks]
-    positions_m = paths(lanes, agents, seen_m).positions_m
+    positions_m = paths(lanes, agents, seen_m).positions_m[:, : len(agents)]
     distance_m = np.linalg.norm(positions_m - positions_m[:, :1], axis=2)
     # Nobody drives back: between two looks, the two come closer by the ways of both at most.
     ways_m = np.diff(seen_m, axis=0, append=seen_m[-1:])
@@ -123,30 +133,25 @@ def actors(
         positions_m = np.ascontiguousarray(group.positions_m[:, numbers].swapaxes(0, 1))
         angles_deg = np.zeros_like(positions_m)
         angles_deg[..., 0] = group.yaw_deg[:, numbers].T
-        there = ~np.isnan(positions_m[..., 0])
-        on_foot = np.array([CATEGORIES[group.kinds[number]] == "pedestrian" for number in numbers], dtype=bool)
-        rows = [row for row, number in enumerate(numbers.tolist()) if number in group.rears]
-        if rows:
-            rears = np.stack([group.rears[int(numbers[row])] for row in rows])
-            rears[~there[rows]] = np.nan
-            lie_m = np.concatenate([rears[..., :2], np.zeros((*rears.shape[:2], 1))], axis=2)
-            turned_deg = np.concatenate([np.rad2deg(rears[..., 2:]), np.zeros((*rears.shape[:2], 2))], axis=2)
-            positions_m, angles_deg = np.concatenate([positions_m, lie_m]), np.concatenate([angles_deg, turned_deg])
-            there, on_foot = np.append(there, there[rows], axis=0), np.append(on_foot, [False] * len(rows))
         if hills is not None:
+            on_foot = np.array([CATEGORIES[group.kinds[number]] == "pedestrian" for number in numbers], dtype=bool)
             positions_m[on_foot, :, 2] += hills.heights_m(positions_m[on_foot, :, :2])
             stances = hills.stances(positions_m[~on_foot, :, :2], angles_deg[~on_foot, :, 0])
             positions_m[~on_foot, :, 2] += stances[..., 0]
             angles_deg[~on_foot, :, 1:] = stances[..., 1:]
+        there = ~np.isnan(positions_m[..., 0])
         always = np.array([all_along.all() for all_along in there], dtype=bool)
         names = dict[int, str]()
-        for row, number in enumerate(np.append(numbers, numbers[rows]).tolist()):
-            kind, some, is_rear = group.kinds[number], slice(None) if always[row] else there[row], number in names
+        for row, number in enumerate(numbers.tolist()):
+            kind, some = group.kinds[number], slice(None) if always[row] else there[row]
             if np.count_nonzero(there[row]) < 2:
                 continue
-            names[number] = REAR_OF + names[number] if is_rear else f"{kind} {len(near)}"
             trajectory = Trajectory(times_s[some], positions_m[row, some], angles_deg[row, some], not always[row])
-            near.append(fleet.actor(names[number], kind, trajectory, is_rear=is_rear))
+            names[number] = f"{kind} {len(near)}"
+            if number >= len(group.kinds) - len(group.fronts):
+                front = group.fronts[number - len(group.kinds)]
+                names[number] = REAR_OF + names.get(front, names[number])
+            near.append(Actor(names[number], CATEGORIES[kind], fleet.meshes[kind], trajectory))
     return tuple(near)
 
 

@@ -2,7 +2,6 @@
 
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import cache, lru_cache
 
 import numpy as np
@@ -11,7 +10,7 @@ from torchcover.geometry import BoundingBox
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.bodies import Vehicle
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.traffic.articulated import HITCHES_M, Articulated
+from torchcover.simulation.traffic.articulated import DRAWS
 from torchcover.simulation.traffic.flow import Agent
 from torchcover.simulation.traffic.idm import Driver
 from torchcover.simulation.traffic.signals import Gate
@@ -26,6 +25,8 @@ BODIES = {
     "van": "car",
     "lorry": "truck",
     "truck": "truck",
+    # It has a box and a category of its own, as in nuScenes.
+    "trailer": "trailer",
     "bus": "bus",
     "motorcycle": "motorcycle",
     "cyclist": "cyclist",
@@ -50,8 +51,7 @@ KIND_OF |= {kind: kind for kind in BODIES}
 CATEGORIES = {name: BODIES[kind] for name, kind in sorted(KIND_OF.items())}
 EGO = "ego"
 HEAVY = ("truck", "lorry", "bus")
-# What is drawn along has a box and a category of its own, as in nuScenes.
-TRAILER, REAR_OF = "trailer", "rear of "
+REAR_OF = "rear of "
 
 WALKING = Driver(
     desired_speed_mps=1.4, headway_s=0.4, standstill_gap_m=0.5, acceleration_mps2=1.0, deceleration_mps2=1.5
@@ -62,15 +62,14 @@ CYCLING = Driver(
 
 
 @cache
-def load_articulated() -> Mapping[str, Articulated]:
-    """Those of the built-in bodies that are in two parts."""
-    return {kind: Articulated.load(kind) for kind in HITCHES_M}
-
-
-@cache
 def load_bodies() -> Mapping[str, Mesh]:
-    """The built-in bodies, in all their sizes, and in one part each."""
-    meshes = {kind: Vehicle.load(kind).mesh() for kind in BODIES}
+    """The built-in bodies, in all their sizes."""
+    truck = Vehicle.load("truck")
+    behind = [part.name.startswith("trailer") for part in truck.parts]
+    meshes = {kind: Vehicle.load(kind).mesh() for kind in BODIES if kind not in ("truck", "trailer")}
+    for kind, is_rear in (("truck", False), ("trailer", True)):
+        parts = tuple(part for part, at_rear in zip(truck.parts, behind, strict=True) if at_rear is is_rear)
+        meshes[kind] = truck.model_copy(update={"parts": parts}).mesh()
     for kind, sizes in SIZES.items():
         for number, shares in enumerate(sizes, 2):
             meshes[f"{kind}_{number}"] = meshes[kind]._replace(vertices_m=meshes[kind].vertices_m * np.array(shares))
@@ -80,31 +79,32 @@ def load_bodies() -> Mapping[str, Mesh]:
 class Fleet:
     """The bodies of a world, and the drivers drawn for them.
 
-    Of those in two parts, `articulated`, the mesh is that of the front; their length is that of both.
-
     Raises:
         ValueError: A kind has no body.
     """
 
-    def __init__(
-        self, bodies: Mapping[str, Mesh | Articulated], ego: Mesh | None, generator: np.random.Generator
-    ) -> None:
+    def __init__(self, bodies: Mapping[str, Mesh], ego: Mesh | None, generator: np.random.Generator) -> None:
         missing = sorted(CATEGORIES.keys() - bodies.keys())
         if missing:
             raise ValueError(f"traffic needs a body for each kind; there is none for {', '.join(missing)}")
-        self.articulated = {kind: body for kind, body in bodies.items() if isinstance(body, Articulated)}
-        self.meshes = {kind: body for kind, body in bodies.items() if not isinstance(body, Articulated)}
-        self.meshes |= {kind: body.front for kind, body in self.articulated.items()}
-        self.meshes[EGO] = self.meshes["suv"] if ego is None else ego
+        self.meshes = {EGO: bodies["suv"] if ego is None else ego, **{kind: bodies[kind] for kind in CATEGORIES}}
         self._sizes = {kind: BoundingBox.around(mesh.vertices_m).size_m for kind, mesh in self.meshes.items()}
-        self._sizes |= {kind: body.size_m for kind, body in self.articulated.items()}
+        self._lengths_m = {kind: self._length_m(kind) for kind in self.meshes}  # asked thousands of times a world
         self._generator = generator
         self.parked: list[Actor] = []
         self.left_out = 0
 
     def length_m(self, kind: str) -> float:
-        """Extent along x."""
-        return self._sizes[kind][0]
+        """Extent along x, on a straight with all that it draws along."""
+        return self._lengths_m[kind]
+
+    def _length_m(self, kind: str) -> float:
+        parts_m = [length_m for length_m, _ in self.sizes_m(kind)]
+        return sum(parts_m) / 2 - DRAWS[kind].hitch_m + DRAWS[kind].middle_m if kind in DRAWS else parts_m[0]
+
+    def sizes_m(self, kind: str) -> tuple[tuple[float, float], ...]:
+        """Lengths and widths of the body and of what it draws along."""
+        return tuple(self._sizes[part][:2] for part in parts_of(kind))
 
     def width_m(self, kind: str) -> float:
         """Extent along y."""
@@ -118,7 +118,8 @@ class Fleet:
     def draw_driver(self, typical: Driver, spread: float) -> Driver:
         """A driver whose desired speed differs from the typical one by up to `spread`, a share of it."""
         desired_mps = float(typical.desired_speed_mps * self._generator.uniform(1 - spread, 1 + spread))
-        return replace(typical, desired_speed_mps=desired_mps)
+        rest = typical.headway_s, typical.standstill_gap_m, typical.acceleration_mps2, typical.deceleration_mps2
+        return Driver(desired_mps, *rest)  # by hand: there are thousands of them in a world
 
     def agent(self, kind: str, lane: int, place_m: float, driver: Driver) -> Agent:
         """Somebody of a kind on a lane."""
@@ -135,11 +136,6 @@ class Fleet:
         x_m, y_m, yaw_deg = pose
         place = Trajectory.resting((x_m, y_m, height_m), (yaw_deg, *tilt_deg))
         self.parked.append(Actor(f"parked {kind} {len(self.parked)}", CATEGORIES[kind], self.meshes[kind], place))
-
-    def actor(self, name: str, kind: str, trajectory: Trajectory, *, is_rear: bool = False) -> Actor:
-        """A body of a kind, or the front or rear of one in two parts, on its way."""
-        mesh = self.articulated[kind].rear if is_rear else self.meshes[kind]
-        return Actor(name, TRAILER if is_rear else CATEGORIES[kind], mesh, trajectory)
 
     def fill(
         self,
@@ -181,6 +177,11 @@ class Fleet:
                 agents.append(agent)
             rear += length
         return agents
+
+
+def parts_of(kind: str) -> tuple[str, ...]:
+    """A kind, and that of what it draws along."""
+    return (kind, DRAWS[kind].rear) if kind in DRAWS else (kind,)
 
 
 @lru_cache(maxsize=64)

@@ -258,7 +258,10 @@ def _drawn(kind: _Kind, lines: _Lines, times: float, generator: np.random.Genera
         first_m, piece_m = first_m[run] + number * every_m[run], (every_m if is_wall else every_m - kind.air_m)[run]
     places_m, right = lines.along(numbers[on[run]], np.stack([first_m, first_m + piece_m], axis=1))
     near_m, far_m = (places_m + right * out_m[run, None, None] for out_m in (at_m, at_m + deep_m))
-    return _Pieces(np.concatenate([far_m, near_m[:, ::-1]], axis=1), high_m[run], run)
+    # Around a corner what is far out would be stretched, and on its inside squeezed.
+    stretched = [np.linalg.norm(side[:, 1] - side[:, 0], axis=1) / piece_m for side in (near_m, far_m)]
+    like = (np.abs(np.log(np.maximum(stretched, TINY_M))) < -np.log(TAPERED)).all(axis=0)
+    return _Pieces(np.concatenate([far_m, near_m[:, ::-1]], axis=1)[like], high_m[run][like], run[like])
 
 
 def _free(
@@ -283,27 +286,25 @@ def _free(
     for found, predicate in ((on, "intersects"), (within, "contains")):
         found[floors.query(np.array(pavements, dtype=object), predicate=predicate)[1]] = True
     free &= on == within
-    # On the inside of a tight curve, where the ways to the right meet, outlines fold or taper.
+    # On the inside of a tight curve, where the ways to the right meet, outlines fold.
     sides = np.roll(outlines_m, -1, axis=1) - outlines_m
     following = np.roll(sides, -1, axis=1)
     free &= (sides[..., 0] * following[..., 1] > sides[..., 1] * following[..., 0]).all(axis=1)
-    far_m, near_m = np.linalg.norm(sides[:, ::2], axis=2).T
-    free &= (far_m > TAPERED * near_m) & (near_m > TAPERED * far_m)
     number = np.flatnonzero(free)
-    later, earlier = number[_meeting(outlines_m[number])]
-    apart = (kinds[earlier] != kinds[later]) | (run[earlier] != run[later])
-    order = np.lexsort((earlier[apart], later[apart]))
-    for one, other in zip(later[apart][order].tolist(), earlier[apart][order].tolist(), strict=True):
+    own = np.unique(np.stack([kinds[number], run[number]]), axis=1, return_inverse=True)[1]
+    later, earlier = number[_meeting(outlines_m[number], own)]
+    order = np.lexsort((earlier, later))
+    for one, other in zip(later[order].tolist(), earlier[order].tolist(), strict=True):
         if free[other]:
             free[one] = False
     return free, PAVEMENT_M * within
 
 
-def _meeting(outlines_m: Numbers) -> NDArray[np.int64]:
-    """(2, P) pairs of (N, 4, 2) convex outlines that no side of the one or the other separates."""
+def _meeting(outlines_m: Numbers, group: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(2, P) pairs of (N, 4, 2) convex outlines of two groups that no side of the one or the other separates."""
     boxes = shapely.box(*outlines_m.min(axis=1).T, *outlines_m.max(axis=1).T)
     pairs = shapely.STRtree(boxes).query(boxes)
-    pairs = pairs[:, pairs[0] > pairs[1]]
+    pairs = pairs[:, (pairs[0] > pairs[1]) & (group[pairs[0]] != group[pairs[1]])]
     for way in (1, -1):
         one, other = pairs[::way]
         normals = (np.roll(outlines_m, -1, axis=1) - outlines_m)[one][..., ::-1] * np.array([1.0, -1.0])
@@ -325,6 +326,7 @@ def _copies(form: Mesh, outlines_m: Numbers, bottom_m: Numbers, base_m: Numbers,
         np.concatenate([places_m, heights_m[..., None]], axis=2).reshape(-1, 3),
         faces.reshape(-1, 3),
         np.tile(form.materials, count),
+        np.ones(len(faces) * len(form.faces), dtype=bool),  # as all forms are closed
     )
 
 

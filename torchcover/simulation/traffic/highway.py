@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from torchcover.simulation.traffic.alignment import Alignment
-from torchcover.simulation.traffic.articulated import rears_of
-from torchcover.simulation.traffic.assemble import HORIZON_M, Paths, actors, ego_actor
+from torchcover.simulation.traffic.assemble import HORIZON_M, Paths, actors, ahead_of, ego_actor
 from torchcover.simulation.traffic.fleet import EGO, HEAVY, KIND_OF, Fleet
 from torchcover.simulation.traffic.flow import Agent, Flow, check_crowd
 from torchcover.simulation.traffic.hills import Hills
@@ -83,9 +82,12 @@ class Highway(Procedural):
             [a.lane % LANES == SIDE_LANE - 1 for a in agents]
         )
         exits[0] = False
-        driving = Overtaking(agents, heavy, exits, side_m, generator)
+        stations = np.arange(middle.stations_m[0], middle.stations_m[-1], CURVATURE_EVERY_M)
+        heights_m = hills.heights_m(middle.poses(stations, 0.0)[:, :2])
+        climb = np.stack([stations, np.gradient(heights_m, CURVATURE_EVERY_M)])
+        driving = Overtaking(agents, heavy, exits, side_m, generator, climb)
         flow = driving.run(times_s, WARM_UP_S)
-        moving = _near(middle, sides, agents, driving, flow, fleet)
+        moving = _near(middle, sides, agents, driving, flow)
         driver = ego_actor(times_s, moving, flow, 0, fleet.meshes[EGO], generator, hills)
         seen_m = (float(flow.place_m[0, 0]) - BEHIND_M, float(flow.place_m[-1, 0]) + AHEAD_M)
         scenery = roadside(middle, {-1: sides[0], 1: sides[1]}, hills, seen_m, shapes)
@@ -145,17 +147,13 @@ class Highway(Procedural):
         return agents
 
 
-def _near(
-    middle: Alignment, sides: list[SideLane], agents: list[Agent], driving: Overtaking, flow: Flow, fleet: Fleet
-) -> Paths:
+def _near(middle: Alignment, sides: list[SideLane], agents: list[Agent], driving: Overtaking, flow: Flow) -> Paths:
     """Where those are at all times who come near the ego, which is the first of them."""
     way = np.array([1.0 if agent.lane < LANES else -1.0 for agent in agents])
     stations = flow.place_m * way
     near = np.flatnonzero((np.abs(stations - stations[:, :1]) < HORIZON_M + SLACK_M).any(axis=0))
-    parts = {k: fleet.articulated[a.kind] for k, a in enumerate(agents[n] for n in near) if a.kind in fleet.articulated}
-    ahead_m = np.array([parts[column].ahead_m if column in parts else 0.0 for column in range(len(near))])
-    way = way[near]
-    stations = stations[:, near] + way * ahead_m
+    way, kinds = way[near], tuple(agents[agent].kind for agent in near)
+    stations = stations[:, near] + way * ahead_of(kinds)
     # How far to the right of the middle they are in their own direction, and how much more after each metre.
     right_m, slope = np.empty((2, *stations.shape))
     for column, agent in enumerate(near.tolist()):
@@ -175,10 +173,7 @@ def _near(
     positions_m[..., 0] = poses[..., 0] + way * right_m * np.sin(yaw)
     positions_m[..., 1] = poses[..., 1] - way * right_m * np.cos(yaw)
     yaw_deg = poses[..., 2] + np.where(way > 0, 0.0, 180.0) - np.rad2deg(np.arctan(slope))
-    # Curves are so wide that it begins straight.
-    fronts = [np.column_stack([positions_m[:, k, :2], np.deg2rad(yaw_deg[:, k])]) for k in parts]
-    rears = rears_of(parts, fronts)
-    return Paths(positions_m, yaw_deg, tuple(agents[agent].kind for agent in near), rears)
+    return Paths(positions_m, yaw_deg, kinds).with_rears()
 
 
 def _lane_at(stations: Numbers, lane: int, sides: list[SideLane]) -> tuple[Numbers | float, Numbers | float]:

@@ -18,6 +18,9 @@ FREE_ROAD_EXPONENT = 4
 HARDEST_BRAKING_MPS2 = 9.0
 # Two bodies that touch would ask for infinite braking.
 SMALLEST_GAP_M = 0.01
+# The lorry that slopes are designed for, 120 kg to a kilowatt (AASHTO, "A Policy on Geometric Design of Highways and
+# Streets"), with usual rolling resistance, and the drag of 40 t behind 6 m2.
+LADEN_W_PER_KG, ROLLING, DRAG_PER_M, GRAVITY_MPS2 = 1000.0 / 120.0, 0.006, 9e-5, 9.81
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +45,9 @@ class Driver:
     deceleration_mps2: Quantity = 2.0
 
     def __post_init__(self) -> None:
-        if not np.all(np.asarray(self.desired_speed_mps) > 0.0):
+        desired = self.desired_speed_mps
+        # There are thousands in a world.
+        if not (desired > 0.0 if isinstance(desired, float) else np.all(np.asarray(desired) > 0.0)):
             raise ValueError(f"a driver needs a desired speed above 0 m/s; got {self.desired_speed_mps}")
 
     @cached_property
@@ -80,6 +85,18 @@ def acceleration_in(driver: Driver, speed_mps: Numbers, tightness: Numbers, desi
     wanted -= tightness**2
     wanted *= driver.acceleration_mps2
     return np.maximum(wanted, -HARDEST_BRAKING_MPS2, out=wanted)
+
+
+def laden_mps2(speed_mps: Numbers, slope: Numbers) -> Numbers:
+    """(N,) the hardest that laden lorries accelerate at (N,) speeds up (N,) slopes, by their power.
+
+    Example:
+        >>> bool(laden_mps2(np.array(20.0), np.array(0.04)) < 0.0 < laden_mps2(np.array(20.0), np.array(0.02)))
+        True
+    """
+    resisted_mps2 = GRAVITY_MPS2 * (slope + ROLLING) + DRAG_PER_M * speed_mps**2
+    found: Numbers = LADEN_W_PER_KG / np.maximum(speed_mps, 1.0) - resisted_mps2
+    return found
 
 
 def advance(speed_mps: Numbers, acceleration_mps2: Numbers, room_m: Numbers, step_s: float) -> tuple[Numbers, Numbers]:

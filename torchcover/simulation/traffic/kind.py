@@ -25,6 +25,11 @@ class Traffic(Document):
     time_step_s: Annotated[float, Field(ge=MIN_TIME_STEP_S)] = 0.1
 
     @property
+    def drawn_words(self) -> str:
+        """What of a recording was not recorded, for results; no words where all is drawn, or nothing."""
+        return ""
+
+    @property
     @abstractmethod
     def steps(self) -> int:
         """Number of instants of a run."""

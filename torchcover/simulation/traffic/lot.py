@@ -1,14 +1,16 @@
-"""What stands on a parking lot: rows of cars, and the low things that one overlooks.
+"""What stands on a parking lot and around it: rows of cars, and the low things that one overlooks.
 
 From the middle outwards, on both sides alike: a walkway between two rows that face each other, a row of stalls (with it
 the island ends), an aisle, another row, a walkway along the edge.
 """
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.fleet import Fleet
+from torchcover.simulation.traffic.frontage import Times, sides_around, stand
 from torchcover.simulation.traffic.scenery import PAVEMENT_M, Scenery, block, box, few, ground, post, tree
 
 Numbers = NDArray[np.float64]
@@ -28,6 +30,11 @@ ISLAND_END_M = 3.0
 BOLLARDS_AT_X_M = 48.0
 BOLLARD_EVERY_M = 1.8
 BUILDING_AT_Y_M = 36.0
+# The lot with its lanes, as far as what stands around it keeps off; and what stands at its edge, and behind that.
+LOT_M = shapely.box(-BOLLARDS_AT_X_M - 14.0, -EDGE_M - 8.0, BOLLARDS_AT_X_M + 14.0, BUILDING_AT_Y_M)
+AROUND_M = (0.2, 2.5)
+# Crowns keep off the market.
+CROWN_M = 2.0
 NOSE_OFF_HEAD_M = 0.35
 PARKED = {"suv": 3.0, "sedan": 3.0, "hatchback": 4.0}
 TROLLEY_M = (0.9, 0.55, 1.0)
@@ -37,9 +44,19 @@ TROLLEY_SHARE = 0.3
 class Lot:
     """Draws a parking lot about the origin, with its aisles along x."""
 
-    def __init__(self, fleet: Fleet, parked_share: float, crossings: int, generator: np.random.Generator) -> None:
+    def __init__(
+        self,
+        fleet: Fleet,
+        parked_share: float,
+        crossings: int,
+        built_share: float,
+        roadside: Times,
+        generator: np.random.Generator,
+    ) -> None:
         self._fleet = fleet
         self._parked_share = parked_share
+        self._built_share = built_share
+        self._roadside = roadside
         self._generator = generator
         self._empty = {side: set(generator.choice(STALLS, size=crossings, replace=False).tolist()) for side in (1, -1)}
 
@@ -59,9 +76,16 @@ class Lot:
                         place = (_stall_x(column), side * head, side * inwards)
                         low += self._occupant(*place)
         islands, trees = self._islands()
-        around = self._surroundings()
+        around, market = self._surroundings()
         level, kerbs = ground((-300.0, -300.0), (300.0, 300.0)), few(islands)
-        return Scenery((level, *few(low, self._bollards()), *kerbs, *few(trees, around)), (0, 3))
+
+        def level_m(places_m: Numbers) -> Numbers:
+            return np.zeros(len(places_m))
+
+        sides = sides_around(LOT_M, AROUND_M, lambda _: np.array(True), self._built_share, self._generator)
+        taken = [LOT_M, market.buffer(CROWN_M)]
+        stood = stand(sides, taken, taken, (), level_m, self._roadside, self._generator)
+        return Scenery((level, *few(low, self._bollards()), *kerbs, *few(trees, around, *stood)), (0, 3))
 
     def _wheel_stop(self, x: float, y: float) -> Mesh:
         return box((x, y), (1.8, 0.15, 0.1))
@@ -104,26 +128,20 @@ class Lot:
         ]
         return ends + front
 
-    def _surroundings(self) -> list[Mesh]:
-        """Low walls along the edges, lamp posts, planters, the market, and houses farther away."""
+    def _surroundings(self) -> tuple[list[Mesh], shapely.Geometry]:
+        """Low walls along the edges, planters, and the market; and the market in plan."""
         half = STALLS_M / 2
+        market = (-half - 5.0, half + 5.0), (BUILDING_AT_Y_M, BUILDING_AT_Y_M + 40.0)
         pieces = [
             block((-half - 12.0, half + 12.0), (-EDGE_M - 0.2, -EDGE_M), (0.0, 0.6)),
             block((-half - 12.0, -6.0), (EDGE_M, EDGE_M + 0.2), (0.0, 0.6)),
             block((6.0, half + 12.0), (EDGE_M, EDGE_M + 0.2), (0.0, 0.6)),
-            block((-half - 5.0, half + 5.0), (BUILDING_AT_Y_M, BUILDING_AT_Y_M + 40.0), (0.0, 7.5)),
+            block(*market, (0.0, 7.5)),
         ]
         for x in np.linspace(-half, half, 5):
-            for y in (-EDGE_M - 1.0, EDGE_M + 1.0):
-                pieces.append(post((x, y), 0.1, 0.0, 7.0))
+            pieces.append(post((x, EDGE_M + 1.0), 0.1, 0.0, 7.0))
             pieces.append(box((x + 5.0, BUILDING_AT_Y_M - 7.0), (1.6, 0.6, 0.5)))
-        for x in (-130.0, -95.0, 80.0, 115.0, 150.0):
-            size = self._generator.uniform((14.0, 30.0, 5.0), (22.0, 60.0, 16.0))
-            pieces.append(box((x, self._generator.uniform(0.0, 30.0)), size))
-        for x in np.arange(-100.0, 100.0, 34.0):
-            size = self._generator.uniform((15.0, 12.0, 5.0), (28.0, 20.0, 18.0))
-            pieces.append(box((x, -EDGE_M - 30.0), size))
-        return pieces
+        return pieces, shapely.box(market[0][0], market[1][0], market[0][1], market[1][1])
 
 
 def _stall_x(column: int) -> float:

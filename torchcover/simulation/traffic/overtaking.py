@@ -13,8 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.simulation.traffic.fleet import KIND_OF
 from torchcover.simulation.traffic.flow import MAX_STEP_S, Agent, Flow
-from torchcover.simulation.traffic.idm import Driver, acceleration_in, advance, tightness
+from torchcover.simulation.traffic.idm import Driver, acceleration_in, advance, laden_mps2, tightness
 
 Numbers = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -34,6 +35,8 @@ HAS_TO_MPS2 = 100.0
 LOOKS_EVERY_S, TURNS, APART_M = 1.0, 2, 120.0
 # How long a change takes, and which share of it one is still in the way of those in the old lane.
 CHANGE_S, SHORTEST_CHANGE_M, IN_BOTH = (4.5, 6.5), 30.0, 0.7
+# Whose power tells on slopes.
+LADEN = ("truck", "lorry")
 # On ramps; who exits slows down before.
 RAMP_MPS, EXIT_BRAKING_MPS2 = 22.0, 1.2
 # So far before its end a side lane is too short for a change.
@@ -69,10 +72,17 @@ class Overtaking:
         side_m: (2, 2) places between which the side lane of each direction lies beside the others: before, it is an
             entry, behind, an exit.
         generator: Draws how long changes take, and how evenly who drives.
+        climb: (2, K) ascending places of the first direction, and the slopes there.
     """
 
     def __init__(
-        self, agents: Sequence[Agent], heavy: Flags, exits: Flags, side_m: Numbers, generator: np.random.Generator
+        self,
+        agents: Sequence[Agent],
+        heavy: Flags,
+        exits: Flags,
+        side_m: Numbers,
+        generator: np.random.Generator,
+        climb: Numbers,
     ) -> None:
         self.place_m = np.array([agent.place_m for agent in agents], dtype=np.float64)
         self.lane = np.array([agent.lane for agent in agents], dtype=np.int64)
@@ -81,7 +91,10 @@ class Overtaking:
         self._driver = Driver(
             *(np.array([getattr(a.driver, name) for a in agents], np.float64) for name in Driver.__dataclass_fields__)
         )
-        self._heavy, self._exits, self._side_m = heavy, exits, side_m
+        self._heavy, self._exits, self._side_m, self._climb = heavy, exits, side_m, climb
+        self._laden = np.array([number for number, a in enumerate(agents) if KIND_OF.get(a.kind) in LADEN], np.int64)
+        # Places of the other direction are those of the first with the sign turned, and slopes, too.
+        self._way = np.where(self.lane[self._laden] < LANES, 1.0, -1.0)
         self._change_s = generator.uniform(*CHANGE_S, len(agents))
         self._waves = (
             2 * np.pi / generator.uniform(*UNEVEN_S, len(agents)),
@@ -116,6 +129,9 @@ class Overtaking:
         tight[twice] = np.maximum(tight[twice], tight[count:])
         gap_m[twice] = np.minimum(gap_m[twice], gap_m[count:])
         self._wanted_mps2 = acceleration_in(self._driver, speed_mps, tight[:count], self._desired_mps)
+        slope = self._way * np.interp(self._way * self.place_m[self._laden], *self._climb)
+        most_mps2 = laden_mps2(speed_mps[self._laden], slope)
+        self._wanted_mps2[self._laden] = np.minimum(self._wanted_mps2[self._laden], most_mps2)
         way_m, self.speed_mps = advance(speed_mps, self._wanted_mps2, gap_m[:count], step_s)
         self.place_m += way_m
         self._time_s += step_s

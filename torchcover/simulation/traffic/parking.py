@@ -10,6 +10,7 @@ from torchcover.simulation.traffic.assemble import Paths, actors, ego_actor, pat
 from torchcover.simulation.traffic.crossing import Footpath, free_for, walk
 from torchcover.simulation.traffic.fleet import EGO, WALKING, Fleet
 from torchcover.simulation.traffic.flow import Agent, Lane, Simulation
+from torchcover.simulation.traffic.frontage import Times
 from torchcover.simulation.traffic.idm import Driver
 from torchcover.simulation.traffic.lot import AISLE_M, ISLAND_M, STALLS_M, WALKWAYS_M, Lot
 from torchcover.simulation.traffic.procedural import Procedural
@@ -38,6 +39,8 @@ class Parking(Procedural):
         cars: Others that drive around.
         parked_share: Share of the stalls that are taken.
         crossings: Places at each of the two aisles where two people cross.
+        built_share: Share of its sides, but that of the market, that have houses.
+        roadside: As in `Urban`, of what stands around it.
     """
 
     type: Literal["parking"] = "parking"
@@ -45,6 +48,8 @@ class Parking(Procedural):
     cars: int = Field(default=2, ge=0, le=6)
     parked_share: float = Field(default=0.75, ge=0.0, le=1.0)
     crossings: int = Field(default=4, ge=0, le=8)
+    built_share: float = Field(default=0.6, ge=0.0, le=1.0)
+    roadside: Times = 1.0
 
     def _build(
         self, fleet: Fleet, times_s: Numbers, generator: np.random.Generator
@@ -53,7 +58,7 @@ class Parking(Procedural):
         agents = self._traffic(lanes[0].line.length_m, fleet, generator)
         flow = Simulation(lanes, agents, Signals.none()).run(times_s, WARM_UP_S)
         driving = paths(lanes, agents, flow.place_m)
-        lot = Lot(fleet, self.parked_share, self.crossings, generator)
+        lot = Lot(fleet, self.parked_share, self.crossings, self.built_share, self.roadside, generator)
         driver = ego_actor(times_s, driving, flow, 0, fleet.meshes[EGO], generator)
         walking = _people(lot, driving, times_s, fleet, generator)
         others = actors(times_s, [driving, walking], driver, fleet)

@@ -10,8 +10,7 @@ from pydantic import Field
 
 from torchcover.simulation.documents import builtin_hashes
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.traffic.articulated import Articulated
-from torchcover.simulation.traffic.fleet import Fleet, load_articulated, load_bodies
+from torchcover.simulation.traffic.fleet import Fleet, load_bodies
 from torchcover.simulation.traffic.kind import Traffic
 from torchcover.simulation.traffic.scenery import Scenery
 from torchcover.simulation.world import Actor, World, steps_of
@@ -35,22 +34,20 @@ class Procedural(Traffic):
 
     duration_s: Annotated[float, Field(gt=0.0, le=MAX_DURATION_S)] = 60.0
 
-    def world(
-        self, seed: int, ego: Mesh | None = None, bodies: Mapping[str, Mesh | Articulated] | None = None
-    ) -> World:
+    def world(self, seed: int, ego: Mesh | None = None, bodies: Mapping[str, Mesh] | None = None) -> World:
         """Build the world; the same for the same arguments.
 
         Args:
             seed: Draws the place and everybody in it.
             ego: Body of the ego, in the vehicle frame; the SUV of `bodies` if not given.
-            bodies: A mesh, or two parts, for each kind of body (`fleet.CATEGORIES`); the built-in ones if not given.
+            bodies: A mesh for each kind of body (`fleet.CATEGORIES`); the built-in ones if not given.
 
         Returns:
             The world: without hills the ground is z = 0; nobody ever overlaps anybody, and the ego is followed closely
             enough for sensors of up to 250 m range.
         """
         generator = np.random.default_rng(seed)
-        fleet = Fleet({**load_bodies(), **load_articulated()} if bodies is None else bodies, ego, generator)
+        fleet = Fleet(load_bodies() if bodies is None else bodies, ego, generator)
         steps = max(1, int(np.ceil(self.duration_s / self.time_step_s - 1e-9)))
         times_s = self.time_step_s * np.arange(steps + 1, dtype=np.float64)
         scenery, driver, others = self._build(fleet, times_s, generator)

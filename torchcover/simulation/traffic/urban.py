@@ -114,7 +114,7 @@ class Urban(Procedural):
         seen = (float(first_m) - BEHIND_M, float(last_m) + AHEAD_M)
         built = (seen[0] - ASIDE_M, seen[1] + ASIDE_M)
         territory = Territory(streets.main, built)
-        moving = _in_place(paths(lanes, agents, place_m, fleet), lanes, agents, place_m, streets, built, fleet)
+        moving = _in_place(paths(lanes, agents, place_m), lanes, agents, place_m, streets, built, fleet)
         driver = ego_actor(times_s, moving, flow, 0, fleet.meshes[EGO], generator, hills)
         crossing = _crossers(streets, flow, times_s, seen, fleet, generator)
         city = City(
@@ -222,6 +222,8 @@ def _in_place(
             beyond_kerb_m = np.minimum(places_m - first_m[next_one], last_m[next_one] - places_m)
             found.positions_m[:, on_lane, 2] = step_height(beyond_kerb_m, radius_m[on_lane])
         found.positions_m[step, on_lane[agent]] = np.nan
+    rears = found.positions_m[:, len(agents) :]
+    rears[np.isnan(found.positions_m[:, list(found.fronts), 0])] = np.nan
     return found
 
 
