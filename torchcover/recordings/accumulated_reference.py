@@ -27,8 +27,8 @@ MOVES_MPS, KNOWN_POINTS = 0.5, 50
 USUAL_BODY = BoundingBox((-2.4, -0.95, 0.0), (2.4, 0.95, 1.7))
 
 
-# How far such numbers were from the truth in simulated drives (docs/measured/recordings.md): points of detection and per
-# cent of the radius (rms) with boxes and without, and points that the difference between two rigs was off.
+# How far such numbers were from the truth in simulated drives, with boxes and without: points of detection and per cent
+# of the radius (rms); docs/measured/recordings.md.
 OFF = {"with boxes": (4, 25), "without": (8, 38)}
 
 
