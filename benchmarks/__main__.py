@@ -33,6 +33,7 @@ BENCHMARKS = (
     "pairing",
     "placement",
     "optimisers",
+    "choices",
     "published",
     "voxels",
     "streets",

@@ -144,13 +144,15 @@ def test_a_lorry_and_its_trailer_are_one_road_user():
 
 
 @pytest.mark.parametrize(
-    ("seen_from", "ttc_s", "in_time"), [(0, 4.0, True), (6, 2.0, True), (7, 1.0, False), (9, 0.0, False)]
+    ("seen_from", "ttc_s", "in_time"),
+    [(0, 4.0, True), (6, 2.0, True), (7, 1.0, False), (8, 1.0, False), (9, 0.0, False)],
 )
 def test_the_nearest_time_until_detection_counts_though_it_grew_again(seen_from, ttc_s, in_time):
     track = Track("t", "car", "passenger", (4.0, 2.0, 1.5), Trajectory.resting([10.0, 0.0, 0.0]))
     there = Drive("w", STEP_S * np.arange(9), np.tile(np.eye(4), (9, 1, 1)), None, [track])
     one = Approach(track, 5, np.array([3.0, 2.0, 1.0, 3.5]), np.array([0.5, 0.5, 1.1, 0.5]), "cars and vans", 0.0, 0.0)
-    eyes = Eyes([1], [1], [1], [1], lambda step, _: [np.array([[9.0, 0.0, 1.0]])[: step >= seen_from]])
+    on_it, about_it = [[9.0, 0.0, 1.0]], [[9.0, 0.0, 1.52], [9.0, 0.0, 0.0], [12.02, 0.0, 1.0], [9.0, -1.02, 1.0]]
+    eyes = Eyes([1], [1], [1], [1], lambda step, _: [np.array(about_it + on_it * (step >= seen_from))])
     found = sight_approach("r", there, one, eyes, Criterion(points=1, looks=1))
     assert (found.ttc_s[0], found.in_time[0], found.from_the_beginning[0]) == (ttc_s, in_time, seen_from == 0)
     assert found.without_ttc_s[0, 0] == 0
@@ -216,6 +218,20 @@ def test_real_road_users_are_first_hit_as_their_layout_says(layout, tmp_path):
     assert one.encounter.ttc_s[0] == pytest.approx((gap_m - one.encounter.step) / 10, abs=0.02)
     assert one.ttc_s[0] == pytest.approx((gap_m - 10) / 10, abs=0.02)
     assert one.encounter.closing_mps == pytest.approx(10.0, abs=0.1)
+
+
+@pytest.mark.parametrize(("category", "met"), [("car", 0), ("pedestrian", 1)])
+def test_parked_vehicles_are_not_met_and_people_who_stand_are(category, met):
+    class Standing(Closing):
+        def world_T_car(self, index):
+            return rigid(np.eye(3), [68.0 + 0.1 * (index % 2), 0.0, 0.75])
+
+        def boxes(self, index):
+            box = super().boxes(index)
+            return Boxes.from_rows(box.rows, ids=box.ids, categories=(category,))
+
+    found = met_in_recording(Standing(steps=15, body=BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))))
+    assert len(found.sightings) == met
 
 
 def test_what_cannot_be_asked_is_told(tmp_path):

@@ -4,7 +4,6 @@ import dataclasses
 import os
 import warnings
 import zlib
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -224,11 +223,10 @@ def full_from_the_start(monkeypatch, tmp_path):
 
 
 def full_at_once(monkeypatch, tmp_path):
-    def write_bytes(path, content):
-        path.touch()
-        raise OSError(28, "No space left on device", str(path))
+    def full(aside, _):
+        raise OSError(28, "No space left on device", str(aside))
 
-    monkeypatch.setattr(Path, "write_bytes", write_bytes)
+    monkeypatch.setattr(stored_worlds.os, "replace", full)
 
 
 def of_others(monkeypatch, tmp_path):

@@ -120,8 +120,8 @@ class PlacementSearch:
         self._check_turn(candidate)
         wrong = [] if candidate.number else list(self.space.violations(self.space.start))
         wrong += [why] if (why := self._too_many_self_hits(prefixes[-1])) else []
-        found = {"prefixes": prefixes, "infeasible": "; ".join(wrong), "lacks": lacks, "seconds": seconds}
-        self._note(replace(candidate, rig=None, **found))
+        why = "; ".join(wrong)
+        self._note(replace(candidate, rig=None, prefixes=prefixes, infeasible=why, lacks=lacks, seconds=seconds))
 
     def refuse(self, candidate: Evaluation, why: str, *, seconds: float = 0.0) -> None:
         """Say that a candidate cannot be.

@@ -11,7 +11,7 @@ import shutil
 import time
 import warnings
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields
 from functools import cache
@@ -91,16 +91,17 @@ class StoredWorlds:
             world = self._scenario.world(self._seed, run, ego)
         for doubt in doubts:
             warnings.warn_explicit(doubt.message, doubt.category, doubt.filename, doubt.lineno)
-        if not doubts:  # else whoever reads it would not be warned
+        if not any(issubclass(doubt.category, UserWarning) for doubt in doubts):  # whoever reads it would not be told
             self._keep(path, _packed(world, key, bodies))
         return world
 
-    def _keep(self, path: Path, content: bytes) -> None:
+    def _keep(self, path: Path, content: Sequence[bytes | memoryview]) -> None:
         # Other runs may be writing the same; what a kill leaves is too old one day, as all else is.
         aside = path.with_name(uuid4().hex)
         try:
-            if _has_room(path.parent, self._budget_bytes - len(content), self._began_s):
-                aside.write_bytes(content)
+            if _has_room(path.parent, self._budget_bytes - sum(map(len, content)), self._began_s):
+                with aside.open("wb") as file:
+                    file.writelines(content)
                 os.replace(aside, path)
         except OSError as error:
             with suppress(OSError):
@@ -160,12 +161,12 @@ def _code() -> str:
     return found.hexdigest()
 
 
-def _packed(world: World, key: str, bodies: Mapping[str, Mesh]) -> bytes:
+def _packed(world: World, key: str, bodies: Mapping[str, Mesh]) -> Sequence[bytes | memoryview]:
     """A world as a file: checksum, length of the text, text, numbers; of bodies that worlds share, the names only.
 
     The text has types and shapes of all arrays, and kinds and fields of all parts, of which the last is the world.
     """
-    arrays, parts, numbers = list[Any](), list[Any](), list[bytes]()
+    arrays, parts, numbers = list[Any](), list[Any](), list[bytes | memoryview]()
     # By where it is in memory: views of the same numbers are one array.
     known: dict[object, dict[str, Any]] = {id(mesh): {"body": name} for name, mesh in bodies.items()}
 
@@ -175,7 +176,8 @@ def _packed(world: World, key: str, bodies: Mapping[str, Mesh]) -> bytes:
             if place not in known:
                 known[place] = {"array": len(arrays)}
                 arrays.append((value.dtype.str, value.shape))
-                numbers.append(_padded(value.tobytes()))
+                numbers.append(np.ascontiguousarray(value).reshape(-1).view(np.uint8).data)
+                numbers.append(bytes(-value.nbytes % 8))
             return known[place]
         if type(value).__name__ in KINDS:
             if id(value) not in known:
@@ -186,13 +188,12 @@ def _packed(world: World, key: str, bodies: Mapping[str, Mesh]) -> bytes:
         return list(map(told, value)) if isinstance(value, tuple) else value
 
     told(world)
-    text = _padded(json.dumps([arrays, parts], default=np.generic.item).encode())
-    content = b"".join([len(text).to_bytes(8, "little"), text, *numbers])
-    return zlib.crc32(content, zlib.crc32(key.encode())).to_bytes(8, "little") + content
-
-
-def _padded(content: bytes) -> bytes:
-    return content + b" " * (-len(content) % 8)
+    text = json.dumps([arrays, parts], default=np.generic.item).encode()
+    text += b" " * (-len(text) % 8)
+    content, checksum = [len(text).to_bytes(8, "little"), text, *numbers], zlib.crc32(key.encode())
+    for part in content:
+        checksum = zlib.crc32(part, checksum)
+    return [checksum.to_bytes(8, "little"), *content]
 
 
 @reads("a world")

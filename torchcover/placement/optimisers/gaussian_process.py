@@ -85,9 +85,9 @@ class GaussianProcessSearch:
         # How bad the worst are tells nothing of where the best is, but would be most of what is learnt.
         values = values.clip(np.median(values) - FAR_DOWN * (values.max() - np.median(values)))
         kept = np.union1d(np.argsort(-values, kind="stable")[:HIGHEST], np.arange(len(values))[-LAST:])
-        each = (torch.from_numpy(np.array(told)[kept]) for told in (self._places, values, self._errors))
+        places, errors = (torch.from_numpy(np.array(told)[kept]) for told in (self._places, self._errors))
         with _one_thread():
-            return GaussianProcess.fitted(self._cube.levels, *each, like)
+            return GaussianProcess.fitted(self._cube.levels, places, torch.from_numpy(values[kept]), errors, like)
 
     def _note(self, unit: Unit, value: float, error: float) -> None:
         self._places.append(np.asarray(unit, dtype=np.float64))
