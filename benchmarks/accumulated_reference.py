@@ -115,8 +115,9 @@ def main():
         true = surface[instant]
         for rig, of in truths.items():
             added(of, true, rig)
+        recording = SimulatedDrive(sweeps, instant, max(options.windows))
         for name, sensors, window_s, labelled in cases:
-            recording = SimulatedDrive(sweeps, instant, window_s, labelled=labelled)
+            recording.labelled = labelled
             recording.rigs = {rig: (rig,) for rig in sensors}
             start_s = time.process_time()
             (frame,) = RecordedFrames(recording, reference=AccumulatedReference(window_s, sensors=sensors))

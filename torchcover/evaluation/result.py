@@ -282,8 +282,8 @@ class Result:
         )
         return [
             f"A frame's reference: {sweeps} sweeps ({skipped} skipped, beyond jumps of the pose), and {rays} rays to "
-            f"judge them; left out: {past} points that others see past, {passing} seen too shortly, {hidden} hidden from "
-            f"beside the vehicle; {movers} movers put back."
+            f"judge them; left out: {past} points that others see past, {passing} seen too shortly, {hidden} hidden "
+            f"from beside the vehicle; {movers} movers put back."
         ]
 
     @property

@@ -62,8 +62,8 @@ def movers(scans_m: Sequence[Float64], apart_s: Float64) -> list[Moved]:
     shape = np.max([cell.max(axis=0) for cell in cells if len(cell)], axis=0) + 3
     filled = np.stack([_filled(cell, shape) for cell in cells])
     left = [np.ones(len(points_m), np.bool_) for points_m in scans_m]
-    together = np.flatnonzero(np.abs(apart_s) <= TOGETHER_S)
-    for scan in together[np.argsort(np.abs(apart_s[together]), kind="stable")]:
+    together = sorted(map(int, np.flatnonzero(np.abs(apart_s) <= TOGETHER_S)), key=lambda one: abs(apart_s[one]))
+    for scan in together:
         others = np.argsort(np.abs(apart_s - apart_s[scan]), kind="stable")
         others = others[others != scan][:COMPARED]
         since_s = np.ascontiguousarray(apart_s[others] - apart_s[scan])

@@ -236,7 +236,8 @@ class RecordedFrames(FrameDataset):
             return places
         windows = np.floor((recording.times_s[frames] - recording.times_s[frames[0]]) / window_s + 1e-6)
         first = dict(zip(reversed(places), reversed(windows.tolist()), strict=True))  # of an instant that is seen again
-        return np.unique([first[place] for place in places], return_inverse=True)[1].tolist()
+        _, ranks = np.unique([first[place] for place in places], return_inverse=True)
+        return [int(rank) for rank in ranks]
 
     def _read(self, sensor: str, instant: int) -> InVehicle:
         return in_vehicle(self.recording.scan(sensor, instant), self.recording.body)

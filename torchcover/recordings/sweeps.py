@@ -104,12 +104,12 @@ class Sweeps:
             return [index]
         apart_s = np.abs(recording.times_s - recording.times_s[index])
         near = np.flatnonzero(apart_s <= (self.window_s / 2 + margin_s) * (1 + 1e-9))
-        places_m = np.array([_pose(recording, instant)[:3, 3] for instant in near])
+        places_m = np.array([_pose(recording, int(instant))[:3, 3] for instant in near])
         speeds_mps = np.linalg.norm(np.diff(places_m, axis=0), axis=1) / np.diff(recording.times_s[near])
         jumps = np.flatnonzero(np.abs(speeds_mps - np.median(speeds_mps)) > JUMP_MPS) if len(speeds_mps) else near[:0]
         own = int(np.searchsorted(near, index))
         near = near[max(jumps[jumps < own] + 1, default=0) : min(jumps[jumps >= own] + 1, default=len(near))]
-        return near[np.argsort(apart_s[near], kind="stable")].tolist()
+        return [int(instant) for instant in near[np.argsort(apart_s[near], kind="stable")]]
 
     def skipped(self, recording: Recording, index: int) -> int:
         """How many instants of the window are left out, for the pose jumps between them and this one."""
