@@ -41,7 +41,8 @@ def test_two_evaluations_of_the_same_frames_are_a_comparison(torchcover, worlds,
     rigs, settings = [worlds / "low.yaml", worlds / "both.yaml"], {"cell_m": 4.0, "thresholds_m": (2.0,), "rays": 1024}
     together = evaluate(rigs, worlds / "yard.yaml", steps=16, **settings)
     rows = json.loads((worlds / "out" / "summary.json").read_text())["rows"]
-    assert rows == together.summary
+    # Of a file of coverage nobody knows what carried the rig, and how its sensors measured.
+    assert rows == [{**row, "vehicle": None, "sensor_model": None} for row in together.summary]
     assert {row["rig"] for row in rows} == {"low", "both"}
     assert (worlds / "out" / "maps" / "difference_radius_area_m_ground_both_minus_low.png").is_file()
     # And what a comparison wrote can be compared again.

@@ -4,6 +4,7 @@ import numpy as np
 
 from tests.placement.worlds import estimate_of
 from torchcover.placement import Objective, Prefix, SearchPlan, SearchSpace, racing_order
+from torchcover.simulation import Scenario
 
 QUESTIONS = 2
 BEST_X, BEST_PITCH = 0.15, 4.0
@@ -41,6 +42,7 @@ class Surface:
         self.level = draws.normal(0.0, 0.1, (len(self.world_of), QUESTIONS))
         self.tilt = draws.normal(0.0, noise, (len(self.world_of), QUESTIONS, 2))
         self.scored, self.closed = [], False
+        self.scenarios = (Scenario.load("courtyard"),)
 
     def __len__(self):
         return len(self.world_of)
