@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchcover.coverage import BevGrid, Coverage, check_paired
 from torchcover.files import write_durably
-from torchcover.report.maps.arrays import draw_map, draw_side_by_side
+from torchcover.report.maps.arrays import draw_side_by_side
 from torchcover.report.maps.colours import difference_scale, scale_of
 from torchcover.report.maps.overlay import SensorView
 from torchcover.report.maps.subjects import Subject, difference, error_subjects_of, subjects_of
@@ -237,15 +237,16 @@ def _draw_differences(subject: Subject, grid: BevGrid, bands: Sequence[_Band], s
     first_stem, *stems = file_stems(list(subject.values))
     for (rig, _), stem, change in zip(others, stems, differences, strict=True):
         for band in bands:
-            figure = draw_map(
+            opacity = band.opacity(subject)
+            figure = draw_side_by_side(
                 # What is infinite takes the last colour: it is better or worse, not a step without a point.
-                change[band.number].clamp(2 * scale.low, 2 * scale.high),
+                {"": change[band.number].clamp(2 * scale.low, 2 * scale.high)},
                 grid,
                 scale,
                 title=f"{rig} minus {first}: {subject.quantity.title}, {band.name}",
                 subtitle=f"blue: {rig} is better, red: {first} is better; {band.subtitle(subject)}",
                 ego_outline_m=setting.ego_outline_m,
                 unknown=subject.unknown,
-                opacity=band.opacity(subject),
+                opacity=None if opacity is None else {"": opacity},
             )
             yield f"difference_{subject.quantity.key}_{band.stem}_{stem}_minus_{first_stem}", figure
