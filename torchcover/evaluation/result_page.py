@@ -3,7 +3,7 @@
 import platform
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -12,7 +12,7 @@ from pydantic import BaseModel
 
 from torchcover.coverage import AGGREGATIONS, Aggregation, Coverage, Region
 from torchcover.files import as_yaml
-from torchcover.report import BOLD_MARKS, PLACE_HEADINGS, Line, PageTable, SensorView, Words, parts_of
+from torchcover.report import BOLD_MARKS, Line, PageTable, SensorView, Words, parts_of
 from torchcover.report.remarks import marks_on, notes_on
 from torchcover.report.table import CoverageTable
 from torchcover.simulation import CameraSensor, Sensor, vertical_fov_deg
@@ -88,9 +88,8 @@ def left_out(
 def page_tables(table: CoverageTable) -> list[PageTable]:
     """The parts of a table, with its notes below the last."""
     marks = [f"{BOLD_MARKS[mark]}: {meaning}" for mark, meaning in marks_on(table).items()]
-    parts = [PageTable(part.title, part.headings, part.rows, len(PLACE_HEADINGS)) for part in parts_of(table)]
-    last = parts[-1]
-    return [*parts[:-1], PageTable(last.title, last.headings, last.rows, last.words_first, [*marks, *notes_on(table)])]
+    *parts, last = parts_of(table)
+    return [*parts, replace(last, notes=[*marks, *notes_on(table)])]
 
 
 def sensor_views(sensors: Sequence[Sensor]) -> list[SensorView]:

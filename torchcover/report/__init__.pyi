@@ -16,7 +16,6 @@ from .drawings.targets import draw_targets as draw_targets
 from .drawings.vehicle import SkinPatch as SkinPatch
 from .drawings.vehicle import draw_vehicle as draw_vehicle
 from .drawings.work_precision import draw_work_precision as draw_work_precision
-from .maps.arrays import draw_map as draw_map
 from .maps.arrays import draw_side_by_side as draw_side_by_side
 from .maps.colours import ColourScale as ColourScale
 from .maps.colours import difference_scale as difference_scale
@@ -32,7 +31,6 @@ from .page.content import Page as Page
 from .page.content import PageMap as PageMap
 from .page.content import PagePicture as PagePicture
 from .page.content import PageRig as PageRig
-from .page.content import PageTable as PageTable
 from .page.maps_of import maps_of as maps_of
 from .page.writing import page_html as page_html
 from .remarks import Remark as Remark
@@ -45,13 +43,12 @@ from .renderers.json_file import json_record as json_record
 from .renderers.json_file import table_dict as table_dict
 from .renderers.layout import BOLD_MARKS as BOLD_MARKS
 from .renderers.layout import PLACE_HEADINGS as PLACE_HEADINGS
-from .renderers.layout import Part as Part
+from .renderers.layout import PageTable as PageTable
 from .renderers.layout import Words as Words
 from .renderers.layout import parts_of as parts_of
 from .renderers.markdown_file import as_markdown as as_markdown
-from .renderers.text_file import narrowest_width as narrowest_width
 from .renderers.text_file import print_table as print_table
-from .renderers.text_file import text_table as text_table
+from .renderers.text_file import print_whole as print_whole
 from .table import CoverageTable as CoverageTable
 from .table import Row as Row
 from .wording import difference_heading as difference_heading

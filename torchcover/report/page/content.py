@@ -8,30 +8,11 @@ from numpy.typing import NDArray
 
 from torchcover.report.maps.colours import NEVER_PROBED, ColourScale
 from torchcover.report.maps.overlay import SensorView
-from torchcover.report.renderers.layout import Words
+from torchcover.report.renderers.layout import PageTable
 
 Bounds = tuple[float, float]
 Array = NDArray[np.floating]
 Sides = NDArray[np.integer]
-
-
-@dataclass(frozen=True)
-class PageTable:
-    """A table of words.
-
-    Args:
-        title: Above it; empty for none.
-        headings: Of its columns.
-        rows: Its cells; marked ones are bold.
-        words_first: How many columns are words, on the left; numbers follow, on the right.
-        notes: Below it.
-    """
-
-    title: str
-    headings: Sequence[str]
-    rows: Sequence[Sequence[Words]]
-    words_first: int = 1
-    notes: Sequence[str] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from torchcover.report.maps.overlay import SensorView, sensor_colour
-from torchcover.report.page.content import Array, PageTable
-from torchcover.report.renderers.layout import Words
+from torchcover.report.page.content import Array
+from torchcover.report.renderers.layout import PageTable, Words
 
 MARGIN_M = 3.0
 NUMBER_M = 0.34

@@ -13,10 +13,10 @@ from string import Template
 import numpy as np
 
 from torchcover.report.page.codes import CellBytes
-from torchcover.report.page.content import Array, Page, PageMap, PagePicture, PageRig, PageTable
+from torchcover.report.page.content import Array, Page, PageMap, PagePicture, PageRig
 from torchcover.report.page.map_content import ERROR_BITS, VALUE_BITS, map_content
 from torchcover.report.page.rig_drawing import rig_drawing, sensor_table
-from torchcover.report.renderers.layout import Words
+from torchcover.report.renderers.layout import PageTable, Words
 
 # Deflated and as base64, at most a quarter more characters.
 MOST_BYTES = 3.8e6

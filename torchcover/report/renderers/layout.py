@@ -7,7 +7,7 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 from torchcover.estimation import Quantity
-from torchcover.report.failures import decisive, failure_headings, failure_title, failure_words, sensors_of
+from torchcover.report.failures import failure_headings, failure_title, failure_words, sensors_of
 from torchcover.report.renderers.records import COLUMNS
 from torchcover.report.table import CoverageTable, Row
 from torchcover.report.wording import (
@@ -32,28 +32,28 @@ class Words(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Part:
-    """A part of a table that has one heading for each column.
+class PageTable:
+    """A table of words.
 
     Args:
         title: Above it; empty for none.
-        quantities: What it has numbers of.
-        of_differences: Whether these are differences.
-        headings: Of its columns, region and height first; line breaks are where they had better be.
-        rows: Its cells.
-        bands: After so many rows comes another region.
+        headings: Of its columns; line breaks are where they had better be.
+        rows: Its cells; marked ones are bold.
+        words_first: How many columns are words, on the left; numbers follow, on the right.
+        notes: Below it.
+        bands: After so many rows comes another section; 0 for one section.
     """
 
     title: str
-    quantities: tuple[Quantity, ...]
-    of_differences: bool
-    headings: tuple[str, ...]
-    rows: tuple[tuple[Words, ...], ...]
-    bands: int
+    headings: Sequence[str]
+    rows: Sequence[Sequence[Words]]
+    words_first: int = 1
+    notes: Sequence[str] = ()
+    bands: int = 0
 
 
-def parts_of(table: CoverageTable) -> list[Part]:
-    """The parts of a table.
+def parts_of(table: CoverageTable) -> list[PageTable]:
+    """The parts of a table, each with one heading for each column: region and height first.
 
     Args:
         table: The table.
@@ -72,43 +72,33 @@ def parts_of(table: CoverageTable) -> list[Part]:
     return [*parts, *failures]
 
 
-def _of_one_rig(table: CoverageTable) -> Part:
+def _of_one_rig(table: CoverageTable) -> PageTable:
     headings = [fill(heading(quantity), MAX_HEADING_CHARS) for quantity in table.quantities]
     cells = [[_number(row, quantity) for quantity in table.quantities] for (row,) in table.places]
-    return _part(table, "", table.quantities, headings, cells)
+    return _part(table, "", headings, cells)
 
 
-def _of_quantity(table: CoverageTable, quantity: Quantity) -> Part:
+def _of_quantity(table: CoverageTable, quantity: Quantity) -> PageTable:
     cells = [[_number(row, quantity) for row in rows] for rows in table.places]
-    return _part(table, capitalised(heading(quantity)), (quantity,), table.rigs, cells)
+    return _part(table, capitalised(heading(quantity)), table.rigs, cells)
 
 
-def _of_differences(table: CoverageTable, quantity: Quantity) -> Part:
+def _of_differences(table: CoverageTable, quantity: Quantity) -> PageTable:
     first, *others = table.rigs
     cells = [[_difference(row, quantity) for row in rows[1:]] for rows in table.places]
-    title = f"Difference to {first}: {difference_heading(quantity)}"
-    return _part(table, title, (quantity,), others, cells, of_differences=True)
+    return _part(table, f"Difference to {first}: {difference_heading(quantity)}", others, cells)
 
 
-def _of_failures(table: CoverageTable, rig: str) -> Part:
+def _of_failures(table: CoverageTable, rig: str) -> PageTable:
     rows = []
     for row in table.rows[rig]:
         cells = [Words(text, "significant" if marked else "") for text, marked in failure_words(table, row)]
         rows.append((Words(row.summary.region), Words(row.summary.height), *cells))
     headings = (*PLACE_HEADINGS, *failure_headings(table, rig))
-    bands = len(table.grid.heights)
-    return Part(failure_title(table, rig), (decisive(table),), True, headings, tuple(rows), bands)
+    return _table(table, failure_title(table, rig), headings, rows)
 
 
-def _part(
-    table: CoverageTable,
-    title: str,
-    quantities: tuple[Quantity, ...],
-    headings: Sequence[str],
-    numbers: Sequence[Sequence[Words]],
-    *,
-    of_differences: bool = False,
-) -> Part:
+def _part(table: CoverageTable, title: str, headings: Sequence[str], numbers: Sequence[Sequence[Words]]) -> PageTable:
     """A part with the columns that every part has: the place first, those of `COLUMNS` that are shown last."""
     shown = [column for column in COLUMNS if column.heading and column.measure in (None, table.measure)]
     rows = []
@@ -116,7 +106,11 @@ def _part(
         last = [Words(column.words(column.of(table, row))) for column in shown]
         rows.append((Words(row.summary.region), Words(row.summary.height), *cells, *last))
     every = (*PLACE_HEADINGS, *headings, *(column.heading for column in shown))
-    return Part(title, quantities, of_differences, every, tuple(rows), len(table.grid.heights))
+    return _table(table, title, every, rows)
+
+
+def _table(table: CoverageTable, title: str, headings: Sequence[str], rows: Sequence[Sequence[Words]]) -> PageTable:
+    return PageTable(title, headings, rows, len(PLACE_HEADINGS), bands=len(table.grid.heights))
 
 
 def _number(row: Row, quantity: Quantity) -> Words:

@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 
 from torchcover.report.remarks import marks_on, notes_on
-from torchcover.report.renderers.layout import BOLD_MARKS, PLACE_HEADINGS, Part, Words, parts_of
+from torchcover.report.renderers.layout import BOLD_MARKS, PLACE_HEADINGS, PageTable, Words, parts_of
 from torchcover.report.table import CoverageTable
 
 # What Markdown would take for something else: an underscore does so at the end of a word only.
@@ -16,7 +16,7 @@ def render(table: CoverageTable) -> str:
     return as_markdown(table, parts_of(table))
 
 
-def as_markdown(table: CoverageTable, parts: Sequence[Part]) -> str:
+def as_markdown(table: CoverageTable, parts: Sequence[PageTable]) -> str:
     """Parts of a table as Markdown text, with the table's notes below.
 
     Args:
@@ -28,7 +28,7 @@ def as_markdown(table: CoverageTable, parts: Sequence[Part]) -> str:
     return "\n".join([*(line for part in parts for line in _lines(part)), *notes, ""])
 
 
-def _lines(part: Part) -> Iterator[str]:
+def _lines(part: PageTable) -> Iterator[str]:
     if part.title:
         yield f"{_escaped(part.title)}\n"
     yield _line(map(_escaped, part.headings))
