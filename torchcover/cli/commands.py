@@ -1,7 +1,7 @@
 """What each command is called with; what it does is imported when it runs."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -14,15 +14,7 @@ from torchcover.evaluation.settings import OPTIONS
 UNITS_S = {"s": 1.0, "min": 60.0, "h": 3600.0}
 
 
-TRIED = [name for name, option in OPTIONS.items() if option.in_study == "tried"]
-
-
-@with_options(
-    [
-        *of_evaluate(*(name for name, option in OPTIONS.items() if option.in_study == "once")),
-        *of_evaluate(*TRIED, several=True),
-    ]
-)
+@with_options(of_evaluate(*(name for name, option in OPTIONS.items() if option.in_study)))
 def study(
     rig: options.Rig,
     steps: Annotated[
@@ -31,23 +23,15 @@ def study(
     out: options.Out = Path("out"),
     **settings: Any,  # noqa: ANN401
 ) -> None:
-    """Find the setting for a wanted error: what each costs, how far it is off, and how many steps it needs.
-
-    Options such as --rays, --workers or --cell-m may be given several times: each further value is tried with
-    everything else as in the first setting. None given: 16384, 4096 and 1024 rays.
-    """
+    """Find the setting for a wanted error: what each costs, how far it is off, and how many steps it needs."""
     from torchcover.cli.printing import print_study
     from torchcover.evaluation import Settings, StudyPlan, error_against_time, rank_count
     from torchcover.files import claimed
 
     if rank_count() > 1:
         raise ValueError("study measures run times, which several ranks would change: run it without torchrun")
-    given = {name: settings.pop(name) for name in TRIED if name in settings}
-    first = {name: values[0] for name, values in given.items() if values}
-    others: Sequence[Mapping[str, Any]] = [{name: value} for name, values in given.items() for value in values[1:]]
-    if not others and "rays" not in first and first.get("reference") != "paper":
-        others = StudyPlan.others
-    plan = StudyPlan(Settings(rig, steps=steps, **settings, **first), tuple(others))
+    fewer = "rays" not in settings and settings.get("reference") != "paper"
+    plan = StudyPlan(Settings(rig, steps=steps, **settings), StudyPlan.others if fewer else ())
     with claimed(out):
         found = error_against_time(plan, progress=True)
         files = found.save(out)
