@@ -19,7 +19,6 @@ from .drawings.work_precision import draw_work_precision as draw_work_precision
 from .maps.arrays import draw_side_by_side as draw_side_by_side
 from .maps.colours import ColourScale as ColourScale
 from .maps.colours import difference_scale as difference_scale
-from .maps.colours import error_scale as error_scale
 from .maps.colours import scale_of as scale_of
 from .maps.figures import band_figures as band_figures
 from .maps.figures import file_stems as file_stems

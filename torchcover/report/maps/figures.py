@@ -17,7 +17,7 @@ from torchcover.files import write_durably
 from torchcover.report.maps.arrays import draw_side_by_side
 from torchcover.report.maps.colours import difference_scale, scale_of
 from torchcover.report.maps.overlay import SensorView
-from torchcover.report.maps.subjects import Subject, difference, error_subjects_of, subjects_of
+from torchcover.report.maps.subjects import Subject, difference, subjects_of
 from torchcover.report.maps.surface import as_drawn
 from torchcover.report.maps.window import Window, asked_and_known, near_field
 from torchcover.report.wording import capitalised, span
@@ -32,7 +32,6 @@ def map_figures(
     ego_outline_m: NDArray[np.floating] | None = None,
     sensors: Mapping[str, Sequence[SensorView]] | None = None,
     vehicle: str | None = None,
-    errors: bool = False,
 ) -> Iterator[Named]:
     """Draw what was measured in every height band, for one rig or for several.
 
@@ -47,12 +46,10 @@ def map_figures(
         ego_outline_m: (K, 2) corners x, y of the ego in the vehicle frame in metres.
         sensors: What to mark, by the name of the rig.
         vehicle: What the ego is called, for the titles.
-        errors: Whether to draw the standard errors too, if there are any.
 
     Returns:
         Pairs, drawn one by one, of a name that is fit for a file and a figure: `radius_m_ground`,
-        `detection_area_0.4m_obstacle`, `radius_m_error_ground`, `difference_radius_m_ground_RIG_minus_FIRST`,
-        `near_radius_m`.
+        `detection_area_0.4m_obstacle`, `difference_radius_m_ground_RIG_minus_FIRST`, `near_radius_m`.
 
     Raises:
         ValueError: Several coverages that are not paired, as in `check_paired`; while drawing, an outline of another
@@ -68,7 +65,7 @@ def map_figures(
     if len(coverages) > 1:
         check_paired(coverages)
     coverages = {name: as_drawn(coverage) for name, coverage in coverages.items()}
-    return _figures(coverages, _Setting(ego_outline_m, sensors or {}, vehicle), errors=errors)
+    return _figures(coverages, _Setting(ego_outline_m, sensors or {}, vehicle))
 
 
 def band_figures(coverage: Coverage) -> Iterator[Named]:
@@ -159,7 +156,7 @@ class _Band:
         return None if subject.opacity is None else subject.opacity[self.number]
 
 
-def _figures(coverages: Mapping[str, Coverage], setting: _Setting, *, errors: bool) -> Iterator[Named]:
+def _figures(coverages: Mapping[str, Coverage], setting: _Setting) -> Iterator[Named]:
     first, ego = next(iter(coverages.values())), setting.ego_outline_m
     bands, shown = _bands(first.grid), asked_and_known(first, ego)
     near = None if ego is None else near_field(first.grid, ego)
@@ -171,8 +168,6 @@ def _figures(coverages: Mapping[str, Coverage], setting: _Setting, *, errors: bo
             around = _within(whole, near)
             own = scale_of(around.quantity, torch.stack(list(around.values.values())))
             yield _draw_near(replace(around, scale=own), near.grid, bands, setting)
-    for whole in map(setting.told, error_subjects_of(coverages) if errors else ()):
-        yield from _draw_rigs(_within(whole, shown), shown.grid, bands, setting)
 
 
 def _within(subject: Subject, shown: Window) -> Subject:
