@@ -36,14 +36,14 @@ types: $(VENV)/.ready
 	$(BIN)/mypy tests/typing
 
 doctest: $(VENV)/.ready  ## the examples in the docstrings; tests/test_documentation.py runs those of the documentation
-	OMP_WAIT_POLICY=passive $(BIN)/python -m pytest --doctest-modules torchcover
+	OMP_WAIT_POLICY=passive TORCHCOVER_CACHE_GB=0 $(BIN)/python -m pytest --doctest-modules torchcover
 
 docs: $(VENV)/.ready  ## the pages, with those made from the code, in out/site
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet
 
 smoke: $(VENV)/.ready  ## the built wheel, in an empty environment outside the repository
-	PYTHON="$(PYTHON)" bash .ci/smoke $(BIN)/python
+	TORCHCOVER_CACHE_GB=0 PYTHON="$(PYTHON)" bash .ci/smoke $(BIN)/python
 
 bench: $(VENV)/.ready  ## docs/measured/performance.md: speed and memory
 	$(BIN)/python -m benchmarks.measured performance

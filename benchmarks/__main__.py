@@ -32,9 +32,10 @@ BENCHMARKS = (
     "towns",
     "pairing",
     "placement",
+    "optimisers",
+    "choices",
     "published",
     "voxels",
-    "cities",
     "streets",
 )
 

@@ -18,7 +18,7 @@ SPACE = {
     "objectives": {"near and far": {"region": ("20m", "80m")}},
 }
 REPEATS, TURNS = 10, (10, 20, 30)
-NAMES = ("gp", "cmaes", "random")
+NAMES = ("gp", "random")
 
 
 def gains(result):

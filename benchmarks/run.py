@@ -69,6 +69,7 @@ def main():
 def measured(checkout, folder):
     """Processor seconds of each part, in one process and on one thread, then those of the run as anybody starts it."""
     said = ("OMP_NUM_THREADS", "OMP_WAIT_POLICY", "OPENBLAS_NUM_THREADS", "PYTHONDONTWRITEBYTECODE")
+    said += ("TORCHCOVER_CACHE_GB",)
     plain = {name: value for name, value in os.environ.items() if name not in said} | {"PYTHONPATH": str(checkout)}
     alone = {**plain, "OMP_NUM_THREADS": "1", "TORCHCOVER_CACHE_GB": "0"}
     here = Path(__file__).resolve()

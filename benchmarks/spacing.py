@@ -65,20 +65,23 @@ def simulated():
     """(C, looks, places, 3) square metres, those times radius and detection; seconds of first steps, and of others."""
     torch.set_num_threads(1)
     looks = round(DURATION_S / EVERY_S)
-    settings = Settings(RIG, "urban", steps=CITIES * looks, seed=SEED, every_s=EVERY_S, no_cache=True)
-    task, sums, taken = simulation(settings), [], []
+    settings = Settings(RIG, "urban", steps=CITIES * looks + looks, seed=SEED, every_s=EVERY_S, no_cache=True)
+    task, sums, taken, city = simulation(settings), [], [], []
     bands, most = task.asked.grid.heights.values(), task.asked.grid.diagonal_m
-    for index in range(CITIES * looks):
-        start = time.process_time()
+    while not city or city[-1] < CITIES:
+        index, start = len(city), time.process_time()
         frame = task.frames[index]
         radius = nearest(frame.reference, frame.clouds[RIG], max_distance=most).distance.double().clamp(max=most)
         taken.append(time.process_time() - start)
+        city.append(frame.place_in_time)
         m2, points = frame.reference_weights.double(), frame.reference.double()
         values = m2 * torch.stack([torch.ones_like(m2), radius, (radius <= THRESHOLD_M).double()])
         of_places = [(region, band) for region in forward_regions() for band in bands]
         sums.append([_within(points, frame.reference_heights_m, values, *place) for place in of_places])
-    taken = np.array(taken).reshape(CITIES, looks)
-    return np.array(sums).reshape(CITIES, looks, -1, 3), np.median(taken[1:, 0]), np.median(taken[:, 1:])
+    # A minute holds one more look now and then.
+    of_city = np.array([np.flatnonzero(np.array(city) == one)[:looks] for one in range(CITIES)])
+    taken = np.array(taken)[of_city]
+    return np.array(sums)[of_city].reshape(CITIES, looks, -1, 3), np.median(taken[1:, 0]), np.median(taken[:, 1:])
 
 
 def judged(sums, city_s, step_s):

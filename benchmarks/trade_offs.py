@@ -48,7 +48,6 @@ def searches():
         "kdtree": lambda: nearest(query, points, backend="kdtree").distance,
         "kdtree, float64": lambda: nearest(*wide, backend="kdtree").distance,
         "cdist": lambda: nearest(query, points, backend="cdist").distance,
-        "cdist, 8 MB": lambda: nearest(query, points, backend="cdist", memory_mb=8.0).distance,
         "torch.cdist, products": lambda: torch_cdist(query, points, product),
         "torch.cdist, products, float64": lambda: torch_cdist(*wide, product),
         "torch.cdist, differences": lambda: torch_cdist(query, points, difference),

@@ -7,14 +7,7 @@ from examples.paper.four_views import draw_four_views
 from examples.paper.measuring import Measurement
 from torchcover import BevGrid, Region
 from torchcover.evaluation import sensor_views
-from torchcover.report import (
-    CoverageTable,
-    as_markdown,
-    map_figures,
-    parts_of,
-    print_table,
-    write_figures,
-)
+from torchcover.report import RENDERERS, CoverageTable, map_figures, print_table, write_figures
 
 RIG = "three_cameras"
 GRID = BevGrid(x=(-40.0, 40.0), y=(-40.0, 40.0), cell=0.25)
@@ -37,7 +30,7 @@ def run(options):
     for (_, measure), coverage in coverages.items():
         table = CoverageTable.of({RIG: coverage}, REGIONS)
         print_table(table, Console())
-        texts.append(as_markdown(table, parts_of(table)))
+        texts.append(RENDERERS["markdown"](table))
         figures = map_figures({RIG: coverage}, ego_outline_m=measurement.frames.ego_outline_m, sensors={RIG: views})
         write_figures(figures, out / "maps" / measure)
         coverage.save(out / f"{RIG}_{measure}.npz")

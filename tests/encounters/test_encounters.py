@@ -270,6 +270,8 @@ def test_rows_are_of_speeds_with_intervals_over_draws():
         assert row.ttc_s_low <= row.ttc_s <= row.ttc_s_high
         assert row.needed_s == pytest.approx(row.speed_kmh / 3.6 / 18 + 0.5)
         assert row.worst == "ahead"
+        of_speed = [one for one in found.sightings if one.encounter.speed_kmh == row.speed_kmh]
+        assert row.without_worst_s == min(one.without_ttc_s[0].min() for one in of_speed)
     slow = [one.ttc_s for one in found.sightings if one.encounter.ego.speed_kmh == 20]
     assert rows[0].in_time == np.mean(np.stack(slow) >= rows[0].needed_s)
     ((name, of_rigs, needed),) = found.bands()

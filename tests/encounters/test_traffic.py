@@ -16,7 +16,7 @@ from torchcover.encounters import Criterion
 from torchcover.encounters.sighting import NEVER
 from torchcover.encounters.traffic import Approach, Drive, Eyes, Watch, approaches, sight_approach
 from torchcover.evaluation import met_in_recording, met_in_traffic
-from torchcover.geometry import rigid
+from torchcover.geometry import BoundingBox, rigid
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings import open_recording
 from torchcover.recordings.objects import Track
@@ -27,7 +27,7 @@ torch.set_num_threads(1)
 STEP_S = 0.1
 CHILD = {"type": "box", "size_m": [0.4, 0.4, 1.1]}
 CAR = {"type": "box", "size_m": [4.0, 2.0, 1.5]}
-WALL = {"name": "wall", "shape": {"type": "box", "size_m": [6.0, 0.2, 3.0]}, "poses": [{"x_m": 34.0, "y_m": -2.5}]}
+WALL = {"name": "wall", "shape": {"type": "box", "size_m": [24.0, 0.2, 3.0]}, "poses": [{"x_m": 31.0, "y_m": -2.5}]}
 
 
 @pytest.fixture(scope="module")
@@ -43,8 +43,9 @@ def scenario(tmp_path_factory):
         "name": "s", "bodies": [FLOOR, WALL], "time_step_s": STEP_S, "duration_s": 3.0,
         "ego": {"shape": CAR, "trajectory": str(drive(folder, (0, 0, 0, 0), (3, 30, 0, 0), name="ego.csv"))},
         "actors": [
-            actor("child", "pedestrian", CHILD, (0, 38, -5.4, 90), (3, 38, -0.9, 90)),
-            actor("faster", "car", CAR, (0, -20, 0, 0), (3, 25, 0, 0)),
+            actor("child", "pedestrian", CHILD, (0, 44, -5.4, 90), (3, 44, -0.9, 90)),
+            actor("faster", "car", CAR, (0, -30, 0, 0), (3, 15, 0, 0)),
+            actor("tailing", "car", CAR, (0, -10, 0, 0), (3, 25.5, 0, 0)),
             actor("aside", "car", CAR, (0, 30, 8, 0), (3, 31, 8, 0)),
         ],
     })  # fmt: skip
@@ -67,15 +68,17 @@ def driven(scenario):
 
 def test_who_is_met_and_how_near_in_time_is_geometry(driven):
     child, faster = approaches(driven[1], Criterion())
-    # The child's side is 1.8 - 0.2 m from that of the ego's way 2 s after 1.6 s; the front has 36 - 0.2 m to go.
+    # The child's side is 1.8 - 0.2 m from that of the ego's way 2 s after 1.6 s; the front has 42 - 0.2 m to go.
     times_s = STEP_S * np.arange(child.step, child.step + len(child.ttc_s))
-    ahead_s, aside_s = (38 - 0.2 - 2 - 10 * times_s) / 10, (5.4 - 1.5 * times_s - 1.0 - 0.2) / 1.5
+    ahead_s, aside_s = (44 - 0.2 - 2 - 10 * times_s) / 10, (5.4 - 1.5 * times_s - 1.0 - 0.2) / 1.5
     assert child.ttc_s == pytest.approx(np.maximum(ahead_s, aside_s), abs=1e-9)
     assert (child.name, child.track.name, child.closing_mps) == ("on foot", "child", pytest.approx(10.0))
     assert child.needed_s == pytest.approx(10 / 18 + 0.5)
-    assert (faster.name, faster.step, faster.closing_mps) == ("from behind", 0, pytest.approx(0.0))
-    assert faster.ttc_s == pytest.approx((20 - 4 - 5 * STEP_S * np.arange(31)) / 5)
-    assert [one.track.name for one in approaches(driven[1], Criterion(within_s=2.5))] == ["child", "faster"]
+    assert (faster.name, faster.step, faster.closing_mps) == ("from behind", 12, pytest.approx(0.0))
+    assert faster.ttc_s == pytest.approx((30 - 4 - 5 * STEP_S * np.arange(12, 31)) / 5)
+    # Nobody knows how late it is with who was near from the beginning.
+    assert "tailing" in [track.name for track in driven[1].tracks]
+    assert [one.track.name for one in approaches(driven[1], Criterion(within_s=2.5))] == ["child", "faster", "tailing"]
 
 
 def test_points_are_those_of_frames(scenario, driven):
@@ -125,14 +128,31 @@ def test_the_answer_is_that_of_looking_all_the_time(driven):
     assert all(some.values())
 
 
+def test_a_lorry_and_its_trailer_are_one_road_user():
+    times_s = STEP_S * np.arange(30)
+    ego = np.tile(np.eye(4), (30, 1, 1))
+    ego[:, 0, 3] = 20 * times_s
+    way = {at_m: Trajectory.from_arrays(times_s, np.column_stack([at_m + 15 * times_s, 0 * times_s, 0 * times_s]),
+                                        np.zeros((30, 3))) for at_m in (36.0, 30.0)}  # fmt: skip
+    parts = [Track("truck 1", "truck", "truck", (5.0, 2.5, 3.0), way[36.0]),
+             Track("rear of truck 1", "trailer", None, (12.0, 2.5, 4.0), way[30.0])]  # fmt: skip
+    there = Drive("w", times_s, ego, BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5)), parts)
+    for tracks in (parts, parts[::-1]):
+        (one,) = approaches(there._replace(tracks=tracks), Criterion())
+        assert (one.track, one.name) == (parts[1], "lorries and buses")
+        assert 3.88 < one.ttc_s[0] <= 4.0
+
+
 @pytest.mark.parametrize(
-    ("seen_from", "ttc_s", "in_time"), [(0, 4.0, True), (6, 2.0, True), (7, 1.0, False), (9, 0.0, False)]
+    ("seen_from", "ttc_s", "in_time"),
+    [(0, 4.0, True), (6, 2.0, True), (7, 1.0, False), (8, 1.0, False), (9, 0.0, False)],
 )
 def test_the_nearest_time_until_detection_counts_though_it_grew_again(seen_from, ttc_s, in_time):
     track = Track("t", "car", "passenger", (4.0, 2.0, 1.5), Trajectory.resting([10.0, 0.0, 0.0]))
     there = Drive("w", STEP_S * np.arange(9), np.tile(np.eye(4), (9, 1, 1)), None, [track])
     one = Approach(track, 5, np.array([3.0, 2.0, 1.0, 3.5]), np.array([0.5, 0.5, 1.1, 0.5]), "cars and vans", 0.0, 0.0)
-    eyes = Eyes([1], [1], [1], [1], lambda step, _: [np.array([[9.0, 0.0, 1.0]])[: step >= seen_from]])
+    on_it, about_it = [[9.0, 0.0, 1.0]], [[9.0, 0.0, 1.52], [9.0, 0.0, 0.0], [12.02, 0.0, 1.0], [9.0, -1.02, 1.0]]
+    eyes = Eyes([1], [1], [1], [1], lambda step, _: [np.array(about_it + on_it * (step >= seen_from))])
     found = sight_approach("r", there, one, eyes, Criterion(points=1, looks=1))
     assert (found.ttc_s[0], found.in_time[0], found.from_the_beginning[0]) == (ttc_s, in_time, seen_from == 0)
     assert found.without_ttc_s[0, 0] == 0
@@ -147,7 +167,7 @@ def test_who_is_hidden_until_braking_is_needed_is_too_late(scenario):
              (("soft", soft), ("hard", hard))}  # fmt: skip
     assert child["soft"].in_time == 0.0
     assert child["hard"].in_time == 1.0
-    assert 3.0 < child["hard"].ttc_s == child["hard"].ttc_s_low < 3.6
+    assert 1.8 < child["hard"].ttc_s == child["hard"].ttc_s_low < 2.6
     assert [(row.encounter, row.draws) for row in hard.rows] == [("on foot", 1), ("from behind", 1), ("all", 2)]
     assert child["hard"].per_hour == pytest.approx(3600 / 3.1)
     assert math.isnan(child["hard"].interval_low)  # a world that repeats is one world
@@ -176,7 +196,7 @@ class Closing(SyntheticDrive):
         return rigid(np.eye(3), [1.5 * index, 0.0, 0.0])
 
     def world_T_car(self, index):
-        return rigid(np.eye(3), [40.0 + 0.5 * index, 0.0, 0.75])
+        return rigid(np.eye(3), [50.0 + 0.5 * index, 0.0, 0.75])
 
     def scan(self, sensor, index):
         back_m, self.back_m = self.back_m, self.back_m[: None if index >= 8 else 0]
@@ -193,11 +213,25 @@ class Closing(SyntheticDrive):
 def test_real_road_users_are_first_hit_as_their_layout_says(layout, tmp_path):
     recording = open_recording(LAYOUTS[layout](Closing(steps=15), tmp_path))
     (one,) = met_in_recording(recording).sightings
-    gap_m = 40.0 - CAR_SIZE_M[0] / 2 - recording.body.upper_m[0]
+    gap_m = 50.0 - CAR_SIZE_M[0] / 2 - recording.body.upper_m[0]
     assert one.encounter.name == "cars and vans"
     assert one.encounter.ttc_s[0] == pytest.approx((gap_m - one.encounter.step) / 10, abs=0.02)
     assert one.ttc_s[0] == pytest.approx((gap_m - 10) / 10, abs=0.02)
     assert one.encounter.closing_mps == pytest.approx(10.0, abs=0.1)
+
+
+@pytest.mark.parametrize(("category", "met"), [("car", 0), ("pedestrian", 1)])
+def test_parked_vehicles_are_not_met_and_people_who_stand_are(category, met):
+    class Standing(Closing):
+        def world_T_car(self, index):
+            return rigid(np.eye(3), [68.0 + 0.1 * (index % 2), 0.0, 0.75])
+
+        def boxes(self, index):
+            box = super().boxes(index)
+            return Boxes.from_rows(box.rows, ids=box.ids, categories=(category,))
+
+    found = met_in_recording(Standing(steps=15, body=BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))))
+    assert len(found.sightings) == met
 
 
 def test_what_cannot_be_asked_is_told(tmp_path):

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from torchcover.geometry import BoundingBox
+from torchcover.geometry import BoundingBox, overlapping
+from torchcover.targets.placing import poses
 
 
 def test_a_box_around_points_touches_them():
@@ -30,3 +31,16 @@ def test_a_box_without_inside_is_refused(lower, upper):
 def test_a_box_in_other_than_three_dimensions_is_refused(lower, upper):
     with pytest.raises(ValueError, match="three numbers for each corner"):
         BoundingBox(lower, upper)
+
+
+def test_boxes_that_touch_share_no_space_and_those_that_are_turned_may():
+    car = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))
+    there = poses(
+        np.array([[4.0, 0.0], [3.99, 0.0], [0.0, -2.0], [2.9, 1.9], [2.9, 1.9]]), np.deg2rad([0, 0, 0, 0, 45])
+    )
+    assert overlapping(car, there, car.corners_m).tolist() == [False, True, False, True, True]
+    above = np.eye(4)[None].copy()
+    above[:, 2, 3] = 1.5
+    assert not overlapping(car, above, car.corners_m).any()
+    away = poses(np.array([[3.6, 2.4]]), np.deg2rad([135]))  # their shadows along x and y overlap
+    assert not overlapping(car, away, car.corners_m).any()

@@ -293,7 +293,7 @@ def test_the_inputs_are_bit_equal_afterwards(backend):
 
 
 def test_backends_agree_under_autocast():
-    """A matrix product in bfloat16 would pick wrong neighbours."""
+    """Coordinates in bfloat16 would pick wrong neighbours."""
     query, points = random_cloud(300, 19), random_cloud(3000, 20)
     with torch.autocast("cpu", dtype=torch.bfloat16):
         for backend in INSTALLED:
@@ -308,6 +308,7 @@ def test_backends_agree_under_autocast():
         ((100, 700_000), torch.float32, "packets"),
         ((17_000, 100), torch.float64, "kdtree"),
         ((6_000, 300_000), torch.float32, "kdtree"),
+        ((1, 1), torch.float32, "kdtree"),
         ((16, 700_000), torch.float32, "packets"),
     ],
 )

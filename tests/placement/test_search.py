@@ -156,7 +156,7 @@ def test_a_child_is_looked_for_around_the_vehicle_of_the_space():
 
 
 def test_requirements_that_contradict_each_other_are_refused_with_the_space():
-    with pytest.raises(ValueError, match=r"requirements contradict each other: 20m ground .* least 0.9 and at most 0.5"):
+    with pytest.raises(ValueError, match=r"contradict each other: 20m ground .* least 0.9 and at most 0.5"):
         space(requirements=required({"least": 0.9}, {"most": 0.5}))
 
 
@@ -187,7 +187,7 @@ def test_a_candidate_is_dropped_only_two_errors_below_its_incumbent():
 
 def test_random_search_draws_the_same_beside_any_optimiser():
     draws = []
-    for optimiser in ("random", "cmaes"):
+    for optimiser in ("random", "gp"):
         search = searched(evaluations=16, optimiser=optimiser).search
         draws.append([one.values for one in search.evaluations if one.arm == "random"])
     shortest = min(map(len, draws))
@@ -198,9 +198,7 @@ def test_random_search_draws_the_same_beside_any_optimiser():
     assert len({one.values["roof.x_m"] for one in search.evaluations}) == 7
 
 
-@pytest.mark.parametrize(
-    ("optimiser", "objectives"), [("gp", ("near",)), ("cmaes", ("near",)), ("gp", ("near", "far"))]
-)
+@pytest.mark.parametrize(("optimiser", "objectives"), [("gp", ("near",)), ("gp", ("near", "far"))])
 def test_a_search_that_was_ended_goes_on_to_the_same_candidates(tmp_path, optimiser, objectives):
     of = space(objectives=objectives)
     settings = {"evaluations": 14, "optimiser": optimiser}
@@ -305,7 +303,7 @@ def test_a_budget_below_one_evaluation_says_what_one_takes(monkeypatch):
         ({"budget_s": 3.0, "evaluations": 3}, "seconds or a number of evaluations is needed; got both"),
         ({"evaluations": 0}, "evaluations: 1 or more is needed; got 0"),
         ({"budget_s": 0.0}, "more than 0 s is needed"),
-        ({"optimiser": "luck"}, "one of auto, gp, cmaes, random, enumerate is needed; got 'luck'"),
+        ({"optimiser": "luck"}, "one of auto, gp, random, enumerate is needed; got 'luck'"),
         ({"estimate": "mean"}, "one of area, known is needed"),
     ],
 )
@@ -411,8 +409,6 @@ def test_of_several_objectives_the_ends_of_the_front_and_its_middle_are_tested()
     pitches = [arm.evaluations[at].values["roof.pitch_deg"] for at in arm.front]
     assert min(pitches) < 0 < max(pitches)
     assert "Hypervolume of the fronts" in result.sentence
-    with pytest.raises(ValueError, match="optimiser cmaes: it follows one objective"):
-        PlacementSearch(space(objectives=("near", "far")), plan(optimiser="cmaes"))
 
 
 def test_an_optimiser_of_ones_own_plugs_in():

@@ -9,7 +9,7 @@ import torch
 from tests.recordings.drives import Drive
 from torchcover.data import AccumulatedReference, RecordedFrames
 from torchcover.detection import Boxes
-from torchcover.geometry import BoundingBox, invert, transform
+from torchcover.geometry import BoundingBox, invert, rigid, transform
 
 FAR_M = (513_248.0, 5_403_655.0, 260.0)
 
@@ -53,12 +53,6 @@ def test_what_sticks_out_of_its_box_moves_with_it():
     assert distances_m(reference, np.concatenate([standing(drive, 2), moving(drive, 2)])).max() < 1e-4
 
 
-def test_nothing_says_that_it_moves_so_it_is_smeared():
-    drive = Drive(labelled=False)
-    reference = RecordedFrames(drive, reference=AccumulatedReference(10.0, voxel_m=0.05))[2].reference
-    assert distances_m(reference, np.concatenate([standing(drive, 2), moving(drive, 2)])).max() > 0.5
-
-
 def test_objects_without_a_name_are_left_out_and_counted():
     drive = Drive(named=False)
     frame = RecordedFrames(drive, reference=AccumulatedReference(10.0, voxel_m=0.05))[2]
@@ -80,17 +74,17 @@ def test_a_judged_sensor_takes_no_part_at_the_instant_itself():
 
 
 def test_a_frame_does_not_depend_on_those_read_before():
-    drive = Drive(steps=8)
+    drive = Drive(steps=5)
 
     def frames():
         return RecordedFrames(drive, reference=AccumulatedReference(0.4, voxel_m=0.3))
 
     one = frames()
-    forward = [one[index].reference for index in range(8)]
+    forward = [one[index].reference for index in range(5)]
     again = frames()
-    backward = [again[index].reference for index in reversed(range(8))][::-1]
-    fresh = [frames()[index].reference for index in range(8)]
-    copied = [pickle.loads(pickle.dumps(one))[index].reference for index in range(8)]
+    backward = [again[index].reference for index in reversed(range(5))][::-1]
+    fresh = [frames()[index].reference for index in range(5)]
+    copied = [pickle.loads(pickle.dumps(one))[index].reference for index in range(5)]
     for others in zip(forward, backward, fresh, copied, strict=True):
         assert all(torch.equal(others[0], other) for other in others[1:])
     assert len(one.reference.sweeps._kept) <= 2 * 5
@@ -130,3 +124,58 @@ def test_what_a_recording_does_not_say_is_named():
     for bad in ({"window_s": -1.0}, {"window_s": np.nan}, {"voxel_m": 0.0}):
         with pytest.raises(ValueError, match=next(iter(bad))):
             AccumulatedReference(**bad)
+
+
+def test_what_is_left_out_is_counted_and_points_have_square_metres():
+    frame = RecordedFrames(Drive(steps=12, labelled=False), reference=AccumulatedReference(10.0, voxel_m=0.05))[5]
+    counts = {name.removeprefix("reference_"): count for name, count in frame.counts.items()}
+    assert counts["sweeps"] == 2 * 11  # all but the two of the instant
+    assert counts["rays"] > counts["seen_past"] + counts["passing"] > 0
+    assert frame.reference_weights.shape == frame.reference.shape[:1]
+    assert frame.reference_weights.min() > 0
+
+
+def test_a_pose_that_jumps_ends_the_window():
+    drive = Drive(steps=20)
+    places = Drive(steps=20).world_T_vehicle
+    drive.world_T_vehicle = lambda index: rigid(np.eye(3), [5.0 * (index >= 8), 0.0, 0.0]) @ places(index)
+    frames = RecordedFrames(drive, reference=AccumulatedReference(10.0))
+    assert frames[9].counts["reference_sweeps"] == 2 * 11
+    assert frames[9].counts["reference_sweeps_skipped"] == 2 * 8
+    assert frames[3].counts["reference_sweeps"] == 2 * 7
+
+
+@pytest.mark.parametrize("steps", [1, 2])
+def test_a_drive_of_hardly_any_sweeps(steps):
+    drive = Drive(steps=steps, labelled=False)
+    frames = RecordedFrames(drive, rigs={"left": ("left",)}, reference=AccumulatedReference(2.0))
+    wall_m = np.concatenate([standing(drive, 0), moving(drive, 0)])
+    assert distances_m(frames[0].reference, wall_m).max() < 0.3  # one sweep alone tells no velocity
+    assert distances_m(standing(drive, 0), frames[0].reference).max() < 0.1
+
+
+class Standing(Drive):
+    """The vehicle stands all the time."""
+
+    def world_T_vehicle(self, index):
+        return super().world_T_vehicle(0)
+
+
+def test_a_vehicle_that_stands_sees_what_moves_move():
+    drive = Standing(steps=12, labelled=False)
+    frame = RecordedFrames(drive, reference=AccumulatedReference(10.0, voxel_m=0.05))[6]
+    here_m = np.concatenate([standing(drive, 6), moving(drive, 6)])
+    assert distances_m(frame.reference, here_m).max() < 0.5
+    assert distances_m(standing(drive, 6), frame.reference).max() < 1e-3
+
+
+def test_memory_does_not_grow_with_the_drive():
+    drive = Drive(steps=60, labelled=False)
+    frames = RecordedFrames(drive, reference=AccumulatedReference(0.4))
+    for index in range(0, 60, 20):
+        _ = frames[index]
+    sweeps = frames.reference.sweeps
+    kept = 2 * (2 * 12 + 1)
+    assert len(sweeps._kept) <= kept
+    assert len(sweeps._votes._counted) <= kept
+    assert len(sweeps._votes._images) <= kept

@@ -12,7 +12,7 @@ from tests.recordings.layouts import LAYOUTS
 from tests.recordings.test_accumulated_reference import distances_m, moving, standing
 from torchcover.data import FORMATS, AccumulatedReference, RecordedFrames, open_recording
 from torchcover.files import BadFileError
-from torchcover.geometry import invert, transform
+from torchcover.geometry import invert
 from torchcover.recordings.formats.kitti_files import read_timestamps
 
 
@@ -43,12 +43,10 @@ def test_clouds_are_where_the_world_is(layout, written):
         frame = frames[number]
         wall_m, car_m = standing(drive, index), moving(drive, index)
         assert distances_m(frame.sensor, np.concatenate([wall_m, car_m])).max() < 1e-3
-        # Moved by poses, and by boxes; without these, the car is wherever it was at another instant.
-        poses = [drive.world_T_car(k) for k in range(5) if k != index]
-        smeared_m = [transform(invert(drive.world_T_vehicle(index)) @ pose, drive.back_m) for pose in poses]
-        world_m = np.concatenate([wall_m, *([car_m] if drive.labelled else smeared_m)])
-        assert distances_m(frame.reference, world_m).max() < 2e-3
-        assert distances_m(world_m, frame.reference).max() < 0.05 * 3**0.5  # nothing is missing
+        # Moved by poses, and by boxes; without these, by what is seen of it.
+        world_m = np.concatenate([wall_m, car_m])
+        assert distances_m(frame.reference, world_m).max() < (2e-3 if drive.labelled else 0.3)
+        assert distances_m(world_m if drive.labelled else wall_m, frame.reference).max() < 0.05 * 3**0.5
         assert frame.name == recording.names[index]
 
 

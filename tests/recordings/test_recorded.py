@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from torchcover.data import BadFrameError, RecordedFrames, collate_frames
+from tests.recordings.drives import Drive
+from torchcover.data import AccumulatedReference, BadFrameError, RecordedFrames, collate_frames
 from torchcover.geometry.rigid import rigid, rotation_from_euler, transform
 
 WHY = ("nonfinite", "no_return", "own_vehicle")
@@ -297,3 +298,20 @@ def test_a_folder_of_rigs_without_any_is_an_error(tmp_path):
     (tmp_path / "rigs").mkdir()
     with pytest.raises(ValueError, match=r"rigs: no rig; each has a folder rigs/NAME/ of its own"):
         RecordedFrames(tmp_path)
+
+
+def test_frames_of_one_window_share_a_place_in_time():
+    drive = Drive(steps=30)  # 0.1 s apart
+
+    def places(window_s, **changed):
+        for name, value in changed.items():
+            setattr(drive, name, value)
+        frames = RecordedFrames(drive, reference=AccumulatedReference(window_s))
+        return [frames[index].place_in_time for index in range(len(frames))]
+
+    assert places(0.5) == [index // 5 for index in range(30)]
+    assert places(5.0) == [0] * 30  # too short for an error
+    # A pause is no room for more blocks; an instant that is seen again is at its first place.
+    later_s = drive.times_s + np.where(np.arange(30) < 15, 0.0, 1e6)
+    assert places(0.5, times_s=later_s) == [index // 5 for index in range(30)]
+    assert places(0.5, instants=[*range(15), *range(15)]) == 2 * [index // 5 for index in range(15)]

@@ -4,7 +4,6 @@ import dataclasses
 import os
 import warnings
 import zlib
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -35,7 +34,7 @@ def disk(monkeypatch, tmp_path):
         return world(self, seed, episode, ego)
 
     monkeypatch.setattr(Scenario, "world", counted)
-    return lambda: sorted((tmp_path / "cache" / "torchcover").glob("*")), built
+    return lambda: sorted((tmp_path / "cache" / "torchcover" / "worlds").glob("*")), built
 
 
 def world_of(scenario, run=0, seed=0, **keys):
@@ -224,16 +223,15 @@ def full_from_the_start(monkeypatch, tmp_path):
 
 
 def full_at_once(monkeypatch, tmp_path):
-    def write_bytes(path, content):
-        path.touch()
-        raise OSError(28, "No space left on device", str(path))
+    def full(aside, _):
+        raise OSError(28, "No space left on device", str(aside))
 
-    monkeypatch.setattr(Path, "write_bytes", write_bytes)
+    monkeypatch.setattr(stored_worlds.os, "replace", full)
 
 
 def of_others(monkeypatch, tmp_path):
-    (tmp_path / "cache" / "torchcover").mkdir(parents=True)
-    (tmp_path / "cache" / "torchcover").chmod(0o777)
+    (tmp_path / "cache" / "torchcover" / "worlds").mkdir(parents=True)
+    (tmp_path / "cache" / "torchcover" / "worlds").chmod(0o777)
 
 
 @pytest.mark.parametrize("lacks", [no_home, a_file, read_only, full_from_the_start, full_at_once, of_others])

@@ -291,7 +291,7 @@ def search(
         int | None, typer.Option(min=1, help="Candidates instead of a time: the same ones whatever the machine.")
     ] = None,
     optimiser: Annotated[
-        str, typer.Option(help="auto, gp (Gaussian process), cmaes (extra `search`), enumerate (choices) or random.")
+        str, typer.Option(help="auto, gp (Gaussian process), enumerate (choices) or random.")
     ] = "auto",
     estimate: Annotated[
         Literal["area", "known"],

@@ -50,7 +50,7 @@ def of_criterion() -> list[inspect.Parameter]:
     found = []
     for name, said in Criterion.__annotations__.items():
         kind, words = get_args(said)
-        annotation = Annotated[kind, typer.Option(f"--{name.replace('_', '-')}", help=words)]
+        annotation: Any = Annotated[kind, typer.Option(f"--{name.replace('_', '-')}", help=words)]
         usual = getattr(Criterion, name)
         found.append(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=usual, annotation=annotation))
     return found

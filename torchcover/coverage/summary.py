@@ -107,9 +107,9 @@ def summarise(coverage: "Coverage", region: Region, height: str) -> RegionSummar
     )
 
 
-def region_redundancy(sensors: Sequence[str], thresholds: Sequence[float], estimate: Estimate) -> RegionRedundancy:
+def region_redundancy(sensors: Sequence[str], thresholds: tuple[float, ...], estimate: Estimate) -> RegionRedundancy:
     """The numbers of a region without each sensor, from what `estimate_redundancy` gives."""
-    single, several = MeanOfMeans(thresholds).quantities, redundancy_quantities((), thresholds)
+    single, several = MeanOfMeans(tuple(thresholds)).quantities, redundancy_quantities((), thresholds)
     numbers, count = estimate.numbers(), len(single)
     each, change = {}, {}
     for at, sensor in enumerate(sensors):

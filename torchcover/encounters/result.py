@@ -101,7 +101,7 @@ class Sightings:
     def _row(self, name: str, rig: str, draws: list[Sighting]) -> EncounterRow:
         sensors = self.sensors[rig]
         none = np.zeros((1, len(sensors), self.phases))
-        ttc_s = np.stack([one.ttc_s for one in draws] or none[:, 0])
+        ttc_s = np.stack([one.ttc_s for one in draws] or [none[0, 0]])
         alone_s = np.mean([one.sensor_ttc_s for one in draws] or none, axis=(0, 2))
         least = np.mean if self.hours else np.min
         without_s = least([one.without_ttc_s for one in draws] or none, axis=(0, 2))

@@ -140,11 +140,11 @@ def sight_encounter(
             is_enough, look_steps(sensors[k].rate_hz, phases, staged.contact_s), criterion.looks
         ),
     )
-    ttc_s = [np.where(steps < NEVER, staged.contact_s - STEP_S * steps, 0.0) for steps in found]
+    ttc_s, alone_s, without_s = (np.where(steps < NEVER, staged.contact_s - STEP_S * steps, 0.0) for steps in found)
     longest_s = max((criterion.looks / sensor.rate_hz for sensor in sensors), default=0.0)
-    from_the_beginning = (ttc_s[0] > staged.contact_s - longest_s) & (encounter.before_s == encounter.seconds)
-    in_time = ttc_s[0] >= criterion.needed_s(encounter.closing_mps)
-    return Sighting(encounter, mounted_rig.rig.name, ttc_s[0], in_time, *ttc_s[1:], from_the_beginning)
+    from_the_beginning = (ttc_s > staged.contact_s - longest_s) & (encounter.before_s == encounter.seconds)
+    in_time = ttc_s >= criterion.needed_s(encounter.closing_mps)
+    return Sighting(encounter, mounted_rig.rig.name, ttc_s, in_time, alone_s, without_s, from_the_beginning)
 
 
 def detections(

@@ -1,6 +1,6 @@
 """Encounters that happen in traffic: who comes within a time to collision, and when sensors first had enough of him."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import NamedTuple, Self
 
@@ -17,6 +17,7 @@ from torchcover.recordings.objects import Track, class_of, objects_of
 from torchcover.recordings.recording import Recording
 from torchcover.simulation.rays import Balls
 from torchcover.simulation.simulator import Simulator
+from torchcover.simulation.traffic.fleet import REAR_OF
 from torchcover.simulation.world import World
 
 Float64 = NDArray[np.float64]
@@ -114,8 +115,12 @@ class Approach(NamedTuple):
     speed_is_swept: bool = False
 
 
-def approaches(drive: Drive, criterion: Criterion) -> Iterator[Approach]:
-    """All that happen in a drive, in the order of its tracks."""
+def approaches(drive: Drive, criterion: Criterion) -> list[Approach]:
+    """All that happen in a drive; of one in two parts, such as a lorry, that of the part which comes near first.
+
+    Not those that began before there were looks enough to detect anybody: nobody knows how late they were.
+    """
+    found: dict[str, Approach] = {}
     ego_mps = _velocities_mps(drive.times_s, drive.world_T_ego[:, :2, 3])
     speed_mps = np.linalg.norm(ego_mps, axis=1)
     ahead = ego_mps / np.where(speed_mps > 0, speed_mps, 1.0)[:, None]
@@ -133,15 +138,17 @@ def approaches(drive: Drive, criterion: Criterion) -> Iterator[Approach]:
         ttc_s = np.full(len(drive.times_s), np.inf)
         ttc_s[near] = contact_s(drive.ego.outline_m, outlines_at(outline_m, there), in_ego_mps)
         met = np.flatnonzero(ttc_s <= criterion.within_s)
-        if len(met):
+        if len(met) and met[0] >= criterion.looks - 1:
             some, first = slice(met[0], met[-1] + 1), int(met[0])
             along_mps = np.maximum((own_mps[some] * ahead[some]).sum(axis=1), 0.0)
             closing_mps = np.maximum(speed_mps[some] - along_mps, 0.0)
             needed_s = np.array([criterion.needed_s(mps) for mps in closing_mps.tolist()])
             behind = there[np.searchsorted(near, first), 0, 3] < drive.ego.lower_m[0]
             name = "from behind" if behind else who(track)
-            kmh = 3.6 * float(speed_mps[first])
-            yield Approach(track, first, ttc_s[some], needed_s, name, kmh, float(closing_mps[0]))
+            kmh, owner = 3.6 * float(speed_mps[first]), track.name.removeprefix(REAR_OF)
+            if owner not in found or first < found[owner].step:
+                found[owner] = Approach(track, first, ttc_s[some], needed_s, name, kmh, float(closing_mps[0]))
+    return list(found.values())
 
 
 def _velocities_mps(times_s: Float64, places_m: Float64) -> Float64:
@@ -254,5 +261,5 @@ def sight_approach(rig: str, drive: Drive, approach: Approach, eyes: Eyes, crite
     ttc_s, alone_s, without_s = (least_s[np.minimum(steps, end) - begin] for steps in found)
     seen = found[0] - begin
     until = int(min(seen[0], end)) + 1 if seen[0] else 0
-    in_time = (approach.ttc_s >= approach.needed_s)[:until].all(keepdims=True)
+    in_time = np.array([(approach.ttc_s >= approach.needed_s)[:until].all()])
     return Sighting(approach, rig, ttc_s, in_time, alone_s, without_s, seen == 0, drive.name)

@@ -37,8 +37,9 @@ Float64 = NDArray[np.float64]
 # What is judged where a mean would hide a step in which nothing is seen.
 JUDGED = {"points": "least_points", "sensors": "least_sensors"}
 NOTE = (
-    "A number with an error keeps a bound if all of its 95 % interval does, and does not if none of it does; else, and "
-    "where something is unknown, it is not checked. Keeping all is geometry, and no homologation."
+    "A number with an error keeps a bound if all of its 95 % interval does, and does not if none of it does; else it "
+    "is not checked, until more steps decide it. What is unknown is never kept. "
+    "Keeping all is geometry, and no homologation."
 )
 
 

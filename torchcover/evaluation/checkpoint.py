@@ -264,7 +264,8 @@ def _array(content: Mapping[str, Any], path: Path) -> Array:
     if dtype.kind not in KINDS or min(shape, default=0) < 0:
         raise ValueError(f"an array of {dtype} and the shape {shape}")
     check_memory(math.prod(shape) * dtype.itemsize)
-    return _read(path, name).view(dtype).reshape(shape)
+    array: Array = _read(path, name).view(dtype).reshape(shape)
+    return array
 
 
 def _read(path: Path, name: str) -> Array:

@@ -141,7 +141,7 @@ def met_in_traffic(
             first = number * world.steps
             drive = Drive.of_world(f"{world.name} {number}", nobody.scene_of(first)[0].world)
             hours[drive.name] = world.steps * world.step_s / 3600
-            met = list(approaches(drive, criterion))
+            met = approaches(drive, criterion)
             for name, simulator in alone.items():
                 eyes = Eyes.of_world(simulator, first, criterion)
                 sightings += [sight_approach(name, drive, one, eyes, criterion) for one in met]

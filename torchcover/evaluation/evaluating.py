@@ -85,9 +85,8 @@ def _compared(each: Sequence[Result | str | Path]) -> Result:
     source = {key: sources[0].get(key) for key in ("scenario", "vehicle", "frames", "seed")}
     source = {key: told if all(one.get(key) == told for one in sources) else None for key, told in source.items()}
     for key in ("sensor_model", "weather"):
-        each = zip(names, measured_already, strict=True)
-        of_rigs = {name: (source.get(key) or {}).get(rig) for name, (rig, *_, source) in each}
-        source[key] = of_rigs if all(of_rigs.values()) else None
+        told = [(of.get(key) or {}).get(rig) for rig, *_, of in measured_already]
+        source[key] = dict(zip(names, told, strict=True)) if all(told) else None
     return Result(
         coverages=coverages,
         regions=next(iter(coverages.values())).regions,

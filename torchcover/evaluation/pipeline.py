@@ -283,7 +283,7 @@ def made_together(indices: Iterable[int], world_of: Callable[[int], int]) -> Ite
 class FramesOrErrors(Dataset[Any]):
     """Frames; what is wrong with one stands in its place, so that it costs none of those that are made with it."""
 
-    def __init__(self, frames: Frames | MeasuredFrames) -> None:
+    def __init__(self, frames: Frames | MeasuredFrames | Dataset[Any]) -> None:
         self.frames = frames
 
     def __getitem__(self, index: int) -> Any:  # noqa: ANN401  (what the frames are, or an error)

@@ -197,7 +197,7 @@ def packed(value: object) -> Tensor:
 class _OnTheCpu(pickle.Pickler):
     def reducer_override(self, value: Any) -> Any:  # noqa: ANN401  (as pickle has it)
         if type(value) is Tensor and value.device.type != "cpu":
-            return value.cpu().__reduce_ex__(pickle.HIGHEST_PROTOCOL)
+            return value.cpu().__reduce_ex__(pickle.HIGHEST_PROTOCOL)  # type: ignore[no-untyped-call]
         return NotImplemented
 
 

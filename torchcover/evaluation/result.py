@@ -265,6 +265,23 @@ class Result:
         return [*told, sensor, *record["notes"], *self._on_refused, *self._on_repetitions]
 
     @property
+    def _on_accumulated(self) -> list[str]:
+        """What a reference that was accumulated was made of, and what was left out."""
+        assert self.run is not None  # asked of a reference that was used
+        counts, steps = self.run.counts, self.run.steps
+        if not counts["reference_sweeps"]:
+            return []
+        sweeps, skipped, rays, past, passing, hidden, movers = (
+            f"{counts[f'reference_{name}'] / steps:,.0f}"
+            for name in ("sweeps", "sweeps_skipped", "rays", "seen_past", "passing", "hidden", "movers")
+        )
+        return [
+            f"A frame's reference: {sweeps} sweeps ({skipped} skipped, beyond jumps of the pose), and {rays} rays to "
+            f"judge them; left out: {past} points that others see past, {passing} seen too shortly, {hidden} hidden from "
+            f"beside the vehicle; {movers} movers put back."
+        ]
+
+    @property
     def _on_refused(self) -> list[str]:
         """That many places of the reference sensor were refused: then it looked from few of those that it should."""
         assert self.run is not None  # asked of a reference that was used

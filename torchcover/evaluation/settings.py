@@ -9,7 +9,7 @@ from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
 from numbers import Real
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias, cast
 
 from torchcover.evaluation.arguments import Option, Read, options_of
 from torchcover.simulation.memory import check_fits
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from torchcover.frames import FrameSource
     from torchcover.simulation import RegionsOfInterest, Rig, Scenario, Weather
 
-    AnyRig = Rig | str | Path
-    AnyScenario = Scenario | str | Path
+    AnyRig: TypeAlias = Rig | str | Path
+    AnyScenario: TypeAlias = Scenario | str | Path
 
 DEFAULT_SCENARIO = "courtyard"
 DEFAULT_STEPS = 64

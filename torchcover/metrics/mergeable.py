@@ -33,8 +33,8 @@ class MergeableMetric(Metric):
     * `.to(torch.float16)` moves the sums but does not round them.
     * Under `torch.inference_mode` everything works as outside of it, and steps may be added outside afterwards.
 
-    A metric passes its parameters to `__init__`, adds its states with `add_sum` and `add_maximum`, and counts `steps`.
-    Their size is fixed; only a table (`add_table`) grows.
+    A metric passes its parameters to `__init__`, adds its states with `add_sum`, and counts `steps`. Their size is
+    fixed; only a table (`add_table`) grows.
 
     Args:
         meaning: What the sums depend on, by the name of the parameter; compared by `==` and `repr`.
@@ -98,11 +98,6 @@ class MergeableMetric(Metric):
     def add_sum(self, name: str, shape: tuple[int, ...], dtype: torch.dtype = torch.float64) -> None:
         """Add a state that starts at zero and adds up; float64 or int64, for sums grow."""
         self.add_state(name, torch.zeros((), dtype=dtype).expand(shape), dist_reduce_fx="sum", persistent=True)
-
-    def add_maximum(self, name: str, shape: tuple[int, ...]) -> None:
-        """Add a float64 state that starts at minus infinity and keeps the largest."""
-        lowest = torch.tensor(-math.inf, dtype=torch.float64).expand(shape)
-        self.add_state(name, lowest, dist_reduce_fx="max", persistent=True)
 
     def add_table(self, name: str, columns: int, reduction: Reduction | None = None) -> None:
         """Add a float64 state of rows that begin with a finite number, none at first.

@@ -122,7 +122,7 @@ def _nearest(query: Tensor, points: Tensor, max_distance: float, backend: str, m
         if len(query) == 0 or len(points) == 0:
             index = torch.full((len(query),), -1, dtype=torch.int64, device=query.device)
         else:
-            # Under autocast a matrix product would be rounded to bfloat16.
+            # Autocast is for networks: no coordinate may be rounded to bfloat16.
             with torch.no_grad(), torch.autocast(query.device.type, enabled=False):
                 scaled, among, bound = _rescale(query, points, max_distance)
                 index = search(scaled, among, _reach(bound, scaled.dtype), memory_mb)

@@ -147,7 +147,8 @@ class Arm:
 
     def _told(self) -> Float64:
         """(evaluations, objectives) what optimisers are told of: gains, less what the lacks cost."""
-        return self.gains - PENALTY * self._scale[: self._objectives] * self.lacks[:, None]
+        told: Float64 = self.gains - PENALTY * self._scale[: self._objectives] * self.lacks[:, None]
+        return told
 
     def _lacking(self, evaluation: Evaluation) -> float:
         prefixes = evaluation.prefixes

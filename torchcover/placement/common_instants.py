@@ -40,7 +40,7 @@ class HeldInstant(NamedTuple):
     world: int
 
 
-class Asked(NamedTuple):
+class AskedInstant(NamedTuple):
     """What is asked of an instant.
 
     Args:
@@ -74,7 +74,7 @@ class HeldWorlds(Dataset[Frame | MeasuredFrame]):
         self._mounted: dict[int, Simulator] = {}
         self._observers: dict[tuple[Measure, ...], Mapping[CoverageObserver, Measure]] = {}
 
-    def __getitem__(self, asked: Asked) -> Frame | MeasuredFrame:
+    def __getitem__(self, asked: AskedInstant) -> Frame | MeasuredFrame:
         frame, measures = self._frame(asked.rig, asked.number), asked.measures
         if asked.rig is None or not measures:
             return frame
@@ -215,7 +215,7 @@ class CommonInstants:
         ]
         self.instants = _instants_of([one.simulator for one in simulations], worlds, per_world)
         self.order = racing_order([instant.world for instant in self.instants], seed)
-        self._batches: list[list[Asked]] = []
+        self._batches: list[list[AskedInstant]] = []
         self._processes = min(workers, self.instants[-1].world + 1)
         self._loader = DataLoader(
             FramesOrErrors(HeldWorlds(simulations, self.instants, self.questions)),
@@ -320,7 +320,7 @@ class CommonInstants:
         for number in numbers:
             shares[self.instants[number].world % len(shares)].append(number)
         # The k-th batch goes to the k-th process, which has built these worlds.
-        self._batches[:] = [[Asked(rig, number, measures) for number in share] for share in shares]
+        self._batches[:] = [[AskedInstant(rig, number, measures) for number in share] for share in shares]
         made: dict[int, Frame | MeasuredFrame | ValueError] = {}
         try:
             for share, batch in zip(shares, self._loader, strict=True):

@@ -195,7 +195,8 @@ def fresh_test(
         SideEffect(name, test, p, shares[name])
         for (name, test), p in zip(tests.items(), holm([test.p for test in tests.values()]), strict=True)
     ]
-    return FreshTest(gains, tuple(sorted(changes, key=lambda one: (not one.is_worse, one.p, one.test.gain))))
+    changes.sort(key=lambda one: (not one.is_worse, math.isnan(one.p), one.p, one.test.gain))
+    return FreshTest(gains, tuple(changes))
 
 
 def holm(p: Sequence[float]) -> list[float]:
@@ -242,8 +243,8 @@ def _of_targets(rig: Rig, start: Rig, searched: CommonInstants) -> dict[str, Dif
             seen = survey(one.sensing("ideal"), empty, Target.load(target), raster)
             there = seen.free & (seen.distance_m <= WITHIN_M)
             # Every fourth cell along each axis is a block of its own: by them it is known what the raster leaves open.
-            row, column = np.indices(there.shape) % 4
-            of = torch.from_numpy((4 * row + column)[there])
+            rows, columns = (np.arange(count) % 4 for count in there.shape)
+            of = torch.from_numpy((4 * rows[:, None] + columns)[there])
             cells = torch.bincount(of, minlength=16)
             enough = torch.bincount(of, torch.from_numpy(seen.enough[there]).double(), minlength=16)
             quantity = Quantity(target, f"{target} seen", "share", lower_is_better=False)

@@ -93,18 +93,10 @@ class SearchPlan:
         return self.seed + 1
 
     def optimiser_in(self, space: SearchSpace) -> tuple[str, MakesOptimiser]:
-        """The optimiser and its name.
-
-        Raises:
-            ValueError: It cannot search several objectives.
-        """
+        """The optimiser and its name."""
         if not isinstance(self.optimiser, str):
             return getattr(self.optimiser, "__name__", str(self.optimiser)), self.optimiser
-        name = self.optimiser
-        if name == AUTO:
-            name = optimiser_for(levels_of(space), len(space.objectives))
-        if name == "cmaes" and len(space.objectives) > 1:
-            raise ValueError("optimiser cmaes: it follows one objective; for several use gp or random")
+        name = optimiser_for(levels_of(space)) if self.optimiser == AUTO else self.optimiser
         return name, OPTIMISERS[name]
 
     def settings(self, space: SearchSpace) -> dict[str, Any]:

@@ -22,8 +22,6 @@ from torchcover.placement.space import SearchSpace
 
 # What is drawn by the control is nothing that the optimiser draws.
 SEEDS = {OPTIMISER: 0, RANDOM: 1}
-# Of what is not kept only somewhere, or not checked, as a share.
-LEAST_LACK = 1e-3
 
 
 class PlacementSearch:
@@ -122,8 +120,8 @@ class PlacementSearch:
         self._check_turn(candidate)
         wrong = [] if candidate.number else list(self.space.violations(self.space.start))
         wrong += [why] if (why := self._too_many_self_hits(prefixes[-1])) else []
-        found = {"prefixes": prefixes, "infeasible": "; ".join(wrong), "lacks": lacks, "seconds": seconds}
-        self._note(replace(candidate, rig=None, **found))
+        why = "; ".join(wrong)
+        self._note(replace(candidate, rig=None, prefixes=prefixes, infeasible=why, lacks=lacks, seconds=seconds))
 
     def refuse(self, candidate: Evaluation, why: str, *, seconds: float = 0.0) -> None:
         """Say that a candidate cannot be.
@@ -160,7 +158,10 @@ class PlacementSearch:
                 return
 
     def _lacks(self, candidate: Evaluation, prefixes: Sequence[Prefix]) -> float:
-        """Of what bodies and encounters require; looked at where it decides, as it takes as long as the rest."""
+        """Of what bodies and encounters require; looked at where it decides, as it takes as long as the rest.
+
+        Of each bound that is not kept, the mean of the share of places that do not keep it and of what the worst lacks.
+        """
         required = self.space.to_check
         if required is None or (candidate.number and not self.arms[candidate.arm].may_lead(prefixes)):
             return 0.0
@@ -168,8 +169,10 @@ class PlacementSearch:
         ego = self.space.scenarios[0].ego
         world = required.scenario or free_space().model_copy(update={"ego": ego})
         (found,) = check(candidate.rig, required, world, sensor_model=self.plan.sensor_model).verdicts.values()
-        lost = [-one.margin / (abs(one.bound.value) or 1.0) for one in found if one.state != "kept"]
-        return float(sum(1.0 if math.isnan(one) else max(one, LEAST_LACK) for one in lost))
+        broken = [one for one in found if one.state != "kept"]
+        worst = (-one.margin / (abs(one.bound.value) or 1.0) for one in broken)
+        at_worst = sum(1.0 if math.isnan(one) else max(one, 0.0) for one in worst)
+        return float(at_worst + sum((one.failed + one.unknown) / max(one.count, 1) for one in broken)) / 2
 
     def state_dict(self) -> dict[str, Any]:
         """All that a checkpoint keeps: the evaluations."""

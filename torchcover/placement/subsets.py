@@ -117,7 +117,7 @@ class Candidates:
         rows = np.packbits(np.stack(seen), axis=0)  # eight candidates a byte
         counts = ~always & rows.any(axis=0) & worth.any(axis=0)
         groups, of = np.unique(rows[:, counts].T, axis=0, return_inverse=True)
-        sums = np.stack([np.bincount(of.reshape(-1), row, len(groups)) for row in worth[:, counts]])
+        sums = np.stack([np.bincount(of.reshape(-1), row, len(groups)) for row in worth[:, counts]]).astype(np.float64)
         sees = np.unpackbits(groups, axis=1, count=len(seen)).astype(bool)
         return cls(sees, sums, worth[:, always].sum(axis=1))
 
@@ -131,7 +131,7 @@ class Candidates:
         return np.array([self.values(chosen) - self.values(some) for some in rest])
 
 
-def best(candidates: Candidates, limits: Limits, weights: Sequence[float] = (1.0,)) -> Subset:
+def best(candidates: Candidates, limits: Limits, weights: Sequence[float] | Float64 = (1.0,)) -> Subset:
     """The best subset, and of equal ones the cheapest.
 
     Args:
@@ -187,7 +187,7 @@ class _Goal:
     ties: Float64
 
     @classmethod
-    def of(cls, candidates: Candidates, limits: Limits, weights: Sequence[float]) -> Self:
+    def of(cls, candidates: Candidates, limits: Limits, weights: Sequence[float] | Float64) -> Self:
         numbers, count = len(candidates.worth), candidates.sees.shape[1]
         prices = np.array(limits.prices or np.zeros(count)) + EACH
         every = np.zeros(numbers)

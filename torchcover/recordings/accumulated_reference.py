@@ -1,7 +1,7 @@
 """A reference made of a recording itself: what all sensors saw within some time."""
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +10,21 @@ from torchcover.detection import Boxes
 from torchcover.geometry import BoundingBox, invert, transform
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.in_vehicle import InVehicle, within
+from torchcover.recordings.movers import COMPARED_S, WITHIN_M, Moved, movers
 from torchcover.recordings.recording import Recording
-from torchcover.recordings.sweeps import Sweeps, first_of_each, pose_of
+from torchcover.recordings.seen_past import Key
+from torchcover.recordings.sweeps import Sweeps, Thinned, first_of_each, pose_of
+from torchcover.recordings.visible import seen_share, square_metres
+
+# So many scans have to see past a point.
+VOTES = 2
+# What stands is seen for at least so long, or half of the time that was looked at; what is no higher is the ground.
+STANDS_S, ON_GROUND_M = 1.0, 0.3
+SEEN_AGAIN = 0.2
+# What is slower stands; of fewer points, its velocity is a guess.
+MOVES_MPS, KNOWN_POINTS = 0.5, 50
+# Where a recording does not say how large its vehicle is.
+USUAL_BODY = BoundingBox((-2.4, -0.95, 0.0), (2.4, 0.95, 1.7))
 
 
 class AccumulatedReference:
@@ -82,44 +95,95 @@ class AccumulatedReference:
         Raises:
             OSError, ValueError: A scan cannot be read, or no point is left.
         """
-        sweeps, vehicle_T_local = self._sweeps, invert(self._sweeps.local_T_vehicle(recording, index))
-        boxes = _by_name(recording.boxes(index))
-        still, voxels, moved, dropped = [], [], [], Counter[str]()
+        sweeps, local_T_vehicle = self._sweeps, self._sweeps.local_T_vehicle(recording, index)
+        sensors = self._taking_part(recording)
+        votes = sweeps.votes(recording, sensors, index)
+        scans = {key: sweeps.thinned(recording, *key) for key in votes if key[1] != index or key[0] not in judged}
+        within = set(sweeps.instants(recording, index))
+        boxes, dropped = _by_name(recording.boxes(index)), Counter[str]()
+        used = [key for key in scans if key[1] in within]
+        dropped["sweeps"] = len(used)
+        if skipped := sweeps.skipped(recording, index):
+            dropped["sweeps_skipped"] = len(sensors) * skipped
         of_box: dict[str, list[NDArray[np.float64]]] = {}
-        for sensor, instant in self._scans(recording, index, judged):
-            scan = sweeps.thinned(recording, sensor, instant)
-            still.append(scan.still_m)
-            voxels.append(scan.voxel)
-            dropped += scan.dropped
-            dropped["gone"] += scan.unnamed
-            for name, points_m in scan.of_box.items():
+        for key in used:
+            dropped += scans[key].dropped
+            dropped["gone"] += scans[key].unnamed
+            for name, points_m in scans[key].of_box.items():
                 of_box.setdefault(name, []).append(points_m)
-        for name, parts in of_box.items():
-            points_m = np.concatenate(parts)
-            if name not in boxes:
+        parts = []
+        for name, boxed in of_box.items():
+            points_m = np.concatenate(boxed)
+            if name in boxes:
+                parts.append(transform(boxes[name], points_m[first_of_each(sweeps.voxel(points_m))]))
+            else:
                 dropped["gone"] += len(points_m)
-                continue
-            moved.append(transform(boxes[name], points_m[first_of_each(sweeps.voxel(points_m))]))
-        first = np.sort(first_of_each(np.concatenate([np.empty(0, np.int64), *voxels])))
-        ends = np.cumsum([0, *map(len, still)])
-        kept = np.split(first, np.searchsorted(first, ends[1:-1]))
-        placed = [
-            transform(vehicle_T_local, points_m.take(own - start, axis=0))
-            for points_m, own, start in zip(still, kept, ends[:-1], strict=False)
-        ]
-        parts = [np.empty((0, 3), np.float32)]
-        for points_m in (*placed, *moved):
-            own = _beneath_or_in(points_m, recording.body)
-            dropped["own_vehicle"] += len(own)
-            parts.append((np.delete(points_m, own, axis=0) if len(own) else points_m).astype(np.float32))
-        reference_m: NDArray[np.float32] = np.concatenate(parts)
-        if not len(reference_m):
+        passing = self._passing(recording, index, scans)
+        loose = {key: (votes[key] >= VOTES) | passing[key] for key in scans}
+        dropped["rays"] = sum(len(scan.still_m) for scan in scans.values() if scan.image is not None)
+        dropped["seen_past"] = sum(int((votes[key] >= VOTES).sum()) for key in used)
+        dropped["passing"] = sum(int((passing[key] & (votes[key] < VOTES)).sum()) for key in used)
+        found = self._movers(recording, index, {key: scan.still_m[loose[key]] for key, scan in scans.items()})
+        dropped["movers"] = sum(
+            len(mover.points_m) >= KNOWN_POINTS and bool(np.linalg.norm(mover.velocity_mps) > MOVES_MPS)
+            for mover in found
+        )
+        local_m = np.concatenate(
+            [np.empty((0, 3)), *(scans[key].still_m[~loose[key]] for key in used), *(mover.points_m for mover in found)]
+        )
+        local_m = local_m[first_of_each(sweeps.voxel(local_m))]
+        points_m = np.concatenate([transform(invert(local_T_vehicle), local_m), *parts])
+        own = _beneath_or_in(points_m, recording.body)
+        dropped["own_vehicle"] += len(own)
+        points_m = np.ascontiguousarray(np.delete(points_m, own, axis=0))
+        share = seen_share(points_m, recording.body or USUAL_BODY, self.voxel_m, index)
+        dropped["hidden"] = int((share == 0).sum())
+        points_m, share = points_m[share > 0], share[share > 0]
+        if not len(points_m):
             raise ValueError(f"no reference point is left of the scans within {self.window_s / 2:g} s of this instant")
-        return InVehicle(reference_m, dropped)
+        weights = (square_metres(points_m) * share).astype(np.float32)
+        return InVehicle(points_m.astype(np.float32), dropped, weights)
+
+    def _passing(self, recording: Recording, index: int, scans: Mapping[Key, Thinned]) -> dict[Key, NDArray[np.bool_]]:
+        """Of the points of each scan, those above ground where nothing is seen for long."""
+        times_s = np.zeros(len(recording.names)) if recording.times_s is None else recording.times_s
+        lengths = [len(scan.cells[0]) for scan in scans.values()]
+        cells = np.concatenate([np.empty(0, np.int64), *(scan.cells[0] for scan in scans.values())])
+        instants, rank = np.unique([instant for _, instant in scans], return_inverse=True)
+        number, of_cell = np.unique(cells, return_inverse=True)
+        seen = np.unique(of_cell * len(instants) + np.repeat(rank, lengths))
+        start = np.searchsorted(seen, np.arange(len(number)) * len(instants))
+        count = np.diff(np.append(start, len(seen)))
+        first, last = seen[start] % len(instants), seen[start + count - 1] % len(instants)
+        least_s = min(STANDS_S, np.ptp(times_s[instants]) / 2) if len(instants) else 0.0
+        shortly = times_s[instants[last]] - times_s[instants[first]] < least_s - 1e-6
+        shortly |= count < SEEN_AGAIN * (last - first + 1)
+        short = np.split(shortly[of_cell], np.cumsum(lengths))
+        ground, found = self._sweeps.ground(recording, index), {}
+        for (key, scan), of_scan in zip(scans.items(), short, strict=False):
+            passing = of_scan[scan.cells[1]]
+            if ground is not None:
+                rows = np.flatnonzero(passing)
+                passing[rows] = ~(ground.heights_m(scan.still_m[rows]) <= ON_GROUND_M)
+            found[key] = passing
+        return found
+
+    def _movers(self, recording: Recording, index: int, loose_m: Mapping[Key, NDArray[np.float64]]) -> list[Moved]:
+        """What moves around the instant."""
+        if recording.times_s is None:
+            return []
+        place_m = self._sweeps.local_T_vehicle(recording, index)[:2, 3]
+        near_m, apart_s = [], []
+        for (_, instant), points_m in loose_m.items():
+            since_s = recording.times_s[instant] - recording.times_s[index]
+            if abs(since_s) <= COMPARED_S:
+                near_m.append(points_m[np.linalg.norm(points_m[:, :2] - place_m, axis=1) < WITHIN_M])
+                apart_s.append(since_s)
+        return movers(near_m, np.array(apart_s))
 
     def square_metres(self, recording: Recording) -> bool:
-        """No: one point a voxel, which all count the same."""
-        return False
+        """Yes: what lies between the nearest points of each."""
+        return True
 
     def record(self, recording: Recording, judged: Collection[str]) -> Mapping[str, object]:
         """Settings, and what such a reference cannot know."""
@@ -145,13 +209,6 @@ class AccumulatedReference:
 
     def _taking_part(self, recording: Recording) -> tuple[str, ...]:
         return tuple(recording.sensors) if self.sensors is None else self.sensors
-
-    def _scans(self, recording: Recording, index: int, judged: Collection[str]) -> Iterator[tuple[str, int]]:
-        """Sensor and instant of each scan, the nearest in time first."""
-        for instant in self._sweeps.instants(recording, index):
-            for sensor in self._taking_part(recording):
-                if instant != index or sensor not in judged:
-                    yield sensor, instant
 
 
 def _by_name(boxes: Boxes | None) -> dict[str, Matrix]:

@@ -5,6 +5,7 @@ import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -215,7 +216,7 @@ class RecordedFrames(FrameDataset):
             reference_weights=None if reference.weights is None else torch.from_numpy(reference.weights),
             reference_heights_m=None if heights_m is None else torch.from_numpy(heights_m),
             boxes=boxes,
-            place_in_time=position if self.recording.instants is None else self.recording.instants[instant],
+            place_in_time=self._places_in_time[position],
             sensor_points={
                 rig: {sensor: len(scans[sensor].points_m) for sensor in of} for rig, of in self.sensors_of_rigs.items()
             },
@@ -226,6 +227,17 @@ class RecordedFrames(FrameDataset):
         """The sensors of all rigs, each once."""
         return tuple(dict.fromkeys(sensor for of in self.sensors_of_rigs.values() for sensor in of))
 
+    @cached_property
+    def _places_in_time(self) -> Sequence[int]:
+        """Of each frame; those within one window share most of their reference points, and so a place."""
+        frames, recording, window_s = list(self.recording.frames), self.recording, self._sweeps.window_s
+        places = list(range(len(frames))) if recording.instants is None else [recording.instants[at] for at in frames]
+        if not window_s or recording.times_s is None or not frames:
+            return places
+        windows = np.floor((recording.times_s[frames] - recording.times_s[frames[0]]) / window_s + 1e-6)
+        first = dict(zip(reversed(places), reversed(windows.tolist()), strict=True))  # of an instant that is seen again
+        return np.unique([first[place] for place in places], return_inverse=True)[1].tolist()
+
     def _read(self, sensor: str, instant: int) -> InVehicle:
         return in_vehicle(self.recording.scan(sensor, instant), self.recording.body)
 
@@ -233,12 +245,15 @@ class RecordedFrames(FrameDataset):
         self, instant: int, reference: InVehicle, boxes: Boxes | None
     ) -> tuple[NDArray[np.float32] | None, Boxes | None]:
         """The heights of the reference points, and the boxes with those of their bottoms."""
-        # Points with square metres, but without heights, were drawn for bands over z.
-        if reference.heights_m is not None or reference.weights is not None or not self.ground:
+        # Recorded points with square metres, but without heights, were drawn for bands over z.
+        drawn = reference.weights is not None and isinstance(self.reference, RecordedReference)
+        if reference.heights_m is not None or drawn or not self.ground:
             return reference.heights_m, boxes
         ground = self._sweeps.ground(self.recording, instant)
         self._modelled = True
         if ground is None:
+            if self._has_heights is False:
+                return None, boxes  # nowhere, so that bands are over z
             return np.full(len(reference.points_m), np.nan, dtype=np.float32), boxes
         local_T_vehicle = self._sweeps.local_T_vehicle(self.recording, instant)
         if boxes is not None:

@@ -1,7 +1,7 @@
 """Scans around an instant, thinned, in one frame that does not move: what references and the ground are made of."""
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -15,12 +15,21 @@ from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.ground_model import GroundModel, low_surfaces
 from torchcover.recordings.in_vehicle import in_vehicle
 from torchcover.recordings.recording import Recording
+from torchcover.recordings.seen_past import Key, RangeImage, Votes
 
 # Voxels are numbered with so many bits an axis: 200 km at 0.1 m.
 VOXEL_BITS = 21
 # Boxes that were drawn by hand leave out mirrors and corners: what is so near to the sides belongs to the object, as in
 # the published scene flow of Argoverse 2 (0.2 m in length and width).
 BESIDE_BOX_M = 0.1
+# What lies in the window is judged by scans so much before and after it, too; by the rays of one in so much time.
+MARGIN_S, RAYS_EVERY_S = 1.0, 0.2
+# Of a drive with so few instants, those of all.
+SHORT = 20
+# Cells in which a thing that stands is seen again.
+CELL_M = 0.6
+# A vehicle that is so much faster or slower between two instants than between most has not moved: its pose has.
+JUMP_MPS = 15.0
 
 
 @dataclass(frozen=True)
@@ -35,6 +44,7 @@ class Thinned:
         unnamed: Points in boxes without a name, which cannot be found again.
         dropped: As `InVehicle.dropped`.
         place_m: (3,) where the vehicle was, likewise.
+        image: How far the scan has seen; None if its rays are not asked for.
     """
 
     still_m: NDArray[np.float64]
@@ -43,6 +53,12 @@ class Thinned:
     unnamed: int
     dropped: Counter[str]
     place_m: NDArray[np.float64]
+    image: RangeImage | None
+
+    @cached_property
+    def cells(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """(K,) numbers of the cells in which it has points, and (N,) in which of these each of `still_m` is."""
+        return np.unique(voxels(self.still_m, CELL_M), return_inverse=True)
 
     @cached_property
     def low_surfaces(self) -> NDArray[np.float64]:
@@ -61,22 +77,63 @@ class Sweeps:
     def __init__(self, window_s: float = 2.0, voxel_m: float = 0.1) -> None:
         self.window_s = window_s
         self.voxel_m = voxel_m
-        self._kept: dict[tuple[str, int], Thinned] = {}
+        self._forget()
+
+    def _forget(self) -> None:
+        self._kept: dict[Key, Thinned] = {}
         self._kept_of: Recording | None = None
+        self._votes = Votes()
+        self._ground: tuple[int, GroundModel | None] | None = None
 
     def __getstate__(self) -> dict[str, object]:
-        return {**vars(self), "_kept": {}, "_kept_of": None}
+        return {"window_s": self.window_s, "voxel_m": self.voxel_m}
 
-    def instants(self, recording: Recording, index: int) -> list[int]:
-        """The instants of the window, the nearest in time first: the one alone where times or poses are unknown."""
-        near = [index]
-        if self.window_s and recording.times_s is not None and recording.world_T_vehicle(index) is not None:
-            apart_s = np.abs(recording.times_s - recording.times_s[index])
-            within = np.flatnonzero(apart_s <= self.window_s / 2 * (1 + 1e-9))
-            near = within[np.argsort(apart_s[within], kind="stable")].tolist()
-        of_recording = self._kept if recording is self._kept_of else {}
-        self._kept_of, self._kept = recording, {key: scan for key, scan in of_recording.items() if key[1] in near}
-        return near
+    def __setstate__(self, state: dict[str, object]) -> None:
+        vars(self).update(state)
+        self._forget()
+
+    def instants(self, recording: Recording, index: int, margin_s: float = 0.0) -> list[int]:
+        """The instants of the window, the nearest in time first: the one alone where times or poses are unknown.
+
+        Args:
+            recording: The recording.
+            index: The instant.
+            margin_s: So much before and after the window, too.
+        """
+        if not self.window_s or recording.times_s is None or recording.world_T_vehicle(index) is None:
+            return [index]
+        apart_s = np.abs(recording.times_s - recording.times_s[index])
+        near = np.flatnonzero(apart_s <= (self.window_s / 2 + margin_s) * (1 + 1e-9))
+        places_m = np.array([_pose(recording, instant)[:3, 3] for instant in near])
+        speeds_mps = np.linalg.norm(np.diff(places_m, axis=0), axis=1) / np.diff(recording.times_s[near])
+        jumps = np.flatnonzero(np.abs(speeds_mps - np.median(speeds_mps)) > JUMP_MPS) if len(speeds_mps) else near[:0]
+        own = int(np.searchsorted(near, index))
+        near = near[max(jumps[jumps < own] + 1, default=0) : min(jumps[jumps >= own] + 1, default=len(near))]
+        return near[np.argsort(apart_s[near], kind="stable")].tolist()
+
+    def skipped(self, recording: Recording, index: int) -> int:
+        """How many instants of the window are left out, for the pose jumps between them and this one."""
+        if recording.times_s is None:
+            return 0
+        apart_s = np.abs(recording.times_s - recording.times_s[index])
+        return int((apart_s <= self.window_s / 2 * (1 + 1e-9)).sum()) - len(self.instants(recording, index))
+
+    def keep(self, recording: Recording, instants: Sequence[int]) -> None:
+        """Forget all scans but those of some instants."""
+        if recording is not self._kept_of:
+            self._forget()
+        near = set(instants)
+        self._kept_of, self._kept = recording, {key: scan for key, scan in self._kept.items() if key[1] in near}
+
+    def votes(self, recording: Recording, sensors: Sequence[str], index: int) -> dict[Key, NDArray[np.int16]]:
+        """How many scans see past each point, of the scans of the window and its margins."""
+        instants = self.instants(recording, index, MARGIN_S)
+        self.keep(recording, instants)
+        scans = {
+            (sensor, instant): self.thinned(recording, sensor, instant) for instant in instants for sensor in sensors
+        }
+        images = {key: scan.image for key, scan in scans.items() if scan.image is not None}
+        return self._votes.of({key: scan.still_m for key, scan in scans.items()}, images)
 
     def local_T_vehicle(self, recording: Recording, index: int) -> Matrix:
         """Where the vehicle was: in the world, from the first place of the drive, for coordinates may be too large."""
@@ -85,19 +142,22 @@ class Sweeps:
     def ground(self, recording: Recording, index: int) -> GroundModel | None:
         """What all sensors have seen of the ground within the window; None where there is none near the vehicle."""
         sensors = (*recording.sensors, *recording.reference_sensors)
-        scans = [
-            self.thinned(recording, sensor, instant)
-            for instant in self.instants(recording, index)
-            for sensor in sensors
-        ]
-        return GroundModel.below([scan.low_surfaces for scan in scans], self.local_T_vehicle(recording, index)[:3, 3])
+        if self._kept_of is not recording or self._ground is None or self._ground[0] != index:
+            instants = self.instants(recording, index)
+            if self._kept_of is not recording or not {key[1] for key in self._kept} >= set(instants):
+                self.keep(recording, instants)
+            scans = [self.thinned(recording, sensor, instant) for instant in instants for sensor in sensors]
+            surfaces = [scan.low_surfaces for scan in scans]
+            self._ground = index, GroundModel.below(surfaces, self.local_T_vehicle(recording, index)[:3, 3])
+        return self._ground[1]
 
     def thinned(self, recording: Recording, sensor: str, index: int) -> Thinned:
         """A scan of the window."""
         key = (sensor, index)
         if key in self._kept:
             return self._kept[key]
-        scan = in_vehicle(recording.scan(sensor, index), recording.body)
+        stored = recording.scan(sensor, index)
+        scan = in_vehicle(stored, recording.body)
         points_m = scan.points_m.astype(np.float64)
         boxes = recording.boxes(index)
         in_box = np.zeros(len(points_m), dtype=bool)
@@ -116,15 +176,26 @@ class Sweeps:
         still_m = transform(local_T_vehicle, points_m[~in_box])
         voxel = self.voxel(still_m)
         first = first_of_each(voxel)
-        thinned = Thinned(still_m[first], voxel[first], of_box, unnamed, scan.dropped, local_T_vehicle[:3, 3])
+        image = None
+        if self.window_s and _casts_rays(recording, index):
+            mount = np.eye(4) if stored.vehicle_T_sensor is None else stored.vehicle_T_sensor
+            seen_m = transform(invert(mount), points_m)
+            image = RangeImage.of(seen_m, invert(local_T_vehicle @ mount))
+        place_m = local_T_vehicle[:3, 3]
+        thinned = Thinned(still_m[first], voxel[first], of_box, unnamed, scan.dropped, place_m, image)
         self._kept[key] = thinned
         return thinned
 
     def voxel(self, points_m: NDArray[np.float64]) -> NDArray[np.int64]:
         """(N,) number of the voxel of each point."""
-        x, y, z = (np.floor(points_m / self.voxel_m).astype(np.int64) & ((1 << VOXEL_BITS) - 1)).T
-        numbers: NDArray[np.int64] = (x << 2 * VOXEL_BITS) | (y << VOXEL_BITS) | z
-        return numbers
+        return voxels(points_m, self.voxel_m)
+
+
+def voxels(points_m: NDArray[np.float64], side_m: float) -> NDArray[np.int64]:
+    """(N,) number of the voxel of each of (N, 3) points."""
+    x, y, z = (np.floor(points_m / side_m).astype(np.int64) & ((1 << VOXEL_BITS) - 1)).T
+    numbers: NDArray[np.int64] = (x << 2 * VOXEL_BITS) | (y << VOXEL_BITS) | z
+    return numbers
 
 
 def first_of_each(numbers: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -139,6 +210,14 @@ def pose_of(boxes: Boxes, number: int) -> Matrix:
     """`vehicle_T_box` of one of them."""
     yaw_deg = float(np.rad2deg(boxes.yaw_rad[number].item()))
     return rigid(rotation_from_euler(yaw_deg, 0.0, 0.0), boxes.centre_m[number].double().numpy())
+
+
+def _casts_rays(recording: Recording, index: int) -> bool:
+    """Whether it is the first instant of its time, so that it does not depend on which one is asked about."""
+    times_s = recording.times_s
+    if times_s is None or index == 0 or len(times_s) <= SHORT:
+        return True
+    return bool(np.diff(np.floor((times_s[index - 1 : index + 1] - times_s[0]) / RAYS_EVERY_S + 1e-6))[0])
 
 
 def _pose(recording: Recording, index: int) -> Matrix:

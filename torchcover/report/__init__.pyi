@@ -41,11 +41,9 @@ from .renderers import RENDERERS as RENDERERS
 from .renderers.json_file import json_record as json_record
 from .renderers.json_file import table_dict as table_dict
 from .renderers.layout import BOLD_MARKS as BOLD_MARKS
-from .renderers.layout import PLACE_HEADINGS as PLACE_HEADINGS
 from .renderers.layout import PageTable as PageTable
 from .renderers.layout import Words as Words
 from .renderers.layout import parts_of as parts_of
-from .renderers.markdown_file import as_markdown as as_markdown
 from .renderers.text_file import print_table as print_table
 from .renderers.text_file import print_whole as print_whole
 from .table import CoverageTable as CoverageTable

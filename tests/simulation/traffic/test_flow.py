@@ -19,7 +19,7 @@ from torchcover.simulation.traffic.signals import CROSS, MAIN, Gate, Signals
 
 TIMES_S = np.arange(0.0, 60.0, 0.1)
 CAR = Driver(14.0)
-LONG = Polyline.straight((0, 0), 0.0, 2000.0)
+LONG = Polyline(np.array([[0.0, 0.0], [2000.0, 0.0]]))
 
 
 def car(lane, place, driver=CAR):
@@ -68,7 +68,7 @@ def test_who_cannot_stop_goes_on_and_is_through_before_the_others_get_green():
 def test_waits_for_somebody_left_on_the_junction_in_spite_of_green():
     lanes = [
         Lane(LONG, (Gate(200.0, 225.0, 0, MAIN),)),
-        Lane(Polyline.straight((0, 0), 90.0, 2000.0), (Gate(200.0, 225.0, 0, CROSS),)),
+        Lane(Polyline(np.array([[0.0, 0.0], [0.0, 2000.0]])), (Gate(200.0, 225.0, 0, CROSS),)),
     ]
     stuck = car(1, 210.0, Driver(0.5))
     flow = run(lanes, [car(0, 100.0), stuck], green_s=(50.0, 10.0))
@@ -171,7 +171,7 @@ def twin(lanes, agents, lights, times_s):
 def test_all_together_are_that_many_single_ones():
     generator = np.random.default_rng(0)
     gates = [Gate(200.0, 225.0, 0, MAIN), Gate(260.0, 285.0, 1, MAIN, green_needed_s=4.0)]
-    crossing = Polyline.straight((0, 0), 90.0, 2000.0)
+    crossing = Polyline(np.array([[0.0, 0.0], [0.0, 2000.0]]))
     lanes = [
         Lane(LONG, tuple(gates)),
         Lane(crossing, (Gate(200.0, 225.0, 0, CROSS),)),

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 
-from torchcover.placement.optimisers.cma_es import CmaEs
 from torchcover.placement.optimisers.enumeration import MOST_COMBINATIONS, Enumeration
 from torchcover.placement.optimisers.gaussian_process import GaussianProcessSearch
 from torchcover.placement.optimisers.optimiser import Cube, Optimiser
@@ -12,36 +11,29 @@ MakesOptimiser = Callable[[Cube, int], Optimiser]
 
 OPTIMISERS: dict[str, MakesOptimiser] = {
     "gp": GaussianProcessSearch,
-    "cmaes": CmaEs,
     "random": RandomSearch,
     "enumerate": Enumeration,
 }
 AUTO = "auto"
-# Above, a Gaussian process learns too little from the values that a search can pay for.
-MOST_NUMBERS_OF_GP = 6
 
 
-def optimiser_for(levels: tuple[int, ...], objectives: int) -> str:
+def optimiser_for(levels: tuple[int, ...]) -> str:
     """What `auto` means.
 
     Args:
         levels: As of `Cube`.
-        objectives: How many.
 
     Example:
-        >>> optimiser_for((0, 0, 0), 1), optimiser_for((0,) * 16, 1), optimiser_for((12, 12), 1)
-        ('gp', 'cmaes', 'enumerate')
+        >>> optimiser_for((0, 0, 0)), optimiser_for((12, 12))
+        ('gp', 'enumerate')
     """
     combinations = Cube(levels).combinations
-    if combinations is not None and combinations <= MOST_COMBINATIONS:
-        return "enumerate"
-    return "cmaes" if objectives == 1 and levels.count(0) > MOST_NUMBERS_OF_GP else "gp"
+    return "enumerate" if combinations is not None and combinations <= MOST_COMBINATIONS else "gp"
 
 
 __all__ = [
     "AUTO",
     "OPTIMISERS",
-    "CmaEs",
     "Cube",
     "Enumeration",
     "GaussianProcessSearch",

@@ -15,8 +15,10 @@ from torchcover.placement.optimisers.optimiser import Cube, Unit
 FIRST = 3
 # Of more values, the model has the highest and the last: it costs their third power.
 HIGHEST, LAST = 200, 600
-SCATTERED, KEPT, AROUND, ROUNDS = 1024, 8, 64, 6
+SCATTERED, KEPT, AROUND, ROUNDS = 512, 8, 32, 4
 FIRST_WIDTH, OTHER_OPTION = 0.1, 0.2
+# How many more values there are when the hyperparameters are learnt again.
+GROWTH = 1.2
 # From the median down, in units of what the best is above it.
 FAR_DOWN = 2.0
 # Below, φ(z) + z Φ(z) is φ(z) / z² to five digits, and a difference of the two has none left.
@@ -46,6 +48,7 @@ class GaussianProcessSearch:
         self._places: list[Unit] = []
         self._values: list[float] = []
         self._errors: list[float] = []
+        self._like: tuple[int, GaussianProcess] | None = None
         if cube.start is not None:
             self._note(cube.snapped(cube.start), 0.0, 0.0)
         self._before = len(self._places)
@@ -66,16 +69,25 @@ class GaussianProcessSearch:
 
     def model(self) -> GaussianProcess | None:
         """What it has learnt; None before the first value. Where no rig can be, the lowest value stands."""
-        values = np.array(self._values)
-        if not np.isfinite(values).any():
+        if not np.isfinite(self._values).any():
             return None
+        # To learn the hyperparameters takes most of the time; they hardly change before there is a fifth more to know.
+        steps = math.floor(math.log(len(self._values)) / math.log(GROWTH) + 1e-9)
+        first = max(math.ceil(GROWTH**steps - 1e-9), int(np.flatnonzero(np.isfinite(self._values))[0]) + 1)
+        if self._like is None or self._like[0] != first:
+            self._like = first, self._fitted(min(first, len(self._values)), None)
+        return self._fitted(len(self._values), self._like[1])
+
+    def _fitted(self, count: int, like: GaussianProcess | None) -> GaussianProcess:
+        """Of the first values."""
+        values = np.array(self._values[:count])
         values = np.where(np.isnan(values), np.nanmin(values), values)
         # How bad the worst are tells nothing of where the best is, but would be most of what is learnt.
         values = values.clip(np.median(values) - FAR_DOWN * (values.max() - np.median(values)))
         kept = np.union1d(np.argsort(-values, kind="stable")[:HIGHEST], np.arange(len(values))[-LAST:])
-        each = (torch.from_numpy(np.array(told)[kept]) for told in (self._places, values, self._errors))
+        places, errors = (torch.from_numpy(np.array(told)[kept]) for told in (self._places, self._errors))
         with _one_thread():
-            return GaussianProcess.fitted(self._cube.levels, *each)
+            return GaussianProcess.fitted(self._cube.levels, places, torch.from_numpy(values[kept]), errors, like)
 
     def _note(self, unit: Unit, value: float, error: float) -> None:
         self._places.append(np.asarray(unit, dtype=np.float64))

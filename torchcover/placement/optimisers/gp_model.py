@@ -48,7 +48,9 @@ class GaussianProcess:
     weights: Tensor
 
     @classmethod
-    def fitted(cls, levels: tuple[int, ...], places: Tensor, values: Tensor, errors: Tensor) -> Self:
+    def fitted(
+        cls, levels: tuple[int, ...], places: Tensor, values: Tensor, errors: Tensor, like: Self | None = None
+    ) -> Self:
         """Learn the hyperparameters: the maximum of the marginal likelihood with a weak prior, from several starts.
 
         Rasmussen and Williams 2006, Gaussian Processes for Machine Learning, algorithm 2.1 and section 5.4.
@@ -58,6 +60,7 @@ class GaussianProcess:
             places: (n, variables) float64, n of 1 or more; duplicates may be among them.
             values: (n,) float64, finite.
             errors: (n,) float64, the standard error of each; 0 for an exact one.
+            like: One whose hyperparameters are taken instead.
 
         Example:
             >>> x = torch.linspace(0, 1, 9, dtype=torch.float64)[:, None]
@@ -72,9 +75,11 @@ class GaussianProcess:
         standard, noise = (values - shift) / scale, (errors / scale).square()
         if scale != spread:
             standard = torch.zeros_like(standard)
-        some = torch.linspace(0, len(values) - 1, min(len(values), MOST_LEARNT_FROM)).round().long()
-        apart = _squared_apart(levels, places[some], places[some])
-        learnt = _learnt(apart, standard[some], noise[some])
+        if like is None:
+            some = torch.linspace(0, len(values) - 1, min(len(values), MOST_LEARNT_FROM)).round().long()
+            learnt = _learnt(_squared_apart(levels, places[some], places[some]), standard[some], noise[some])
+        else:
+            learnt = like.log_lengths, like.log_signal, like.log_noise
         kernel = _kernel(_squared_apart(levels, places, places), *learnt[:2])
         cholesky = _factor(kernel + torch.diag(noise + learnt[2].exp() + LEAST_NOISE))
         weights = torch.cholesky_solve(standard[:, None], cholesky)[:, 0]

@@ -20,6 +20,7 @@ from torchcover.report.wording import (
 
 MAX_HEADING_CHARS = 16
 PLACE_HEADINGS = ("region", "height")
+PLACES = len(PLACE_HEADINGS)
 # What the marks look like, and what the legend calls that, where text may be bold.
 BOLD_MARKS: Mapping[str, str] = MappingProxyType({"best": "In bold", "significant": "In bold among the differences"})
 
@@ -37,11 +38,10 @@ class PageTable:
 
     Args:
         title: Above it; empty for none.
-        headings: Of its columns; line breaks are where they had better be.
+        headings: Of its columns.
         rows: Its cells; marked ones are bold.
         words_first: How many columns are words, on the left; numbers follow, on the right.
         notes: Below it.
-        bands: After so many rows comes another section; 0 for one section.
     """
 
     title: str
@@ -49,11 +49,10 @@ class PageTable:
     rows: Sequence[Sequence[Words]]
     words_first: int = 1
     notes: Sequence[str] = ()
-    bands: int = 0
 
 
 def parts_of(table: CoverageTable) -> list[PageTable]:
-    """The parts of a table, each with one heading for each column: region and height first.
+    """The parts of a table.
 
     Args:
         table: The table.
@@ -86,7 +85,8 @@ def _of_quantity(table: CoverageTable, quantity: Quantity) -> PageTable:
 def _of_differences(table: CoverageTable, quantity: Quantity) -> PageTable:
     first, *others = table.rigs
     cells = [[_difference(row, quantity) for row in rows[1:]] for rows in table.places]
-    return _part(table, f"Difference to {first}: {difference_heading(quantity)}", others, cells)
+    title = f"Difference to {first}: {difference_heading(quantity)}"
+    return _part(table, title, others, cells)
 
 
 def _of_failures(table: CoverageTable, rig: str) -> PageTable:
@@ -94,8 +94,7 @@ def _of_failures(table: CoverageTable, rig: str) -> PageTable:
     for row in table.rows[rig]:
         cells = [Words(text, "significant" if marked else "") for text, marked in failure_words(table, row)]
         rows.append((Words(row.summary.region), Words(row.summary.height), *cells))
-    headings = (*PLACE_HEADINGS, *failure_headings(table, rig))
-    return _table(table, failure_title(table, rig), headings, rows)
+    return PageTable(failure_title(table, rig), [*PLACE_HEADINGS, *failure_headings(table, rig)], rows, PLACES)
 
 
 def _part(table: CoverageTable, title: str, headings: Sequence[str], numbers: Sequence[Sequence[Words]]) -> PageTable:
@@ -105,12 +104,8 @@ def _part(table: CoverageTable, title: str, headings: Sequence[str], numbers: Se
     for (row, *_), cells in zip(table.places, numbers, strict=True):
         last = [Words(column.words(column.of(table, row))) for column in shown]
         rows.append((Words(row.summary.region), Words(row.summary.height), *cells, *last))
-    every = (*PLACE_HEADINGS, *headings, *(column.heading for column in shown))
-    return _table(table, title, every, rows)
-
-
-def _table(table: CoverageTable, title: str, headings: Sequence[str], rows: Sequence[Sequence[Words]]) -> PageTable:
-    return PageTable(title, headings, rows, len(PLACE_HEADINGS), bands=len(table.grid.heights))
+    every = [*PLACE_HEADINGS, *headings, *(column.heading for column in shown)]
+    return PageTable(title, every, rows, PLACES)
 
 
 def _number(row: Row, quantity: Quantity) -> Words:

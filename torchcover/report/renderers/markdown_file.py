@@ -1,10 +1,10 @@
 """A table as Markdown, for documents and web pages."""
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 
 from torchcover.report.remarks import marks_on, notes_on
-from torchcover.report.renderers.layout import BOLD_MARKS, PLACE_HEADINGS, PageTable, Words, parts_of
+from torchcover.report.renderers.layout import BOLD_MARKS, PageTable, Words, parts_of
 from torchcover.report.table import CoverageTable
 
 # What Markdown would take for something else: an underscore does so at the end of a word only.
@@ -13,26 +13,16 @@ SPECIAL = re.compile(r"[\\`*|\[\]]|<(?=[A-Za-z/!?])|&(?=[\w#]+;)|(?<![^\W_])_|_(
 
 def render(table: CoverageTable) -> str:
     """The table as Markdown text; what is marked is bold."""
-    return as_markdown(table, parts_of(table))
-
-
-def as_markdown(table: CoverageTable, parts: Sequence[PageTable]) -> str:
-    """Parts of a table as Markdown text, with the table's notes below.
-
-    Args:
-        table: The table.
-        parts: Its parts as `parts_of` gives them, maybe with columns of one's own.
-    """
     marks = [f"{BOLD_MARKS[mark]}: {meaning}" for mark, meaning in marks_on(table).items()]
     notes = [f"* {_escaped(note)}" for note in (*marks, *notes_on(table))]
-    return "\n".join([*(line for part in parts for line in _lines(part)), *notes, ""])
+    return "\n".join([*(line for part in parts_of(table) for line in _lines(part)), *notes, ""])
 
 
 def _lines(part: PageTable) -> Iterator[str]:
     if part.title:
         yield f"{_escaped(part.title)}\n"
     yield _line(map(_escaped, part.headings))
-    yield _line(["---"] * len(PLACE_HEADINGS) + ["---:"] * (len(part.headings) - len(PLACE_HEADINGS)))
+    yield _line(["---"] * part.words_first + ["---:"] * (len(part.headings) - part.words_first))
     yield from (_line(map(_cell, row)) for row in part.rows)
     yield ""
 

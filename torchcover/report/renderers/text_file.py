@@ -60,12 +60,12 @@ def rich_tables(table: CoverageTable, *, two_lines: bool = False) -> list[Table]
     """
     parts = parts_of(table)
     if two_lines:
-        parts = [replace(part, rows=[list(map(_below, row)) for row in part.rows]) for part in parts]
+        parts = [replace(part, rows=[[*map(_below, row)] for row in part.rows]) for part in parts]
     lines = [
         line for part in parts for row in part.rows for cell in row[2:-1] for line in _text(cell).plain.split("\n")
     ]
     widest = max(map(cell_len, lines), default=0)
-    tables = [_rich_table(part, widest) for part in parts]
+    tables = [_rich_table(part, widest, len(table.grid.heights)) for part in parts]
     marks = [f"{SIGNS[mark]} {meaning}" for mark, meaning in marks_on(table).items()]
     tables[-1].caption = Text("\n".join([*marks, *notes_on(table)]))
     return tables
@@ -103,7 +103,8 @@ def narrowest_width(tables: Sequence[Table], folded: Sequence[str] = ()) -> int:
     return natural - sum(max(0, cell_len(name) - numbers) for name in folded)
 
 
-def _rich_table(part: PageTable, widest: int) -> Table:
+def _rich_table(part: PageTable, widest: int, bands: int) -> Table:
+    """With a line after so many rows, the bands of a region."""
     left: dict[str, Any] = {"title_justify": "left", "caption_justify": "left"}
     table = Table(title=Text(part.title) if part.title else None, title_style="bold", caption_style="", **left)
     for name in PLACE_HEADINGS:
@@ -113,7 +114,7 @@ def _rich_table(part: PageTable, widest: int) -> Table:
         table.add_column(Text(name), justify="right", overflow="fold", min_width=widest)
     table.add_column(part.headings[-1], justify="right", no_wrap=True)
     for at, row in enumerate(part.rows, 1):
-        table.add_row(*map(_text, row), end_section=at % part.bands == 0)
+        table.add_row(*map(_text, row), end_section=at % bands == 0)
     return table
 
 

@@ -23,7 +23,8 @@ FASTEST_ON_FOOT_MPS, CATCH_UP_MPS, HURRIES_MPS = 4.0, 0.8, 3.5
 # People go so far within the edges of pavements and crossings, to which those come back who were no farther from them.
 OFF_EDGE_M, BESIDE_M = 0.25, 2.0
 # Whose rear axle follows its own way so closely is off the kerbs, as its lane is; poses are looked at this often.
-ASTRAY_M, LOOKS_EVERY = 0.25, 2
+# Riders go anywhere in a lane, and a little beyond.
+ASTRAY_M, LOOKS_EVERY, NARROW_M = 0.25, 2, 1.0
 # How often a way is moved aside, over which length before and after, and the room that is left; to rub is to be off.
 SWINGS, SWING_M, SWING_LENGTHS, ROOM_M, RUBS_M = 4, 8.0, 1.0, 0.1, 0.05
 # Outlines of bodies are that far apart. Who meets whom is looked for in pieces of ways of so many poses.
@@ -171,7 +172,8 @@ def _keep_off(
     for number, (user, way_m, own) in enumerate(zip(users, ways_m, poses, strict=True)):
         if not user.track.on_foot:
             astray_m = _lengths(2 * own[:, :2] - way_m - _behind(way_m, user.drawn_m, own[0, 2]))
-            look[number, False] = np.flatnonzero(astray_m > ASTRAY_M)[::LOOKS_EVERY]
+            anywhere = user.sizes_m[0][1] < NARROW_M
+            look[number, False] = np.flatnonzero(anywhere | (astray_m > ASTRAY_M))[::LOOKS_EVERY]
         if number in rears:
             astray_m = DRAWS[user.kind].rod_m / 2 * np.abs(rears[number][:, 2] - own[:, 2])
             look[number, True] = np.flatnonzero(astray_m > ASTRAY_M)[::LOOKS_EVERY]

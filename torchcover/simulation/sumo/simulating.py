@@ -75,15 +75,6 @@ def _errors(lines: Sequence[str]) -> str:
     return " ".join(told or lines[-1:] or ["it says nothing"])[:MAX_TOLD_CHARS]
 
 
-def installed() -> list[object]:
-    """Which SUMO there is: its program, how large that is and when it was written; nothing if there is none."""
-    try:
-        program = home() / "bin" / "sumo"
-        return [str(program), program.stat().st_size, program.stat().st_mtime_ns]
-    except (ImportError, OSError):
-        return []
-
-
 def home() -> Path:
     """The folder of the installed package, else of the programs that the shell finds; ImportError if neither is."""
     found = find_spec("sumo")

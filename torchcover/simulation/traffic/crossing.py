@@ -76,19 +76,7 @@ def walk(
     Returns:
         (T, 3) positions and (T,) headings in degrees.
     """
-    share, back = _stroll(may_go, crossing_s, float(times_s[1] - times_s[0]), generator)
-    return path.poses(share, back, body_radius_m)
-
-
-def step_height(beyond_kerb_m: Numbers, body_radius_m: float | Numbers) -> Numbers:
-    """Height of the feet of somebody whose middle is so far beyond the kerb, on the carriageway's side."""
-    stepping = (beyond_kerb_m - body_radius_m) / PAVEMENT_M
-    return PAVEMENT_M * (1.0 - np.clip(stepping, 0.0, 1.0))
-
-
-def _stroll(may_go: Flags, crossing_s: float, step_s: float, generator: np.random.Generator) -> tuple[Numbers, Flags]:
-    """(T,) share of the way gone, and (T,) whether the face is towards the start."""
-    count = len(may_go)
+    count, step_s = len(may_go), float(times_s[1] - times_s[0])
     chances = np.flatnonzero(may_go)
     steps = int(np.ceil(crossing_s / step_s))
     back = bool(generator.random() < 0.5)
@@ -98,7 +86,7 @@ def _stroll(may_go: Flags, crossing_s: float, step_s: float, generator: np.rando
         now += round(generator.uniform(0.0, MAX_STAY_S) / step_s)
         ahead = chances[np.searchsorted(chances, now) :]
         if len(ahead) == 0:
-            return share, faces_start
+            return path.poses(share, faces_start, body_radius_m)
         set_off = int(ahead[0])
         now = set_off + 1
         if generator.random() < EAGERNESS:
@@ -107,6 +95,12 @@ def _stroll(may_go: Flags, crossing_s: float, step_s: float, generator: np.rando
             arrived = set_off + steps
             faces_start[arrived:] = not back
             back, now = not back, arrived
+
+
+def step_height(beyond_kerb_m: Numbers, body_radius_m: float | Numbers) -> Numbers:
+    """Height of the feet of somebody whose middle is so far beyond the kerb, on the carriageway's side."""
+    stepping = (beyond_kerb_m - body_radius_m) / PAVEMENT_M
+    return PAVEMENT_M * (1.0 - np.clip(stepping, 0.0, 1.0))
 
 
 def free_for(blocked: Flags, duration_s: float, step_s: float) -> Flags:

@@ -89,12 +89,16 @@ class Fleet:
             raise ValueError(f"traffic needs a body for each kind; there is none for {', '.join(missing)}")
         self.meshes = {EGO: bodies["suv"] if ego is None else ego, **{kind: bodies[kind] for kind in CATEGORIES}}
         self._sizes = {kind: BoundingBox.around(mesh.vertices_m).size_m for kind, mesh in self.meshes.items()}
+        self._lengths_m = {kind: self._length_m(kind) for kind in self.meshes}  # asked thousands of times a world
         self._generator = generator
         self.parked: list[Actor] = []
         self.left_out = 0
 
     def length_m(self, kind: str) -> float:
         """Extent along x, on a straight with all that it draws along."""
+        return self._lengths_m[kind]
+
+    def _length_m(self, kind: str) -> float:
         parts_m = [length_m for length_m, _ in self.sizes_m(kind)]
         return sum(parts_m) / 2 - DRAWS[kind].hitch_m + DRAWS[kind].middle_m if kind in DRAWS else parts_m[0]
 

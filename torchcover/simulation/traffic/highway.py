@@ -82,7 +82,7 @@ class Highway(Procedural):
             [a.lane % LANES == SIDE_LANE - 1 for a in agents]
         )
         exits[0] = False
-        stations = np.arange(*middle.stations_m[[0, -1]], CURVATURE_EVERY_M)
+        stations = np.arange(middle.stations_m[0], middle.stations_m[-1], CURVATURE_EVERY_M)
         heights_m = hills.heights_m(middle.poses(stations, 0.0)[:, :2])
         climb = np.stack([stations, np.gradient(heights_m, CURVATURE_EVERY_M)])
         driving = Overtaking(agents, heavy, exits, side_m, generator, climb)

@@ -19,18 +19,12 @@ class Polyline:
             straight part.
 
     Example:
-        >>> Polyline.straight((0.0, 5.0), yaw_deg=90.0, length_m=100.0).poses(20.0).round(6)
+        >>> Polyline(np.array([[0.0, 5.0], [0.0, 105.0]])).poses(20.0)
         array([ 0., 25., 90.])
     """
 
     points_m: Numbers
     closed: bool = False
-
-    @classmethod
-    def straight(cls, start_m: ArrayLike, yaw_deg: float, length_m: float) -> "Polyline":
-        """A straight line from a point in a direction."""
-        start, yaw = np.asarray(start_m, dtype=np.float64), np.deg2rad(yaw_deg)
-        return cls(np.stack([start, start + length_m * np.array([np.cos(yaw), np.sin(yaw)])]))
 
     @cached_property
     def arc_m(self) -> Numbers:
@@ -53,25 +47,11 @@ class Polyline:
         """
         place = np.asarray(place_m, dtype=np.float64)
         place = np.mod(place, self.length_m) if self.closed else place
-        if len(self.points_m) == 2:
-            poses = np.empty((*place.shape, 3))
-            poses[..., :2] = self.points_m[0] + place[..., None] * self._directions[0]
-            poses[..., 2] = np.rad2deg(self.headings[0])
-            return poses
         segment = np.clip(np.searchsorted(self.arc_m, place, side="right") - 1, 0, len(self.arc_m) - 2)
         along = (place - self.arc_m[segment])[..., None]
         position = self.points_m[segment] + along * self._directions[segment]
         yaw = np.rad2deg(np.interp(place, self.arc_m, self.headings))
         return np.concatenate([position, yaw[..., None]], axis=-1)
-
-    def shifted(self, left_m: float) -> "Polyline":
-        """The line beside this one, with a way of its own."""
-        normals = np.stack([-np.sin(self.headings), np.cos(self.headings)], axis=1)
-        return Polyline(self.points_m + left_m * normals, self.closed)
-
-    def reversed(self) -> "Polyline":
-        """The same line in the other direction."""
-        return Polyline(self.points_m[::-1], self.closed)
 
     @cached_property
     def _directions(self) -> Numbers:

@@ -1,0 +1,87 @@
+"""Loops over points of scans, compiled; importing this fails where numba is missing."""
+
+import math
+
+import numpy as np
+
+from torchcover.neighbors.compiled import Array, compiled
+from torchcover.recordings.seen_past import COLUMNS, ROWS
+from torchcover.recordings.visible import BEHIND, BEHIND_M
+
+
+@compiled("void(f8[:, ::1], f4[:, ::1], i8, f8[:, ::1], f8, i2[::1], i8)")
+def vote_by_loop(
+    points_m: Array, free_m: Array, first_row: int, sensor_T_local: Array, farthest_m: float, votes: Array, vote: int
+) -> None:
+    """Count the places that lie in free space: `vote_by_arrays`."""
+    T, rows, times = sensor_T_local, free_m.shape[0], COLUMNS // free_m.shape[1]
+    for i in range(points_m.shape[0]):
+        px, py, pz = points_m[i, 0], points_m[i, 1], points_m[i, 2]
+        x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+        y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+        range_m = math.sqrt(x * x + y * y + z * z)
+        if range_m >= farthest_m:
+            continue
+        row = min(int((1 + z / max(range_m, 1e-9)) * (ROWS / 2)), ROWS - 1) // times - first_row
+        if row < 0 or row >= rows:
+            continue
+        low, high = min(abs(x), abs(y)), max(abs(x), abs(y), 1e-9)
+        turn = low / high * (0.64 - 0.14 * (low / high))
+        if abs(y) > abs(x):
+            turn = 1 - turn
+        if x < 0:
+            turn = 2 - turn
+        if y < 0:
+            turn = 4 - turn
+        if range_m < free_m[row, int(turn * (COLUMNS / 4)) % COLUMNS // times]:
+            votes[i] += vote
+
+
+@compiled("void(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], b1[::1])")
+def hide_by_loop(
+    points_m: Array, place_m: Array, body_m: Array, bins_rad: Array, reach_m: Array, hidden: Array
+) -> None:
+    """Mark the points that a body or others hide from a place: `hide_by_arrays`."""
+    count = points_m.shape[0]
+    up, across, range_m = np.empty(count), np.empty(count), np.empty(count)
+    for i in range(count):
+        x, y, z = points_m[i, 0] - place_m[0], points_m[i, 1] - place_m[1], points_m[i, 2] - place_m[2]
+        flat_m = math.sqrt(x * x + y * y)
+        range_m[i] = math.sqrt(flat_m * flat_m + z * z)
+        up[i], across[i] = math.atan2(z, flat_m) + math.pi / 2, math.atan2(y, x) + math.pi
+        enters, leaves = -math.inf, math.inf
+        for axis in range(3):
+            way_m = points_m[i, axis] - place_m[axis]
+            one, other = (body_m[0, axis] - place_m[axis]) / way_m, (body_m[1, axis] - place_m[axis]) / way_m
+            enters, leaves = max(enters, min(one, other)), min(leaves, max(one, other))
+        hidden[i] |= enters < leaves and leaves > 0 and enters < 1
+    for level in range(bins_rad.shape[0]):
+        bin_rad, columns = bins_rad[level], int(2 * math.pi / bins_rad[level]) + 1
+        nearest_m = np.full((int(math.pi / bin_rad) + 1) * columns, np.inf)
+        for i in range(count):
+            if range_m[i] < reach_m[level]:
+                number = int(up[i] / bin_rad) * columns + int(across[i] / bin_rad)
+                nearest_m[number] = min(nearest_m[number], range_m[i])
+        for i in range(count):
+            number = int(up[i] / bin_rad) * columns + int(across[i] / bin_rad)
+            hidden[i] |= nearest_m[number] * (1 + BEHIND) + BEHIND_M < range_m[i]
+
+
+@compiled("void(f8[:, ::1], f8[::1], u1[:, :, ::1], f8, f8[:, ::1], f8[::1])")
+def overlap_by_loop(
+    places_m: Array, since_s: Array, filled: Array, cell_m: float, velocities_mps: Array, overlap: Array
+) -> None:
+    """How much of what each velocity makes of places is filled at other times: `overlap_by_arrays`."""
+    scans, columns, rows = filled.shape
+    for v in range(velocities_mps.shape[0]):
+        total = 0
+        for scan in range(scans):
+            dx_m, dy_m = velocities_mps[v, 0] * since_s[scan], velocities_mps[v, 1] * since_s[scan]
+            for i in range(places_m.shape[0]):
+                x_m, y_m = places_m[i, 0] + dx_m, places_m[i, 1] + dy_m
+                if x_m >= 0 and y_m >= 0:
+                    x, y = int(x_m / cell_m), int(y_m / cell_m)
+                    if x < columns and y < rows:
+                        total += filled[scan, x, y]
+        overlap[v] = total / (2.0 * scans * places_m.shape[0])
