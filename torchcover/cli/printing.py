@@ -32,7 +32,6 @@ def print_result(result: Result, files: Sequence[Path], out: Path, *, explain: b
 
 
 def _print_world(result: Result, console: Console, *, explain: bool) -> None:
-    """The tables, and what the run left out if that is asked for."""
     print_table(result.table, console)
     if result.metrics:
         print_whole(page_tables(result.metrics, parts=False))

@@ -340,7 +340,6 @@ def _first_steps(coverage: Coverage) -> int:
 
 
 def _tried(options: str, settings: Settings, first: Coverage | None) -> tuple[Trial, Coverage]:
-    """Run a setting, and hold it against the first."""
     task, before_s = simulation(settings), sum(os.times()[:4])
     result = measured(task, settings)
     processor_s = sum(os.times()[:4]) - before_s

@@ -151,7 +151,6 @@ def _row(one: Ranking) -> list[str]:
 
 
 def _words(number: Number, rank: float) -> str:
-    """A number and its rank; an unknown one is a dash."""
     if not number.known:
         return "–"
     return number_words(number) if math.isnan(rank) else f"{number_words(number)} ({rank:g})"

@@ -125,8 +125,6 @@ def file_stems(names: Sequence[str]) -> list[str]:
 
 @dataclass(frozen=True)
 class _Setting:
-    """What is drawn over the maps."""
-
     ego_outline_m: NDArray[np.floating] | None
     sensors: Mapping[str, Sequence[SensorView]]
     vehicle: str | None
@@ -140,8 +138,6 @@ class _Setting:
 
 @dataclass(frozen=True)
 class _Band:
-    """A height band as titles and file names have it."""
-
     number: int
     name: str
     stem: str
@@ -181,7 +177,6 @@ def _bands(grid: BevGrid) -> list[_Band]:
 
 
 def _draw_rigs(subject: Subject, grid: BevGrid, bands: Sequence[_Band], setting: _Setting) -> Iterator[Named]:
-    """Rigs side by side; one alone has no heading."""
     headings = {rig: rig if len(subject.values) > 1 else "" for rig in subject.values}
     for band in bands:
         opacity = band.opacity(subject)
@@ -200,7 +195,6 @@ def _draw_rigs(subject: Subject, grid: BevGrid, bands: Sequence[_Band], setting:
 
 
 def _draw_near(subject: Subject, grid: BevGrid, bands: Sequence[_Band], setting: _Setting) -> Named:
-    """All rigs and bands around the ego."""
     several = len(subject.values) > 1
     panels = {
         f"{rig}, {band.name}, {band.z}" if several else f"{band.name}, {band.z}": (rig, band)
