@@ -177,14 +177,13 @@ def test_frames_that_are_skipped_leave_their_place_in_time(torchcover, recording
 
 
 def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sensor(torchcover, recording, tmp_path):
-    _, printed, _ = torchcover("evaluate", "--frames", recording, "--out", tmp_path / "out", "--error-maps")
+    _, printed, _ = torchcover("evaluate", "--frames", recording, "--out", tmp_path / "out")
     assert "Not enough steps for errors: 4 blocks, 8 are needed." in printed
     assert "In brackets" not in printed
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert (summary["reference"]["sensor"], summary["target_error"]) == ("recorded", None)
     assert (summary["blocks"], summary["steps_per_block"]) == (4, 1)
     assert summary["rows"][0]["radius_m_error"] is None
-    assert (tmp_path / "out" / "maps" / "radius_m_error_ground.png").is_file()
 
 
 @pytest.mark.parametrize(

@@ -107,12 +107,8 @@ def test_maps_are_side_by_side_and_as_differences(torchcover, worlds):
     assert sorted(path.name for path in (out / "maps").iterdir()) == sorted([*of_bands, *near])
 
 
-def test_errors_are_drawn_if_asked_for_and_differences_come_with_theirs(torchcover, worlds):
-    *_, out = compare(torchcover, worlds, "low", "both", steps=9, options=["--error-maps"])
-    names = {path.name for path in (out / "maps").iterdir()}
-    keys = ("radius_area_m", "detection_area_2m")
-    errors = {f"{key}_error_{band}.png" for key in keys for band in ("ground", "obstacle")}
-    assert {name for name in names if "error" in name} == errors
+def test_differences_come_with_their_errors(torchcover, worlds):
+    *_, out = compare(torchcover, worlds, "low", "both", steps=9)
     summary = json.loads((out / "summary.json").read_text())
     assert (summary["blocks"], summary["steps_per_block"]) == (9, 1)
     known = [row for row in summary["rows"] if row["rig"] == "both" and row["height"] == "ground"][:3]

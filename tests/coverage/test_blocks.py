@@ -135,9 +135,9 @@ def test_no_error_of_a_cell_is_zero_however_much_its_blocks_agree(radius, detect
         [{"clouds": clouds_of({0: [radius]}), "more": {"place_in_time": at}} for at in range(40)]
     ).compute()
     each = math.sqrt(12 / 11) / 12
-    assert float(coverage.detection_error.flatten()[0]) == pytest.approx(each * detection_error)
+    assert float(coverage.errors["detection_0.5m"].flatten()[0]) == pytest.approx(each * detection_error)
     expected = radius * math.sqrt(1 + 4**2) * each
-    assert float(coverage.radius_error.flatten()[0]) == pytest.approx(expected or math.nan, nan_ok=True)
+    assert float(coverage.errors["radius_m"].flatten()[0]) == pytest.approx(expected or math.nan, nan_ok=True)
 
 
 def test_one_step_a_block_gives_the_textbook_error_in_a_region():
@@ -168,7 +168,7 @@ def test_sums_and_errors_are_those_of_plain_loops(count):
 def test_the_error_in_a_cell_is_that_of_a_ratio_of_sums_with_two_more_blocks():
     steps = random_steps(64, seed=3)
     coverage, sums = metric_over(steps).compute(), slow_blocks(steps, 16)
-    for name, found in (("radius", coverage.radius_error), ("detection", coverage.detection_error)):
+    for name, found in zip(("radius", "detection"), coverage.errors.values(), strict=True):
         for cell in range(CELLS):
             n, s = sums["probed_steps"][:, cell], sums[name][:, cell]
             mean, usual = s.sum() / n.sum(), n.sum() / np.count_nonzero(n)
@@ -187,13 +187,13 @@ def test_no_error_is_told_from_fewer_than_8_blocks_nor_in_a_cell_that_fewer_prob
     assert math.isnan(few.numbers["detection_0.5m"].error)
     assert enough.numbers["radius_m"].error > 0
     coverage = metric_over(steps).compute()
-    assert coverage.radius_error.isnan().flatten().tolist() == [False, True, True, True]
-    assert coverage.detection_error.isnan().flatten().tolist() == [False, True, True, True]
+    assert coverage.errors["radius_m"].isnan().flatten().tolist() == [False, True, True, True]
+    assert coverage.errors["detection_0.5m"].isnan().flatten().tolist() == [False, True, True, True]
 
 
 def test_without_blocks_there_are_no_errors():
     coverage = metric_over(random_steps(20), blocks=1).compute()
-    assert (coverage.blocks, coverage.radius_error, coverage.detection_error) == (None, None, None)
+    assert (coverage.blocks, len(coverage.errors)) == (None, 0)
     assert math.isnan(coverage.summary([EVERYWHERE])[0].numbers["radius_m"].error)
 
 
@@ -372,7 +372,9 @@ def test_equal_weights_change_nothing_and_their_scale_in_a_step_neither():
         (equal, metric_over(plain, **options).compute()),
         (scaled, metric_over(steps, **options).compute()),
     ):
-        torch.testing.assert_close(one.radius_error, other.radius_error, rtol=1e-6, atol=1e-9, equal_nan=True)
+        torch.testing.assert_close(
+            one.errors["radius_m"], other.errors["radius_m"], rtol=1e-6, atol=1e-9, equal_nan=True
+        )
         for key, layer in one.layers.items():
             expected = other.layers[key].values
             torch.testing.assert_close(layer.values, expected, rtol=1e-6, atol=1e-9, equal_nan=True)
@@ -468,7 +470,7 @@ def test_the_reported_errors_are_the_spread_over_many_runs(alike):
         numbers.append(estimate.value)
         errors.append(estimate.error)
         cells.append(coverage.radius.flatten())
-        of_cells.append(coverage.radius_error.flatten())
+        of_cells.append(coverage.errors["radius_m"].flatten())
     # Each known to 4 %: the spread from 300 runs.
     torch.testing.assert_close(torch.stack(errors).mean(dim=0), torch.stack(numbers).std(dim=0), rtol=0.12, atol=0)
     truth = torch.tensor([0.3, 0.6, 0.9, 1.2], dtype=torch.float64)  # of 2 x 0.3 times a half, one, ...

@@ -331,7 +331,7 @@ def test_a_folder_of_results_is_of_one_run(tmp_path):
     (tmp_path / "maps").mkdir()
     for mine in ("notes.txt", "maps/mine.png"):
         (tmp_path / mine).write_text("mine")
-    torchcover.evaluate(frames=Source(), cell_m=8.0, thresholds_m=(0.4, 1.0)).save(tmp_path, error_maps=True)
+    torchcover.evaluate(frames=Source(), cell_m=8.0, thresholds_m=(0.4, 1.0)).save(tmp_path)
     files = torchcover.evaluate(frames=Single(), cell_m=8.0, steps=2).save(tmp_path)
     found = {path for path in tmp_path.rglob("*") if path.is_file()}
     assert found == {*files, tmp_path / "notes.txt", tmp_path / "maps" / "mine.png"}

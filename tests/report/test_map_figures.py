@@ -180,38 +180,6 @@ def test_the_bands_of_a_quantity_lie_side_by_side_for_loggers():
     assert headings == ["ground, z -0.5 to 0.5 m", "obstacle, z 0.5 to 2 m"]
 
 
-# Standard errors
-
-
-@pytest.mark.parametrize("rigs", ["a", "ab"])
-@pytest.mark.usefixtures("blank_maps")
-def test_errors_are_drawn_only_if_asked_for_and_never_as_differences(rigs):
-    coverages = dict.fromkeys(rigs, blocked(16))
-    plain, more = names(coverages), names(coverages, errors=True)
-    assert not any("error" in name for name in plain)
-    assert more[: len(plain)] == plain
-    errors = [f"{key}_error_{band}" for key in ("radius_m", "detection_0.4m") for band in BANDS]
-    assert more[len(plain) :] == errors
-
-
-def test_without_blocks_there_are_no_errors_to_draw():
-    assert not any("error" in name for name in names({"a": coverage_of(SQUARE)}, errors=True))
-
-
-def test_a_map_of_errors_says_what_it_shows_in_which_unit_and_why_cells_are_unknown():
-    coverage = blocked(16)
-    figures = dict(map_figures({"a": coverage}, errors=True))
-    radius, within = figures["radius_m_error_ground"], figures["detection_0.4m_error_ground"]
-    assert words(radius)[0] == "Standard error of the mean blind spot radius, ground"
-    assert radius.axes[1].get_ylabel() == "standard error of the mean blind spot radius (m)"
-    assert words(within)[0] == "Standard error of the detection within 0.4 m, ground"
-    assert within.axes[1].get_ylabel() == "standard error of the detection within 0.4 m (percentage points)"
-    assert within.axes[1].get_ylim()[1] >= 100 * float(coverage.errors["detection_0.4m"][0, 10, 20]) > 1
-    # Two of the sixteen blocks probed x = 9.5 m: known, but without an error.
-    assert legend(radius)[0].startswith("unknown: probed in fewer than 8 blocks of steps (")
-    assert legend(figures["radius_m_ground"])[0].startswith("unknown: never probed (")
-
-
 # Several rigs
 
 

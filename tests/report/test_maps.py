@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from torchcover.coverage import BevGrid
 from torchcover.coverage.quantity import RADIUS, detection
 from torchcover.geometry import rigid, rotation_from_euler
-from torchcover.report import ColourScale, SensorView, draw_map, scale_of
+from torchcover.report import ColourScale, SensorView, draw_side_by_side, scale_of
 from torchcover.report.maps.colours import INFINITE, UNKNOWN
 
 SCALE = ColourScale("blind spot radius", "m", "viridis_r", 0.0, 1.0)
@@ -54,7 +54,10 @@ def marked(name: str, x_m: float, y_m: float, yaw_deg: float, wide_deg: float, r
 
 
 def draw(values: torch.Tensor, grid: BevGrid = SQUARE, **options) -> Picture:
-    return Picture(draw_map(values, grid, options.pop("scale", SCALE), title=options.pop("title", "A map"), **options))
+    for name in options.keys() & {"sensors", "opacity"}:
+        options[name] = {"": options[name]}
+    scale, title = options.pop("scale", SCALE), options.pop("title", "A map")
+    return Picture(draw_side_by_side({"": values}, grid, scale, title=title, **options))
 
 
 def test_a_blind_spot_at_the_front_left_is_dark_at_the_upper_right():

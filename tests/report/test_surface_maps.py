@@ -12,7 +12,6 @@ from torchcover.report.maps.surface import (
     FAINTEST,
     MIN_POINTS,
     as_drawn,
-    errors_of_ratios,
     opacity_of,
     over_squares,
     ratios,
@@ -140,15 +139,6 @@ def test_open_ground_is_opaque_in_squares_that_the_grid_cuts_off_too():
         torch.testing.assert_close(opacity, torch.ones_like(opacity), rtol=1e-12, atol=0)
         quarter = opacity_of(sums_of(ground / 4), 10, torch.full((1, 5, 5), side), CELL_M)
         torch.testing.assert_close(quarter, torch.full_like(quarter, (1 + FAINTEST) / 2), rtol=1e-12, atol=0)
-
-
-def test_errors_are_those_of_cells_where_squares_are_cells(coverage, sides):
-    alone = sides == 1
-    keys = list(coverage.layers)[3:]
-    for key, found in zip(keys, errors_of_ratios(coverage.area, coverage.quantities, sides), strict=True):
-        expected = coverage.errors[key][alone]
-        torch.testing.assert_close(found[alone], expected, rtol=1e-12, atol=0, equal_nan=True)
-        assert int(expected.isfinite().sum()) > 10
 
 
 def test_infinity_stays_in_its_square():

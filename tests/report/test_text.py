@@ -8,9 +8,9 @@ import torch
 from rich.console import Console
 
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric, Region
-from torchcover.report import CoverageTable, narrowest_width, print_table
+from torchcover.report import CoverageTable, print_table
 from torchcover.report.renderers.records import COLUMNS
-from torchcover.report.renderers.text_file import rich_tables
+from torchcover.report.renderers.text_file import narrowest_width, rich_tables
 
 NEAR = Region("near", x=(0.0, 2.0), y=(0.0, 2.0))
 FAR = Region("far", x=(2.0, 4.0), y=(0.0, 2.0))

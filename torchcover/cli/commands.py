@@ -1,7 +1,7 @@
 """What each command is called with; what it does is imported when it runs."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -14,15 +14,7 @@ from torchcover.evaluation.settings import OPTIONS
 UNITS_S = {"s": 1.0, "min": 60.0, "h": 3600.0}
 
 
-TRIED = [name for name, option in OPTIONS.items() if option.in_study == "tried"]
-
-
-@with_options(
-    [
-        *of_evaluate(*(name for name, option in OPTIONS.items() if option.in_study == "once")),
-        *of_evaluate(*TRIED, several=True),
-    ]
-)
+@with_options(of_evaluate(*(name for name, option in OPTIONS.items() if option.in_study)))
 def study(
     rig: options.Rig,
     steps: Annotated[
@@ -31,23 +23,15 @@ def study(
     out: options.Out = Path("out"),
     **settings: Any,  # noqa: ANN401
 ) -> None:
-    """Find the setting for a wanted error: what each costs, how far it is off, and how many steps it needs.
-
-    Options such as --rays, --workers or --cell-m may be given several times: each further value is tried with
-    everything else as in the first setting. None given: 16384, 4096 and 1024 rays.
-    """
+    """Find the setting for a wanted error: what each costs, how far it is off, and how many steps it needs."""
     from torchcover.cli.printing import print_study
     from torchcover.evaluation import Settings, StudyPlan, error_against_time, rank_count
     from torchcover.files import claimed
 
     if rank_count() > 1:
         raise ValueError("study measures run times, which several ranks would change: run it without torchrun")
-    given = {name: settings.pop(name) for name in TRIED if name in settings}
-    first = {name: values[0] for name, values in given.items() if values}
-    others: Sequence[Mapping[str, Any]] = [{name: value} for name, values in given.items() for value in values[1:]]
-    if not others and "rays" not in first and first.get("reference") != "paper":
-        others = StudyPlan.others
-    plan = StudyPlan(Settings(rig, steps=steps, **settings, **first), tuple(others))
+    fewer = "rays" not in settings and settings.get("reference") != "paper"
+    plan = StudyPlan(Settings(rig, steps=steps, **settings), StudyPlan.others if fewer else ())
     with claimed(out):
         found = error_against_time(plan, progress=True)
         files = found.save(out)
@@ -229,14 +213,15 @@ def check(
     """Is it enough? Exit code 0: all is checked and kept; 1: something is not kept; 3: something is not checked."""
     from rich.console import Console
 
-    from torchcover.cli.printing import in_words, print_files, print_whole
+    from torchcover.cli.printing import print_files
     from torchcover.evaluation import check
     from torchcover.files import claimed
+    from torchcover.report import print_whole
 
     with claimed(out):
         found = check(rigs, requirements, scenario, progress=True, **settings)
         written = found.save(out)
-    print_whole([in_words(table) for table in found.tables()])
+    print_whole(found.tables())
     print_files(written, out, Console())
     raise typer.Exit(found.exit_code)
 
@@ -268,11 +253,11 @@ def encounter(
     """Would it see the child in time? Of crossings and other encounters: the time to collision at detection."""
     from rich.console import Console
 
-    from torchcover.cli.printing import in_words, print_files, print_whole
+    from torchcover.cli.printing import print_files
     from torchcover.encounters import Criterion
     from torchcover.evaluation import encounter, encounter_film, met_in_recording, met_in_traffic, save_encounters
     from torchcover.files import claimed
-    from torchcover.report import check_film, write_film
+    from torchcover.report import check_film, print_whole, write_film
 
     criterion = Criterion(**{name: settings.pop(name) for name in Criterion.__annotations__})
     if frames is not None and (rigs or scenario is not None):
@@ -292,7 +277,7 @@ def encounter(
     if film is not None:
         told = {name: settings.get(name) for name in ("vehicle", "sensor_model")}
         write_film(film, encounter_film((rigs or [])[0], found, **told), per_s=10)
-    print_whole([in_words(table) for table in found.tables()])
+    print_whole(found.tables())
     print_files(written, out, Console())
 
 

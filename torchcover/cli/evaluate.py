@@ -57,7 +57,6 @@ def _measure(
     ] = None,
     out: options.Out = Path("out"),
     files: options.Files = options.ALL_FILES,
-    error_maps: Annotated[bool, typer.Option("--error-maps", help="Draw maps of the standard errors too.")] = False,
     rerun: Annotated[
         Path | None,
         typer.Option(help="Write clouds, boxes, rigs and maps to this .rrd file for the Rerun viewer (extra `rerun`)."),
@@ -103,7 +102,7 @@ def _measure(
             progress=True,
             **settings,
         )
-        finish(result, out, ranks, log, checkpoint, files=files, error_maps=error_maps, explain=explain)
+        finish(result, out, ranks, log, checkpoint, files=files, explain=explain)
 
 
 MEASURING = [
@@ -112,7 +111,7 @@ MEASURING = [
 ]
 USUAL = {each.name: each.default for each in MEASURING}
 # Options that measure nothing.
-SAVING = ("out", "files", "error_maps", "explain")
+SAVING = ("out", "files", "explain")
 
 
 @with_options(MEASURING)
@@ -257,7 +256,6 @@ def finish(
     checkpoint: "Checkpoint | None" = None,
     *,
     files: str,
-    error_maps: bool,
     explain: bool,
 ) -> None:
     """Results are safe before anything is printed; then the command ends as the run did."""
@@ -266,7 +264,7 @@ def finish(
     from torchcover.report import file_stems
 
     if ranks is None or ranks.rank == 0:
-        written = result.save(out, files=files, error_maps=error_maps)
+        written = result.save(out, files=files)
         print_result(result, written, out, explain=explain)
         if log is not None and not isinstance(result, MixedResult):
             log.finish(result)

@@ -40,14 +40,9 @@ def with_options(parameters: Sequence[inspect.Parameter]) -> Callable[[Command],
     return decorate
 
 
-def of_evaluate(*names: str, several: bool = False) -> list[inspect.Parameter]:
-    """Options of `evaluate`, as `Settings` declares them: their names there, with dashes for underscores.
-
-    Args:
-        names: Which.
-        several: Whether each may be given several times.
-    """
-    return [_parameter(name, several=several) for name in names]
+def of_evaluate(*names: str) -> list[inspect.Parameter]:
+    """Options of `evaluate`, as `Settings` declares them: their names there, with dashes for underscores."""
+    return [_parameter(name) for name in names]
 
 
 def of_criterion() -> list[inspect.Parameter]:
@@ -67,13 +62,10 @@ def parameters_of(command: Command) -> list[inspect.Parameter]:
     return [each.replace(annotation=hints[each.name]) for each in inspect.signature(command).parameters.values()]
 
 
-def _parameter(name: str, *, several: bool) -> inspect.Parameter:
+def _parameter(name: str) -> inspect.Parameter:
     option, usual = OPTIONS[name], getattr(Settings, name)
-    shown = usual if type(usual) in (bool, int, str) and not several else None
+    shown = usual if type(usual) in (bool, int, str) else None
     kind = option.typed or get_args(Settings.__annotations__[name])[0]
-    if several:
-        of_each = next(one for one in (*get_args(kind), kind) if one is not type(None))  # of a union
-        kind = list[of_each if isinstance(of_each, type) else str]  # type: ignore[misc]  # of words, no more is known
     told = typer.Option(f"--{name.replace('_', '-')}", help=option.words, min=option.minimum)
     annotation: Any = Annotated[kind if shown is not None else kind | None, told]
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=shown, annotation=annotation)

@@ -6,7 +6,6 @@ from pathlib import Path
 
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from torchcover.evaluation import AgreementStudy, MixedResult, Result, Study, relation, verdict
 from torchcover.evaluation.agreeing import NOTES
@@ -14,22 +13,8 @@ from torchcover.evaluation.mixed import MIXTURE
 from torchcover.evaluation.result import sensor_model_words
 from torchcover.evaluation.result_page import left_out_table
 from torchcover.evaluation.study import WANTED
-from torchcover.published.comparison import text_tables
-from torchcover.report import PageTable, narrowest_width, print_table, text_table
-
-
-def print_whole(tables: Sequence[Table]) -> None:
-    """Print tables as wide as they are: rather lines that are too long than numbers that are cut off."""
-    console = Console()
-    console.width = max(console.width, narrowest_width(tables))
-    for table in tables:
-        console.print(table)
-
-
-def in_words(table: PageTable) -> Table:
-    """A table of a page, for the terminal."""
-    rows = [[words.text for words in row] for row in table.rows]
-    return text_table(table.headings, [rows], title=table.title, caption="\n".join(table.notes))
+from torchcover.published.comparison import page_tables
+from torchcover.report import PageTable, Words, print_table, print_whole
 
 
 def print_result(result: Result, files: Sequence[Path], out: Path, *, explain: bool) -> None:
@@ -47,12 +32,11 @@ def print_result(result: Result, files: Sequence[Path], out: Path, *, explain: b
 
 
 def _print_world(result: Result, console: Console, *, explain: bool) -> None:
-    """The tables, and what the run left out if that is asked for."""
     print_table(result.table, console)
     if result.metrics:
-        print_whole(text_tables(result.metrics))
+        print_whole(page_tables(result.metrics, parts=False))
     if explain and result.left_out:
-        print_whole([in_words(left_out_table(result.left_out))])
+        print_whole([left_out_table(result.left_out)])
     if explain and result.run:
         frames_s = result.run.seconds - result.run.measuring_s
         console.print(
@@ -95,11 +79,11 @@ def print_agreement(study: AgreementStudy, files: Sequence[Path], out: Path) -> 
     for reading in readings:
         each = [study.found[truth, reading].ranked for truth in truths]
         rows = [
-            (of[0].metric + " *" * (not of[0].over_worlds), *(relation(row.spearman) for row in of))
+            [Words(of[0].metric + " *" * (not of[0].over_worlds)), *(Words(relation(row.spearman)) for row in of)]
             for of in zip(*each, strict=True)
         ]
         title = f"Spearman correlation with what detectors reached, rolls in {reading}; 95 % intervals"
-        tables.append(text_table(("metric", *truths), [rows], title=title, caption=DETECTORS_ONLY))
+        tables.append(PageTable(title, ("metric", *truths), rows, notes=[DETECTORS_ONLY]))
     print_whole(tables)
     for truth in truths:
         console.print(verdict(truth, {one: study.found[truth, one] for one in readings}), markup=False, soft_wrap=True)

@@ -7,7 +7,7 @@ from typing import Any
 import typer
 from rich.console import Console
 
-from torchcover.cli.printing import in_words, print_files, print_whole
+from torchcover.cli.printing import print_files
 from torchcover.evaluation.cores import usual_workers
 from torchcover.files import SUMMARY, claimed
 from torchcover.placement import (
@@ -23,6 +23,7 @@ from torchcover.placement import (
 from torchcover.placement.common_instants import WORLDS
 from torchcover.placement.plan import common_instants
 from torchcover.placement.running import CHECKPOINT
+from torchcover.report import print_whole
 from torchcover.simulation.documents import read_mapping
 
 CHOICE_KEY = "candidates"
@@ -53,7 +54,7 @@ def run(
         written = report.save(out, files=files)
         if not resume:
             (out / CHECKPOINT).unlink(missing_ok=True)  # there is nothing left that would go on from it
-    print_whole([in_words(table) for table in report.tables[:2]])
+    print_whole(report.tables[:2])
     console = Console()
     print_files(written, out, console)
     console.print(report.sentence, markup=False, soft_wrap=True)

@@ -97,7 +97,6 @@ def _steps_of_film(world: Scenario, first: int) -> range:
 
 
 def _kind(name: str) -> str:
-    """Which of `KINDS` is meant."""
     if Path(name).suffix in (".yaml", ".yml"):
         return _kind_of_file(Path(name))
     of = {kind: builtin_names(f"{kind}s") for kind in KINDS}

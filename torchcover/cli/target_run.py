@@ -5,10 +5,11 @@ from typing import Any
 
 from rich.console import Console
 
-from torchcover.cli.printing import in_words, print_files, print_whole
+from torchcover.cli.printing import print_files
 from torchcover.evaluation import save_targets, survey_target
 from torchcover.evaluation.target_survey import places_table, sides_table
 from torchcover.files import claimed
+from torchcover.report import print_whole
 from torchcover.simulation import Rig
 from torchcover.targets import Heading, Raster, TargetMap
 
@@ -85,6 +86,6 @@ def _print(seen: TargetMap) -> None:
         soft_wrap=True,
     )
     worst = places_table(seen.worst(), "The places with the fewest points, 1 m apart")
-    print_whole([in_words(sides_table(seen)), in_words(worst)])
+    print_whole([sides_table(seen), worst])
     if unknown := seen.counts["share_unknown"]:
         console.print(f"{unknown:,} places show no surface to any random place: their share is unknown.")

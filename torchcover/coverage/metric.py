@@ -184,20 +184,11 @@ class CoverageMetric(SumsInBlocks):
         for sums in self.sums_of(sensor, reference, **given):
             self.add(sums)
 
-    def forward(
-        self,
-        sensor: SensorClouds,
-        reference: Clouds,
-        *,
-        weights: Clouds | None = None,
-        height: Clouds | None = None,
-        place_in_time: int | Sequence[int] | None = None,
-        error: Clouds | None = None,
-    ) -> Coverage:
-        """Add steps as `update` does, and return the coverage of these steps alone."""
-        if place_in_time is None:  # torchmetrics adds the steps to an empty state first: counting would start at 0
-            place_in_time = [int(self.steps) + step for step in range(len(as_list(reference, "reference")))]
-        given = {"weights": weights, "height": height, "place_in_time": place_in_time, "error": error}
+    def forward(self, sensor: SensorClouds, reference: Clouds, **given: Any) -> Coverage:  # noqa: ANN401
+        """Add steps as `update` does, which takes the same, and return the coverage of these steps alone."""
+        if given.get("place_in_time") is None:  # torchmetrics adds steps to an empty state: counting would start at 0
+            steps = range(len(as_list(reference, "reference")))
+            given["place_in_time"] = [int(self.steps) + step for step in steps]
         return super().forward(sensor, reference, **given)  # type: ignore[no-any-return]
 
     def sums_of(self, sensor: SensorClouds, reference: Clouds, **given: Any) -> list[StepSums]:  # noqa: ANN401

@@ -146,17 +146,6 @@ class Coverage:
             errors |= {by_area(one).key: each[one.key] for one in self.quantities}
         return errors
 
-    @property
-    def radius_error(self) -> Tensor | None:
-        """(H, Y, X) standard error of `radius` in metres; None without blocks."""
-        return self.errors.get(RADIUS.key)
-
-    @property
-    def detection_error(self) -> Tensor | None:
-        """(T, H, Y, X) standard error of `detection`, likewise."""
-        errors = self.listed_errors
-        return self._stacked([errors[quantity.key] for quantity in self.quantities[1:]]) if errors else None
-
     def _stacked(self, each: Sequence[Tensor]) -> Tensor:
         """(T, H, Y, X) one entry for each threshold."""
         return torch.stack(list(map(self.known.spread, each))) if each else self.radius.new_empty((0, *self.grid.shape))

@@ -18,19 +18,14 @@ class Quantity(NamedTuple):
         lower_is_better: Whether less of it is better. Nothing else decides the direction of a number.
 
     Example:
-        >>> Quantity("radius_m", "mean blind spot radius", "m", lower_is_better=True).error_key
-        'radius_m_error'
+        >>> Quantity("radius_m", "mean blind spot radius", "m", lower_is_better=True).gain(-0.1)
+        0.1
     """
 
     key: str
     title: str
     unit: Unit
     lower_is_better: bool
-
-    @property
-    def error_key(self) -> str:
-        """The key of its standard error."""
-        return f"{self.key}_error"
 
     def gain(self, difference: float) -> float:
         """A difference of two of them with the sign turned so that more is better."""

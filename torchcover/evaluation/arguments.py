@@ -5,7 +5,7 @@ import textwrap
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import update_wrapper
-from typing import Annotated, Any, Generic, Literal, ParamSpec, TypeVar, get_args, get_origin
+from typing import Annotated, Any, Generic, ParamSpec, TypeVar, get_args, get_origin
 
 GivenT = TypeVar("GivenT")
 ValueT = TypeVar("ValueT")
@@ -22,13 +22,13 @@ class Option:
         words: What it is, for the help and the documentation.
         typed: Its type on the command line; that of Python if not given.
         minimum: The least value.
-        in_study: Whether `torchcover study` has it, too: once, or also several times, to try each value.
+        in_study: Whether `torchcover study` has it, too.
     """
 
     words: str
     typed: Any = None
     minimum: int | None = None
-    in_study: Literal["once", "tried"] | None = None
+    in_study: bool = False
 
 
 class Read(Generic[GivenT, ValueT]):

@@ -93,7 +93,6 @@ def _workers(task: Task[FrameSource], settings: Settings) -> int:
 
 
 def _observed(task: Task[FrameSource], settings: Settings, others: Observers) -> tuple[Observers, Observers, Run]:
-    """All that was seen, by all ranks."""
     ranks, checkpoint = settings.ranks, settings.checkpoint
     if ranks:
         settings = replace(settings, device=ranks.device(settings.device))

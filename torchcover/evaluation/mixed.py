@@ -107,26 +107,25 @@ class MixedResult(Result):
         each = {MIXTURE: page_tables(self.table), **{name: world.tables for name, world in self.worlds.items()}}
         return [replace(one, title=f"{name}: {one.title}".rstrip(": ")) for name, of in each.items() for one in of]
 
-    def maps(self, *, errors: bool = False) -> Iterator[tuple[str, Figure]]:
+    def maps(self) -> Iterator[tuple[str, Figure]]:
         """Those of each kind of world; its name is the first part of the stems."""
         for name, world in self.worlds.items():
-            yield from ((f"{name}/{stem}", figure) for stem, figure in world.maps(errors=errors))
+            yield from ((f"{name}/{stem}", figure) for stem, figure in world.maps())
 
-    def save(self, folder: str | Path, *, files: str | Iterable[str] = FILES, error_maps: bool = False) -> list[Path]:
+    def save(self, folder: str | Path, *, files: str | Iterable[str] = FILES) -> list[Path]:
         """Write the files of each kind of world to a folder of its own, as `Result.save`, and those of the mixture.
 
         Args:
             folder: Where to write: `NAME/...`; `summary.csv`, with the rows of all worlds and of the mixture,
                 `report.html` and `summary.json`.
             files: As in `Result.save`.
-            error_maps: Likewise.
 
         Returns:
             The files.
         """
         record, folders = self.record, file_stems(list(self.worlds))
         each = zip(folders, self.worlds.values(), strict=True)
-        parts = [world.save(Path(folder) / name, files=files, error_maps=error_maps) for name, world in each]
+        parts = [world.save(Path(folder) / name, files=files) for name, world in each]
         with Publication(Path(folder)) as written:
             if "numbers" in wanted_files(files):
                 written.add_text("summary.csv", self._csv())

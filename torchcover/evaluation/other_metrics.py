@@ -73,7 +73,6 @@ def metrics_of(task: Task[FrameSource], settings: Settings) -> OtherMetrics:
 
 
 def _lacking(task: Task[FrameSource]) -> frozenset[Need]:
-    """What the frames, or the rigs, do not have."""
     there: dict[Need, bool] = {
         "sensors": all(task.sensors.get(rig) for rig in task.rigs),
         "boxes": task.frames.has_boxes(),

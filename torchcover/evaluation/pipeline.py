@@ -223,7 +223,6 @@ def observe(
 
 @contextmanager
 def _threads_beside(workers: int) -> Iterator[None]:
-    """Leave each worker a core."""
     before = torch.get_num_threads()
     if workers:
         torch.set_num_threads(max(1, min(before, cores() - workers)))
@@ -261,7 +260,6 @@ def _feed(seen: MeasuredFrame, observers: Sequence[AnyObserver], run: Run, devic
 
 
 def _left(indices: Iterator[int], run: Run, *, skip_bad_frames: bool) -> Iterator[int]:
-    """What a checkpoint has left to do."""
     done = run.steps + len(run.skipped)
     if (most := sum(1 for _ in islice(indices, done))) < done:
         raise ValueError(f"steps: {done} are done in the checkpoint; got {most}, which is less")
@@ -301,7 +299,6 @@ class FramesOrErrors(Dataset[Any]):
 def _each(
     frames: MeasuredFrames, tasks: Iterable[list[int]], workers: int, run: Run, *, skip_bad_frames: bool
 ) -> Iterator[MeasuredFrame]:
-    """One frame at a time; notes bad ones if they are to be skipped."""
     loader = DataLoader(
         FramesOrErrors(frames),
         batch_sampler=tasks,

@@ -128,8 +128,6 @@ def held_back() -> Iterator[list[int]]:
 
 
 class _Program:
-    """Handles the signals of a program."""
-
     def __init__(self, told: Callable[[Sequence[int]], object]) -> None:
         self.arrived: list[int] = []
         self._told = told

@@ -129,7 +129,6 @@ def frustum(view: SensorView) -> list[NDArray[np.float64]]:
 
 
 def _cells(values: NDArray[Any], grid: BevGrid, scale: ColourScale) -> Any:  # noqa: ANN401
-    """Known cells as coloured squares on the ground."""
     import rerun as rr
 
     row, column = np.nonzero(~np.isnan(values))

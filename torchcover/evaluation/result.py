@@ -165,11 +165,8 @@ class Result:
             more_tables=[left_out_table(self.left_out)] if self.left_out else [],
         )
 
-    def maps(self, *, errors: bool = False) -> Iterator[tuple[str, Figure]]:
+    def maps(self) -> Iterator[tuple[str, Figure]]:
         """Draw the maps, one by one; several rigs side by side, and their differences to the first.
-
-        Args:
-            errors: Whether to draw the standard errors too.
 
         Returns:
             The stem of the file name, and a figure of its own, outside pyplot.
@@ -180,10 +177,9 @@ class Result:
             ego_outline_m=self.ego_outline_m,
             sensors=views,
             vehicle=self.vehicle,
-            errors=errors,
         )
 
-    def save(self, folder: str | Path, *, files: str | Iterable[str] = FILES, error_maps: bool = False) -> list[Path]:
+    def save(self, folder: str | Path, *, files: str | Iterable[str] = FILES) -> list[Path]:
         """Write the files of the command line: first the numbers, then the maps.
 
         At any time `summary.json` lists files of one run; those of an earlier one stay until the new numbers are there.
@@ -194,7 +190,6 @@ class Result:
                 does not exist. Files of an earlier run that this one does not write are deleted: those that its
                 `summary.json` lists.
             files: What to write beside `summary.json`: "numbers", "maps", "page", or a text as in "numbers,page".
-            error_maps: Whether to draw maps of the standard errors too.
 
         Returns:
             The files.
@@ -214,7 +209,7 @@ class Result:
                 written.publish(summary)
             if "page" in wanted:
                 written.add_text("report.html", page_html(self.page))
-            for stem, figure in self.maps(errors=error_maps) if "maps" in wanted else ():
+            for stem, figure in self.maps() if "maps" in wanted else ():
                 written.add_figure(f"maps/{stem}.png", figure)
             written.publish(summary)
         return written.paths

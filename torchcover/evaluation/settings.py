@@ -194,7 +194,7 @@ class Settings:
             "then mixed: `urban,highway`, with weights `urban=0.7,highway=0.3` (equal if not given); in Python also a "
             "sequence, or a mapping to weights.",
             str,
-            in_study="once",
+            in_study=True,
         ),
     ] = None
     _: KW_ONLY
@@ -208,14 +208,14 @@ class Settings:
             minimum=1,
         ),
     ] = None
-    seed: Annotated[int, Option("Seed of the simulation.", minimum=0, in_study="once")] = 0
+    seed: Annotated[int, Option("Seed of the simulation.", minimum=0, in_study=True)] = 0
     vehicle: Annotated[
         str | Path | None,
         Option(
             "What carries the rigs: a built-in vehicle, a YAML file or a mesh in metres. Not given: the scenario's own "
             "ego, else the vehicle that the rigs name, else an SUV.",
             str,
-            in_study="once",
+            in_study=True,
         ),
     ] = None
     sensor_model: Annotated[
@@ -240,15 +240,15 @@ class Settings:
             "Regions, also polygons, height bands and grid, in a YAML file. Not given: the paper's regions in front, "
             "and the near field on the four sides of the vehicle.",
             Path,
-            in_study="once",
+            in_study=True,
         ),
     ] = Read(_asked, None)
     cell_m: Annotated[
-        float | None, Option("Side of a grid cell in metres, whatever `ask` says (0.25).", in_study="tried")
+        float | None, Option("Side of a grid cell in metres, whatever `ask` says (0.25).", in_study=True)
     ] = None
     thresholds_m: Annotated[
         Read[float | Iterable[float], tuple[float, ...]],
-        Option("Detection thresholds in metres (0.4); may be repeated.", list[float], in_study="once"),
+        Option("Detection thresholds in metres (0.4); may be repeated.", list[float], in_study=True),
     ] = Read(_thresholds, (0.4,))
     aggregations: Annotated[
         Read["str | Sequence[Aggregation | str]", "tuple[Aggregation, ...]"],
@@ -263,7 +263,7 @@ class Settings:
         Option(
             "Reference sensor: `surface`, points drawn evenly on what can be seen (default), or `paper`. On the "
             "command line with --frames: `recorded`, or `accumulated` from the recording itself.",
-            in_study="tried",
+            in_study=True,
         ),
     ] = None
     rays: Annotated[
@@ -271,7 +271,7 @@ class Settings:
         Option(
             "Rays of the reference sensor at each step (surface: 16384; paper: 1048576, a square).",
             minimum=1,
-            in_study="tried",
+            in_study=True,
         ),
     ] = None
     estimate: Annotated[
@@ -279,7 +279,7 @@ class Settings:
         Option(
             "What the number of a region is a mean over: `area`, its visible surface (default; needs `surface`), or "
             "`known`, its known cells, as in the paper.",
-            in_study="tried",
+            in_study=True,
         ),
     ] = None
     band_frame: Annotated[
@@ -287,7 +287,7 @@ class Settings:
         Option(
             "What height bands are over: `ground`, the local ground (default), or `vehicle`, z of the vehicle (`paper` "
             "and recordings without heights have no other).",
-            in_study="tried",
+            in_study=True,
         ),
     ] = None
     every_s: Annotated[
@@ -295,7 +295,7 @@ class Settings:
         Option(
             "Seconds between one step and the next; steps that follow each other are alike. Not given: 10 in traffic, "
             "which starts anew in another city every minute, else what spreads the steps over the scenario.",
-            in_study="tried",
+            in_study=True,
         ),
     ] = None
     target_error: Annotated[
@@ -311,7 +311,7 @@ class Settings:
         Option(
             "Only the detections of regions: no radii, and rough maps. Few reference points (2048 rays), and of the "
             "rig only those rays are cast that can change their detection: for target errors, with more steps.",
-            in_study="tried",
+            in_study=True,
         ),
     ] = False
     redundancy: Annotated[
@@ -327,14 +327,14 @@ class Settings:
     ] = Read(_metrics, ())
     device: Annotated[
         Read["str | torch.device", str],
-        Option("Where the search and the sums run: cpu, cuda, cuda:1, ...", str, in_study="tried"),
+        Option("Where the search and the sums run: cpu, cuda, cuda:1, ...", str, in_study=True),
     ] = Read(_device, "cpu")
     workers: Annotated[
         int | None,
         Option(
             "Processes that make frames; 0 makes them in this one. Not given: of a simulation, as many as help.",
             minimum=0,
-            in_study="tried",
+            in_study=True,
         ),
     ] = None
     no_cache: Annotated[

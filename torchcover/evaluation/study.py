@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import torch
 from matplotlib.figure import Figure
-from rich.table import Table
 from torch import Tensor
 
 from torchcover import __version__
@@ -26,13 +25,14 @@ from torchcover.evaluation.target_error import MIN_STEPS, rounded_up
 from torchcover.evaluation.task import simulation
 from torchcover.files import Publication, end_with_parent
 from torchcover.report import (
+    PageTable,
+    Words,
     difference_heading,
     difference_words,
     draw_work_precision,
     error_words,
     json_record,
     shown_unit,
-    text_table,
 )
 
 DEFAULT_STEPS = 512
@@ -45,6 +45,13 @@ FEWER_RAYS: tuple[Mapping[str, Any], ...] = (
 )
 # Errors of the detection that settings are recommended for.
 WANTED = (0.02, 0.01, 0.005)
+
+
+def _points(error: float) -> str:
+    return f"{100 * error:g} percentage point{'s' * (error != 0.01)}"
+
+
+STEPS_HEADINGS = tuple(f"steps for {_points(error)}" for error in WANTED)
 # Another setting than the first is recommended only where it saves a fifth of the time.
 WORTH = 0.8
 # A bias is one if chance gives the largest of all numbers less than this often.
@@ -192,25 +199,24 @@ class Study:
         return reached[0 if first else times.index(min(times))]
 
     @property
-    def tables(self) -> list[Table]:
-        """For people: the settings; the numbers of the first."""
+    def tables(self) -> list[PageTable]:
+        """The settings; the numbers of the first."""
         return [self._settings(), self._numbers()]
 
-    def _settings(self) -> Table:
+    def _settings(self) -> PageTable:
         rows = []
         for trial in self.trials:
             needed = [_steps_words(trial, trial.steps_for(error), self.start_s) for error in WANTED]
             times = [f"{1000 * s / trial.steps:.0f}" for s in (trial.seconds, trial.processor_s)]
-            rows.append([trial.options or "as given", *times, _bias(trial), *needed])
-        wanted = [f"steps for {_points(error)}" for error in WANTED]
-        return text_table(
-            ("setting", "step (ms)", "of processors (ms)", "bias (points)", *wanted),
-            [rows],
-            title="Every detection in front to so many percentage points",
-            caption="bias: the largest to the first setting on the same instants, * if it is beyond chance",
+            rows.append(list(map(Words, [trial.options or "as given", *times, _bias(trial), *needed])))
+        return PageTable(
+            "Every detection in front to so many percentage points",
+            ("setting", "step (ms)", "of processors (ms)", "bias (points)", *STEPS_HEADINGS),
+            rows,
+            notes=["bias: the largest to the first setting on the same instants, * if it is beyond chance"],
         )
 
-    def _numbers(self) -> Table:
+    def _numbers(self) -> PageTable:
         first, rows = self.trials[0], []
         for one in first.numbers:
             steps = [one.error.steps_for(error) for error in WANTED] if one.quantity.unit == "share" else [None] * 3
@@ -218,11 +224,10 @@ class Study:
                 _steps_words(first, each and rounded_up(max(each, first.least_steps)), self.start_s) for each in steps
             ]
             error = error_words(one.error.error_after(first.steps), one.quantity.unit)
-            rows.append([f"{one.region} {one.height}", difference_heading(one.quantity), error, *words])
-        wanted = [f"steps for {_points(error)}" for error in WANTED]
-        return text_table(
-            ("place", "number", f"error after {first.steps:,}", *wanted), [rows], title="Each number, as given"
-        )
+            place = f"{one.region} {one.height}"
+            rows.append(list(map(Words, [place, difference_heading(one.quantity), error, *words])))
+        headings = ("place", "number", f"error after {first.steps:,}", *STEPS_HEADINGS)
+        return PageTable("Each number, as given", headings, rows)
 
     def advice(self, error: float) -> str:
         """The options of `evaluate` that reach an error."""
@@ -281,10 +286,6 @@ class Study:
         return files.paths
 
 
-def _points(error: float) -> str:
-    return f"{100 * error:g} percentage point{'s' * (error != 0.01)}"
-
-
 def _steps_words(trial: Trial, steps: int | None, start_s: float) -> str:
     return "-" if steps is None else f"{steps:,} ({trial.seconds_for(steps, start_s):.0f} s)"
 
@@ -339,7 +340,6 @@ def _first_steps(coverage: Coverage) -> int:
 
 
 def _tried(options: str, settings: Settings, first: Coverage | None) -> tuple[Trial, Coverage]:
-    """Run a setting, and hold it against the first."""
     task, before_s = simulation(settings), sum(os.times()[:4])
     result = measured(task, settings)
     processor_s = sum(os.times()[:4]) - before_s

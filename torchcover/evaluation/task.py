@@ -181,7 +181,6 @@ def _rays(settings: Settings) -> int | None:
 
 
 def _band_frame(settings: Settings) -> BandFrame:
-    """Of a simulation."""
     return settings.band_frame or ("vehicle" if settings.reference == "paper" else DEFAULT_BAND_FRAME)
 
 

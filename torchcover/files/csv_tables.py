@@ -64,7 +64,6 @@ def csv_text(rows: Iterable[Iterable[object]]) -> str:
 
 
 def _rows(text: str) -> Iterator[tuple[int, list[str]]]:
-    """Line and words of each row that is not blank."""
     reader = csv.reader(text.splitlines(keepends=True), strict=True)
     try:
         for row in reader:

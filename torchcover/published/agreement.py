@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torchcover.files import read_csv, reads
 from torchcover.published.ranks import (
     BASELINE,
+    DRAWS,
     OWN,
     Array,
     Ranking,
@@ -175,7 +176,7 @@ class Agreement:
 
 
 def agreement_of(
-    rankings: Sequence[Ranking], judged: Judged, *, draws: int = 500, seed: int = 0, placements: bool = False
+    rankings: Sequence[Ranking], judged: Judged, *, draws: int = DRAWS, placements: bool = False
 ) -> Agreement:
     """Rank placements by metrics, and compare with the mean of the judges.
 
@@ -186,7 +187,6 @@ def agreement_of(
         rankings: What the metrics say of the placements of `judged`, in its order.
         judged: What the judges say.
         draws: How often; at most as many as the rankings have.
-        seed: Of the draws.
         placements: Whether to draw placements, too.
 
     Raises:
@@ -204,7 +204,7 @@ def agreement_of(
     for one in rankings:
         if len(one.numbers) != count or (one.draws is not None and one.draws[:draws].shape != (draws, count)):
             raise ValueError(f"{one.name}: a value of each of {count} placements is needed, and {draws} draws or none")
-    truths, columns = _drawn(judged, draws, seed, placements=placements)
+    truths, columns = _drawn(judged, draws, placements=placements)
     ranked = tuple(_ranked(one, judged.mean, truths, columns) for one in rankings)
     strength = np.array([abs(row.spearman.value) for row in ranked])
     if np.isnan(strength).all():
@@ -219,9 +219,7 @@ def agreement_of(
     )
 
 
-def lead(
-    one: Ranking, other: Ranking, judged: Judged, *, draws: int = 500, seed: int = 0, placements: bool = False
-) -> Relation:
+def lead(one: Ranking, other: Ranking, judged: Judged, *, draws: int = DRAWS, placements: bool = False) -> Relation:
     """By how much Spearman's correlation of a metric is above that of another one, with its interval.
 
     Both are held against the same draws, so that what they share cancels out.
@@ -231,7 +229,6 @@ def lead(
         other: What it is to beat.
         judged: As in `agreement_of`, and so are all that follow.
         draws: How often.
-        seed: Of the draws.
         placements: Whether to draw placements, too.
 
     Example:
@@ -242,15 +239,15 @@ def lead(
         >>> lead(good, bad, judged)
         Relation(value=2.0, low=2.0, high=2.0)
     """
-    truths, columns = _drawn(judged, draws, seed, placements=placements)
+    truths, columns = _drawn(judged, draws, placements=placements)
     found = [spearman(each.gains, judged.mean) for each in (one, other)]
     drawn = [spearman(*_along(each, truths, columns)) for each in (one, other)]
     return _with_ends(float(found[0] - found[1]), drawn[0] - drawn[1])
 
 
-def _drawn(judged: Judged, draws: int, seed: int, *, placements: bool) -> tuple[Array, NDArray[np.int64]]:
+def _drawn(judged: Judged, draws: int, *, placements: bool) -> tuple[Array, NDArray[np.int64]]:
     """(R, n) the mean of judges that are drawn anew, and which placements are drawn."""
-    generator, count = np.random.default_rng(seed), len(judged.placements)
+    generator, count = np.random.default_rng(0), len(judged.placements)
     chosen = generator.integers(len(judged.judges), size=(draws, len(judged.judges)))
     columns = generator.integers(count, size=(draws, count)) if placements else np.tile(np.arange(count), (draws, 1))
     return judged.values[chosen].mean(axis=1), columns

@@ -8,13 +8,12 @@ from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
-from rich.table import Table
 
 from torchcover.estimation import Number
 from torchcover.files import csv_text
 from torchcover.published.ranks import LEAST, Ranking, kendall_tau_b
 from torchcover.published.s_mig import unequal_rays
-from torchcover.report import PageTable, Words, json_record, number_words, shown_unit, text_table
+from torchcover.report import PageTable, Words, json_record, number_words, shown_unit
 
 TITLE, TAU_TITLE = "Metrics of others", "Kendall's tau-b with torchcover's numbers, 95 % over worlds"
 
@@ -103,26 +102,17 @@ def tau_of(first: Ranking, second: Ranking) -> Tau:
     return Tau(first.name, second.name, value, low, high, known)
 
 
-def page_tables(comparison: MetricComparison) -> list[PageTable]:
-    """All numbers, those of parts too; and the taus, if there are any."""
-    rows = [[Words(word) for word in row] for row in map(_row, comparison.rankings)]
-    tables = [PageTable(_title(comparison), _headings(comparison), rows, 3, comparison.notes)]
-    if taus := _tau_rows(comparison):
-        headings, *tau_rows = taus
-        tables.append(PageTable(TAU_TITLE, headings, [[Words(word) for word in row] for row in tau_rows]))
-    return tables
+def page_tables(comparison: MetricComparison, *, parts: bool = True) -> list[PageTable]:
+    """The numbers, and the taus, if there are any.
 
-
-def text_tables(comparison: MetricComparison) -> list[Table]:
-    """The main numbers, and the taus, for `rich.console.Console.print`."""
-    by_metric: dict[str, list[list[str]]] = {}
-    for one in comparison.main:
-        by_metric.setdefault(one.metric, []).append(_row(one))
-    caption = "\n".join(comparison.notes)
-    tables = [text_table(_headings(comparison), by_metric.values(), title=_title(comparison), caption=caption)]
-    if taus := _tau_rows(comparison):
-        tables.append(text_table(taus[0], [taus[1:]], title=TAU_TITLE))
-    return tables
+    Args:
+        comparison: What the metrics say.
+        parts: Whether to tell those too that are about a category or a region only.
+    """
+    rows = [list(map(Words, _row(one))) for one in (comparison.rankings if parts else comparison.main)]
+    headings = ["metric", "unit", "better", *comparison.rigs]
+    title = f"{TITLE} (rank)" if len(comparison.rigs) > 1 else TITLE
+    return [PageTable(title, headings, rows, 3, comparison.notes), *_tau_tables(comparison)]
 
 
 def record(comparison: MetricComparison) -> dict[str, Any]:
@@ -154,14 +144,6 @@ def _tau_records(comparison: MetricComparison) -> list[dict[str, Any]]:
     return [json_record(tau._asdict()) for tau in comparison.taus()]
 
 
-def _title(comparison: MetricComparison) -> str:
-    return f"{TITLE} (rank)" if len(comparison.rigs) > 1 else TITLE
-
-
-def _headings(comparison: MetricComparison) -> list[str]:
-    return ["metric", "unit", "better", *comparison.rigs]
-
-
 def _row(one: Ranking) -> list[str]:
     better = "less" if one.quantity.lower_is_better else "more"
     ranks = one.ranks.tolist() if len(one.numbers) > 1 else [math.nan]
@@ -169,19 +151,19 @@ def _row(one: Ranking) -> list[str]:
 
 
 def _words(number: Number, rank: float) -> str:
-    """A number and its rank; an unknown one is a dash."""
     if not number.known:
         return "–"
     return number_words(number) if math.isnan(rank) else f"{number_words(number)} ({rank:g})"
 
 
-def _tau_rows(comparison: MetricComparison) -> list[list[str]]:
-    """The headings, then a row for each main number; nothing if there are no taus."""
+def _tau_tables(comparison: MetricComparison) -> list[PageTable]:
+    """A row for each main number; no table if there are no taus."""
     found = {(tau.first, tau.second): tau for tau in comparison.taus()}
     # Numbers of torchcover that the table has room for: the detections.
     shown = [own.name for own in comparison.own if not own.quantity.lower_is_better]
-    rows = [[one.name, *(_tau_words(found[one.name, own]) for own in shown)] for one in comparison.main if found]
-    return [["metric", *shown], *rows] if rows else []
+    mains = [one.name for one in comparison.main if found]
+    rows = [[Words(name), *(Words(_tau_words(found[name, own])) for own in shown)] for name in mains]
+    return [PageTable(TAU_TITLE, ["metric", *shown], rows)] if rows else []
 
 
 def _tau_words(tau: Tau) -> str:

@@ -1,7 +1,7 @@
 """Rigs in the order of a number, how alike two such orders are, and whether that is more than chance."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from itertools import permutations
 from typing import NamedTuple, TypeAlias
@@ -13,8 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 from torchcover.estimation import MIN_BLOCKS, Estimate, Number, Quantity
 
 Array: TypeAlias = NDArray[np.float64]
-# Of two (..., n) series: how alike they are, (...).
-Statistic: TypeAlias = Callable[[ArrayLike, ArrayLike], Array]
 
 # Two things have two orders, and are alike or opposite by chance.
 LEAST = 3
@@ -191,42 +189,38 @@ def orders(count: int, seed: int = 0) -> NDArray[np.int64]:
     return found
 
 
-def permutation_p(first: ArrayLike, second: ArrayLike, statistic: Statistic = spearman, seed: int = 0) -> float:
-    """Probability that chance gives so strong a relation, of either sign: two-sided.
+def permutation_p(first: ArrayLike, second: ArrayLike) -> float:
+    """Probability that chance gives so strong a rank correlation (`spearman`), of either sign: two-sided.
 
     With several first series it is that of the best of them: of k metrics that were looked at, one is always good.
 
     Args:
         first: (n,) or (k, n), NaN where unknown.
         second: (n,) what their orders are held against.
-        statistic: `spearman` or `kendall_tau_b`.
-        seed: Of the orders that are drawn where they are too many to try.
 
     Returns:
-        The share of orders of the second with as strong a relation; NaN if no relation is known.
+        The share of orders of the second with as strong a correlation; NaN if none is known.
 
     Example:
         >>> permutation_p([1, 2, 3, 4], [1, 2, 3, 4])           # 2 of 24 orders
         0.0833...
     """
     series, target = np.atleast_2d(np.asarray(first, dtype=np.float64)), np.asarray(second, dtype=np.float64)
-    found = np.abs([statistic(one, target) for one in series])
+    found = np.abs([spearman(one, target) for one in series])
     if np.isnan(found).all():
         return math.nan
-    best = strongest_by_chance(series, target, statistic, seed)
+    best = strongest_by_chance(series, target)
     as_strong = int((best >= np.nanmax(found) - 1e-12).sum())
     drawn = math.factorial(target.size) > MOST_TRIED  # then the order that was found is one more
     return (as_strong + drawn) / (len(best) + drawn)
 
 
-def strongest_by_chance(first: ArrayLike, second: ArrayLike, statistic: Statistic = spearman, seed: int = 0) -> Array:
-    """The strongest relation of several series, of either sign, to each of many orders of the second.
+def strongest_by_chance(first: ArrayLike, second: ArrayLike) -> Array:
+    """The strongest rank correlation of several series, of either sign, to each of many orders of the second.
 
     Args:
         first: (n,) or (k, n), NaN where unknown.
         second: (n,) what is put in other orders.
-        statistic: As in `permutation_p`.
-        seed: Likewise.
 
     Returns:
         (P,) from 0 to 1: what the best of k metrics that mean nothing reaches.
@@ -235,13 +229,11 @@ def strongest_by_chance(first: ArrayLike, second: ArrayLike, statistic: Statisti
         >>> float(strongest_by_chance([1, 2, 3], [1, 2, 3]).mean())             # of six orders two have 1, four 0.5
         0.666...
     """
-    target, numbers = np.asarray(second, dtype=np.float64), orders(np.size(second), seed)
+    target, numbers = np.asarray(second, dtype=np.float64), orders(np.size(second))
     best = np.zeros(len(numbers))
     for one in np.atleast_2d(np.asarray(first, dtype=np.float64)):
-        if statistic is spearman and not np.isnan(one + target).any():
-            found = _spearman_of_orders(one, target, numbers)
-        else:
-            found = statistic(one, target[numbers])
+        known = not np.isnan(one + target).any()
+        found = _spearman_of_orders(one, target, numbers) if known else spearman(one, target[numbers])
         best = np.fmax(best, np.abs(found))
     return best
 

@@ -124,7 +124,6 @@ class SMig(FrameMetric):
         self.boxes = with_rows(self.boxes, rows)
 
     def _found(self) -> tuple[Estimate, Sequence[Number]]:
-        """All categories together, then each."""
         of_each, times, rays = self._occupancies(), self._crossings(), ray_count(self.sensors)
         about = [
             said(

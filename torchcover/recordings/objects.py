@@ -174,7 +174,6 @@ def class_of(category: str) -> str | None:
 
 
 def _labelled(recording: Recording, times_s: NDArray[np.float64], world_T_vehicle: Matrix) -> Iterator[Seen]:
-    """The objects of all instants, one after the other."""
     labelled = False
     for index, (name, time_s) in enumerate(zip(recording.names, times_s.tolist(), strict=True)):
         boxes = recording.boxes(index)

@@ -16,11 +16,9 @@ from .drawings.targets import draw_targets as draw_targets
 from .drawings.vehicle import SkinPatch as SkinPatch
 from .drawings.vehicle import draw_vehicle as draw_vehicle
 from .drawings.work_precision import draw_work_precision as draw_work_precision
-from .maps.arrays import draw_map as draw_map
 from .maps.arrays import draw_side_by_side as draw_side_by_side
 from .maps.colours import ColourScale as ColourScale
 from .maps.colours import difference_scale as difference_scale
-from .maps.colours import error_scale as error_scale
 from .maps.colours import scale_of as scale_of
 from .maps.figures import band_figures as band_figures
 from .maps.figures import file_stems as file_stems
@@ -46,9 +44,8 @@ from .renderers.layout import BOLD_MARKS as BOLD_MARKS
 from .renderers.layout import PageTable as PageTable
 from .renderers.layout import Words as Words
 from .renderers.layout import parts_of as parts_of
-from .renderers.text_file import narrowest_width as narrowest_width
 from .renderers.text_file import print_table as print_table
-from .renderers.text_file import text_table as text_table
+from .renderers.text_file import print_whole as print_whole
 from .table import CoverageTable as CoverageTable
 from .table import Row as Row
 from .wording import difference_heading as difference_heading

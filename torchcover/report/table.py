@@ -139,7 +139,6 @@ def _rows(
     regions: Sequence[Region],
     summaries: Mapping[str, Sequence[RegionSummary]],
 ) -> list[dict[str, Row]]:
-    """For each region and band, the row of each rig."""
     first = next(iter(coverages.values()))
     places = [(region, height) for region in regions for height in first.grid.heights]
     several = len(coverages) > 1
@@ -156,7 +155,6 @@ def _rows(
 
 
 def _parts(coverage: Coverage | Mixture) -> list[Coverage]:
-    """What was measured in each kind of world."""
     return [coverage] if isinstance(coverage, Coverage) else [part for _, part in coverage.parts]
 
 

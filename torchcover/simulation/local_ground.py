@@ -337,7 +337,6 @@ def _planes(triangles_m: Float64) -> tuple[Float64, Float64]:
 
 
 def _halved(raster: Float32) -> Float32:
-    """A raster with squares twice as large."""
     columns, rows = (side + side % 2 for side in raster.shape[1:])
     even = np.empty((2, columns, rows), dtype=np.float32)
     even[0], even[1] = np.inf, -np.inf

@@ -84,7 +84,6 @@ class Radar(Ranging):
         return rows * self.azimuth_cells * columns
 
     def _raster(self) -> tuple[int, int]:
-        """Rows of rays, and columns in each cell of azimuth."""
         spacing_deg = math.degrees(self.ray_spacing_m / self.max_range_m)
         low_deg, high_deg = self.vertical_fov_deg
         cell_deg = self.horizontal_fov_deg / self.azimuth_cells

@@ -169,7 +169,6 @@ def pixels_in_tiles(directions: Float64) -> NDArray[np.int64]:
 
 
 def _cuts(shape: tuple[int, ...], tile_rows: int, tile_columns: int) -> Iterator[tuple[slice, slice]]:
-    """The rows and the columns of each tile."""
     _, rows, columns = shape
     for top in range(0, rows, tile_rows):
         for left in range(0, columns, tile_columns):

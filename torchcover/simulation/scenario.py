@@ -28,7 +28,6 @@ DEFAULT_EGO = VehicleShape(type="vehicle", vehicle="suv")
 
 
 def _traffic(content: Any, info: ValidationInfo) -> Traffic | None:  # noqa: ANN401  (whatever stood in the file)
-    """Traffic of the kind that its `type` names."""
     if content is None:
         return None
     kind = content.get("type") if isinstance(content, dict) else getattr(content, "type", type(content).__name__)

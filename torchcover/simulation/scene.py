@@ -205,7 +205,6 @@ class Scene:
 
     @property
     def _first_moving(self) -> int:
-        """Number of the first body that moves."""
         return len(self._resting) + len(self.world.static)
 
     @property
@@ -268,7 +267,6 @@ class Scene:
                 )
 
     def _placed(self, numbers: NDArray[np.intp], vehicle_T_world: Matrix, time_s: float) -> Moving:
-        """Some of the bodies that move, at a time."""
         solids = [self._solids.of(self._moving[k].mesh) for k in numbers.tolist()]
         return Moving.placed(solids, self._parts(numbers, vehicle_T_world, time_s), self._first_moving + numbers)
 

@@ -209,7 +209,6 @@ class MeshFile(Document):
 
 @reads("a mesh")
 def _read_mesh(path: Path) -> Mesh:
-    """All geometry of a file, in its own unit."""
     import trimesh
 
     with path.open("rb") as file:

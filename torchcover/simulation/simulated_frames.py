@@ -331,7 +331,6 @@ def reference_of_objects(asked: Asked | None = None) -> SurfaceReference:
 
 
 def _rigs(rig: Rig | str | Path | None, rigs: Mapping[str, Rig | str | Path] | None) -> dict[str, Rig]:
-    """One rig by its own name, or several by the names that they are given."""
     if (rig is None) == (rigs is None):
         raise ValueError("give one rig, or several as rigs={name: rig}")
     if rig is not None:

@@ -158,7 +158,6 @@ class Stages:
         return self._on_moving_ego
 
     def _on(self, scene: Scene) -> Mapping[str, Sequence[MountedSensor]]:
-        """The rigs' sensors on the ego of a scene."""
         return {name: mounted_on(scene, self._scenes.scenario, name, rig) for name, rig in self._rigs.items()}
 
     def __getstate__(self) -> dict[str, Any]:

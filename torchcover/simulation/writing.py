@@ -114,7 +114,6 @@ def _setup(frames: SimulatedFrames) -> RecordingSetup:
 
 
 def _step(frames: SimulatedFrames, index: int) -> RecordedStep:
-    """Simulate a step of the only rig."""
     ((name, rig),) = frames.rigs.items()
     seen = frames.simulator.step(index)
     landed = [scan.points if scan.landed is None else scan.landed for scan in seen.scans[name]]

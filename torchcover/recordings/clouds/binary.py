@@ -32,8 +32,6 @@ SIGNATURES = {
     b"\x89PNG": "a PNG image",
     b"\x1f\x8b": "a gzip file",
 }
-# Other numbers of columns that there are.
-UNKNOWN_WIDTHS = (6, 7, 8)
 # Layouts with a suffix of their own, by their number of columns.
 SUFFIXES = {4: ".bin (x y z intensity)", 5: ".pcd.bin (x y z intensity ring)"}
 
@@ -42,7 +40,7 @@ def check_records(data: bytes, columns: int) -> NDArray[np.float32]:
     """(N, columns) little-endian float32, x y z first, if the bytes may be such.
 
     Raises:
-        ValueError: Bytes are left over, or the numbers are no coordinates; with the likelier format, if there is one.
+        ValueError: Bytes are left over, or the numbers are no coordinates.
     """
     known = next((name for start, name in SIGNATURES.items() if data.startswith(start)), None)
     if known is None and all(byte in PRINTABLE for byte in data[:1024]):
@@ -53,7 +51,7 @@ def check_records(data: bytes, columns: int) -> NDArray[np.float32]:
     if len(data) % record_bytes:
         raise ValueError(
             f"{len(data)} bytes are no whole number of {record_bytes}-byte points ({columns} float32 each), "
-            f"{len(data) % record_bytes} bytes are left over: truncated, or {_likelier(data, columns)}"
+            f"{len(data) % record_bytes} bytes are left over: truncated, or of another format"
         )
     records = np.frombuffer(data, "<f4").reshape(-1, columns)
     if not any(data):
@@ -61,9 +59,10 @@ def check_records(data: bytes, columns: int) -> NDArray[np.float32]:
     coordinates = _plainly_coordinates(records)
     complaint = (None if coordinates else _complaint(records[:, :3])) or _of_other_columns(records)
     if complaint:
+        others = " or ".join(suffix for width, suffix in SUFFIXES.items() if width != columns)
         raise ValueError(
-            f"{complaint}, so it holds no {SUFFIXES[columns]}; likelier is {_likelier(data, columns)}. "
-            "Rename it, or write it again"
+            f"{complaint}, so it holds no {SUFFIXES[columns]} of little-endian float32: give it the suffix of its "
+            f"format, as {others}, or write its points as .npy (N, 3 or more)"
         )
     return records
 
@@ -150,24 +149,3 @@ def _is_intensity(values: NDArray[np.float32]) -> bool:
 
 def _is_ring(values: NDArray[np.float32]) -> bool:
     return bool(((values >= 0) & (values <= MAX_RING) & (values == np.round(values))).all())
-
-
-def _likelier(data: bytes, columns: int) -> str:
-    other = 9 - columns
-    if len(data) % (4 * other) == 0:
-        records = np.frombuffer(data, "<f4").reshape(-1, other)
-        last = _is_ring(records[:, 4]) if other == 5 else _is_intensity(records[:, 3])
-        if last and _complaint(records[:, :3]) is None:
-            return f"a {SUFFIXES[other]}"
-    numbers = np.frombuffer(data[: len(data) // 4 * 4], "<f4")
-    for width in UNKNOWN_WIDTHS:
-        if numbers.size % width == 0 and numbers.size >= MIN_POINTS * width:
-            rows = numbers.reshape(-1, width)
-            if _is_intensity(rows[:, 3:]) and _complaint(rows[:, :3]) is None:
-                return f"{width} columns, for which there is .npy (N, {width})"
-    for name, kind, width in (("float64", "<f8", 8), ("big-endian float32", ">f4", 4)):
-        if len(data) % width == 0:
-            size = np.abs(np.frombuffer(data, kind))
-            if ((size == 0) | ((size > SMALLEST_NORMAL) & (size < MAX_COORDINATE_M))).all():
-                return f"{name}, where little-endian float32 is needed"
-    return "another format"

@@ -212,7 +212,6 @@ _LENS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "height_px", "wid
 
 
 def _camera(row: Mapping[str, Any], vehicle_T_camera: Matrix) -> Calibration:
-    """A camera with the radial distortion of its lens."""
     fx, fy, cx, cy, k1, k2, k3 = (float(row[name]) for name in _LENS[:7])
     return Calibration(
         int(row["width_px"]),

@@ -191,7 +191,6 @@ def read_objects(path: Path, scene: str | None = None) -> RecordedObjects:
 
 
 def _seen(tables: Path, times_s: Mapping[str, float]) -> list[Seen]:
-    """The annotations of samples."""
     categories, instances = read_json_table(tables / "category.json"), read_json_table(tables / "instance.json")
     seen = []
     for row in read_json_table(tables / "sample_annotation.json").rows:
@@ -205,7 +204,6 @@ def _seen(tables: Path, times_s: Mapping[str, float]) -> list[Seen]:
 
 
 def _scene(samples: list[dict[str, Any]], path: Path, scene: str | None) -> str:
-    """The token of the scene that is meant."""
     tokens = dict.fromkeys(str(row["scene_token"]) for row in samples)
     rows = read_json_table(path).rows if path.exists() else []
     names = {row["name"]: row["token"] for row in rows if row["token"] in tokens}

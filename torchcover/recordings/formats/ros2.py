@@ -190,7 +190,6 @@ class Ros2(Layout):
         return self._stamps_ns[index]
 
     def _cloud(self, sensor: str, index: int) -> tuple[CloudMessage, int]:
-        """The cloud, and when it was made."""
         logged_ns, first_ns = int(self._logged_ns[sensor][index]), self._logged_ns[self.sensors[0]]
         apart_s = abs(logged_ns - int(first_ns[index])) * 1e-9
         every_s = float(np.median(np.diff(first_ns))) * 1e-9 if len(first_ns) > 1 else np.inf

@@ -126,7 +126,6 @@ def _draw_side(
     seen_from: str,
     shift_m: float,
 ) -> None:
-    """The body from one side, and all patches on it."""
     view = VIEWS[seen_from]
     aside = shift_m * np.array(view.right)
     draw_body(axes, vertices_m + aside, faces, view)

@@ -1,4 +1,4 @@
-"""One array over a grid as a map, or several side by side."""
+"""Arrays over a grid as maps: one, or several side by side."""
 
 from collections.abc import Mapping, Sequence
 
@@ -28,64 +28,6 @@ from torchcover.report.maps.sheet import (
 )
 
 
-def draw_map(
-    values: Tensor,
-    grid: BevGrid,
-    scale: ColourScale,
-    *,
-    title: str,
-    subtitle: str = "",
-    ego_outline_m: NDArray[np.floating] | None = None,
-    sensors: Sequence[SensorView] = (),
-    unknown: str = NEVER_PROBED,
-    opacity: Tensor | None = None,
-) -> Figure:
-    """Draw one array over a grid, seen from above: x forward to the right, y left upwards.
-
-    Args:
-        values: (Y, X) numbers in the unit of `scale`. NaN is unknown and drawn hatched grey; infinity has a colour of
-            its own.
-        grid: The cells.
-        scale: What the colours mean.
-        title: First line.
-        subtitle: Second line, smaller.
-        ego_outline_m: (K, 2) corners x, y of the ego in the vehicle frame in metres.
-        sensors: What to mark.
-        unknown: Why a cell is, for the legend.
-        opacity: (Y, X) in [0, 1], less where less of the surface is seen in a step; all cells alike if not given.
-
-    Returns:
-        A figure of its own, outside pyplot: `figure.savefig(path)`, or hand it to a logger.
-
-    Raises:
-        ValueError: `values`, the opacity or the outline have another shape.
-
-    Example:
-        >>> import torch
-        >>> grid = BevGrid(x=(0.0, 2.0), y=(-1.0, 1.0), cell=1.0)
-        >>> change = torch.tensor([[0.5, -0.5], [float("nan"), 0.0]])
-        >>> scale = ColourScale("change of the blind spot radius", "m", "PuOr", -1.0, 1.0)
-        >>> draw_map(change, grid, scale, title="Rig B against rig A").axes[0].get_xlabel()
-        'x forward (m)'
-    """
-    for name, given in (("values", values), ("opacity", opacity)):
-        if given is not None and tuple(given.shape) != grid.shape[1:]:
-            raise ValueError(
-                f"{name}: shape {grid.shape[1:]} is needed, as of a band of the grid; got {tuple(given.shape)}"
-            )
-    return draw_side_by_side(
-        {"": values},
-        grid,
-        scale,
-        title=title,
-        subtitle=subtitle,
-        ego_outline_m=ego_outline_m,
-        sensors={"": sensors},
-        unknown=unknown,
-        opacity=None if opacity is None else {"": opacity},
-    )
-
-
 def draw_side_by_side(
     values: Mapping[str, Tensor],
     grid: BevGrid,
@@ -99,10 +41,11 @@ def draw_side_by_side(
     unknown: str = NEVER_PROBED,
     opacity: Mapping[str, Tensor] | None = None,
 ) -> Figure:
-    """Draw several arrays over one grid, with one colour bar.
+    """Draw arrays over one grid, seen from above, with one colour bar: x forward to the right, y left upwards.
 
     Args:
-        values: (Y, X) numbers in the unit of `scale`, by their headings; as in `draw_map`, which has one of no words.
+        values: (Y, X) numbers in the unit of `scale`, by their headings, which may be empty. NaN is unknown and drawn
+            hatched grey; infinity has a colour of its own.
         grid: The cells.
         scale: What the colours of all of them mean.
         title: First line.
@@ -111,14 +54,28 @@ def draw_side_by_side(
         sensors: What to mark, by the headings.
         directions: Whether to draw directions and fields of view; else the places of the sensors only.
         unknown: Why a cell is, for the legend.
-        opacity: As in `draw_map`, by the headings.
+        opacity: (Y, X) in [0, 1] by the headings, less where less of the surface is seen in a step; all cells alike if
+            not given.
 
     Returns:
-        A figure of its own, outside pyplot.
+        A figure of its own, outside pyplot: `figure.savefig(path)`, or hand it to a logger.
 
     Raises:
-        ValueError: An outline of another shape.
+        ValueError: An array or the outline has another shape.
+
+    Example:
+        >>> import torch
+        >>> grid = BevGrid(x=(0.0, 2.0), y=(-1.0, 1.0), cell=1.0)
+        >>> change = torch.tensor([[0.5, -0.5], [float("nan"), 0.0]])
+        >>> scale = ColourScale("change of the blind spot radius", "m", "PuOr", -1.0, 1.0)
+        >>> draw_side_by_side({"": change}, grid, scale, title="Rig B against rig A").axes[0].get_xlabel()
+        'x forward (m)'
     """
+    for name, given in (("values", values), ("opacity", opacity or {})):
+        for one in given.values():
+            if tuple(one.shape) != grid.shape[1:]:
+                wanted = f"shape {grid.shape[1:]} is needed, as of a band of the grid"
+                raise ValueError(f"{name}: {wanted}; got {tuple(one.shape)}")
     arrays = {name: as_array(value) for name, value in values.items()}
     opaque = {name: as_array(value) for name, value in (opacity or {}).items()}
     sheets = lay_out(grid, len(arrays))

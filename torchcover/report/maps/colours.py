@@ -89,12 +89,6 @@ def scale_of(quantity: Quantity, values: Tensor) -> ColourScale:
     return ColourScale(quantity.title, unit.name, colormap, 0.0, high)
 
 
-def error_scale(quantity: Quantity, errors: Tensor) -> ColourScale:
-    """Scale for standard errors, from 0 to the 98th percentile of the known; as `scale_of`."""
-    unit = shown_unit(quantity.unit).difference_name
-    return ColourScale(quantity.title, unit, "viridis_r", 0.0, _robust_end(errors))
-
-
 def difference_scale(quantity: Quantity, differences: Tensor) -> ColourScale:
     """Scale for differences: white is none, blue is better, red is worse, both to the 98th percentile of the size.
 

@@ -14,10 +14,10 @@ from torch import Tensor
 
 from torchcover.coverage import BevGrid, Coverage, check_paired
 from torchcover.files import write_durably
-from torchcover.report.maps.arrays import draw_map, draw_side_by_side
+from torchcover.report.maps.arrays import draw_side_by_side
 from torchcover.report.maps.colours import difference_scale, scale_of
 from torchcover.report.maps.overlay import SensorView
-from torchcover.report.maps.subjects import Subject, difference, error_subjects_of, subjects_of
+from torchcover.report.maps.subjects import Subject, difference, subjects_of
 from torchcover.report.maps.surface import as_drawn
 from torchcover.report.maps.window import Window, asked_and_known, near_field
 from torchcover.report.wording import capitalised, span
@@ -32,7 +32,6 @@ def map_figures(
     ego_outline_m: NDArray[np.floating] | None = None,
     sensors: Mapping[str, Sequence[SensorView]] | None = None,
     vehicle: str | None = None,
-    errors: bool = False,
 ) -> Iterator[Named]:
     """Draw what was measured in every height band, for one rig or for several.
 
@@ -47,12 +46,10 @@ def map_figures(
         ego_outline_m: (K, 2) corners x, y of the ego in the vehicle frame in metres.
         sensors: What to mark, by the name of the rig.
         vehicle: What the ego is called, for the titles.
-        errors: Whether to draw the standard errors too, if there are any.
 
     Returns:
         Pairs, drawn one by one, of a name that is fit for a file and a figure: `radius_m_ground`,
-        `detection_area_0.4m_obstacle`, `radius_m_error_ground`, `difference_radius_m_ground_RIG_minus_FIRST`,
-        `near_radius_m`.
+        `detection_area_0.4m_obstacle`, `difference_radius_m_ground_RIG_minus_FIRST`, `near_radius_m`.
 
     Raises:
         ValueError: Several coverages that are not paired, as in `check_paired`; while drawing, an outline of another
@@ -68,7 +65,7 @@ def map_figures(
     if len(coverages) > 1:
         check_paired(coverages)
     coverages = {name: as_drawn(coverage) for name, coverage in coverages.items()}
-    return _figures(coverages, _Setting(ego_outline_m, sensors or {}, vehicle), errors=errors)
+    return _figures(coverages, _Setting(ego_outline_m, sensors or {}, vehicle))
 
 
 def band_figures(coverage: Coverage) -> Iterator[Named]:
@@ -128,8 +125,6 @@ def file_stems(names: Sequence[str]) -> list[str]:
 
 @dataclass(frozen=True)
 class _Setting:
-    """What is drawn over the maps."""
-
     ego_outline_m: NDArray[np.floating] | None
     sensors: Mapping[str, Sequence[SensorView]]
     vehicle: str | None
@@ -143,8 +138,6 @@ class _Setting:
 
 @dataclass(frozen=True)
 class _Band:
-    """A height band as titles and file names have it."""
-
     number: int
     name: str
     stem: str
@@ -159,7 +152,7 @@ class _Band:
         return None if subject.opacity is None else subject.opacity[self.number]
 
 
-def _figures(coverages: Mapping[str, Coverage], setting: _Setting, *, errors: bool) -> Iterator[Named]:
+def _figures(coverages: Mapping[str, Coverage], setting: _Setting) -> Iterator[Named]:
     first, ego = next(iter(coverages.values())), setting.ego_outline_m
     bands, shown = _bands(first.grid), asked_and_known(first, ego)
     near = None if ego is None else near_field(first.grid, ego)
@@ -171,8 +164,6 @@ def _figures(coverages: Mapping[str, Coverage], setting: _Setting, *, errors: bo
             around = _within(whole, near)
             own = scale_of(around.quantity, torch.stack(list(around.values.values())))
             yield _draw_near(replace(around, scale=own), near.grid, bands, setting)
-    for whole in map(setting.told, error_subjects_of(coverages) if errors else ()):
-        yield from _draw_rigs(_within(whole, shown), shown.grid, bands, setting)
 
 
 def _within(subject: Subject, shown: Window) -> Subject:
@@ -186,7 +177,6 @@ def _bands(grid: BevGrid) -> list[_Band]:
 
 
 def _draw_rigs(subject: Subject, grid: BevGrid, bands: Sequence[_Band], setting: _Setting) -> Iterator[Named]:
-    """Rigs side by side; one alone has no heading."""
     headings = {rig: rig if len(subject.values) > 1 else "" for rig in subject.values}
     for band in bands:
         opacity = band.opacity(subject)
@@ -205,7 +195,6 @@ def _draw_rigs(subject: Subject, grid: BevGrid, bands: Sequence[_Band], setting:
 
 
 def _draw_near(subject: Subject, grid: BevGrid, bands: Sequence[_Band], setting: _Setting) -> Named:
-    """All rigs and bands around the ego."""
     several = len(subject.values) > 1
     panels = {
         f"{rig}, {band.name}, {band.z}" if several else f"{band.name}, {band.z}": (rig, band)
@@ -237,15 +226,16 @@ def _draw_differences(subject: Subject, grid: BevGrid, bands: Sequence[_Band], s
     first_stem, *stems = file_stems(list(subject.values))
     for (rig, _), stem, change in zip(others, stems, differences, strict=True):
         for band in bands:
-            figure = draw_map(
+            opacity = band.opacity(subject)
+            figure = draw_side_by_side(
                 # What is infinite takes the last colour: it is better or worse, not a step without a point.
-                change[band.number].clamp(2 * scale.low, 2 * scale.high),
+                {"": change[band.number].clamp(2 * scale.low, 2 * scale.high)},
                 grid,
                 scale,
                 title=f"{rig} minus {first}: {subject.quantity.title}, {band.name}",
                 subtitle=f"blue: {rig} is better, red: {first} is better; {band.subtitle(subject)}",
                 ego_outline_m=setting.ego_outline_m,
                 unknown=subject.unknown,
-                opacity=band.opacity(subject),
+                opacity=None if opacity is None else {"": opacity},
             )
             yield f"difference_{subject.quantity.key}_{band.stem}_{stem}_minus_{first_stem}", figure

@@ -1,6 +1,6 @@
 """What the maps of a run show: the quantities of its measure, and those of other aggregations."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -9,14 +9,13 @@ from torch import Tensor
 from torchcover.coverage import Coverage
 from torchcover.coverage.blocks import BlockSums
 from torchcover.coverage.quantity import by_area
-from torchcover.estimation import MIN_BLOCKS_OF_A_CELL, Quantity
-from torchcover.report.maps.colours import NEVER_PROBED, ColourScale, error_scale, scale_of
-from torchcover.report.maps.surface import errors_of_ratios, opacity_of, ratios, square_sides
+from torchcover.estimation import Quantity
+from torchcover.report.maps.colours import NEVER_PROBED, ColourScale, scale_of
+from torchcover.report.maps.surface import opacity_of, ratios, square_sides
 from torchcover.report.wording import shown_unit, steps_and_cell
 
 LARGER = ", larger where points are few"
 NOTHING_FOUND = "no visible surface found"
-TOO_FEW_BLOCKS = f"probed in fewer than {MIN_BLOCKS_OF_A_CELL} blocks of steps"
 
 
 @dataclass(frozen=True)
@@ -52,7 +51,7 @@ def subjects_of(coverages: Mapping[str, Coverage]) -> Iterator[Subject]:
     for quantity, by_surface in quantities_shown(first):
         if not by_surface:
             values = {name: coverage.layers[quantity.key].values for name, coverage in coverages.items()}
-            yield _subject(quantity, values, scale_of, NEVER_PROBED, _conditions(first))
+            yield _subject(quantity, values, NEVER_PROBED, _conditions(first))
 
 
 def quantities_shown(coverage: Coverage) -> list[tuple[Quantity, bool]]:
@@ -69,29 +68,6 @@ def difference(values: Tensor, expected: Tensor) -> Tensor:
     return (values - expected).where(values != expected, 0.0)
 
 
-def error_subjects_of(coverages: Mapping[str, Coverage]) -> Iterator[Subject]:
-    """The standard errors of the quantities of the measure; none without blocks.
-
-    Args:
-        coverages: As in `subjects_of`.
-    """
-    first = next(iter(coverages.values()))
-    if first.blocks is None:
-        return
-    if first.measure == "area":
-        sides = square_sides(first.points, first.grid.cell)
-        each = {name: errors_of_ratios(area, first.quantities, sides) for name, area in _areas(coverages).items()}
-        quantities = [by_area(quantity) for quantity in first.quantities]
-        conditions = _conditions(first) + LARGER
-    else:
-        each = {name: list(coverage.errors.values()) for name, coverage in coverages.items()}
-        quantities, conditions = list(first.quantities), _conditions(first)
-    for at, of in enumerate(quantities):
-        quantity = Quantity(of.error_key, f"standard error of the {of.title}", of.unit, lower_is_better=True)
-        errors = {name: errors[at] for name, errors in each.items()}
-        yield _subject(quantity, errors, error_scale, TOO_FEW_BLOCKS, conditions)
-
-
 def _of_surface(coverages: Mapping[str, Coverage]) -> Iterator[Subject]:
     first, areas = next(iter(coverages.values())), _areas(coverages)
     sides = square_sides(first.points, first.grid.cell)
@@ -100,7 +76,7 @@ def _of_surface(coverages: Mapping[str, Coverage]) -> Iterator[Subject]:
     each = {name: ratios(area, sides) for name, area in areas.items()}
     for at, quantity in enumerate(map(by_area, first.quantities)):
         values = {name: values[at] for name, values in each.items()}
-        yield _subject(quantity, values, scale_of, NOTHING_FOUND, _conditions(first) + LARGER, opacity)
+        yield _subject(quantity, values, NOTHING_FOUND, _conditions(first) + LARGER, opacity)
 
 
 def _areas(coverages: Mapping[str, Coverage]) -> dict[str, BlockSums]:
@@ -114,11 +90,10 @@ def _conditions(coverage: Coverage) -> str:
 def _subject(
     quantity: Quantity,
     values: Mapping[str, Tensor],
-    scale: Callable[[Quantity, Tensor], ColourScale],
     unknown: str,
     conditions: str,
     opacity: Tensor | None = None,
 ) -> Subject:
     """With the values in the unit that is shown, and one scale for all."""
     shown = {name: shown_unit(quantity.unit).factor * each for name, each in values.items()}
-    return Subject(quantity, shown, scale(quantity, torch.stack(list(shown.values()))), unknown, conditions, opacity)
+    return Subject(quantity, shown, scale_of(quantity, torch.stack(list(shown.values()))), unknown, conditions, opacity)

@@ -5,7 +5,6 @@ region together have its number.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -15,7 +14,6 @@ from torch.nn.functional import avg_pool2d
 from torchcover.coverage import Coverage, Layer
 from torchcover.coverage.blocks import BlockSums, KnownCells
 from torchcover.coverage.quantity import by_area
-from torchcover.estimation import Quantity, ratio_errors
 from torchcover.metrics import added_up
 
 # A detection from 8 points is off by 18 percentage points at most: 1 / sqrt(4 * 8).
@@ -75,21 +73,6 @@ def ratios(area: BlockSums, sides: Tensor) -> Tensor:
     """(Q, H, Y, X) the radius in metres, then the detection at each threshold; NaN where nothing was seen."""
     m2, *sums = area.totals()
     return over_squares(torch.stack(sums), sides) / over_squares(m2, sides)
-
-
-def errors_of_ratios(area: BlockSums, quantities: Sequence[Quantity], sides: Tensor) -> list[Tensor]:
-    """(H, Y, X) standard errors of each of the `ratios`, which are of these quantities."""
-    rows, columns = sides.shape[1:]
-    y, x = (torch.arange(count, device=sides.device) for count in (rows, columns))
-    first = torch.arange(len(sides), device=sides.device)[:, None, None] * rows + y[:, None] // sides * sides
-    square = (first * columns + x // sides * sides).flatten()  # by the cell in its lower corner
-    cells = len(square)
-    at, m2, sums = area.moved(lambda cell: square[cell], cells).spread_where(1)
-    errors = []
-    for quantity, own in zip(quantities, sums, strict=True):
-        of_square = sums.new_full((cells,), math.nan).index_copy_(0, at, ratio_errors(m2, own, quantity.unit))
-        errors.append(of_square[square].view(sides.shape))
-    return errors
 
 
 def as_drawn(coverage: Coverage) -> Coverage:

@@ -80,7 +80,6 @@ def _cells(bounds: Bounds, whole: Bounds, cell_m: float, count: int) -> tuple[sl
 
 
 def _held(known: Tensor, edges_m: Tensor, whole: Bounds) -> Bounds:
-    """From the first to the last cell that is known."""
     at = known.nonzero().flatten()
     return (float(edges_m[at[0]]), float(edges_m[at[-1] + 1])) if len(at) else whole
 

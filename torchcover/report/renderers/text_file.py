@@ -1,7 +1,7 @@
 """A table as text for a terminal."""
 
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -71,25 +71,23 @@ def rich_tables(table: CoverageTable, *, two_lines: bool = False) -> list[Table]
     return tables
 
 
-def text_table(
-    headings: Sequence[str], sections: Iterable[Sequence[Sequence[str]]], *, title: str = "", caption: str = ""
-) -> Table:
-    """A table of words for `rich.console.Console.print`: the first column left, the others right.
+def print_whole(tables: Sequence[PageTable]) -> None:
+    """Print tables as wide as they are: rather lines that are too long than numbers that are cut off."""
+    console, whole = Console(), [_in_words(table) for table in tables]
+    console.width = max(console.width, narrowest_width(whole))
+    for table in whole:
+        console.print(table)
 
-    Args:
-        headings: Of the columns.
-        sections: Their rows, a line between two sections; the words are no markup.
-        title: Above it; empty for none.
-        caption: Below it, likewise.
-    """
-    table = Table(title=Text(title) if title else None, caption=Text(caption) if caption else None)
-    for at, heading in enumerate(headings):
-        table.add_column(Text(heading), justify="right" if at else "left")
-    for rows in sections:
-        for row in rows:
-            table.add_row(*map(Text, row))
-        table.add_section()
-    return table
+
+def _in_words(table: PageTable) -> Table:
+    """The first column left, the others right; no words are markup."""
+    title, caption = (Text(words) if words else None for words in (table.title, "\n".join(table.notes)))
+    shown = Table(title=title, caption=caption)
+    for at, heading in enumerate(table.headings):
+        shown.add_column(Text(heading), justify="right" if at else "left")
+    for row in table.rows:
+        shown.add_row(*(Text(cell.text) for cell in row))
+    return shown
 
 
 def narrowest_width(tables: Sequence[Table], folded: Sequence[str] = ()) -> int:

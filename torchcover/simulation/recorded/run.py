@@ -146,7 +146,6 @@ def _apart(times_s: Matrix) -> Sequence[int] | slice:
 
 
 def _drive(ego: Ego, ego_T_vehicle: Matrix | None) -> Trajectory:
-    """Of the vehicle frame of an ego."""
     world_T_vehicle = ego.world_T_ego @ (ego.ego_T_vehicle if ego_T_vehicle is None else ego_T_vehicle)
     return Trajectory.from_poses(ego.times_s, world_T_vehicle)
 

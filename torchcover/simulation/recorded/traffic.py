@@ -138,12 +138,10 @@ class RecordedTraffic(Traffic):
 
     @cached_property
     def _objects(self) -> RecordedObjects:
-        """Who was recorded; read when first needed."""
         return read_objects(self.path, self.scene)
 
     @cached_property
     def _run(self) -> Excerpt:
-        """What of the recording is shown."""
         recording = self._objects
         if self.ego_trajectory is not None:
             if self.ego_id is not None:
@@ -158,7 +156,6 @@ class RecordedTraffic(Traffic):
             raise ValueError(f"{self.path}: {error}") from error
 
     def _shown(self, trajectory: Trajectory) -> Trajectory:
-        """The same in the time of the run."""
         times_s = trajectory.times_s - self._run.begin_s
         steps = np.round(times_s / self.time_step_s)
         instants_s = self.time_step_s * steps
@@ -204,10 +201,8 @@ class RecordedTraffic(Traffic):
 
     @staticmethod
     def _read(ground: Path) -> Mesh:
-        """The ground from a file."""
         return sound_mesh(MeshFile(type="mesh", path=ground), str(ground))
 
     def _fitted(self, ego: Actor) -> Plain | Slopes:
-        """The ground below all road users of the recording."""
         standing = [track.trajectory.positions_m for track in self._run.others if track.vehicle_class is not None]
         return ground_below(stood_on(standing), stood_on([ego.trajectory.positions_at(self._times_s)]))
