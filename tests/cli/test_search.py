@@ -22,7 +22,9 @@ objectives: {near: {region: 20m}}
 
 @pytest.fixture
 def space(tmp_path, monkeypatch):
-    """A file; instants are surfaces."""
+    """A file; instants are surfaces, and one target is looked at in the end."""
+    monkeypatch.setattr("torchcover.placement.fresh.TARGETS", ("pole",))
+    monkeypatch.setattr("torchcover.placement.fresh.WITHIN_M", 1.0)
     makes = lambda space, plan, seed, worlds: Surface(seed, worlds, plan.per_world)  # noqa: E731
     monkeypatch.setattr(search_run, "SearchPlan", partial(SearchPlan, instants=makes))
     (tmp_path / "space.yaml").write_text(SPACE)
