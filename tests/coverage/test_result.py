@@ -253,7 +253,7 @@ def rewrite(path, header=None, **arrays):
         {"header": lambda _: "[1]"},
         {"header": lambda _: "3"},
         {"header": lambda _: "no JSON"},
-        {"header": lambda _: '{"format": 9}'},
+        {"header": lambda _: '{"format": 10}'},
         {"header": lambda old: json.dumps({name: value for name, value in old.items() if name != "counts"})},
         {"header": lambda old: json.dumps({**old, "grid": {**old["grid"], "cell": 0.7}})},
     ],
@@ -316,10 +316,10 @@ def test_an_array_file_is_no_coverage_file(saved):
 
 
 @pytest.mark.parametrize(
-    ("number", "then"), [(8, "; height bands of older ones were over z of the vehicle"), (10, "$")]
+    ("number", "then"), [(9, "; height bands of older ones were over z of the vehicle"), (11, "$")]
 )
 def test_another_format_is_refused_by_its_number(saved, number, then):
     rewrite(saved, header=lambda old: json.dumps({**old, "format": number, "unheard of": 1}))
-    said = rf"coverage\.npz: coverage format {number}; this torchcover reads format 9{then}"
+    said = rf"coverage\.npz: coverage format {number}; this torchcover reads format 10{then}"
     with pytest.raises(ValueError, match=said):
         Coverage.load(saved)

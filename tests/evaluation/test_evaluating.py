@@ -22,7 +22,7 @@ from torchcover.evaluation import Settings, TargetError
 from torchcover.evaluation.result_page import HEAVY
 from torchcover.evaluation.target_error import MIN_GROWTH, MIN_STEPS
 
-SMALL = {"steps": 2, "cell_m": 4.0, "rays": 1024}
+SMALL = {"steps": 2, "cell_m": 4.0, "rays": 1024, "probe": "pole"}
 
 
 class PointCount:
@@ -65,8 +65,11 @@ def test_one_rig(tmp_path):
     assert result.observed["points"] > 1000
     assert result.coverage is result.coverages["front_roof_32"]
     assert result.coverage.counts["steps"] == result.run.steps == 2
-    # Of the near field, two sides hold a centre of such large cells.
-    assert [row["region"] for row in result.summary][::2] == ["20m", "80m", "160m", "left_3m", "right_3m"]
+    # Of the near field, two sides hold a centre of such large cells, and of that the ground is asked about.
+    places = [(row["region"], row["height"]) for row in result.summary]
+    assert places[:6:2] == [("20m", "ground"), ("80m", "ground"), ("160m", "ground")]
+    assert places[6:8] == [("left_3m", "ground"), ("right_3m", "ground")]
+    assert places[8:] == [(f"{side}_3m", "pole_100cm") for side in ("front", "rear", "left", "right")]
     assert "front_roof_32: 2 steps" in repr(result)
     assert "mean blind spot" in repr(result)
     stem, figure = next(iter(result.maps()))
@@ -100,7 +103,7 @@ def test_rigs_and_scenarios_as_objects_and_the_others_against_the_first(tmp_path
     result.save(tmp_path)
     assert sorted(path.name for path in (tmp_path / "coverage").iterdir()) == ["again.npz", "front_roof_32.npz"]
     with (tmp_path / "summary.csv").open() as file:
-        assert len(list(csv.DictReader(file))) == 20
+        assert len(list(csv.DictReader(file))) == 24
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert (summary["rigs"]["again"], summary["scenario"]) == ("again", "courtyard")
 

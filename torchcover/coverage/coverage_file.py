@@ -18,6 +18,7 @@ from torch import Tensor
 
 from torchcover.coverage.aggregations import Layer
 from torchcover.coverage.blocks import BlockSums, KnownCells
+from torchcover.coverage.bodies import COLUMNS, BodySums
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.redundancy import Redundancy, redundancy_quantities
 from torchcover.coverage.region_sums import PlaceNumbers, PlaceSums
@@ -26,13 +27,14 @@ from torchcover.estimation import Quantity
 from torchcover.files import NpyHeader, TooLargeError, check_memory, read_npz, reads, write_npz
 from torchcover.metrics.blocks import FINER
 
-FORMAT_VERSION = 9
+FORMAT_VERSION = 10
 Arrays = dict[str, NDArray[Any]]
 # Steps, cells, what is divided by, sums.
 IN_BLOCKS = ("block_steps", "block_cell", "block_probed_steps", "block_sums")
 OVER_AREA = ("area_steps", "area_cell", "area_m2", "area_sums")
 OVER_PLACES = ("place_steps", "place_m2", "place_sums")
 # Numbers of regions, and what they are without each block.
+BODIES = ("body_steps", "body_sums", "body_cells")
 AGGREGATED = ("region_numbers", "region_numbers_left_out")
 
 
@@ -51,6 +53,7 @@ class CoverageParts(TypedDict):
     places: PlaceSums | None
     aggregated: PlaceNumbers | None
     redundancy: Redundancy | None
+    bodies: BodySums | None
 
 
 def write_coverage(parts: CoverageParts, errors: Mapping[str, Tensor], path: Path) -> None:
@@ -62,7 +65,7 @@ def write_coverage(parts: CoverageParts, errors: Mapping[str, Tensor], path: Pat
         parts["area"],
         parts["redundancy"],
     )
-    places, aggregated = parts["places"], parts["aggregated"]
+    places, aggregated, bodies = parts["places"], parts["aggregated"], parts["bodies"]
     header = {
         "format": FORMAT_VERSION,
         "grid": {
@@ -83,6 +86,7 @@ def write_coverage(parts: CoverageParts, errors: Mapping[str, Tensor], path: Pat
         "by_area": places is not None,
         "aggregated": [] if aggregated is None else [quantity._asdict() for quantity in aggregated.quantities],
         "sensors": None if redundancy is None else redundancy.sensors,
+        "bodies": None if bodies is None else bodies.stored(),
         "redundancy": [] if redundancy is None else [layer.quantity._asdict() for layer in redundancy.listed.values()],
     }
     tensors = {"cell": known.at, "probed_steps": known.probed_steps, "points": known.points}
@@ -94,6 +98,8 @@ def write_coverage(parts: CoverageParts, errors: Mapping[str, Tensor], path: Pat
         tensors |= {key: layer.values for key, layer in redundancy.listed.items()}
     if places is not None:
         tensors |= dict(zip(OVER_PLACES, places, strict=True))
+    if bodies is not None:
+        tensors |= dict(zip(BODIES, (bodies.steps, bodies.sums, bodies.cells), strict=True))
     arrays: dict[str, Any] = {name: tensor.cpu().numpy() for name, tensor in tensors.items()}
     arrays["cell"] = _short(arrays["cell"], grid.cells)
     arrays |= {} if blocks is None else _listed(blocks, IN_BLOCKS)
@@ -155,7 +161,18 @@ def _parts(header: dict[str, Any], arrays: Arrays) -> CoverageParts:
         "places": _places(header, grid, arrays) if header["by_area"] else None,
         "aggregated": _aggregated(header, grid, arrays) if header["aggregated"] else None,
         "redundancy": None if header["sensors"] is None else _redundancy(header, known, arrays),
+        "bodies": None if header["bodies"] is None else _bodies(header["bodies"], arrays),
     }
+
+
+def _bodies(stored: dict[str, Any], arrays: Arrays) -> BodySums:
+    grid = BevGrid(**stored.pop("grid"))
+    bodies, regions = tuple(stored.pop("bodies")), tuple(map(_region, stored.pop("regions")))
+    steps, sums, cells = (torch.from_numpy(arrays[name]) for name in BODIES)
+    shapes = (len(steps), len(bodies), len(regions), len(COLUMNS)), (len(bodies), *grid.shape[1:], 2)
+    if (tuple(sums.shape), tuple(cells.shape)) != shapes:
+        raise ValueError(f"sums of {len(bodies)} bodies of shape {tuple(sums.shape)} and {tuple(cells.shape)}")
+    return BodySums(bodies=bodies, regions=regions, grid=grid, steps=steps, sums=sums, cells=cells, **stored)
 
 
 def _aggregated(header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> PlaceNumbers:
@@ -216,7 +233,7 @@ def _short(at: NDArray[Any], end: int) -> NDArray[Any]:
 
 def _region(stored: Mapping[str, Any]) -> Region:
     corners = tuple((x, y) for x, y in stored["corners_m"])
-    return Region(stored["name"], tuple(stored["x"]), tuple(stored["y"]), corners)
+    return Region(stored["name"], tuple(stored["x"]), tuple(stored["y"]), corners, tuple(stored["bands"]))
 
 
 def _listed(blocks: BlockSums, names: Sequence[str]) -> Arrays:

@@ -15,8 +15,8 @@ from torchcover.estimation import MIN_BLOCKS_OF_A_CELL, Estimate, Quantity, rati
 if TYPE_CHECKING:
     from torchcover.coverage.result import Coverage
 
-# What the number of a region is a mean over: its visible surface, or its known cells.
-Measure = Literal["area", "known"]
+# What the number of a region is a mean over: its visible surface, its known cells, or places of a body.
+Measure = Literal["area", "known", "places"]
 
 
 def estimate_known(coverage: "Coverage", region: Region, height: str) -> Estimate:

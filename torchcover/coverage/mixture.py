@@ -4,12 +4,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from torchcover.coverage.measures import Measure, estimate_redundancy
-from torchcover.coverage.regions import Region
+from torchcover.coverage.regions import Region, shown_places
 from torchcover.coverage.result import Coverage
 from torchcover.coverage.summary import RegionSummary, region_redundancy
 from torchcover.estimation import Estimate
 
-SAME = ("band_frame", "grid", "thresholds", "max_radius", "measure", "regions")
+SAME = ("band_frame", "grid", "thresholds", "max_radius", "measure", "regions", "body_places")
 
 
 class Mixture:
@@ -49,9 +49,29 @@ class Mixture:
 
     def summary(self, regions: Sequence[Region]) -> list[RegionSummary]:
         """As `Coverage.summary`; of cells and square metres, means with the same weights, redundancy's too."""
-        places = [(region, height) for region in regions for height in self.grid.heights]
+        places = shown_places(regions, self.grid)
         rows = zip(*(part.summary(regions) for _, part in self.parts), strict=True)
         return [self._row(place, row) for place, row in zip(places, rows, strict=True)]
+
+    @property
+    def body_places(self) -> list[tuple[Region, str]]:
+        """As `Coverage.body_places`."""
+        return self.parts[0][1].body_places
+
+    def estimate_body(self, region: Region, body: str) -> Estimate:
+        """As `Coverage.estimate_body`."""
+        return Estimate.mixed([(weight, part.estimate_body(region, body)) for weight, part in self.parts])
+
+    def body_summary(self) -> list[RegionSummary]:
+        """As `Coverage.body_summary`, of the places in all kinds together."""
+        rows = []
+        each_part = (part.body_summary() for _, part in self.parts)
+        for place, *each in zip(self.body_places, *each_part, strict=True):
+            tried, free = (sum(getattr(row, name) for row in each) for name in ("cells", "known_cells"))
+            numbers = self.estimate_body(*place).numbers(count=free, count_of="free places")
+            m2 = sum(weight * row.visible_m2 for (weight, _), row in zip(self.parts, each, strict=True))
+            rows.append(replace(each[0], cells=tried, known_cells=free, numbers=numbers, visible_m2=m2))
+        return rows
 
     def _row(self, place: tuple[Region, str], rows: Sequence[RegionSummary]) -> RegionSummary:
         weights = [weight for weight, _ in self.parts]

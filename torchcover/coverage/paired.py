@@ -1,18 +1,22 @@
 """Comparisons are paired: rigs at the same instants, measured against the same reference."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from operator import attrgetter
+from typing import TypeAlias
 
 import torch
 
 from torchcover.coverage.mixture import Mixture
 from torchcover.coverage.regions import Region
 from torchcover.coverage.result import Coverage
-from torchcover.estimation import Difference
+from torchcover.estimation import Difference, Estimate
 
-# What there is an estimate of, in each region and band.
+Parts: TypeAlias = tuple[Callable[[Coverage | Mixture], Callable[[Region, str], Estimate]], ...]
+
+# What there is an estimate of, in each region and band, and in each region of each body.
 PARTS = attrgetter("estimate"), attrgetter("estimate_aggregated")
+OF_BODIES = (attrgetter("estimate_body"),)
 
 
 def check_paired(coverages: Mapping[str, Coverage]) -> None:
@@ -32,6 +36,8 @@ def check_paired(coverages: Mapping[str, Coverage]) -> None:
         for what in ("band_frame", "grid", "thresholds", "max_radius"):
             if getattr(coverage, what) != getattr(expected, what):
                 raise ValueError(f"{first!r} and {name!r} cannot be compared: they differ in their {what}")
+        if coverage.body_places != expected.body_places:
+            raise ValueError(f"{first!r} and {name!r} cannot be compared: other bodies were put beside them")
         if coverage.measure != expected.measure or coverage.layers.keys() != expected.layers.keys():
             raise ValueError(f"{first!r} and {name!r} cannot be compared: they have different layers")
         if not _same_steps(coverage, expected):
@@ -50,31 +56,34 @@ def _same_steps(a: Coverage, b: Coverage) -> bool:
 
 
 def differences(
-    coverages: Mapping[str, Coverage | Mixture], region: Region, height: str
+    coverages: Mapping[str, Coverage | Mixture], region: Region, height: str, parts: Parts = PARTS
 ) -> dict[str, dict[str, Difference]]:
     """The differences of every rig, the first one too, to the first.
 
     Args:
         coverages: By the name of the rig, from the same frames.
         region: A region within the grid.
-        height: Name of the band.
+        height: Name of the band, or of a body.
+        parts: What there is an estimate of there.
 
     Returns:
         Name of the rig -> key of the quantity -> difference.
     """
     first = next(iter(coverages.values()))
     found: dict[str, dict[str, Difference]] = {name: {} for name in coverages}
-    for part in PARTS:
+    for part in parts:
         expected = part(first)(region, height)
         for name, coverage in coverages.items():
             found[name] |= part(coverage)(region, height).differences(expected)
     return found
 
 
-def leaders(coverages: Mapping[str, Coverage | Mixture], region: Region, height: str) -> dict[str, str]:
+def leaders(
+    coverages: Mapping[str, Coverage | Mixture], region: Region, height: str, parts: Parts = PARTS
+) -> dict[str, str]:
     """Key of a quantity -> the rig that is best in it, where its lead over the next is more than chance."""
     found = {}
-    for part in PARTS:
+    for part in parts:
         each = {rig: part(coverage)(region, height) for rig, coverage in coverages.items()}
         for at, quantity in enumerate(next(iter(each.values())).quantities):
             gains = {rig: quantity.gain(float(estimate.value[at])) for rig, estimate in each.items()}

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -26,6 +26,7 @@ class Region:
         x: Lower and upper bound forward, in metres.
         y: Lower and upper bound to the left, in metres.
         corners_m: Corners x, y of a polygon, in either direction, which has these bounds; see `Region.polygon`.
+        bands: Names of the height bands that tables show of it; all if empty.
 
     Raises:
         ValueError: No name, bounds that are inverted or not finite, a polygon that crosses or touches itself, or has
@@ -40,6 +41,7 @@ class Region:
     x: tuple[float, float]
     y: tuple[float, float]
     corners_m: tuple[tuple[float, float], ...] = ()
+    bands: tuple[str, ...] = field(default=(), compare=False, repr=False)
 
     def __post_init__(self) -> None:
         if not self.name:
@@ -212,6 +214,11 @@ def check_regions(regions: Sequence[Region], grid: BevGrid) -> None:
             empty = not region.mask(grid).any()
         if empty:
             raise ValueError(f"region {region.name!r} holds no cell centre; use smaller cells than {grid.cell:g} m")
+
+
+def shown_places(regions: Sequence[Region], grid: BevGrid) -> list[tuple[Region, str]]:
+    """The regions, each with the height bands that tables show of it."""
+    return [(region, band) for region in regions for band in grid.heights if not region.bands or band in region.bands]
 
 
 def regions_within(grid: BevGrid) -> tuple[Region, ...]:

@@ -13,13 +13,14 @@ from torch import Tensor
 
 from torchcover.coverage.aggregations import Layer, MeanOfMeans
 from torchcover.coverage.blocks import BlockSums, KnownCells, Maps
+from torchcover.coverage.bodies import BodySums
 from torchcover.coverage.coverage_file import CoverageParts, read_coverage, write_coverage
 from torchcover.coverage.grid import BandFrame, BevGrid
 from torchcover.coverage.measures import Measure, errors_of_cells, estimate_area, estimate_known, estimate_redundancy
 from torchcover.coverage.quantity import RADIUS, by_area, over_known
 from torchcover.coverage.redundancy import Redundancy, layers_of, redundancy_quantities
 from torchcover.coverage.region_sums import PlaceNumbers, PlaceSums
-from torchcover.coverage.regions import Places, Region, check_regions, regions_within
+from torchcover.coverage.regions import Places, Region, check_regions, regions_within, shown_places
 from torchcover.coverage.summary import RegionSummary, summarise
 from torchcover.estimation import Estimate, Quantity
 from torchcover.files import write_durably
@@ -46,6 +47,7 @@ class Coverage:
         places: The sums by area over `regions`, point by point; None if the reference points had no square metres.
         aggregated: What other aggregations than the mean of means say of `regions`, if there were any.
         redundancy: What each sensor of the rig adds, if the metric was told of the sensors.
+        bodies: What the rig sees of bodies that were put beside the vehicle, if any were.
 
     Attributes:
         listed: The layers over the known cells, by the key of their quantity.
@@ -76,6 +78,7 @@ class Coverage:
         places: PlaceSums | None = None,
         aggregated: PlaceNumbers | None = None,
         redundancy: Redundancy | None = None,
+        bodies: BodySums | None = None,
     ) -> None:
         self.grid = grid
         self.thresholds = tuple(thresholds)
@@ -89,6 +92,7 @@ class Coverage:
         self.places = places
         self.aggregated = aggregated
         self.redundancy = redundancy
+        self.bodies = bodies
         self._estimates: dict[tuple[Region, str, Measure], Estimate] = {}
 
     def __repr__(self) -> str:
@@ -151,7 +155,7 @@ class Coverage:
         return torch.stack(list(map(self.known.spread, each))) if each else self.radius.new_empty((0, *self.grid.shape))
 
     def summary(self, regions: Sequence[Region] | None = None) -> list[RegionSummary]:
-        """One row for each region and height band.
+        """One row for each region and height band that tables show of it.
 
         Args:
             regions: Regions within the grid; `self.regions` if not given.
@@ -163,7 +167,21 @@ class Coverage:
             ValueError: A region reaches beyond the grid, or holds no cell centre.
         """
         wanted = self.regions if regions is None else regions
-        return [summarise(self, region, height) for region in wanted for height in self.grid.heights]
+        return [summarise(self, *place) for place in shown_places(wanted, self.grid)]
+
+    @property
+    def body_places(self) -> list[tuple[Region, str]]:
+        """The regions and bodies that `estimate_body` has numbers of."""
+        return self.bodies.places if self.bodies else []
+
+    def estimate_body(self, region: Region, body: str) -> Estimate:
+        """The numbers of a body in free places of a region, with what they become without each block."""
+        assert self.bodies is not None  # there is such a place
+        return self.bodies.estimate(region, body)
+
+    def body_summary(self) -> list[RegionSummary]:
+        """One row for each of `body_places`."""
+        return self.bodies.summary() if self.bodies else []
 
     @property
     def measure(self) -> Measure:
@@ -251,7 +269,7 @@ class Coverage:
             `"radius_m/20m/ground"`, `"detection_0.4m/20m/ground"`, `"known_share/20m/ground"` and so on, and
             `"visible_m2/20m/ground"` if the reference points had square metres.
         """
-        rows = self.summary(regions)
+        rows = [*self.summary(regions), *self.body_summary()]
         return {key: value for row in rows for key, value in row.scalars(errors=self.blocks is not None).items()}
 
     def save(self, path: str | Path) -> None:

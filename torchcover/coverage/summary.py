@@ -45,7 +45,8 @@ class RegionSummary:
         height: Name of the height band.
         cells: Number of cells in the region.
         known_cells: How many of them a reference point has probed.
-        measure: What `numbers` are means over: "area", the visible surface, or "known", the known cells.
+        measure: What `numbers` are means over: "area", the visible surface, "known", the known cells, or "places" of a
+            body, which is then the `height`, the places that were tried the cells, and the free ones the known ones.
         numbers: Key of the quantity, such as `"radius_m"` or `"detection_0.4m"` -> its number, those of other
             aggregations last; the error is NaN if it was not asked for, or if there are not enough steps.
         known: Radius and detections over the known cells, every cell weighing the same; as in `numbers` if that is its
@@ -68,7 +69,7 @@ class RegionSummary:
     @property
     def known_share(self) -> float:
         """Share of the region's cells that are known. `known` is about this share, and biased when it is low."""
-        return self.known_cells / self.cells
+        return self.known_cells / self.cells if self.cells else math.nan
 
     def scalars(self, *, errors: bool) -> dict[str, float]:
         """As `Coverage.scalars` has them, with or without errors."""

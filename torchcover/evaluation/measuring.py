@@ -25,12 +25,15 @@ from torchcover.files import claimed
 from torchcover.frames import BadFrameError, FrameSource
 from torchcover.simulation import Asked, SimulatedFrames
 from torchcover.simulation.memory import check_fits
+from torchcover.targets import ProbeMetric, Probes, Target
 
 Observers = Mapping[str, AnyObserver]
 # For standard errors: at least half as many are in use at the end of a long run.
 BLOCKS = 16
 # The sums are over what was touched, but maps are made of all cells, several of which are there at a time.
 BYTES_A_CELL = 64
+# Beside the vehicle, unless others are asked for.
+PROBES = ("child", "adult", "cyclist", "pole")
 # To see of how many worlds they are.
 ENOUGH_FRAMES = 256
 
@@ -49,8 +52,10 @@ def measured(task: Task[FrameSource], settings: Settings) -> Result:
     metrics = metrics_of(task, settings) if settings.metrics else None
     others = {**settings.observers, **(metrics.observers if metrics else {})}
     with ranks.aborting() if ranks else nullcontext():
-        coverage, seen, run = _observed(task, settings, others)
+        coverage, probed, seen, run = _observed(task, settings, others)
     coverages = {name: observer.compute() for name, observer in coverage.items()}
+    for name, one in coverages.items() if probed else ():
+        one.bodies = probed.seen_by(name)
     if len({coverage.counts["steps"] for coverage in coverages.values()}) > 1:
         run.raise_failure()  # within a step: the rigs have not seen the same
     result = Result(
@@ -92,7 +97,9 @@ def _workers(task: Task[FrameSource], settings: Settings) -> int:
     return usual_workers(most, len({frames.world_of(index) for index in range(most)}), whole=whole)
 
 
-def _observed(task: Task[FrameSource], settings: Settings, others: Observers) -> tuple[Observers, Observers, Run]:
+def _observed(
+    task: Task[FrameSource], settings: Settings, others: Observers
+) -> tuple[Observers, ProbeMetric | None, Observers, Run]:
     ranks, checkpoint = settings.ranks, settings.checkpoint
     if ranks:
         settings = replace(settings, device=ranks.device(settings.device))
@@ -104,7 +111,8 @@ def _observed(task: Task[FrameSource], settings: Settings, others: Observers) ->
     }
     target = settings.target_error
     watch = TargetWatch(target, coverage, task.asked.awaited) if target else None
-    observers: Sequence[AnyObserver] = [*coverage.values(), *others.values()]
+    probing = _probing(task, settings)
+    observers: Sequence[AnyObserver] = [*coverage.values(), *others.values(), *probing]
     identity = run_identity(task, settings, others, ranks.size if ranks else 1) if ranks or checkpoint else {}
     if ranks:
         if target:
@@ -117,7 +125,7 @@ def _observed(task: Task[FrameSource], settings: Settings, others: Observers) ->
             place = place.of(ranks.rank if ranks else 0)
             if ranks is None or ranks.rank == 0:
                 stack.enter_context(claimed(place.path.parent))
-            journal = Journal(place, identity, _states(coverage, others, watch))
+            journal = Journal(place, identity, _states(coverage, others, watch, probing))
         run = observe(
             task.frames,
             observers,
@@ -133,8 +141,21 @@ def _observed(task: Task[FrameSource], settings: Settings, others: Observers) ->
         )
         if ranks:
             run, observers = _whole(run, observers, ranks)
-    rigs = len(coverage)
-    return dict(zip(coverage, observers[:rigs], strict=True)), dict(zip(others, observers[rigs:], strict=True)), run
+    rigs, every = len(coverage), len(coverage) + len(others)
+    of_rigs, seen = zip(coverage, observers[:rigs], strict=True), zip(others, observers[rigs:every], strict=True)
+    return dict(of_rigs), next(iter(observers[every:]), None), dict(seen), run
+
+
+def _probing(task: Task[FrameSource], settings: Settings) -> list[ProbeMetric]:
+    """Who puts bodies beside the vehicle; nobody where there is no scene to put them into."""
+    usual = () if settings.ask and settings.ask.regions else PROBES
+    names = usual if settings.probe is None else settings.probe
+    if not (names and isinstance(task.frames, SimulatedFrames)):
+        return []
+    bodies = [Target.load(name) for name in names]
+    if len({body.name for body in bodies}) < len(bodies):
+        raise ValueError(f"probe: one is given twice: {', '.join(body.name for body in bodies)}")
+    return [ProbeMetric(Probes(task.frames.simulator, bodies), BLOCKS)]
 
 
 def _whole(run: Run, observers: Sequence[AnyObserver], ranks: Ranks) -> tuple[Run, Sequence[AnyObserver]]:
@@ -162,9 +183,12 @@ def _whole(run: Run, observers: Sequence[AnyObserver], ranks: Ranks) -> tuple[Ru
     return whole, observers
 
 
-def _states(coverage: Observers, others: Observers, watch: TargetWatch | None) -> dict[str, object]:
+def _states(
+    coverage: Observers, others: Observers, watch: TargetWatch | None, probing: Sequence[ProbeMetric]
+) -> dict[str, object]:
     """What a checkpoint keeps, by the names that its file and messages have."""
     rigs = {f"coverage of {name}": one for name, one in coverage.items()}
+    rigs |= dict(zip(["bodies"], probing, strict=False))
     return {**rigs, **{f"observer {name}": one for name, one in others.items()}, **({"watch": watch} if watch else {})}
 
 

@@ -58,6 +58,19 @@ class Observer(Protocol[ResultT]):
         ...
 
 
+@runtime_checkable
+class InPlace(Protocol):
+    """An observer that measures frames where they are made: what travels between processes is small then."""
+
+    def sums_of(self, frame: Frame) -> object:
+        """What a frame is to `add`."""
+        ...
+
+    def add(self, sums: Any) -> None:  # noqa: ANN401  (what its `sums_of` gives)
+        """Add a frame that `sums_of` an observer of the same parameters has measured."""
+        ...
+
+
 class CoverageObserver:
     """Coverage of one rig: feeds frames to a `CoverageMetric`.
 

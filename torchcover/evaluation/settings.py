@@ -168,6 +168,13 @@ def _weather(given: "Weather | str | Path | Sequence[Weather | str | Path]") -> 
     return tuple(one if isinstance(one, Weather) else Weather.load(one) for one in each)
 
 
+def _probes(given: "str | Path | Iterable[str | Path] | None") -> "tuple[str | Path, ...] | None":
+    each = (given,) if isinstance(given, str | Path) else None if given is None else tuple(given)
+    if each and "none" in each and len(each) > 1:
+        raise ValueError(f"probe: none, or bodies; got {', '.join(map(str, each))}")
+    return () if each == ("none",) else each
+
+
 def _device(given: "str | torch.device") -> str:
     return str(given)
 
@@ -243,6 +250,14 @@ class Settings:
             in_study=True,
         ),
     ] = Read(_asked, None)
+    probe: Annotated[
+        Read["str | Path | Iterable[str | Path] | None", "tuple[str | Path, ...] | None"],
+        Option(
+            "Body that is put in free places beside the vehicle, as of `targets`; may be repeated; `none` puts none. "
+            "Not given: child, adult, cyclist and pole where nothing else is asked about.",
+            list[str],
+        ),
+    ] = Read(_probes, None)
     cell_m: Annotated[
         float | None, Option("Side of a grid cell in metres, whatever `ask` says (0.25).", in_study=True)
     ] = None
@@ -425,6 +440,8 @@ class Settings:
             raise ValueError("only_detection: for simulations; a recording has all its points")
         if self.vehicle is not None:
             raise ValueError("vehicle: for simulations; a recording has its own")
+        if self.probe:
+            raise ValueError("probe: not for recordings, which have no scene to put a body into")
         if any(setting is not None for setting in (self.reference, self.rays, self.every_s)):
             raise ValueError("reference, rays and every_s are for simulations; a recording has its reference points")
 

@@ -4,9 +4,20 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from torchcover.coverage import BevGrid, Coverage, Mixture, Region, RegionSummary, check_paired, differences
+from torchcover.coverage import (
+    OF_BODIES,
+    PARTS,
+    BevGrid,
+    Coverage,
+    Mixture,
+    Region,
+    RegionSummary,
+    check_paired,
+    differences,
+    shown_places,
+)
 from torchcover.coverage.measures import Measure
-from torchcover.coverage.paired import leaders
+from torchcover.coverage.paired import Parts, leaders
 from torchcover.estimation import MIN_BLOCKS, Difference, Quantity
 
 
@@ -61,6 +72,7 @@ class CoverageTable:
         conditions: Name of the rig -> what its numbers hold under.
         notes: What else they hold under, in words of the caller.
         source: What carried the rigs, `vehicle`, and what sensors make of their hits, `sensor_model` by rig; if known.
+        bodies: Name of the rig -> its rows of bodies beside the vehicle, if any were put there.
     """
 
     quantities: tuple[Quantity, ...]
@@ -72,6 +84,7 @@ class CoverageTable:
     conditions: Mapping[str, Conditions]
     notes: tuple[str, ...]
     source: Mapping[str, object] = field(default_factory=dict)
+    bodies: Mapping[str, tuple[Row, ...]] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -100,7 +113,9 @@ class CoverageTable:
                 check_paired(dict(zip(coverages, of_one_world, strict=True)))
         first = next(iter(coverages.values()))
         summaries = {rig: coverage.summary(regions) for rig, coverage in coverages.items()}
-        rows = _rows(coverages, regions, summaries)
+        rows = _rows(coverages, shown_places(regions, first.grid), summaries)
+        of_bodies = {rig: coverage.body_summary() for rig, coverage in coverages.items()}
+        bodies = _rows(coverages, first.body_places, of_bodies, OF_BODIES)
         return cls(
             quantities=(*first.quantities, *(first.aggregated.quantities if first.aggregated else ())),
             grid=first.grid,
@@ -111,6 +126,7 @@ class CoverageTable:
             conditions={rig: _conditions(coverage) for rig, coverage in coverages.items()},
             notes=tuple(notes),
             source=source or {},
+            bodies={rig: tuple(row[rig] for row in bodies) for rig in coverages},
         )
 
     @property
@@ -133,19 +149,24 @@ class CoverageTable:
         """The rows of each region and band: one for each rig."""
         return list(zip(*self.rows.values(), strict=True))
 
+    @property
+    def body_quantities(self) -> tuple[Quantity, ...]:
+        """What there is a number of for each body in each region."""
+        row = next((row for rows in self.bodies.values() for row in rows), None)
+        return tuple(number.quantity for number in row.summary.numbers.values()) if row else ()
+
 
 def _rows(
     coverages: Mapping[str, Coverage | Mixture],
-    regions: Sequence[Region],
+    places: Sequence[tuple[Region, str]],
     summaries: Mapping[str, Sequence[RegionSummary]],
+    parts: Parts = PARTS,
 ) -> list[dict[str, Row]]:
-    first = next(iter(coverages.values()))
-    places = [(region, height) for region in regions for height in first.grid.heights]
     several = len(coverages) > 1
     rows = []
     for (region, height), of_rigs in zip(places, zip(*summaries.values(), strict=True), strict=True):
-        compared = differences(coverages, region, height) if several else {}
-        best = leaders(coverages, region, height)
+        compared = differences(coverages, region, height, parts) if several else {}
+        best = leaders(coverages, region, height, parts)
         row = {}
         for rig, summary in zip(coverages, of_rigs, strict=True):
             marked = frozenset(key for key, leader in best.items() if leader == rig)

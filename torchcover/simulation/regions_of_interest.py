@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from dataclasses import replace
 from typing import Annotated, NamedTuple, Self
 
 import numpy as np
@@ -118,7 +119,9 @@ class RegionsOfInterest(Readable):
             return Asked(grid, named, (*(_area(region) for region in named), (grid.x, grid.y)), named)
         forward = tuple(region for region in forward_regions() if region.fits(grid))
         check_regions(forward, grid)
-        near = () if vehicle is None else near_field_regions(*vehicle)
+        near = () if ego_outline_m is None else near_field(ego_outline_m)
+        if not self.heights:  # of what is above the ground there, bodies are put there
+            near = tuple(replace(region, bands=("ground",)) for region in near)
         # Cells may be larger than the near field.
         near = tuple(region for region in near if region.fits(grid) and region.mask(grid).any())
         around = (_around(near),) if near else ()
@@ -151,6 +154,11 @@ class Asked(NamedTuple):
     def bands_m(self) -> Bands:
         """The height bands that the reference sensor is aimed at."""
         return tuple(self.grid.heights.values())
+
+
+def near_field(ego_outline_m: NDArray[np.float64]) -> tuple[Region, ...]:
+    """That of a vehicle with (K, 2) corners x, y; see `near_field_regions`."""
+    return near_field_regions(*_bounds(ego_outline_m))
 
 
 def _bounds(outline_m: NDArray[np.float64]) -> tuple[tuple[float, float], tuple[float, float]]:

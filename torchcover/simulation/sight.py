@@ -64,6 +64,7 @@ class MountedSensor:
         self._times = ray_times(sensor, self.tiles, self.pixel_of_ray) if scene.moves else None
         self._is_raw = bool(self._times and timing and not timing.deskewed)
         self.own_m = scene.own_m(self.vehicle_T_sensor, self.tiles, max_range_m=reach_m)
+        self._knows_ego = bool(self.own_m)
         housings = [
             mesh.moved(other.mount.matrix()) for other in others for body in other.housing for mesh in body.meshes()
         ]
@@ -74,6 +75,7 @@ class MountedSensor:
             self.own_m = tuple(np.minimum(*both) for both in zip(ends_m, ego_m, strict=True))
         self._at_rest = not scene.moves
         self._resting: tuple[SensorScan, RayHits] | None = None
+        self._scanned: tuple[Instant, SensorScan] | None = None
 
     def scan(self, instant: Instant, draws: Draws, *, threads: int = 1, within: Balls | None = None) -> SensorScan:
         """What it makes of what its rays hit at one time of the scene.
@@ -131,6 +133,8 @@ class MountedSensor:
                 rays_spared=len(cast) - scan.rays,
                 self_hits=scan.self_hits + ended,
             )
+        elif self._knows_ego and self._times is None:
+            self._scanned = instant, scan._replace(struck=None, ways=None)
         hits = RayHits(scan.ray, scan.range_m, self.pixel_of_ray, find=scan.struck, weather=self.weather)
         if self._at_rest:
             self._resting = scan, hits
@@ -148,6 +152,11 @@ class MountedSensor:
 
     def ends(self, instant: Instant) -> Ends:
         """Where each of its rays ends: at what it hits first, the ego's body included, or at its reach."""
+        if self._scanned is not None and self._scanned[0] is instant:  # nothing is cast twice
+            scan, ends_m = self._scanned[1], np.minimum(np.concatenate(self.own_m), np.float32(self.reach_m))
+            met = np.zeros(len(ends_m), dtype=bool)
+            ends_m[scan.ray], met[scan.ray] = scan.range_m, True
+            return Ends(ends_m, met)
         bodies, own = instant.outlines(self.vehicle_T_sensor[:3, 3]), self.own_m or [None] * len(self.tiles)
         range_m, is_hit = [], []
         for tile, own_m in zip(self.tiles, own, strict=True):

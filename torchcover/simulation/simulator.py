@@ -177,7 +177,7 @@ class Simulator:
             >>> roof.rays, roof.points.dtype
             (230400, dtype('float32'))
         """
-        stage, instant = self._placed(index)
+        stage, instant = self.placed(index)
         return self._scans(stage, instant, index, within)
 
     def step(self, index: int) -> Observation:
@@ -191,7 +191,7 @@ class Simulator:
             ValueError: A negative index, a sensor inside a body or below the ground, an actor that overlaps the ego, an
                 ego below the ground.
         """
-        stage, instant = self._placed(index)
+        stage, instant = self.placed(index)
         reference = self.reference_sensor.scan(self._surroundings(stage.scene, instant, index))
         within = None if self.within_m is None else Balls.around(reference.points, self.within_m)
         scans = self._scans(stage, instant, index, within)
@@ -293,8 +293,15 @@ class Simulator:
         run, step = self.scenario.locate(index * self._every_steps)
         return self._stages.of_run(run), step
 
-    def _placed(self, index: int) -> tuple[Stage, Instant]:
-        """The stage of a step, and all of it at its time, with no sensor where none can be."""
+    def placed(self, index: int) -> tuple[Stage, Instant]:
+        """The stage of a step, and all of it at its time, with no sensor where none can be.
+
+        Args:
+            index: Number of the step, from 0.
+
+        Raises:
+            FileNotFoundError, ValueError: As for `step`.
+        """
         stage, step = self._stage(index)
         instant = stage.scene.at(step, within_m=self._reach_m(stage.scene.ego_box))
         stage.check_mounts(instant)

@@ -106,11 +106,11 @@ def blocked(instant: Instant, box: BoundingBox, samples_m: Float64, vehicle_T_ta
         vehicle_T_target: (P, 4, 4) where it stands.
     """
     taken = np.zeros(len(vehicle_T_target), dtype=bool)
-    reach_m = float(np.linalg.norm(box.corners_m, axis=1).max())
-    for k in np.flatnonzero(instant.moving.body != instant.ego).tolist():
-        away_m = np.linalg.norm(vehicle_T_target[:, :3, 3] - instant.moving.centre_m[k], axis=1)
-        near = np.flatnonzero(away_m <= instant.moving.radius_m[k] + reach_m)
-        taken[near] |= overlapping(box, vehicle_T_target[near], instant.moving.corners_m[k])
+    moving, reach_m = instant.moving, float(np.linalg.norm(box.corners_m, axis=1).max())
+    away_m = np.linalg.norm(vehicle_T_target[:, None, :3, 3] - moving.centre_m, axis=2)
+    near = (away_m <= moving.radius_m + reach_m) & (moving.body != instant.ego)
+    for k in np.flatnonzero(near.any(axis=0)).tolist():
+        taken[near[:, k]] |= overlapping(box, vehicle_T_target[near[:, k]], moving.corners_m[k])
     return taken | _meets_static(instant, box, samples_m, vehicle_T_target)
 
 

@@ -104,7 +104,10 @@ class Steps:
             instant = stage.scene.at(step, within_m=self._within_m)
             stage.check_mounts(instant)
             # Where nothing moves, the first answer holds.
-            ends, ground_z_m, free = resting or ([m.ends(instant) for m in stage.mounted[RIG]], *self._free(instant))
+            ends, ground_z_m, free = resting or (
+                [m.ends(instant) for m in stage.mounted[RIG]],
+                *free_places(instant, self._target, self._surface, self._poses),
+            )
             if not stage.scene.moves and self._scenario.repeats:
                 resting = ends, ground_z_m, free
             # The numbers of each ray: all places see the same rays err and drop out.
@@ -115,14 +118,6 @@ class Steps:
             visible = self._visible(stage.scene, instant, standing(self._poses, ground_z_m), index)
             yield Step(sensors, ground_z_m, free, visible)
 
-    def _free(self, instant: Instant) -> tuple[Float64, Bools]:
-        """Where the ground is, 0 where there is none, and where there is some, with room on it."""
-        box, samples_m = self._target.solid.box, self._surface.points_m
-        z_m = ground_under(instant, self._poses[:, :2, 3])
-        there, z_m = np.isfinite(z_m), np.nan_to_num(z_m)
-        taken = [blocked(instant, box, samples_m, poses) for poses in _chunks(standing(self._poses, z_m))]
-        return z_m, there & ~np.concatenate([np.empty(0, dtype=bool), *taken])
-
     def _visible(self, scene: Scene, instant: Instant, vehicle_T_target: Float64, index: int) -> NDArray[np.uint8]:
         generator = np.random.default_rng([self._seed, index])
         surroundings = Surroundings(
@@ -130,7 +125,7 @@ class Steps:
         )
         seen = []
         for _ in range(self.places):
-            pose, _ = surroundings.free_pose(_pose_in_shell)
+            pose, _ = surroundings.free_pose(pose_in_shell)
             seen.append(
                 [
                     self._surface.seen_from(pose[:3, 3], self._target, poses, instant, threads=surroundings.threads)
@@ -142,7 +137,17 @@ class Steps:
         return np.stack([np.concatenate([none, *of_place]) for of_place in seen])
 
 
-def _pose_in_shell(ego: BoundingBox, generator: np.random.Generator) -> Float64:
+def free_places(instant: Instant, target: Target, surface: Surface, vehicle_T_target: Float64) -> tuple[Float64, Bools]:
+    """Where the ground is, 0 where there is none, and where there is some, with room for a target on it: (P,) each."""
+    z_m = ground_under(instant, vehicle_T_target[:, :2, 3])
+    there, z_m = np.isfinite(z_m), np.nan_to_num(z_m)
+    upright = _chunks(standing(vehicle_T_target, z_m))
+    taken = [blocked(instant, target.solid.box, surface.points_m, some) for some in upright]
+    return z_m, there & ~np.concatenate([np.empty(0, dtype=bool), *taken])
+
+
+def pose_in_shell(ego: BoundingBox, generator: np.random.Generator) -> Float64:
+    """A (4, 4) random place of a reference sensor."""
     return rigid(np.eye(3), position_in_shell(ego, SHELL_M, generator))
 
 

@@ -20,8 +20,8 @@ Float64 = NDArray[np.float64]
 SAMPLES = 64
 # Drawn for each that is kept: what lies inside another part of the body is nobody's surface.
 DRAWN_FOR_EACH = 16
-# Rows of distances that are held at once.
-HITS_AT_ONCE = 65_536
+# Rows of distances that are held at once: no more than a cache has room for.
+HITS_AT_ONCE = 512
 
 
 class Surface(NamedTuple):
@@ -104,9 +104,10 @@ class Surface(NamedTuple):
 
 def _enclosed(target: Target, points_m: Float64) -> Bools:
     """(N,) whether no ray gets out from a place."""
-    rays = ALL_AROUND_RAYS.shape[1]
-    origins_m = points_m.astype(np.float32).repeat(rays, axis=0)
-    directions = np.tile(ALL_AROUND_RAYS, len(points_m))
-    hits = target.solid.caster.cast_from_each(origins_m, directions, np.full(len(origins_m), np.inf, dtype=np.float32))
-    enclosed: Bools = np.all((hits.body >= 0).reshape(-1, rays), axis=1)
+    left = np.arange(len(points_m))
+    for towards in ALL_AROUND_RAYS.T:  # most get out at once
+        directions, far_m = np.tile(towards[:, None], len(left)), np.full(len(left), np.inf, dtype=np.float32)
+        hits = target.solid.caster.cast_from_each(points_m[left].astype(np.float32), directions, far_m)
+        left = left[hits.body >= 0]
+    enclosed: Bools = np.isin(np.arange(len(points_m)), left)
     return enclosed

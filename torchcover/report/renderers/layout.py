@@ -20,7 +20,9 @@ from torchcover.report.wording import (
 
 MAX_HEADING_CHARS = 16
 PLACE_HEADINGS = ("region", "height")
+BODY_HEADINGS = ("region", "body")
 PLACES = len(PLACE_HEADINGS)
+Rows = tuple[Row, ...]
 # What the marks look like, and what the legend calls that, where text may be bold.
 BOLD_MARKS: Mapping[str, str] = MappingProxyType({"best": "In bold", "significant": "In bold among the differences"})
 
@@ -59,34 +61,29 @@ def parts_of(table: CoverageTable) -> list[PageTable]:
 
     Returns:
         For one rig one part, a column for each quantity. For several the paper's layout: a part for each quantity, a
-        column for each rig; and, if there are errors, as many parts with the differences to the first rig. With
-        redundancy a part for each rig more, a column for each of its sensors.
+        column for each rig; and, if there are errors, as many parts with the differences to the first rig. Then the
+        same of bodies beside the vehicle. With redundancy a part for each rig more, a column for each of its sensors.
     """
     failures = [_of_failures(table, rig) for rig in table.rigs if sensors_of(table.rows[rig])]
+    of_bodies = list(zip(*table.bodies.values(), strict=True))
+    parts = _of_rows(table, table.places, table.quantities)
+    return [*parts, *(_of_rows(table, of_bodies, table.body_quantities) if of_bodies else ()), *failures]
+
+
+def _of_rows(table: CoverageTable, places: Sequence[Rows], quantities: Sequence[Quantity]) -> list[PageTable]:
     if len(table.rigs) == 1:
-        return [_of_one_rig(table), *failures]
-    parts = [_of_quantity(table, quantity) for quantity in table.quantities]
-    if table.first.blocks is not None:
-        parts += [_of_differences(table, quantity) for quantity in table.quantities]
-    return [*parts, *failures]
-
-
-def _of_one_rig(table: CoverageTable) -> PageTable:
-    headings = [fill(heading(quantity), MAX_HEADING_CHARS) for quantity in table.quantities]
-    cells = [[_number(row, quantity) for quantity in table.quantities] for (row,) in table.places]
-    return _part(table, "", headings, cells)
-
-
-def _of_quantity(table: CoverageTable, quantity: Quantity) -> PageTable:
-    cells = [[_number(row, quantity) for row in rows] for rows in table.places]
-    return _part(table, capitalised(heading(quantity)), table.rigs, cells)
-
-
-def _of_differences(table: CoverageTable, quantity: Quantity) -> PageTable:
-    first, *others = table.rigs
-    cells = [[_difference(row, quantity) for row in rows[1:]] for rows in table.places]
-    title = f"Difference to {first}: {difference_heading(quantity)}"
-    return _part(table, title, others, cells)
+        headings = [fill(heading(quantity), MAX_HEADING_CHARS) for quantity in quantities]
+        cells = [[_number(row, quantity) for quantity in quantities] for (row,) in places]
+        return [_part(table, places, "", headings, cells)]
+    (first, *others), parts = table.rigs, []
+    for one in quantities:
+        cells = [[_number(row, one) for row in rows] for rows in places]
+        parts.append(_part(table, places, capitalised(heading(one)), table.rigs, cells))
+    for one in quantities if table.first.blocks is not None else ():
+        cells = [[_difference(row, one) for row in rows[1:]] for rows in places]
+        title = f"Difference to {first}: {difference_heading(one)}"
+        parts.append(_part(table, places, title, others, cells))
+    return parts
 
 
 def _of_failures(table: CoverageTable, rig: str) -> PageTable:
@@ -97,14 +94,22 @@ def _of_failures(table: CoverageTable, rig: str) -> PageTable:
     return PageTable(failure_title(table, rig), [*PLACE_HEADINGS, *failure_headings(table, rig)], rows, PLACES)
 
 
-def _part(table: CoverageTable, title: str, headings: Sequence[str], numbers: Sequence[Sequence[Words]]) -> PageTable:
+def _part(
+    table: CoverageTable,
+    places: Sequence[Rows],
+    title: str,
+    headings: Sequence[str],
+    numbers: Sequence[Sequence[Words]],
+) -> PageTable:
     """A part with the columns that every part has: the place first, those of `COLUMNS` that are shown last."""
-    shown = [column for column in COLUMNS if column.heading and column.measure in (None, table.measure)]
+    measure = places[0][0].summary.measure if places else table.measure
+    shown = [column for column in COLUMNS if column.heading and column.measure in (None, measure)]
     rows = []
-    for (row, *_), cells in zip(table.places, numbers, strict=True):
+    for (row, *_), cells in zip(places, numbers, strict=True):
         last = [Words(column.words(column.of(table, row))) for column in shown]
         rows.append((Words(row.summary.region), Words(row.summary.height), *cells, *last))
-    every = [*PLACE_HEADINGS, *headings, *(column.heading for column in shown)]
+    first = BODY_HEADINGS if measure == "places" else PLACE_HEADINGS
+    every = [*first, *headings, *(column.heading for column in shown)]
     return PageTable(title, every, rows, PLACES)
 
 

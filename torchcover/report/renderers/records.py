@@ -41,8 +41,16 @@ def _sensor_model(table: CoverageTable, row: Row) -> object:
     return of_rigs.get(row.rig) if isinstance(of_rigs, Mapping) else of_rigs
 
 
+def _band(table: CoverageTable, row: Row) -> tuple[float, float]:
+    return table.grid.heights.get(row.summary.height, (math.nan, math.nan))
+
+
 COLUMNS = (
-    Column("measure", "what the numbers are means over: `area` or `known`", lambda _, row: row.summary.measure),
+    Column(
+        "measure",
+        "what the numbers are means over: `area`, `known`, or `places` of a body, which `height` names",
+        lambda _, row: row.summary.measure,
+    ),
     Column(
         "visible_m2",
         "mean of the square metres that the reference sees in a step",
@@ -59,8 +67,17 @@ COLUMNS = (
         percent,
         "known",
     ),
-    Column("known_cells", "how many are known", lambda _, row: row.summary.known_cells),
-    Column("cells", "how many cells the region has", lambda _, row: row.summary.cells),
+    Column(
+        "known_cells",
+        "how many are known; of a body, in how many of the places there was room",
+        lambda _, row: row.summary.known_cells,
+        "free places",
+        str,
+        "places",
+    ),
+    Column(
+        "cells", "how many cells the region has; of a body, places that were tried", lambda _, row: row.summary.cells
+    ),
     Column("cell_m", "side of a cell", lambda table, _: table.grid.cell),
     Column("steps", "how many were measured", lambda table, row: table.conditions[row.rig].counts["steps"]),
     Column("blocks", "how many the errors come from", lambda table, row: table.conditions[row.rig].blocks),
@@ -72,20 +89,21 @@ COLUMNS = (
     Column("y_min_m", "its right border", lambda _, row: row.region.y[0]),
     Column("y_max_m", "its left border", lambda _, row: row.region.y[1]),
     Column("band_frame", "what the band is over: `ground` or `vehicle`", lambda table, _: table.grid.band_frame),
-    Column("z_min_m", "where the band begins", lambda table, row: table.grid.heights[row.summary.height][0]),
-    Column("z_max_m", "where it ends", lambda table, row: table.grid.heights[row.summary.height][1]),
+    Column("z_min_m", "where the band begins", lambda table, row: _band(table, row)[0]),
+    Column("z_max_m", "where it ends", lambda table, row: _band(table, row)[1]),
 )
 
 
 def records_of(table: CoverageTable) -> list[Record]:
     """A record for each row, rig by rig; lengths in metres, detection and shares in [0, 1], NaN where unknown."""
     columns = columns_of(table)
-    return [{name: of(row) for name, of in columns.items()} for rows in table.rows.values() for row in rows]
+    rows = [row for each in (table.rows, table.bodies) for of_rig in each.values() for row in of_rig]
+    return [{name: of(row) for name, of in columns.items()} for row in rows]
 
 
 def columns_of(table: CoverageTable) -> Columns:
     """What each record has, and where it is in a row."""
-    keys = [quantity.key for quantity in table.quantities]
+    keys = [quantity.key for quantity in (*table.quantities, *table.body_quantities)]
     means = [quantity.key for quantity in table.means]
     columns: Columns = {
         "rig": lambda row: row.rig,
@@ -111,18 +129,18 @@ def columns_of(table: CoverageTable) -> Columns:
 
 
 def _of_summary(key: str) -> Columns:
-    return _number(key, lambda row: row.summary.numbers[key])
+    return _number(key, lambda row: row.summary.numbers.get(key))
 
 
 def _known(key: str) -> Columns:
-    return _number(f"known_{key}", lambda row: row.summary.known[key])
+    return _number(f"known_{key}", lambda row: row.summary.known.get(key))
 
 
 def _compared(key: str) -> Columns:
     return {
         f"{key}_best": lambda row: key in row.best,
-        **_number(f"{key}_difference", lambda row: row.differences[key]),
-        f"{key}_difference_significant": lambda row: row.differences[key].significant,
+        **_number(f"{key}_difference", lambda row: row.differences.get(key)),
+        f"{key}_difference_significant": lambda row: getattr(row.differences.get(key), "significant", None),
     }
 
 

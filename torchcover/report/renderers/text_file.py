@@ -3,6 +3,8 @@
 import io
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import groupby
+from operator import itemgetter
 from typing import Any
 
 from rich.cells import cell_len
@@ -12,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from torchcover.report.remarks import marks_on, notes_on
-from torchcover.report.renderers.layout import PLACE_HEADINGS, PageTable, Words, parts_of
+from torchcover.report.renderers.layout import PageTable, Words, parts_of
 from torchcover.report.table import CoverageTable
 
 # Survive files and terminals without bold type.
@@ -65,7 +67,7 @@ def rich_tables(table: CoverageTable, *, two_lines: bool = False) -> list[Table]
         line for part in parts for row in part.rows for cell in row[2:-1] for line in _text(cell).plain.split("\n")
     ]
     widest = max(map(cell_len, lines), default=0)
-    tables = [_rich_table(part, widest, len(table.grid.heights)) for part in parts]
+    tables = [_rich_table(part, widest) for part in parts]
     marks = [f"{SIGNS[mark]} {meaning}" for mark, meaning in marks_on(table).items()]
     tables[-1].caption = Text("\n".join([*marks, *notes_on(table)]))
     return tables
@@ -103,18 +105,20 @@ def narrowest_width(tables: Sequence[Table], folded: Sequence[str] = ()) -> int:
     return natural - sum(max(0, cell_len(name) - numbers) for name in folded)
 
 
-def _rich_table(part: PageTable, widest: int, bands: int) -> Table:
-    """With a line after so many rows, the bands of a region."""
+def _rich_table(part: PageTable, widest: int) -> Table:
+    """With a line after the rows of each region."""
     left: dict[str, Any] = {"title_justify": "left", "caption_justify": "left"}
     table = Table(title=Text(part.title) if part.title else None, title_style="bold", caption_style="", **left)
-    for name in PLACE_HEADINGS:
+    for name in part.headings[:2]:
         table.add_column(name, no_wrap=True)
     for name in part.headings[2:-1]:
         # As Text, for names may hold what rich takes for markup. Names are folded, numbers never.
         table.add_column(Text(name), justify="right", overflow="fold", min_width=widest)
     table.add_column(part.headings[-1], justify="right", no_wrap=True)
-    for at, row in enumerate(part.rows, 1):
-        table.add_row(*map(_text, row), end_section=at % bands == 0)
+    for _, rows in groupby(part.rows, itemgetter(0)):
+        for row in rows:
+            table.add_row(*map(_text, row))
+        table.add_section()
     return table
 
 

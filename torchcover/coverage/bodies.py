@@ -1,0 +1,80 @@
+"""Bodies beside the vehicle: in which share of the free places a rig sees them, and how much of them."""
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from torch import Tensor
+
+from torchcover.coverage.grid import BevGrid
+from torchcover.coverage.regions import Region
+from torchcover.coverage.summary import RegionSummary
+from torchcover.estimation import Estimate, Quantity
+
+# Of a body in a region: places that were tried, those that were free, those of them where it was seen; square metres
+# of it that could be seen there, those of them that were.
+TRIED, FREE, SEEN, VISIBLE, NEAR = COLUMNS = range(5)
+
+
+@dataclass(frozen=True, eq=False)
+class BodySums:
+    """Sums over the places where bodies were put, one at a time and seen by nothing else, in B fine blocks of steps.
+
+    Args:
+        bodies: Their names.
+        regions: Where their middles stood.
+        hits: How many points are enough to see one.
+        threshold_m: How near a point on it must be to its surface.
+        grid: Cells of the maps.
+        steps: (B,) int64 steps in each block at which bodies were put.
+        sums: (B, bodies, regions, 5) float64 of `TRIED`, `FREE`, `SEEN`, `VISIBLE`, `NEAR`.
+        cells: (bodies, Y, X, 2) float64 places that were free, and those where the body was seen.
+    """
+
+    bodies: tuple[str, ...]
+    regions: tuple[Region, ...]
+    hits: int
+    threshold_m: float
+    grid: BevGrid
+    steps: Tensor
+    sums: Tensor
+    cells: Tensor
+
+    @property
+    def quantities(self) -> tuple[Quantity, ...]:
+        """What there is a number of for each region and body: the share of places, and of surface."""
+        seen = f"free places with {self.hits} points or more"
+        near = f"surface within {self.threshold_m:g} m of a point"
+        return (
+            Quantity(f"places_{self.hits}_points", seen, "share", lower_is_better=False),
+            Quantity(f"surface_{self.threshold_m:g}m", near, "share", lower_is_better=False),
+        )
+
+    @property
+    def places(self) -> list[tuple[Region, str]]:
+        """The regions and bodies that there are numbers of."""
+        return [(region, body) for region in self.regions for body in self.bodies]
+
+    def estimate(self, region: Region, body: str) -> Estimate:
+        """The numbers of a body in a region; NaN where no place was free, or nothing of it could be seen."""
+        own = self._of(region, body)
+        return Estimate.of_ratios(self.quantities, own[:, [FREE, VISIBLE]], own[:, [SEEN, NEAR]], self.steps)
+
+    def summary(self) -> list[RegionSummary]:
+        """A row for each of `places`: its cells are places that were tried, the known ones those that were free."""
+        rows = []
+        for region, body in self.places:
+            tried, free, _, visible_m2, _ = self._of(region, body).sum(dim=0).tolist()
+            numbers = self.estimate(region, body).numbers(count=int(free), count_of="free places")
+            m2 = visible_m2 / free if free else math.nan
+            rows.append(RegionSummary(region.name, body, int(tried), int(free), "places", numbers, {}, m2))
+        return rows
+
+    def stored(self) -> dict[str, Any]:
+        """All but the tensors, for JSON."""
+        told = {name: getattr(self, name) for name in ("bodies", "hits", "threshold_m")}
+        extent = {"x": self.grid.x, "y": self.grid.y, "cell": self.grid.cell}
+        return {**told, "regions": [asdict(region) for region in self.regions], "grid": extent}
+
+    def _of(self, region: Region, body: str) -> Tensor:
+        return self.sums[:, self.bodies.index(body), self.regions.index(region)]
