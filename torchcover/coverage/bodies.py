@@ -1,8 +1,9 @@
 """Bodies beside the vehicle: in which share of the free places a rig sees them, and how much of them."""
 
 import math
-from dataclasses import asdict, dataclass
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, NamedTuple
 
 from torch import Tensor
 
@@ -78,3 +79,24 @@ class BodySums:
 
     def _of(self, region: Region, body: str) -> Tensor:
         return self.sums[:, self.bodies.index(body), self.regions.index(region)]
+
+
+class BodyMixture(NamedTuple):
+    """What `BodySums` says of one kind of world, of a mixture: of the same `places` in each, with weights."""
+
+    parts: Sequence[tuple[float, BodySums]]
+    places: Sequence[tuple[Region, str]]
+
+    def estimate(self, region: Region, body: str) -> Estimate:
+        """As `BodySums.estimate`."""
+        return Estimate.mixed([(weight, part.estimate(region, body)) for weight, part in self.parts])
+
+    def summary(self) -> list[RegionSummary]:
+        """As `BodySums.summary`; places are those of all kinds together."""
+        rows = []
+        for place, *each in zip(self.places, *(part.summary() for _, part in self.parts), strict=True):
+            tried, free = (sum(getattr(row, name) for row in each) for name in ("cells", "known_cells"))
+            numbers = self.estimate(*place).numbers(count=free, count_of="free places")
+            m2 = sum(weight * row.visible_m2 for (weight, _), row in zip(self.parts, each, strict=True))
+            rows.append(replace(each[0], cells=tried, known_cells=free, numbers=numbers, visible_m2=m2))
+        return rows

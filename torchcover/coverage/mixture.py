@@ -3,13 +3,14 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+from torchcover.coverage.bodies import BodyMixture
 from torchcover.coverage.measures import Measure, estimate_redundancy
 from torchcover.coverage.regions import Region, shown_places
 from torchcover.coverage.result import Coverage
 from torchcover.coverage.summary import RegionSummary, region_redundancy
 from torchcover.estimation import Estimate
 
-SAME = ("band_frame", "grid", "thresholds", "max_radius", "measure", "regions", "body_places")
+SAME = ("band_frame", "grid", "thresholds", "max_radius", "measure", "regions")
 
 
 class Mixture:
@@ -33,6 +34,10 @@ class Mixture:
                 raise ValueError(f"kinds of world cannot be mixed: they differ in their {what}; ask about the same")
         self.grid, self.thresholds, self.max_radius = first.grid, first.thresholds, first.max_radius
         self.measure, self.quantities, self.aggregated = first.measure, first.quantities, first.aggregated
+        each = [(weight, part.bodies) for weight, part in self.parts if part.bodies]
+        if any(bodies.places != each[0][1].places for _, bodies in each) or 0 < len(each) < len(self.parts):
+            raise ValueError("kinds of world cannot be mixed: other bodies were put beside the vehicle in one of them")
+        self.bodies = BodyMixture(each, each[0][1].places) if each else None
 
     def estimate(self, region: Region, height: str, measure: Measure | None = None) -> Estimate:
         """As `Coverage.estimate`."""
@@ -52,26 +57,6 @@ class Mixture:
         places = shown_places(regions, self.grid)
         rows = zip(*(part.summary(regions) for _, part in self.parts), strict=True)
         return [self._row(place, row) for place, row in zip(places, rows, strict=True)]
-
-    @property
-    def body_places(self) -> list[tuple[Region, str]]:
-        """As `Coverage.body_places`."""
-        return self.parts[0][1].body_places
-
-    def estimate_body(self, region: Region, body: str) -> Estimate:
-        """As `Coverage.estimate_body`."""
-        return Estimate.mixed([(weight, part.estimate_body(region, body)) for weight, part in self.parts])
-
-    def body_summary(self) -> list[RegionSummary]:
-        """As `Coverage.body_summary`, of the places in all kinds together."""
-        rows = []
-        each_part = (part.body_summary() for _, part in self.parts)
-        for place, *each in zip(self.body_places, *each_part, strict=True):
-            tried, free = (sum(getattr(row, name) for row in each) for name in ("cells", "known_cells"))
-            numbers = self.estimate_body(*place).numbers(count=free, count_of="free places")
-            m2 = sum(weight * row.visible_m2 for (weight, _), row in zip(self.parts, each, strict=True))
-            rows.append(replace(each[0], cells=tried, known_cells=free, numbers=numbers, visible_m2=m2))
-        return rows
 
     def _row(self, place: tuple[Region, str], rows: Sequence[RegionSummary]) -> RegionSummary:
         weights = [weight for weight, _ in self.parts]

@@ -16,7 +16,7 @@ Parts: TypeAlias = tuple[Callable[[Coverage | Mixture], Callable[[Region, str], 
 
 # What there is an estimate of, in each region and band, and in each region of each body.
 PARTS = attrgetter("estimate"), attrgetter("estimate_aggregated")
-OF_BODIES = (attrgetter("estimate_body"),)
+OF_BODIES = (attrgetter("bodies.estimate"),)
 
 
 def check_paired(coverages: Mapping[str, Coverage]) -> None:
@@ -36,7 +36,7 @@ def check_paired(coverages: Mapping[str, Coverage]) -> None:
         for what in ("band_frame", "grid", "thresholds", "max_radius"):
             if getattr(coverage, what) != getattr(expected, what):
                 raise ValueError(f"{first!r} and {name!r} cannot be compared: they differ in their {what}")
-        if coverage.body_places != expected.body_places:
+        if (coverage.bodies and coverage.bodies.places) != (expected.bodies and expected.bodies.places):
             raise ValueError(f"{first!r} and {name!r} cannot be compared: other bodies were put beside them")
         if coverage.measure != expected.measure or coverage.layers.keys() != expected.layers.keys():
             raise ValueError(f"{first!r} and {name!r} cannot be compared: they have different layers")

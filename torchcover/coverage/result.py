@@ -170,20 +170,6 @@ class Coverage:
         return [summarise(self, *place) for place in shown_places(wanted, self.grid)]
 
     @property
-    def body_places(self) -> list[tuple[Region, str]]:
-        """The regions and bodies that `estimate_body` has numbers of."""
-        return self.bodies.places if self.bodies else []
-
-    def estimate_body(self, region: Region, body: str) -> Estimate:
-        """The numbers of a body in free places of a region, with what they become without each block."""
-        assert self.bodies is not None  # there is such a place
-        return self.bodies.estimate(region, body)
-
-    def body_summary(self) -> list[RegionSummary]:
-        """One row for each of `body_places`."""
-        return self.bodies.summary() if self.bodies else []
-
-    @property
     def measure(self) -> Measure:
         """What its numbers are means over: "area" if the reference points had square metres, else "known"."""
         return "known" if self.area is None else "area"
@@ -269,7 +255,7 @@ class Coverage:
             `"radius_m/20m/ground"`, `"detection_0.4m/20m/ground"`, `"known_share/20m/ground"` and so on, and
             `"visible_m2/20m/ground"` if the reference points had square metres.
         """
-        rows = [*self.summary(regions), *self.body_summary()]
+        rows = [*self.summary(regions), *(self.bodies.summary() if self.bodies else ())]
         return {key: value for row in rows for key, value in row.scalars(errors=self.blocks is not None).items()}
 
     def save(self, path: str | Path) -> None:

@@ -25,7 +25,7 @@ from torchcover.files import claimed
 from torchcover.frames import BadFrameError, FrameSource
 from torchcover.simulation import Asked, SimulatedFrames
 from torchcover.simulation.memory import check_fits
-from torchcover.targets import ProbeMetric, Probes, Target
+from torchcover.targets import Probes, Target
 
 Observers = Mapping[str, AnyObserver]
 # For standard errors: at least half as many are in use at the end of a long run.
@@ -99,7 +99,7 @@ def _workers(task: Task[FrameSource], settings: Settings) -> int:
 
 def _observed(
     task: Task[FrameSource], settings: Settings, others: Observers
-) -> tuple[Observers, ProbeMetric | None, Observers, Run]:
+) -> tuple[Observers, Probes | None, Observers, Run]:
     ranks, checkpoint = settings.ranks, settings.checkpoint
     if ranks:
         settings = replace(settings, device=ranks.device(settings.device))
@@ -146,7 +146,7 @@ def _observed(
     return dict(of_rigs), next(iter(observers[every:]), None), dict(seen), run
 
 
-def _probing(task: Task[FrameSource], settings: Settings) -> list[ProbeMetric]:
+def _probing(task: Task[FrameSource], settings: Settings) -> list[Probes]:
     """Who puts bodies beside the vehicle; nobody where there is no scene to put them into."""
     usual = () if settings.ask and settings.ask.regions else PROBES
     names = usual if settings.probe is None else settings.probe
@@ -155,7 +155,7 @@ def _probing(task: Task[FrameSource], settings: Settings) -> list[ProbeMetric]:
     bodies = [Target.load(name) for name in names]
     if len({body.name for body in bodies}) < len(bodies):
         raise ValueError(f"probe: one is given twice: {', '.join(body.name for body in bodies)}")
-    return [ProbeMetric(Probes(task.frames.simulator, bodies), BLOCKS)]
+    return [Probes(task.frames.simulator, bodies, BLOCKS)]
 
 
 def _whole(run: Run, observers: Sequence[AnyObserver], ranks: Ranks) -> tuple[Run, Sequence[AnyObserver]]:
@@ -184,7 +184,7 @@ def _whole(run: Run, observers: Sequence[AnyObserver], ranks: Ranks) -> tuple[Ru
 
 
 def _states(
-    coverage: Observers, others: Observers, watch: TargetWatch | None, probing: Sequence[ProbeMetric]
+    coverage: Observers, others: Observers, watch: TargetWatch | None, probing: Sequence[Probes]
 ) -> dict[str, object]:
     """What a checkpoint keeps, by the names that its file and messages have."""
     rigs = {f"coverage of {name}": one for name, one in coverage.items()}

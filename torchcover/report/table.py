@@ -114,8 +114,10 @@ class CoverageTable:
         first = next(iter(coverages.values()))
         summaries = {rig: coverage.summary(regions) for rig, coverage in coverages.items()}
         rows = _rows(coverages, shown_places(regions, first.grid), summaries)
-        of_bodies = {rig: coverage.body_summary() for rig, coverage in coverages.items()}
-        bodies = _rows(coverages, first.body_places, of_bodies, OF_BODIES)
+        bodies = []
+        if first.bodies:
+            each = {rig: coverage.bodies.summary() for rig, coverage in coverages.items() if coverage.bodies}
+            bodies = _rows(coverages, first.bodies.places, each, OF_BODIES)
         return cls(
             quantities=(*first.quantities, *(first.aggregated.quantities if first.aggregated else ())),
             grid=first.grid,

@@ -1,7 +1,6 @@
 from .files import write_arrays as write_arrays
 from .files import write_csv as write_csv
 from .placing import Heading as Heading
-from .probing import ProbeMetric as ProbeMetric
 from .probing import Probes as Probes
 from .raster import SIDES as SIDES
 from .raster import Raster as Raster

@@ -41,6 +41,9 @@ class Target:
         """Its geometry, to cast rays at."""
         return Solid(self.mesh)
 
+    def __getstate__(self) -> dict[str, object]:
+        return {"name": self.name, "mesh": self.mesh}  # Embree's scenes cannot be pickled
+
     @classmethod
     def load(cls, name_or_path: str | Path) -> Self:
         """One of `TARGETS`, a built-in vehicle by its name, the YAML file of one, or a mesh file in metres.
