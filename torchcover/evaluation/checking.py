@@ -190,6 +190,7 @@ def _coverage(asked: Requirements, rig: Rig, scenario: AnyScenario | None, **mor
     redundancy = any(one.without or one.number.startswith(("sensors", "seen")) for one in of_regions)
     settings = Settings(
         [rig], scenario, ask=asked, thresholds_m=thresholds_m or 0.4, aggregations=aggregations, redundancy=redundancy,
+        probe="none",
         **more,
     )  # fmt: skip
     result = measured_coverage(task_of(settings), settings)

@@ -256,6 +256,7 @@ class Result:
         record, told = self._reference_used, [self.cut_short] if self.cut_short else []
         told += [f"Vehicle: {self.vehicle}."] if self.vehicle else []
         told += sensor_model_words(self.source.get("sensor_model")) + weather_words(self.source.get("weather"))
+        told += self._on_bodies
         if record is None:
             return told
         if "every_s" not in record:
@@ -265,21 +266,14 @@ class Result:
         return [*told, sensor, *record["notes"], *self._on_refused, *self._on_repetitions]
 
     @property
-    def _on_accumulated(self) -> list[str]:
-        """What a reference that was accumulated was made of, and what was left out."""
-        assert self.run is not None  # asked of a reference that was used
-        counts, steps = self.run.counts, self.run.steps
-        if not counts["reference_sweeps"]:
-            return []
-        sweeps, skipped, rays, past, passing, hidden, movers = (
-            f"{counts[f'reference_{name}'] / steps:,.0f}"
-            for name in ("sweeps", "sweeps_skipped", "rays", "seen_past", "passing", "hidden", "movers")
-        )
-        return [
-            f"A frame's reference: {sweeps} sweeps ({skipped} skipped, beyond jumps of the pose), and {rays} rays to "
-            f"judge them; left out: {past} points that others see past, {passing} seen too shortly, {hidden} hidden "
-            f"from beside the vehicle; {movers} movers put back."
-        ]
+    def _on_bodies(self) -> list[str]:
+        """Where bodies were put, or that a recording has none."""
+        bodies = self._first.bodies
+        if bodies is not None:
+            put = f"at {int(bodies.steps.sum()):,} steps, in random places whose middle is in the region"
+            return [f"Bodies: {put}, one at a time and seen by nothing else; intervals are about the places, too."]
+        near = any(region.bands for region in self.regions) and self.source.get("frames")
+        return ["Bodies beside the vehicle: not for recordings, which have no scene to put them into."] if near else []
 
     @property
     def _on_refused(self) -> list[str]:

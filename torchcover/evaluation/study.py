@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchcover import __version__
-from torchcover.coverage import Coverage, Region
+from torchcover.coverage import Coverage, Region, shown_places
 from torchcover.coverage.grid import BandFrame
 from torchcover.estimation import MIN_BLOCKS, ROUND_OFF, Difference, ErrorModel, Estimate, Quantity
 from torchcover.evaluation.measuring import measured
@@ -327,7 +327,7 @@ def error_against_time(plan: StudyPlan, *, progress: bool = False) -> Study:
     first: Coverage | None = None
     for options, settings in plan.each.items():
         steps = settings.steps if first is None else _first_steps(first)
-        trial, coverage = _tried(options, replace(settings, steps=steps, progress=progress), first)
+        trial, coverage = _tried(options, replace(settings, steps=steps, probe="none", progress=progress), first)
         trials.append(trial)
         first = first or coverage
     return Study(plan, trials, max(0.0, command_s(plan) - trials[0].seconds / trials[0].steps))
@@ -346,7 +346,7 @@ def _tried(options: str, settings: Settings, first: Coverage | None) -> tuple[Tr
     assert result.run is not None  # it was not loaded
     result.run.raise_failure()
     coverage, awaited = result.coverage, task.asked.awaited
-    places = [(region, height) for region in result.regions for height in coverage.grid.heights]
+    places = shown_places(result.regions, coverage.grid)
     count, steps, worlds = len(places) * len(coverage.quantities), coverage.counts["steps"], math.inf
     numbers = []
     for region, height in places:

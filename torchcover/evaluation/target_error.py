@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from itertools import groupby
 from typing import Any
 
-from torchcover.coverage import Coverage, Region
+from torchcover.coverage import Coverage, Region, shown_places
 from torchcover.estimation import ROUND_OFF, ErrorModel
 from torchcover.evaluation.observers import Observer
 from torchcover.report import json_record
@@ -140,18 +140,17 @@ def standings(target: TargetError, coverages: Mapping[str, Coverage], regions: S
     """
     (first_name, first), *_ = coverages.items()
     found = []
-    for region in regions:
-        for height in first.grid.heights:
-            estimates = {name: coverage.estimate(region, height) for name, coverage in coverages.items()}
-            others = [name for name in estimates if name != first_name]
-            paired = {f"{name} minus {first_name}": estimates[name].minus(estimates[first_name]) for name in others}
-            for name, estimate in (estimates | paired).items():
-                numbers = zip(first.quantities, estimate.value.tolist(), estimate.error.tolist(), strict=True)
-                for quantity, value, error in numbers:
-                    good = target.radius_m if quantity.unit == "m" else target.detection
-                    if good is not None and not math.isnan(value):
-                        where = (name, region.name, height, quantity.key)
-                        found.append(Standing(*where, error, good, first.counts["steps"]))
+    for region, height in shown_places(regions, first.grid):
+        estimates = {name: coverage.estimate(region, height) for name, coverage in coverages.items()}
+        others = [name for name in estimates if name != first_name]
+        paired = {f"{name} minus {first_name}": estimates[name].minus(estimates[first_name]) for name in others}
+        for name, estimate in (estimates | paired).items():
+            numbers = zip(first.quantities, estimate.value.tolist(), estimate.error.tolist(), strict=True)
+            for quantity, value, error in numbers:
+                good = target.radius_m if quantity.unit == "m" else target.detection
+                if good is not None and not math.isnan(value):
+                    where = (name, region.name, height, quantity.key)
+                    found.append(Standing(*where, error, good, first.counts["steps"]))
     return found
 
 

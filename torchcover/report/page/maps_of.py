@@ -17,7 +17,7 @@ from torchcover.report.wording import shown_unit, span
 
 
 def maps_of(coverages: Mapping[str, Coverage]) -> Iterator[PageMap]:
-    """A map for each quantity, height band and rig; at last those of redundancy, of the rigs that have them.
+    """A map for each quantity, height band and rig; at last those of redundancy and of bodies, where there are any.
 
     Args:
         coverages: By the name of the rig; one, or several that are paired.
@@ -37,6 +37,22 @@ def maps_of(coverages: Mapping[str, Coverage]) -> Iterator[PageMap]:
     for key in dict.fromkeys(key for layers in of_sensors.values() for key in layers):
         having = {rig: layers[key] for rig, layers in of_sensors.items() if key in layers}
         yield from _of_quantity(having, {}, surface or steps, first.grid)
+    for rig, bodies in ((rig, coverage.bodies) for rig, coverage in coverages.items()):
+        for body, cells in zip(bodies.bodies, bodies.cells, strict=True) if bodies else ():
+            free, share, quantity = _known(cells[..., 0]), cells[..., 1] / cells[..., 0], bodies.quantities[0]
+            yield PageMap(
+                quantity=quantity.title,
+                band=body,
+                rig=rig,
+                x=bodies.grid.x,
+                y=bodies.grid.y,
+                cell_m=bodies.grid.cell,
+                values=shown_unit(quantity.unit).factor * as_array(share),
+                scale=scale_of(quantity, share),
+                unknown="no place was free",
+                weights=free,
+                weight_name="free places",
+            )
 
 
 class Weights(NamedTuple):
