@@ -1,0 +1,133 @@
+"""Bodies beside the vehicle: what `targets` says of the same cells, whatever the budget, the processes and the side."""
+
+import pickle
+
+import numpy as np
+import pytest
+import torch
+
+from torchcover.coverage import BevGrid
+from torchcover.coverage.bodies import TRIED
+from torchcover.data import SimulatedFrames
+from torchcover.geometry import rigid
+from torchcover.simulation import PaperReference
+from torchcover.simulation.regions_of_interest import near_field
+from torchcover.targets import Probes, Raster, Target, probing, steps, survey
+from torchcover.targets.probing import Probe
+
+from .worlds import WALL, drive, lidar, rig, world
+
+LEFT, RIGHT = 2, 3
+ALL = 10_000
+TOP = rig(lidar(mount={"z_m": 1.4}, vertical_fov_deg=[-30, 5], columns=90, channels=15))
+# Right beside the vehicle, which is 2 m wide.
+BLOCK = {"name": "block", "shape": {"type": "box", "size_m": [40, 4, 2]}, "poses": [{"y_m": 3.2}]}
+
+
+def simulated(scenario, steps=8, rigs=TOP, seed=0):
+    return SimulatedFrames(scenario, rigs, steps=steps, seed=seed, reference_sensor=PaperReference(rows=2, columns=2))
+
+
+def probed(frames, indices=None, body="pole", **budget):
+    probes = Probes(frames.simulator, [Target.load(body)], blocks=8, **({"every": 1} | budget))
+    for index in range(len(frames)) if indices is None else indices:
+        probes.update(frames[index])
+    return probes
+
+
+def numbers(probes, region, rig="small"):
+    bodies = probes.seen_by(rig)
+    return list(bodies.estimate(bodies.regions[region], bodies.bodies[0]).numbers().values())
+
+
+@pytest.mark.parametrize("bodies", [(), (WALL,)], ids=["free space", "a wall"])
+def test_the_numbers_are_those_of_targets_over_the_same_cells(bodies, monkeypatch):
+    scenario, target = world(*bodies), Target.load("pole")
+    for module in (steps, probing):  # its surface is looked at from random places
+        monkeypatch.setattr(module, "pose_in_shell", lambda *_: rigid(np.eye(3), np.array([0.3, 0.2, 1.3])))
+    found = survey(TOP, scenario, target, Raster.around(scenario.ego_box(), 3.0))
+    probes = probed(simulated(scenario, steps=1), places=ALL)
+    x, y = (torch.from_numpy(each) for each in found.raster.positions_m.T)
+    for number, region in enumerate(probes.regions):
+        cells = region.contains(x, y).numpy().reshape(found.raster.shape)
+        free = cells & found.free
+        visible_m2 = found.visible_m2[free]
+        expected = [cells.sum(), free.sum(), found.seen[free].sum(), visible_m2.sum()]
+        assert probes.compute()[0, 0, number, :-1].tolist() == pytest.approx(expected)
+        share = np.nansum(found.share[free] * visible_m2) / visible_m2.sum()
+        assert numbers(probes, number)[1].value == pytest.approx(share)
+    assert 0.1 < numbers(probes, LEFT)[0].value < 1
+
+
+def test_every_place_of_a_region_is_as_likely_as_any_other_and_so_the_budget_moves_no_number():
+    vehicle = world().ego_box()
+    grid = BevGrid((-6.0, 6.0), (-5.0, 5.0), 1.0)
+    pole = Probe.of(Target.load("pole"), vehicle, near_field(vehicle.outline_m), grid)
+    generator = np.random.default_rng(0)
+    for places, draws in ((1, 1200), (3, 400)):
+        counts = np.bincount(
+            np.concatenate([pole.some(places, generator) for _ in range(draws)]), minlength=len(pole.region)
+        )
+        for region in range(4):
+            own = counts[pole.region == region]
+            assert own.sum() == draws * places
+            # Pearson's chi-square of as many degrees of freedom, less one.
+            excess = ((own - own.mean()) ** 2 / own.mean()).sum() / len(own)
+            assert excess == pytest.approx(1.0, abs=5 * np.sqrt(2 / len(own)))
+
+
+def test_a_mirror_symmetric_rig_is_symmetric_exactly_in_all_places_and_within_errors_in_some():
+    frames = simulated(world(), steps=32)
+    every = probed(frames, [0], places=ALL)
+    assert numbers(every, LEFT)[0].value == numbers(every, RIGHT)[0].value
+    assert 0.1 < numbers(every, LEFT)[0].value < 0.9
+    some = probed(frames, places=3)
+    (left, *_), (right, *_) = numbers(some, LEFT), numbers(some, RIGHT)
+    assert 0.01 < left.error < 0.15
+    for one in (left, right):
+        assert abs(one.value - numbers(every, LEFT)[0].value) < 4 * one.error
+
+
+def test_parts_and_other_processes_add_up_to_the_whole(tmp_path):
+    path = drive(tmp_path, (0, 0, 0, 0), (2, 20, 0, 0))
+    frames = simulated(world(ego={"shape": {"type": "box", "size_m": [4, 2, 1]}, "trajectory": str(path)}), steps=20)
+    whole, parts = (
+        probed(frames, every=4, places=2),
+        [probed(frames, part, every=4, places=2) for part in (range(10), range(10, 20))],
+    )
+    first = pickle.loads(pickle.dumps(parts[0]))  # as ranks send them
+    first.merge_state(pickle.loads(pickle.dumps(parts[1])))
+    assert all(torch.equal(one, first.metric_state[name]) for name, one in whole.metric_state.items())
+    assert (int(whole.steps), int(whole.compute()[..., TRIED].sum())) == (5, 5 * 4 * 2)
+    again = Probes(frames.simulator, [Target.load("pole")], blocks=8)
+    again.load_state_dict(whole.state_dict())
+    assert torch.equal(again.compute(), whole.compute())
+    other = Probes(frames.simulator, [Target.load("child")], blocks=8)
+    with pytest.raises(ValueError, match="different bodies"):
+        other.merge_state(whole)
+
+
+def test_where_nothing_is_free_the_number_is_unknown_with_a_count():
+    probes = probed(simulated(world(BLOCK), steps=8), body="child", places=3)
+    left, right = probes.seen_by("small").summary()[LEFT:]
+    assert (left.cells, left.known_cells, left.visible_m2) == (24, 0, pytest.approx(np.nan, nan_ok=True))
+    assert all(np.isnan([one.value, one.error]).all() and one.count == 0 for one in left.numbers.values())
+    assert 0 < right.known_cells == next(iter(right.numbers.values())).count
+
+
+def test_rays_that_were_cast_for_the_clouds_end_where_they_are_cast_again(tmp_path, monkeypatch):
+    path = drive(tmp_path, (0, 0, 0, 0), (2, 20, 0, 0))
+    ego = {"shape": {"type": "box", "size_m": [4, 2, 1]}, "trajectory": str(path)}
+    frames = simulated(world(WALL, ego=ego), rigs=rig(lidar(mount={"z_m": 1.1})))
+    frame = frames[3]
+    probes = Probes(frames.simulator, [Target.load("pole")], every=1)
+    kept = probes.sums_of(frame)
+    stage, instant = frames.simulator.placed(3)
+    (mounted,) = stage.mounted["small"]
+    known = mounted.ends(instant)
+    monkeypatch.setattr(mounted, "_scanned", None)
+    anew = mounted.ends(instant)
+    assert np.array_equal(known.range_m, anew.range_m)
+    assert np.array_equal(known.is_hit, anew.is_hit)
+    assert 0 < known.is_hit.sum() < len(known.is_hit)
+    assert all(map(torch.equal, kept[1:], probes.sums_of(frame)[1:]))
