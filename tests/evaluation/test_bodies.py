@@ -1,0 +1,118 @@
+"""Bodies beside the vehicle in a run: rows, files, comparisons, mixtures, other processes; and not in recordings."""
+
+import csv
+import json
+
+import pytest
+
+from torchcover import Coverage, Rig, compare, evaluate
+from torchcover.evaluation import Checkpoint, MixedResult
+from torchcover.report import RENDERERS
+from torchcover.simulation import RegionsOfInterest, Scenario
+
+YARD = {
+    "ego": {"shape": {"type": "box", "size_m": [4, 2, 1]}},
+    "bodies": [{"name": "floor", "shape": {"type": "plane", "size_m": [400, 400]}}],
+}
+SMALL = {"steps": 32, "cell_m": 4.0, "rays": 128, "probe": "pole", "workers": 0}
+SIDES = ["front_3m", "rear_3m", "left_3m", "right_3m"]
+
+
+def yard(name):
+    return Scenario.model_validate({"name": name, **YARD})
+
+
+def rig(name, z_m=1.4, fov_deg=360):
+    mount = {"x_m": 0.0 if z_m > 1 else 2.1, "z_m": z_m}
+    sensor = {
+        "name": "top",
+        "mount": mount,
+        "channels": 16,
+        "vertical_fov_deg": [-30, 5],
+        "horizontal_fov_deg": fov_deg,
+    }
+    return Rig.model_validate({"name": name, "sensors": [{**sensor, "columns": 240, "max_range_m": 60}]})
+
+
+RIGS = [rig("roof"), rig("grille", 0.6, 120)]
+
+
+@pytest.fixture(scope="module")
+def both():
+    return evaluate(RIGS, yard("yard"), **SMALL)
+
+
+def of_bodies(result, **wanted):
+    rows = [row for row in result.summary if row["measure"] == "places"]
+    return [row for row in rows if all(row[name] == value for name, value in wanted.items())]
+
+
+def test_rows_of_bodies_take_the_place_of_those_of_traffic_in_the_near_field(both):
+    near = [(row["region"], row["height"]) for row in both.summary if row["rig"] == "roof" and row["region"] in SIDES]
+    bands = [(region, "ground") for region in SIDES if (region, "ground") in near]
+    assert near == [*bands, *((region, "pole_100cm") for region in SIDES)]
+    for row in of_bodies(both):
+        assert 0 < row["known_cells"] <= row["cells"] == 8 * 4
+        assert 0 <= row["surface_0.4m"] <= 1
+        assert (row["radius_m"], row["z_min_m"]) == (None, None)
+    (roof,), (grille,) = (of_bodies(both, rig=name, region="front_3m") for name in ("roof", "grille"))
+    assert grille["places_5_points_difference"] == pytest.approx(grille["places_5_points"] - roof["places_5_points"])
+    (front,) = of_bodies(both, rig="grille", region="front_3m")
+    assert 0 <= front["places_5_points_low"] < front["places_5_points"] < front["places_5_points_high"] <= 1
+    text = RENDERERS["text"](both.table)
+    assert "Free places with 5 points or more (%)" in text
+    assert "Bodies: at 8 steps" in " ".join(text.split())
+    assert "free places" in evaluate(RIGS[0], yard("yard"), **{**SMALL, "steps": 1}).tables[1].headings
+
+
+def test_files_keep_them_and_compare_reads_them(both, tmp_path):
+    both.save(tmp_path)
+    again = compare([tmp_path / "coverage" / "roof.npz", tmp_path / "coverage" / "grille.npz"])
+    assert of_bodies(again) == [{**row, "vehicle": None, "sensor_model": None} for row in of_bodies(both)]
+    loaded = Coverage.load(tmp_path / "coverage" / "roof.npz")
+    scalars = both.coverages["roof"].scalars()
+    assert loaded.scalars() == pytest.approx(scalars, rel=0, abs=0, nan_ok=True)
+    assert scalars["places_5_points/left_3m/pole_100cm"] == of_bodies(both, rig="roof")[2]["places_5_points"]
+    rows = list(csv.DictReader((tmp_path / "summary.csv").read_text().splitlines()))
+    assert [row["region"] for row in rows if row["height"] == "pole_100cm"] == SIDES * 2
+    assert json.loads((tmp_path / "summary.json").read_text())["rows"] == both.summary
+    assert [one.band for one in both.page.maps].count("pole_100cm") == 2
+    without = evaluate(RIGS[1], yard("yard"), **{**SMALL, "steps": 1, "probe": "none"})
+    assert of_bodies(without) == []
+    with pytest.raises(ValueError, match="other bodies were put beside them"):
+        _ = compare([both, without]).table
+
+
+def test_workers_and_checkpoints_change_no_bit(both, tmp_path):
+    path = tmp_path / "run.npz"
+    evaluate(RIGS, yard("yard"), checkpoint=Checkpoint(path, keep=True), **{**SMALL, "steps": 14})
+    resumed = evaluate(RIGS, yard("yard"), checkpoint=Checkpoint(path), **SMALL)
+    assert of_bodies(resumed) == of_bodies(both)
+    assert of_bodies(evaluate(RIGS, yard("yard"), **{**SMALL, "workers": 2})) == of_bodies(both)
+
+
+def test_a_mixture_is_the_weighted_mean(both):
+    other = evaluate(RIGS, yard("other"), **{**SMALL, "seed": 1})
+    mixed = MixedResult.of({"yard": both, "other": other}, {"yard": 0.75, "other": 0.25})
+    for row, first, second in zip(of_bodies(mixed), of_bodies(both), of_bodies(other), strict=True):
+        value = 0.75 * first["places_5_points"] + 0.25 * second["places_5_points"]
+        assert row["places_5_points"] == pytest.approx(value)
+        assert row["known_cells"] == first["known_cells"] + second["known_cells"]
+    without = evaluate(RIGS, yard("other"), **{**SMALL, "steps": 1, "probe": "none"})
+    with pytest.raises(ValueError, match="other bodies"):
+        _ = MixedResult.of({"yard": both, "other": without}, {"yard": 0.75, "other": 0.25})
+
+
+def test_who_asks_about_other_regions_asks_for_bodies_by_name_or_has_none():
+    asked = RegionsOfInterest(regions={"ahead": {"x_m": (2.0, 22.0), "y_m": (-8.0, 8.0)}})
+    few = {**SMALL, "steps": 1, "ask": asked}
+    assert {row["region"] for row in of_bodies(evaluate(RIGS[0], yard("yard"), **few))} == set(SIDES)
+    assert of_bodies(evaluate(RIGS[0], yard("yard"), **{**few, "probe": None})) == []
+
+
+@pytest.mark.parametrize(
+    ("probe", "message"), [(["none", "child"], "none, or bodies"), (["child", "child_110cm"], "twice")]
+)
+def test_bodies_that_make_no_sense_are_refused(probe, message):
+    with pytest.raises(ValueError, match=message):
+        evaluate(RIGS[0], yard("yard"), **{**SMALL, "probe": probe})
