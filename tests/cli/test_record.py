@@ -18,8 +18,12 @@ def test_a_recording_has_the_numbers_of_the_simulation(torchcover, worlds, tmp_p
     assert (code, len(printed.splitlines())) == (0, 1)
     assert printed.startswith(f"Wrote 3 frames to {recording}; ")
     cell = ("--cell-m", 1, "--thresholds-m", 0.4, "--thresholds-m", 1)
-    assert torchcover("evaluate", worlds / "both.yaml", *options, *cell, "--out", measured)[0] == 0
-    assert torchcover("evaluate", "--frames", recording, *cell, "--out", read)[0] == 0
+    assert torchcover("evaluate", worlds / "both.yaml", *options, *cell, "--probe", "none", "--out", measured)[0] == 0
+    code, printed, _ = torchcover("evaluate", "--frames", recording, *cell, "--out", read)
+    assert code == 0
+    assert "Bodies beside the vehicle: not for recordings" in " ".join(printed.split())
+    code, _, told = torchcover("evaluate", "--frames", recording, "--probe", "child", "--out", read)
+    assert (code, "probe: not for recordings" in told) == (2, True)
     first, second = (Coverage.load(folder / "coverage.npz") for folder in (measured, read))
     assert first.measure == second.measure == "area"
     for name in ("radius", "detection", "probed_steps", "points"):

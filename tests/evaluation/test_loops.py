@@ -27,7 +27,7 @@ RIG = Rig.model_validate(
         ],
     }
 )
-FEW = {"cell_m": 4.0, "rays": 64, "reference": "paper"}
+FEW = {"probe": "none", "cell_m": 4.0, "rays": 64, "reference": "paper"}
 
 
 @pytest.fixture

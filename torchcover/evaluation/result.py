@@ -271,7 +271,7 @@ class Result:
         bodies = self._first.bodies
         if bodies is not None:
             put = f"at {int(bodies.steps.sum()):,} steps, in random places whose middle is in the region"
-            return [f"Bodies: {put}, one at a time and seen by nothing else; their intervals are about these, too."]
+            return [f"Bodies: {put}, one at a time and seen by nothing else."]
         near = any(region.bands for region in self.regions) and self.source.get("frames")
         return ["Bodies beside the vehicle: not for recordings, which have no scene to put them into."] if near else []
 
