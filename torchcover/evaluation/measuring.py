@@ -32,8 +32,9 @@ Observers = Mapping[str, AnyObserver]
 BLOCKS = 16
 # The sums are over what was touched, but maps are made of all cells, several of which are there at a time.
 BYTES_A_CELL = 64
-# Beside the vehicle, unless others are asked for.
+# Beside the vehicle, unless others are asked for; and what a run calls who puts them there.
 PROBES = ("child", "adult", "cyclist", "pole")
+BODIES = "bodies beside the vehicle"
 # To see of how many worlds they are.
 ENOUGH_FRAMES = 256
 
@@ -50,12 +51,12 @@ def measured(task: Task[FrameSource], settings: Settings) -> Result:
     check_drawable(sensors)
     settings = replace(settings, workers=_workers(task, settings))
     metrics = metrics_of(task, settings) if settings.metrics else None
-    others = {**settings.observers, **(metrics.observers if metrics else {})}
+    others = {**settings.observers, **(metrics.observers if metrics else {}), **_probes(task, settings)}
     with ranks.aborting() if ranks else nullcontext():
-        coverage, probed, seen, run = _observed(task, settings, others)
+        coverage, seen, run = _observed(task, settings, others)
     coverages = {name: observer.compute() for name, observer in coverage.items()}
-    for name, one in coverages.items() if probed else ():
-        one.bodies = probed.seen_by(name)
+    for name, one in coverages.items() if BODIES in seen else ():
+        one.bodies = seen[BODIES].seen_by(name)
     if len({coverage.counts["steps"] for coverage in coverages.values()}) > 1:
         run.raise_failure()  # within a step: the rigs have not seen the same
     result = Result(
@@ -97,9 +98,19 @@ def _workers(task: Task[FrameSource], settings: Settings) -> int:
     return usual_workers(most, len({frames.world_of(index) for index in range(most)}), whole=whole)
 
 
-def _observed(
-    task: Task[FrameSource], settings: Settings, others: Observers
-) -> tuple[Observers, Probes | None, Observers, Run]:
+def _probes(task: Task[FrameSource], settings: Settings) -> dict[str, Probes]:
+    """Who puts bodies beside the vehicle; nobody where there is no scene to put them into."""
+    usual = () if settings.ask and settings.ask.regions else PROBES
+    names = usual if settings.probe is None else settings.probe
+    if not (names and isinstance(task.frames, SimulatedFrames)):
+        return {}
+    bodies = [Target.load(name) for name in names]
+    if len({body.name for body in bodies}) < len(bodies):
+        raise ValueError(f"probe: one is given twice: {', '.join(body.name for body in bodies)}")
+    return {BODIES: Probes(task.frames.simulator, bodies, BLOCKS)}
+
+
+def _observed(task: Task[FrameSource], settings: Settings, others: Observers) -> tuple[Observers, Observers, Run]:
     ranks, checkpoint = settings.ranks, settings.checkpoint
     if ranks:
         settings = replace(settings, device=ranks.device(settings.device))
@@ -111,8 +122,7 @@ def _observed(
     }
     target = settings.target_error
     watch = TargetWatch(target, coverage, task.asked.awaited) if target else None
-    probing = _probing(task, settings)
-    observers: Sequence[AnyObserver] = [*coverage.values(), *others.values(), *probing]
+    observers: Sequence[AnyObserver] = [*coverage.values(), *others.values()]
     identity = run_identity(task, settings, others, ranks.size if ranks else 1) if ranks or checkpoint else {}
     if ranks:
         if target:
@@ -125,7 +135,7 @@ def _observed(
             place = place.of(ranks.rank if ranks else 0)
             if ranks is None or ranks.rank == 0:
                 stack.enter_context(claimed(place.path.parent))
-            journal = Journal(place, identity, _states(coverage, others, watch, probing))
+            journal = Journal(place, identity, _states(coverage, others, watch))
         run = observe(
             task.frames,
             observers,
@@ -141,21 +151,8 @@ def _observed(
         )
         if ranks:
             run, observers = _whole(run, observers, ranks)
-    rigs, every = len(coverage), len(coverage) + len(others)
-    of_rigs, seen = zip(coverage, observers[:rigs], strict=True), zip(others, observers[rigs:every], strict=True)
-    return dict(of_rigs), next(iter(observers[every:]), None), dict(seen), run
-
-
-def _probing(task: Task[FrameSource], settings: Settings) -> list[Probes]:
-    """Who puts bodies beside the vehicle; nobody where there is no scene to put them into."""
-    usual = () if settings.ask and settings.ask.regions else PROBES
-    names = usual if settings.probe is None else settings.probe
-    if not (names and isinstance(task.frames, SimulatedFrames)):
-        return []
-    bodies = [Target.load(name) for name in names]
-    if len({body.name for body in bodies}) < len(bodies):
-        raise ValueError(f"probe: one is given twice: {', '.join(body.name for body in bodies)}")
-    return [Probes(task.frames.simulator, bodies, BLOCKS)]
+    rigs = len(coverage)
+    return dict(zip(coverage, observers[:rigs], strict=True)), dict(zip(others, observers[rigs:], strict=True)), run
 
 
 def _whole(run: Run, observers: Sequence[AnyObserver], ranks: Ranks) -> tuple[Run, Sequence[AnyObserver]]:
@@ -183,12 +180,9 @@ def _whole(run: Run, observers: Sequence[AnyObserver], ranks: Ranks) -> tuple[Ru
     return whole, observers
 
 
-def _states(
-    coverage: Observers, others: Observers, watch: TargetWatch | None, probing: Sequence[Probes]
-) -> dict[str, object]:
+def _states(coverage: Observers, others: Observers, watch: TargetWatch | None) -> dict[str, object]:
     """What a checkpoint keeps, by the names that its file and messages have."""
     rigs = {f"coverage of {name}": one for name, one in coverage.items()}
-    rigs |= dict(zip(["bodies"], probing, strict=False))
     return {**rigs, **{f"observer {name}": one for name, one in others.items()}, **({"watch": watch} if watch else {})}
 
 

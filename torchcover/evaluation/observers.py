@@ -31,7 +31,8 @@ class Observer(Protocol[ResultT]):
     """Something that looks at frames, one after the other, and says something in the end.
 
     Over several processes or ranks each has an observer of its own over other frames; one merges the others. A run with
-    a checkpoint needs those that are `Stateful`, too.
+    a checkpoint needs those that are `Stateful`, too. One that has `sums_of`, from a frame to what is to `add`, as
+    `CoverageObserver` has, measures frames where they are made.
 
     Example:
         >>> class PointCount:
@@ -55,19 +56,6 @@ class Observer(Protocol[ResultT]):
 
     def merge_state(self, other: Self, /) -> None:
         """Add the frames of another observer, which is left as it was."""
-        ...
-
-
-@runtime_checkable
-class InPlace(Protocol):
-    """An observer that measures frames where they are made: what travels between processes is small then."""
-
-    def sums_of(self, frame: Frame) -> object:
-        """What a frame is to `add`."""
-        ...
-
-    def add(self, sums: Any) -> None:  # noqa: ANN401  (what its `sums_of` gives)
-        """Add a frame that `sums_of` an observer of the same parameters has measured."""
         ...
 
 

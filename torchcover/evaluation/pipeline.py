@@ -15,7 +15,7 @@ from torch.utils.data import DataLoader, Dataset, get_worker_info
 
 from torchcover.evaluation.checkpoint import Journal
 from torchcover.evaluation.cores import cores, warn_of_spinning
-from torchcover.evaluation.observers import AnyObserver, CoverageObserver, InPlace
+from torchcover.evaluation.observers import AnyObserver, CoverageObserver
 from torchcover.evaluation.progress import ENDS, Progress, held_back
 from torchcover.evaluation.ranks import Ranks
 from torchcover.files import end_with_parent
@@ -80,16 +80,16 @@ class MeasuredFrame(NamedTuple):
 class MeasuredFrames:
     """Frames that are measured where they are made, in this process or in a worker.
 
-    By observers that are `InPlace`, but for coverage on another device; others are fed with the frame itself.
+    By observers with `sums_of`, but for coverage on another device; others are fed with the frame itself.
     """
 
     def __init__(self, frames: Frames, observers: Sequence[AnyObserver], device: torch.device | str) -> None:
         on_the_cpu = torch.device(device).type == "cpu"
         self.frames = frames
-        self._observers = {
+        self._observers: dict[int, Any] = {
             number: one
             for number, one in enumerate(observers)
-            if isinstance(one, InPlace) and (on_the_cpu or not isinstance(one, CoverageObserver))
+            if hasattr(one, "sums_of") and (on_the_cpu or not isinstance(one, CoverageObserver))
         }
         self._needs_frame = len(self._observers) < len(observers)
 
@@ -254,7 +254,7 @@ def _feed(seen: MeasuredFrame, observers: Sequence[AnyObserver], run: Run, devic
     frame = None if seen.frame is None else seen.frame.to(device)
     for number, observer in enumerate(observers):
         if number in seen.sums:
-            observer.add(seen.sums[number])
+            observer.add(seen.sums[number])  # type: ignore[attr-defined]  # who has `sums_of` has it
         elif frame is not None:
             observer.update(frame)
     run.measuring_s += seen.measuring_s + time.perf_counter() - start

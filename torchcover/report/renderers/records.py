@@ -41,15 +41,10 @@ def _sensor_model(table: CoverageTable, row: Row) -> object:
     return of_rigs.get(row.rig) if isinstance(of_rigs, Mapping) else of_rigs
 
 
-def _band(table: CoverageTable, row: Row) -> tuple[float, float]:
-    return table.grid.heights.get(row.summary.height, (math.nan, math.nan))
-
-
+NO_BAND = math.nan, math.nan
 COLUMNS = (
     Column(
-        "measure",
-        "what the numbers are means over: `area`, `known`, or `places` of a body, which `height` names",
-        lambda _, row: row.summary.measure,
+        "measure", "what numbers are means over: `area`, `known`, `places` of a body", lambda _, r: r.summary.measure
     ),
     Column(
         "visible_m2",
@@ -69,15 +64,12 @@ COLUMNS = (
     ),
     Column(
         "known_cells",
-        "how many are known; of a body, in how many of the places there was room",
+        "how many are known; of a body, places with room",
         lambda _, row: row.summary.known_cells,
         "free places",
-        str,
-        "places",
+        measure="places",
     ),
-    Column(
-        "cells", "how many cells the region has; of a body, places that were tried", lambda _, row: row.summary.cells
-    ),
+    Column("cells", "of the region; of a body, places that were tried", lambda _, row: row.summary.cells),
     Column("cell_m", "side of a cell", lambda table, _: table.grid.cell),
     Column("steps", "how many were measured", lambda table, row: table.conditions[row.rig].counts["steps"]),
     Column("blocks", "how many the errors come from", lambda table, row: table.conditions[row.rig].blocks),
@@ -89,8 +81,10 @@ COLUMNS = (
     Column("y_min_m", "its right border", lambda _, row: row.region.y[0]),
     Column("y_max_m", "its left border", lambda _, row: row.region.y[1]),
     Column("band_frame", "what the band is over: `ground` or `vehicle`", lambda table, _: table.grid.band_frame),
-    Column("z_min_m", "where the band begins", lambda table, row: _band(table, row)[0]),
-    Column("z_max_m", "where it ends", lambda table, row: _band(table, row)[1]),
+    Column(
+        "z_min_m", "where the band begins", lambda table, row: table.grid.heights.get(row.summary.height, NO_BAND)[0]
+    ),
+    Column("z_max_m", "where it ends", lambda table, row: table.grid.heights.get(row.summary.height, NO_BAND)[1]),
 )
 
 
