@@ -48,8 +48,8 @@ def test_files_agree_with_each_other_and_with_evaluate(torchcover, worlds):
         assert row["radius_m"] == ("" if same["radius_m"] is None else str(same["radius_m"]))
         assert row["radius_m_best"] == str(same["radius_m_best"])
     alone = worlds / "alone"
-    options = ["--scenario", worlds / "yard.yaml", "--steps", 2, "--cell-m", 4, "--thresholds-m", 2, "--probe", "none", "--out", alone]
-    assert torchcover("evaluate", worlds / "both.yaml", *options, "--rays", 4096)[0] == 0
+    options = ["--scenario", worlds / "yard.yaml", "--steps", 2, "--cell-m", 4, "--thresholds-m", 2, "--out", alone]
+    assert torchcover("evaluate", worlds / "both.yaml", *options, "--rays", 4096, "--probe", "none")[0] == 0
     np.testing.assert_array_equal(Coverage.load(alone / "coverage.npz").radius, coverages["both"].radius)
 
 

@@ -55,8 +55,9 @@ def measured(task: Task[FrameSource], settings: Settings) -> Result:
     with ranks.aborting() if ranks else nullcontext():
         coverage, seen, run = _observed(task, settings, others)
     coverages = {name: observer.compute() for name, observer in coverage.items()}
-    for name, one in coverages.items() if BODIES in seen else ():
-        one.bodies = seen[BODIES].seen_by(name)
+    if isinstance(probes := seen.get(BODIES), Probes):
+        for name, one in coverages.items():
+            one.bodies = probes.seen_by(name)
     if len({coverage.counts["steps"] for coverage in coverages.values()}) > 1:
         run.raise_failure()  # within a step: the rigs have not seen the same
     result = Result(

@@ -138,8 +138,9 @@ class Probes(SumsInBlocks):
                     for k, one in enumerate(ends[rig], 1)
                 ]
                 step = Step(sensors, z_m, free & probe.room[some] & ~held, visible[None])
-                how = {"hits": HITS, "threshold_m": THRESHOLD_M}
-                seen = count(probe.body, probe.surface, vehicle_T_body, mounted, [step], **how)
+                seen = count(
+                    probe.body, probe.surface, vehicle_T_body, mounted, [step], hits=HITS, threshold_m=THRESHOLD_M
+                )
                 m2 = np.multiply(probe.surface.m2_each, (seen.visible, seen.near))
                 each = np.stack([np.ones(len(some)), seen.steps, seen.seen, *m2], axis=1)
                 np.add.at(sums[rig, number], probe.region[some], each)

@@ -37,8 +37,8 @@ def maps_of(coverages: Mapping[str, Coverage]) -> Iterator[PageMap]:
     for key in dict.fromkeys(key for layers in of_sensors.values() for key in layers):
         having = {rig: layers[key] for rig, layers in of_sensors.items() if key in layers}
         yield from _of_quantity(having, {}, surface or steps, first.grid)
-    for rig, bodies in ((rig, coverage.bodies) for rig, coverage in coverages.items()):
-        for body, cells in zip(bodies.bodies, bodies.cells, strict=True) if bodies else ():
+    for rig, bodies in ((rig, coverage.bodies) for rig, coverage in coverages.items() if coverage.bodies):
+        for body, cells in zip(bodies.bodies, bodies.cells, strict=True):
             free, share, quantity = _known(cells[..., 0]), cells[..., 1] / cells[..., 0], bodies.quantities[0]
             yield PageMap(
                 quantity=quantity.title,
