@@ -52,7 +52,7 @@ def test_rows_of_bodies_take_the_place_of_those_of_traffic_in_the_near_field(bot
     bands = [(region, "ground") for region in SIDES if (region, "ground") in near]
     assert near == [*bands, *((region, "pole_100cm") for region in SIDES)]
     for row in of_bodies(both):
-        assert 0 < row["known_cells"] <= row["cells"] == 8 * 4
+        assert 0 < row["known_cells"] <= row["cells"] == 8 * 3
         assert 0 <= row["surface_0.4m"] <= 1
         assert (row["radius_m"], row["z_min_m"]) == (None, None)
     (roof,), (grille,) = (of_bodies(both, rig=name, region="front_3m") for name in ("roof", "grille"))

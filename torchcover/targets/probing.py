@@ -26,7 +26,7 @@ from torchcover.targets.survey import HITS, THRESHOLD_M
 from torchcover.targets.target import Target
 
 # Steps from one at which bodies are put to the next, and places of each in each region then: a tenth of a run's time.
-EVERY, PLACES = 4, 4
+EVERY, PLACES = 4, 3
 # Side of the cells of maps, each of 25 places.
 MAP_CELL_M = 1.0
 # Of its own random numbers: those of sensors have smaller ones.
