@@ -40,13 +40,13 @@ def numbers(probes, region, rig="small"):
     return list(bodies.estimate(bodies.regions[region], bodies.bodies[0]).numbers().values())
 
 
-@pytest.mark.parametrize("bodies", [(), (WALL,)], ids=["free space", "a wall"])
-def test_the_numbers_are_those_of_targets_over_the_same_cells(bodies, monkeypatch):
-    scenario, target = world(*bodies), Target.load("pole")
+@pytest.mark.parametrize(("name", "bodies"), [("child", ()), ("pole", (WALL,))], ids=["free space", "a wall"])
+def test_the_numbers_are_those_of_targets_over_the_same_cells(name, bodies, monkeypatch):
+    scenario, target = world(*bodies), Target.load(name)
     for module in (steps, probing):  # its surface is looked at from random places
         monkeypatch.setattr(module, "pose_in_shell", lambda *_: rigid(np.eye(3), np.array([0.3, 0.2, 1.3])))
     found = survey(TOP, scenario, target, Raster.around(scenario.ego_box(), 3.0))
-    probes = probed(simulated(scenario, steps=1), places=ALL)
+    probes = probed(simulated(scenario, steps=1), body=name, places=ALL)
     x, y = (torch.from_numpy(each) for each in found.raster.positions_m.T)
     for number, region in enumerate(probes.regions):
         cells = region.contains(x, y).numpy().reshape(found.raster.shape)
