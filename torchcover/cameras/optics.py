@@ -8,10 +8,11 @@ from torch import Tensor
 
 from torchcover.cameras import inverse
 from torchcover.cameras.inverse import ANSWERED, OUTSIDE
-from torchcover.cameras.lens import Array, Distortion
+from torchcover.cameras.lens import Distortion
 from torchcover.cameras.models import build_lens
 from torchcover.cameras.start import StartTable, make_start_table
 from torchcover.cameras.valid_region import HORIZON, ValidRegion, find_region
+from torchcover.geometry.arrays import Float64
 
 
 class Optics:
@@ -72,7 +73,7 @@ class Optics:
             self._found_region = find_region(solver, self._solver.chart.limit)
         return self._found_region
 
-    def _start_table(self, solver: Distortion, distorted: Array) -> StartTable:
+    def _start_table(self, solver: Distortion, distorted: Float64) -> StartTable:
         """A table up to the next power of two: what a pixel gets must not depend on what was asked before."""
         farthest = float(distorted[np.isfinite(distorted)].max(initial=0.0))
         exponent = max(frexp(farthest)[1], -60)

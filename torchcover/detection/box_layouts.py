@@ -2,10 +2,11 @@
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from torchcover.geometry import rotation_from_quaternion
+from torchcover.geometry.arrays import Float64
 from torchcover.geometry.rigid import Matrix, transform
 
 
@@ -31,13 +32,13 @@ def upright_rows(centre_m: ArrayLike, size_m: ArrayLike, heading: ArrayLike, veh
     return torch.from_numpy(np.column_stack([centre, size, yaw])).float()
 
 
-def headings(quaternions_wxyz: ArrayLike) -> NDArray[np.float64]:
+def headings(quaternions_wxyz: ArrayLike) -> Float64:
     """(K, 3) the first axes of K rotations given as quaternions."""
     given = np.asarray(quaternions_wxyz, dtype=np.float64).reshape(-1, 4)
     return rotation_from_quaternion(given)[..., 0]
 
 
-def _rows(name: str, given: ArrayLike) -> NDArray[np.float64]:
+def _rows(name: str, given: ArrayLike) -> Float64:
     array = np.asarray(given, dtype=np.float64)
     array = array.reshape(0, 3) if array.size == 0 else array
     if array.ndim != 2 or array.shape[1] != 3:

@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from torchcover.detection.box_layouts import headings, upright_rows
+from torchcover.geometry.arrays import Float64
 from torchcover.neighbors import check_tensor
 
 
@@ -135,9 +136,7 @@ class Boxes:
         return cls.from_rows(centred, **others)
 
     @classmethod
-    def from_kitti_label(
-        cls, numbers: ArrayLike, vehicle_T_camera: NDArray[np.float64] | None = None, **others: object
-    ) -> "Boxes":
+    def from_kitti_label(cls, numbers: ArrayLike, vehicle_T_camera: Float64 | None = None, **others: object) -> "Boxes":
         """From the numbers of KITTI's `label_2`: places in the rectified camera frame, at the bottom of the box.
 
         Args:
@@ -163,7 +162,7 @@ class Boxes:
         translation: ArrayLike,
         size: ArrayLike,
         rotation: ArrayLike,
-        vehicle_T_global: NDArray[np.float64] | None = None,
+        vehicle_T_global: Float64 | None = None,
         **others: object,
     ) -> "Boxes":
         """From nuScenes' `sample_annotation`.

@@ -1,9 +1,8 @@
 """When two outlines that move straight on touch."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float64 = NDArray[np.float64]
+from torchcover.geometry.arrays import Float64
 
 
 def outlines_at(outline_m: Float64, poses: Float64) -> Float64:

@@ -4,11 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from torchcover.geometry import euler_from_rotation, rigid, rotation_from_euler
-
-Matrix = NDArray[np.float64]
+from torchcover.geometry.rigid import Matrix
 
 
 @dataclass(frozen=True, eq=False)

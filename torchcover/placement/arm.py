@@ -4,10 +4,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from torchcover.geometry.arrays import Float64
 from torchcover.placement.evaluation import Evaluation
 from torchcover.placement.optimisers import Cube, MakesOptimiser, Optimiser
 from torchcover.placement.pareto import chebyshev, non_dominated
-from torchcover.placement.racing import Float64, Prefix, gains
+from torchcover.placement.racing import Prefix, gains
 
 # Of an objective's value at the start, for each such share that a number which must not be worse has lost: so much more
 # than could be gained by it that an optimiser turns away, and no more than it can learn from.

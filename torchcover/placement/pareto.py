@@ -1,14 +1,14 @@
 """Several objectives: which candidates no other beats, and how much they beat together. Higher is better."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-Values = NDArray[np.float64]
+from torchcover.geometry.arrays import Bools, Float64
+
 # Of the sum beside the smallest: without it, weakly dominated candidates would be worth as much (Knowles 2006).
 AUGMENTATION = 0.05
 
 
-def non_dominated(values: Values) -> NDArray[np.bool_]:
+def non_dominated(values: Float64) -> Bools:
     """Which candidates no other is as good as everywhere and better than somewhere; equal ones stay together.
 
     Args:
@@ -21,11 +21,11 @@ def non_dominated(values: Values) -> NDArray[np.bool_]:
     known = np.logical_not(np.isnan(values).any(axis=1))
     as_good = np.all(values[:, None] >= values[None], axis=2)
     better = np.any(values[:, None] > values[None], axis=2)
-    beaten: NDArray[np.bool_] = (known[:, None] & as_good & better).any(axis=0)
+    beaten: Bools = (known[:, None] & as_good & better).any(axis=0)
     return known & ~beaten
 
 
-def hypervolume(values: Values, reference: Values) -> float:
+def hypervolume(values: Float64, reference: Float64) -> float:
     """Volume of what lies between the candidates and a point that they are measured from.
 
     By slices along the last objective, whose number is that of the candidates: exact, and quick for two or three.
@@ -55,7 +55,7 @@ def hypervolume(values: Values, reference: Values) -> float:
     )
 
 
-def chebyshev(values: Values, weights: Values) -> Values:
+def chebyshev(values: Float64, weights: Float64) -> Float64:
     """One number of several objectives: the least weighted one, and a little of their sum.
 
     Args:
@@ -70,5 +70,5 @@ def chebyshev(values: Values, weights: Values) -> Values:
         array([0.025, 0.22 ])
     """
     weighted = values * weights
-    least: Values = weighted.min(axis=1) + AUGMENTATION * weighted.sum(axis=1)
+    least: Float64 = weighted.min(axis=1) + AUGMENTATION * weighted.sum(axis=1)
     return least

@@ -8,9 +8,7 @@ from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from typing import Any, NamedTuple, Self
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.coverage import AGGREGATIONS, Aggregation, BevGrid, CoverageMetric, MeanOfMeans, Measure, Region
@@ -20,6 +18,7 @@ from torchcover.estimation import Estimate
 from torchcover.evaluation import CoverageObserver
 from torchcover.evaluation.measuring import BLOCKS
 from torchcover.evaluation.pipeline import MeasuredFrame
+from torchcover.geometry.arrays import Float64
 from torchcover.placement.objective import THRESHOLD_M, Objective, published_numbers
 from torchcover.published import PUBLISHED, FrameMetric, Setup, Sights
 from torchcover.simulation import Areas, RegionsOfInterest, Rig, SurfaceReference
@@ -52,7 +51,7 @@ class Questions(NamedTuple):
     thresholds_m: tuple[float, ...]
 
     @classmethod
-    def around(cls, ego_outline_m: NDArray[np.float64], objectives: Mapping[str, Objective]) -> Self:
+    def around(cls, ego_outline_m: Float64, objectives: Mapping[str, Objective]) -> Self:
         """What follows for one vehicle.
 
         Args:

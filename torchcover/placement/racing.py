@@ -4,12 +4,9 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchcover.estimation import Estimate
-
-Float64 = NDArray[np.float64]
-Numbers = NDArray[np.int64]
+from torchcover.geometry.arrays import Float64, Int64
 
 TOGETHER = 3
 ERRORS_BELOW = 2.0
@@ -43,7 +40,7 @@ def gains(estimate: Estimate, other: Estimate) -> tuple[Float64, Float64]:
     return between.value.numpy() * sign, between.errors(MIN_WORLDS).numpy()
 
 
-def racing_order(world_of: Sequence[int] | Numbers, seed: int) -> Numbers:
+def racing_order(world_of: Sequence[int] | Int64, seed: int) -> Int64:
     """All instants in an order drawn at random, round by round of one instant of each world.
 
     Args:
@@ -64,7 +61,7 @@ def racing_order(world_of: Sequence[int] | Numbers, seed: int) -> Numbers:
     worlds = np.asarray(world_of)[shuffled]
     # How many instants of its world come before each.
     rounds = np.array([np.count_nonzero(worlds[:k] == world) for k, world in enumerate(worlds)], dtype=np.int64)
-    order: Numbers = shuffled[np.argsort(rounds, kind="stable")]
+    order: Int64 = shuffled[np.argsort(rounds, kind="stable")]
     return order
 
 

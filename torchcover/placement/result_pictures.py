@@ -5,8 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from torchcover.geometry.arrays import Float64
 from torchcover.placement.arm import Arm
 from torchcover.placement.evaluation import Evaluation
 from torchcover.placement.fresh import unit_words
@@ -17,8 +17,6 @@ from torchcover.placement.search import PlacementSearch
 from torchcover.placement.variables import FreeChoice
 from torchcover.report import Slice, draw_fronts, draw_progress, draw_slices
 from torchcover.report.wording import shown_unit
-
-Float64 = NDArray[np.float64]
 
 PLACES = 65
 # Beyond, a picture would take longer than the search.

@@ -11,13 +11,14 @@ import numpy as np
 
 from torchcover.evaluation.checking import check
 from torchcover.evaluation.target_survey import free_space
+from torchcover.geometry.arrays import Float64
 from torchcover.placement.arm import Arm
 from torchcover.placement.common_instants import CommonInstants
 from torchcover.placement.evaluation import OPTIMISER, RANDOM, START, Evaluation
 from torchcover.placement.optimisers import Cube, RandomSearch
 from torchcover.placement.optimisers.optimiser import Unit
 from torchcover.placement.plan import SearchPlan, levels_of
-from torchcover.placement.racing import ERRORS_BELOW, Float64, Prefix, race
+from torchcover.placement.racing import ERRORS_BELOW, Prefix, race
 from torchcover.placement.space import SearchSpace
 
 # What is drawn by the control is nothing that the optimiser draws.

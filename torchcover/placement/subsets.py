@@ -11,10 +11,9 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Float64 = NDArray[np.float64]
-Bools = NDArray[np.bool_]
+from torchcover.geometry.arrays import Bools, Float64
 
 # Shares closer than this are equal: a ten-thousandth of a percentage point. Then the price decides.
 SAME = 1e-6

@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Literal, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchcover.files import read_csv, reads
+from torchcover.geometry.arrays import Float64, Int64
 from torchcover.published.ranks import (
     BASELINE,
     DRAWS,
     OWN,
-    Array,
     Ranking,
     kendall_tau_b,
     permutation_p,
@@ -55,7 +54,7 @@ class Judged:
     name: str
     placements: tuple[str, ...]
     judges: tuple[str, ...]
-    values: Array
+    values: Float64
 
     def __post_init__(self) -> None:
         if self.values.shape != (len(self.judges), len(self.placements)) or not np.isfinite(self.values).all():
@@ -65,7 +64,7 @@ class Judged:
             )
 
     @property
-    def mean(self) -> Array:
+    def mean(self) -> Float64:
         """(n,) mean over the judges."""
         return np.asarray(self.values.mean(axis=0))
 
@@ -245,7 +244,7 @@ def lead(one: Ranking, other: Ranking, judged: Judged, *, draws: int = DRAWS, pl
     return _with_ends(float(found[0] - found[1]), drawn[0] - drawn[1])
 
 
-def _drawn(judged: Judged, draws: int, *, placements: bool) -> tuple[Array, NDArray[np.int64]]:
+def _drawn(judged: Judged, draws: int, *, placements: bool) -> tuple[Float64, Int64]:
     """(R, n) the mean of judges that are drawn anew, and which placements are drawn."""
     generator, count = np.random.default_rng(0), len(judged.placements)
     chosen = generator.integers(len(judged.judges), size=(draws, len(judged.judges)))
@@ -253,13 +252,13 @@ def _drawn(judged: Judged, draws: int, *, placements: bool) -> tuple[Array, NDAr
     return judged.values[chosen].mean(axis=1), columns
 
 
-def _along(one: Ranking, truths: Array, columns: NDArray[np.int64]) -> tuple[Array, Array]:
+def _along(one: Ranking, truths: Float64, columns: Int64) -> tuple[Float64, Float64]:
     """(R, n) what a metric and the judges say in each draw."""
     drawn = np.broadcast_to(one.gains, truths.shape) if one.drawn_gains is None else one.drawn_gains[: len(truths)]
     return np.take_along_axis(drawn, columns, axis=1), np.take_along_axis(truths, columns, axis=1)
 
 
-def _ranked(one: Ranking, truth: Array, truths: Array, columns: NDArray[np.int64]) -> Ranked:
+def _ranked(one: Ranking, truth: Float64, truths: Float64, columns: Int64) -> Ranked:
     drawn = _along(one, truths, columns)
     rho, tau = (
         _with_ends(float(statistic(one.gains, truth)), statistic(*drawn)) for statistic in (spearman, kendall_tau_b)
@@ -267,7 +266,7 @@ def _ranked(one: Ranking, truth: Array, truths: Array, columns: NDArray[np.int64
     return Ranked(one.name, kind_of(one), rho, tau, permutation_p(one.gains, truth), one.draws is not None)
 
 
-def _with_ends(value: float, drawn: Array) -> Relation:
+def _with_ends(value: float, drawn: Float64) -> Relation:
     known = drawn[~np.isnan(drawn)]
     if math.isnan(value) or not known.size:
         return Relation(value, math.nan, math.nan)

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchcover.detection import Boxes
 from torchcover.geometry import BoundingBox, VoxelGrid
+from torchcover.geometry.arrays import Bools, Float64, Int32, Int64
 
 # Columns of the table: the place in time of the frame, what stands for its content, the number of the category (of the
 # frame itself: -1), and the box as in `Boxes.rows`.
@@ -57,13 +58,13 @@ class Occupancy:
         boxes: How many boxes there were that hold the centre of a voxel.
     """
 
-    voxels: NDArray[np.int64]
-    pattern: NDArray[np.int64]
-    counts: NDArray[np.int64]
-    steps: NDArray[np.int64]
+    voxels: Int64
+    pattern: Int64
+    counts: Int64
+    steps: Int64
     boxes: int
 
-    def entropy_nats(self, times: NDArray[np.float64 | np.bool_], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    def entropy_nats(self, times: NDArray[np.float64 | np.bool_], weights: Float64) -> Float64:
         """(R,) sum over the voxels of Hb(p) = -p ln p - (1 - p) ln(1 - p).
 
         Args:
@@ -83,7 +84,7 @@ class Occupancy:
         return np.where(steps > 0, total, np.nan)
 
 
-def binary_entropy(p: NDArray[np.float64]) -> NDArray[np.float64]:
+def binary_entropy(p: Float64) -> Float64:
     """-p ln p - (1 - p) ln(1 - p) in nats; 0 at 0 and 1.
 
     Example:
@@ -95,7 +96,7 @@ def binary_entropy(p: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(inside, -p * np.log(p) - (1 - p) * np.log1p(-p), 0.0)
 
 
-def occupancy_of(table: NDArray[np.float64], category: int, grid: VoxelGrid, blocks: int) -> Occupancy:
+def occupancy_of(table: Float64, category: int, grid: VoxelGrid, blocks: int) -> Occupancy:
     """The occupancy by the boxes of one category.
 
     A voxel is inside a box if its centre is; of a box that leaves the region, the voxels in the region count. Boxes of
@@ -110,7 +111,7 @@ def occupancy_of(table: NDArray[np.float64], category: int, grid: VoxelGrid, blo
     own, centres_m = table[:, CATEGORY] == FRAME, grid.centres_m()
     block_of = (table[:, PLACE] // block_length(table[own, PLACE], blocks)).astype(np.int64)
     in_frame, counted = np.zeros(grid.voxels, dtype=bool), np.zeros(grid.voxels, dtype=np.int32)
-    found: list[tuple[NDArray[np.int64], NDArray[np.int32]]] = []
+    found: list[tuple[Int64, Int32]] = []
     boxes = 0
     for block in range(blocks):
         touched = [np.empty(0, dtype=np.int64)]
@@ -138,10 +139,10 @@ def occupancy_of(table: NDArray[np.float64], category: int, grid: VoxelGrid, blo
 
 
 def _patterns(
-    every: NDArray[np.int64],
-    found: Sequence[tuple[NDArray[np.int64], NDArray[np.int32]]],
-    marks: NDArray[np.bool_],
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    every: Int64,
+    found: Sequence[tuple[Int64, Int32]],
+    marks: Bools,
+) -> tuple[Int64, Int64]:
     """(K,) pattern of each voxel and (P, B) what the patterns are, from the voxels and their counts in each block."""
     pattern, counts = np.zeros(len(every), dtype=np.int64), np.zeros((1, 0), dtype=np.int64)
     for voxels, count in found:
@@ -159,7 +160,7 @@ def _patterns(
     return pattern, counts
 
 
-def block_length(places: NDArray[np.float64], blocks: int) -> int:
+def block_length(places: Float64, blocks: int) -> int:
     """How many places in time are in a block, as `CoverageMetric` doubles it."""
     length = 1
     while len(places) and places.max() >= blocks * length:
@@ -167,7 +168,7 @@ def block_length(places: NDArray[np.float64], blocks: int) -> int:
     return length
 
 
-def voxels_in_box(centres_m: Sequence[NDArray[np.float64]], box: NDArray[np.float64]) -> NDArray[np.int64]:
+def voxels_in_box(centres_m: Sequence[Float64], box: Float64) -> Int64:
     """Numbers of the voxels whose centre is in a box, half-open: boxes side by side share none.
 
     Args:
@@ -188,16 +189,16 @@ def voxels_in_box(centres_m: Sequence[NDArray[np.float64]], box: NDArray[np.floa
     x, y = (_within(ahead, box[3]) & _within(left, box[4])).nonzero()
     z = np.flatnonzero(_within(z_m - box[2], box[5]))
     column = (x + x0) * len(y_m) + y + y0
-    voxels: NDArray[np.int64] = (column[:, None] * len(z_m) + z).reshape(-1)
+    voxels: Int64 = (column[:, None] * len(z_m) + z).reshape(-1)
     return voxels
 
 
-def _within(offset_m: NDArray[np.float64], extent_m: float) -> NDArray[np.bool_]:
+def _within(offset_m: Float64, extent_m: float) -> Bools:
     offset_m = offset_m + ROUNDING_M
     return np.asarray((offset_m >= -extent_m / 2) & (offset_m < extent_m / 2))
 
 
-def _frames(table: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+def _frames(table: Float64) -> list[Float64]:
     """The rows of each frame, from those of several in ascending order."""
     borders = np.flatnonzero((np.diff(table[:, : CONTENT + 1], axis=0) != 0).any(axis=1)) + 1
     return np.split(table, borders) if len(table) else []

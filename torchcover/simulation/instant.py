@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.geometry import transform
+from torchcover.geometry.arrays import Bools, Float32, Float64, Int32, Int64
+from torchcover.geometry.rigid import Matrix
 from torchcover.simulation.local_ground import LocalGround
 from torchcover.simulation.moving import Moving
 from torchcover.simulation.raycaster import Hits, RayCaster, Struck, cast_from
@@ -25,8 +27,6 @@ BURIED_SHARE = 0.25
 # Seen from farther than this many radii, fewer of those directions than that share point at a ball.
 CLEAR_RADII = 2.0
 
-Matrix = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 
 # Sweeps begin and end at whole ones of these.
 WHOLE_S = 0.005
@@ -46,7 +46,7 @@ class SensorScan(NamedTuple):
     """
 
     points: Float32
-    ray: NDArray[np.int64]
+    ray: Int64
     range_m: Float32
     rays: int
     self_hits: int
@@ -57,7 +57,7 @@ class SensorScan(NamedTuple):
     ways: Callable[[], Float32] | None = None
     rays_spared: int = 0
 
-    def some(self, which: NDArray[np.int64]) -> "SensorScan":
+    def some(self, which: Int64) -> "SensorScan":
         """Some of its points."""
         names = ("points", "ray", "range_m", "landed")
         given = {name: value[which] for name in names if (value := getattr(self, name)) is not None}
@@ -93,7 +93,7 @@ class Instant:
         """(N,) heights above the local ground of (N, 3) points of the vehicle frame; see `LocalGround.heights_m`."""
         return self.ground.heights_m(points_m, self.world_T_vehicle)
 
-    def first_faces(self, points_m: Float32, normals: Float32, within_m: float) -> NDArray[np.int64]:
+    def first_faces(self, points_m: Float32, normals: Float32, within_m: float) -> Int64:
         """Which face that never moves lies at each of some points of such faces, or above it.
 
         Args:
@@ -185,8 +185,8 @@ class Instant:
             landed=np.concatenate(landed) if any(map(operator.is_not, landed, points)) else None,
         )
 
-    def _seen(self, hits: Hits, ego_points: bool) -> NDArray[np.bool_]:
-        seen: NDArray[np.bool_] = (hits.body >= 0) & (ego_points | (hits.body != self.ego))
+    def _seen(self, hits: Hits, ego_points: bool) -> Bools:
+        seen: Bools = (hits.body >= 0) & (ego_points | (hits.body != self.ego))
         return seen
 
     def _sweep(self, times: Sequence[RayTimes]) -> Sweep | None:
@@ -199,7 +199,7 @@ class Instant:
             self._sweeps[ends_s] = Sweep.of(self.static, now, self.moving, *self.motion(*ends_s))
         return self._sweeps[ends_s]
 
-    def struck(self, body: NDArray[np.int32], triangle: NDArray[np.int32], directions: Float32) -> Struck:
+    def struck(self, body: Int32, triangle: Int32, directions: Float32) -> Struck:
         """What the rays hit that ended on some faces, as `RayCaster.struck`; directions in the vehicle frame."""
         moved = np.flatnonzero(body >= self.static.bodies)
         # What moves is looked up as any face of what does not, and then put right.
@@ -212,9 +212,7 @@ class Instant:
             found.cos_incidence[moved], found.material[moved] = others.cos_incidence, others.material
         return found._replace(body=body, triangle=triangle)
 
-    def range_image(
-        self, vehicle_T_sensor: Matrix, directions: NDArray[np.float64], *, max_range_m: float = np.inf
-    ) -> Float32:
+    def range_image(self, vehicle_T_sensor: Matrix, directions: Float64, *, max_range_m: float = np.inf) -> Float32:
         """Distance along the ray of every pixel, the ego's body included.
 
         Args:
@@ -319,7 +317,7 @@ class _TileScan(NamedTuple):
 
     points: Float32
     landed: Float32
-    seen: NDArray[np.bool_]
+    seen: Bools
     range_m: Float32
     directions: Float32
     hits: Hits
@@ -330,7 +328,7 @@ def _limit(tile: Tile, max_range_m: float) -> Float32:
     return np.full(tile.directions.shape[1], min(max_range_m, np.finfo(np.float32).max), dtype=np.float32)
 
 
-def _points(origin_m: Float32, directions: Float32, range_m: Float32, seen: NDArray[np.bool_]) -> Float32:
+def _points(origin_m: Float32, directions: Float32, range_m: Float32, seen: Bools) -> Float32:
     """(K, 3) where the rays that saw something ended, which start at a (3,) place or at (3, n) of their own."""
     points = np.empty((np.count_nonzero(seen), 3), dtype=np.float32)
     for axis in range(3):

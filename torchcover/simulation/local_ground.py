@@ -9,14 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.geometry import transform
+from torchcover.geometry.arrays import Bools, Float32, Float64, Int64
 from torchcover.simulation.patches import connected, edges_of, outward_faces
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.shapes import Mesh, parts_of
-
-Bools = NDArray[np.bool_]
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Numbers = NDArray[np.int64]
 
 # Nothing steeper is driven or walked on.
 STEEPEST_DEG = 45.0
@@ -107,7 +103,7 @@ def ground_under(meshes: Sequence[Mesh], places_m: Float64) -> list[Bools]:
     return level
 
 
-def _stood_on(caster: RayCaster, places_m: Float64, is_sheet: Bools) -> Numbers:
+def _stood_on(caster: RayCaster, places_m: Float64, is_sheet: Bools) -> Int64:
     """Numbers of the bodies that places stand on; if none is near, of those far below, or of sheets above them."""
     near = _met(caster, places_m, NEAR_M)
     if (near >= 0).any():
@@ -121,7 +117,7 @@ def _stood_on(caster: RayCaster, places_m: Float64, is_sheet: Bools) -> Numbers:
     return np.empty(0, dtype=np.int64)
 
 
-def _probes_m(corners_m: Float64, border: Numbers) -> Float64:
+def _probes_m(corners_m: Float64, border: Int64) -> Float64:
     """(edges x 3, 3) places a little beyond some edges, which are counted through all faces."""
     face, side = np.divmod(border, 3)
     start_m, end_m, apex_m = (corners_m[face, (side + k) % 3] for k in range(3))
@@ -135,7 +131,7 @@ def _probes_m(corners_m: Float64, border: Numbers) -> Float64:
     return probes
 
 
-def _met(caster: RayCaster, places_m: Float64, near_m: float) -> Numbers:
+def _met(caster: RayCaster, places_m: Float64, near_m: float) -> Int64:
     """(N,) number of the highest body no farther above or below each place than this, -1 for none."""
     starts_m = (places_m + np.array([0.0, 0.0, near_m])).astype(np.float32)
     limit_m = np.full(len(starts_m), 2 * near_m, dtype=np.float32)
@@ -316,7 +312,7 @@ def height_bounds(low_m: Float64, high_m: Float64) -> Float32:
     return bounds_m
 
 
-def _squares_of(first: Numbers, count: Numbers, at_once: int = 2_000_000) -> list[tuple[Numbers, Numbers, Numbers]]:
+def _squares_of(first: Int64, count: Int64, at_once: int = 2_000_000) -> list[tuple[Int64, Int64, Int64]]:
     """Pairs of a triangle and a square: (K,) triangles, columns and rows, a few million at a time."""
     total = count.prod(axis=0)
     found = []

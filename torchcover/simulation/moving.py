@@ -7,9 +7,9 @@ from itertools import pairwise
 from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchcover.geometry import BoundingBox, invert
+from torchcover.geometry.arrays import Bools, Float32, Float64, Int32, Int64
 from torchcover.simulation.patches import Patches
 from torchcover.simulation.raycaster import Hits, RayCaster, Struck
 from torchcover.simulation.rays import (
@@ -23,10 +23,6 @@ from torchcover.simulation.rays import (
     rotate_each,
 )
 from torchcover.simulation.shapes import Mesh
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Numbers = NDArray[np.int64]
 
 
 class Solid:
@@ -80,10 +76,10 @@ class Meetings(NamedTuple):
     `triangle` (L,) says on which face of the body.
     """
 
-    part: Numbers
-    ray: Numbers
+    part: Int64
+    ray: Int64
     range_m: Float32
-    triangle: NDArray[np.int32]
+    triangle: Int32
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,13 +97,13 @@ class Moving:
 
     casters: Sequence[RayCaster]
     vehicle_T_part: Float64
-    body: Numbers
+    body: Int64
     corners_m: Float64
     centre_m: Float64
     radius_m: Float64
 
     @classmethod
-    def placed(cls, solids: Sequence[Solid], vehicle_T_part: Float64, body: Numbers) -> Self:
+    def placed(cls, solids: Sequence[Solid], vehicle_T_part: Float64, body: Int64) -> Self:
         """Bodies of these kinds, (P,), where they are, (P, 4, 4), with their numbers, (P,)."""
         outlines_m = np.array([solid.outline_m for solid in solids]).reshape(-1, 9, 3)
         outlines_m = outlines_m @ vehicle_T_part[:, :3, :3].swapaxes(1, 2) + vehicle_T_part[:, None, :3, 3]
@@ -129,15 +125,15 @@ class Moving:
         return invert(self.vehicle_T_part)
 
     @cached_property
-    def kinds(self) -> tuple[Sequence[RayCaster], Numbers]:
+    def kinds(self) -> tuple[Sequence[RayCaster], Int64]:
         """The different casters, and (P,) which of them each body has."""
         different = list(dict.fromkeys(self.casters))
         number = {caster: k for k, caster in enumerate(different)}
         return different, np.array([number[caster] for caster in self.casters], dtype=np.int64)
 
-    def touched_by(self, place_m: Float64, places_m: Float64) -> NDArray[np.bool_]:
+    def touched_by(self, place_m: Float64, places_m: Float64) -> Bools:
         """(P,) whether a (3,) place of the vehicle frame, `places_m` (P, 3) from there, lies on a face of each body."""
-        touched: NDArray[np.bool_] = np.linalg.norm(self.centre_m - place_m, axis=1) <= self.radius_m + SLACK_M
+        touched: Bools = np.linalg.norm(self.centre_m - place_m, axis=1) <= self.radius_m + SLACK_M
         for k in np.flatnonzero(touched).tolist():
             touched[k] = len(self.casters[k].touched(places_m[k])) > 0
         return touched
@@ -158,7 +154,7 @@ class Moving:
         bodies: Outlines,
         *,
         leaving_out: int | None = None,
-    ) -> tuple[Numbers, Numbers]:
+    ) -> tuple[Int64, Int64]:
         """Which rays of one tile may meet which body before they end: (K,) bodies and (K,) rays.
 
         Args:
@@ -198,7 +194,7 @@ class Moving:
         met = hits.body >= 0
         return Meetings(part[met], ray[met], hits.range_m[met], hits.triangle[met]), len(met)
 
-    def struck(self, part: Numbers, triangle: NDArray[np.int32], directions: Float32) -> Struck:
+    def struck(self, part: Int64, triangle: Int32, directions: Float32) -> Struck:
         """What the rays hit that met some of the bodies, as `RayCaster.struck`."""
         towards = rotate_each(self.part_T_vehicle[:, :3, :3].astype(np.float32)[part], directions)
         casters, kind = self.kinds
@@ -211,7 +207,7 @@ class Moving:
 
     def cast_pairs(
         self,
-        part: Numbers,
+        part: Int64,
         starts_m: Float32,
         towards: Float32,
         limit_m: Float32,

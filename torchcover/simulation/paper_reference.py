@@ -6,10 +6,10 @@ from functools import lru_cache
 from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchcover.coverage.grid import BandFrame
 from torchcover.geometry import BoundingBox, rigid, rotation_from_euler
+from torchcover.geometry.arrays import Float64
 from torchcover.simulation.rays import Tile, into_tiles, unit_directions
 from torchcover.simulation.reference_sensor import (
     DEFAULT_BAND_FRAME,
@@ -24,8 +24,6 @@ from torchcover.simulation.reference_sensor import (
 
 # Pitch and roll of the paper's sensor are uniform between minus this and this.
 MAX_TILT_DEG = 45.0
-
-Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,8 @@ from typing import NamedTuple, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.geometry.arrays import Bools, Float32, Float64, Int64
+
 # Rows and columns in a tile. A constant, so that the order of points depends on the sensor alone.
 TILE_ROWS = 128
 TILE_COLUMNS = 256
@@ -37,8 +39,6 @@ PAIRS_AT_ONCE = 1 << 20
 FEW = 800
 TOGETHER_RAD = 0.2
 
-Float64 = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 
 AnyFloat = TypeVar("AnyFloat", np.float32, np.float64)
 
@@ -59,11 +59,11 @@ class Tile:
     directions: Float32
     axis: Float64
     half_angle: float
-    blocks: NDArray[np.int64]
+    blocks: Int64
     block_lower: Float64
     block_upper: Float64
 
-    def some(self, which: NDArray[np.bool_]) -> "Tile":
+    def some(self, which: Bools) -> "Tile":
         """The tile of those of its rays for which (n,) is true, in the same cone."""
         filled = which[self.blocks]
         kept = filled.any(axis=1)
@@ -105,7 +105,7 @@ class Balls(NamedTuple):
         of_each = np.repeat(centres_m, np.diff(first, append=len(points)), axis=0)
         return cls(centres_m, np.maximum.reduceat(np.linalg.norm(points - of_each, axis=1), first) + radius_m)
 
-    def met_by(self, tile: Tile, vehicle_T_sensor: Float64) -> NDArray[np.bool_]:
+    def met_by(self, tile: Tile, vehicle_T_sensor: Float64) -> Bools:
         """(n,) whether each ray of a tile may pass through one of them, and of the others some."""
         ways_m = (self.centres_m - vehicle_T_sensor[:3, 3]) @ vehicle_T_sensor[:3, :3]
         distance_m = np.linalg.norm(ways_m, axis=1)
@@ -161,7 +161,7 @@ def into_tiles(directions: Float64, tile_rows: int = TILE_ROWS, tile_columns: in
     return tuple(_tile(directions[:, *cut]) for cut in _cuts(directions.shape, tile_rows, tile_columns))
 
 
-def pixels_in_tiles(directions: Float64) -> NDArray[np.int64]:
+def pixels_in_tiles(directions: Float64) -> Int64:
     """(rays,) where each ray, counted over the tiles of `into_tiles`, stands in (3, rows, columns), row by row."""
     has_ray = ~np.isnan(directions[0])
     pixel = np.arange(has_ray.size).reshape(has_ray.shape)
@@ -195,7 +195,7 @@ def _tile(directions: Float64) -> Tile:
     return Tile(rounded, axis, half_angle, blocks, lower, upper)
 
 
-def _blocks(has_ray: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _blocks(has_ray: Bools) -> Int64:
     """(B, m) numbers of the rays in each block of the pixels of a tile, where (rows, columns) pixels have a ray."""
     rows, columns = has_ray.shape
     high, wide = min(BLOCK, rows), min(BLOCK, columns)
@@ -207,7 +207,7 @@ def _blocks(has_ray: NDArray[np.bool_]) -> NDArray[np.int64]:
     # Pixels without a ray repeat the first one of their block that has one.
     first = np.take_along_axis(pixels, filled.argmax(axis=1)[:, None], axis=1)
     pixels = np.where(filled, pixels, first)[filled.any(axis=1)]
-    numbers: NDArray[np.int64] = has_ray.cumsum()[pixels] - 1
+    numbers: Int64 = has_ray.cumsum()[pixels] - 1
     return numbers
 
 
@@ -299,7 +299,7 @@ def boxes_in_cone(outlines: Outlines, axis: Float64, half_angle: float, range_m:
     return np.flatnonzero(~outside & (outlines.nearest_m <= range_m))
 
 
-def blocks_towards(outlines: Outlines, tile: Tile, vehicle_R_sensor: Float64, range_m: Float32) -> NDArray[np.bool_]:
+def blocks_towards(outlines: Outlines, tile: Tile, vehicle_R_sensor: Float64, range_m: Float32) -> Bools:
     """(P, B) whether a ray of each block of a tile may meet each box before it ends.
 
     Args:
@@ -314,13 +314,13 @@ def blocks_towards(outlines: Outlines, tile: Tile, vehicle_R_sensor: Float64, ra
     bounds = np.vstack([tile.block_lower, tile.block_upper]).astype(np.float32)
     towards = np.hstack([np.maximum(normals, 0.0), np.minimum(normals, 0.0)]).astype(np.float32)
     least = (towards @ bounds).reshape(len(outlines.normals), 4, bounds.shape[1])
-    reached: NDArray[np.bool_] = (least.max(axis=1) <= ROUNDING) & (outlines.nearest_m[:, None] <= ends_m)
+    reached: Bools = (least.max(axis=1) <= ROUNDING) & (outlines.nearest_m[:, None] <= ends_m)
     return reached
 
 
 def rays_towards(
-    outlines: Outlines, box: NDArray[np.intp], rays: NDArray[np.int64], directions: Float32, range_m: Float32
-) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
+    outlines: Outlines, box: NDArray[np.intp], rays: Int64, directions: Float32, range_m: Float32
+) -> tuple[NDArray[np.intp], Int64]:
     """Which rays of some blocks may meet a box before they end.
 
     Args:

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from typing import ClassVar, NamedTuple, Protocol, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchcover.coverage.grid import BandFrame
 from torchcover.geometry import BoundingBox
+from torchcover.geometry.arrays import Float32, Float64, Int64
 from torchcover.simulation.instant import Instant
 from torchcover.simulation.scene import Scene
 
@@ -23,7 +23,7 @@ Areas = tuple[Area, ...]
 Bands = tuple[tuple[float, float], ...]
 
 # From the ego's bounding box and the random numbers to a (4, 4) pose in the vehicle frame.
-DrawPose = Callable[[BoundingBox, np.random.Generator], NDArray[np.float64]]
+DrawPose = Callable[[BoundingBox, np.random.Generator], Float64]
 
 # What height bands are over, where nothing else is said.
 DEFAULT_BAND_FRAME: BandFrame = "ground"
@@ -51,7 +51,7 @@ class Surroundings:
     name: str
     threads: int = 1
 
-    def free_pose(self, draw: DrawPose) -> tuple[NDArray[np.float64], int]:
+    def free_pose(self, draw: DrawPose) -> tuple[Float64, int]:
         """Draw a pose until it lies inside no body.
 
         Args:
@@ -90,14 +90,14 @@ class ReferenceScan(NamedTuple):
         places: From how many places it has looked.
     """
 
-    points: NDArray[np.float32]
-    weights: NDArray[np.float32] | None
+    points: Float32
+    weights: Float32 | None
     rays: int
     self_hits: int
     body_casts: int
     redrawn: int
-    drawn: NDArray[np.int64] | None = None
-    heights_m: NDArray[np.float32] | None = None
+    drawn: Int64 | None = None
+    heights_m: Float32 | None = None
     places: int = 1
 
 
@@ -186,7 +186,7 @@ def check_reach(shell_m: float, max_range_m: float) -> None:
         raise ValueError(f"max_range_m: a positive distance in metres is needed; got {max_range_m}")
 
 
-def position_in_shell(ego: BoundingBox, shell_m: float, generator: np.random.Generator) -> NDArray[np.float64]:
+def position_in_shell(ego: BoundingBox, shell_m: float, generator: np.random.Generator) -> Float64:
     """(3,) place in metres, uniform between the ego's bounding box and that box grown sideways and upwards.
 
     Args:

@@ -4,12 +4,11 @@ import math
 import warnings
 from typing import Annotated, NamedTuple, Self
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat, model_validator
 
 from torchcover.coverage import BevGrid, Region, check_regions, forward_regions, near_field_regions
 from torchcover.coverage.grid import PAPER_HEIGHTS, BandFrame
+from torchcover.geometry.arrays import Float64
 from torchcover.simulation.documents import Bounds, Coordinate, Document, Readable
 from torchcover.simulation.reference_sensor import DEFAULT_BAND_FRAME, Areas, Bands
 
@@ -91,7 +90,7 @@ class RegionsOfInterest(Readable):
 
     def around(
         self,
-        ego_outline_m: NDArray[np.float64] | None = None,
+        ego_outline_m: Float64 | None = None,
         cell_m: float | None = None,
         band_frame: BandFrame = DEFAULT_BAND_FRAME,
     ) -> "Asked":
@@ -153,7 +152,7 @@ class Asked(NamedTuple):
         return tuple(self.grid.heights.values())
 
 
-def _bounds(outline_m: NDArray[np.float64]) -> tuple[tuple[float, float], tuple[float, float]]:
+def _bounds(outline_m: Float64) -> tuple[tuple[float, float], tuple[float, float]]:
     """The bounds x and y of a vehicle, to the millimetre."""
     lower, upper = outline_m.min(axis=0).round(3).tolist(), outline_m.max(axis=0).round(3).tolist()
     return (lower[0], upper[0]), (lower[1], upper[1])

@@ -6,6 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.geometry.arrays import Float64, Int64
+
 # Elevations are counted in bins of this width and blurred with one width after the other.
 BIN_DEG, FINEST_DEG, COARSEST_DEG, GROWTH = 0.005, 0.01, 1.0, 1.15
 # As long as a blur is wider than a row and narrower than the space between two, the number of peaks is that of rows; it
@@ -29,7 +31,7 @@ class ScanEstimate(NamedTuple):
         max_range_m: Range of the farthest return.
     """
 
-    elevations_deg: NDArray[np.float64]
+    elevations_deg: Float64
     columns: int
     horizontal_fov_deg: float
     centre_deg: float
@@ -37,7 +39,7 @@ class ScanEstimate(NamedTuple):
     max_range_m: float
 
 
-def estimate_scan(scans: Sequence[NDArray[np.float64]]) -> ScanEstimate | None:
+def estimate_scan(scans: Sequence[Float64]) -> ScanEstimate | None:
     """Estimate the scan pattern of a LiDAR; None if its points do not lie in rows.
 
     A row whose rays all miss everything is not found.
@@ -77,7 +79,7 @@ def estimate_scan(scans: Sequence[NDArray[np.float64]]) -> ScanEstimate | None:
     )
 
 
-def rows_of(elevation_deg: NDArray[np.float64]) -> NDArray[np.float64] | None:
+def rows_of(elevation_deg: Float64) -> Float64 | None:
     """(R,) the elevations that points gather at, ascending, to a bin; None if that depends on how closely one looks."""
     lowest = float(elevation_deg.min()) - 4 * COARSEST_DEG
     number = ((elevation_deg - lowest) / BIN_DEG).astype(np.int64)
@@ -98,11 +100,11 @@ def rows_of(elevation_deg: NDArray[np.float64]) -> NDArray[np.float64] | None:
     longest = int(lengths.argmax())
     if lengths[longest] < SAME_THROUGH:
         return None
-    rows_deg: NDArray[np.float64] = lowest + BIN_DEG * (found[starts[longest] + lengths[longest] // 2] + 0.5)
+    rows_deg: Float64 = lowest + BIN_DEG * (found[starts[longest] + lengths[longest] // 2] + 0.5)
     return rows_deg
 
 
-def _column_step_deg(azimuth_deg: NDArray[np.float64], of_row: NDArray[np.int64]) -> float | None:
+def _column_step_deg(azimuth_deg: Float64, of_row: Int64) -> float | None:
     """The angle from a column to the next: most points have a neighbour in their row."""
     order = np.lexsort((azimuth_deg, of_row))
     gaps_deg = np.diff(azimuth_deg[order])[np.diff(of_row[order]) == 0]
@@ -115,7 +117,7 @@ def _column_step_deg(azimuth_deg: NDArray[np.float64], of_row: NDArray[np.int64]
     return step_deg
 
 
-def _field_of_view(azimuth_deg: NDArray[np.float64], step_deg: float) -> tuple[float, float]:
+def _field_of_view(azimuth_deg: Float64, step_deg: float) -> tuple[float, float]:
     """How wide it is and where its middle is; full turns have theirs ahead."""
     ordered = np.sort(azimuth_deg)
     gaps_deg = np.diff(ordered, append=ordered[0] + 360.0)

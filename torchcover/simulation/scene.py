@@ -7,6 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.geometry import BoundingBox, invert, overlapping
+from torchcover.geometry.arrays import Bools, Float32, Int32, Int64
+from torchcover.geometry.rigid import Matrix
 from torchcover.geometry.trajectory import poses_at
 from torchcover.simulation.instant import ALL_AROUND_RAYS, Instant
 from torchcover.simulation.local_ground import LocalGround, ground_under, level_faces, looks_down
@@ -19,9 +21,6 @@ from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.surface import AboveGround, SceneSurface, bounds_along
 from torchcover.simulation.sweep import SAMPLES, Poses
 from torchcover.simulation.world import Actor, World
-
-Matrix = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 
 # Three float64, and the copies that are made on the way to them.
 BYTES_PER_POSITION = 96
@@ -86,7 +85,7 @@ class Scene:
         return LocalGround(meshes, self._world_T_local[:3, 3])
 
     @cached_property
-    def is_ground(self) -> Sequence[NDArray[np.bool_]]:
+    def is_ground(self) -> Sequence[Bools]:
         """For each static mesh (F,) which of its faces are ground."""
         static, known = self.world.static, self.world.ground
         if known is None:
@@ -99,7 +98,7 @@ class Scene:
         ]
 
     @cached_property
-    def _outward(self) -> Sequence[NDArray[np.bool_]]:
+    def _outward(self) -> Sequence[Bools]:
         """For each static mesh what `outward_faces` says of it."""
         return [outward_faces(mesh) for mesh in self.world.static]
 
@@ -137,7 +136,7 @@ class Scene:
         return self._surfaces[box]
 
     @cached_property
-    def coincident(self) -> Sequence[NDArray[np.int32]]:
+    def coincident(self) -> Sequence[Int32]:
         """For each static mesh (F,) numbers of its faces that coincide with others among all that never move, or -1."""
         first = sum(len(actor.mesh.faces) for actor in self._resting)
         ends = first + np.cumsum([len(mask) for mask in self.world.coincident])
@@ -186,7 +185,7 @@ class Scene:
         motion = partial(self._motion, near, time_s)
         return Instant(self._static, static_T_vehicle, moving, ego, out_of_range, self.ground, world_T_vehicle, motion)
 
-    def check_apart(self, steps: NDArray[np.int64]) -> None:
+    def check_apart(self, steps: Int64) -> None:
         """Refuse time steps at which an actor overlaps the ego, as `at` does for one."""
         ego = self.world.ego
         bodies = self._resting + self._moving

@@ -13,13 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
+from torchcover.geometry.arrays import Float64, Int64
 from torchcover.simulation.bodies import Body
 from torchcover.simulation.documents import Document, Pose
 from torchcover.simulation.raycaster import Struck
 from torchcover.simulation.weather import CLEAR, Weather
 
-Float64 = NDArray[np.float64]
-Numbers = NDArray[np.int64]
 Elevation = Annotated[float, Field(ge=-90.0, le=90.0)]
 
 
@@ -36,17 +35,17 @@ class RayHits:
         weather: What they went through.
     """
 
-    ray: Numbers
+    ray: Int64
     range_m: NDArray[np.floating]
-    pixel_of_ray: Numbers
-    place: Numbers | None = None
+    pixel_of_ray: Int64
+    place: Int64 | None = None
     find: Callable[[], Struck] | None = None
     weather: Weather = CLEAR
 
     @property
-    def pixel(self) -> Numbers:
+    def pixel(self) -> Int64:
         """(N,) row * columns + column of each ray in `Sensor.directions`."""
-        pixels: Numbers = self.pixel_of_ray[self.ray]
+        pixels: Int64 = self.pixel_of_ray[self.ray]
         return pixels
 
     @cached_property
@@ -67,7 +66,7 @@ class Returns(NamedTuple):
     None for `hit`: of each, in order. None for `error_m`: they are exact.
     """
 
-    hit: Numbers | None
+    hit: Int64 | None
     error_m: Float64 | None
 
 
@@ -94,19 +93,19 @@ class Draws:
         self._of_rays: dict[str, Float64] = {}
         self._lock = Lock()
 
-    def normal(self, ray: Numbers) -> Float64:
+    def normal(self, ray: Int64) -> Float64:
         """(N,) of a normal distribution with standard deviation 1, for hits of these rays."""
         return np.zeros(len(ray)) if self._generator is None else self._drawn("error", "standard_normal", ray)
 
-    def uniform(self, ray: Numbers) -> Float64:
+    def uniform(self, ray: Int64) -> Float64:
         """(N,) evenly from [0, 1), for hits of these rays; 1 where there is no source."""
         return np.ones(len(ray)) if self._generator is None else self._drawn("dropout", "random", ray)
 
-    def chance(self, ray: Numbers) -> Float64:
+    def chance(self, ray: Int64) -> Float64:
         """(N,) evenly from [0, 1), others than `uniform`, for hits of these rays; 1/2 where there is no source."""
         return np.full(len(ray), 0.5) if self._generator is None else self._drawn("return", "random", ray)
 
-    def _drawn(self, purpose: str, kind: str, ray: Numbers) -> Float64:
+    def _drawn(self, purpose: str, kind: str, ray: Int64) -> Float64:
         draw = getattr(self._generator, kind)
         if self._rays is None:
             drawn: Float64 = draw(len(ray))
@@ -181,7 +180,7 @@ class Sensor(Protocol):
         """(rows, columns) when each ray is cast, after the time of the frame; None if all are at that time."""
         ...
 
-    def beams(self) -> Numbers | None:
+    def beams(self) -> Int64 | None:
         """(rows, columns) the number of the beam that each ray is part of; None if each is a beam of its own.
 
         What the rays of one beam hit is measured together; what those of others hit changes nothing about it.
@@ -268,7 +267,7 @@ class Ranging(Document):
         """None: all rays are cast at the time of the frame."""
         return None
 
-    def beams(self) -> Numbers | None:
+    def beams(self) -> Int64 | None:
         """None: every ray measures alone."""
         return None
 
@@ -279,7 +278,7 @@ class Ranging(Document):
         far_enough = hits.range_m >= self.min_range_m
         return self.erring(hits, None if far_enough.all() else np.flatnonzero(far_enough), draws)
 
-    def erring(self, hits: RayHits, hit: Numbers | None, draws: Draws) -> Returns:
+    def erring(self, hits: RayHits, hit: Int64 | None, draws: Draws) -> Returns:
         """Points at some of N hits, with noise and drop-out.
 
         Args:

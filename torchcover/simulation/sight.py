@@ -5,9 +5,9 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchcover.geometry import rigid
+from torchcover.geometry.arrays import Bools, Float32, Float64, Int32, Int64
 from torchcover.simulation.instant import Instant, SensorScan
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.rays import BLOCK, Balls, Tile, into_tiles, pixels_in_tiles, rotate
@@ -27,8 +27,8 @@ SHORTER = 1e-6
 class Ends(NamedTuple):
     """Where n rays end, in the order of the tiles: `range_m` (n,); `is_hit` (n,) whether on something but the ego."""
 
-    range_m: NDArray[np.float32]
-    is_hit: NDArray[np.bool_]
+    range_m: Float32
+    is_hit: Bools
 
 
 class MountedSensor:
@@ -136,7 +136,7 @@ class MountedSensor:
             self._resting = scan, hits
         return scan, hits
 
-    def _met(self, within: Balls) -> list[NDArray[np.bool_]]:
+    def _met(self, within: Balls) -> list[Bools]:
         """For each tile (n,) which of its rays have to be cast: all of a beam, or none."""
         met = [within.met_by(tile, self.vehicle_T_sensor) for tile in self.tiles]
         beams = self.sensor.beams()
@@ -158,7 +158,7 @@ class MountedSensor:
         return Ends(np.concatenate(range_m), np.concatenate(is_hit))
 
 
-def ray_times(sensor: Sensor, tiles: Sequence[Tile], pixel_of_ray: NDArray[np.int64]) -> list[RayTimes] | None:
+def ray_times(sensor: Sensor, tiles: Sequence[Tile], pixel_of_ray: Int64) -> list[RayTimes] | None:
     """When the rays of each tile of a sensor are cast; None if all are at once."""
     times_s = sensor.times_s()
     if times_s is None:
@@ -171,12 +171,12 @@ def ray_times(sensor: Sensor, tiles: Sequence[Tile], pixel_of_ray: NDArray[np.in
 class Sight(NamedTuple):
     """What a place sees of N points: `seen` (N,); `self_hits` were hidden by the ego; the rest as in `SensorScan`."""
 
-    seen: NDArray[np.bool_]
+    seen: Bools
     self_hits: int
     body_casts: int
 
 
-def sight(instant: Instant, place_m: NDArray[np.float64], targets_m: NDArray[np.float32], *, threads: int = 1) -> Sight:
+def sight(instant: Instant, place_m: Float64, targets_m: Float32, *, threads: int = 1) -> Sight:
     """Cast one ray from a place to each of some points; a point is seen if nothing lies in between.
 
     Args:
@@ -194,7 +194,7 @@ def sight(instant: Instant, place_m: NDArray[np.float64], targets_m: NDArray[np.
     limit_m = (distance_m * (1 - SHORTER)).astype(np.float32)
     order = _neighbours(directions)
 
-    def cast(first: int) -> tuple[NDArray[np.int64], NDArray[np.int32], int]:
+    def cast(first: int) -> tuple[Int64, Int32, int]:
         rays = order[first : first + TILE_RAYS]
         tile = _tile(directions[:, rays])
         _, hits, casts = instant.cast(vehicle_T_place, tile, limit_m[rays], bodies)
@@ -213,7 +213,7 @@ def sight(instant: Instant, place_m: NDArray[np.float64], targets_m: NDArray[np.
     return Sight(hidden_by < 0, self_hits, sum(casts for _, _, casts in answers))
 
 
-def _neighbours(directions: NDArray[np.float64]) -> NDArray[np.int64]:
+def _neighbours(directions: Float64) -> Int64:
     """An order in which as many directions as a block of a tile has are close to each other."""
     by_azimuth = np.argsort(np.arctan2(directions[1], directions[0]))
     sectors = max(1, round(np.sqrt(len(by_azimuth)) / BLOCK))
@@ -222,7 +222,7 @@ def _neighbours(directions: NDArray[np.float64]) -> NDArray[np.int64]:
     return by_azimuth[np.argsort(4.0 * sector + directions[2, by_azimuth])]
 
 
-def _tile(directions: NDArray[np.float64]) -> Tile:
+def _tile(directions: Float64) -> Tile:
     """The tile of (3, n) directions; those that follow each other are a block, the last one repeats its last ray."""
     rays = directions.shape[1]
     blocks = np.minimum(np.arange(-(-rays // BLOCK**2) * BLOCK**2), rays - 1).reshape(-1, BLOCK**2)

@@ -6,12 +6,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.simulation.patches import edges_of, outward_by, outward_faces, surfaces_of
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.shapes import Mesh, corners_of, normals_of, parts_of
-
-Bools = NDArray[np.bool_]
-Float64 = NDArray[np.float64]
 
 # Surfaces that are nearer to each other are one; nearer than the other, float32 cannot tell that they are two.
 COINCIDE_M = 1e-3
@@ -120,7 +118,7 @@ def warn_of_coincidence(names: Sequence[str], coincident: Sequence[Bools]) -> No
         )
 
 
-def _first_of_each(edge: NDArray[np.int64], way: NDArray[np.int8]) -> NDArray[np.int64]:
+def _first_of_each(edge: Int64, way: NDArray[np.int8]) -> Int64:
     """Numbers of the faces but those that have the same edges as one before, run through the same way."""
     triples = np.sort(edge.reshape(-1, 3) * 3 + 1 + way.reshape(-1, 3), axis=1)
     # Hardly ever are any alike; then no two have the same number, and the slow comparison is not needed.
@@ -131,7 +129,7 @@ def _first_of_each(edge: NDArray[np.int64], way: NDArray[np.int8]) -> NDArray[np
     return np.sort(first)
 
 
-def _encloses(mesh: Mesh, surface: NDArray[np.int64]) -> Bools:
+def _encloses(mesh: Mesh, surface: Int64) -> Bools:
     """(F,) whether the surface of that number looks like a body: its normals point to all sides."""
     normals = np.empty((3, len(mesh.faces)))
     for part, (first, second, third) in mesh.parts():

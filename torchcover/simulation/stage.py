@@ -8,9 +8,9 @@ from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 from torch.utils.data import get_worker_info
 
+from torchcover.geometry.arrays import Float64
 from torchcover.simulation.instant import Instant
 from torchcover.simulation.memory import machine_bytes
 from torchcover.simulation.moving import Solids
@@ -60,7 +60,7 @@ class Stage:
         self.mounts.free_for_good = not self.scene.moves
 
 
-def _check_place(sensor: str, place_m: NDArray[np.float64], instant: Instant) -> None:
+def _check_place(sensor: str, place_m: Float64, instant: Instant) -> None:
     where = f"{sensor} at {place_m.round(3).tolist()} m"
     on_a_face = instant.on_a_face(place_m)
     if instant.buried(place_m + LIFT_M if on_a_face else place_m):

@@ -4,16 +4,10 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from torchcover.geometry.arrays import Bools, Float32, Float64, Int32, Int64
 from torchcover.simulation.local_ground import SLACK_M as HEIGHT_SLACK_M
 from torchcover.simulation.patches import Bounds, Patches
-
-Bools = NDArray[np.bool_]
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Int32 = NDArray[np.int32]
-Numbers = NDArray[np.int64]
 
 # Patches are looked up with this much to spare: drawn points are rounded to float32.
 SLACK_M = 1e-3
@@ -52,7 +46,7 @@ class Stratum(NamedTuple):
     All three are (K,).
     """
 
-    patch: Numbers
+    patch: Int64
     m2: Float64
     inside_m2: Float64
 
@@ -63,10 +57,10 @@ class Objects(NamedTuple):
     `number` (J,) of each object, and `first` (J,) of its patches among these.
     """
 
-    patch: Numbers
+    patch: Int64
     m2: Float64
     number: Int32
-    first: Numbers
+    first: Int64
 
 
 class SurfaceStrata:
@@ -130,7 +124,7 @@ class SurfaceStrata:
             self._patches.face.take(patch, axis=1),
         )
 
-    def _heights_of(self, points_m: Float32, patch: Numbers) -> Float32:
+    def _heights_of(self, points_m: Float32, patch: Int64) -> Float32:
         """(K,) what the third bounds of the boxes are about, of (3, K) points on the patches."""
         if self._heights_m is None:
             z_m: Float32 = points_m[2]
@@ -140,7 +134,7 @@ class SurfaceStrata:
         heights_m[asked] = self._heights_m(points_m.take(asked, axis=1).T)
         return heights_m
 
-    def _points(self, patch: Numbers, generator: np.random.Generator) -> Float32:
+    def _points(self, patch: Int64, generator: np.random.Generator) -> Float32:
         """(3, K) one point on each of the patches."""
         start = generator.random((2, 1))
         a, b = ((start + np.arange(len(patch)) * np.array(PLANE_STEPS)[:, None]) % 1).astype(np.float32)
@@ -160,7 +154,7 @@ def _inside(placed_m: Sequence[Float32], low: Float64, high: Float64) -> Bools:
 
 def _strata(m2: Float32, lower_m: Float32, upper_m: Float32, boxes: Bounds) -> list[Stratum]:
     # What lies in an area, whatever its height, and how much of it: several bands ask about it.
-    above: dict[bytes, tuple[Numbers, Float32, Float32]] = {}
+    above: dict[bytes, tuple[Int64, Float32, Float32]] = {}
     strata = []
     for low, high in zip(*boxes, strict=True):
         area = np.stack([low[:2], high[:2]]).tobytes()
@@ -186,7 +180,7 @@ def _share(from_m: Float32, to_m: Float32, low: float, high: float) -> Float32:
     return share
 
 
-def _drawn(stratum: Stratum, front: Bools, each: float, generator: np.random.Generator) -> tuple[Numbers, float]:
+def _drawn(stratum: Stratum, front: Bools, each: float, generator: np.random.Generator) -> tuple[Int64, float]:
     """Patches, drawn by their area so that about `each` points lie in the stratum, and points per square metre."""
     seen = front.take(stratum.patch)
     up_to_m2 = np.cumsum(stratum.m2 * seen)
@@ -213,7 +207,7 @@ def _objects(of_object: Int32, m2: Float32) -> Objects:
 
 def _drawn_on_objects(
     objects: Objects, front: Bools, each: int, generator: np.random.Generator
-) -> tuple[Numbers, Float64]:
+) -> tuple[Int64, Float64]:
     """Patches, `each` for every object, drawn by their area, and points per square metre by the object's number.
 
     The last density is for what is no object.

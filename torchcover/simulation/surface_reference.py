@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from typing import ClassVar, Self, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchcover.coverage.grid import BandFrame
 from torchcover.geometry import BoundingBox, rigid
+from torchcover.geometry.arrays import Float64
 from torchcover.simulation.local_ground import TOLERANCE_M
 from torchcover.simulation.patches import Bounds
 from torchcover.simulation.reference_sensor import (
@@ -26,8 +26,6 @@ from torchcover.simulation.sight import Sight, sight
 from torchcover.simulation.sound import COINCIDE_M
 from torchcover.simulation.surface_points import SurfacePoints, SurfaceStrata
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 DEFAULT_RAYS = 16_384
 # How far above the surface a ray to it ends, in metres, and as a share of the coordinates that casting rounds.
 ABOVE_M = 1e-3

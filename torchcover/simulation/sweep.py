@@ -10,16 +10,12 @@ from dataclasses import dataclass
 from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchcover.geometry import invert, transform
+from torchcover.geometry.arrays import Float32, Float64, Int64
 from torchcover.simulation.moving import Meetings, Moving
 from torchcover.simulation.raycaster import Hits, RayCaster, cast_from
 from torchcover.simulation.rays import SLACK_M, Outlines, Tile, outlines, rotate, rotate_each
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Numbers = NDArray[np.int64]
 
 # Poses at the begin, in the middle and at the end: parabolas, off by the cube of what a body turns in the meantime.
 SAMPLES = 3
@@ -29,7 +25,7 @@ class RayTimes(NamedTuple):
     """When the rays of a tile are cast, after the frame's time: `at_s` (g,) ascending, `of_ray` (n,) which of these."""
 
     at_s: Float64
-    of_ray: Numbers
+    of_ray: Int64
 
 
 class Poses(NamedTuple):
@@ -63,7 +59,7 @@ class SweptHits(NamedTuple):
     hits: Hits
     directions: Float32
     starts_m: Float32
-    on_body: Numbers
+    on_body: Int64
     points: Float32
     casts: int
 
@@ -160,7 +156,7 @@ class Sweep:
         return SweptHits(hits, turned, from_m, on_body, points, len(ray))
 
     def _cast_at_static(
-        self, weights: Float64, of_ray: Numbers, origin_m: Float64, directions: Float32, limit_m: Float32
+        self, weights: Float64, of_ray: Int64, origin_m: Float64, directions: Float32, limit_m: Float32
     ) -> tuple[Hits, Float32, Float32]:
         """What n rays hit of what never moves; their (3, n) directions and starts in the vehicle frame of now."""
         now_T_static = invert(self.now.static_T_vehicle)
@@ -174,7 +170,7 @@ class Sweep:
         starts_m = transform(now_T_static, starts_m).T
         return hits, rotate(now_T_static[:3, :3], towards), starts_m.astype(np.float32).take(of_ray, axis=1)
 
-    def _parts(self, weights: Float64, part: Numbers) -> Float64:
+    def _parts(self, weights: Float64, part: Int64) -> Float64:
         """(K, 4, 4) `part_T_vehicle` of some bodies at times with these weights, (K, 3)."""
         poses: Float64 = np.einsum("ks,skij->kij", weights, self.part_T_vehicle[:, part])
         return poses
@@ -205,7 +201,7 @@ def _moved(poses: Float64, places_m: Float64) -> Float64:
     return moved
 
 
-def _turned(poses: Float64, of_ray: Numbers, directions: Float32) -> Float32:
+def _turned(poses: Float64, of_ray: Int64, directions: Float32) -> Float32:
     """(3, n) directions, each turned by the pose of its time."""
     rotations, (x, y, z) = poses[:, :3, :3].astype(np.float32), directions
     rows = rotations.transpose(1, 2, 0)

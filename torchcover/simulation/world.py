@@ -4,13 +4,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchcover.geometry import BoundingBox, euler_from_rotation, invert, transform
+from torchcover.geometry.arrays import Bools
+from torchcover.geometry.rigid import Matrix
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.shapes import Mesh
-
-Matrix = NDArray[np.float64]
 
 # A day at ten to a second.
 MAX_STEPS = 1_000_000
@@ -59,7 +58,7 @@ class World:
     duration_s: float = 0.0
     parked: tuple[Actor, ...] = ()
     ground: tuple[int, ...] | None = None
-    coincident: tuple[NDArray[np.bool_], ...] = ()
+    coincident: tuple[Bools, ...] = ()
     left_out: int = 0
 
     @property

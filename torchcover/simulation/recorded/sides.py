@@ -4,13 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from torchcover.simulation.traffic.assemble import HORIZON_M
 from torchcover.simulation.traffic.frontage import Side, sides_around
 from torchcover.simulation.world import Actor
-
-Numbers = NDArray[np.float64]
 
 # From the middle of a track to the kerb; what lies between tracks that are nearer to each other is street, too.
 TO_KERB_M, BETWEEN_M, SIDEWALK_M = 5.0, 12.0, 3.0

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchcover.files import feed_xml, reads
 from torchcover.simulation.sumo.floating import Recorded, SumoTrack
@@ -13,8 +12,6 @@ from torchcover.simulation.sumo.motion import RoadUser
 from torchcover.simulation.traffic.assemble import HORIZON_M
 from torchcover.simulation.traffic.fleet import CATEGORIES, EGO, Fleet
 from torchcover.simulation.traffic.vehicle_class import VehicleType
-
-Numbers = NDArray[np.float64]
 
 PIECE_BYTES = 1 << 18
 

@@ -7,11 +7,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchcover.files import feed_xml, reads
-
-Numbers = NDArray[np.float64]
+from torchcover.geometry.arrays import Float64
 
 ATTRIBUTES = "id,x,y,z,angle,slope,type"
 # Who is not heard of for longer than this many usual steps, or moves faster than this from one to the next, is gone in
@@ -38,10 +36,10 @@ class SumoTrack(NamedTuple):
     name: str
     kind: str
     on_foot: bool
-    times_s: Numbers
-    places_m: Numbers
-    yaw_deg: Numbers
-    slope_deg: Numbers
+    times_s: Float64
+    places_m: Float64
+    yaw_deg: Float64
+    slope_deg: Float64
 
     def covers(self, duration_s: float) -> bool:
         """Whether it is there from the first time to so much later."""
@@ -77,7 +75,7 @@ class _Collector:
         self.kinds: list[str] = []
         self.times_s: list[float] = []
         self.of: list[int] = []
-        self.rows: list[Numbers] = []
+        self.rows: list[Float64] = []
         self.counts: list[int] = []
 
     def start(self, name: str, attributes: list[str]) -> None:

@@ -3,12 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from torchcover.geometry.arrays import Bools, Float64
 from torchcover.simulation.traffic.scenery import PAVEMENT_M
-
-Numbers = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 # Probability to take the first chance after a stay, instead of waiting for another.
 EAGERNESS = 0.8
@@ -25,8 +22,8 @@ class Footpath:
         kerb_m: How far behind a waiting place the kerb is, at both ends; without one the path is level.
     """
 
-    start_m: Numbers
-    end_m: Numbers
+    start_m: Float64
+    end_m: Float64
     kerb_m: float | None = None
 
     @property
@@ -34,7 +31,7 @@ class Footpath:
         """From one waiting place to the other."""
         return float(np.linalg.norm(self.end_m - self.start_m))
 
-    def poses(self, share: Numbers, back: Flags, body_radius_m: float) -> tuple[Numbers, Numbers]:
+    def poses(self, share: Float64, back: Bools, body_radius_m: float) -> tuple[Float64, Float64]:
         """Where somebody is who has gone a share of the way.
 
         Args:
@@ -57,12 +54,12 @@ class Footpath:
 
 def walk(
     path: Footpath,
-    may_go: Flags,
+    may_go: Bools,
     crossing_s: float,
-    times_s: Numbers,
+    times_s: Float64,
     body_radius_m: float,
     generator: np.random.Generator,
-) -> tuple[Numbers, Numbers]:
+) -> tuple[Float64, Float64]:
     """Go to and fro on a path, setting off only when one may.
 
     Args:
@@ -97,13 +94,13 @@ def walk(
             back, now = not back, arrived
 
 
-def step_height(beyond_kerb_m: Numbers, body_radius_m: float | Numbers) -> Numbers:
+def step_height(beyond_kerb_m: Float64, body_radius_m: float | Float64) -> Float64:
     """Height of the feet of somebody whose middle is so far beyond the kerb, on the carriageway's side."""
     stepping = (beyond_kerb_m - body_radius_m) / PAVEMENT_M
     return PAVEMENT_M * (1.0 - np.clip(stepping, 0.0, 1.0))
 
 
-def free_for(blocked: Flags, duration_s: float, step_s: float) -> Flags:
+def free_for(blocked: Bools, duration_s: float, step_s: float) -> Bools:
     """(T,) whether nothing is blocked from each time on for a duration; what is after the last time counts as free."""
     steps = int(np.ceil(duration_s / step_s))
     before = np.concatenate([[0], np.cumsum(blocked)])

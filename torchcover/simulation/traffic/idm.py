@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-Numbers = NDArray[np.float64]
-Quantity = float | Numbers
+from torchcover.geometry.arrays import Float64
+
+Quantity = float | Float64
 
 FREE_ROAD_EXPONENT = 4
 # What tyres give on a dry road; the model itself would ask for more when somebody appears right ahead.
@@ -55,7 +55,7 @@ class Driver:
         return 2 * np.sqrt(self.acceleration_mps2 * self.deceleration_mps2)
 
 
-def tightness(driver: Driver, speed_mps: Numbers, gap_m: Numbers, closing_mps: Numbers) -> Numbers:
+def tightness(driver: Driver, speed_mps: Float64, gap_m: Float64, closing_mps: Float64) -> Float64:
     """The gap that N drivers would like to have as a multiple of the one that they have.
 
     Args:
@@ -74,7 +74,7 @@ def tightness(driver: Driver, speed_mps: Numbers, gap_m: Numbers, closing_mps: N
     return gaps
 
 
-def acceleration_in(driver: Driver, speed_mps: Numbers, tightness: Numbers, desired_mps: Quantity) -> Numbers:
+def acceleration_in(driver: Driver, speed_mps: Float64, tightness: Float64, desired_mps: Quantity) -> Float64:
     """(N,) acceleration of N drivers, at least -9 m/s²; of several things ahead the largest tightness counts.
 
     `desired_mps` is what they want to drive here: less than elsewhere in a curve.
@@ -87,7 +87,7 @@ def acceleration_in(driver: Driver, speed_mps: Numbers, tightness: Numbers, desi
     return np.maximum(wanted, -HARDEST_BRAKING_MPS2, out=wanted)
 
 
-def laden_mps2(speed_mps: Numbers, slope: Numbers) -> Numbers:
+def laden_mps2(speed_mps: Float64, slope: Float64) -> Float64:
     """(N,) the hardest that laden lorries accelerate at (N,) speeds up (N,) slopes, by their power.
 
     Example:
@@ -95,11 +95,11 @@ def laden_mps2(speed_mps: Numbers, slope: Numbers) -> Numbers:
         True
     """
     resisted_mps2 = GRAVITY_MPS2 * (slope + ROLLING) + DRAG_PER_M * speed_mps**2
-    found: Numbers = LADEN_W_PER_KG / np.maximum(speed_mps, 1.0) - resisted_mps2
+    found: Float64 = LADEN_W_PER_KG / np.maximum(speed_mps, 1.0) - resisted_mps2
     return found
 
 
-def advance(speed_mps: Numbers, acceleration_mps2: Numbers, room_m: Numbers, step_s: float) -> tuple[Numbers, Numbers]:
+def advance(speed_mps: Float64, acceleration_mps2: Float64, room_m: Float64, step_s: float) -> tuple[Float64, Float64]:
     """Move N drivers on by one step of constant acceleration (the ballistic update).
 
     A driver who comes to a stop within the step stays there instead of driving backwards, and nobody goes farther

@@ -5,9 +5,9 @@ from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
+from torchcover.geometry.arrays import Float64
 from torchcover.simulation.documents import builtin_hashes
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.fleet import Fleet, load_bodies
@@ -73,6 +73,6 @@ class Procedural(Traffic):
 
     @abstractmethod
     def _build(
-        self, fleet: Fleet, times_s: NDArray[np.float64], generator: np.random.Generator
+        self, fleet: Fleet, times_s: Float64, generator: np.random.Generator
     ) -> tuple[Scenery, Actor, tuple[Actor, ...]]:
         """What rests, the ego, and who else moves, at (T,) times from 0 to the end, T >= 2."""

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Numbers = NDArray[np.float64]
+from torchcover.geometry.arrays import Float64
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,11 +23,11 @@ class Polyline:
         array([ 0., 25., 90.])
     """
 
-    points_m: Numbers
+    points_m: Float64
     closed: bool = False
 
     @cached_property
-    def arc_m(self) -> Numbers:
+    def arc_m(self) -> Float64:
         """(K,) way along the line at each corner."""
         return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self.points_m, axis=0), axis=1))])
 
@@ -36,7 +36,7 @@ class Polyline:
         """Length, of a loop once around."""
         return float(self.arc_m[-1])
 
-    def poses(self, place_m: ArrayLike) -> Numbers:
+    def poses(self, place_m: ArrayLike) -> Float64:
         """Where one is after a way along the line.
 
         Args:
@@ -54,12 +54,12 @@ class Polyline:
         return np.concatenate([position, yaw[..., None]], axis=-1)
 
     @cached_property
-    def _directions(self) -> Numbers:
+    def _directions(self) -> Float64:
         steps = np.diff(self.points_m, axis=0)
         return np.asarray(steps / np.linalg.norm(steps, axis=1, keepdims=True))
 
     @cached_property
-    def headings(self) -> Numbers:
+    def headings(self) -> Float64:
         """(K,) heading at each corner in radians, halfway between the pieces that meet there, without jumps."""
         pieces = np.unwrap(np.arctan2(self._directions[:, 1], self._directions[:, 0]))
         return np.concatenate([pieces[:1], (pieces[:-1] + pieces[1:]) / 2, pieces[-1:]])

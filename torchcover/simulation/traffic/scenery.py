@@ -5,13 +5,12 @@ from typing import NamedTuple
 
 import numpy as np
 import shapely
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from torchcover.geometry import rigid, rotation_from_euler
+from torchcover.geometry.arrays import Float64
 from torchcover.simulation.bodies import merge
 from torchcover.simulation.shapes import Mesh, band, circle, prism_faces
-
-Numbers = NDArray[np.float64]
 
 PAVEMENT_M = 0.15
 # Kerbs go on below the ground, as far as it may rise between two of their corners.
@@ -50,7 +49,7 @@ def prism(outlines_m: Sequence[ArrayLike], heights_m: Sequence[float]) -> Mesh:
     return Mesh(rings.reshape(-1, 3), prism_faces(levels, corners))
 
 
-def rectangle(x_m: tuple[float, float], y_m: tuple[float, float]) -> Numbers:
+def rectangle(x_m: tuple[float, float], y_m: tuple[float, float]) -> Float64:
     """(4, 2) outline."""
     return np.array([[x_m[0], y_m[0]], [x_m[1], y_m[0]], [x_m[1], y_m[1]], [x_m[0], y_m[1]]])
 
@@ -61,7 +60,7 @@ def block(x_m: tuple[float, float], y_m: tuple[float, float], z_m: tuple[float, 
     return prism([outline, outline], z_m)
 
 
-def slab(corners_m: Numbers, z_m: tuple[float, float]) -> Mesh:
+def slab(corners_m: Float64, z_m: tuple[float, float]) -> Mesh:
     """A closed body between two heights over a net.
 
     Args:
@@ -81,7 +80,7 @@ def slab(corners_m: Numbers, z_m: tuple[float, float]) -> Mesh:
     return Mesh(np.column_stack([places_m, np.repeat(z_m, up)]), np.concatenate([over[:, ::-1], over + up, sides]))
 
 
-def plateau(piece: shapely.Geometry, heights_m: Callable[[Numbers], Numbers]) -> Mesh:
+def plateau(piece: shapely.Geometry, heights_m: Callable[[Float64], Float64]) -> Mesh:
     """Pavement of any outline: a closed body from above the ground, whose heights are given, to below it."""
     triangles = shapely.get_coordinates(shapely.get_parts(shapely.constrained_delaunay_triangles(piece)))
     corners_m = np.round(triangles.reshape(-1, 4, 2)[:, :3].reshape(-1, 2) / PLACES_ALIKE_M) * PLACES_ALIKE_M

@@ -4,15 +4,14 @@ from collections.abc import Sequence
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from torchcover.geometry.arrays import Float64
 from torchcover.simulation.bodies import merge
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.alignment import Alignment, Territory
 from torchcover.simulation.traffic.hills import Hills
 from torchcover.simulation.traffic.scenery import PAVEMENT_M, slab
 
-Numbers = NDArray[np.float64]
 Bounds = tuple[float, float]
 
 # What bends is cut into such pieces, and on hills across the street, too.
@@ -55,7 +54,7 @@ class BuildingSite:
         self._territory = territory
         self._hills = hills
         self._deep_m = deep_m
-        self._reaches_m: dict[int, tuple[Numbers, Numbers]] = {}
+        self._reaches_m: dict[int, tuple[Float64, Float64]] = {}
 
     def block(self, x_m: Bounds, side: int, kerb_m: float, depth_m: float) -> tuple[Mesh, shapely.Geometry]:
         """Pavement from a kerb on, on the left (1) or the right (-1), as far as the site goes there; and in plan."""
@@ -73,7 +72,7 @@ class BuildingSite:
             mesh.vertices_m[:, 2] = above_m
         return mesh.made_of("pavement"), outline
 
-    def depth_m(self, x_m: Numbers, side: int, kerb_m: float, depth_m: float) -> Numbers:
+    def depth_m(self, x_m: Float64, side: int, kerb_m: float, depth_m: float) -> Float64:
         """(N,) how deep a block is there that is not deeper than given."""
         if self.street.is_straight:
             return np.full(len(x_m), depth_m)
