@@ -45,10 +45,8 @@ class Plain(NamedTuple):
 class Slopes(NamedTuple):
     """Ground with a height at each corner of a raster; two triangles are between four of them.
 
-    Args:
-        lower_m: (2,) the first corner.
-        corners_m: (rows, columns) heights, rows along y.
-        wanted: (rows - 1, columns - 1) which squares rays may hit.
+    `lower_m` (2,) is the first corner; `corners_m` (rows, columns) are heights, rows along y; `wanted` (rows - 1,
+    columns - 1) which squares rays may hit.
     """
 
     lower_m: Float64

@@ -94,15 +94,10 @@ class Instant:
         return self.ground.heights_m(points_m, self.world_T_vehicle)
 
     def first_faces(self, points_m: Float32, normals: Float32, within_m: float) -> Int64:
-        """Which face that never moves lies at each of some points of such faces, or above it.
+        """Which face that never moves lies at (N, 3) points of such faces, or above them: (N,) numbers, -1 for none.
 
-        Args:
-            points_m: (N, 3) in the vehicle frame.
-            normals: (N, 3) of length one, on the side that is looked at.
-            within_m: How far above at most.
-
-        Returns:
-            (N,) numbers of the faces, as `RayCaster.faces_met` counts them, -1 for none.
+        It is within so much above, towards the (N, 3) `normals` of length one, and counted as `RayCaster.faces_met`
+        does.
         """
         starts_m = transform(self.static_T_vehicle, points_m + np.float32(within_m) * normals)
         towards = -(normals @ self.static_T_vehicle[:3, :3].T)
@@ -123,16 +118,13 @@ class Instant:
 
         Args:
             vehicle_T_sensor: (4, 4) pose of the sensor.
-            tiles: Its rays, from `into_tiles`.
+            tiles: Its rays, from `into_tiles`; points are in their order.
             max_range_m: Farther hits give no point.
-            own_m: Of a sensor that is fixed to the ego: where the ego's body ends the rays of each tile, from
-                `Scene.own_m`. They are not cast at it again. The result is the same.
+            own_m: Where the ego's body, which is not cast at again then, ends the rays of each tile, from
+                `Scene.own_m`.
             ego_points: Whether hits on the ego give points too.
             times: When the rays of each tile are cast; all at once if not given.
             threads: Number of threads; the result does not depend on it.
-
-        Returns:
-            A `SensorScan`, the points in the order of the tiles.
         """
         origin_m = vehicle_T_sensor[:3, 3]
         sweep = self._sweep(times) if times else None
@@ -213,15 +205,9 @@ class Instant:
         return found._replace(body=body, triangle=triangle)
 
     def range_image(self, vehicle_T_sensor: Matrix, directions: Float64, *, max_range_m: float = np.inf) -> Float32:
-        """Distance along the ray of every pixel, the ego's body included.
+        """(rows, columns) metres along (3, rows, columns) directions to what they hit, the ego's body included.
 
-        Args:
-            vehicle_T_sensor: (4, 4) pose of the frame of the directions.
-            directions: (3, rows, columns) unit directions; NaN for a pixel that has no ray.
-            max_range_m: Hits farther than this are none.
-
-        Returns:
-            (rows, columns) metres; infinite where a ray hits nothing, NaN where there is none.
+        Infinite where a ray hits nothing within the range, NaN where there is no ray.
         """
         image = np.full(directions.shape[1:], np.nan, dtype=np.float32)
         bodies = self.outlines(vehicle_T_sensor[:3, 3])
@@ -268,17 +254,10 @@ class Instant:
         bodies: Outlines,
         own_m: Float32 | None = None,
     ) -> tuple[Float32, Hits, int]:
-        """Cast the rays of one tile.
+        """Cast n rays of a tile: (3, n) directions in the vehicle frame, hits, and how many were cast at what moves.
 
-        Args:
-            vehicle_T_sensor: (4, 4) pose of the sensor.
-            tile: n of its rays.
-            limit_m: (n,) distance at which each of them ends; finite.
-            bodies: The bodies that move as they look from there, from `outlines`.
-            own_m: (n,) where the ego's body ends them, if that is known.
-
-        Returns:
-            (3, n) directions in the vehicle frame, their hits, and how many rays were cast at bodies that move.
+        Each ends at its (n,) `limit_m`, which is finite, and at (n,) `own_m`, the ego's body, if that is known;
+        `bodies` are those that move as they look from the sensor, from `outlines`.
         """
         origin_m, vehicle_R_sensor = vehicle_T_sensor[:3, 3], vehicle_T_sensor[:3, :3]
         directions = rotate(vehicle_R_sensor, tile.directions)

@@ -170,14 +170,10 @@ class LocalGround:
         return sum(len(mesh.faces) for mesh in self._meshes)
 
     def heights_m(self, points_m: NDArray[np.floating], world_T_points: Float64 | None = None) -> Float32:
-        """How high above the ground points are.
+        """(N,) how high above the ground (N, 3) points are, in metres; NaN where there is none at or below.
 
-        Args:
-            points_m: (N, 3) points.
-            world_T_points: (4, 4) where their frame lies in the world; they are in its own frame if not given.
-
-        Returns:
-            (N,) metres, not less than -0.05, 0 where rounding alone tells; NaN where there is no ground at or below.
+        Not less than -0.05, and 0 where rounding alone tells. `world_T_points` is where their frame lies in the world;
+        they are in its own frame if it is not given.
         """
         places_m = self._local(points_m, world_T_points)
         places_m[:, 2] += TOLERANCE_M
@@ -265,11 +261,7 @@ class GroundSquares(NamedTuple):
         return cls(first_m, square_m, levels)
 
     def between_m(self, lower_m: NDArray[np.floating], upper_m: NDArray[np.floating]) -> tuple[Float32, Float32]:
-        """The lowest and the highest ground anywhere in N upright rectangles between (2, N) corners.
-
-        Returns:
-            (N,) and (N,); infinite and minus infinite where there is none.
-        """
+        """(N,) lowest and (N,) highest ground in rectangles between (2, N) corners; inf, -inf where there is none."""
         if math.isinf(self.square_m):
             lowest_m, highest_m = (np.full(lower_m.shape[1], bound) for bound in self.levels[0].ravel())
             return lowest_m, highest_m
@@ -293,13 +285,10 @@ class GroundSquares(NamedTuple):
         return lowest_m, highest_m
 
     def heights_m(self, triangles_m: NDArray[np.floating]) -> Float32:
-        """(2, N) between which heights above the ground all points of triangles lie that have ground below them.
+        """(2, N) between which heights above ground points of (3, 3, N) triangles lie that have ground below them.
 
-        Args:
-            triangles_m: (3, 3, N) corners, coordinates, triangles, in the frame of the squares.
-
-        Returns:
-            The lowest and the highest; infinite and minus infinite where there is no ground.
+        Triangles are corners, coordinates, triangles, in the frame of the squares; inf and -inf where there is no
+        ground.
         """
         lower_m, upper_m = triangles_m.min(axis=0), triangles_m.max(axis=0)
         lowest_m, highest_m = self.between_m(lower_m[:2], upper_m[:2])

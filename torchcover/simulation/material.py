@@ -71,10 +71,7 @@ class Materials(NamedTuple):
 
 
 def material_number(name: str) -> int:
-    """The number of a material, which meshes have in this process; 0 is where none was said.
-
-    Args:
-        name: Of a built-in material, or the path of a YAML file.
+    """The number of a material by name or YAML file, which meshes have in this process; 0 is where none was said.
 
     Raises:
         FileNotFoundError: There is none; the message lists those that there are.

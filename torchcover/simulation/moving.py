@@ -30,9 +30,6 @@ class Solid:
 
     `outline_m` (9, 3) has the corners of its box, grown a little, and the centre; no vertex is farther from that than
     `radius_m`, nor from the origin of the frame than `reach_m`.
-
-    Args:
-        mesh: Its form.
     """
 
     def __init__(self, mesh: Mesh) -> None:
@@ -155,15 +152,10 @@ class Moving:
         *,
         leaving_out: int | None = None,
     ) -> tuple[Int64, Int64]:
-        """Which rays of one tile may meet which body before they end: (K,) bodies and (K,) rays.
+        """Which rays of a tile may meet which body before their (n,) limits: (K,) bodies and (K,) rays.
 
-        Args:
-            vehicle_R_sensor: (3, 3) rotation of the sensor.
-            tile: n of its rays.
-            directions: (3, n) the same in the vehicle frame.
-            limit_m: (n,) where they end.
-            bodies: These bodies as they look from there, from `outlines`.
-            leaving_out: Number of a body that they are not cast at.
+        `directions` (3, n) are those of the tile in the vehicle frame, `bodies` what they look like from there, from
+        `outlines`; `leaving_out` is the number of a body that they are not cast at.
         """
         near = boxes_in_cone(bodies, vehicle_R_sensor @ tile.axis, tile.half_angle, float(limit_m.max(initial=0.0)))
         if leaving_out is not None:
@@ -215,13 +207,9 @@ class Moving:
     ) -> Hits:
         """Cast K pairs of a ray and a body, each as if it were alone.
 
-        Args:
-            part: (K,) the bodies.
-            starts_m: (K, 3) where the rays start, each in the frame of its body.
-            towards: (3, K) their directions, likewise.
-            limit_m: (K,) where they end.
-            common: If they start at one place: (3,) that, and (P, 3) the same in the frame of each body. It may lie on
-                a face.
+        Starts (K, 3) and directions (3, K) are in the frames of the (K,) bodies, `limit_m` (K,) is where rays end. If
+        they start at one place, which may lie on a face, `common` is that, (3,), and the same in the frame of each
+        body, (P, 3).
         """
         casters, kind = self.kinds
         touched = np.zeros(len(self), dtype=bool) if common is None else self.touched_by(*common)

@@ -193,15 +193,9 @@ class RayCaster:
         return len(self._bodies)
 
     def cast(self, origin_m: NDArray[np.floating], directions: Float32, limit_m: Float32) -> Hits:
-        """Cast rays from one origin. A ray that starts on a face does not hit that face.
+        """Cast (3, N) unit directions from one origin, up to (N,) limits, which may be infinite.
 
-        Args:
-            origin_m: (3,) common origin of the rays.
-            directions: (3, N) unit directions.
-            limit_m: (N,) distance at which each ray ends; may be infinite.
-
-        Returns:
-            `Hits(range_m, body)`: the nearest hit within the limit; else the limit, and -1.
+        A ray that starts on a face does not hit that face. What hits nothing has its limit as range, and body -1.
         """
         # One origin for all rays: an array that steps over no memory from row to row.
         origins = np.ndarray(
@@ -214,40 +208,19 @@ class RayCaster:
         return hits
 
     def cast_from_each(self, origins_m: Float32, directions: Float32, limit_m: Float32) -> Hits:
-        """Cast rays with an origin each, none of which lies on a face; see `touched`.
-
-        Args:
-            origins_m: (N, 3) where they start.
-            directions: (3, N) unit directions.
-            limit_m: (N,) distance at which each ray ends; may be infinite.
-        """
+        """Cast (3, N) unit directions from (N, 3) origins up to (N,) limits; none starts on a face, see `touched`."""
         answer = self._scene.run(origins_m, directions.T, dists=limit_m.copy(), output=True)
         return Hits(answer["tfar"], answer["geomID"], answer["primID"])
 
     def struck(self, body: Int32, triangle: Int32, directions: Float32) -> Struck:
-        """What the rays hit that ended on some faces.
-
-        Args:
-            body: (N,) of `Hits`, none of them -1.
-            triangle: (N,) likewise.
-            directions: (3, N) unit directions of these rays.
-        """
+        """What N rays with (3, N) unit directions hit that ended on some faces, as `Hits` has them, none of them -1."""
         face = self._first_face.take(body) + triangle
         (nx, ny, nz), (x, y, z) = self._faces.normals.take(face, axis=1), directions
         cosine = np.abs(nx * x + ny * y + nz * z)
         return Struck(body, triangle, np.minimum(cosine, 1.0, out=cosine), self._materials.take(face))
 
     def faces_met(self, origins_m: NDArray[np.floating], directions: NDArray[np.floating], limit_m: float) -> Int64:
-        """Which face each of some rays meets first, counted through the faces of all bodies.
-
-        Args:
-            origins_m: (N, 3) where they start.
-            directions: (N, 3) unit directions.
-            limit_m: Where they end.
-
-        Returns:
-            (N,) numbers, -1 for none.
-        """
+        """(N,) which face each ray meets first within a limit, counted through those of all bodies; -1 for none."""
         starts_m, towards = origins_m.astype(np.float32), directions.astype(np.float32)
         ends_m = np.full(len(starts_m), limit_m, dtype=np.float32)
         answer = self._scene.run(starts_m, towards, dists=ends_m, output=True)
@@ -302,15 +275,10 @@ class RayCaster:
             rays, travelled_m, range_m, faces = rays[again], travelled_m[again], range_m[again], faces[again]
 
     def met_from_behind(self, origin_m: NDArray[np.floating], directions: Float32) -> Int32:
-        """Which closed bodies rays first meet from behind, as those do that start inside: a sheet has no inside.
+        """(N,) which closed bodies rays first meet from behind, as those do that start inside; else -1.
 
-        Args:
-            origin_m: (3,) common origin of the rays, or (N, 3) of each.
-            directions: (3, N) unit directions.
-
-        Returns:
-            (N,) number of the body of which a ray first hits the back of a face, if that face is one of a closed
-            surface that is turned outwards; else -1.
+        A sheet has no inside: the face is one of a closed surface that is turned outwards. Rays have (3, N) unit
+        directions and one (3,) origin, or (N, 3).
         """
         origins = np.ascontiguousarray(np.broadcast_to(origin_m.astype(np.float32), (directions.shape[1], 3)))
         answer = self._scene.run(origins, directions.T, output=True)

@@ -133,15 +133,7 @@ class Balls(NamedTuple):
 
 
 def unit_directions(elevation_deg: Float64, azimuth_deg: Float64) -> Float64:
-    """Directions from angles.
-
-    Args:
-        elevation_deg: Angle above the x-y plane, of a shape that broadcasts to (rows, columns).
-        azimuth_deg: Angle from x towards y, likewise.
-
-    Returns:
-        (3, rows, columns) float64 unit vectors.
-    """
+    """(3, rows, columns) float64 unit vectors, of elevations above x-y and azimuths from x towards y, in degrees."""
     elevation, azimuth = np.broadcast_arrays(np.deg2rad(elevation_deg), np.deg2rad(azimuth_deg))
     horizontal = np.cos(elevation)
     return np.stack([horizontal * np.cos(azimuth), horizontal * np.sin(azimuth), np.sin(elevation)])
@@ -241,12 +233,7 @@ class Outlines(NamedTuple):
 
 
 def outlines(corners_m: Float64, origin_m: Float64) -> Outlines:
-    """How boxes look from a place.
-
-    Args:
-        corners_m: (P, 8, 3) their corners; or (P, C, 3), those at several times one after the other.
-        origin_m: (3,) the place, in the same frame.
-    """
+    """How boxes with (P, 8, 3) corners, or (P, C, 3) at several times, look from a (3,) place in their frame."""
     ways_m = corners_m - origin_m
     forward = _unit(ways_m.mean(axis=1))
     # Upright bodies fill a pyramid whose sides are upright.
@@ -270,10 +257,9 @@ def outlines(corners_m: Float64, origin_m: Float64) -> Outlines:
 
 
 def _faces_towards(ways_m: Float64) -> Float64:
-    """(P, 4, 3) normals of those faces of boxes whose outer side the place is on: no ray that leaves it turns back.
+    """(P, 4, 3) normals of the faces of boxes whose outer side the place is on: no ray that leaves it turns back.
 
-    Args:
-        ways_m: (P, 8, 3) from the place to the corners, in the order of `Box.corners_m`.
+    `ways_m` (P, 8, 3) lead from the place to the corners, in the order of `Box.corners_m`.
     """
     normals = np.zeros((len(ways_m), 4, 3))
     for axis, across in enumerate((4, 2, 1)):
@@ -285,13 +271,9 @@ def _faces_towards(ways_m: Float64) -> Float64:
 
 
 def boxes_in_cone(outlines: Outlines, axis: Float64, half_angle: float, range_m: float) -> NDArray[np.intp]:
-    """Numbers of the boxes that a ray of a cone may meet before it ends.
+    """Numbers of the boxes that a ray of a cone, `half_angle` radians about its axis, may meet before it ends.
 
-    Args:
-        outlines: The boxes, seen from the tip of the cone.
-        axis: (3,) middle of the cone, in the frame of the boxes.
-        half_angle: Half its opening in radians.
-        range_m: Where its longest ray ends.
+    The boxes are seen from its tip, in whose frame the axis is.
     """
     wider = half_angle + ROUNDING
     # Beyond a right angle no plane has a cone on one side of it.
@@ -300,14 +282,7 @@ def boxes_in_cone(outlines: Outlines, axis: Float64, half_angle: float, range_m:
 
 
 def blocks_towards(outlines: Outlines, tile: Tile, vehicle_R_sensor: Float64, range_m: Float32) -> Bools:
-    """(P, B) whether a ray of each block of a tile may meet each box before it ends.
-
-    Args:
-        outlines: The boxes, seen from the sensor.
-        tile: Rays of the sensor.
-        vehicle_R_sensor: (3, 3) rotation from the sensor's frame to that of the boxes.
-        range_m: (n,) where each of the tile's rays ends.
-    """
+    """(P, B) whether a ray of each block of a tile may meet each box, seen from the sensor, before its (n,) range."""
     ends_m = range_m.take(tile.blocks).max(axis=1)
     normals = (outlines.normals @ vehicle_R_sensor).reshape(-1, 3)
     # No direction between the lower and the upper bounds of a block has a smaller product with a normal.
@@ -321,17 +296,10 @@ def blocks_towards(outlines: Outlines, tile: Tile, vehicle_R_sensor: Float64, ra
 def rays_towards(
     outlines: Outlines, box: NDArray[np.intp], rays: Int64, directions: Float32, range_m: Float32
 ) -> tuple[NDArray[np.intp], Int64]:
-    """Which rays of some blocks may meet a box before they end.
+    """Which rays of some blocks may meet a box before they end: (L,) boxes and (L,) rays, in the order of the blocks.
 
-    Args:
-        outlines: The boxes.
-        box: (K,) number of a box for each block.
-        rays: (K, m) numbers of the rays in the blocks.
-        directions: (3, n) all rays, in the frame of the boxes.
-        range_m: (n,) where they end.
-
-    Returns:
-        Pairs, in the order of the blocks: (L,) number of the box, and (L,) number of the ray.
+    `box` (K,) is the box of each block, `rays` (K, m) those in it; `directions` (3, n) of all are in the frame of the
+    boxes, and `range_m` (n,) is where they end.
     """
     normals, nearest_m = outlines.normals.astype(np.float32), outlines.nearest_m.astype(np.float32)
     across = normals[box] @ directions.take(rays, axis=1).swapaxes(0, 1)

@@ -40,12 +40,9 @@ class ScanEstimate(NamedTuple):
 
 
 def estimate_scan(scans: Sequence[Float64]) -> ScanEstimate | None:
-    """Estimate the scan pattern of a LiDAR; None if its points do not lie in rows.
+    """Estimate a LiDAR's pattern from (N, 3) points of scans in its frame; None if they do not lie in rows.
 
-    A row whose rays all miss everything is not found.
-
-    Args:
-        scans: (N, 3) points of several scans in the frame of the LiDAR, z along the axis that it turns about.
+    The LiDAR turns about z. A row whose rays all miss everything is not found.
 
     Example:
         >>> azimuth, elevation = np.meshgrid(np.deg2rad(np.arange(0.0, 360.0)), np.deg2rad([-20.0, -10.0, -7.0]))

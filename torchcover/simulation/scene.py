@@ -105,12 +105,8 @@ class Scene:
     def surface(self, lower_m: Matrix, upper_m: Matrix, heights_m: tuple[float, float] | None = None) -> SceneSurface:
         """The surface of everything but the ego, for questions about a box that the vehicle carries along.
 
-        It is cut when first asked for, once for each box.
-
-        Args:
-            lower_m: (3,) smallest coordinates of the box in the vehicle frame.
-            upper_m: (3,) largest.
-            heights_m: Lowest and highest above the local ground that are asked about in it; all if not given.
+        It is cut when first asked for, once for each box. `heights_m` are the lowest and highest above the local ground
+        that are asked about in it; all if not given.
         """
         box = (*lower_m.tolist(), *upper_m.tolist(), *(heights_m or ()))
         if box not in self._surfaces:
@@ -154,9 +150,7 @@ class Scene:
     def at(self, step: int, within_m: float = np.inf) -> "Instant":
         """Place everything for one step; the last few are kept, for other rigs that look at them.
 
-        Args:
-            step: Number of time steps since the start of the world.
-            within_m: Moving bodies whose origin is farther from the vehicle than this and their size are left out.
+        Moving bodies whose origin is farther from the vehicle than `within_m` and their size are left out.
 
         Raises:
             ValueError: The bounding box of an actor overlaps that of the ego.
@@ -231,14 +225,8 @@ class Scene:
     ) -> tuple[Float32, ...]:
         """Where the ego's own body ends the rays of a sensor that is fixed to it, for `Instant.scan`.
 
-        Args:
-            vehicle_T_sensor: (4, 4) pose of the sensor.
-            tiles: Its rays, from `into_tiles`.
-            max_range_m: Farther hits are none.
-
-        Returns:
-            For each tile (n,) distances in metres, infinite where the ego is not hit. Nothing at all for an ego that
-            rests: it is part of what never moves, at which the rays are cast anyway.
+        For each tile (n,) metres, infinite where the ego is not hit within the range. Nothing at all for an ego that
+        rests: it is part of what never moves, at which the rays are cast anyway.
         """
         if not self.world.ego.trajectory.moves:
             return ()

@@ -279,13 +279,7 @@ class Ranging(Document):
         return self.erring(hits, None if far_enough.all() else np.flatnonzero(far_enough), draws)
 
     def erring(self, hits: RayHits, hit: Int64 | None, draws: Draws) -> Returns:
-        """Points at some of N hits, with noise and drop-out.
-
-        Args:
-            hits: All of them.
-            hit: (K,) which hits would give a point; None for all.
-            draws: Source of the random numbers.
-        """
+        """Points at some of N hits, (K,) `hit` of them or all, with noise and drop-out."""
         if not self._errs:
             return Returns(hit, None)
         ray, range_m = (hits.ray, hits.range_m) if hit is None else (hits.ray[hit], hits.range_m[hit])

@@ -76,13 +76,10 @@ class MountedSensor:
         self._resting: tuple[SensorScan, RayHits] | None = None
 
     def scan(self, instant: Instant, draws: Draws, *, threads: int = 1, within: Balls | None = None) -> SensorScan:
-        """What it makes of what its rays hit at one time of the scene.
+        """What it makes of what its rays hit at one time of the scene; no number depends on `threads`.
 
-        Args:
-            instant: The scene then.
-            draws: Source of the random numbers, which each ray has of its own if some are not cast.
-            threads: Number of threads; the result does not depend on it.
-            within: What is asked about: rays that hit nothing there need not be cast. The points within are the same.
+        Rays that hit nothing `within` what is asked about need not be cast. The points within are the same: each ray
+        has random numbers of its own in `draws` then.
         """
         scan, hits = self._cast(instant, threads, within)
         if self._is_raw:
@@ -177,13 +174,9 @@ class Sight(NamedTuple):
 
 
 def sight(instant: Instant, place_m: Float64, targets_m: Float32, *, threads: int = 1) -> Sight:
-    """Cast one ray from a place to each of some points; a point is seen if nothing lies in between.
+    """Cast a ray from a (3,) place to each of (N, 3) targets; one is seen if nothing lies in between.
 
-    Args:
-        instant: The scene.
-        place_m: (3,) in the vehicle frame.
-        targets_m: (N, 3) likewise; a little above the surface that they lie on, lest it hides them.
-        threads: Number of threads; the result does not depend on it.
+    Targets lie a little above their surface, lest it hides them. The result does not depend on the number of threads.
     """
     vehicle_T_place, bodies = rigid(np.eye(3), place_m), instant.outlines(place_m)
     way_m = targets_m.T - place_m[:, None]

@@ -66,14 +66,8 @@ def coincident_faces(meshes: Sequence[Mesh], within: Sequence[bool]) -> list[Boo
     """Which faces coincide with another one that looks the same way, or may be seen from both sides, within 1 mm.
 
     Points of the faces are asked; of two surfaces that cover each other in a small part only, that may be overlooked.
-
-    Args:
-        meshes: What never moves, near the origin.
-        within: For each mesh, whether its faces may coincide with each other, too: parts of a vehicle that end in one
-            plane are no lie.
-
-    Returns:
-        One (F,) mask for each mesh.
+    Meshes never move and are near the origin; `within` says of each whether its faces may coincide with each other,
+    too, as of parts of a vehicle that end in one plane. One (F,) mask for each.
     """
     outward = np.concatenate([outward_faces(mesh) for mesh in meshes])
     number = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])

@@ -67,12 +67,7 @@ class StoredWorlds:
         self._drawn_from = ""
 
     def world(self, run: int, ego: Mesh | None) -> World:
-        """That of one run, to the bit as `Scenario.world` builds it.
-
-        Args:
-            run: Which; see `Scenario.locate`.
-            ego: The body of the ego in traffic.
-        """
+        """That of one run, see `Scenario.locate`, to the bit as `Scenario.world` builds it with an ego in traffic."""
         if self._folder is None or ego is None:
             return self._scenario.world(self._seed, run, ego)
         self._drawn_from = self._drawn_from or _drawn_from(self._scenario)

@@ -79,13 +79,10 @@ class AboveGround(NamedTuple):
         return heights
 
     def of_objects(self, patches: Patches, static_T_patches: Float64, corners_m: Float64, count: Int64) -> Patches:
-        """Patches of objects with their heights above the ground that is anywhere below the object.
+        """Patches of objects, one after the other, with heights above the ground anywhere below the object.
 
-        Args:
-            patches: All of one object, then all of the next.
-            static_T_patches: Where their frame is.
-            corners_m: (J, 8, 3) of boxes around the objects in that frame.
-            count: (J,) how many patches each has.
+        `static_T_patches` is where their frame is, in which `corners_m` (J, 8, 3) are of boxes around the objects;
+        `count` (J,) how many patches each has.
         """
         squares_T_patches = self.squares_T_static @ static_T_patches
         corners_m = transform(squares_T_patches, corners_m.reshape(-1, 3)).reshape(-1, 8, 3)
@@ -154,12 +151,9 @@ class SceneSurface:
         return sum(column.nbytes for column in self._static)
 
     def near(self, instant: Instant, boxes: Bounds, objects_within_m: float = -np.inf) -> Patches:
-        """The patches that may meet boxes of the vehicle frame, in that frame, and some that do not.
+        """The patches that may meet boxes of the vehicle frame at an instant, in that frame, and some that do not.
 
-        Args:
-            instant: The scene at one time.
-            boxes: In the vehicle frame.
-            objects_within_m: All patches of an object are there, too, if it may come this near to the vehicle's origin.
+        All patches of an object are there, too, if it may come within `objects_within_m` of the vehicle's origin.
         """
         vehicle_T_static = invert(instant.static_T_vehicle)
         wanted = np.zeros(len(self._static.outward), dtype=bool)
@@ -202,12 +196,7 @@ def placed_each(kinds: Sequence[tuple[Patches, int]], destination_T_source: Floa
 
 
 def bounds_along(static_T_vehicle: Float64, box: Bounds) -> Bounds:
-    """Upright boxes in a frame that holds the drive of a vehicle, around all places of a box that it carries along.
-
-    Args:
-        static_T_vehicle: (T, 4, 4) poses of the vehicle, one after the other.
-        box: One box in the vehicle frame.
-    """
+    """Upright boxes around all places of a box that a vehicle carries along its drive, (T, 4, 4) poses in a row."""
     rotation, half_m = static_T_vehicle[:, :3, :3], (box.upper_m - box.lower_m)[0] / 2
     middle_m = rotation @ (box.lower_m + half_m)[0] + static_T_vehicle[:, :3, 3]
     lower_m, upper_m = middle_m - np.abs(rotation) @ half_m, middle_m + np.abs(rotation) @ half_m

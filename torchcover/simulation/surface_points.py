@@ -66,11 +66,8 @@ class Objects(NamedTuple):
 class SurfaceStrata:
     """A surface, ready to draw points from: evenly within each of some boxes, which may overlap, and on each object.
 
-    Args:
-        patches: The surface in the frame of the boxes.
-        boxes: Strata, half-open: lower bounds belong to them.
-        heights_m: From (K, 3) points to (K,) heights, NaN for none, which the third bounds of the boxes are about, as
-            `Patches.heights_m` are; their z if not given.
+    Boxes are half-open, in the frame of the patches; their third bounds are about what `heights_m` makes of (K, 3)
+    points, (K,), NaN for none, as `Patches.heights_m` are, or about z if it is not given.
     """
 
     def __init__(self, patches: Patches, boxes: Bounds, heights_m: Callable[[Float32], Float32] | None = None) -> None:
@@ -90,14 +87,10 @@ class SurfaceStrata:
     def draw(
         self, place_m: Float64, each: float, generator: np.random.Generator, *, on_objects: int = 0
     ) -> SurfacePoints:
-        """Points on the patches that a place is in front of.
+        """Points on patches that a place is in front of, about `each` a box; below 1, one with that probability.
 
-        Args:
-            place_m: (3,) the place.
-            each: About how many points each box gets; if it is below 1, one with this probability.
-            generator: Source of the random numbers.
-            on_objects: How many more each object gets, wherever it is. One that turns no face to the place gets them
-                on the outer side of all its faces, which hide them.
+        Each object gets `on_objects` more, wherever it is. One that turns no face to the place gets them on the outer
+        side of all its faces, which hide them.
         """
         x, y, z = place_m.tolist()
         height_m = x * self._normals[0] + y * self._normals[1] + z * self._normals[2] - self._plane_m

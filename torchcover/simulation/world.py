@@ -99,16 +99,10 @@ class Label(NamedTuple):
 
 
 def labels(world: World, step: int, within_m: float) -> list[Label]:
-    """All objects near the ego at one step, the ego itself left out.
+    """All objects near the ego at one step, in the order of the world; the ego itself is left out.
 
-    Args:
-        world: The world.
-        step: Number of time steps since its start.
-        within_m: An object is near if the origin of its frame is, measured over ground.
-
-    Returns:
-        One label an object, in the order of the world. Boxes stand upright in the vehicle frame: a body that tilts
-        against the ego by a degree leaves its box by a few centimetres.
+    An object is near if the origin of its frame is, over ground. Boxes stand upright in the vehicle frame: a body that
+    tilts against the ego by a degree leaves its box by a few centimetres.
     """
     time_s = step * world.time_step_s
     world_T_vehicle = world.ego.trajectory.at(time_s)

@@ -25,9 +25,7 @@ SCALES_M = tuple(CELL_M * factor for factor in (16.0, 8.0, 4.0, 2.0, 1.0))
 def ground_below(places_m: Float64, ego_m: Float64) -> Plain | Slopes:
     """The ground around the ego's way: plain if everybody stands at one height.
 
-    Args:
-        places_m: (N, 3) on which others stood; some may be wrong.
-        ego_m: (T, 3) on which the ego stood: these are believed.
+    The (T, 3) places on which the ego stood are believed; of the (N, 3) of others some may be wrong.
     """
     margin_m = HORIZON_M + MARGIN_M
     lower_m, upper_m = ego_m[:, :2].min(axis=0) - margin_m, ego_m[:, :2].max(axis=0) + margin_m

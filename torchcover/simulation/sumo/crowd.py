@@ -85,14 +85,8 @@ def crowd(
 ) -> Crowd:
     """Choose the ego, and leave out whoever never comes near.
 
-    Args:
-        recorded: What the simulation had.
-        known: Its types.
-        fleet: Our bodies.
-        ego_name: Which one the ego is; drawn if not given.
-        ego_type: Of which type it is, if it is drawn; any car if not given.
-        duration_s: Of the run.
-        generator: Draws the ego, in proportion to the ways that vehicles drive.
+    The ego is the one of a name; else it is drawn in proportion to the ways that vehicles drive, of one type or of all
+    cars.
 
     Raises:
         ValueError: Nobody who may be the ego is there for the whole run.

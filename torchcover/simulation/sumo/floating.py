@@ -47,13 +47,7 @@ class SumoTrack(NamedTuple):
 
 
 class TimeWindow(NamedTuple):
-    """What of the data is meant.
-
-    Args:
-        begin_s: Its first time, in that of the simulation.
-        duration_s: Its length.
-        from_name: It begins when this one is heard of, if that is later.
-    """
+    """What of the data is meant: from `begin_s` of the simulation, or from when `from_name` is heard of, if later."""
 
     begin_s: float
     duration_s: float
@@ -158,11 +152,7 @@ class Recorded(NamedTuple):
 
 
 def record(pieces: Iterable[bytes], window: TimeWindow) -> Recorded:
-    """Read floating car data.
-
-    Args:
-        pieces: XML as SUMO writes it; no more of it is asked for than the window needs.
-        window: What is kept of it.
+    """Read floating car data from pieces of XML, no more of which are asked for than the window needs.
 
     Raises:
         ValueError: Not such data, or without angles.

@@ -32,13 +32,9 @@ BODIES_AT_ONCE = 256
 
 
 class RoadUser(NamedTuple):
-    """Somebody, and the body that stands for it.
+    """Somebody, where their front is, the length that the simulation takes them for, and the body that stands for them.
 
-    Args:
-        track: Where its front is.
-        kind: Of its body.
-        length_m: That the simulation takes it for.
-        sizes_m: Lengths and widths of the body, and of what it draws along.
+    `sizes_m` are lengths and widths of the body, and of what it draws along.
     """
 
     track: SumoTrack
@@ -108,7 +104,7 @@ def motions(
         duration_s: Of the run, from 0 on.
         origin_m: (2,) what is subtracted of all places.
         obstacles: Polygons in plan, of pavements and what is parked: vehicles swing out for them where they can.
-        walked: Likewise what people walk on: who is beside it goes along its edge instead, where there is time to.
+        walked: What people walk on: who is beside it goes along its edge instead, where there is time to.
     """
     shapely.prepare(walked)
     times_s = np.linspace(0.0, duration_s, int(np.ceil(duration_s / FINE_S - TIME_SLACK_S)) + 1)
@@ -215,8 +211,7 @@ def _keep_off(
 def possible(bodies: Sequence[Motion]) -> list[Motion]:
     """Those that can be, and are never where another one is: of two that meet the one stays that meets fewer.
 
-    Args:
-        bodies: Some, of which the first is there all the time, and stays.
+    The first is there all the time, and stays.
     """
     bodies = [bodies[0], *(body for body in bodies[1:] if body.can_be)]
     meets = np.zeros((len(bodies), len(bodies)), dtype=bool)

@@ -30,13 +30,7 @@ OFF_STREET_M = 10.0
 
 
 class Vicinity:
-    """A piece of a network.
-
-    Args:
-        network: All of it.
-        way_m: (T, 2) the ego's way.
-        origin_m: (2,) what is subtracted of all coordinates, in float64; the way is given without it.
-    """
+    """A piece of a network, near the ego's (T, 2) way, of whose places `origin_m` (2,) was subtracted in float64."""
 
     def __init__(self, network: Network, way_m: Float64, origin_m: Float64) -> None:
         self.way = shapely.LineString(way_m if len(way_m) > 1 else np.repeat(way_m, 2, axis=0)).simplify(WAY_WITHIN_M)

@@ -115,13 +115,9 @@ def squared_distances(places_m: Float64, others_m: Float64) -> Float64:
 
 
 class Beside:
-    """A line that keeps its distance from the middle of a street, with a way of its own.
+    """A line `left_m` to the left of the middle of a street, that follows it (`way` 1) or runs against it (-1).
 
-    Args:
-        street: The street.
-        left_m: How far to the left of its middle.
-        way: 1 to follow it, -1 to run against it.
-        reach_m: The line begins so far before station 0, and ends as far behind.
+    It begins `reach_m` before station 0, and ends as far behind.
     """
 
     closed = False

@@ -36,12 +36,9 @@ DRAWS: Mapping[str, Hitch] = {"truck": Hitch("trailer", 4.925, -1.175, 8.41, 5.2
 
 
 def rears_of(kinds: Sequence[str], poses: Sequence[Float64], start: Sequence[float] | None = None) -> list[Float64]:
-    """(T, 3) poses of what N bodies draw along, x, y and heading in radians.
+    """(T, 3) poses x, y and heading in radians of what N bodies of these kinds draw along, whose own are likewise.
 
-    Args:
-        kinds: Of the bodies, each of which draws something.
-        poses: Of each (T, 3) likewise; T may differ.
-        start: Headings of the rears at first; straight behind if not given.
+    T may differ. `start` are headings of the rears at first; straight behind if not given.
     """
     if not kinds:
         return []
@@ -62,15 +59,10 @@ def together(ways_m: Sequence[Float64]) -> Float64:
 
 
 def tractrix(lead_m: Float64, length_m: Float64, yaw: Float64) -> Float64:
-    """Headings of rods that are drawn along at their front end, exactly for ways of straight pieces.
+    """(T, N) headings in radians, without leaps, of N rods that are drawn along at their front ends, (T, N, 2).
 
-    Args:
-        lead_m: (T, N, 2) where the front ends go.
-        length_m: (N,) of the rods; their rear ends never slip sideways.
-        yaw: (N,) headings at first, in radians.
-
-    Returns:
-        (T, N) headings, without leaps: with the angle a between rod and way, tan(a / 2) falls by exp(-way / length).
+    Their rear ends never slip sideways. Exact for ways of straight pieces: with the angle a between rod and way, tan(a
+    / 2) falls by exp(-way / length).
     """
     ways_m = np.diff(lead_m, axis=0)
     towards = np.arctan2(ways_m[..., 1], ways_m[..., 0])

@@ -112,15 +112,7 @@ def ego_actor(
 def actors(
     times_s: Float64, found: Sequence[Paths], ego: Actor, fleet: Fleet, hills: Hills | None = None
 ) -> tuple[Actor, ...]:
-    """All who ever come near the ego; the ego itself is left out.
-
-    Args:
-        times_s: (T,) times.
-        found: Who there is, in groups; NaN where somebody is not there.
-        ego: The ego.
-        fleet: Their bodies.
-        hills: What they stand on; on a plain if there are none.
-    """
+    """All who ever come near the ego, in groups; the ego itself is left out. NaN where somebody is not there."""
     near: list[Actor] = []
     for group in found:
         # On the level, and one axis after the other: hills come later, and this is done for very many.
@@ -156,21 +148,12 @@ def actors(
 def attitude(
     times_s: Float64, way_m: Float64, speed_mps: Float64, yaw_deg: Float64, generator: np.random.Generator
 ) -> Float64:
-    """Yaw, pitch and roll of a car about the point on the road under its middle.
+    """(T, 3) yaw, pitch and roll in degrees of a car about the point on the road under its middle.
 
     The wheels of a car pivot about a point midway between the axles, so a pitch of 1 degree lifts or lowers them by
     under 3 cm: the springs' stroke, which a rigid body has to show at its wheels. |pitch| < 2 and |roll| < 1.5 degrees.
-
-    Args:
-        times_s: (T,) evenly spaced times.
-        way_m: (T,) way driven; the road's unevenness depends on it alone, so a standing car does not rock.
-        speed_mps: (T,) speed.
-        yaw_deg: (T,) heading.
-        generator: Draws the unevenness of the road.
-
-    Returns:
-        (T, 3) yaw, pitch and roll in degrees. Braking turns the nose down (positive pitch); in a left-hand curve the
-        right side goes down (positive roll).
+    Braking turns the nose down (positive pitch); in a left-hand curve the right side goes down (positive roll). The
+    road's unevenness depends on the way alone, so a standing car does not rock. Times are evenly spaced.
     """
     forward = np.gradient(speed_mps, times_s)
     leftward = speed_mps * np.gradient(np.unwrap(np.deg2rad(yaw_deg)), times_s)

@@ -146,17 +146,11 @@ class City:
                 )
 
     def _far_kerb(self, index: int, face_m: Float64, inwards: int) -> Float64:
-        """The kerb of a street that goes straight on where the main street turns away.
+        """(K, 2) places at the kerb of a street that goes straight on where the main street turns away, at a junction.
 
-        People walk around the turn on the level, between what lies beside that street and the main street.
-
-        Args:
-            index: Number of the junction.
-            face_m: (K, 2) places along the end of the block beside it, away from the main street.
-            inwards: 1 at the beginning of that block, -1 at its end.
-
-        Returns:
-            (K, 2) places as far away from the main street.
+        People walk around the turn on the level, between what lies beside that street and the main street. They are as
+        far away from that as `face_m` (K, 2), at the end of the block beside it: `inwards` is 1 at its beginning, -1 at
+        its end.
         """
         street, turn = self._streets.crossing[index], int(self._streets.course.turns[index])
         kerb_m = float(self._streets.cross_lanes_each_way[index]) * self._section.lane_m + GUTTER_M

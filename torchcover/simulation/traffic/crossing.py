@@ -14,13 +14,7 @@ MAX_STAY_S = 12.0
 
 @dataclass(frozen=True, eq=False)
 class Footpath:
-    """A straight way from one waiting place to another.
-
-    Args:
-        start_m: (2,) one waiting place.
-        end_m: (2,) the other.
-        kerb_m: How far behind a waiting place the kerb is, at both ends; without one the path is level.
-    """
+    """A straight way from one (2,) waiting place to another, with a kerb `kerb_m` behind both, or none."""
 
     start_m: Float64
     end_m: Float64
@@ -32,15 +26,9 @@ class Footpath:
         return float(np.linalg.norm(self.end_m - self.start_m))
 
     def poses(self, share: Float64, back: Bools, body_radius_m: float) -> tuple[Float64, Float64]:
-        """Where somebody is who has gone a share of the way.
+        """(T, 3) positions and (T,) headings in degrees of who has gone (T,) shares of the way, forth or back.
 
-        Args:
-            share: (T,) 0 at the start, 1 at the end.
-            back: (T,) whether they face the start.
-            body_radius_m: How far the body reaches from its middle: it steps down when all of it is past the kerb.
-
-        Returns:
-            (T, 3) positions and (T,) headings in degrees.
+        The body steps down when all of it, so far from its middle, is past the kerb.
         """
         way = self.end_m - self.start_m
         yaw = np.rad2deg(np.arctan2(way[1], way[0])) + 180.0 * back
@@ -60,18 +48,9 @@ def walk(
     body_radius_m: float,
     generator: np.random.Generator,
 ) -> tuple[Float64, Float64]:
-    """Go to and fro on a path, setting off only when one may.
+    """Go to and fro on a path, `crossing_s` each way: (T, 3) positions and (T,) headings in degrees at even times.
 
-    Args:
-        path: The path.
-        may_go: (T,) whether who sets off at this time finds the way free until the end.
-        crossing_s: How long it takes from one end to the other.
-        times_s: (T,) evenly spaced times.
-        body_radius_m: How far the body reaches from its middle.
-        generator: Draws the stays and which side is first.
-
-    Returns:
-        (T, 3) positions and (T,) headings in degrees.
+    One sets off only when one may, (T,), as who does then finds the way free until the end.
     """
     count, step_s = len(may_go), float(times_s[1] - times_s[0])
     chances = np.flatnonzero(may_go)

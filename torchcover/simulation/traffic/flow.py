@@ -75,13 +75,7 @@ class Flow(NamedTuple):
 
 
 class Simulation:
-    """N agents on L lanes.
-
-    Args:
-        lanes: The lanes.
-        agents: Who follows them; they must not overlap, nor stand on a junction.
-        signals: The lights of all junctions that gates name.
-    """
+    """N agents, who must not overlap, nor stand on a junction, on L lanes."""
 
     def __init__(self, lanes: Sequence[Lane], agents: Sequence[Agent], signals: Signals) -> None:
         self.place_m = np.array([agent.place_m for agent in agents], dtype=np.float64)

@@ -116,14 +116,10 @@ def sides_around(
     built_share: float,
     generator: np.random.Generator,
 ) -> list[Side]:
-    """The sides of all streets that are known in plan only.
+    """The sides of all streets that are known in plan only, a drawn share of them built up.
 
-    Args:
-        street: What is driven and walked on.
-        off_m: How far beyond its edge kerb furniture begins, and how far what stands behind it.
-        sees: Which of (N, 2) places matter.
-        built_share: Share of the sides that are built up.
-        generator: Draws which.
+    `off_m` is how far beyond its edge kerb furniture begins, and what stands behind it; `sees` which (N, 2) places
+    matter.
     """
     sides: list[Side] = []
     for number, away_m in enumerate(off_m):
@@ -156,7 +152,7 @@ def stand(
     times: float | Mapping[str, float],
     generator: np.random.Generator,
 ) -> tuple[list[Mesh], list[Mesh]]:
-    """Draw what stands along the sides of streets.
+    """Draw what stands along the sides of streets: houses and all else, each kind in one mesh.
 
     Args:
         sides: The sides.
@@ -166,9 +162,6 @@ def stand(
         heights_m: Of the ground, at (N, 2) places.
         times: See `Times`.
         generator: Draws it.
-
-    Returns:
-        Houses and all else, each kind in one mesh.
     """
     if not sides:
         return [], []

@@ -56,13 +56,9 @@ class Driver:
 
 
 def tightness(driver: Driver, speed_mps: Float64, gap_m: Float64, closing_mps: Float64) -> Float64:
-    """The gap that N drivers would like to have as a multiple of the one that they have.
+    """The gap that N drivers would like to have as a multiple of the one that they have, which may be infinite.
 
-    Args:
-        driver: The drivers.
-        speed_mps: (N,) their speeds.
-        gap_m: (N,) free road to the one ahead, bumper to bumper; infinite on an empty road.
-        closing_mps: (N,) own speed minus that of the one ahead.
+    `closing_mps` (N,) is their own speed minus that of the one ahead.
     """
     # In place, here and below: what is written anew has to come from farther away than what was read just now.
     gaps = speed_mps * closing_mps
@@ -100,20 +96,11 @@ def laden_mps2(speed_mps: Float64, slope: Float64) -> Float64:
 
 
 def advance(speed_mps: Float64, acceleration_mps2: Float64, room_m: Float64, step_s: float) -> tuple[Float64, Float64]:
-    """Move N drivers on by one step of constant acceleration (the ballistic update).
+    """(N,) ways in metres and (N,) new speeds after one step of constant acceleration (the ballistic update).
 
-    A driver who comes to a stop within the step stays there instead of driving backwards, and nobody goes farther
-    than the room that was free when the step began: those ahead do not drive backwards either, so no step of any
-    length leads through them.
-
-    Args:
-        speed_mps: (N,) speeds.
-        acceleration_mps2: (N,) accelerations.
-        room_m: (N,) how far each may go at most; infinite on an empty road.
-        step_s: Length of the step.
-
-    Returns:
-        (N,) ways in metres and (N,) new speeds.
+    A driver who comes to a stop within the step stays there instead of driving backwards, and nobody goes farther than
+    the room (N,) that was free when the step began: those ahead do not drive backwards either, so no step of any length
+    leads through them.
     """
     end_speed = acceleration_mps2 * step_s
     end_speed += speed_mps

@@ -37,14 +37,7 @@ class Polyline:
         return float(self.arc_m[-1])
 
     def poses(self, place_m: ArrayLike) -> Float64:
-        """Where one is after a way along the line.
-
-        Args:
-            place_m: (...) ways from the start; on a loop of any size.
-
-        Returns:
-            (..., 3) x and y in metres, and yaw in degrees.
-        """
+        """(..., 3) x and y in metres, and yaw in degrees, after (...) ways along the line; on a loop of any size."""
         place = np.asarray(place_m, dtype=np.float64)
         place = np.mod(place, self.length_m) if self.closed else place
         segment = np.clip(np.searchsorted(self.arc_m, place, side="right") - 1, 0, len(self.arc_m) - 2)

@@ -69,14 +69,9 @@ def roadside(
     span_m: tuple[float, float],
     generator: np.random.Generator,
 ) -> Scenery:
-    """The ground, and what stands along the part of the road that the ego gets to see.
+    """The ground, and what stands along the part of the road from one station to another.
 
-    Args:
-        middle: Of the median.
-        sides: The side lanes, on the left (1) and on the right (-1).
-        hills: The ground.
-        span_m: The stations of that part.
-        generator: Draws what stands there.
+    `middle` is that of the median, `sides` are the side lanes on the left (1) and on the right (-1).
     """
     way_m = middle.poses(np.arange(span_m[0], span_m[1] + 50.0, 50.0), 0.0)[:, :2]
     plain = (way_m.min(axis=0) - GROUND_M, way_m.max(axis=0) + GROUND_M)

@@ -35,12 +35,7 @@ def ground(lower_m: ArrayLike, upper_m: ArrayLike) -> Mesh:
 
 
 def prism(outlines_m: Sequence[ArrayLike], heights_m: Sequence[float]) -> Mesh:
-    """A closed body through convex outlines at ascending heights.
-
-    Args:
-        outlines_m: One (K, 2) outline for each height, counter-clockwise from above.
-        heights_m: Their z.
-    """
+    """A closed body through convex (K, 2) outlines, counter-clockwise from above, at ascending heights."""
     outlines = np.array(outlines_m, dtype=np.float64)
     levels, corners, _ = outlines.shape
     rings = np.empty((levels, corners, 3))
@@ -61,12 +56,9 @@ def block(x_m: tuple[float, float], y_m: tuple[float, float], z_m: tuple[float, 
 
 
 def slab(corners_m: Float64, z_m: tuple[float, float]) -> Mesh:
-    """A closed body between two heights over a net.
+    """A closed body between two heights over a net with (rows, columns, 2) corners, which may bend.
 
-    Args:
-        corners_m: (rows, columns, 2) corners of the net, which may bend; seen from above, columns are to the left of
-            rows.
-        z_m: Its lower and its upper side.
+    Seen from above, columns are to the left of rows.
     """
     rows, columns, _ = corners_m.shape
     number = np.arange(rows * columns).reshape(rows, columns)

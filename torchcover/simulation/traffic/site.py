@@ -40,14 +40,7 @@ def bent(street: Alignment, hills: Hills, pieces: Sequence[Mesh]) -> list[Mesh]:
 
 
 class BuildingSite:
-    """The places along a street: a station, and how far to the left.
-
-    Args:
-        street: The street.
-        territory: What belongs to it.
-        hills: The ground.
-        deep_m: How far from its middle it is built at most.
-    """
+    """The places along a street, up to `deep_m` from its middle: a station, and how far to the left."""
 
     def __init__(self, street: Alignment, territory: Territory, hills: Hills, deep_m: float) -> None:
         self.street = street

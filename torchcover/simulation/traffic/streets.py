@@ -42,14 +42,7 @@ BUS_HALF_M, BUS_M = 6.0, 2.65
 
 @dataclass(frozen=True)
 class Section:
-    """The main street from its middle to the houses; all streets have lanes of one width.
-
-    Args:
-        lanes_each_way: For motor traffic.
-        lane_m: Their width.
-        bay_m: Width of the parking bays; 0 if there are none.
-        sidewalk_m: Width of the sidewalk.
-    """
+    """The main street from its middle to the houses: lanes of one width, as all streets have, bays (or 0), sidewalk."""
 
     lanes_each_way: int
     lane_m: float = 3.25
