@@ -28,7 +28,7 @@ from torchcover.placement.report_files import PlacementReport
 from torchcover.placement.subsets import Candidates, Limits, Subset, best, best_of_several, random_subsets
 from torchcover.report import ChoiceSize, PageTable, Words, draw_choice, file_stems
 from torchcover.simulation import Rig, Sensor
-from torchcover.simulation.reference_sensor import DEFAULT_BAND_FRAME
+from torchcover.simulation.regions_of_interest import DEFAULT_BAND_FRAME
 
 # Random choices that keep to the limits, as a control.
 DRAWN = 1000

@@ -13,7 +13,7 @@ from torchcover.placement.common_instants import EVERY_S, MEASURES, PER_WORLD, R
 from torchcover.placement.optimisers import AUTO, OPTIMISERS, MakesOptimiser, optimiser_for
 from torchcover.placement.space import SearchSpace
 from torchcover.placement.variables import FreeChoice
-from torchcover.simulation.reference_sensor import DEFAULT_BAND_FRAME
+from torchcover.simulation.regions_of_interest import DEFAULT_BAND_FRAME
 
 FRESH_WORLDS = 16
 

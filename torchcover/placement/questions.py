@@ -108,7 +108,9 @@ class Questions(NamedTuple):
 
     def reference_sensor(self, rays: int) -> SurfaceReference:
         """One that is aimed at what is asked about."""
-        return SurfaceReference.from_rays(self.areas, rays, tuple(self.grid.heights.values()), self.grid.band_frame)
+        return SurfaceReference(
+            self.areas, rays, bands_m=tuple(self.grid.heights.values()), band_frame=self.grid.band_frame
+        )
 
     def asked(self, points: Tensor, height: Tensor | None = None) -> Tensor:
         """(M,) bool: which of (M, 3) points lie in a region and band that is asked about, or any for other metrics.

@@ -3,7 +3,6 @@
 Another pattern is a class with the members of `ReferenceSensor` and a line in `kinds.py`.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple, Protocol, Self
@@ -14,21 +13,12 @@ from torchcover.coverage.grid import BandFrame
 from torchcover.geometry import BoundingBox
 from torchcover.geometry.arrays import Float32, Float64, Int64
 from torchcover.simulation.instant import Instant
+from torchcover.simulation.regions_of_interest import Asked
 from torchcover.simulation.scene import Scene
-
-# A rectangle of the ground in the vehicle frame in metres: ((x_low, x_high), (y_low, y_high)).
-Area = tuple[tuple[float, float], tuple[float, float]]
-Areas = tuple[Area, ...]
-# Heights in the vehicle frame in metres: (low, high) of each.
-Bands = tuple[tuple[float, float], ...]
 
 # From the ego's bounding box and the random numbers to a (4, 4) pose in the vehicle frame.
 DrawPose = Callable[[BoundingBox, np.random.Generator], Float64]
 
-# What height bands are over, where nothing else is said.
-DEFAULT_BAND_FRAME: BandFrame = "ground"
-# The paper's heights: ground, and what stands on it.
-PAPER_BANDS_M: Bands = ((-0.5, 0.5), (0.5, 2.0))
 # A place inside a body is drawn again, at most this often.
 MAX_DRAWS = 100
 
@@ -119,20 +109,12 @@ class ReferenceSensor(Protocol):
         ...
 
     @classmethod
-    def from_rays(
-        cls,
-        areas: Areas,
-        rays: int | None,
-        bands_m: Bands = PAPER_BANDS_M,
-        band_frame: BandFrame = DEFAULT_BAND_FRAME,
-    ) -> Self:
+    def from_rays(cls, asked: Asked, rays: int | None) -> Self:
         """The sensor for a question.
 
         Args:
-            areas: The rectangles of the ground that are asked about; they may overlap.
+            asked: Its areas, heights and what these are measured from.
             rays: About how many rays it casts at a step; None for the number that it does best with.
-            bands_m: The heights that are asked about; they may overlap too.
-            band_frame: What they are measured from: "ground", the local ground, or "vehicle", z = 0 of its frame.
 
         Raises:
             ValueError: Areas or a number of rays that it cannot do with.
@@ -167,15 +149,6 @@ class ReferenceSensor(Protocol):
             ValueError: There is no place for it that is not inside a body.
         """
         ...
-
-
-def check_areas(areas: Areas) -> None:
-    """Refuse areas that ask nothing."""
-    if not areas:
-        raise ValueError("areas: at least one rectangle ((x_low, x_high), (y_low, y_high)) is needed")
-    for area in areas:
-        if not all(-math.inf < low < high < math.inf for low, high in area):
-            raise ValueError(f"areas: finite bounds, lower first, are needed; got {area}")
 
 
 def check_reach(shell_m: float, max_range_m: float) -> None:

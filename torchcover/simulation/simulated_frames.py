@@ -310,8 +310,7 @@ def reference_called(name: str | None = None, rays: int | None = None, asked: As
     kind = REFERENCE_SENSORS.get(DEFAULT_REFERENCE if name is None else name)
     if kind is None:
         raise ValueError(f"reference {name}: {' or '.join(f'`{known}`' for known in REFERENCE_SENSORS)} is needed")
-    asked = asked or RegionsOfInterest().around()
-    return kind.from_rays(asked.areas, rays, asked.bands_m, asked.grid.band_frame)
+    return kind.from_rays(asked or RegionsOfInterest().around(), rays)
 
 
 def reference_of_objects(asked: Asked | None = None) -> SurfaceReference:
@@ -324,10 +323,7 @@ def reference_of_objects(asked: Asked | None = None) -> SurfaceReference:
         >>> reference_of_objects().object_points
         64
     """
-    asked = asked or RegionsOfInterest().around()
-    return SurfaceReference(
-        asked.areas, bands_m=asked.bands_m, object_points=OBJECT_POINTS, band_frame=asked.grid.band_frame
-    )
+    return replace(SurfaceReference.from_rays(asked or RegionsOfInterest().around(), None), object_points=OBJECT_POINTS)
 
 
 def _rigs(rig: Rig | str | Path | None, rigs: Mapping[str, Rig | str | Path] | None) -> dict[str, Rig]:
