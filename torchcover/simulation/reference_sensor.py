@@ -106,7 +106,6 @@ class ReferenceSensor(Protocol):
     @property
     def band_frame(self) -> BandFrame:
         """What its height bands are over: "ground" if all of its scans have heights, "vehicle" if none has."""
-        ...
 
     @classmethod
     def from_rays(cls, asked: Asked, rays: int | None) -> Self:
@@ -119,22 +118,18 @@ class ReferenceSensor(Protocol):
         Raises:
             ValueError: Areas or a number of rays that it cannot do with.
         """
-        ...
 
     @property
     def rays(self) -> int:
         """About how many rays it casts at a step: asked before it is made to scan."""
-        ...
 
     @property
     def shell_m(self) -> float:
         """How far its places lie from the ego's bounding box in metres, at most."""
-        ...
 
     @property
     def max_range_m(self) -> float:
         """What is farther from its place, in metres, gives no point."""
-        ...
 
     def scan(self, surroundings: Surroundings) -> ReferenceScan:
         """What it sees at one step.
@@ -148,7 +143,6 @@ class ReferenceSensor(Protocol):
         Raises:
             ValueError: There is no place for it that is not inside a body.
         """
-        ...
 
 
 def check_reach(shell_m: float, max_range_m: float) -> None:

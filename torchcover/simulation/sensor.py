@@ -125,67 +125,54 @@ class Sensor(Protocol):
     @property
     def name(self) -> str:
         """What maps and messages call it; another one for each sensor of a rig."""
-        ...
 
     @property
     def mount(self) -> Pose:
         """`vehicle_T_sensor`; the sensor's frame is x forward, y left, z up."""
-        ...
 
     @property
     def horizontal_fov_deg(self) -> float:
         """Angle that its rays span, seen from above; 360 for a full turn."""
-        ...
 
     @property
     def min_range_m(self) -> float:
         """Closer hits give no point."""
-        ...
 
     @property
     def max_range_m(self) -> float:
         """Farther hits give no point; so far its rays are cast."""
-        ...
 
     @property
     def rate_hz(self) -> float:
         """How often it looks in a second."""
-        ...
 
     @property
     def housing(self) -> Sequence[Body]:
         """What it is built into, in its own frame: the other sensors of its rig see that, and it looks out of it."""
-        ...
 
     @property
     def is_exact(self) -> bool:
         """Whether it measures the same thing alike at any time: its measuring draws no random numbers."""
-        ...
 
     @property
     def rays(self) -> int:
         """How many rays `directions` has, NaN ones included: asked before it is called."""
-        ...
 
     def directions(self) -> Float64:
         """(3, rows, columns) unit directions in the sensor's frame; NaN where there is no ray."""
-        ...
 
     @property
     def counts_as(self) -> int:
         """How many points each of its points is counted as on a body: of a camera, pixels of the full image."""
-        ...
 
     def times_s(self) -> Float64 | None:
         """(rows, columns) when each ray is cast, after the time of the frame; None if all are at that time."""
-        ...
 
     def beams(self) -> Int64 | None:
         """(rows, columns) the number of the beam that each ray is part of; None if each is a beam of its own.
 
         What the rays of one beam hit is measured together; what those of others hit changes nothing about it.
         """
-        ...
 
     def measure(self, hits: RayHits, draws: Draws) -> Returns:
         """What it makes of the hits of its rays.
@@ -194,7 +181,6 @@ class Sensor(Protocol):
             hits: All hits of each beam that has one.
             draws: Source of all random numbers.
         """
-        ...
 
 
 class ScanTimes(Document):
