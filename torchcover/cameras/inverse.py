@@ -208,18 +208,10 @@ class _ImplicitSolution(torch.autograd.Function):
 def attach_gradients(
     solver: Distortion, distortion: Distortion, a: Tensor, b: Tensor, u: Tensor, v: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Make a solution a function of the coefficients in `distortion` and of the images (u, v).
+    """Make answered points `a`, `b` (N,) a function of the coefficients in `distortion` and of their images (u, v).
 
-    Args:
-        solver: The distortion with coefficients that are floats.
-        distortion: The same with coefficients that may require gradients.
-        a: (N,) answered points, from `solve`.
-        b: (N,) likewise.
-        u: (N,) their images, with their graph.
-        v: (N,) likewise.
-
-    Returns:
-        `a`, `b` (N,) with first-order gradients; second-order ones raise.
+    `solver` is the same distortion with coefficients that are floats. Gradients are of first order; second-order ones
+    raise.
     """
     at = solver.linearise(a.numpy(force=True), b.numpy(force=True))
     rows = np.stack((at.u_a, at.u_b, at.v_a, at.v_b), axis=-1).reshape(-1, 2, 2)

@@ -32,12 +32,7 @@ class CellMeans(NamedTuple):
 
 
 def mean_per_cell(cell: Tensor, values: Tensor, weights: Tensor | None = None) -> CellMeans:
-    """Mean of each value over the points of each cell, summed in float64.
-
-    Args:
-        cell: (N,) int64 cell numbers.
-        values: (V, N) one row a value, one column a point.
-        weights: (N,) positive weight of each point; all the same if not given.
+    """Mean of each of (V, N) values over the points of each cell, summed in float64; all weigh alike if not told.
 
     Example:
         >>> means = mean_per_cell(torch.tensor([4, 4, 7]), torch.tensor([[1.0, 3.0, 5.0]]))

@@ -11,13 +11,9 @@ from torchcover.geometry.rigid import Matrix, transform
 
 
 def upright_rows(centre_m: ArrayLike, size_m: ArrayLike, heading: ArrayLike, vehicle_T_source: Matrix | None) -> Tensor:
-    """(K, 7) rows of boxes in the vehicle frame; what leans is put upright, its heading kept.
+    """(K, 7) rows of boxes in the vehicle frame; what leans is put upright, its heading, (K, 3) vectors, kept.
 
-    Args:
-        centre_m: (K, 3) centres in the source frame.
-        size_m: (K, 3) length, width, height.
-        heading: (K, 3) vectors along the length, in the source frame.
-        vehicle_T_source: (4, 4) where that frame is; None: it is the vehicle frame.
+    `vehicle_T_source` is where the frame of the centres and headings is; None: it is the vehicle frame.
 
     Raises:
         ValueError: Numbers that are not finite, or shapes that do not fit.

@@ -278,10 +278,6 @@ def unit_words(unit: str) -> str:
 def told(gain: FreshGain, *, optimism: bool = False) -> str:
     """A gain in words, which call it one only where it is told from chance: by Student's t at 95 %.
 
-    Args:
-        gain: It.
-        optimism: Whether to say how much more the search had promised.
-
     Example:
         >>> from torchcover.coverage.quantity import detection
         >>> test = Difference(detection(0.4), 0.0132, 0.0024, 0.0081, 0.0183, significant=True, blocks=16, better=16)

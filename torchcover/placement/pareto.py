@@ -56,14 +56,10 @@ def hypervolume(values: Float64, reference: Float64) -> float:
 
 
 def chebyshev(values: Float64, weights: Float64) -> Float64:
-    """One number of several objectives: the least weighted one, and a little of their sum.
+    """(candidates,) one number of several objectives: the least weighted one, and a little of their sum.
 
-    Args:
-        values: (candidates, objectives), in units that can be compared.
-        weights: (objectives,), positive; they add up to 1.
-
-    Returns:
-        (candidates,). Higher is better; whatever has the highest is dominated by none.
+    `values` (candidates, objectives) are in units that can be compared; weights are positive and add up to 1. Higher is
+    better; whatever has the highest is dominated by none.
 
     Example:
         >>> chebyshev(np.array([[1.0, 0.0], [0.4, 0.4]]), np.array([0.5, 0.5]))

@@ -29,11 +29,9 @@ class Prefix(NamedTuple):
 
 
 def gains(estimate: Estimate, other: Estimate) -> tuple[Float64, Float64]:
-    """What one rig has better than another after the same instants, and the standard errors of that.
+    """(O,) what one rig has better than another after the same instants, and (O,) standard errors of that over worlds.
 
-    Returns:
-        (O,) gains in the units of the objectives, more is better; NaN where one is unknown. (O,) errors over worlds;
-        NaN for fewer than 3.
+    In the units of the objectives, more is better; NaN where one is unknown, and errors for fewer than 3 worlds.
     """
     between = estimate.minus(other)
     sign = [quantity.gain(1.0) for quantity in between.quantities]

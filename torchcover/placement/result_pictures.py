@@ -26,8 +26,7 @@ MOST_VALUES, MOST_SLICES = 1000, 12
 def search_pictures(search: PlacementSearch, best: Evaluation | None) -> Iterator[tuple[str, str, Figure]]:
     """How the search went, what each variable does to each objective, and what objectives cost each other.
 
-    Returns:
-        Stem of the file, what it shows, and a figure of its own, outside pyplot.
+    Each is the stem of its file, what it shows, and a figure of its own, outside pyplot.
     """
     names, title = list(search.space.objectives), search.space.name
     quantities = search.evaluations[0].prefixes[-1].estimate.quantities[: len(names)]

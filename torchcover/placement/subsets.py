@@ -301,14 +301,7 @@ def _cliques(apart: Bools) -> Iterable[list[int]]:
 
 
 def random_subsets(candidates: Candidates, limits: Limits, count: int, seed: int) -> list[Subset]:
-    """Subsets that are drawn: candidates in a random order, each added if it may be.
-
-    Args:
-        candidates: What there is.
-        limits: What to keep to.
-        count: How many subsets.
-        seed: Seed of the orders.
-    """
+    """Subsets that are drawn: candidates in a random order, each added if it may be."""
     generator, found = np.random.default_rng(seed), []
     for _ in range(count):
         chosen: list[int] = []

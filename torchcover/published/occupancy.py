@@ -65,14 +65,10 @@ class Occupancy:
     boxes: int
 
     def entropy_nats(self, times: NDArray[np.float64 | np.bool_], weights: Float64) -> Float64:
-        """(R,) sum over the voxels of Hb(p) = -p ln p - (1 - p) ln(1 - p).
+        """(R,) sum over the voxels of Hb(p) = -p ln p - (1 - p) ln(1 - p); NaN where no frame counts.
 
-        Args:
-            times: (voxels of the grid,) how often each voxel counts.
-            weights: (R, B) how often each block of worlds does.
-
-        Returns:
-            NaN where no frame counts.
+        `times` (voxels of the grid,) is how often each voxel counts, `weights` (R, B) how often each block of worlds
+        does.
         """
         of_pattern = np.bincount(self.pattern, weights=times[self.voxels], minlength=len(self.counts))
         steps = weights @ self.steps
@@ -97,16 +93,10 @@ def binary_entropy(p: Float64) -> Float64:
 
 
 def occupancy_of(table: Float64, category: int, grid: VoxelGrid, blocks: int) -> Occupancy:
-    """The occupancy by the boxes of one category.
+    """The occupancy by the boxes of one category, from (N, 10) rows of `occupancy_rows` in ascending order.
 
     A voxel is inside a box if its centre is; of a box that leaves the region, the voxels in the region count. Boxes of
-    one frame that overlap count once.
-
-    Args:
-        table: (N, 10) rows of frames, from `occupancy_rows`, in ascending order.
-        category: Number of the category.
-        grid: The voxels.
-        blocks: Number of blocks, an even number.
+    one frame that overlap count once. The number of blocks is even.
     """
     own, centres_m = table[:, CATEGORY] == FRAME, grid.centres_m()
     block_of = (table[:, PLACE] // block_length(table[own, PLACE], blocks)).astype(np.int64)
@@ -169,11 +159,9 @@ def block_length(places: Float64, blocks: int) -> int:
 
 
 def voxels_in_box(centres_m: Sequence[Float64], box: Float64) -> Int64:
-    """Numbers of the voxels whose centre is in a box, half-open: boxes side by side share none.
+    """Numbers of the voxels whose centre, as of `VoxelGrid.centres_m`, is in a box, a row of `Boxes.rows`.
 
-    Args:
-        centres_m: (X,), (Y,) and (Z,) from `VoxelGrid.centres_m`.
-        box: x, y, z of the centre, length, width, height, yaw.
+    Half-open: boxes side by side share none.
 
     Example:
         >>> grid = VoxelGrid(BoundingBox((0.0, 0.0, 0.0), (4.0, 4.0, 1.0)), 1.0)

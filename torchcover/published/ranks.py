@@ -84,13 +84,9 @@ class Ranking(NamedTuple):
 def rankings(
     metric: str, numbers: Sequence[Sequence[Number]], estimates: Sequence[Estimate], seed: int
 ) -> list[Ranking]:
-    """A ranking by each number of a metric.
+    """A ranking by each number of a metric, the same of each rig, with draws of worlds from what they come from.
 
-    Args:
-        metric: As in `Ranking`.
-        numbers: What it says of each rig, the same numbers of all.
-        estimates: What these come from, of each rig.
-        seed: Of the worlds that are drawn again, the same for all metrics of a run.
+    The seed is the same for all metrics of a run.
     """
     draws = [drawn_again(estimate, seed) for estimate in estimates]
     known = [each for each in draws if each is not None]
@@ -112,13 +108,7 @@ def drawn_again(estimate: Estimate, seed: int) -> Float64 | None:
 
 
 def midranks(values: ArrayLike) -> Float64:
-    """Ranks from 1, the smallest, on; equal values share the mean of theirs, and what is unknown has none.
-
-    Args:
-        values: (..., n), NaN where unknown.
-
-    Returns:
-        (..., n) ranks, NaN where the value is.
+    """(..., n) ranks from 1, the smallest, on; equal values share the mean of theirs, and what is NaN stays so.
 
     Example:
         >>> midranks([3.0, float("nan"), 1.0, 3.0]).tolist()
@@ -156,14 +146,7 @@ def kendall_tau_b(first: ArrayLike, second: ArrayLike) -> Float64:
 
 
 def spearman(first: ArrayLike, second: ArrayLike) -> Float64:
-    """Spearman's rank correlation: Pearson's of the midranks, so that ties are right.
-
-    Args:
-        first: As in `kendall_tau_b`.
-        second: Likewise.
-
-    Returns:
-        (...); NaN for fewer than three that are known, or if all of one are equal.
+    """Spearman's rank correlation: Pearson's of the midranks, so that ties are right; else as `kendall_tau_b`.
 
     Example:
         >>> float(spearman([1, 2, 3, 4], [10, 20, 40, 30]))
@@ -191,14 +174,8 @@ def orders(count: int, seed: int = 0) -> Int64:
 def permutation_p(first: ArrayLike, second: ArrayLike) -> float:
     """Probability that chance gives so strong a rank correlation (`spearman`), of either sign: two-sided.
 
-    With several first series it is that of the best of them: of k metrics that were looked at, one is always good.
-
-    Args:
-        first: (n,) or (k, n), NaN where unknown.
-        second: (n,) what their orders are held against.
-
-    Returns:
-        The share of orders of the second with as strong a correlation; NaN if none is known.
+    It is the share of orders of the second with as strong a one, NaN if none is known. With several first series, (k,
+    n), it is that of the best of them: of k metrics that were looked at, one is always good.
 
     Example:
         >>> permutation_p([1, 2, 3, 4], [1, 2, 3, 4])           # 2 of 24 orders
@@ -215,14 +192,9 @@ def permutation_p(first: ArrayLike, second: ArrayLike) -> float:
 
 
 def strongest_by_chance(first: ArrayLike, second: ArrayLike) -> Float64:
-    """The strongest rank correlation of several series, of either sign, to each of many orders of the second.
+    """(P,) the strongest rank correlation of (k, n) series, of either sign, to each of many orders of the second.
 
-    Args:
-        first: (n,) or (k, n), NaN where unknown.
-        second: (n,) what is put in other orders.
-
-    Returns:
-        (P,) from 0 to 1: what the best of k metrics that mean nothing reaches.
+    From 0 to 1: what the best of k metrics that mean nothing reaches.
 
     Example:
         >>> float(strongest_by_chance([1, 2, 3], [1, 2, 3]).mean())             # of six orders two have 1, four 0.5

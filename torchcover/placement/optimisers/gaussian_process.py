@@ -137,11 +137,7 @@ class GaussianProcessSearch:
 def log_expected_improvement(mean: Tensor, deviation: Tensor, best: float, scale: float) -> Tensor:
     """The logarithm of E[max(f - best, 0)] / scale for normally distributed f, without underflow (Ament et al. 2023).
 
-    Args:
-        mean: (m,).
-        deviation: (m,), 0 or more.
-        best: What is to be beaten.
-        scale: Of the values; deviations below a trillionth of it count as that.
+    Means and deviations are (m,); deviations below a trillionth of the scale count as that.
 
     Example:
         >>> float(log_expected_improvement(torch.zeros(1), torch.ones(1), 0.0, 1.0).exp() * math.sqrt(2 * math.pi))
