@@ -290,9 +290,7 @@ def search(
     evaluations: Annotated[
         int | None, typer.Option(min=1, help="Candidates instead of a time: the same ones whatever the machine.")
     ] = None,
-    optimiser: Annotated[
-        str, typer.Option(help="auto, gp (Gaussian process), enumerate (choices) or random.")
-    ] = "auto",
+    optimiser: Annotated[str, typer.Option(help="gp (Gaussian process) or random.")] = "gp",
     estimate: Annotated[
         Literal["area", "known"],
         typer.Option(help="What a score is: `area`, the share of the visible surface, or `known`, of the known cells."),
