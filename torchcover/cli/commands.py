@@ -348,31 +348,6 @@ def parsed_budget(text: str) -> float:
     return float(match[1]) * UNITS_S[match[2]]
 
 
-@with_options(of_evaluate("sensor_model", "seed", "every_s", "workers"))
-def agree(
-    paper: Annotated[str, typer.Argument(help="Published placements: place3d2024.")],
-    scenario: Annotated[str, typer.Option(help="Scenario: a built-in name or a YAML file.")] = "urban",
-    metrics: Annotated[
-        str, typer.Option(help="Metrics of others, as in `k_cover,point_density`, or `all`; see `compare --metrics`.")
-    ] = "all",
-    steps: Annotated[int, typer.Option(min=1, help="Steps to simulate.")] = 64,
-    out: options.Out = Path("out/agree"),
-    **settings: Any,  # noqa: ANN401
-) -> None:
-    """Rank published placements by metrics, and by the detectors that were trained on them; say what that is worth."""
-    from torchcover.cli.printing import print_agreement
-    from torchcover.evaluation import agree, rank_count
-    from torchcover.files import claimed
-    from torchcover.published import metric_names
-
-    if rank_count() > 1:
-        raise ValueError("agree: ranks do not share it; run it without torchrun, with --workers")
-    with claimed(out):
-        study = agree(paper, scenario, metrics=metric_names(metrics), steps=steps, progress=True, **settings)
-        files = study.save(out)
-    print_agreement(study, files, out)
-
-
 def list_builtin(
     word: Annotated[
         str | None, typer.Argument(help="Only those with this word, with all that is said of them.")

@@ -5,16 +5,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
-from typing import Literal, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
 from torchcover.files import read_csv, reads
 from torchcover.geometry.arrays import Float64, Int64
 from torchcover.published.ranks import (
-    BASELINE,
     DRAWS,
-    OWN,
     Ranking,
     kendall_tau_b,
     permutation_p,
@@ -22,8 +20,6 @@ from torchcover.published.ranks import (
     strongest_by_chance,
 )
 
-# coverage: torchcover's own numbers; published: those of others; baseline: what takes no simulation to know, or little.
-Kind = Literal["coverage", "published", "baseline"]
 # Ends of the intervals.
 LEVELS = 0.025, 0.975
 # What the best of several metrics that mean nothing exceeds in one of twenty orders.
@@ -89,11 +85,6 @@ class Judged:
         return type(self)(self.name, tuple(placements), self.judges, self.values[:, columns])
 
 
-def kind_of(one: Ranking) -> Kind:
-    """Whose number it is."""
-    return "coverage" if one.metric == OWN else "baseline" if one.metric == BASELINE else "published"
-
-
 @reads("a table of published results")
 def read_results(path: Path) -> Mapping[tuple[str, str], Judged]:
     """The results of a table in CSV with the columns placement, quantity, model, class and value.
@@ -128,6 +119,16 @@ class Relation(NamedTuple):
     low: float
     high: float
 
+    @property
+    def words(self) -> str:
+        """Both.
+
+        Example:
+            >>> Relation(0.857, 0.5, 0.95).words
+            '+0.86 [+0.50, +0.95]'
+        """
+        return "-" if math.isnan(self.value) else f"{self.value:+.2f} [{self.low:+.2f}, {self.high:+.2f}]"
+
 
 @dataclass(frozen=True)
 class Ranked:
@@ -135,7 +136,6 @@ class Ranked:
 
     Args:
         metric: Its name.
-        kind: Whose it is.
         spearman: Spearman's rank correlation with the mean of the judges.
         kendall: Kendall's tau-b with it.
         p: Probability of a Spearman correlation as strong, of either sign, by chance; of this metric alone.
@@ -143,7 +143,6 @@ class Ranked:
     """
 
     metric: str
-    kind: Kind
     spearman: Relation
     kendall: Relation
     p: float
@@ -263,7 +262,7 @@ def _ranked(one: Ranking, truth: Float64, truths: Float64, columns: Int64) -> Ra
     rho, tau = (
         _with_ends(float(statistic(one.gains, truth)), statistic(*drawn)) for statistic in (spearman, kendall_tau_b)
     )
-    return Ranked(one.name, kind_of(one), rho, tau, permutation_p(one.gains, truth), one.draws is not None)
+    return Ranked(one.name, rho, tau, permutation_p(one.gains, truth), one.draws is not None)
 
 
 def _with_ends(value: float, drawn: Float64) -> Relation:
