@@ -38,8 +38,7 @@ class Polar:
         place = (np.arctan2(b, a) + np.pi) * ((len(self.values) - 1) / (2.0 * np.pi))
         low = np.nan_to_num(place).astype(np.int64).clip(0, len(self.values) - 2)
         left = self.values[low]
-        interpolated: Float64 = left + (place - low) * (self.values[low + 1] - left)
-        return interpolated
+        return np.asarray(left + (place - low) * (self.values[low + 1] - left))
 
     def holds(self, radius: Float64, a: Float64, b: Float64) -> Bools:
         """Whether the radii of (a, b) are at most the function; it is looked up only where its minimum is passed."""

@@ -78,5 +78,4 @@ def overlapping(box: BoundingBox, there_T_box: Float64, corners_m: Float64) -> B
     axes = np.concatenate([np.broadcast_to(sides, (len(ours_m), 3, 3)), there_T_box[:, :3, :2].swapaxes(1, 2)], 1)
     ours_m, theirs_m = np.einsum("pak,pck->pac", axes, ours_m), np.einsum("pak,ck->pac", axes, corners_m)
     apart = (ours_m.min(axis=2) >= theirs_m.max(axis=2)) | (theirs_m.min(axis=2) >= ours_m.max(axis=2))
-    overlaps: Bools = ~apart.any(axis=1)
-    return overlaps
+    return np.asarray(~apart.any(axis=1))

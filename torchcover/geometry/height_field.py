@@ -60,8 +60,7 @@ class HeightField(NamedTuple):
         right = x >= y
         side = corners_m[np.where(right, here + 1, here + columns)]
         far, near = np.maximum(x, y), np.minimum(x, y)
-        heights_m: Float64 = first + far * (side - first) + near * (across - side)
-        return heights_m
+        return np.asarray(first + far * (side - first) + near * (across - side))
 
 
 def spread(

@@ -148,8 +148,7 @@ class Arm:
 
     def _told(self) -> Float64:
         """(evaluations, objectives) what optimisers are told of: gains, less what the lacks cost."""
-        told: Float64 = self.gains - PENALTY * self._scale[: self._objectives] * self.lacks[:, None]
-        return told
+        return np.asarray(self.gains - PENALTY * self._scale[: self._objectives] * self.lacks[:, None])
 
     def _lacking(self, evaluation: Evaluation) -> float:
         prefixes = evaluation.prefixes

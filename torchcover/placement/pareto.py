@@ -66,5 +66,4 @@ def chebyshev(values: Float64, weights: Float64) -> Float64:
         array([0.025, 0.22 ])
     """
     weighted = values * weights
-    least: Float64 = weighted.min(axis=1) + AUGMENTATION * weighted.sum(axis=1)
-    return least
+    return np.asarray(weighted.min(axis=1) + AUGMENTATION * weighted.sum(axis=1))

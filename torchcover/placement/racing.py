@@ -59,8 +59,7 @@ def racing_order(world_of: Sequence[int] | Int64, seed: int) -> Int64:
     worlds = np.asarray(world_of)[shuffled]
     # How many instants of its world come before each.
     rounds = np.array([np.count_nonzero(worlds[:k] == world) for k, world in enumerate(worlds)], dtype=np.int64)
-    order: Int64 = shuffled[np.argsort(rounds, kind="stable")]
-    return order
+    return np.asarray(shuffled[np.argsort(rounds, kind="stable")])
 
 
 def race(

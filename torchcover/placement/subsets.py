@@ -199,8 +199,7 @@ class _Goal:
     def of_values(self, values: Float64) -> Float64:
         """Of (Q, ...) values, without the price."""
         lacks = np.minimum(values.T - self.least, 0.0)
-        worth: Float64 = values.T @ self.weights + FIRST * lacks.sum(axis=-1)
-        return worth
+        return np.asarray(values.T @ self.weights + FIRST * lacks.sum(axis=-1))
 
 
 def _searched(goal: _Goal) -> tuple[tuple[int, ...], float]:

@@ -177,8 +177,7 @@ def voxels_in_box(centres_m: Sequence[Float64], box: Float64) -> Int64:
     x, y = (_within(ahead, box[3]) & _within(left, box[4])).nonzero()
     z = np.flatnonzero(_within(z_m - box[2], box[5]))
     column = (x + x0) * len(y_m) + y + y0
-    voxels: Int64 = (column[:, None] * len(z_m) + z).reshape(-1)
-    return voxels
+    return np.asarray((column[:, None] * len(z_m) + z).reshape(-1))
 
 
 def _within(offset_m: Float64, extent_m: float) -> Bools:

@@ -99,8 +99,7 @@ class CameraSensor(Ranging):
             focal_px = float(self.camera().intrinsics[0])
             per_m2 = self.stereo.subpixel_px / (focal_px * self.stereo.baseline_m)
             squared = squared + (per_m2 * range_m**2) ** 2
-        noise_m: NDArray[np.floating] = np.sqrt(squared)
-        return noise_m
+        return np.asarray(np.sqrt(squared))
 
     @property
     def counts_as(self) -> int:

@@ -178,8 +178,7 @@ class Instant:
         )
 
     def _seen(self, hits: Hits, ego_points: bool) -> Bools:
-        seen: Bools = (hits.body >= 0) & (ego_points | (hits.body != self.ego))
-        return seen
+        return np.asarray((hits.body >= 0) & (ego_points | (hits.body != self.ego)))
 
     def _sweep(self, times: Sequence[RayTimes]) -> Sweep | None:
         """How everything moves meanwhile; for sensors that take as long it is the same."""

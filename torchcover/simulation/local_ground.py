@@ -127,8 +127,7 @@ def _probes_m(corners_m: Float64, border: Int64) -> Float64:
     across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), np.finfo(np.float64).tiny)
     probes_m = start_m[:, None] + PROBES[:, None] * (end_m - start_m)[:, None]
     probes_m[..., :2] += BEYOND_M * across[:, None]
-    probes: Float64 = probes_m.reshape(-1, 3)
-    return probes
+    return np.asarray(probes_m.reshape(-1, 3))
 
 
 def _met(caster: RayCaster, places_m: Float64, near_m: float) -> Int64:
@@ -297,8 +296,7 @@ class GroundSquares(NamedTuple):
 
 def height_bounds(low_m: Float64, high_m: Float64) -> Float32:
     """(2, N) bounds of heights that float32 does not break; none is less than what counts as the ground below."""
-    bounds_m: Float32 = np.stack([np.maximum(low_m, -TOLERANCE_M) - SLACK_M, high_m + SLACK_M]).astype(np.float32)
-    return bounds_m
+    return np.asarray(np.stack([np.maximum(low_m, -TOLERANCE_M) - SLACK_M, high_m + SLACK_M]).astype(np.float32))
 
 
 def _squares_of(first: Int64, count: Int64, at_once: int = 2_000_000) -> list[tuple[Int64, Int64, Int64]]:

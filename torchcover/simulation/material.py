@@ -107,5 +107,4 @@ def materials() -> Materials:
 
 def tone(body: NDArray[np.integer]) -> Float32:
     """(N,) by how many spreads each body is brighter than its material, by its number; 0 for what is no body, -1."""
-    tones: Float32 = TONES[body % len(TONES)]
-    return tones
+    return np.asarray(TONES[body % len(TONES)])

@@ -139,8 +139,7 @@ class Moving:
         """(P, 3) a (3,) place of the vehicle frame in the frame of each body, as `transform` has it."""
         rotation, translation = self.part_T_vehicle[:, :3, :3], self.part_T_vehicle[:, :3, 3:]
         back = rotation.swapaxes(1, 2)
-        place: Float64 = ((place_m + (back @ translation)[..., 0])[:, None] @ back)[:, 0]
-        return place
+        return np.asarray(((place_m + (back @ translation)[..., 0])[:, None] @ back)[:, 0])
 
     def pairs(
         self,

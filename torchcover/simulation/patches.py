@@ -60,8 +60,7 @@ def outward_by(mesh: Mesh, edge: Int64, way: Int8, surface: Int64) -> Bools:
         volumes[part] = (first * np.cross(second, third, axis=0)).sum(axis=0)
     volume = np.bincount(surface, weights=volumes, minlength=len(mesh.faces))
     rounding = VOLUME_ROUNDING * np.bincount(surface, weights=np.abs(volumes), minlength=len(mesh.faces))
-    outward: Bools = ((open_edges == 0) & (volume >= -rounding))[surface]
-    return outward
+    return np.asarray(((open_edges == 0) & (volume >= -rounding))[surface])
 
 
 def edges_of(mesh: Mesh) -> tuple[Int64, Int8]:
@@ -214,21 +213,18 @@ class Patches(NamedTuple):
     @property
     def lower_m(self) -> Float32:
         """(3, N) smallest coordinates."""
-        lower: Float32 = self.corner_m + np.minimum(np.minimum(self.first_m, self.second_m), 0)
-        return lower
+        return np.asarray(self.corner_m + np.minimum(np.minimum(self.first_m, self.second_m), 0))
 
     @property
     def upper_m(self) -> Float32:
         """(3, N) largest coordinates."""
-        upper: Float32 = self.corner_m + np.maximum(np.maximum(self.first_m, self.second_m), 0)
-        return upper
+        return np.asarray(self.corner_m + np.maximum(np.maximum(self.first_m, self.second_m), 0))
 
     @property
     def normals_m2(self) -> Float32:
         """(3, N) normals, as long as twice the area."""
         (ax, ay, az), (bx, by, bz) = self.first_m, self.second_m
-        normals: Float32 = np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
-        return normals
+        return np.asarray(np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx]))
 
 
 def _cut(
@@ -282,5 +278,4 @@ def _halved(triangles: Float64, longest: Int64) -> Float64:
 
 def _areas(triangles: Float64) -> Float64:
     a, b, c = triangles
-    areas: Float64 = np.linalg.norm(np.cross(b - a, c - a, axis=0), axis=0) / 2
-    return areas
+    return np.asarray(np.linalg.norm(np.cross(b - a, c - a, axis=0), axis=0) / 2)

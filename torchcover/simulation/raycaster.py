@@ -94,14 +94,12 @@ class Faces:
             near = near[(self._lower_m[axis, near] <= coordinate_m) & (coordinate_m <= self._upper_m[axis, near])]
         if len(near) == 0:
             return near
-        held: Int64 = near[self.from_plane_m(place_m, near) <= 2 * self.contact_m[near]]
-        return held
+        return np.asarray(near[self.from_plane_m(place_m, near) <= 2 * self.contact_m[near]])
 
     def from_plane_m(self, place_m: NDArray[np.floating], faces: Int64) -> Float64:
         """Distance of a (3,) place from the planes of some of them."""
         corners_m = corners_of(self._bodies, faces)
-        distance_m: Matrix = np.abs(((place_m[:, None] - corners_m[0]) * normals_of(corners_m)).sum(axis=0))
-        return distance_m
+        return np.asarray(np.abs(((place_m[:, None] - corners_m[0]) * normals_of(corners_m)).sum(axis=0)))
 
 
 def _contact_m(corners_m: Matrix) -> Matrix:
@@ -114,8 +112,7 @@ def _contact_m(corners_m: Matrix) -> Matrix:
     largest = np.abs(corners_m).max(axis=0)
     rounding_m = (products * largest).sum(axis=0) / np.where(length == 0, np.inf, length)
     # The plane of a sliver is anybody's guess, but the sliver is not far from where it is.
-    contact_m: Matrix = np.minimum(rounding_m, largest.max(axis=0)) * (CONTACT_ROUNDINGS * np.finfo(np.float32).eps)
-    return contact_m
+    return np.asarray(np.minimum(rounding_m, largest.max(axis=0)) * (CONTACT_ROUNDINGS * np.finfo(np.float32).eps))
 
 
 class Hits(NamedTuple):
@@ -224,13 +221,11 @@ class RayCaster:
         starts_m, towards = origins_m.astype(np.float32), directions.astype(np.float32)
         ends_m = np.full(len(starts_m), limit_m, dtype=np.float32)
         answer = self._scene.run(starts_m, towards, dists=ends_m, output=True)
-        met: Int64 = np.where(answer["geomID"] >= 0, self._numbers(answer), -1)
-        return met
+        return np.asarray(np.where(answer["geomID"] >= 0, self._numbers(answer), -1))
 
     def _numbers(self, answer: dict[str, NDArray[Any]]) -> Int64:
         """(N,) which of all faces each ray hit; any number where it hit none."""
-        numbers: Int64 = self._first_face[np.maximum(answer["geomID"], 0)] + np.maximum(answer["primID"], 0)
-        return numbers
+        return np.asarray(self._first_face[np.maximum(answer["geomID"], 0)] + np.maximum(answer["primID"], 0))
 
     def touched(self, place_m: NDArray[np.floating]) -> Int64:
         """Numbers of the bodies on whose faces a place lies: hardly any does, and the faces are sooner asked than rays.
@@ -254,8 +249,7 @@ class RayCaster:
         """Let the rays go on that hit a face whose plane they start on: by rounding alone, as they leave it."""
 
         def starts_on_plane(faces: Int64) -> Bools:
-            near: Bools = self._faces.from_plane_m(origin_m, faces) <= self._faces.contact_m[faces]
-            return near
+            return np.asarray(self._faces.from_plane_m(origin_m, faces) <= self._faces.contact_m[faces])
 
         rays, travelled_m = np.flatnonzero(hits.body >= 0), 0.0
         rays = rays[starts_on_plane(faces[rays])]

@@ -199,8 +199,7 @@ def _blocks(has_ray: Bools) -> Int64:
     # Pixels without a ray repeat the first one of their block that has one.
     first = np.take_along_axis(pixels, filled.argmax(axis=1)[:, None], axis=1)
     pixels = np.where(filled, pixels, first)[filled.any(axis=1)]
-    numbers: Int64 = has_ray.cumsum()[pixels] - 1
-    return numbers
+    return np.asarray(has_ray.cumsum()[pixels] - 1)
 
 
 def rotate(rotation: Float64, directions: Float32) -> Float32:
@@ -289,8 +288,7 @@ def blocks_towards(outlines: Outlines, tile: Tile, vehicle_R_sensor: Float64, ra
     bounds = np.vstack([tile.block_lower, tile.block_upper]).astype(np.float32)
     towards = np.hstack([np.maximum(normals, 0.0), np.minimum(normals, 0.0)]).astype(np.float32)
     least = (towards @ bounds).reshape(len(outlines.normals), 4, bounds.shape[1])
-    reached: Bools = (least.max(axis=1) <= ROUNDING) & (outlines.nearest_m[:, None] <= ends_m)
-    return reached
+    return np.asarray((least.max(axis=1) <= ROUNDING) & (outlines.nearest_m[:, None] <= ends_m))
 
 
 def rays_towards(
@@ -316,5 +314,4 @@ def _cross(a: Float64, b: Float64) -> Float64:
 def _unit(vectors: Float64) -> Float64:
     # A vector of length 0 has no direction; it is left as it is.
     length = np.sqrt((vectors * vectors).sum(axis=-1, keepdims=True))
-    unit: Float64 = vectors / np.maximum(length, np.finfo(np.float64).tiny)
-    return unit
+    return np.asarray(vectors / np.maximum(length, np.finfo(np.float64).tiny))

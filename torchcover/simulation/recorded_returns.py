@@ -70,8 +70,7 @@ class RoadProfile(NamedTuple):
 
     def height_m(self, points_m: Float64) -> Float64:
         """(N,) z of the road below N points."""
-        height_m: Float64 = _terms(points_m) @ self.coefficients
-        return height_m
+        return np.asarray(_terms(points_m) @ self.coefficients)
 
 
 def _terms(points_m: Float64) -> Float64:

@@ -97,8 +97,7 @@ def rows_of(elevation_deg: Float64) -> Float64 | None:
     longest = int(lengths.argmax())
     if lengths[longest] < SAME_THROUGH:
         return None
-    rows_deg: Float64 = lowest + BIN_DEG * (found[starts[longest] + lengths[longest] // 2] + 0.5)
-    return rows_deg
+    return np.asarray(lowest + BIN_DEG * (found[starts[longest] + lengths[longest] // 2] + 0.5))
 
 
 def _column_step_deg(azimuth_deg: Float64, of_row: Int64) -> float | None:

@@ -193,8 +193,7 @@ class Scene:
 
     def _distance_m(self, step: int, world_T_vehicle: Matrix) -> Matrix:
         """(bodies,) how far each is from the vehicle at least."""
-        distance_m: Matrix = np.linalg.norm(self._positions_m[step] - world_T_vehicle[:3, 3], axis=1) - self._reach_m
-        return distance_m
+        return np.asarray(np.linalg.norm(self._positions_m[step] - world_T_vehicle[:3, 3], axis=1) - self._reach_m)
 
     @property
     def _first_moving(self) -> int:

@@ -45,8 +45,7 @@ class RayHits:
     @property
     def pixel(self) -> Int64:
         """(N,) row * columns + column of each ray in `Sensor.directions`."""
-        pixels: Int64 = self.pixel_of_ray[self.ray]
-        return pixels
+        return np.asarray(self.pixel_of_ray[self.ray])
 
     @cached_property
     def struck(self) -> Struck:
@@ -108,8 +107,7 @@ class Draws:
     def _drawn(self, purpose: str, kind: str, ray: Int64) -> Float64:
         draw = getattr(self._generator, kind)
         if self._rays is None:
-            drawn: Float64 = draw(len(ray))
-            return drawn
+            return np.asarray(draw(len(ray)))
         with self._lock:  # whichever thread asks first draws for all
             if purpose not in self._of_rays:
                 self._of_rays[purpose] = draw(self._rays)
@@ -200,8 +198,7 @@ class ScanTimes(Document):
     def times_s(self, count: int) -> Float64:
         """(count,) when each is cast, after the time of the frame."""
         start_s = -self.period_s if self.start_s is None else self.start_s
-        times_s: Float64 = start_s + self.period_s * (np.arange(count) + 0.5) / count
-        return times_s
+        return np.asarray(start_s + self.period_s * (np.arange(count) + 0.5) / count)
 
 
 class Ranging(Document):

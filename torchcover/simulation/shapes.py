@@ -90,8 +90,7 @@ def normals_of(corners_m: Float64) -> Float64:
     first, second, third = corners_m
     across = np.cross(second - first, third - first, axis=0)
     length = np.linalg.norm(across, axis=0)
-    normals: Float64 = across / np.where(length == 0, np.inf, length)
-    return normals
+    return np.asarray(across / np.where(length == 0, np.inf, length))
 
 
 class Plane(Document):

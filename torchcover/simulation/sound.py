@@ -130,8 +130,7 @@ def _encloses(mesh: Mesh, surface: Int64) -> Bools:
         normals[:, part] = np.cross(second - first, third - first, axis=0)
     sums = np.stack([np.bincount(surface, axis, minlength=len(mesh.faces)) for axis in normals])
     area = np.bincount(surface, np.linalg.norm(normals, axis=0), minlength=len(mesh.faces))
-    encloses: Bools = np.linalg.norm(sums, axis=0) < BODY_SHARE * area
-    return encloses
+    return np.asarray(np.linalg.norm(sums, axis=0) < BODY_SHARE * area)
 
 
 def _inner_points(side: int) -> Float64:

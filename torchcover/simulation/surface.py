@@ -225,8 +225,7 @@ def _interleaved(place: Int64) -> Int64:
         spread = (spread | (spread << bits)) & mask
     for bits, mask in ((2, 0x3333333333333333), (1, 0x5555555555555555)):
         spread = (spread | (spread << bits)) & mask
-    interleaved: Int64 = spread[0] | (spread[1] << 1)
-    return interleaved
+    return np.asarray(spread[0] | (spread[1] << 1))
 
 
 def _groups(patches: Patches, group: Int64 | Int32) -> Groups:

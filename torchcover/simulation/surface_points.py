@@ -120,8 +120,7 @@ class SurfaceStrata:
     def _heights_of(self, points_m: Float32, patch: Int64) -> Float32:
         """(K,) what the third bounds of the boxes are about, of (3, K) points on the patches."""
         if self._heights_m is None:
-            z_m: Float32 = points_m[2]
-            return z_m
+            return np.asarray(points_m[2])
         asked = np.flatnonzero(self._patches.heights_m[1].take(patch) > HEIGHT_SLACK_M)  # the others are the ground
         heights_m = np.zeros(len(patch), dtype=np.float32)
         heights_m[asked] = self._heights_m(points_m.take(asked, axis=1).T)
@@ -134,8 +133,7 @@ class SurfaceStrata:
         beyond = a + b > 1
         a, b = np.where(beyond, 1 - a, a), np.where(beyond, 1 - b, b)
         taken = self._patches.taken(patch)
-        points_m: Float32 = taken.corner_m + a * taken.first_m + b * taken.second_m
-        return points_m
+        return np.asarray(taken.corner_m + a * taken.first_m + b * taken.second_m)
 
 
 def _inside(placed_m: Sequence[Float32], low: Float64, high: Float64) -> Bools:
@@ -169,8 +167,7 @@ def _strata(m2: Float32, lower_m: Float32, upper_m: Float32, boxes: Bounds) -> l
 
 def _share(from_m: Float32, to_m: Float32, low: float, high: float) -> Float32:
     """Which share of each stretch lies between two bounds, of those that meet them."""
-    share: Float32 = (np.minimum(to_m, high) - np.maximum(from_m, low)) / (to_m - from_m)
-    return share
+    return np.asarray((np.minimum(to_m, high) - np.maximum(from_m, low)) / (to_m - from_m))
 
 
 def _drawn(stratum: Stratum, front: Bools, each: float, generator: np.random.Generator) -> tuple[Int64, float]:

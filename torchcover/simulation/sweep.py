@@ -172,8 +172,7 @@ class Sweep:
 
     def _parts(self, weights: Float64, part: Int64) -> Float64:
         """(K, 4, 4) `part_T_vehicle` of some bodies at times with these weights, (K, 3)."""
-        poses: Float64 = np.einsum("ks,skij->kij", weights, self.part_T_vehicle[:, part])
-        return poses
+        return np.asarray(np.einsum("ks,skij->kij", weights, self.part_T_vehicle[:, part]))
 
 
 def parabola_weights(samples_s: Float64, times_s: Float64) -> Float64:
@@ -197,8 +196,7 @@ def parabola_weights(samples_s: Float64, times_s: Float64) -> Float64:
 
 def _moved(poses: Float64, places_m: Float64) -> Float64:
     """(K, 3) places, each moved by its own of (K, 4, 4) poses."""
-    moved: Float64 = (poses[:, :3, :3] @ places_m[:, :, None])[:, :, 0] + poses[:, :3, 3]
-    return moved
+    return np.asarray((poses[:, :3, :3] @ places_m[:, :, None])[:, :, 0] + poses[:, :3, 3])
 
 
 def _turned(poses: Float64, of_ray: Int64, directions: Float32) -> Float32:

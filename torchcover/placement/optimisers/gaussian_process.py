@@ -129,8 +129,7 @@ class GaussianProcessSearch:
             places = places[worth.argsort(descending=True, stable=True)[:KEPT].numpy()]
             if again < ROUNDS:
                 places = np.vstack([places, self._around(places, again, draws)])
-        chosen: Unit = places[0]
-        return chosen
+        return np.asarray(places[0])
 
     def _around(self, places: Unit, narrower: int, draws: np.random.Generator) -> Unit:
         """Places near others; some with another option."""

@@ -55,8 +55,7 @@ def thinned(places_m: Float64) -> Float64:
     stay = np.cumsum(np.diff(way_m // STAYS_M, prepend=0.0) > 0)
     count = np.bincount(stay)
     sums = [np.bincount(stay, axis) for axis in (places_m - places_m[0]).T]
-    middles: Float64 = places_m[0] + np.stack(sums, axis=1) / count[:, None]
-    return middles
+    return np.asarray(places_m[0] + np.stack(sums, axis=1) / count[:, None])
 
 
 def stood_on(tracks: Sequence[Float64]) -> Float64:

@@ -63,8 +63,7 @@ def tilts_deg(ground: Ground, places_m: Float64, yaw_deg: Float64, size_m: tuple
     ]
     # Up at the front is a negative pitch; up at the left lowers the right side.
     pitch, roll = np.arctan2(-rises[0], 2 * size_m[0] / 3), np.arctan2(rises[1], size_m[1])
-    tilts: Float64 = np.rad2deg(np.stack([pitch, roll], axis=1))
-    return tilts
+    return np.asarray(np.rad2deg(np.stack([pitch, roll], axis=1)))
 
 
 class Pavement:

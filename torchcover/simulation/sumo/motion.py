@@ -287,14 +287,12 @@ def corners_m(poses: Float64, size_m: Float64) -> Float64:
     left = np.stack([-forward[:, 1], forward[:, 0]], axis=1)
     half = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]]) / 2
     along_m, aside_m = (half[:, k] * size_m[:, k, None] for k in (0, 1))
-    found: Float64 = poses[:, None, :2] + along_m[..., None] * forward[:, None] + aside_m[..., None] * left[:, None]
-    return found
+    return np.asarray(poses[:, None, :2] + along_m[..., None] * forward[:, None] + aside_m[..., None] * left[:, None])
 
 
 def _lengths(vectors: Float64) -> Float64:
     """(...) lengths in plan of (..., 2) vectors, or of what else begins with x and y."""
-    lengths: Float64 = np.hypot(vectors[..., 0], vectors[..., 1])
-    return lengths
+    return np.asarray(np.hypot(vectors[..., 0], vectors[..., 1]))
 
 
 def _along_m(way_m: Float64) -> Float64:

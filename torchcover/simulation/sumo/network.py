@@ -206,8 +206,7 @@ def _without_repeats(line_m: Float64) -> Float64:
     if len(line_m) == 0:
         return line_m
     steps = np.linalg.norm(np.diff(line_m[:, :2], axis=0), axis=1)
-    kept: Float64 = line_m[np.concatenate([[True], steps > SAME_PLACE_M])]
-    return kept
+    return np.asarray(line_m[np.concatenate([[True], steps > SAME_PLACE_M])])
 
 
 def _number(item: Attributes, key: str, otherwise: float) -> float:

@@ -106,5 +106,4 @@ def park(
             places.tolist(), heights_m.tolist(), tilts.tolist(), strict=True
         ):
             fleet.park(kind, (x_m, y_m, yaw_deg), height_m, (pitch, roll))
-    parked: NDArray[np.object_] = shapely.polygons(np.concatenate(outlines_m))
-    return parked
+    return np.asarray(shapely.polygons(np.concatenate(outlines_m)))

@@ -127,8 +127,7 @@ class DrawnStreets(Document):
         share = np.linspace(0.0, 1.0, BEND_PIECES + 1)[:, None]
         along = end_m - start_m
         aside = generator.uniform(-self.bend, self.bend) * np.sin(np.pi * share) ** 2
-        way_m: Float64 = start_m + share * along + aside * np.array([-along[1], along[0]])
-        return way_m
+        return np.asarray(start_m + share * along + aside * np.array([-along[1], along[0]]))
 
     def _lanes(self, generator: np.random.Generator) -> str:
         """One side of a street, from the houses inwards."""

@@ -54,13 +54,11 @@ class Vicinity:
         meet = (low_m <= self.upper_m + BEYOND_M) & (high_m >= self.lower_m - BEYOND_M)
         near = np.flatnonzero(meet.all(axis=1))
         boxes = shapely.box(*low_m[near].T, *high_m[near].T)
-        seen: Int64 = near[shapely.dwithin(boxes, self.way, HORIZON_M + BEYOND_M)]
-        return seen
+        return np.asarray(near[shapely.dwithin(boxes, self.way, HORIZON_M + BEYOND_M)])
 
     def sees(self, places_m: Float64) -> Bools:
         """(N,) whether (N, 2) places may be seen from the way."""
-        seen: Bools = shapely.dwithin(shapely.points(places_m), self.way, HORIZON_M + BEYOND_M)
-        return seen
+        return np.asarray(shapely.dwithin(shapely.points(places_m), self.way, HORIZON_M + BEYOND_M))
 
     def on_streets(self, places_m: Float64) -> Bools:
         """(N,) whether (N, 2) places are on a street, or at least near to one."""
@@ -104,8 +102,7 @@ class Vicinity:
         pieces = pieces[(shapely.get_type_id(pieces) == 3) & (shapely.area(pieces) > SMALLEST_MEDIAN_M2)]
         outlines = shapely.get_exterior_ring(pieces)
         shared = shapely.intersection(outlines, shapely.buffer(driven, ALONGSIDE_M))
-        medians: NDArray[np.object_] = pieces[shapely.length(shared) > ENCLOSED * shapely.length(outlines)]
-        return medians
+        return np.asarray(pieces[shapely.length(shared) > ENCLOSED * shapely.length(outlines)])
 
     @cached_property
     def samples_m(self) -> Float64:
@@ -131,8 +128,7 @@ class Vicinity:
         np.minimum.at(lowest, tuple(square.T), self.samples_m[:, 2])
         for axis in (0, 1):
             lowest = np.minimum.reduce([lowest, np.roll(lowest, 1, axis), np.roll(lowest, -1, axis)])
-        above: Bools = self.samples_m[:, 2] > lowest[tuple(square.T)] + BRIDGE_M
-        return above
+        return np.asarray(self.samples_m[:, 2] > lowest[tuple(square.T)] + BRIDGE_M)
 
 
 def _lines(lines_m: Sequence[Float64]) -> NDArray[np.object_]:
@@ -140,8 +136,7 @@ def _lines(lines_m: Sequence[Float64]) -> NDArray[np.object_]:
         return np.empty(0, dtype=object)
     count = [len(line) for line in lines_m]
     of_line = np.repeat(np.arange(len(count)), count)
-    found: NDArray[np.object_] = shapely.linestrings(np.concatenate(lines_m), indices=of_line)
-    return found
+    return np.asarray(shapely.linestrings(np.concatenate(lines_m), indices=of_line))
 
 
 def _polygon(outline_m: Float64) -> shapely.Geometry:

@@ -102,8 +102,7 @@ class Alignment:
         """(..., 2) from knots to places beyond them."""
         first, middle, last = (self._heading(knot, share * beyond_m) for share in GAUSS_PLACES)
         mean = [(5 * turn(first) + 8 * turn(middle) + 5 * turn(last)) / 18 for turn in (np.cos, np.sin)]
-        ways_m: Float64 = np.stack(mean, axis=-1) * beyond_m[..., None]
-        return ways_m
+        return np.asarray(np.stack(mean, axis=-1) * beyond_m[..., None])
 
 
 def squared_distances(places_m: Float64, others_m: Float64) -> Float64:
@@ -149,8 +148,7 @@ class Beside:
     def stations(self, place_m: ArrayLike) -> Float64:
         """(...) stations of the street after ways along the line."""
         knot, beyond_m = self._knot(np.asarray(place_m, dtype=np.float64))
-        stations_m: Float64 = self.street.stations_m[knot] + beyond_m * self._stations_per_m[knot]
-        return stations_m
+        return np.asarray(self.street.stations_m[knot] + beyond_m * self._stations_per_m[knot])
 
     def poses(self, place_m: ArrayLike) -> Float64:
         """(..., 3) x and y in metres, and yaw in degrees, after ways along the line; to a hundredth of a millimetre."""

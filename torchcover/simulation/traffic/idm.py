@@ -91,8 +91,7 @@ def laden_mps2(speed_mps: Float64, slope: Float64) -> Float64:
         True
     """
     resisted_mps2 = GRAVITY_MPS2 * (slope + ROLLING) + DRAG_PER_M * speed_mps**2
-    found: Float64 = LADEN_W_PER_KG / np.maximum(speed_mps, 1.0) - resisted_mps2
-    return found
+    return np.asarray(LADEN_W_PER_KG / np.maximum(speed_mps, 1.0) - resisted_mps2)
 
 
 def advance(speed_mps: Float64, acceleration_mps2: Float64, room_m: Float64, step_s: float) -> tuple[Float64, Float64]:

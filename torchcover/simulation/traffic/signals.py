@@ -100,5 +100,4 @@ class Gates(NamedTuple):
         """(N,) numbers of the first gate of a lane that each of N rear ends has not left."""
         first = self.first[lane]
         last = first + int(np.argmax(np.isinf(self.exit_m[first:])))
-        numbers: Int64 = first + np.searchsorted(self.exit_m[first:last], rear_m)
-        return numbers
+        return np.asarray(first + np.searchsorted(self.exit_m[first:last], rear_m))
