@@ -5,7 +5,6 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from torchcover.geometry import rotation_from_quaternion
 from torchcover.geometry.arrays import Float64
 from torchcover.geometry.rigid import Matrix, transform
 
@@ -26,12 +25,6 @@ def upright_rows(centre_m: ArrayLike, size_m: ArrayLike, heading: ArrayLike, veh
         centre, ahead = transform(vehicle_T_source, centre), ahead @ vehicle_T_source[:3, :3].T
     yaw = np.arctan2(ahead[:, 1], ahead[:, 0])
     return torch.from_numpy(np.column_stack([centre, size, yaw])).float()
-
-
-def headings(quaternions_wxyz: ArrayLike) -> Float64:
-    """(K, 3) the first axes of K rotations given as quaternions."""
-    given = np.asarray(quaternions_wxyz, dtype=np.float64).reshape(-1, 4)
-    return rotation_from_quaternion(given)[..., 0]
 
 
 def _rows(name: str, given: ArrayLike) -> Float64:
