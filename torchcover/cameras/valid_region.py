@@ -51,13 +51,10 @@ class Polar:
 
 @dataclass(frozen=True)
 class ValidRegion:
-    """The valid region of a distortion.
+    """The valid region of a distortion, which ends at the radius `edge` over the azimuth.
 
-    Args:
-        edge: Radius at which it ends, over the azimuth.
-        guard: Radius up to which a positive determinant means "inside"; it lies behind the edge, so that the
-            determinant itself decides, not the table.
-        reach: Largest distorted radius of any pixel worth solving, over the azimuth of the distorted point.
+    Up to `guard`, which lies behind the edge, a positive determinant means "inside", so that it decides, not the table.
+    `reach` is the largest distorted radius of any pixel worth solving, over the azimuth of the distorted point.
     """
 
     edge: Polar

@@ -14,14 +14,10 @@ MAX_BORDERS_COMPARED = 32
 
 
 class CellMeans(NamedTuple):
-    """Means over the points of one step.
+    """Means over the points of one step in those K cells that have points, ascending.
 
-    Args:
-        cell: (K,) int64 numbers of the cells that have points, ascending.
-        of_point: (N,) int64 which of these each point lies in.
-        points: (K,) int64 points in each of them.
-        weight: (K,) float64 sum of their weights; the number of points where there are none.
-        mean: (V, K) float64 mean of each of the V values.
+    `of_point` (N,) is which of these each point lies in, `weight` (K,) the sum of their weights, or their number where
+    there are none, `mean` (V, K) that of each of the V values.
     """
 
     cell: Tensor

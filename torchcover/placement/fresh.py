@@ -78,13 +78,10 @@ class FreshGain(NamedTuple):
 
 
 class SideEffect(NamedTuple):
-    """What else the winner has better or worse than the start, whether anybody asked for it or not.
+    """What else the winner has better or worse than the start on fresh worlds, whether anybody asked for it or not.
 
-    Args:
-        what: Which number.
-        test: The difference on fresh worlds, paired; of a target over the cells around the vehicle.
-        p: Probability of a difference as large to either side by chance, with all other changes looked at (Holm 1979).
-        shares: Name of an objective -> what share of its gain on fresh worlds this is, if it is a part of it.
+    `p` is the probability of a difference as large to either side by chance, with all other changes looked at (Holm
+    1979), `shares` what share of an objective's gain this is, if it is a part of it.
     """
 
     what: str

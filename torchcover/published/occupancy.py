@@ -50,12 +50,8 @@ def occupancy_rows(boxes: Boxes, place_in_time: int, categories: Sequence[str], 
 class Occupancy:
     """In how many frames each voxel was inside a box of one category, in blocks of contiguous worlds.
 
-    Args:
-        voxels: (K,) numbers of the voxels that were in any, ascending.
-        pattern: (K,) which row of `counts` is that of the voxel: many have the same.
-        counts: (P, B) frames of each block.
-        steps: (B,) frames of each block in all.
-        boxes: How many boxes there were that hold the centre of a voxel.
+    `voxels` (K,) are those that were in any, ascending; `pattern` (K,) is which row of `counts` (P, B), frames of each
+    block, is theirs: many have the same. `steps` (B,) are all frames, `boxes` how many held the centre of a voxel.
     """
 
     voxels: Int64

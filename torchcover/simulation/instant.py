@@ -66,17 +66,11 @@ class SensorScan(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Instant:
-    """A scene at one time. Its bodies are numbered: what never moves, then what moves.
+    """A scene at one time. Its bodies are numbered: what never moves, then what moves and is near.
 
-    Args:
-        static: What never moves.
-        static_T_vehicle: From the vehicle frame to that of what never moves.
-        moving: The bodies that move and are near.
-        ego: Number of the ego.
-        out_of_range: How many bodies that move are not near, or not there.
-        ground: What one drives or walks on; none if not given.
-        world_T_vehicle: (4, 4) where the vehicle is in the frame that the ground is given in.
-        motion: Where everything is from a time before this one to another.
+    `out_of_range` says how many others that move are not near, or not there; `ground` what one drives or walks on,
+    `world_T_vehicle` where the vehicle is in its frame, and `motion` where everything is from a time before this one to
+    another.
     """
 
     static: RayCaster

@@ -146,11 +146,8 @@ def _vertical(count: int, up: float) -> Float32:
 class LocalGround:
     """The ground below each place: the highest surface of it at or below the place, a few centimetres above included.
 
-    Heights are measured along the world's vertical, not along the z axis of a vehicle that pitches.
-
-    Args:
-        meshes: What is ground, and no other face, in the world frame; none at all where there is no ground.
-        origin_m: (3,) what is subtracted of world coordinates, in float64: they become float32.
+    Heights are measured along the world's vertical, not along the z axis of a vehicle that pitches. Meshes are of
+    ground alone, in the world frame; `origin_m` (3,) is subtracted in float64: coordinates become float32.
 
     Example:
         >>> from torchcover.simulation.shapes import Plane

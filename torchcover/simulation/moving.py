@@ -81,15 +81,10 @@ class Meetings(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Moving:
-    """P bodies that move, placed at one instant.
+    """P bodies that move, placed at one instant: casters in their own frames, which one kind shares, and numbers.
 
-    Args:
-        casters: Of each, in its own frame; bodies of one kind share one.
-        vehicle_T_part: (P, 4, 4) where they are.
-        body: (P,) their numbers.
-        corners_m: (P, 8, 3) of the boxes around them in the vehicle frame.
-        centre_m: (P, 3) of balls around them, likewise.
-        radius_m: (P,) of these balls.
+    In the vehicle frame, `corners_m` (P, 8, 3) are of boxes around them; of balls around them `centre_m` is (P, 3),
+    `radius_m` (P,).
     """
 
     casters: Sequence[RayCaster]

@@ -127,13 +127,9 @@ class Hits(NamedTuple):
 
 
 class Struck(NamedTuple):
-    """What N rays hit.
+    """What N rays hit: the number of the body, see `Instant`, or -1, the face of its mesh, and what that is made of.
 
-    Args:
-        body: (N,) its number, see `Instant`; -1 for what is no body of a scene.
-        triangle: (N,) which face of its mesh.
-        cos_incidence: (N,) float32 cosine of the angle between the ray and the normal of the face, on either side.
-        material: (N,) uint8 what the face is made of, as `Mesh.material` has it.
+    `cos_incidence` is the cosine of the angle between the ray and the normal of the face, on either side.
     """
 
     body: Int32

@@ -200,14 +200,9 @@ def _expected(
 
 
 class ReturnFit(NamedTuple):
-    """Range at 10 % and spread of a LiDAR, from rays to a road.
+    """Range at 10 % and spread of ln range of a LiDAR, the likeliest from rays to a road, and errors of ln of both.
 
-    Args:
-        range_at_10_percent_m: The likeliest.
-        spread: The likeliest, of ln range.
-        range_error: Standard error of ln of the range.
-        spread_error: Of ln of the spread.
-        fades: Whether the recording tells: twice the range would have left other returns.
+    `fades` says whether the recording tells: twice the range would have left other returns.
     """
 
     range_at_10_percent_m: float

@@ -20,15 +20,10 @@ BLIND_DEG = 30.0
 
 
 class ScanEstimate(NamedTuple):
-    """A scan pattern.
+    """A scan pattern: (R,) elevations of the rows that returned anything, the highest first, and how many columns.
 
-    Args:
-        elevations_deg: (R,) of the rows that returned anything, the highest first.
-        columns: How many.
-        horizontal_fov_deg: Field of view, 360 for a full turn.
-        centre_deg: Azimuth of its middle.
-        min_range_m: Range of the nearest return.
-        max_range_m: Range of the farthest return.
+    `horizontal_fov_deg` is 360 for a full turn, `centre_deg` the azimuth of its middle; ranges are of the nearest and
+    the farthest return.
     """
 
     elevations_deg: Float64

@@ -35,13 +35,9 @@ INSTANTS_KEPT = 4
 class Scene:
     """The geometry of a world, built once; `at` places what moves.
 
-    What never moves is one ray casting scene. A body that moves has a scene of its own kind, in its own frame, which
-    is never built again: only the rays that point at the body are cast at it. An ego that rests belongs to what never
-    moves.
-
-    Args:
-        world: Meshes, actors and the ego.
-        solids: Those of other worlds whose bodies may be of the same kinds; its own if not given.
+    What never moves is one ray casting scene. A body that moves has a scene of its own kind, which it may share with
+    those of other worlds, in its own frame, which is never built again: only the rays that point at the body are cast
+    at it. An ego that rests belongs to what never moves.
     """
 
     def __init__(self, world: World, solids: Solids | None = None) -> None:

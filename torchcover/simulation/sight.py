@@ -32,17 +32,11 @@ class Ends(NamedTuple):
 
 
 class MountedSensor:
-    """What a sensor of a rig sees.
+    """What a sensor of a rig sees, whose rays are cast `reach_m` far (`Scenario.reach_m`) through some weather.
 
-    Its place on the ego is fixed, so the rays that the ego's own body ends are the same at every step: it is not cast
-    at again. Where nothing moves at all, the rays are cast once for every step.
-
-    Args:
-        sensor: The sensor.
-        scene: Where it is.
-        reach_m: How far its rays are cast there; `Scenario.reach_m`.
-        weather: What they go through.
-        others: The other sensors of its rig, whose housings may be in the way.
+    Its place on the ego is fixed, so the rays that the ego's own body ends are the same at every step, as are those
+    that the housings of others end: these are not cast at again. Where nothing moves at all, the rays are cast once for
+    every step.
     """
 
     def __init__(

@@ -79,13 +79,8 @@ class Scenes:
     """The geometry of a scenario's runs: each is built when first needed, and a few are kept, in case they are again.
 
     In each process, that is: Embree's scenes cannot be pickled, so that a DataLoader worker builds its own. The bodies
-    of each kind, which runs have in common, are made once.
-
-    Args:
-        scenario: What plays.
-        seed: Seed of procedural traffic.
-        kept_bytes: What all that are kept may take; a small share of the machine's memory if not given.
-        no_cache: As in `StoredWorlds`.
+    of each kind, which runs have in common, are made once. All that are kept may take `kept_bytes`; a small share of
+    the machine's memory if not given.
     """
 
     def __init__(

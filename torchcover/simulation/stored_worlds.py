@@ -49,12 +49,7 @@ class StoredWorlds:
     """The worlds of a scenario. Those that are drawn are kept in torchcover/worlds of $XDG_CACHE_HOME or ~/.cache.
 
     Where they take more than the budget, those go that were not asked for longest, but none of this run: else a long
-    one would leave nothing to the next.
-
-    Args:
-        scenario: What plays.
-        seed: Seed of procedural traffic.
-        no_cache: Whether every world is built.
+    one would leave nothing to the next. With `no_cache` every world is built.
     """
 
     def __init__(self, scenario: Scenario, seed: int, *, no_cache: bool = False) -> None:

@@ -45,15 +45,11 @@ def no_motion(*_: float) -> tuple[Float64, Sequence[Poses]]:
 
 
 class SweptHits(NamedTuple):
-    """What n rays of a tile hit.
+    """What n rays of a tile hit, and at how many pairs of a ray and a moving body they were cast.
 
-    Args:
-        hits: Of each.
-        directions: (3, n) in the vehicle frame at the frame's time.
-        starts_m: (3, n) where they start, likewise, or (3, 1) if all start there.
-        on_body: (K,) the rays that hit a body that moves, and is not the ego.
-        points: (K, 3) where these points are at the frame's time: they have travelled with their body.
-        casts: How many rays were cast at bodies that move.
+    `directions` (3, n) and `starts_m` (3, n), or (3, 1) if all start there, are in the vehicle frame at the frame's
+    time. `on_body` (K,) are the rays that hit a body that moves, and is not the ego; `points` (K, 3) where these points
+    are at the frame's time: they have travelled with their body.
     """
 
     hits: Hits
@@ -68,14 +64,9 @@ class SweptHits(NamedTuple):
 class Sweep:
     """How everything moves while rays are cast one after the other.
 
-    Args:
-        static: What never moves.
-        now: Where everything is at the frame's time.
-        moving: The bodies that move, as they are then.
-        samples_s: (3,) times after that.
-        static_T_vehicle: (3, 4, 4) at these times.
-        part_T_vehicle: (3, P, 4, 4) likewise.
-        corners_m: (P, 24, 3) of boxes around the bodies at these times, as the vehicle sees them.
+    `now` says where everything is at the frame's time. At three times after that, `samples_s` (3,), are
+    `static_T_vehicle` (3, 4, 4), `part_T_vehicle` (3, P, 4, 4), and `corners_m` (P, 24, 3) of boxes around the bodies
+    as the vehicle sees them.
     """
 
     static: RayCaster

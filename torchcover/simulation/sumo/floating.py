@@ -138,12 +138,9 @@ class _Collector:
 
 
 class Recorded(NamedTuple):
-    """What there is in a window.
+    """What there is in a window that begins at `begin_s` of the simulation; `last_s` is the last time read, or -inf.
 
-    Args:
-        tracks: All, in the order of their first appearance; somebody who was gone in between has several.
-        begin_s: When it begins, in the time of the simulation.
-        last_s: The last time that was read; minus infinity if there was none.
+    The tracks are in the order of their first appearance; somebody who was gone in between has several.
     """
 
     tracks: tuple[SumoTrack, ...]

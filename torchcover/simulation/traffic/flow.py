@@ -34,12 +34,9 @@ BYTES_PER_STATE = 128
 
 @dataclass(frozen=True, eq=False)
 class Lane:
-    """A line that is followed in one direction.
+    """A line that is followed in one direction, and the junctions on it, in their order.
 
-    Args:
-        line: The line.
-        gates: The junctions on it, in their order.
-        limits_mps: (K,) how fast its curves may be driven, at 0 m, `LIMIT_EVERY_M`, ...; any speed if not given.
+    `limits_mps` (K,) is how fast its curves may be driven, at 0 m, `LIMIT_EVERY_M`, ...; any speed if not given.
     """
 
     line: Polyline | Beside
@@ -49,15 +46,7 @@ class Lane:
 
 @dataclass(frozen=True, eq=False)
 class Agent:
-    """Somebody who follows a lane.
-
-    Args:
-        kind: Which body.
-        length_m: Of the body, bumper to bumper.
-        lane: Index of the lane.
-        place_m: Where the centre is on it when the simulation begins.
-        driver: How they drive or walk.
-    """
+    """Somebody of a kind, so long bumper to bumper, whose centre is at a place on a lane at first; their driver."""
 
     kind: str
     length_m: float

@@ -11,12 +11,10 @@ from torchcover.geometry.arrays import Float64
 
 @dataclass(frozen=True, eq=False)
 class Polyline:
-    """A polyline on the ground that goes on straight beyond its ends, or a loop.
+    """A polyline through (K, 2) corners on the ground that goes on straight beyond its ends, or a loop.
 
-    Args:
-        points_m: (K, 2) corners, K >= 2. Curves need corners close to each other.
-        closed: Whether the last corner, which then equals the first, leads on to the first. The seam must lie on a
-            straight part.
+    Curves need corners close to each other. The seam of a loop, whose last corner equals the first, lies on a straight
+    part.
 
     Example:
         >>> Polyline(np.array([[0.0, 5.0], [0.0, 105.0]])).poses(20.0)

@@ -17,11 +17,8 @@ MAIN, CROSS = 0, 1
 class Signals:
     """The lights of J junctions: main green, amber, all red, cross green, amber, all red, and again.
 
-    Args:
-        offset_s: (J,) how far into its cycle each junction is at time 0.
-        green_s: Length of the main and of the cross green.
-        amber_s: Time after green in which those who cannot stop any more still enter.
-        clear_s: Time after amber in which all have red.
+    `offset_s` (J,) is how far into its cycle each is at time 0. In amber those still enter who cannot stop any more;
+    then for `clear_s` all have red.
     """
 
     offset_s: Float64
@@ -51,14 +48,9 @@ class Signals:
 
 @dataclass(frozen=True)
 class Gate:
-    """Where a lane passes a junction.
+    """Where a lane passes a junction in a phase: from its stop line to where a rear end has left the junction.
 
-    Args:
-        enter_m: Place of the stop line.
-        exit_m: Place after which a rear end has left the junction.
-        junction: Index of the junction.
-        phase: `MAIN` or `CROSS`.
-        green_needed_s: Who enters must have this much green left (people on foot, who are slow to cross).
+    Who enters must have so much green left; people on foot are slow to cross.
     """
 
     enter_m: float
