@@ -20,17 +20,9 @@ ROUNDING = 1e-9
 class Arm:
     """One of the two that share a budget. The start is evaluation 0 of both.
 
-    An optimiser knows one number. Of several objectives it is told the augmented Chebyshev value, with other random
-    weights each time (ParEGO, Knowles 2006).
-
-    Args:
-        name: "optimiser" or "random".
-        makes: Of the optimiser.
-        cube: What is free.
-        seed: Of the optimiser, and of the weights.
-        start: Evaluation 0, scored at all instants.
-        objectives: How many of the first numbers are made better.
-        floors: What all of them must not be worse than; NaN for anything.
+    An optimiser knows one number. Of several objectives, the first numbers of each estimate, it is told the augmented
+    Chebyshev value, with other random weights each time (ParEGO, Knowles 2006). `floors` are what all numbers must not
+    be worse than; NaN for anything.
     """
 
     def __init__(

@@ -63,13 +63,7 @@ NamedVehicle = Annotated[NameOrFile, AfterValidator(_vehicle)]
 
 
 class Carrier(NamedTuple):
-    """The vehicle that all candidates are mounted on.
-
-    Args:
-        name: What messages call it.
-        skin: Of its body.
-        regions: By name, where sensors can be mounted.
-    """
+    """The vehicle that all candidates are mounted on: its name, its skin, and by name where sensors can be mounted."""
 
     name: str
     skin: Skin

@@ -107,11 +107,7 @@ class CandidateGroup(Document):
         return self
 
     def sensors(self, group: str, carrier: Carrier) -> Iterator[Sensor]:
-        """A sensor at each place, called after the group and the place.
-
-        Args:
-            group: Name of the group.
-            carrier: What it is mounted on.
+        """A sensor at each place on a vehicle, called after the group and the place.
 
         Raises:
             ValueError: The vehicle has no such region.

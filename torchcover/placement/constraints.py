@@ -39,10 +39,7 @@ class Constraints(Document):
     def broken_by(self, rig: Rig, free: Collection[str], cost_eur: float | None) -> tuple[str, ...]:
         """What of it a rig does not keep to, in words; not its self-hits, which only a scan knows.
 
-        Args:
-            rig: The rig.
-            free: Names of the sensors that a search may place.
-            cost_eur: What it costs.
+        `free` are the names of the sensors that a search may place.
         """
         return (*self._too_close(rig, free), *self._lopsided(rig), *self._too_dear(cost_eur))
 

@@ -9,10 +9,9 @@ AUGMENTATION = 0.05
 
 
 def non_dominated(values: Float64) -> Bools:
-    """Which candidates no other is as good as everywhere and better than somewhere; equal ones stay together.
+    """Which of (candidates, objectives) no other is as good as everywhere and better than somewhere; equal ones stay.
 
-    Args:
-        values: (candidates, objectives); a row with NaN is not among them.
+    A row with NaN is not among them.
 
     Example:
         >>> non_dominated(np.array([[1.0, 0.0], [0.0, 1.0], [0.5, 0.5], [0.4, 0.5]]))
@@ -26,13 +25,10 @@ def non_dominated(values: Float64) -> Bools:
 
 
 def hypervolume(values: Float64, reference: Float64) -> float:
-    """Volume of what lies between the candidates and a point that they are measured from.
+    """Volume of what lies between (candidates, objectives) and a point that they are measured from, (objectives,).
 
-    By slices along the last objective, whose number is that of the candidates: exact, and quick for two or three.
-
-    Args:
-        values: (candidates, objectives); what is not above the reference in all of them adds nothing.
-        reference: (objectives,).
+    What is not above that in all of them adds nothing. By slices along the last objective, whose number is that of the
+    candidates: exact, and quick for two or three.
 
     Example:
         >>> hypervolume(np.array([[2.0, 1.0], [1.0, 2.0]]), np.zeros(2))

@@ -17,10 +17,7 @@ MIN_WORLDS = 3
 class Prefix(NamedTuple):
     """What is known of a rig after the first instants, in the one order that all rigs are scored in.
 
-    Args:
-        instants: How many these are.
-        estimate: Of the objectives.
-        self_hit_share: Share of the rig's rays that the vehicle itself took.
+    `self_hit_share` is the share of the rig's rays that the vehicle itself took.
     """
 
     instants: int
@@ -39,14 +36,7 @@ def gains(estimate: Estimate, other: Estimate) -> tuple[Float64, Float64]:
 
 
 def racing_order(world_of: Sequence[int] | Int64, seed: int) -> Int64:
-    """All instants in an order drawn at random, round by round of one instant of each world.
-
-    Args:
-        world_of: World of each instant.
-        seed: Decides it.
-
-    Returns:
-        (n,) numbers of the instants.
+    """(n,) all instants in an order drawn at random, round by round of one instant of each world.
 
     Example:
         >>> worlds = np.array([0, 0, 1, 1, 2, 2])
@@ -67,15 +57,8 @@ def race(
 ) -> tuple[Prefix, ...]:
     """Score a rig on until it is clearly below an incumbent after the same instants, or was scored at all of them.
 
-    Clearly is two standard errors of their paired difference, over worlds, in every objective.
-
-    Args:
-        prefixes: What is known of it after more and more instants; no more of them is asked for than is needed.
-        incumbents: The best so far, at all instants; of several objectives there may be several.
-        objectives: How many of the first numbers these are; all if not given.
-
-    Returns:
-        What was asked for.
+    Clearly is two standard errors of their paired difference, over worlds, in every objective: of so many numbers, or
+    all. Of `prefixes` no more is asked for than is needed. Of several objectives there may be several incumbents.
     """
     known: list[Prefix] = []
     for prefix in prefixes:

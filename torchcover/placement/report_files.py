@@ -55,14 +55,8 @@ class PlacementReport:
     def save(self, folder: str | Path, *, files: str | Iterable[str] = FILES) -> list[Path]:
         """Write the files of the command line: first what was found, then the pictures and the page.
 
-        Args:
-            folder: Where to write the rigs, the tables, `search.json`, the pictures, `report.html`, and, last,
-                `summary.json`. Made if it does not exist; files of an earlier run that its `summary.json` lists are
-                deleted.
-            files: What to write beside `summary.json`, as in `Result.save`; "maps" are the pictures.
-
-        Returns:
-            The files.
+        A folder is made if it does not exist; files of an earlier run that its `summary.json` lists are deleted.
+        `files` is as in `Result.save`; "maps" are the pictures.
         """
         wanted = wanted_files(files)
         summary = {"torchcover": __version__, "complete": True, "sentence": self.sentence}

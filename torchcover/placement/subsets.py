@@ -33,14 +33,10 @@ HALVINGS = 7
 
 @dataclass(frozen=True)
 class Limits:
-    """What a subset must keep to.
+    """What a subset must keep to: so many candidates, which cost so much, at most.
 
-    Args:
-        most: The most candidates in it.
-        prices: Of each candidate.
-        most_to_pay: In all.
-        apart: (C, C) bool whether two candidates may both be there; all may if not given.
-        least: What the numbers of `Candidates.worth` must be at least; anything, -inf, if not given.
+    `apart` (C, C) is whether two candidates may both be there; all may if not given. `least` is what the numbers of
+    `Candidates.worth` must be at least; anything, -inf, if not given.
     """
 
     most: int
@@ -99,12 +95,7 @@ class Candidates:
 
     @classmethod
     def grouped(cls, worth: ArrayLike, seen: Sequence[Bools], always: Bools) -> Self:
-        """Group points.
-
-        Args:
-            worth: (Q, P) what each point is worth.
-            seen: (P,) which of them each candidate sees.
-            always: (P,) which are seen anyway.
+        """Group P points by what each is worth, (Q, P), which candidates see it, and whether it is seen anyway.
 
         Example:
             >>> seen = [np.array(each, dtype=bool) for each in ([1, 1, 0, 0], [1, 1, 1, 0])]
@@ -131,12 +122,9 @@ class Candidates:
 
 
 def best(candidates: Candidates, limits: Limits, weights: Sequence[float] | Float64 = (1.0,)) -> Subset:
-    """The best subset, and of equal ones the cheapest.
+    """The best subset, and of equal ones the cheapest. Where none is worth `least`, what lacks the least in all.
 
-    Args:
-        candidates: What there is.
-        limits: What to keep to. Where no subset is worth `least`, what lacks the least in all.
-        weights: Of the first numbers of `Candidates.worth`, whose sum is made as large as it gets.
+    `weights` are of the first numbers of `Candidates.worth`, whose sum is made as large as it gets.
 
     Example:
         >>> seen = [np.array(each, dtype=bool) for each in ([1, 1, 0, 0], [0, 1, 1, 1], [1, 0, 0, 0])]
