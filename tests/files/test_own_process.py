@@ -64,7 +64,7 @@ def test_memory_is_what_files_may_take(path, monkeypatch):
         apart_readers.greedy(path, 40.0)
     with pytest.raises(ValueError, match="OSError"):
         apart_readers.writing(path)
-    assert not path.with_suffix(".new").read_bytes() if path.with_suffix(".new").exists() else True
+    assert path.with_suffix(".new").stat().st_size == 0
 
 
 def test_threads_and_forks_read_too(path):
@@ -92,7 +92,11 @@ def test_parts_of_a_mesh_are_looked_at_as_the_mesh_is(tmp_path):
     os.mkfifo(tmp_path / "pipe.bin")
     (tmp_path.parent / "outside.bin").write_bytes(corners.tobytes())
     path = tmp_path / "mesh.gltf"
-    for name, words in (("good.bin", None), ("pipe.bin", "a pipe, a socket"), ("../outside.bin", "escapes")):
+    for name, words in (
+        ("good.bin", None),
+        ("pipe.bin", "a pipe, a socket"),
+        ("../outside.bin", "outside of its folder"),
+    ):
         content = {
             "asset": {"version": "2.0"},
             "buffers": [{"uri": name, "byteLength": 36}],

@@ -6,7 +6,6 @@ of memory, time and open files for each. What goes through the pipes is JSON and
 
 import atexit
 import json
-import math
 import os
 import select
 import subprocess
@@ -34,6 +33,8 @@ Reader = Callable[Concatenate[Path, Arguments], Arrays]
 MOST_S = 60.0
 BYTES_PER_S = 1e6
 KNOWN_ERRORS = {kind.__name__: kind for kind in (ValueError, MemoryError, ImportError, FileNotFoundError)}
+# As much as a scan has: or both wait for each other, again and again.
+PIPE_BYTES = 1 << 20
 # The same modules as here, whatever folder this one was started in.
 PROGRAM = "import sys; sys.path[:] = {path!r}; from torchcover.files.own_process import serve; serve()"
 
@@ -57,7 +58,7 @@ def apart(read: Reader[Arguments]) -> Reader[Arguments]:
         request = [os.environ.get(VARIABLE), read.__module__, read.__name__, str(path.absolute()), *args]
         return _own_process().ask(request, limit_s)
 
-    return asked
+    return asked  # type: ignore[return-value]  # which would have the path without a name
 
 
 class _Process:
@@ -72,6 +73,7 @@ class _Process:
             stderr=subprocess.DEVNULL,  # where OpenEXR says what is wrong
             env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
             preexec_fn=end_with_parent(),  # noqa: PLW1509  (it calls prctl only)
+            pipesize=PIPE_BYTES,
         )
 
     def is_alive(self) -> bool:
@@ -141,7 +143,7 @@ def serve() -> None:
             else:
                 _send(answers, [None, [[key, array.dtype.str, array.shape] for key, array in arrays.items()]])
                 for array in arrays.values():
-                    answers.write(memoryview(array).cast("B") if array.size else b"")
+                    answers.write(array.reshape(-1).view(np.uint8).data)
                 answers.flush()
 
 
@@ -162,8 +164,8 @@ def _received(pipe: IO[bytes], limit_s: float) -> tuple[list[str] | None, Arrays
     error, listed = _received_json(pipe)
     arrays = {}
     for name, dtype, shape in listed:
-        data = _whole(pipe, math.prod(shape) * np.dtype(dtype).itemsize)
-        arrays[name] = np.frombuffer(data, dtype=dtype).reshape(shape)
+        arrays[name] = np.empty(shape, dtype)
+        _fill(pipe, arrays[name].reshape(-1).view(np.uint8).data)
     return error, arrays
 
 
@@ -173,10 +175,13 @@ def _received_json(pipe: IO[bytes]) -> Any:  # noqa: ANN401
 
 def _whole(pipe: IO[bytes], size: int) -> bytearray:
     data = bytearray(size)
-    view = memoryview(data)
-    while view:
-        count = pipe.readinto(view)  # type: ignore[attr-defined]
+    _fill(pipe, memoryview(data))
+    return data
+
+
+def _fill(pipe: IO[bytes], room: memoryview) -> None:
+    while room:
+        count = pipe.readinto(room)  # type: ignore[attr-defined]
         if not count:
             raise EOFError
-        view = view[count:]
-    return data
+        room = room[count:]

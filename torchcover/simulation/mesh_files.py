@@ -36,13 +36,13 @@ def _parts_of(path: Path) -> object:
     """Where a mesh finds what it refers to, such as its buffers: regular files below its folder, and not too large."""
     from trimesh.resolvers import FilePathResolver
 
-    class Parts(FilePathResolver):
+    class Parts(FilePathResolver):  # type: ignore[misc]  # trimesh has no types
         def get(self, name: str) -> bytes:
-            for candidate in (name.strip(), name.strip().lstrip("/"), Path(name).name):
-                place = (path.parent / candidate).resolve()
-                if place.exists():
-                    check_regular(place, "a part of a mesh")
-                    check_memory(place.stat().st_size)
-            return super().get(name)
+            place = (path.parent / name.strip()).resolve()
+            if not place.is_relative_to(path.parent.resolve()):
+                raise ValueError(f"it refers to {name}, outside of its folder")
+            check_regular(place, "a part of a mesh")
+            check_memory(place.stat().st_size)
+            return place.read_bytes()
 
     return Parts(path)
