@@ -91,8 +91,7 @@ def euler_from_rotation(rotation: Matrix) -> Matrix:
     left = sine * r[..., 0, 2] - cosine * r[..., 1, 2], cosine * r[..., 1, 1] - sine * r[..., 0, 1]
     roll = np.where(upright, 0.0, np.arctan2(*left))
     pitch = np.arctan2(-r[..., 2, 0], horizontal)
-    angles: Matrix = np.rad2deg(np.stack([yaw, pitch, roll], axis=-1))
-    return angles
+    return np.asarray(np.rad2deg(np.stack([yaw, pitch, roll], axis=-1)))
 
 
 def rotation_from_quaternion(wxyz: ArrayLike) -> Matrix:

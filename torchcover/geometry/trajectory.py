@@ -4,11 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from torchcover.geometry import euler_from_rotation, rigid, rotation_from_euler
-
-Matrix = NDArray[np.float64]
+from torchcover.geometry.rigid import Matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,8 +123,7 @@ class Trajectory:
         if first >= end or not self.times_s[0] <= time_s <= self.times_s[-1]:
             return np.zeros(3)
         way, taken = np.diff(self.positions_m[first : end + 1], axis=0), np.diff(self.times_s[first : end + 1])
-        velocity: Matrix = (way / taken[:, None]).mean(axis=0)
-        return velocity
+        return np.asarray((way / taken[:, None]).mean(axis=0))
 
 
 def poses_at(trajectories: Sequence[Trajectory], time_s: float) -> Matrix:

@@ -93,15 +93,9 @@ def _environment(folder: Path) -> dict[str, str]:
 def simulate(
     network: Path, routes: Sequence[Path], begin_s: float, seed: int, *, around: str | None, drawn: bool
 ) -> Iterator[bytes]:
-    """Floating car data of a simulation, from a time on and for as long as they are asked for.
+    """Floating car data of a simulation from `begin_s` on, of those near to the vehicle `around` if one is given.
 
-    Args:
-        network: A `.net.xml`.
-        routes: Who drives and walks.
-        begin_s: From when on it is told where they are.
-        seed: Of the simulation.
-        around: Only those near to this vehicle are told of.
-        drawn: Whether the traffic was drawn: then nobody is taken out of a jam, and ways may end anywhere.
+    Traffic that was `drawn` is not taken out of a jam, and its ways may end anywhere.
     """
     options = ["--time-to-teleport", "-1", "--ignore-route-errors"] if drawn else []
     if around is not None:
