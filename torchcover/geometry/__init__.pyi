@@ -12,6 +12,7 @@ from .rigid import quaternion_from_rotation as quaternion_from_rotation
 from .rigid import rigid as rigid
 from .rigid import rotation_from_euler as rotation_from_euler
 from .rigid import rotation_from_quaternion as rotation_from_quaternion
+from .rigid import slerp as slerp
 from .rigid import transform as transform
 from .tensors import transform_tensor as transform_tensor
 from .voxel_walk import VoxelGrid as VoxelGrid

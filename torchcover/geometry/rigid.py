@@ -146,6 +146,19 @@ def quaternion_from_rotation(rotation: Matrix) -> Matrix:
     return found
 
 
+def slerp(first_wxyz: Matrix, second_wxyz: Matrix, share: Matrix) -> Matrix:
+    """(N, 4) unit quaternions at (N, 1) shares of the shorter way between two of (N, 4) each, at an even rate."""
+    cosine = (first_wxyz * second_wxyz).sum(axis=1, keepdims=True)
+    second_wxyz, cosine = np.where(cosine < 0, -second_wxyz, second_wxyz), np.abs(cosine).clip(max=1.0)
+    angle = np.arccos(cosine)
+    straight = angle < 1e-6
+    sine = np.where(straight, 1.0, np.sin(angle))
+    of_first = np.where(straight, 1 - share, np.sin((1 - share) * angle) / sine)
+    of_second = np.where(straight, share, np.sin(share * angle) / sine)
+    between: Matrix = of_first * first_wxyz + of_second * second_wxyz
+    return between
+
+
 def check_rigid(matrix: ArrayLike, name: str) -> Matrix:
     """Return `matrix` as float64 if it is a rigid transform, else say by how much it is not.
 

@@ -1,6 +1,5 @@
 """Shapes: primitives, and meshes from files."""
 
-import gc
 from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
@@ -15,6 +14,7 @@ from torchcover.geometry import transform
 from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.simulation.documents import Document, PathBeside
 from torchcover.simulation.material import material_number
+from torchcover.simulation.mesh_files import mesh_arrays
 
 CYLINDER_SIDES = 24
 MAX_SIDES = 10_000
@@ -209,21 +209,10 @@ class MeshFile(Document):
 
 @reads("a mesh")
 def _read_mesh(path: Path) -> Mesh:
-    import trimesh
-
     with path.open("rb") as file:
         is_binary = b"\0" in file.read(PART)
-    size = path.stat().st_size
-    check_memory((_BYTES_PER_BINARY_BYTE if is_binary else _BYTES_PER_TEXT_BYTE) * size)
-    try:
-        loaded = trimesh.load_mesh(path, process=False)
-    except Exception as error:  # trimesh raises whatever the reader of the format raises
-        raise ValueError(f"trimesh cannot read it as a mesh ({error})") from error
-    vertices = np.asarray(getattr(loaded, "vertices", ()), dtype=np.float64)
-    faces = np.asarray(getattr(loaded, "faces", ()), dtype=np.int64)
-    del loaded
-    if size > PART:
-        gc.collect()  # it stood in a circle with what it was read from, four times as large as the mesh
+    check_memory((_BYTES_PER_BINARY_BYTE if is_binary else _BYTES_PER_TEXT_BYTE) * path.stat().st_size)
+    vertices, faces = mesh_arrays(path).values()
     if len(faces) == 0:
         raise ValueError(f"a mesh with faces is needed; it has {len(vertices)} vertices and no face")
     if not np.isfinite(vertices).all():

@@ -10,7 +10,7 @@ from shutil import which
 from tempfile import TemporaryFile
 from xml.etree import ElementTree
 
-from torchcover.files import end_with_parent, parse_xml, reads
+from torchcover.files import end_with_parent, most_gb, parse_xml, reads
 from torchcover.simulation.sumo.floating import ATTRIBUTES
 from torchcover.simulation.traffic.assemble import HORIZON_M
 
@@ -48,7 +48,7 @@ def output_of(program: str, *options: str | Path) -> Iterator[bytes]:
             stdout=subprocess.PIPE,
             stderr=said,
             env=_environment(folder),
-            preexec_fn=end_with_parent(),  # noqa: PLW1509  (one call of the system, no lock)
+            preexec_fn=end_with_parent(most_gb()),  # noqa: PLW1509  (one call of the system, no lock)
         )
         assert process.stdout is not None  # as asked for
         try:
