@@ -110,17 +110,12 @@ def solve(
 ) -> tuple[Float64, Float64, Status]:
     """Find the points of the valid region whose distorted images are (u, v), on as many threads as torch may use.
 
-    Args:
-        distortion: With coefficients that are floats.
-        region: Its valid region.
-        table: Its start table.
-        u: (N,) float64 normalised image coordinate.
-        v: (N,) likewise.
-        focal: Pixels per unit of u and of v; the residual is measured in pixels.
+    `u` and `v` are (N,) float64 normalised image coordinates, `focal` is pixels per unit of both, for the residual is
+    measured in pixels; the coefficients of `distortion` are floats.
 
     Returns:
-        `a`, `b` (N,) float64, 0 where there is no answer, and (N,) uint8: `ANSWERED`, `OUTSIDE` (no point of the
-        valid region has this image) or `UNCONVERGED`.
+        `a`, `b` (N,) float64, 0 where there is no answer, and (N,) uint8: `ANSWERED`, `OUTSIDE` (no point of the valid
+            region has this image) or `UNCONVERGED`.
     """
 
     def quick(u: Float64, v: Float64) -> tuple[Float64, ...]:

@@ -54,16 +54,9 @@ def _sum_per_cell(cell: Tensor, values: Tensor, cells: int) -> Tensor:
 def edges_below(values: Tensor, bounds: Tensor, low: float, high: float) -> Tensor:
     """How many edges at equal distances are not above each value: what `torch.bucketize` gives, sooner.
 
-    Divided by their distance first, then compared with, so that no rounding moves a point over a border.
-
-    Args:
-        values: (N,) float64.
-        bounds: (B + 3,) float64 edges between two NaN, which are never less, nor more.
-        low: The first edge; as a number, for which a GPU need not be waited for.
-        high: The last edge.
-
-    Returns:
-        (N,) int32.
+    Divided by their distance first, then compared with, so that no rounding moves a point over a border. `bounds` are
+    (B + 3,) float64 edges between two NaN, which are never less, nor more. `low` and `high`, the first and the last
+    edge, are numbers, for which a GPU need not be waited for. The counts are (N,) int32.
     """
     cells = len(bounds) - 3
     fine = high - low <= MIN_CELL_SHARE * cells * max(abs(low), abs(high))  # the quotient would be off by more than one

@@ -161,13 +161,8 @@ def crossed_voxels(
 class _Upwards:
     """Rays within the region, in voxels, each seen in mirrors in which it moves upwards on every axis.
 
-    Args:
-        place: (3, n) where they start.
-        way: (3, n) where they go, nowhere below 0.
-        first: (3, n) voxel that each is in first.
-        last: (3, n) and last.
-        strides: (3, n) how a voxel's number grows along the mirrored axes.
-        number: (n,) number of the voxel at 0, 0, 0, in the mirrors.
+    `place` and `way`, nowhere below 0, are (3, n) where they start and go, `first` and `last` the voxels at both ends,
+    `strides` how a voxel's number grows along the mirrored axes, and `number` (n,) that of the voxel at 0, 0, 0 there.
     """
 
     place: Float64

@@ -59,13 +59,11 @@ class Limits:
 
 
 class Subset(NamedTuple):
-    """A choice of candidates.
+    """A choice of candidates by their numbers, and what they are worth together with what is always there.
 
-    Args:
-        chosen: Their numbers.
-        values: What they are worth together with what is always there: the numbers of `Candidates.worth`.
-        gap: No subset that keeps to the limits is better by more, in what was made better.
-        short: How much it lacks of `Limits.least`, in all; unless there is a gap, no subset lacks less.
+    `values` are the numbers of `Candidates.worth`. No subset that keeps to the limits is better by more than the `gap`
+    in what was made better. `short` is how much it lacks of `Limits.least`, in all; unless there is a gap, no subset
+    lacks less.
     """
 
     chosen: tuple[int, ...]
@@ -83,10 +81,8 @@ class Subset(NamedTuple):
 class Candidates:
     """Candidates by what they see, of points that are grouped by who sees them.
 
-    Args:
-        sees: (G, C) bool which candidates see a group; no two rows are the same.
-        worth: (Q, G) float64 what the points of each group are worth, one row for each number that counts.
-        always: (Q,) what is seen without any of them.
+    `sees` is (G, C) bool, which candidates see a group, without two equal rows; `worth` (Q, G) float64 what the points
+    of each group are worth, one row for each number that counts; `always` (Q,) what is seen without any of them.
     """
 
     sees: Bools

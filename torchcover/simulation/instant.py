@@ -110,15 +110,9 @@ class Instant:
     ) -> SensorScan:
         """Cast the rays of one sensor. The ego occludes, but its own points are left out unless they are wanted.
 
-        Args:
-            vehicle_T_sensor: (4, 4) pose of the sensor.
-            tiles: Its rays, from `into_tiles`; points are in their order.
-            max_range_m: Farther hits give no point.
-            own_m: Where the ego's body, which is not cast at again then, ends the rays of each tile, from
-                `Scene.own_m`.
-            ego_points: Whether hits on the ego give points too.
-            times: When the rays of each tile are cast; all at once if not given.
-            threads: Number of threads; the result does not depend on it.
+        Points are in the order of `tiles`, its rays from `into_tiles`, whatever the number of threads. `own_m` is where
+        the ego's body, which is not cast at again then, ends the rays of each tile, from `Scene.own_m`; `times` when
+        the rays of each tile are cast, all at once if not given.
         """
         origin_m = vehicle_T_sensor[:3, 3]
         sweep = self._sweep(times) if times else None

@@ -42,13 +42,9 @@ NOISE_WITHIN_M = 12.0
 class GroundRays(NamedTuple):
     """Rays that point at the road, nothing being in their way, by (C,) cells: one row in one sector of one sweep.
 
-    Args:
-        range_m: (C,) how far the ground is there.
-        cos_incidence: (C,) of the rays on it.
-        rays: (C,) how many rays there are.
-        returned: (C,) how many of them returned from there; too many where a row is taken for its neighbour.
-        azimuth_deg: (C,) middle of the sector, in the sensor's frame.
-        sweep: (C,) number of the sweep.
+    How far the ground is there and how the rays meet it, how many rays there are, and how many of them returned from
+    there: too many where a row is taken for its neighbour. `azimuth_deg` is the middle of the sector in the sensor's
+    frame.
     """
 
     range_m: Float64

@@ -21,16 +21,10 @@ TIME_SLACK_S = 1e-6
 
 
 class SumoTrack(NamedTuple):
-    """One vehicle or person, for as long as it was there without a gap.
+    """One vehicle or person, for as long as it was there without a gap; `kind` is the name of its type.
 
-    Args:
-        name: Of the simulation.
-        kind: Name of its type.
-        on_foot: Whether it is a person.
-        times_s: (K,) from the first time of the run.
-        places_m: (K, 3) the middle of its front, float64: they may be of UTM size.
-        yaw_deg: (K,) heading, counter-clockwise from x; SUMO's own angles are clockwise from north.
-        slope_deg: (K,) upwards.
+    At (K,) times from the first of the run: (K, 3) the middle of its front, float64, for they may be of UTM size; its
+    heading, counter-clockwise from x, where SUMO's own angles are clockwise from north; and its slope upwards.
     """
 
     name: str

@@ -59,15 +59,10 @@ class RoadUser(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Where a body is.
+    """Where a body is, at (K,) evenly spaced times; those who are there all the time share them.
 
-    Args:
-        user: Whose.
-        times_s: (K,) evenly spaced; those who are there all the time share them.
-        poses: (K, 3) x and y of its middle, and its heading in radians, without leaps; of its front, if it is in two
-            parts.
-        over_kerb_m: How far its outline reaches over a kerb at the worst.
-        rear: (K, 3) likewise what it draws along.
+    `poses` are (K, 3) x and y of its middle, of its front if it is in two parts, and its heading in radians, without
+    leaps; `rear` is likewise what it draws along; `over_kerb_m` how far its outline reaches over a kerb at the worst.
     """
 
     user: RoadUser
@@ -97,14 +92,10 @@ def motions(
     obstacles: NDArray[np.object_] | None = None,
     walked: shapely.Geometry | None = None,
 ) -> list[Motion]:
-    """Move bodies along their tracks, without those who are there for no time.
+    """Move bodies along their tracks, without those who are there for no time; `origin_m` is subtracted of all places.
 
-    Args:
-        users: Who.
-        duration_s: Of the run, from 0 on.
-        origin_m: (2,) what is subtracted of all places.
-        obstacles: Polygons in plan, of pavements and what is parked: vehicles swing out for them where they can.
-        walked: What people walk on: who is beside it goes along its edge instead, where there is time to.
+    Vehicles swing out for `obstacles`, polygons in plan of pavements and what is parked, where they can. Who is beside
+    what people walk on goes along its edge instead, where there is time to.
     """
     shapely.prepare(walked)
     times_s = np.linspace(0.0, duration_s, int(np.ceil(duration_s / FINE_S - TIME_SLACK_S)) + 1)

@@ -9,14 +9,10 @@ from torchcover.geometry.arrays import Float64
 
 
 class Hitch(NamedTuple):
-    """How a body draws another one along.
+    """How a body draws another one along, of kind `rear`, whose axles never slip sideways.
 
-    Args:
-        rear: Kind of the body that is drawn along; its axles never slip sideways.
-        ahead_m: How far the middle of the front is before that of both, on a straight.
-        hitch_m: How far the hitch is before the middle of the front; negative behind it.
-        rod_m: From the hitch back to the axles of the rear.
-        middle_m: From the hitch back to its middle.
+    The middle of the front is `ahead_m` before that of both, on a straight, and the hitch `hitch_m` before the middle
+    of the front, negative behind it. From the hitch, the axles of the rear are `rod_m` back, and its middle `middle_m`.
     """
 
     rear: str

@@ -41,16 +41,11 @@ def course(
     reach_m: float,
     generator: np.random.Generator,
 ) -> Course:
-    """Draw one that never comes near itself.
+    """Draw one that never comes near itself, and that begins and ends `reach_m` from the origin.
 
-    Args:
-        junctions_m: (J,) stations of the junctions.
-        halves_m: (J,) how far from its middle each ends where the street goes straight on.
-        bend_deg: How much the street may bend between two junctions, and from its first direction.
-        turn_share: Share of the junctions with a turn, of those that may have one: neither the first nor the last.
-        radius_m: Of the turns.
-        reach_m: How far from the origin the street begins and ends.
-        generator: Draws it.
+    Each of the junctions, at (J,) stations, ends `halves_m` from its middle where the street goes straight on. It bends
+    by `bend_deg` at most between two of them, and from its first direction. Of those that may have a turn, which is
+    neither the first nor the last, `turn_share` have one.
     """
     for _ in range(DRAWS):
         found = _draw(junctions_m, halves_m, np.deg2rad(bend_deg), turn_share, radius_m, generator)

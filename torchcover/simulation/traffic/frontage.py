@@ -152,16 +152,10 @@ def stand(
     times: float | Mapping[str, float],
     generator: np.random.Generator,
 ) -> tuple[list[Mesh], list[Mesh]]:
-    """Draw what stands along the sides of streets: houses and all else, each kind in one mesh.
+    """Draw what stands along the sides of streets: houses and all else, each kind in one mesh; see `Times`.
 
-    Args:
-        sides: The sides.
-        driven: In plan: where nothing at kerbs may stand.
-        walked: In plan: where nothing behind sidewalks may stand.
-        pavements: In plan: what is a kerb higher than the ground.
-        heights_m: Of the ground, at (N, 2) places.
-        times: See `Times`.
-        generator: Draws it.
+    In plan, nothing at kerbs may stand on what is `driven`, nor anything behind sidewalks on what is `walked`;
+    `pavements` are a kerb higher than the ground, whose heights `heights_m` gives at (N, 2) places.
     """
     if not sides:
         return [], []

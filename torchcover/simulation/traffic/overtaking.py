@@ -59,16 +59,11 @@ class Change(NamedTuple):
 
 
 class Overtaking:
-    """N agents on the lanes of both directions: 0 to 3 of the first, 4 to 7 of the other.
+    """N agents on the lanes of both directions: 0 to 3 of the first, 4 to 7 of the other. They must not overlap.
 
-    Args:
-        agents: Who they are; they must not overlap.
-        heavy: (N,) who keeps out of the lane at the median.
-        exits: (N,) who takes the exit, from the lane beside it.
-        side_m: (2, 2) places between which the side lane of each direction lies beside the others: before, it is an
-            entry, behind, an exit.
-        generator: Draws how long changes take, and how evenly who drives.
-        climb: (2, K) ascending places of the first direction, and the slopes there.
+    Who is `heavy` keeps out of the lane at the median; who `exits` takes the exit, from the lane beside it. The side
+    lane of each direction lies beside the others between two places of `side_m` (2, 2): before, it is an entry, behind,
+    an exit. `climb` are (2, K) ascending places of the first direction, and the slopes there.
     """
 
     def __init__(
