@@ -29,8 +29,9 @@ class EncounterRow(NamedTuple):
     """A rig in one encounter at one speed, or in all that were drawn or met; 0 s if it was too late.
 
     `ttc_s` is the mean time to collision at detection over phases and draws, of which `ttc_s_low` is the least and
-    `ttc_s_high` the most. `needed_s` is the most of any draw, `in_time` the share of phases and draws, `never` that
-    without detection, `from_the_beginning` that in which it was seen as soon as it began, and may have been before.
+    `ttc_s_high` the most. `needed_s` is the most of any draw, `in_time` the share of phases and draws, of traffic of the
+    `to_brake` for whom braking was needed; `never` the share without detection, `from_the_beginning` that in which it
+    was seen as soon as it began, and may have been before.
     `first` is the sensor that alone is first in the mean; of the sensors that may fail, one at a time, `worst` is that
     without which the least time is left, `without_worst_s`: the least of all, of traffic the mean. Of traffic,
     `per_hour` says how many were met. Intervals of 95 % are over draws or worlds, NaN of fewer than 8: `interval_low`
@@ -48,6 +49,7 @@ class EncounterRow(NamedTuple):
     ttc_s_high: float
     interval_low: float
     interval_high: float
+    to_brake: int
     in_time: float
     never: float
     from_the_beginning: float
@@ -106,6 +108,7 @@ class Sightings:
         least = np.mean if self.hours else np.min
         without_s = least([one.without_ttc_s for one in draws] or none, axis=(0, 2))
         numbers = self._numbers(draws)
+        in_time = np.array([one.in_time for one in draws if not np.isnan(one.in_time).any()])
         swept = bool(draws) and draws[0].encounter.speed_is_swept
         return EncounterRow(
             rig=rig,
@@ -119,7 +122,8 @@ class Sightings:
             ttc_s_high=float(ttc_s.max()),
             interval_low=numbers["ttc_s"].low,
             interval_high=numbers["ttc_s"].high,
-            in_time=float(np.mean([one.in_time for one in draws])) if draws else math.nan,
+            to_brake=len(in_time),
+            in_time=float(in_time.mean()) if len(in_time) else math.nan,
             never=float((ttc_s == 0).mean()),
             from_the_beginning=numbers["from_the_beginning"].value,
             from_the_beginning_low=numbers["from_the_beginning"].low,
@@ -171,7 +175,7 @@ class Sightings:
         rows = [row._asdict() for row in self.rows]
         met = [{"rig": one.rig, "world": one.world, "who": one.encounter.name, "name": one.encounter.track.name,
                 "step": one.encounter.step, "least_s": float(one.encounter.ttc_s.min()),
-                "ttc_s": float(one.ttc_s[0]), "in_time": bool(one.in_time[0])}
+                "ttc_s": float(one.ttc_s[0]), "in_time": None if np.isnan(one.in_time[0]) else bool(one.in_time[0])}
                for one in self.sightings if isinstance(one.encounter, Approach)]  # fmt: skip
         listed = {"rows": rows, "speeds": [] if self.hours else up_to, "met": met}
         return self.settings() | {name: list(map(json_record, each)) for name, each in listed.items()}
@@ -211,7 +215,7 @@ class Sightings:
             f"Met: came within {within_s:g} s of a collision, if both had gone straight on, in "
             f"{60 * sum(self.hours.values()):.0f} minutes. Detected before that, with a 95 % interval over "
             f"{len(self.hours)} worlds (of 8 or more), or at the least time to collision, or never.",
-            f"{self.criterion.words} Too late: it was needed before.",
+            f"{self.criterion.words} Too late: it was needed before, of those for whom it ever was.",
             *([] if self.sightings else ["Nobody was met: drive longer (--worlds), or elsewhere."]),
         ]
         return PageTable("Met, and detected before", ("who", "met", "an hour", *rigs), cells, notes=notes)
@@ -266,9 +270,9 @@ def _met(row: EncounterRow) -> str:
     if row.draws == 0:
         return "-"
     least = f", least {row.ttc_s_low:.2f} s" if row.from_the_beginning < 1 and row.never == 0 else ""
-    counts = ((row.never, "never"), (1 - row.in_time, "too late"))
-    told = [f", {round(share * row.draws)} {word}" for share, word in counts if share]
-    return f"{_with_interval(row, 'from_the_beginning', percent)} %{least}{''.join(told)}"
+    never = f", {round(row.never * row.draws)} never" if row.never else ""
+    late = f", {round((1 - row.in_time) * row.to_brake)} of {row.to_brake} too late" if row.in_time < 1 else ""
+    return f"{_with_interval(row, 'from_the_beginning', percent)} %{least}{never}{late}"
 
 
 def _speeds(up_to_kmh: dict[tuple[str, str], float], rigs: Sequence[str]) -> PageTable:

@@ -44,15 +44,15 @@ NEVER = np.iinfo(np.int64).max
 class Sighting(NamedTuple):
     """What a rig had of an encounter, for P phases of its looks and S sensors; 0 is not before the collision.
 
-    `ttc_s` (P,) time to collision at detection, `in_time` (P,) whether that was in time; `sensor_ttc_s` (S, P) of each
-    sensor alone, `without_ttc_s` (S, P) of all others; `from_the_beginning` (P,) whether it was seen as soon as the
-    encounter began, and the other may have been there before.
+    `ttc_s` (P,) time to collision at detection, `in_time` (P,) 1 if that was in time, 0 if not, NaN if braking never was
+    needed; `sensor_ttc_s` (S, P) of each sensor alone, `without_ttc_s` (S, P) of all others; `from_the_beginning` (P,)
+    whether it was seen as soon as the encounter began, and the other may have been there before.
     """
 
     encounter: "Encounter | Approach"
     rig: str
     ttc_s: Float64
-    in_time: Bools
+    in_time: Float64
     sensor_ttc_s: Float64
     without_ttc_s: Float64
     from_the_beginning: Bools
@@ -143,7 +143,7 @@ def sight_encounter(
     ttc_s, alone_s, without_s = (np.where(steps < NEVER, staged.contact_s - STEP_S * steps, 0.0) for steps in found)
     longest_s = max((criterion.looks / sensor.rate_hz for sensor in sensors), default=0.0)
     from_the_beginning = (ttc_s > staged.contact_s - longest_s) & (encounter.before_s == encounter.seconds)
-    in_time = ttc_s >= criterion.needed_s(encounter.closing_mps)
+    in_time = (ttc_s >= criterion.needed_s(encounter.closing_mps)).astype(np.float64)
     return Sighting(encounter, mounted_rig.rig.name, ttc_s, in_time, alone_s, without_s, from_the_beginning)
 
 

@@ -240,7 +240,8 @@ def sight_approach(rig: str, drive: Drive, approach: Approach, eyes: Eyes, crite
     """When a rig had enough of somebody, of looks that begin as long before as the time that is asked about.
 
     The time to collision is the least until he is detected, and that asked about if he is by then. Whether he is, is
-    asked first, and more only of those sensors that this leaves open.
+    asked first, and more only of those sensors that this leaves open. In time is nobody knows, if braking never was
+    needed.
     """
     begin, end = approach.step, approach.step + len(approach.ttc_s)
     first = int(np.searchsorted(drive.times_s, drive.times_s[begin] - criterion.within_s))
@@ -261,5 +262,6 @@ def sight_approach(rig: str, drive: Drive, approach: Approach, eyes: Eyes, crite
     ttc_s, alone_s, without_s = (least_s[np.minimum(steps, end) - begin] for steps in found)
     seen = found[0] - begin
     until = int(min(seen[0], end)) + 1 if seen[0] else 0
-    in_time = np.array([(approach.ttc_s >= approach.needed_s)[:until].all()])
+    late = approach.ttc_s < approach.needed_s
+    in_time = np.array([float(not late[:until].any()) if late.any() else np.nan])
     return Sighting(approach, rig, ttc_s, in_time, alone_s, without_s, seen == 0, drive.name)
