@@ -69,6 +69,21 @@ def test_the_sight_opens_when_the_line_past_the_corner_of_a_wall_meets_the_walke
     assert one.ttc_s[0] == pytest.approx(opens_s - 0.01 / (speed_kmh / 3.6), abs=0.005)
 
 
+@pytest.mark.parametrize("kmh", [(50, 0), (50, 50), (20, 90), (90, 3), (90, -54), (0, 30), (-15, 20), (-15, -6)])
+def test_what_braking_needs_is_what_a_braking_vehicle_needs(kmh):
+    ego, other = kmh
+    case = crossing(float(ego), {"yaw_deg": 0 if other < 0 else 180, "speed_kmh": abs(other) * math.copysign(1.0, ego)})
+    criterion = Criterion(deceleration_mps2=6.0, latency_s=0.4)
+    speed_mps, towards_mps = abs(ego) / 3.6, case.towards_mps
+    assert towards_mps == pytest.approx(other / 3.6)
+    # The least gap from which none is lost until the ego stands, or is no faster than who drives ahead.
+    times_s = np.linspace(0.0, 0.4 + speed_mps / 6, 100_001)
+    own_mps = np.maximum(speed_mps - 6 * np.maximum(times_s - 0.4, 0.0), 0.0)
+    lost_m = np.cumsum(own_mps + towards_mps) * times_s[1]
+    expected_s = lost_m.max() / (speed_mps + towards_mps)
+    assert criterion.needed_s(speed_mps, towards_mps) == pytest.approx(expected_s, abs=1e-4)
+
+
 def test_outlines_touch_when_the_front_has_come_to_the_side():
     assert Staged(crossing(36.0, {"body": BOX}), SOLID).contact_s == pytest.approx(1.0 - 0.5 / 10, abs=2e-6)
     oncoming = {"body": BOX, "yaw_deg": 180, "speed_kmh": 18, "from_m": 5}

@@ -72,9 +72,9 @@ def test_who_is_met_and_how_near_in_time_is_geometry(driven):
     times_s = STEP_S * np.arange(child.step, child.step + len(child.ttc_s))
     ahead_s, aside_s = (44 - 0.2 - 2 - 10 * times_s) / 10, (5.4 - 1.5 * times_s - 1.0 - 0.2) / 1.5
     assert child.ttc_s == pytest.approx(np.maximum(ahead_s, aside_s), abs=1e-9)
-    assert (child.name, child.track.name, child.closing_mps) == ("on foot", "child", pytest.approx(10.0))
+    assert (child.name, child.track.name) == ("on foot", "child")
     assert child.needed_s == pytest.approx(10 / 18 + 0.5)
-    assert (faster.name, faster.step, faster.closing_mps) == ("from behind", 12, pytest.approx(0.0))
+    assert (faster.name, faster.step, faster.needed_s.tolist()) == ("from behind", 12, [0.0] * 19)
     assert faster.ttc_s == pytest.approx((30 - 4 - 5 * STEP_S * np.arange(12, 31)) / 5)
     # Nobody knows how late it is with who was near from the beginning.
     assert "tailing" in [track.name for track in driven[1].tracks]
@@ -141,7 +141,7 @@ def test_who_is_in_time_is_open_where_braking_was_never_needed(driven):
     found = Sightings("t", soft, 1, 0, {"r": ("s",)}, sightings, {"w": 1.0})
     (every,) = [row for row in found.rows if row.encounter == "all"]
     assert (every.in_time, every.to_brake, every.draws) == (0.0, 1, len(sightings))
-    assert {one["name"]: one["in_time"] for one in found.record()["met"]} == dict.fromkeys(rows, None) | {"child": False}
+    assert {one["name"]: one["in_time"] for one in found.record()["met"]} == {"child": False, "faster": None}
     assert "1 of 1 too late" in found.tables()[0].rows[-1][3].text
 
 
@@ -161,8 +161,23 @@ def test_a_lorry_and_its_trailer_are_one_road_user():
 
 
 @pytest.mark.parametrize(
+    ("ego_mps", "other_mps", "needed_s"),
+    [(10, -10, 10 / 9 * 0.75 + 0.5), (10, 4, 6 / 18 + 0.5), (0.05, -10, 0.0), (-10, -12, 0.0)],
+)
+def test_braking_is_needed_where_it_helps(ego_mps, other_mps, needed_s):
+    times_s = STEP_S * np.arange(60)
+    ego = np.tile(np.eye(4), (60, 1, 1))
+    ego[:, 0, 3] = ego_mps * times_s
+    way_m = np.column_stack([50.0 + other_mps * times_s, 0 * times_s, 0 * times_s])
+    track = Track("t", "car", "passenger", (4.0, 2.0, 1.5), Trajectory.from_arrays(times_s, way_m, np.zeros((60, 3))))
+    there = Drive("w", times_s, ego, BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5)), [track])
+    (one,) = approaches(there, Criterion(within_s=20.0, looks=1))
+    assert one.needed_s[0] == pytest.approx(needed_s)
+
+
+@pytest.mark.parametrize(
     ("seen_from", "ttc_s", "in_time"),
-    [(0, 4.0, True), (6, 2.0, True), (7, 1.0, False), (8, 1.0, False), (9, 0.0, False)],
+    [(0, 4.0, 1), (6, 2.0, 1), (7, 1.0, 0), (8, 1.0, 0), (9, 0.0, 0)],
 )
 def test_the_nearest_time_until_detection_counts_though_it_grew_again(seen_from, ttc_s, in_time):
     track = Track("t", "car", "passenger", (4.0, 2.0, 1.5), Trajectory.resting([10.0, 0.0, 0.0]))
@@ -173,6 +188,10 @@ def test_the_nearest_time_until_detection_counts_though_it_grew_again(seen_from,
     found = sight_approach("r", there, one, eyes, Criterion(points=1, looks=1))
     assert (found.ttc_s[0], found.in_time[0], found.from_the_beginning[0]) == (ttc_s, in_time, seen_from == 0)
     assert found.without_ttc_s[0, 0] == 0
+    # Whoever needs more than was asked about may have been too late before.
+    early = one._replace(needed_s=np.full(4, 4.1))
+    found = sight_approach("r", there, early, eyes, Criterion(points=1, looks=1))
+    assert math.isnan(found.in_time[0]) if seen_from == 0 else found.in_time[0] == 0
 
 
 def test_who_is_hidden_until_braking_is_needed_is_too_late(scenario):
@@ -235,7 +254,7 @@ def test_real_road_users_are_first_hit_as_their_layout_says(layout, tmp_path):
     assert one.encounter.name == "cars and vans"
     assert one.encounter.ttc_s[0] == pytest.approx((gap_m - one.encounter.step) / 10, abs=0.02)
     assert one.ttc_s[0] == pytest.approx((gap_m - 10) / 10, abs=0.02)
-    assert one.encounter.closing_mps == pytest.approx(10.0, abs=0.1)
+    assert one.needed_s == pytest.approx(10 / 18 + 0.5, abs=0.01)
 
 
 @pytest.mark.parametrize(("category", "met"), [("car", 0), ("pedestrian", 1)])

@@ -164,17 +164,16 @@ class Encounter(Document):
         return f"encounter {self.name!r} at {self.speed_kmh:g} km/h"
 
     @property
-    def closing_mps(self) -> float:
-        """What the brakes must take away: the ego's speed, less that of the other in the same direction.
+    def towards_mps(self) -> float:
+        """How fast the other comes towards the ego, along the ego's way; negative if it drives ahead.
 
         Example:
-            >>> ways = {"ego": {"speed_kmh": 90}, "other": {"body": "hatchback", "speed_kmh": 54, "yaw_deg": 0}}
-            >>> round(Encounter.model_validate({"name": "ahead", **ways}).closing_mps, 9)
-            10.0
+            >>> ways = {"ego": {"speed_kmh": 90}, "other": {"body": "hatchback", "speed_kmh": 54, "yaw_deg": 180}}
+            >>> round(Encounter.model_validate({"name": "oncoming", **ways}).towards_mps, 9)
+            15.0
         """
         along_mps = self.other.speed_mps * math.cos(math.radians(self.other.yaw_deg))
-        speed_mps = self.ego.speed_mps
-        return max(abs(speed_mps) - max(math.copysign(along_mps, along_mps * speed_mps), 0.0), 0.0)
+        return -math.copysign(1.0, self.ego.speed_mps) * along_mps
 
     @property
     def before_s(self) -> float:

@@ -29,9 +29,9 @@ class EncounterRow(NamedTuple):
     """A rig in one encounter at one speed, or in all that were drawn or met; 0 s if it was too late.
 
     `ttc_s` is the mean time to collision at detection over phases and draws, of which `ttc_s_low` is the least and
-    `ttc_s_high` the most. `needed_s` is the most of any draw, `in_time` the share of phases and draws, of traffic of the
-    `to_brake` for whom braking was needed; `never` the share without detection, `from_the_beginning` that in which it
-    was seen as soon as it began, and may have been before.
+    `ttc_s_high` the most. `needed_s` is the most of any draw, `in_time` the share of phases and draws, in traffic of
+    the `to_brake` for whom braking was needed; `never` the share without detection, `from_the_beginning` that in which
+    it was seen as soon as it began, and may have been before.
     `first` is the sensor that alone is first in the mean; of the sensors that may fail, one at a time, `worst` is that
     without which the least time is left, `without_worst_s`: the least of all, of traffic the mean. Of traffic,
     `per_hour` says how many were met. Intervals of 95 % are over draws or worlds, NaN of fewer than 8: `interval_low`
@@ -116,7 +116,7 @@ class Sightings:
             speed_kmh=draws[0].encounter.speed_kmh if swept else math.nan,
             draws=len(draws),
             phases=self.phases,
-            needed_s=max((self.criterion.needed_s(one.encounter.closing_mps) for one in draws), default=math.nan),
+            needed_s=max((one.needed_s for one in draws), default=math.nan),
             ttc_s=numbers["ttc_s"].value,
             ttc_s_low=float(ttc_s.min()),
             ttc_s_high=float(ttc_s.max()),
@@ -239,8 +239,8 @@ class Sightings:
                     if one.rig == rig:
                         times.setdefault(abs(one.encounter.speed_kmh), []).extend(one.ttc_s.tolist())
                 bands[rig] = [(speed, min(each), max(each)) for speed, each in sorted(times.items())]
-            cases = {abs(one.encounter.speed_kmh): one.encounter.closing_mps for one in of_names[name]}
-            yield name, bands, [(speed, self.criterion.needed_s(mps)) for speed, mps in sorted(cases.items())]
+            needed_s = {abs(one.encounter.speed_kmh): one.needed_s for one in of_names[name]}
+            yield name, bands, sorted(needed_s.items())
 
 
 def _cells(row: EncounterRow) -> list[str]:

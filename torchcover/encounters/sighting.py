@@ -44,13 +44,15 @@ NEVER = np.iinfo(np.int64).max
 class Sighting(NamedTuple):
     """What a rig had of an encounter, for P phases of its looks and S sensors; 0 is not before the collision.
 
-    `ttc_s` (P,) time to collision at detection, `in_time` (P,) 1 if that was in time, 0 if not, NaN if braking never was
-    needed; `sensor_ttc_s` (S, P) of each sensor alone, `without_ttc_s` (S, P) of all others; `from_the_beginning` (P,)
-    whether it was seen as soon as the encounter began, and the other may have been there before.
+    `needed_s` is what braking needs, in traffic the most of all the while; `ttc_s` (P,) time to collision at detection,
+    `in_time` (P,) 1 if that was in time, 0 if not, NaN if nobody knows; `sensor_ttc_s` (S, P) of each sensor alone,
+    `without_ttc_s` (S, P) of all others; `from_the_beginning` (P,) whether it was seen as soon as the encounter began,
+    and the other may have been there before.
     """
 
     encounter: "Encounter | Approach"
     rig: str
+    needed_s: float
     ttc_s: Float64
     in_time: Float64
     sensor_ttc_s: Float64
@@ -143,8 +145,9 @@ def sight_encounter(
     ttc_s, alone_s, without_s = (np.where(steps < NEVER, staged.contact_s - STEP_S * steps, 0.0) for steps in found)
     longest_s = max((criterion.looks / sensor.rate_hz for sensor in sensors), default=0.0)
     from_the_beginning = (ttc_s > staged.contact_s - longest_s) & (encounter.before_s == encounter.seconds)
-    in_time = (ttc_s >= criterion.needed_s(encounter.closing_mps)).astype(np.float64)
-    return Sighting(encounter, mounted_rig.rig.name, ttc_s, in_time, alone_s, without_s, from_the_beginning)
+    needed_s = criterion.needed_s(abs(encounter.ego.speed_mps), encounter.towards_mps)
+    in_time = (ttc_s >= needed_s).astype(np.float64)
+    return Sighting(encounter, mounted_rig.rig.name, needed_s, ttc_s, in_time, alone_s, without_s, from_the_beginning)
 
 
 def detections(

@@ -36,6 +36,8 @@ WHO = {
 }
 # A vehicle of which all labels lie so near to each other was parked.
 PARKED_M = 2.0
+# Poses of an ego that stands may still move so fast.
+STANDS_MPS = 0.1
 # Scans that are kept: of those who are met at the same time.
 SCANS = 8
 
@@ -102,7 +104,8 @@ class Approach(NamedTuple):
     """A road user who comes within a time to collision, from the first such step to the last.
 
     `ttc_s` and `needed_s` (K,) are those of each of these steps, which begin with `step`: both outlines go straight on
-    as they do, and nobody brakes; and what the brakes need then. The rest as an `Encounter` has it.
+    as they do, and nobody brakes; and what the brakes need then, 0 where they would not help. The rest as an
+    `Encounter` has it.
     """
 
     track: Track
@@ -111,7 +114,6 @@ class Approach(NamedTuple):
     needed_s: Float64
     name: str
     speed_kmh: float
-    closing_mps: float
     speed_is_swept: bool = False
 
 
@@ -127,27 +129,27 @@ def approaches(drive: Drive, criterion: Criterion) -> list[Approach]:
     for track in drive.tracks:
         places_m = track.trajectory.positions_at(drive.times_s)
         own_mps = _velocities_mps(drive.times_s, places_m[:, :2])
-        towards_mps = own_mps - ego_mps
+        closing_mps = own_mps - ego_mps
         reach_m = np.linalg.norm(drive.ego.outline_m, axis=1).max() + np.linalg.norm(track.size_m[:2]) / 2
         away_m = np.linalg.norm(places_m[:, :2] - drive.world_T_ego[:, :2, 3], axis=1) - reach_m
-        near = np.flatnonzero(away_m <= criterion.within_s * np.linalg.norm(towards_mps, axis=1))
+        near = np.flatnonzero(away_m <= criterion.within_s * np.linalg.norm(closing_mps, axis=1))
         world_T_ego = drive.world_T_ego[near]
         there = invert(world_T_ego) @ track.trajectory.at_each(drive.times_s[near])
         outline_m = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * track.size_m[:2] / 2
-        in_ego_mps = np.einsum("tji,tj->ti", world_T_ego[:, :2, :2], towards_mps[near])
+        in_ego_mps = np.einsum("tji,tj->ti", world_T_ego[:, :2, :2], closing_mps[near])
         ttc_s = np.full(len(drive.times_s), np.inf)
         ttc_s[near] = contact_s(drive.ego.outline_m, outlines_at(outline_m, there), in_ego_mps)
         met = np.flatnonzero(ttc_s <= criterion.within_s)
         if len(met) and met[0] >= criterion.looks - 1:
             some, first = slice(met[0], met[-1] + 1), int(met[0])
-            along_mps = np.maximum((own_mps[some] * ahead[some]).sum(axis=1), 0.0)
-            closing_mps = np.maximum(speed_mps[some] - along_mps, 0.0)
-            needed_s = np.array([criterion.needed_s(mps) for mps in closing_mps.tolist()])
+            towards_mps = -(own_mps[some] * ahead[some]).sum(axis=1)
+            helps = (speed_mps[some] > STANDS_MPS) & (speed_mps[some] + towards_mps > 0)
+            needed_s = np.where(helps, list(map(criterion.needed_s, speed_mps[some], towards_mps)), 0.0)
             behind = there[np.searchsorted(near, first), 0, 3] < drive.ego.lower_m[0]
             name = "from behind" if behind else who(track)
             kmh, owner = 3.6 * float(speed_mps[first]), track.name.removeprefix(REAR_OF)
             if owner not in found or first < found[owner].step:
-                found[owner] = Approach(track, first, ttc_s[some], needed_s, name, kmh, float(closing_mps[0]))
+                found[owner] = Approach(track, first, ttc_s[some], needed_s, name, kmh)
     return list(found.values())
 
 
@@ -240,8 +242,8 @@ def sight_approach(rig: str, drive: Drive, approach: Approach, eyes: Eyes, crite
     """When a rig had enough of somebody, of looks that begin as long before as the time that is asked about.
 
     The time to collision is the least until he is detected, and that asked about if he is by then. Whether he is, is
-    asked first, and more only of those sensors that this leaves open. In time is nobody knows, if braking never was
-    needed.
+    asked first, and more only of those sensors that this leaves open. Nobody knows who is in time if
+    braking never was needed, or more than was asked about.
     """
     begin, end = approach.step, approach.step + len(approach.ttc_s)
     first = int(np.searchsorted(drive.times_s, drive.times_s[begin] - criterion.within_s))
@@ -263,5 +265,7 @@ def sight_approach(rig: str, drive: Drive, approach: Approach, eyes: Eyes, crite
     seen = found[0] - begin
     until = int(min(seen[0], end)) + 1 if seen[0] else 0
     late = approach.ttc_s < approach.needed_s
-    in_time = np.array([float(not late[:until].any()) if late.any() else np.nan])
-    return Sighting(approach, rig, ttc_s, in_time, alone_s, without_s, seen == 0, drive.name)
+    unknown = not late.any() or (until == 0 and approach.needed_s[0] > criterion.within_s)
+    in_time = np.array([np.nan if unknown else float(not late[:until].any())])
+    needed_s = float(approach.needed_s.max())
+    return Sighting(approach, rig, needed_s, ttc_s, in_time, alone_s, without_s, seen == 0, drive.name)

@@ -186,15 +186,14 @@ def encounter_film(
         sensor_model: As it was told.
     """
     ((name, sensing),) = _sensing(rig, sensor_model).items()
-    needed_s = {id(one): found.criterion.needed_s(one.encounter.closing_mps) for one in found.sightings}
-    latest = min((one for one in found.sightings if one.rig == name), key=lambda o: o.ttc_s.min() - needed_s[id(o)])
+    latest = min((one for one in found.sightings if one.rig == name), key=lambda one: one.ttc_s.min() - one.needed_s)
     case, without_s = cast(Encounter, latest.encounter), latest.without_ttc_s.min(axis=1)
     mounted = MountedRig(sensing, with_ego(free_space(), {name: sensing}, vehicle))
     staged = Staged(case, mounted.ego)
     scene, looks = staged.scene(mounted.solids, whole=True), Looks(mounted, staged, found.seed)
     sensors, names = mounted.mounted(case, scene), found.sensors[name]
     first, worst, up_to_kmh = latest.sensor_ttc_s.mean(axis=1).argmax(), without_s.argmin(), found.up_to_kmh()
-    told = f"{case.words}: detected {latest.ttc_s.min():.2f} s before, needed {needed_s[id(latest)]:.2f} s"
+    told = f"{case.words}: detected {latest.ttc_s.min():.2f} s before, needed {latest.needed_s:.2f} s"
     told += f"; first {names[first]}, without {names[worst]} {without_s[worst]:.2f} s" if len(names) > 1 else ""
     told += f"; in time up to {up_to_kmh[case.name, name]:g} km/h" if case.speed_is_swept else ""
     for step in range(max(int((staged.contact_s - FILM_S) / STEP_S), 0), int(staged.contact_s / STEP_S), FILM_STEPS):
