@@ -10,7 +10,7 @@ from matplotlib.text import Text
 
 from tests.targets.worlds import EGO, FLOOR, lidar, on_target
 from torchcover.encounters import Criterion, Encounter, EncounterSet, Staged, sight_encounter
-from torchcover.encounters.sighting import NEVER, Looks, MountedRig, channels, first_run, kinds_of, look_steps
+from torchcover.encounters.sighting import NEVER, Looks, MountedRig, channels, first_run, look_steps
 from torchcover.evaluation import encounter, encounter_film, free_space
 from torchcover.geometry import euler_from_rotation, overlapping
 from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, with_ego
@@ -227,19 +227,29 @@ def test_the_answer_is_that_of_looking_all_the_time():
     assert (found.without_ttc_s[0] == found.sensor_ttc_s[1:].max(axis=0)).all()
 
 
-def test_lidars_of_one_rate_count_together_and_a_loss_is_never_a_gain():
-    sensors = rig(lidar("a"), lidar("b"), lidar("c", rate_hz=20), CAMERA, RADAR).sensors
-    assert channels(kinds_of(sensors), range(5)) == [(0, 1), (2,), (3,), (4,)]
+def test_lidars_count_together_at_the_looks_of_the_slower_and_a_loss_is_never_a_gain():
+    assert channels([0.1, None, 0.05, 0.1, None, 0.2], range(6)) == [(1,), (4,), (0, 3, 2), (2,), (5, 0, 3, 2)]
+    assert channels([2, None, 1], [2]) == [(2,)]
     few = lidar("few", columns=180, channels=8, vertical_fov_deg=[-20, 0])
     found = sight_encounter(mounted(few, few | {"name": "same"}), crossing(), Criterion(points=6), phases=3)
     assert (found.without_ttc_s <= found.ttc_s).all()
     assert (found.without_ttc_s == found.sensor_ttc_s[::-1]).all()
     assert (found.ttc_s > found.sensor_ttc_s[0]).any()
+    for rate_hz in (10.001, 13, 20):
+        faster = sight_encounter(
+            mounted(few, few | {"name": "fast", "rate_hz": rate_hz}), crossing(), Criterion(points=6), phases=3
+        )
+        assert (faster.ttc_s >= found.ttc_s).all()
 
 
 def test_a_sensor_that_is_slower_than_the_encounter_is_too_late():
     with pytest.warns(UserWarning, match=r"3 looks of sensor 'top' take 3 s, .* ends after 0.98"):
         found = sight_encounter(mounted(lidar(rate_hz=1)), crossing(), Criterion(), phases=2)
+    assert not found.ttc_s.any()
+    assert not found.from_the_beginning.any()
+    unseen = crossing(20.0, {"from_m": None, "speed_kmh": 0}, seconds=2)
+    with pytest.warns(UserWarning, match="too late, whatever it sees"):
+        found = sight_encounter(mounted(lidar(rate_hz=1)), unseen, Criterion(), phases=2)
     assert not found.ttc_s.any()
     assert not found.from_the_beginning.any()
 
@@ -307,9 +317,14 @@ def test_in_time_up_to_a_speed_is_in_time_at_all_that_are_slower():
     found = encounter(rig(high("ahead")), these, between, phases=5)
     assert [row.in_time for row in found.rows][-1] == 0.6
     assert list(found.up_to_kmh().values()) == [30.0]
-    for brakes, expected in ((1e6, 50.0), (1.0, 0.0)):
+    for brakes, expected, words in ((1e6, 50.0, "50"), (1.0, math.nan, "none")):
         found = encounter(rig(high("ahead")), these, Criterion(deceleration_mps2=brakes, latency_s=0.1), phases=5)
-        assert list(found.up_to_kmh().values()) == [expected]
+        assert list(found.up_to_kmh().values()) == pytest.approx([expected], nan_ok=True)
+        assert found.tables()[0].rows[0][1].text == words
+    standing = [crossing(float(kmh), {"from_m": 3}) for kmh in (50, 0)]
+    both = EncounterSet(name="s", encounters=tuple(standing))
+    found = encounter(rig(high("ahead")), both, Criterion(deceleration_mps2=1.0), phases=2)
+    assert (list(found.up_to_kmh().values()), found.tables()[0].rows[0][1].text) == ([0.0], "0")
 
 
 def test_a_film_shows_where_everybody_is_and_what_is_on_the_other():
@@ -319,7 +334,13 @@ def test_a_film_shows_where_everybody_is_and_what_is_on_the_other():
     picture = next(encounter_film(two, encounter([two], these, phases=2, vehicle="suv"), vehicle="suv"))
     words = " ".join(text.get_text() for text in picture.findobj(Text))
     assert "s to the collision; points on it: ahead 10, top 0" in words
-    for told in ("at 40 km/h: detected", "first ahead, without ahead", "in time up to", "child (1)", "hatchback (1)"):
+    for told in (
+        "at 40 km/h: detected",
+        "first ahead, without ahead",
+        "in time at none of the speeds",
+        "child (1)",
+        "hatchback (1)",
+    ):
         assert told in words
 
 
@@ -335,6 +356,8 @@ MISTAKES = [
     ({"ego": {"speed_kmh": list(range(1, 201))}, "seconds": list(range(1, 60))},
      "11,800 encounters of a family, of at most 10,000"),
     ({"obstacle": []}, "obstacle"),
+    ({"ego": {"speed_kmh": [-10, 0, 10]}}, "'f' has speeds forward and in reverse"),
+    ({"ego": {"speed_kmh": {"from": -10, "to": 10}}}, "'f' has speeds forward and in reverse"),
 ]  # fmt: skip
 
 
@@ -346,6 +369,14 @@ def test_a_family_that_makes_no_sense_is_told_once(keys, told, tmp_path):
     with pytest.raises((ValueError, FileNotFoundError), match=told) as failure:
         encounter(rig(high("top")), path, phases=1)
     assert len(str(failure.value)) < 1000
+
+
+def test_families_of_one_name_are_told():
+    families = [
+        {"name": "f", "ego": {"speed_kmh": kmh}, "other": {"body": "child", "speed_kmh": 5}} for kmh in (10, 20)
+    ]
+    with pytest.raises(ValueError, match=r"encounters.1: encounters.0 is called 'f', too"):
+        EncounterSet.model_validate({"name": "s", "encounters": families})
 
 
 @pytest.mark.parametrize(

@@ -97,6 +97,22 @@ def test_points_are_those_of_frames(scenario, driven):
     assert counted > 1000
 
 
+def test_lidars_count_together_by_steps_and_who_looks_more_often_loses_nothing(driven):
+    simulator, there = driven
+    eyes = Eyes.of_world(simulator, 0, Criterion())
+    assert (eyes.periods, eyes.every) == ([1, 2, None], [1, 2, 1])
+    child, _ = approaches(there, Criterion())
+    middle_m = [
+        there.tracks[0].trajectory.at(STEP_S * step)[:3, 3] - [10 * STEP_S * step, 0, -0.5] for step in range(31)
+    ]
+
+    def detected_s(*steps):
+        few = Eyes(steps, [5, 5], [1, 1], steps, lambda step, _: [np.tile(middle_m[step], (3, 1)) * (step >= 20)] * 2)
+        return sight_approach("r", there, child, few, Criterion()).ttc_s[0]
+
+    assert detected_s(1, 1) > detected_s(2, 1) == detected_s(1, 2) == detected_s(2, 2) > 0
+
+
 def test_the_answer_is_that_of_looking_all_the_time(driven):
     simulator, there = driven
     some = {"before": 0, "later": 0, "never": 0}

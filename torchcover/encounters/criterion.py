@@ -13,7 +13,7 @@ class Criterion:
         ValueError: A number out of its bounds.
     """
 
-    points: Annotated[int, "Points that are enough, of all LiDARs with the same rate together; of a radar one is."] = 5
+    points: Annotated[int, "Points that are enough, of all LiDARs together; of a radar one is."] = 5
     pixels: Annotated[int, "Pixels of the full image that are enough, of a camera alone."] = 200
     looks: Annotated[int, "In so many looks in a row."] = 3
     deceleration_mps2: Annotated[float, "Of the brakes, in m/s2."] = 9.0

@@ -217,7 +217,7 @@ class EncounterSet(BuiltIn):
         sound = isinstance(draws, int) and isinstance(seed, int) and 1 <= draws <= MOST and seed >= 0
         if not isinstance(families, list | tuple) or not sound:
             return content  # which is told field by field
-        found: list[Any] = []
+        found, first = list[Any](), dict[str, int]()
         for number, family in enumerate(families):
             if not isinstance(family, dict):
                 found.append(family)
@@ -225,9 +225,19 @@ class EncounterSet(BuiltIn):
             try:
                 for one in expanded(family, draws, np.random.default_rng([seed, number])):
                     found.append(Encounter.model_validate(one, context=info.context))
+                    name = found[-1].name
+                    if first.setdefault(name, number) < number:
+                        raise ValueError(f"encounters.{number}: encounters.{first[name]} is called {name!r}, too")
             except ValidationError as error:
                 raise ValueError(f"encounters.{number}: {explain(error)}") from error
         return {**content, "encounters": tuple(found)}
+
+    @model_validator(mode="after")
+    def _check_directions(self) -> Self:
+        forward = {one.name for one in self.encounters if one.speed_kmh > 0}
+        if both := next((one.name for one in self.encounters if one.speed_kmh < 0 and one.name in forward), None):
+            raise ValueError(f"encounters: {both!r} has speeds forward and in reverse; make an encounter of each")
+        return self
 
 
 def expanded(family: dict[str, Any], draws: int, generator: np.random.Generator) -> Iterator[dict[str, Any]]:

@@ -148,15 +148,17 @@ class Sightings:
         return Estimate.of_ratios(NUMBERS, base, sums, torch.ones(len(blocks), dtype=torch.int64)).numbers()
 
     def up_to_kmh(self) -> dict[tuple[str, str], float]:
-        """Encounter and rig -> the speed up to which it is in time in every phase and draw, of those that were swept.
+        """Encounter and rig -> the speed up to which it is in time in every phase and draw, where speeds were swept.
 
-        0 if it is too late at the least; NaN where the speed was drawn.
+        NaN if it is too late at the least.
         """
         found: dict[tuple[str, str], float] = {}
         late = set[tuple[str, str]]()
-        for row in sorted(self.rows, key=lambda row: abs(row.speed_kmh)):
+        for row in sorted(
+            (row for row in self.rows if row.speed_kmh == row.speed_kmh), key=lambda row: abs(row.speed_kmh)
+        ):
             key = row.encounter, row.rig
-            found.setdefault(key, math.nan if math.isnan(row.speed_kmh) else 0.0)
+            found.setdefault(key, math.nan)
             if row.in_time < 1:
                 late.add(key)
             elif key not in late:
@@ -177,15 +179,15 @@ class Sightings:
                 "step": one.encounter.step, "least_s": float(one.encounter.ttc_s.min()),
                 "ttc_s": float(one.ttc_s[0]), "in_time": None if np.isnan(one.in_time[0]) else bool(one.in_time[0])}
                for one in self.sightings if isinstance(one.encounter, Approach)]  # fmt: skip
-        listed = {"rows": rows, "speeds": [] if self.hours else up_to, "met": met}
+        listed = {"rows": rows, "speeds": up_to, "met": met}
         return self.settings() | {name: list(map(json_record, each)) for name, each in listed.items()}
 
     def tables(self) -> list[PageTable]:
         """Up to which speed, when, and by which sensor."""
         rows, rigs = self.rows, list(self.sensors)
         tables = [self._met(rows, rigs) if self.hours else self._times(rows, rigs)]
-        if any(one.encounter.speed_is_swept for one in self.sightings):
-            tables.insert(0, _speeds(self.up_to_kmh(), rigs))
+        if up_to_kmh := self.up_to_kmh():
+            tables.insert(0, _speeds(up_to_kmh, rigs))
         several = [row for row in rows if len(self.sensors[row.rig]) > 1]
         return [*tables, _sensors(several)] if several else tables
 
@@ -276,11 +278,9 @@ def _met(row: EncounterRow) -> str:
 
 
 def _speeds(up_to_kmh: dict[tuple[str, str], float], rigs: Sequence[str]) -> PageTable:
-    def words(kmh: float) -> str:
-        return "drawn" if math.isnan(kmh) else f"{kmh:g}" if kmh else "none"
-
     names = dict.fromkeys(name for name, _ in up_to_kmh)
-    rows = [tuple(map(Words, (name, *(words(up_to_kmh[name, rig]) for rig in rigs)))) for name in names]
+    speeds = {key: "none" if math.isnan(kmh) else f"{kmh:g}" for key, kmh in up_to_kmh.items()}
+    rows = [tuple(map(Words, (name, *(speeds[name, rig] for rig in rigs)))) for name in names]
     headings = ("encounter", *(f"{rig}\n(km/h)" for rig in rigs))
     return PageTable("In time up to, of the speeds that were swept", headings, rows)
 

@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 from torchcover.coverage.quantity import MEASURED_WITHIN_M
 from torchcover.detection.inside import SKIN_M
 from torchcover.encounters.criterion import Criterion
-from torchcover.encounters.sighting import NEVER, IsEnough, Sighting, detections, enough_of, first_run, kinds_of
+from torchcover.encounters.sighting import NEVER, IsEnough, Sighting, detections, enough_of, first_run
 from torchcover.geometry import BoundingBox, contact_s, invert, outlines_at
 from torchcover.recordings.in_vehicle import in_vehicle
 from torchcover.recordings.objects import Track, class_of, objects_of
 from torchcover.recordings.recording import Recording
+from torchcover.simulation.lidar import Lidar
 from torchcover.simulation.rays import Balls
 from torchcover.simulation.simulator import Simulator
 from torchcover.simulation.traffic.fleet import REAR_OF
@@ -166,14 +167,14 @@ class Eyes(NamedTuple):
     """The S sensors of a rig in one drive.
 
     Args:
-        kinds: As `detections` has them.
+        periods: As `channels` has them, in steps.
         enough: How many points are.
         counts_as: How many points each of their points is.
         every: They look at every so-manieth step.
         clouds: Of a step, the points (N, 3) of each in the vehicle frame that lie in some balls, and maybe others.
     """
 
-    kinds: Sequence[object]
+    periods: Sequence[float | None]
     enough: Sequence[int]
     counts_as: Sequence[int]
     every: Sequence[int]
@@ -194,7 +195,8 @@ class Eyes(NamedTuple):
         sensors = rig.sensors
         every = [max(1, round(1 / (one.rate_hz * simulator.every_s))) for one in sensors]
         enough, counts_as = [enough_of(criterion, one) for one in sensors], [one.counts_as for one in sensors]
-        return cls(kinds_of(sensors), enough, counts_as, every, clouds)
+        periods = [steps if isinstance(one, Lidar) else None for one, steps in zip(sensors, every, strict=True)]
+        return cls(periods, enough, counts_as, every, clouds)
 
     @classmethod
     def of_recording(cls, recording: Recording, sensors: Sequence[str], criterion: Criterion) -> Self:
@@ -225,7 +227,7 @@ class Watch:
         """(S,) the points in his box, which stands as he does; sides and top as `points_in_boxes` has them."""
         time_s, way, size_m = self._drive.times_s[step], self._track.trajectory, np.array(self._track.size_m)
         if np.isnan(way.positions_at(np.array([time_s]))).any():
-            return np.zeros(len(self._eyes.kinds), dtype=np.int64)
+            return np.zeros(len(self._eyes.periods), dtype=np.int64)
         pose = invert(self._drive.world_T_ego[step]) @ way.at(time_s)
         middle_m = pose[:3, 3] + size_m[2] / 2 * pose[:3, 2]
         clouds = self._eyes.clouds(step, Balls(middle_m[None], float(np.linalg.norm(size_m / 2 + SKIN_M))))
@@ -257,7 +259,7 @@ def sight_approach(rig: str, drive: Drive, approach: Approach, eyes: Eyes, crite
             return np.array([begin])
         return np.maximum(first_run(is_enough, steps[None], criterion.looks), begin)
 
-    found = detections(eyes.kinds, eyes.enough, watch.points, first_run_of)
+    found = detections(eyes.periods, eyes.enough, watch.points, first_run_of)
     # By the steps of the approach; last for who was never detected.
     least_s = np.append(np.minimum.accumulate(approach.ttc_s), 0.0)
     least_s[0] = criterion.within_s

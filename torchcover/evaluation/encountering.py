@@ -1,5 +1,6 @@
 """In time or too late: names and defaults in, what rigs had of encounters and its files out."""
 
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
@@ -192,10 +193,11 @@ def encounter_film(
     staged = Staged(case, mounted.ego)
     scene, looks = staged.scene(mounted.solids, whole=True), Looks(mounted, staged, found.seed)
     sensors, names = mounted.mounted(case, scene), found.sensors[name]
-    first, worst, up_to_kmh = latest.sensor_ttc_s.mean(axis=1).argmax(), without_s.argmin(), found.up_to_kmh()
+    first, worst = latest.sensor_ttc_s.mean(axis=1).argmax(), without_s.argmin()
     told = f"{case.words}: detected {latest.ttc_s.min():.2f} s before, needed {latest.needed_s:.2f} s"
     told += f"; first {names[first]}, without {names[worst]} {without_s[worst]:.2f} s" if len(names) > 1 else ""
-    told += f"; in time up to {up_to_kmh[case.name, name]:g} km/h" if case.speed_is_swept else ""
+    for kmh in [found.up_to_kmh()[case.name, name]] if case.speed_is_swept else []:
+        told += "; in time at none of the speeds" if math.isnan(kmh) else f"; in time up to {kmh:g} km/h"
     for step in range(max(int((staged.contact_s - FILM_S) / STEP_S), 0), int(staged.contact_s / STEP_S), FILM_STEPS):
         instant, at = scene.at(step), np.array([step])
         scans = [one.scan(instant, Draws(np.random.default_rng(step), one.sensor.rays)) for one in sensors]
