@@ -1,6 +1,7 @@
 """When a rig detects whom it meets: geometry, and the same as looking all the time."""
 
 import math
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -124,6 +125,13 @@ def test_rows_of_obstacles_lie_where_the_ego_comes_from_or_beyond(speed_kmh):
     assert placed["boxright0.5"] == pytest.approx([back * (0.5 + 0.5 + 1.0), -1.0 - 1.0 - 0.5])
     assert placed["boxright0.4"] == pytest.approx([back * (0.5 + 0.5 + 2.0 + 0.4 + 1.5), -1.0 - 2.0 - 0.25])
     assert placed["boxleft0.3"] == pytest.approx([-back * (0.5 + 0.3 + 0.5), 1.0 + 0.7 + 1.0])
+
+
+@pytest.mark.parametrize("speed_kmh", [36.0, -31.7])
+@pytest.mark.parametrize("yaw_deg", [0.0, 17.0])
+def test_bodies_may_touch(speed_kmh, yaw_deg):
+    row = [{"body": body, "gap_m": 0.0, "beside_m": 0.0, "yaw_deg": yaw_deg} for body in ("van", "suv", WALL, BOX)]
+    assert len(Staged(crossing(speed_kmh, {"from_m": 0.7}, obstacles=row), SOLID).obstacles) == 4
 
 
 def test_a_bend_ends_at_the_meeting_and_is_as_long_as_its_angle():
@@ -328,20 +336,30 @@ def test_in_time_up_to_a_speed_is_in_time_at_all_that_are_slower():
 
 
 def test_a_film_shows_where_everybody_is_and_what_is_on_the_other():
-    other = {"body": "child", "speed_kmh": 5, "from_m": 1.5}
-    these = EncounterSet.model_validate({"name": "s", "encounters": [FAMILY | {"other": other}]})
+    other = {"body": "child", "speed_kmh": 5, "from_m": 2.0}
+    these = EncounterSet.model_validate(
+        {"name": "s", "encounters": [FAMILY | {"ego": {"speed_kmh": [20, 90]}, "other": other}]}
+    )
     two = rig(high("ahead"), high("top", columns=40))
-    picture = next(encounter_film(two, encounter([two], these, phases=2, vehicle="suv"), vehicle="suv"))
+    pictures = list(islice(encounter_film(two, encounter([two], these, phases=2, vehicle="suv"), vehicle="suv"), 2))
+    picture, (axes,) = pictures[0], pictures[0].axes
+    child, parked, ego = (patch.get_xy() for patch in axes.patches)
+    for (low_m, high_m), of_axis in zip((axes.get_xlim(), axes.get_ylim()), range(2), strict=True):
+        assert all(low_m < patch[:, of_axis].min() < patch[:, of_axis].max() < high_m for patch in (child, parked, ego))
+    assert {(one.axes[0].get_xlim(), one.axes[0].get_ylim()) for one in pictures} == {
+        (axes.get_xlim(), axes.get_ylim())
+    }
     words = " ".join(text.get_text() for text in picture.findobj(Text))
-    assert "s to the collision; points on it: ahead 10, top 0" in words
+    assert "s to the collision; points on it: ahead 1, top 0" in words
     for told in (
-        "at 40 km/h: detected",
+        "at 90 km/h: detected",
         "first ahead, without ahead",
-        "in time at none of the speeds",
+        "in time up to 20 km/h",
         "child (1)",
         "hatchback (1)",
     ):
         assert told in words
+    assert "reference points" not in words
 
 
 MISTAKES = [
@@ -387,6 +405,10 @@ def test_families_of_one_name_are_told():
         (crossing(36, {"body": BOX, "yaw_deg": 0, "speed_kmh": 36}), "overlap from the beginning"),
         (crossing(36, obstacles=[{"body": WALL, "beside_m": -1.0}]), "'box' is in the way of the ego"),
         (crossing(36, {"from_m": 3}, obstacles=[{"body": WALL, "gap_m": -1.0}]), "'box' is in the way of the other"),
+        (
+            crossing(36, obstacles=[{"body": WALL}, {"body": "van", "gap_m": -0.1}]),
+            "'box' and 'van' are inside one anot",
+        ),
     ],
 )
 def test_ways_that_never_meet_or_are_blocked_are_mistakes(case, told):

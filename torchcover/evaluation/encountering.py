@@ -34,8 +34,8 @@ from torchcover.report import (
 from torchcover.simulation import Draws, PaperReference, Rig, Scenario, Simulator, with_ego
 from torchcover.simulation.bodies import called
 
-# Of a film: seconds, steps between two pictures, and what they show.
-FILM_S, FILM_STEPS, FILM_M = 3.0, 100, ((-30.0, 30.0), (-15.0, 15.0))
+# Of a film: seconds, steps between two pictures, and what they show around all bodies.
+FILM_S, FILM_STEPS, FILM_AROUND_M = 3.0, 100, 3.0
 
 
 def encounter(
@@ -196,23 +196,27 @@ def encounter_film(
     first, worst = latest.sensor_ttc_s.mean(axis=1).argmax(), without_s.argmin()
     told = f"{case.words}: detected {latest.ttc_s.min():.2f} s before, needed {latest.needed_s:.2f} s"
     told += f"; first {names[first]}, without {names[worst]} {without_s[worst]:.2f} s" if len(names) > 1 else ""
-    for kmh in [found.up_to_kmh()[case.name, name]] if case.speed_is_swept else []:
+    if case.speed_is_swept:
+        kmh = found.up_to_kmh()[case.name, name]
         told += "; in time at none of the speeds" if math.isnan(kmh) else f"; in time up to {kmh:g} km/h"
-    for step in range(max(int((staged.contact_s - FILM_S) / STEP_S), 0), int(staged.contact_s / STEP_S), FILM_STEPS):
+    steps = np.arange(max(int((staged.contact_s - FILM_S) / STEP_S), 0), int(staged.contact_s / STEP_S), FILM_STEPS)
+    vehicle_T_world = invert(staged.world_T_ego(STEP_S * steps))
+    bodies = [(one.body, vehicle_T_world @ pose) for one, pose in staged.obstacles]
+    bodies.append((case.other.body, staged.vehicle_T_other(STEP_S * steps)))
+    outlines_m = np.stack([outlines_at(solid_of(body).box.outline_m, there) for body, there in bodies], axis=1)
+    ego_m = mounted.ego.box.outline_m
+    low_m = np.minimum(outlines_m.min(axis=(0, 1, 2)), ego_m.min(axis=0)) - FILM_AROUND_M
+    high_m = np.maximum(outlines_m.max(axis=(0, 1, 2)), ego_m.max(axis=0)) + FILM_AROUND_M
+    for step, now_m in zip(steps.tolist(), outlines_m, strict=True):
         instant, at = scene.at(step), np.array([step])
         scans = [one.scan(instant, Draws(np.random.default_rng(step), one.sensor.rays)) for one in sensors]
         seen = ", ".join(f"{sensor} {looks.points([k], at)[0]}" for k, sensor in enumerate(names))
-        bodies = [(one.body, pose) for one, pose in staged.obstacles]
-        bodies.append((case.other.body, staged.world_T_other(STEP_S * at)[0]))
-        vehicle_T_world = invert(staged.world_T_ego(STEP_S * at)[0])
-        outlines_m = [outlines_at(solid_of(body).box.outline_m, vehicle_T_world @ pose) for body, pose in bodies]
         yield draw_scene(
-            *FILM_M,
+            *zip(low_m.tolist(), high_m.tolist(), strict=True),
             standing=StandingFaces(np.empty((0, 3, 2)), np.empty(0)),
-            ego_outline_m=mounted.ego.box.outline_m,
-            actors=[ActorMark(called(body), there) for (body, _), there in zip(bodies, outlines_m, strict=True)],
+            ego_outline_m=ego_m,
+            actors=[ActorMark(called(body), there) for (body, _), there in zip(bodies, now_m, strict=True)],
             sensor=np.concatenate([scan.points for scan in scans]),
-            reference=np.empty((0, 3)),
             title=f"{staged.contact_s - STEP_S * step:.2f} s to the collision; points on it: {seen}",
             subtitle=told,
         )
