@@ -42,6 +42,10 @@ def mounted(*sensors):
     return MountedRig(rig(*sensors), with_ego(world, {}))
 
 
+def sighted(mounted_rig, case, criterion, **keys):
+    return sight_encounter(mounted_rig, Staged(case, mounted_rig.ego), criterion, **keys)
+
+
 def ahead(name="ahead", **keys):
     """A dense LiDAR in the middle of the front."""
     return lidar(name, mount={"x_m": 1.9, "z_m": 1.2}, columns=900, channels=11, vertical_fov_deg=[-12, 0], **keys)
@@ -59,7 +63,7 @@ def test_the_sight_opens_when_the_line_past_the_corner_of_a_wall_meets_the_walke
     }  # fmt: skip
     walls = [{"body": WALL, "beside_m": 0.6, "gap_m": 1.0}]
     walker = {"body": WALKER, "from_m": 2.1}
-    one = sight_encounter(
+    one = sighted(
         mounted(scanner), crossing(speed_kmh, walker, obstacles=walls), Criterion(points=1, looks=1), phases=1
     )
     # Seconds before the ego's front is at the walker's way, which the line past (-1.01, -1.6) meets at y = ..
@@ -215,7 +219,7 @@ def test_points_are_those_of_a_simulation_with_the_other_in_the_world():
 def test_the_answer_is_that_of_looking_all_the_time():
     case, criterion = crossing(obstacles=HIDDEN), Criterion(points=12, pixels=150)
     small = mounted(ahead(dropout=0.3), ahead("noisy", rate_hz=20, range_noise_m=0.3), CAMERA)
-    found = sight_encounter(small, case, criterion, phases=4, seed=3)
+    found = sighted(small, case, criterion, phases=4, seed=3)
     staged = Staged(case, small.ego)
     looks, sensors = Looks(small, staged, 3), small.rig.sensors
     for k, sensor in enumerate(sensors):
@@ -239,12 +243,12 @@ def test_lidars_count_together_at_the_looks_of_the_slower_and_a_loss_is_never_a_
     assert channels([0.1, None, 0.05, 0.1, None, 0.2], range(6)) == [(1,), (4,), (0, 3, 2), (2,), (5, 0, 3, 2)]
     assert channels([2, None, 1], [2]) == [(2,)]
     few = lidar("few", columns=180, channels=8, vertical_fov_deg=[-20, 0])
-    found = sight_encounter(mounted(few, few | {"name": "same"}), crossing(), Criterion(points=6), phases=3)
+    found = sighted(mounted(few, few | {"name": "same"}), crossing(), Criterion(points=6), phases=3)
     assert (found.without_ttc_s <= found.ttc_s).all()
     assert (found.without_ttc_s == found.sensor_ttc_s[::-1]).all()
     assert (found.ttc_s > found.sensor_ttc_s[0]).any()
     for rate_hz in (10.001, 13, 20):
-        faster = sight_encounter(
+        faster = sighted(
             mounted(few, few | {"name": "fast", "rate_hz": rate_hz}), crossing(), Criterion(points=6), phases=3
         )
         assert (faster.ttc_s >= found.ttc_s).all()
@@ -252,12 +256,12 @@ def test_lidars_count_together_at_the_looks_of_the_slower_and_a_loss_is_never_a_
 
 def test_a_sensor_that_is_slower_than_the_encounter_is_too_late():
     with pytest.warns(UserWarning, match=r"3 looks of sensor 'top' take 3 s, .* ends after 0.98"):
-        found = sight_encounter(mounted(lidar(rate_hz=1)), crossing(), Criterion(), phases=2)
+        found = sighted(mounted(lidar(rate_hz=1)), crossing(), Criterion(), phases=2)
     assert not found.ttc_s.any()
     assert not found.from_the_beginning.any()
     unseen = crossing(20.0, {"from_m": None, "speed_kmh": 0}, seconds=2)
     with pytest.warns(UserWarning, match="too late, whatever it sees"):
-        found = sight_encounter(mounted(lidar(rate_hz=1)), unseen, Criterion(), phases=2)
+        found = sighted(mounted(lidar(rate_hz=1)), unseen, Criterion(), phases=2)
     assert not found.ttc_s.any()
     assert not found.from_the_beginning.any()
 
@@ -265,7 +269,7 @@ def test_a_sensor_that_is_slower_than_the_encounter_is_too_late():
 def test_fog_hides_what_is_beyond_and_it_is_said_what_was_there_from_the_beginning():
     far = crossing(72.0, {"from_m": None, "speed_kmh": 0}, seconds=3)
     sensor = lidar(channels=60, vertical_fov_deg=[-4, 0], columns=7200, max_range_m=80)
-    found = [sight_encounter(mounted(sensor), case, Criterion(points=1), phases=2) for case in (
+    found = [sighted(mounted(sensor), case, Criterion(points=1), phases=2) for case in (
         far, far.model_copy(update={"weather": crossing(weather="fog_50m").weather}))]  # fmt: skip
     assert found[0].from_the_beginning.all()
     assert found[0].ttc_s.min() > 2.5
@@ -329,10 +333,11 @@ def test_in_time_up_to_a_speed_is_in_time_at_all_that_are_slower():
         found = encounter(rig(high("ahead")), these, Criterion(deceleration_mps2=brakes, latency_s=0.1), phases=5)
         assert list(found.up_to_kmh().values()) == pytest.approx([expected], nan_ok=True)
         assert found.tables()[0].rows[0][1].text == words
-    standing = [crossing(float(kmh), {"from_m": 3}) for kmh in (50, 0)]
+    standing = [crossing(float(kmh), {"from_m": 3}) for kmh in (-50, 0, -20)]
     both = EncounterSet(name="s", encounters=tuple(standing))
     found = encounter(rig(high("ahead")), both, Criterion(deceleration_mps2=1.0), phases=2)
     assert (list(found.up_to_kmh().values()), found.tables()[0].rows[0][1].text) == ([0.0], "0")
+    assert [row.speed_kmh for row in found.rows] == [0, -20, -50]
 
 
 def test_a_film_shows_where_everybody_is_and_what_is_on_the_other():
@@ -414,3 +419,10 @@ def test_families_of_one_name_are_told():
 def test_ways_that_never_meet_or_are_blocked_are_mistakes(case, told):
     with pytest.raises(ValueError, match=told):
         Staged(case, SOLID)
+
+
+def test_mistakes_of_the_last_encounter_are_told_before_the_first_look(monkeypatch):
+    monkeypatch.setattr(MountedRig, "mounted", None)
+    both = crossing(), crossing(36, {"at_width": 3.0, "yaw_deg": 0, "from_m": 4})
+    with pytest.raises(ValueError, match="never touch"):
+        encounter(rig(), EncounterSet(name="s", encounters=both))

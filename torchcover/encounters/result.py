@@ -93,7 +93,7 @@ class Sightings:
         groups: dict[tuple[int, float, int], list[Sighting]] = {}
         rigs = {name: k for k, name in enumerate(self.sensors)}
         for one in self.sightings:
-            speed_kmh = one.encounter.speed_kmh if one.encounter.speed_is_swept else -math.inf
+            speed_kmh = abs(one.encounter.speed_kmh) if one.encounter.speed_is_swept else -math.inf
             groups.setdefault((order[one.encounter.name], speed_kmh, rigs[one.rig]), []).append(one)
         if self.hours:
             together = [[one for one in self.sightings if one.rig == rig] for rig in rigs]
@@ -152,13 +152,10 @@ class Sightings:
 
         NaN if it is too late at the least.
         """
-        found: dict[tuple[str, str], float] = {}
-        late = set[tuple[str, str]]()
-        for row in sorted(
-            (row for row in self.rows if row.speed_kmh == row.speed_kmh), key=lambda row: abs(row.speed_kmh)
-        ):
+        swept, late = [row for row in self.rows if row.speed_kmh == row.speed_kmh], set[tuple[str, str]]()
+        found = dict.fromkeys(((row.encounter, row.rig) for row in swept), math.nan)
+        for row in swept:
             key = row.encounter, row.rig
-            found.setdefault(key, math.nan)
             if row.in_time < 1:
                 late.add(key)
             elif key not in late:

@@ -113,7 +113,7 @@ def _at_once(sensor: Sensor) -> Sensor:
 
 
 def sight_encounter(
-    mounted_rig: MountedRig, encounter: Encounter, criterion: Criterion, *, phases: int = 10, seed: int = 0
+    mounted_rig: MountedRig, staged: Staged, criterion: Criterion, *, phases: int = 10, seed: int = 0
 ) -> Sighting:
     """When a rig detects whom it meets.
 
@@ -122,16 +122,15 @@ def sight_encounter(
 
     Args:
         mounted_rig: The rig.
-        encounter: What happens.
+        staged: What happens, with its ego.
         criterion: What is detected.
         phases: How many phases there are.
         seed: Of noise and drop-out.
 
     Raises:
-        ValueError: What `Staged` and `MountedRig.mounted` refuse.
+        ValueError: What `MountedRig.mounted` refuses.
     """
-    staged = Staged(encounter, mounted_rig.ego)
-    looks = Looks(mounted_rig, staged, seed)
+    encounter, looks = staged.encounter, Looks(mounted_rig, staged, seed)
     sensors = mounted_rig.rig.sensors
     mounted_rig.check_rates(criterion.looks, staged)
     found = detections(

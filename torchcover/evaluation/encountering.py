@@ -82,7 +82,8 @@ def encounter(
     with Progress(len(sensing) * len(these.encounters), "encounters", shown=progress) as bar:
         for name, rig in sensing.items():
             mounted = MountedRig(rig, with_ego(free_space(), {name: rig}, vehicle))
-            for one in these.encounters:
+            # Their mistakes are told before the first look.
+            for one in [Staged(one, mounted.ego) for one in these.encounters]:
                 sightings.append(sight_encounter(mounted, one, criterion, phases=phases, seed=seed))
                 bar.advance(len(sensing) * len(these.encounters))
     return Sightings(these.name, criterion, phases, seed, _sensors(sensing), sightings)
