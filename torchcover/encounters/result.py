@@ -238,8 +238,8 @@ class Sightings:
                     if one.rig == rig:
                         times.setdefault(abs(one.encounter.speed_kmh), []).extend(one.ttc_s.tolist())
                 bands[rig] = [(speed, min(each), max(each)) for speed, each in sorted(times.items())]
-            needed_s = {abs(one.encounter.speed_kmh): one.needed_s for one in of_names[name]}
-            yield name, bands, sorted(needed_s.items())
+            most_last = sorted(of_names[name], key=lambda one: one.needed_s)
+            yield name, bands, sorted({abs(one.encounter.speed_kmh): one.needed_s for one in most_last}.items())
 
 
 def _cells(row: EncounterRow) -> list[str]:

@@ -215,11 +215,11 @@ def _of_encounters(one: EncounterRequirement, rig: Rig, **given: Any) -> dict[st
     """Of each encounter the latest detection of all phases."""
     found, names = encounter(rig, one.encounters, one.criterion, **given), [sensor.name for sensor in rig.sensors]
     times_s, where = [], []
-    for each in found.sightings:
+    for case, each in zip(one.encounters.encounters, found.sightings, strict=True):
         lost = {f", without {name}": each.without_ttc_s[names.index(name)] for name in one.failing(names)}
         for words, ttc_s in ({"": each.ttc_s} | lost).items():
             times_s.append((ttc_s.min(), ttc_s.min() - each.needed_s))
-            where.append(f"{each.encounter.words}{words}")
+            where.append(f"{case.words}{words}")
     return {key: _exact(of_key, where) for key, of_key in zip(("ttc_s", "spare_s"), np.array(times_s).T, strict=True)}
 
 

@@ -201,13 +201,14 @@ def encounter_film(
         kmh = found.up_to_kmh()[case.name, name]
         told += "; in time at none of the speeds" if math.isnan(kmh) else f"; in time up to {kmh:g} km/h"
     steps = np.arange(max(int((staged.contact_s - FILM_S) / STEP_S), 0), int(staged.contact_s / STEP_S), FILM_STEPS)
-    vehicle_T_world = invert(staged.world_T_ego(STEP_S * steps))
+    times_s = STEP_S * steps.astype(np.float64)
+    vehicle_T_world = invert(staged.world_T_ego(times_s))
     bodies = [(one.body, vehicle_T_world @ pose) for one, pose in staged.obstacles]
-    bodies.append((case.other.body, staged.vehicle_T_other(STEP_S * steps)))
+    bodies.append((case.other.body, staged.vehicle_T_other(times_s)))
     outlines_m = np.stack([outlines_at(solid_of(body).box.outline_m, there) for body, there in bodies], axis=1)
     ego_m = mounted.ego.box.outline_m
-    low_m = np.minimum(outlines_m.min(axis=(0, 1, 2)), ego_m.min(axis=0)) - FILM_AROUND_M
-    high_m = np.maximum(outlines_m.max(axis=(0, 1, 2)), ego_m.max(axis=0)) + FILM_AROUND_M
+    all_m = np.concatenate([outlines_m.reshape(-1, 2), ego_m])
+    low_m, high_m = all_m.min(axis=0) - FILM_AROUND_M, all_m.max(axis=0) + FILM_AROUND_M
     for step, now_m in zip(steps.tolist(), outlines_m, strict=True):
         instant, at = scene.at(step), np.array([step])
         scans = [one.scan(instant, Draws(np.random.default_rng(step), one.sensor.rays)) for one in sensors]
