@@ -161,6 +161,17 @@ def test_who_is_in_time_is_open_where_braking_was_never_needed(driven):
     assert "1 of 1 too late" in found.tables()[0].rows[-1][3].text
 
 
+def test_who_looks_rarely_has_seen_him_before():
+    track = Track("t", "car", "passenger", (4.0, 2.0, 1.5), Trajectory.resting([10.0, 0.0, 0.0]))
+    there = Drive("w", STEP_S * np.arange(70), np.tile(np.eye(4), (70, 1, 1)), None, [track])
+    one = Approach(track, 45, np.array([2.0] * 20), np.array([0.5] * 20), "cars and vans", 0.0)
+    for seen_from, ttc_s in ((0, 2.5), (20, 2.0), (40, 0.0)):
+        eyes = Eyes(
+            [20], [1], [1], [20], lambda step, _, since=seen_from: [np.tile([9.0, 0.0, 1.0], (int(step >= since), 1))]
+        )
+        assert sight_approach("r", there, one, eyes, Criterion(within_s=2.5)).ttc_s[0] == ttc_s
+
+
 def test_a_lorry_and_its_trailer_are_one_road_user():
     times_s = STEP_S * np.arange(30)
     ego = np.tile(np.eye(4), (30, 1, 1))

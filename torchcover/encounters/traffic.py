@@ -241,23 +241,23 @@ class Watch:
 
 
 def sight_approach(rig: str, drive: Drive, approach: Approach, eyes: Eyes, criterion: Criterion) -> Sighting:
-    """When a rig had enough of somebody, of looks that begin as long before as the time that is asked about.
+    """When a rig had enough of somebody, of looks from as long before as is asked about, or the last few of a slow one.
 
     The time to collision is the least until he is detected, and that asked about if he is by then. Whether he is, is
-    asked first, and more only of those sensors that this leaves open. Nobody knows who is in time if
-    braking never was needed, or more than was asked about.
+    asked first, and more only of those sensors that this leaves open. Nobody knows who is in time if braking never was
+    needed, or needed more than was asked about.
     """
     begin, end = approach.step, approach.step + len(approach.ttc_s)
     first = int(np.searchsorted(drive.times_s, drive.times_s[begin] - criterion.within_s))
     watch = Watch(drive, approach.track, eyes)
 
     def first_run_of(is_enough: IsEnough, k: int) -> Numbers:
-        steps = np.arange(first, end)
-        steps = steps[steps % eyes.every[k] == 0]
+        steps = np.arange(0, end, eyes.every[k])
         latest = steps[steps <= begin][-criterion.looks :]
         if first_run(is_enough, latest[None], criterion.looks)[0] < NEVER:
             return np.array([begin])
-        return np.maximum(first_run(is_enough, steps[None], criterion.looks), begin)
+        since = steps[steps >= min(first, latest[0])]
+        return np.maximum(first_run(is_enough, since[None], criterion.looks), begin)
 
     found = detections(eyes.periods, eyes.enough, watch.points, first_run_of)
     # By the steps of the approach; last for who was never detected.
