@@ -158,7 +158,9 @@ def test_who_is_in_time_is_open_where_braking_was_never_needed(driven):
     (every,) = [row for row in found.rows if row.encounter == "all"]
     assert (every.in_time, every.to_brake, every.draws) == (0.0, 1, len(sightings))
     assert {one["name"]: one["in_time"] for one in found.record()["met"]} == {"child": False, "faster": None}
-    assert "1 of 1 too late" in found.tables()[0].rows[-1][3].text
+    table, *_ = found.tables()
+    assert "1 of 1 too late" in table.rows[-1][3].text
+    assert "Braking was needed for 1 of them" in table.notes[1]
 
 
 def test_who_looks_rarely_has_seen_him_before():
@@ -188,14 +190,20 @@ def test_a_lorry_and_its_trailer_are_one_road_user():
 
 
 @pytest.mark.parametrize(
-    ("ego_mps", "other_mps", "needed_s"),
-    [(10, -10, 10 / 9 * 0.75 + 0.5), (10, 4, 6 / 18 + 0.5), (0.05, -10, 0.0), (-10, -12, 0.0)],
+    ("ego_mps", "other_mps", "from_m", "needed_s"),
+    [
+        (10, (-10, 0), (50, 0), 10 / 9 * 0.75 + 0.5),
+        (10, (4, 0), (50, 0), 6 / 18 + 0.5),
+        (0.05, (-10, 0), (50, 0), 0.0),
+        (-10, (-12, 0), (50, 0), 0.0),
+        (10, (9.9, 4), (-3, -8), 0.0),
+    ],
 )
-def test_braking_is_needed_where_it_helps(ego_mps, other_mps, needed_s):
+def test_braking_is_needed_where_it_helps(ego_mps, other_mps, from_m, needed_s):
     times_s = STEP_S * np.arange(60)
     ego = np.tile(np.eye(4), (60, 1, 1))
     ego[:, 0, 3] = ego_mps * times_s
-    way_m = np.column_stack([50.0 + other_mps * times_s, 0 * times_s, 0 * times_s])
+    way_m = np.pad(np.array(from_m) + np.outer(times_s, other_mps), ((0, 0), (0, 1)))
     track = Track("t", "car", "passenger", (4.0, 2.0, 1.5), Trajectory.from_arrays(times_s, way_m, np.zeros((60, 3))))
     there = Drive("w", times_s, ego, BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5)), [track])
     (one,) = approaches(there, Criterion(within_s=20.0, looks=1))

@@ -144,9 +144,9 @@ def approaches(drive: Drive, criterion: Criterion) -> list[Approach]:
         if len(met) and met[0] >= criterion.looks - 1:
             some, first = slice(met[0], met[-1] + 1), int(met[0])
             towards_mps = -(own_mps[some] * ahead[some]).sum(axis=1)
-            helps = (speed_mps[some] > STANDS_MPS) & (speed_mps[some] + towards_mps > 0)
-            needed_s = np.where(helps, list(map(criterion.needed_s, speed_mps[some], towards_mps)), 0.0)
             behind = there[np.searchsorted(near, first), 0, 3] < drive.ego.lower_m[0]
+            helps = ~behind & (speed_mps[some] > STANDS_MPS) & (speed_mps[some] + towards_mps > 0)
+            needed_s = np.where(helps, list(map(criterion.needed_s, speed_mps[some], towards_mps)), 0.0)
             name = "from behind" if behind else who(track)
             kmh, owner = 3.6 * float(speed_mps[first]), track.name.removeprefix(REAR_OF)
             if owner not in found or first < found[owner].step:
