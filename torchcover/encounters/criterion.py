@@ -46,12 +46,9 @@ class Criterion:
             >>> [round(Criterion().needed_s(50 / 3.6, towards_kmh / 3.6), 2) for towards_kmh in (0, 50, -20)]
             [1.27, 1.66, 0.96]
         """
-        closing_mps = speed_mps + towards_mps
-        if towards_mps > 0:
-            taken_mps = speed_mps * (speed_mps / 2 + towards_mps) / closing_mps
-        else:
-            taken_mps = max(closing_mps, 0.0) / 2
-        return self.latency_s + taken_mps / self.deceleration_mps2
+        closing_mps, towards = speed_mps + towards_mps, towards_mps > 0
+        mps = speed_mps * (speed_mps / 2 + towards_mps) / closing_mps if towards else max(closing_mps, 0.0) / 2
+        return self.latency_s + mps / self.deceleration_mps2
 
     @property
     def words(self) -> str:
