@@ -214,7 +214,7 @@ class Sightings:
             f"Met: came within {within_s:g} s of a collision, if both had gone straight on, in "
             f"{60 * sum(self.hours.values()):.0f} minutes. Detected before that, with a 95 % interval over "
             f"{len(self.hours)} worlds (of 8 or more), or at the least time to collision, or never.",
-            f"{self.criterion.words} Braking was needed for {rows[-1].to_brake} of them; too late: before the detection.",
+            f"{self.criterion.words} Braking was needed for {rows[-1].to_brake} of them; too late: before detection.",
             *([] if self.sightings else ["Nobody was met: drive longer (--worlds), or elsewhere."]),
         ]
         return PageTable("Met, and detected before", ("who", "met", "an hour", *rigs), cells, notes=notes)
