@@ -267,8 +267,8 @@ def expanded(family: dict[str, Any], draws: int, generator: np.random.Generator)
         for draw in range(draws if drawn else 1):
             values = of_swept | {place: each[draw] for place, each in drawn.items()}
             one = _with(family, values, ())
-            if words:
-                one["name"] = f"{family.get('name')}: {', '.join(words)}"
+            if words and isinstance(family.get("name"), str):
+                one["name"] = f"{family['name']}: {', '.join(words)}"
             if SPEED in drawn:
                 one["speed_is_swept"] = False
             yield one
@@ -286,7 +286,7 @@ def _leaves(value: Any, place: Place) -> Iterator[tuple[Place, Any]]:  # noqa: A
         if any(isinstance(each, dict) for each in value):
             for number, inner in enumerate(value):
                 yield from _leaves(inner, (*place, number))
-        elif place != ("obstacles",):
+        elif place not in (("obstacles",), ("name",)):
             yield place, value
 
 
