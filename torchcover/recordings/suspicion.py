@@ -11,10 +11,11 @@ from torchcover.detection import Boxes, points_in_boxes
 from torchcover.geometry import invert
 from torchcover.neighbors import nearest
 from torchcover.recordings.accumulated_reference import AccumulatedReference
+from torchcover.recordings.agreement import disagreement
 from torchcover.recordings.ground_model import GroundModel, low_surfaces
 from torchcover.recordings.in_vehicle import in_vehicle
 from torchcover.recordings.recorded_reference import RecordedReference, Reference
-from torchcover.recordings.recording import Recording
+from torchcover.recordings.recording import Recording, whole_recording
 
 # What is looked at, evenly spread over what will be measured.
 FRAMES, POSES = 5, 64
@@ -32,6 +33,8 @@ BOX_POINTS, FULLER, BOXES, MORE, MOST_BOXES = 5, 5, 5, 4, 0.6
 # Steps that say where the vehicle goes; in a bend it points elsewhere by far less than this.
 STEP_M, WAY_M, SIDEWAYS_DEG, MOST_OF_WAY = (0.05, 20.0), 5.0, (45.0, 135.0), 0.8
 FASTEST_MPS = 100.0
+# Half of the points of a LiDAR are nearer, in metres; and in centimetres.
+FARTHEST_USUAL_M, FARTHEST_USUAL_CM = 300.0, 4000.0
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,10 @@ def suspicions(recording: Recording, reference: Reference, rigs: Mapping[str, Se
         for position in _spread(many, FRAMES)
         if (look := _look(recording, sensors, recording.frames[position])) is not None
     ]
+    if (doubt := wrong_units([look.clouds for look in looks])) is not None:
+        return [f"{recording.path}: {doubt}"]
+    sizes = {sensor: sum(len(look.clouds[sensor]) for look in looks) for sensor in judged} if looks else {}
+    disagreeing = disagreement(recording, max(sizes, key=lambda sensor: sizes[sensor]), many) if sizes else []
     doubts = [
         ground_is_elsewhere({sensor: [look.clouds[sensor] for look in looks] for sensor in sensors}),
         *(mirrored(sensor, [(look.clouds[sensor], look.boxes) for look in looks]) for sensor in sensors),
@@ -68,10 +75,35 @@ def suspicions(recording: Recording, reference: Reference, rigs: Mapping[str, Se
             same_clouds(rig, [(_joined(look, of), _joined(look, recorded)) for look in looks])
             for rig, of in rigs.items()
         ),
-        *wrong_motion(recording),
+        *(disagreeing or wrong_motion(recording)),
+        nothing_labelled(recording, many),
         alone_in_window(recording, reference) if isinstance(reference, AccumulatedReference) else None,
     ]
     return [f"{recording.path}: {doubt}" for doubt in doubts if doubt is not None]
+
+
+def wrong_units(looks: Sequence[Mapping[str, NDArray[np.float32]]]) -> str | None:
+    """Whether coordinates are too large for metres."""
+    ranges_m = [np.linalg.norm(cloud, axis=1) for clouds in looks for cloud in clouds.values()]
+    usual_m = float(np.median(np.concatenate([*ranges_m, np.zeros(1)])))
+    if usual_m < FARTHEST_USUAL_M:
+        return None
+    unit = "mm" if usual_m > FARTHEST_USUAL_CM else "cm"
+    return f"half of the points are more than {usual_m:,.0f} m away: are clouds in {unit}? (--units {unit})"
+
+
+def nothing_labelled(recording: Recording, many: int) -> str | None:
+    """Whether a recording with labels has none in any frame that is looked at."""
+    try:
+        labelled = [recording.boxes(recording.frames[position]) for position in _spread(many, POSES)]
+    except (OSError, ValueError):
+        return None
+    if not labelled or any(boxes is None or len(boxes) for boxes in labelled) or _is_ours(recording):
+        return None
+    return (
+        f"it has labels, and none of {len(labelled)} frames has a labelled object: do names and times of labels fit "
+        "those of its clouds?"
+    )
 
 
 def ground_is_elsewhere(clouds: Mapping[str, Sequence[NDArray[np.float32]]]) -> str | None:
@@ -186,6 +218,11 @@ def alone_in_window(recording: Recording, reference: AccumulatedReference) -> st
         f"its instants are {apart_s:g} s apart, and a window of {reference.window_s:g} s reaches none but its own: are "
         "the times in seconds? Else ask for a longer window (--window-s)"
     )
+
+
+def _is_ours(recording: Recording) -> bool:
+    """Whether torchcover has written it: then what is not labelled is not there."""
+    return recording.path.is_dir() and whole_recording(recording.path) is not None
 
 
 def _look(recording: Recording, sensors: Sequence[str], instant: int) -> RecordedInstant | None:
