@@ -232,9 +232,10 @@ def _held(stretches: Sequence[Matrix]) -> str | None:
 def _stretches(recording: Recording, many: int) -> Iterator[tuple[NDArray[np.float64], Matrix, int]]:
     """Times and poses of instants in a row, and the number of the first."""
     frames, times_s = recording.frames, recording.times_s
-    if times_s is None or many < 2:
+    if times_s is None or not many:
         return
-    start, stop = frames[0], frames[many - 1] + 1
+    # What is around the last is in its window.
+    start, stop = frames[0], min(frames[many - 1] + IN_A_ROW, len(recording.names))
     if stop - start <= STRETCHES * IN_A_ROW:
         firsts, length = [start], stop - start
     else:

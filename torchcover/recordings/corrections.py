@@ -7,10 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.geometry import invert, quaternion_from_rotation, rigid, rotation_from_euler, rotation_from_quaternion
-from torchcover.geometry.rigid import Matrix, euler_from_rotation
-
 if TYPE_CHECKING:  # which the command line's help would wait for
+    from torchcover.geometry.rigid import Matrix
     from torchcover.recordings.recording import Recording, Scan
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
@@ -55,8 +53,17 @@ class Corrections:
         pairs = zip(told.items(), usual, strict=True)
         return " ".join(f"--{name} {value}" for (name, value), default in pairs if value != default)
 
-    def of_poses(self, world_T_vehicle: Matrix, times_s: NDArray[np.float64]) -> Matrix:
+    def of_poses(self, world_T_vehicle: "Matrix", times_s: NDArray[np.float64]) -> "Matrix":
         """(N, 4, 4) poses of N instants in a row, put right."""
+        from torchcover.geometry import (  # torch, which the help has no need of
+            euler_from_rotation,
+            invert,
+            quaternion_from_rotation,
+            rigid,
+            rotation_from_euler,
+            rotation_from_quaternion,
+        )
+
         poses = world_T_vehicle.copy()
         if self.quaternions == "xyzw":  # what was read as w, x, y, z
             wxyz = np.roll([quaternion_from_rotation(rotation) for rotation in poses[:, :3, :3]], 1, axis=1)
@@ -100,12 +107,12 @@ class Corrected:
         """What the recording has, put right."""
         return self.corrections.of_scan(self.recording.scan(sensor, index))
 
-    def world_T_vehicle(self, index: int) -> Matrix | None:
+    def world_T_vehicle(self, index: int) -> "Matrix | None":
         """Where the vehicle was, put right."""
         return None if self._poses is None else self._poses[index]
 
     @cached_property
-    def _poses(self) -> Matrix | None:
+    def _poses(self) -> "Matrix | None":
         poses = [self.recording.world_T_vehicle(instant) for instant in range(len(self.recording.names))]
         known = [pose for pose in poses if pose is not None]
         if len(known) < len(poses):

@@ -88,6 +88,10 @@ class RecordedFrames(FrameDataset):
         self._has_heights: bool | None = None
         self._modelled = False
 
+    def leave_out_bad_sweeps(self) -> None:
+        """A scan that cannot be read costs its own frame, and not all whose window it is in; those count it."""
+        self._sweeps.skip_bad = True
+
     @property
     def names(self) -> Sequence[str]:
         """What a user calls the frames."""
@@ -204,6 +208,9 @@ class RecordedFrames(FrameDataset):
             scans = {sensor: self._read(sensor, instant) for sensor in self._judged}
             reference = self.reference.cloud(self.recording, instant, self._judged)
             heights_m, boxes = self._above_ground(instant, reference, self.recording.boxes(instant))
+        except BadFrameError as error:
+            window = f"it is in the window of {name} (frame {position}); --skip-bad-frames leaves it out"
+            raise BadFrameError(f"{error}; {window}") from error
         except (OSError, ValueError) as error:
             raise BadFrameError(f"{name} (frame {position}): {error}") from error
         dropped = sum((scan.dropped for scan in scans.values()), Counter[str]())
