@@ -8,6 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchcover.detection import Boxes, points_in_boxes
+from torchcover.files import RECORDING
 from torchcover.geometry import invert
 from torchcover.neighbors import nearest
 from torchcover.recordings.accumulated_reference import AccumulatedReference
@@ -57,6 +58,8 @@ def suspicions(recording: Recording, reference: Reference, rigs: Mapping[str, Se
         many: How many of its frames will be measured, from the first on.
     """
     judged = dict.fromkeys(sensor for of in rigs.values() for sensor in of)
+    if many and (doubt := wrong_units(recording, next(iter(judged)))) is not None:
+        return [f"{recording.path}: {doubt}"]
     recorded = recording.reference_sensors if isinstance(reference, RecordedReference) else ()
     sensors = tuple(dict.fromkeys((*judged, *recorded)))
     looks = [
@@ -64,8 +67,6 @@ def suspicions(recording: Recording, reference: Reference, rigs: Mapping[str, Se
         for position in _spread(many, FRAMES)
         if (look := _look(recording, sensors, recording.frames[position])) is not None
     ]
-    if (doubt := wrong_units([look.clouds for look in looks])) is not None:
-        return [f"{recording.path}: {doubt}"]
     sizes = {sensor: sum(len(look.clouds[sensor]) for look in looks) for sensor in judged} if looks else {}
     disagreeing = disagreement(recording, max(sizes, key=lambda sensor: sizes[sensor]), many) if sizes else []
     doubts = [
@@ -77,19 +78,23 @@ def suspicions(recording: Recording, reference: Reference, rigs: Mapping[str, Se
         ),
         *(disagreeing or wrong_motion(recording)),
         nothing_labelled(recording, many),
+        unmarked(recording),
         alone_in_window(recording, reference) if isinstance(reference, AccumulatedReference) else None,
     ]
     return [f"{recording.path}: {doubt}" for doubt in doubts if doubt is not None]
 
 
-def wrong_units(looks: Sequence[Mapping[str, NDArray[np.float32]]]) -> str | None:
+def wrong_units(recording: Recording, sensor: str) -> str | None:
     """Whether coordinates are too large for metres."""
-    ranges_m = [np.linalg.norm(cloud, axis=1) for clouds in looks for cloud in clouds.values()]
-    usual_m = float(np.median(np.concatenate([*ranges_m, np.zeros(1)])))
+    try:
+        range_m = np.linalg.norm(recording.scan(sensor, recording.frames[0]).points_m, axis=1)
+    except (OSError, ValueError, IndexError):
+        return None
+    usual_m = float(np.median(np.append(range_m[np.isfinite(range_m)], 0.0)))
     if usual_m < FARTHEST_USUAL_M:
         return None
     unit = "mm" if usual_m > FARTHEST_USUAL_CM else "cm"
-    return f"half of the points are more than {usual_m:,.0f} m away: are clouds in {unit}? (--units {unit})"
+    return f"half of the points of {sensor} are beyond {usual_m:,.0f} m: is it {unit}? (--units {unit})"
 
 
 def nothing_labelled(recording: Recording, many: int) -> str | None:
@@ -98,11 +103,21 @@ def nothing_labelled(recording: Recording, many: int) -> str | None:
         labelled = [recording.boxes(recording.frames[position]) for position in _spread(many, POSES)]
     except (OSError, ValueError):
         return None
-    if not labelled or any(boxes is None or len(boxes) for boxes in labelled) or _is_ours(recording):
+    ours = recording.path.is_dir() and whole_recording(recording.path) is not None  # what has no label is not there
+    if not labelled or any(boxes is None or len(boxes) for boxes in labelled) or ours:
         return None
     return (
         f"it has labels, and none of {len(labelled)} frames has a labelled object: do names and times of labels fit "
         "those of its clouds?"
+    )
+
+
+def unmarked(recording: Recording) -> str | None:
+    """Whether it is one of torchcover's that does not say that it is whole."""
+    if recording.instants is None or not recording.path.is_dir() or whole_recording(recording.path) is not None:
+        return None
+    return (
+        f"torchcover wrote it, and it has no {RECORDING}: is it whole, with its {len(recording.names):,} frames?"
     )
 
 
@@ -218,11 +233,6 @@ def alone_in_window(recording: Recording, reference: AccumulatedReference) -> st
         f"its instants are {apart_s:g} s apart, and a window of {reference.window_s:g} s reaches none but its own: are "
         "the times in seconds? Else ask for a longer window (--window-s)"
     )
-
-
-def _is_ours(recording: Recording) -> bool:
-    """Whether torchcover has written it: then what is not labelled is not there."""
-    return recording.path.is_dir() and whole_recording(recording.path) is not None
 
 
 def _look(recording: Recording, sensors: Sequence[str], instant: int) -> RecordedInstant | None:
