@@ -95,7 +95,7 @@ class Yard:
 
 
 def doubts(yard):
-    return disagreement(yard, "lidar", len(yard.frames))
+    return disagreement(yard, "lidar", len(yard.frames)) or ""
 
 
 @pytest.mark.parametrize(
@@ -110,7 +110,7 @@ def doubts(yard):
     ],
 )
 def test_what_is_right_is_left_alone(right):
-    assert doubts(right) == []
+    assert not doubts(right)
 
 
 MENDED = {
@@ -125,14 +125,14 @@ MENDED = {
 
 @pytest.mark.parametrize("fault", MENDED)
 def test_what_would_mend_a_fault_is_named_and_mends_it(fault):
-    (doubt,) = doubts(Yard(fault))
+    doubt = doubts(Yard(fault))
     assert MENDED[fault] in doubt
     names = {"quaternions": str, "poses": str, "axes": str, "lag": float}
     option, value = MENDED[fault].removeprefix("--").split()
     corrections = Corrections(**{option.replace("lag", "lag_s"): names[option](value)})
     mended = corrected(Yard(fault), corrections)
     assert corrections.words in (MENDED[fault], "--lag 0.1")
-    assert doubts(mended) == []
+    assert not doubts(mended)
     off = [invert(Yard().true(step)) @ pickle.loads(pickle.dumps(mended)).world_T_vehicle(step) for step in range(10)]
     # The last poses, and those between two, are not there: where the vehicle went on evenly they would be right.
     exact = fault not in ("late", "held")
@@ -144,10 +144,10 @@ def test_what_would_mend_a_fault_is_named_and_mends_it(fault):
 
 @pytest.mark.parametrize(
     ("fault", "says"),
-    [("stuck", r"stands by its poses, and drives by its clouds.* \+[12]\.\d m"), ("same", "same cloud again and again")],
+    [("stuck", r"does not stand, but has moved \+[12]\.\d m"), ("same", "same cloud again and again")],
 )
 def test_what_nothing_mends_is_said(fault, says):
-    (doubt,) = doubts(Yard(fault))
+    doubt = doubts(Yard(fault))
     assert re.search(says, doubt)
 
 
@@ -164,7 +164,7 @@ def test_units_of_clouds(unit):
 
 def test_labels_of_which_none_fits():
     (doubt,) = RecordedFrames(Yard("unlabelled")).doubts()
-    assert "none of 12 frames has a labelled object" in doubt
+    assert "labels, and none in 12 frames" in doubt
 
 
 def test_lags_that_are_none():

@@ -67,8 +67,8 @@ def suspicions(recording: Recording, reference: Reference, rigs: Mapping[str, Se
         for position in _spread(many, FRAMES)
         if (look := _look(recording, sensors, recording.frames[position])) is not None
     ]
-    sizes = {sensor: sum(len(look.clouds[sensor]) for look in looks) for sensor in judged} if looks else {}
-    disagreeing = disagreement(recording, max(sizes, key=lambda sensor: sizes[sensor]), many) if sizes else []
+    widest = max(judged, key=lambda sensor: sum(len(look.clouds[sensor]) for look in looks))
+    disagreeing = disagreement(recording, widest, many)
     doubts = [
         ground_is_elsewhere({sensor: [look.clouds[sensor] for look in looks] for sensor in sensors}),
         *(mirrored(sensor, [(look.clouds[sensor], look.boxes) for look in looks]) for sensor in sensors),
@@ -76,7 +76,7 @@ def suspicions(recording: Recording, reference: Reference, rigs: Mapping[str, Se
             same_clouds(rig, [(_joined(look, of), _joined(look, recorded)) for look in looks])
             for rig, of in rigs.items()
         ),
-        *(disagreeing or wrong_motion(recording)),
+        *(wrong_motion(recording) if disagreeing is None else [disagreeing]),
         nothing_labelled(recording, many),
         unmarked(recording),
         alone_in_window(recording, reference) if isinstance(reference, AccumulatedReference) else None,
@@ -98,27 +98,25 @@ def wrong_units(recording: Recording, sensor: str) -> str | None:
 
 
 def nothing_labelled(recording: Recording, many: int) -> str | None:
-    """Whether a recording with labels has none in any frame that is looked at."""
+    """Whether a recording with labels has none in any frame; of one that says that it is whole, that is so."""
     try:
         labelled = [recording.boxes(recording.frames[position]) for position in _spread(many, POSES)]
     except (OSError, ValueError):
         return None
-    ours = recording.path.is_dir() and whole_recording(recording.path) is not None  # what has no label is not there
-    if not labelled or any(boxes is None or len(boxes) for boxes in labelled) or ours:
+    if not labelled or any(boxes is None or len(boxes) for boxes in labelled) or _is_whole(recording):
         return None
-    return (
-        f"it has labels, and none of {len(labelled)} frames has a labelled object: do names and times of labels fit "
-        "those of its clouds?"
-    )
+    return f"it has labels, and none in {len(labelled)} frames: do their names and times fit those of its clouds?"
 
 
 def unmarked(recording: Recording) -> str | None:
-    """Whether it is one of torchcover's that does not say that it is whole."""
-    if recording.instants is None or not recording.path.is_dir() or whole_recording(recording.path) is not None:
+    """Whether it is one of torchcover's, whose frames have instants, that does not say that it is whole."""
+    if recording.instants is None or _is_whole(recording):
         return None
-    return (
-        f"torchcover wrote it, and it has no {RECORDING}: is it whole, with its {len(recording.names):,} frames?"
-    )
+    return f"torchcover wrote it, and it has no {RECORDING}: is it whole, with its {len(recording.names):,} frames?"
+
+
+def _is_whole(recording: Recording) -> bool:
+    return recording.path.is_dir() and whole_recording(recording.path) is not None
 
 
 def ground_is_elsewhere(clouds: Mapping[str, Sequence[NDArray[np.float32]]]) -> str | None:
