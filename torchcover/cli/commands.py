@@ -286,9 +286,7 @@ def search(
     evaluations: Annotated[
         int | None, typer.Option(min=1, help="Candidates instead of a time: the same ones whatever the machine.")
     ] = None,
-    optimiser: Annotated[
-        str, typer.Option(help="auto, gp (Gaussian process), enumerate (choices) or random.")
-    ] = "auto",
+    optimiser: Annotated[str, typer.Option(help="gp (Gaussian process) or random.")] = "gp",
     estimate: Annotated[
         Literal["area", "known"],
         typer.Option(help="What a score is: `area`, the share of the visible surface, or `known`, of the known cells."),
@@ -348,31 +346,6 @@ def parsed_budget(text: str) -> float:
     if match is None:
         raise ValueError(f"--budget: a time is needed, as in 90s, 30min or 2h; got {text!r}")
     return float(match[1]) * UNITS_S[match[2]]
-
-
-@with_options(of_evaluate("sensor_model", "seed", "every_s", "workers"))
-def agree(
-    paper: Annotated[str, typer.Argument(help="Published placements: place3d2024.")],
-    scenario: Annotated[str, typer.Option(help="Scenario: a built-in name or a YAML file.")] = "urban",
-    metrics: Annotated[
-        str, typer.Option(help="Metrics of others, as in `k_cover,point_density`, or `all`; see `compare --metrics`.")
-    ] = "all",
-    steps: Annotated[int, typer.Option(min=1, help="Steps to simulate.")] = 64,
-    out: options.Out = Path("out/agree"),
-    **settings: Any,  # noqa: ANN401
-) -> None:
-    """Rank published placements by metrics, and by the detectors that were trained on them; say what that is worth."""
-    from torchcover.cli.printing import print_agreement
-    from torchcover.evaluation import agree, rank_count
-    from torchcover.files import claimed
-    from torchcover.published import metric_names
-
-    if rank_count() > 1:
-        raise ValueError("agree: ranks do not share it; run it without torchrun, with --workers")
-    with claimed(out):
-        study = agree(paper, scenario, metrics=metric_names(metrics), steps=steps, progress=True, **settings)
-        files = study.save(out)
-    print_agreement(study, files, out)
 
 
 def list_builtin(

@@ -14,14 +14,10 @@ MAX_BORDERS_COMPARED = 32
 
 
 class CellMeans(NamedTuple):
-    """Means over the points of one step.
+    """Means over the points of one step in those K cells that have points, ascending.
 
-    Args:
-        cell: (K,) int64 numbers of the cells that have points, ascending.
-        of_point: (N,) int64 which of these each point lies in.
-        points: (K,) int64 points in each of them.
-        weight: (K,) float64 sum of their weights; the number of points where there are none.
-        mean: (V, K) float64 mean of each of the V values.
+    `of_point` (N,) is which of these each point lies in, `weight` (K,) the sum of their weights, or their number where
+    there are none, `mean` (V, K) that of each of the V values.
     """
 
     cell: Tensor
@@ -32,12 +28,7 @@ class CellMeans(NamedTuple):
 
 
 def mean_per_cell(cell: Tensor, values: Tensor, weights: Tensor | None = None) -> CellMeans:
-    """Mean of each value over the points of each cell, summed in float64.
-
-    Args:
-        cell: (N,) int64 cell numbers.
-        values: (V, N) one row a value, one column a point.
-        weights: (N,) positive weight of each point; all the same if not given.
+    """Mean of each of (V, N) values over the points of each cell, summed in float64; all weigh alike if not told.
 
     Example:
         >>> means = mean_per_cell(torch.tensor([4, 4, 7]), torch.tensor([[1.0, 3.0, 5.0]]))

@@ -102,16 +102,13 @@ class StoppingRule(Protocol):
 
     def is_reached(self, steps: int) -> bool:
         """Whether the run may end after so many steps."""
-        ...
 
     def expected_steps(self, most: int) -> int:
         """Steps that the run is thought to take, of so many at most."""
-        ...
 
     @property
     def words(self) -> str:
         """How far it is, for the progress bar."""
-        ...
 
 
 def observe(

@@ -26,7 +26,7 @@ from torchcover.simulation import (
     reference_called,
     with_ego,
 )
-from torchcover.simulation.reference_sensor import DEFAULT_BAND_FRAME
+from torchcover.simulation.regions_of_interest import DEFAULT_BAND_FRAME
 from torchcover.simulation.simulated_frames import DEFAULT_REFERENCE
 
 AnyRig = Rig | str | Path

@@ -4,16 +4,19 @@ from torchcover.files.bad_file import (
     BadFileError,
     TooLargeError,
     check_memory,
+    check_regular,
     decode,
+    most_gb,
     naming,
     read_short_text,
     reads,
     said_gb,
 )
 from torchcover.files.csv_tables import csv_text, read_csv
-from torchcover.files.feather import read_feather
 from torchcover.files.json_tables import read_json_table
+from torchcover.files.native import exr_image, laz_points, read_feather
 from torchcover.files.numpy_files import DEFLATE_MAX_RATIO, NpyHeader, npz_headers, read_npy, read_npz, write_npz
+from torchcover.files.own_process import apart
 from torchcover.files.processes import end_with_parent
 from torchcover.files.publishing import (
     RECORDING,
@@ -37,13 +40,18 @@ __all__ = [
     "NpyHeader",
     "Publication",
     "TooLargeError",
+    "apart",
     "as_yaml",
     "check_memory",
+    "check_regular",
     "claimed",
     "csv_text",
     "decode",
     "end_with_parent",
+    "exr_image",
     "feed_xml",
+    "laz_points",
+    "most_gb",
     "naming",
     "noted",
     "npz_headers",

@@ -11,6 +11,7 @@ from torchcover.geometry.rigid import (
     rigid,
     rotation_from_euler,
     rotation_from_quaternion,
+    slerp,
     transform,
 )
 from torchcover.geometry.tensors import transform_tensor
@@ -32,6 +33,7 @@ __all__ = [
     "rigid",
     "rotation_from_euler",
     "rotation_from_quaternion",
+    "slerp",
     "spread",
     "transform",
     "transform_tensor",

@@ -41,12 +41,9 @@ class HeldInstant(NamedTuple):
 
 
 class AskedInstant(NamedTuple):
-    """What is asked of an instant.
+    """What is asked of an instant: the frame of a rig, or without one the reference, with the bytes of its world.
 
-    Args:
-        rig: Whose frame; of no rig: the reference, and in the counts the bytes of its world.
-        number: Of the instant.
-        measures: What its coverage is summed up by, where the frame is made; the frame itself if by none.
+    With `measures` the coverage is summed up where the frame is made, and the frame itself stays there.
     """
 
     rig: Rig | None
@@ -58,11 +55,7 @@ class HeldWorlds(Dataset[Frame | MeasuredFrame]):
     """What any rig sees at some instants, whose worlds and references are kept in the process that is asked.
 
     Frames are measured there, too, so that sums travel and not clouds; published metrics need the frame itself.
-
-    Args:
-        simulations: Of the scenarios, without rigs.
-        instants: Which instants.
-        questions: What is asked about: of the reference only these points are kept.
+    Simulations have no rigs; of the reference only the points are kept that questions are about.
     """
 
     def __init__(

@@ -3,11 +3,9 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from torchcover.geometry.arrays import Float64, Int64
 from torchcover.simulation.traffic.alignment import Alignment, squared_distances
-
-Numbers = NDArray[np.float64]
 
 # Between junctions no curve is tighter; crossings and stop lines lie on straights.
 SMALLEST_RADIUS_M = 110.0
@@ -30,13 +28,13 @@ class Course(NamedTuple):
     """
 
     street: Alignment
-    turns: NDArray[np.int64]
-    halves_m: Numbers
+    turns: Int64
+    halves_m: Float64
 
 
 def course(
-    junctions_m: Numbers,
-    halves_m: Numbers,
+    junctions_m: Float64,
+    halves_m: Float64,
     bend_deg: float,
     turn_share: float,
     radius_m: float,
@@ -62,8 +60,8 @@ def course(
 
 
 def _draw(
-    junctions_m: Numbers,
-    halves_m: Numbers,
+    junctions_m: Float64,
+    halves_m: Float64,
     bend: float,
     turn_share: float,
     radius_m: float,
