@@ -21,7 +21,7 @@ from torchcover.geometry import (
     transform,
 )
 from torchcover.recordings.agreement import disagreement
-from torchcover.recordings.corrections import corrected
+from torchcover.recordings.corrected import corrected
 
 MOUNT = rigid(rotation_from_euler(2.0, 1.0, -1.0), [0.5, 0.1, 1.73])
 GROUND, SIDES = 3000, 6000

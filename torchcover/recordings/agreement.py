@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from torchcover.geometry import invert, rigid, rotation_from_euler, transform
 from torchcover.geometry.rigid import Matrix
+from torchcover.recordings.corrected import corrected_poses
 from torchcover.recordings.corrections import Corrections
 from torchcover.recordings.in_vehicle import in_vehicle
 from torchcover.recordings.recording import Recording
@@ -51,11 +52,12 @@ class Surfaces:
     """
 
     def __init__(self, points_m: NDArray[np.floating]) -> None:
-        points_m = points_m[np.linalg.norm(points_m, axis=1) < WITHIN_M].astype(np.float64)
-        numbers, of_point, count = np.unique(voxels(points_m, CELL_M), return_inverse=True, return_counts=True)
-        sums = [np.bincount(of_point, along_m, len(count)) for along_m in points_m.T]
+        near_m: Matrix = points_m[np.linalg.norm(points_m, axis=1) < WITHIN_M].astype(np.float64)
+        numbers, of_point = np.unique(voxels(near_m, CELL_M), return_inverse=True)
+        count = np.bincount(of_point)
+        sums = [np.bincount(of_point, along_m, len(count)) for along_m in near_m.T]
         middle_m = np.stack(sums, axis=1) / count[:, None]
-        off_m, spread = points_m - middle_m[of_point], np.empty((len(count), 3, 3))
+        off_m, spread = near_m - middle_m[of_point], np.empty((len(count), 3, 3))
         for a, b in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
             spread[:, a, b] = spread[:, b, a] = np.bincount(of_point, off_m[:, a] * off_m[:, b], len(count)) / count
         stands = count >= LEAST_POINTS
@@ -63,7 +65,7 @@ class Surfaces:
         self._numbers, self._middle_m = numbers[stands], middle_m[stands]
         self._inverse = (axes / np.maximum(squares, THICK_M**2)[:, None]) @ axes.swapaxes(1, 2)
         stands[stands] = (np.abs(axes[:, 2, 0]) <= UPRIGHT) | (squares[:, 0] >= THIN * squares[:, 1])
-        self.points_m = np.random.default_rng(0).permutation(points_m[stands[of_point]])[:QUERIES]
+        self.points_m = np.random.default_rng(0).permutation(near_m[stands[of_point]])[:QUERIES]
         self._own = 1.0
         self._own = self.agreement(self.points_m) if len(self.points_m) else 1.0
 
@@ -99,7 +101,7 @@ class Pair:
 
     def motion(self, corrections: Corrections = GIVEN) -> Matrix:
         """(4, 4) from the vehicle frame of the other to that of the one."""
-        poses = self._poses if corrections is GIVEN else corrections.of_poses(self._poses, self._times_s)
+        poses = self._poses if corrections is GIVEN else corrected_poses(self._poses, self._times_s, corrections)
         return np.asarray(invert(poses[self.one]) @ poses[self.other])
 
     def read(self, recording: Recording, sensor: str) -> bool:
@@ -198,13 +200,15 @@ def _held(stretches: Sequence[Matrix]) -> str | None:
 
 def _stretches(recording: Recording, many: int) -> Iterator[tuple[NDArray[np.float64], Matrix, int]]:
     """Times and poses of instants in a row, and the number of the first."""
-    times_s, start = recording.times_s, recording.frames[0] if many else 0
+    times_s = recording.times_s
+    if times_s is None or not many:
+        return
     # What is around the last is in its window.
-    stop = min(recording.frames[many - 1] + IN_A_ROW, len(recording.names)) if many else 0
+    start, stop = recording.frames[0], min(recording.frames[many - 1] + IN_A_ROW, len(recording.names))
     firsts, length = [start], stop - start
     if length > STRETCHES * IN_A_ROW:
         firsts, length = np.linspace(start, stop - IN_A_ROW, STRETCHES).astype(int).tolist(), IN_A_ROW
-    for first in firsts if times_s is not None and length > 1 else ():
+    for first in firsts if length > 1 else ():
         poses = [recording.world_T_vehicle(instant) for instant in range(first, first + length)]
         if all(pose is not None for pose in poses):
             yield times_s[first : first + length], np.array(poses), first
@@ -214,7 +218,7 @@ def _chosen(stretches: Sequence[tuple[NDArray[np.float64], Matrix, int]]) -> lis
     """Pairs of instants, spread over the recording; and those whose motion a lag would change most."""
     found = []
     for times_s, poses, first in stretches:
-        early, late = (Corrections(lag_s=lag_s).of_poses(poses, times_s) for lag_s in (-0.1, 0.1))
+        early, late = (corrected_poses(poses, times_s, Corrections(lag_s=lag_s)) for lag_s in (-0.1, 0.1))
         for one in range(len(times_s) - 1):
             for other in range(one + 1, len(times_s)):
                 pair = Pair(times_s, poses, first, one, other)

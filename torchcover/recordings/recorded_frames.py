@@ -18,7 +18,8 @@ from torchcover.frames.frame import Frame
 from torchcover.frames.source import BadFrameError, FrameDataset
 from torchcover.geometry import transform
 from torchcover.recordings.accumulated_reference import AccumulatedReference
-from torchcover.recordings.corrections import Corrections, corrected
+from torchcover.recordings.corrected import corrected
+from torchcover.recordings.corrections import Corrections
 from torchcover.recordings.in_vehicle import InVehicle, in_vehicle, joined
 from torchcover.recordings.recorded_reference import RecordedReference, Reference
 from torchcover.recordings.recording import Recording
