@@ -9,6 +9,7 @@ import torch
 from tests.recordings.drives import Drive
 from torchcover.data import AccumulatedReference, BadFrameError, RecordedFrames
 from torchcover.detection import Boxes
+from torchcover.evaluation import evaluate
 from torchcover.geometry import BoundingBox, invert, rigid, transform
 
 FAR_M = (513_248.0, 5_403_655.0, 260.0)
@@ -194,9 +195,8 @@ def test_one_bad_sweep_costs_its_own_frame():
         frames[0]
     with pytest.raises(BadFrameError, match=r"^f2 \(frame 2\): f2.bin: truncated$"):
         frames[2]
-    frames.leave_out_bad_sweeps()
-    with pytest.raises(BadFrameError, match=r"^f2 \(frame 2\): f2.bin: truncated$"):
-        frames[2]
+    result = evaluate(frames=frames, skip_bad_frames=True, cell_m=8.0)
+    assert (result.run.steps, result.run.skipped) == (5, ["f2 (frame 2): f2.bin: truncated"])
     assert pickle.loads(pickle.dumps(frames.reference)).sweeps.skip_bad
     assert all(len(frames[each].reference) for each in (0, 1, 3, 5))
     assert frames[0].counts["reference_sweeps_skipped"] == 2  # both sensors
