@@ -4,6 +4,7 @@ import pickle
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from torchcover.geometry import (
     rotation_from_quaternion,
     transform,
 )
-from torchcover.recordings.agreement import disagreement
+from torchcover.recordings.agreement import _late, disagreement
 from torchcover.recordings.corrected import corrected
 
 MOUNT = rigid(rotation_from_euler(2.0, 1.0, -1.0), [0.5, 0.1, 1.73])
@@ -176,3 +177,17 @@ def test_lags_that_are_none():
         corrected(untimed, Corrections(lag_s=0.1)).world_T_vehicle(0)
     assert corrected(untimed, Corrections()) is untimed
     assert replace(Corrections(), units="mm").words == "--units mm"
+
+
+def test_poses_with_noise_are_not_late():
+    """Many lags are better, with worse ones in between."""
+
+    class Noisy(NamedTuple):
+        better_s: float
+        width_s: float
+
+        def agreement(self, corrections):
+            return 0.7 + 0.2 * np.exp(-(((corrections.lag_s - self.better_s) / self.width_s) ** 2))
+
+    assert "--lag 0.10" in _late([Noisy(0.1, 0.2)], 0.75)
+    assert _late([Noisy(0.1, 0.2), Noisy(-0.2, 0.03)], 0.75) is None

@@ -28,7 +28,7 @@ WAY_M, TURN_DEG, APART_S, LONGEST_S, PAIRS = 1.5, 3.0, 0.3, 1.5, 3
 # Poses are held if such a share of them is that of the instant before, for no more than so many instants.
 REPEATED, LONGEST_RUN = 0.2, 3
 # What agrees so much better is right; noise of poses has many lags that are better, with worse ones in between.
-MORE, TIMES, MORE_BY_LAG, WELL, RAGGED = 0.15, 1.4, 0.06, 0.6, 0.015
+MORE, TIMES, MORE_BY_LAG, WELL, RAGGED = 0.15, 1.4, 0.06, 0.6, 0.03
 LAGS_S = [number * 0.025 for number in range(-12, 13)]
 # Where poses say that a vehicle stands: what it is moved by to see whether it does, with every so many points.
 STANDS_M, FASTEST_MPS, TURNS_DEG, FEWER = 0.1, 40.0, [half / 2 for half in range(-8, 9)], 3
@@ -155,8 +155,9 @@ def _mean(pairs: Sequence[Pair], corrections: Corrections) -> float:
 def _late(pairs: Sequence[Pair], given: float) -> str | None:
     by_lag = np.array([_mean(pairs, Corrections(lag_s=lag_s)) for lag_s in LAGS_S])
     best = int(by_lag.argmax())
-    rises = np.diff(by_lag) * np.where(np.arange(len(by_lag) - 1) < best, 1, -1)
-    if by_lag[best] < max(given + MORE_BY_LAG, WELL) or rises.min() < -RAGGED:
+    # By how much it rises again on the way from the best.
+    rises = max((side - np.minimum.accumulate(side)).max() for side in (by_lag[best::-1], by_lag[best:]))
+    if by_lag[best] < max(given + MORE_BY_LAG, WELL) or rises > RAGGED:
         return None
     return f"{by_lag[best]:.0%} if they are late (early, if negative): --lag {LAGS_S[best]:.2f}"
 
