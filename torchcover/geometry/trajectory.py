@@ -174,5 +174,5 @@ def _between(from_m: Matrix, to_m: Matrix, from_deg: Matrix, to_deg: Matrix, sha
         ends = [np.reshape([quaternion_from_rotation(rotation_from_euler(*each)) for each in np.reshape(ends, (-1, 3))],
                            (-1, 4)) for ends in (from_deg[steep], to_deg[steep])]  # fmt: skip
         shares = np.broadcast_to(share, (*steep.shape, 1))[steep].reshape(-1, 1)
-        rotation[steep] = rotation_from_quaternion(slerp(*ends, shares)).reshape(rotation[steep].shape)
+        rotation[steep] = rotation_from_quaternion(slerp(ends[0], ends[1], shares)).reshape(rotation[steep].shape)
     return rigid(rotation, from_m + share * (to_m - from_m))

@@ -10,6 +10,7 @@ from torch.utils.data import DataLoader, Dataset
 from torchcover.coverage import Measure
 from torchcover.estimation import Estimate
 from torchcover.evaluation import CoverageObserver
+from torchcover.evaluation.cores import start_method
 from torchcover.evaluation.pipeline import FramesOrErrors, MeasuredFrame, killed_worker
 from torchcover.frames import Frame
 from torchcover.placement.carrier import Carrier
@@ -215,6 +216,7 @@ class CommonInstants:
             batch_sampler=self._batches,
             collate_fn=list,
             num_workers=self._processes,
+            multiprocessing_context=start_method() if self._processes else None,
             prefetch_factor=1 if workers else None,
             persistent_workers=workers > 0,
         )
