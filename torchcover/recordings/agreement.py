@@ -83,15 +83,7 @@ class Surfaces:
 
 
 class Pair:
-    """Two instants of a stretch.
-
-    Args:
-        times_s: (N,) of the stretch.
-        poses: (N, 4, 4) `world_T_vehicle` there.
-        first: Number of its first instant in the recording.
-        one: Which of them the one is.
-        other: Which the other.
-    """
+    """Two of the N instants in a row from `first` on, with (N,) times and (N, 4, 4) `world_T_vehicle`."""
 
     def __init__(self, times_s: NDArray[np.float64], poses: Matrix, first: int, one: int, other: int) -> None:
         self.first, self.one, self.other, self._times_s, self._poses = first, one, other, times_s, poses
@@ -124,13 +116,7 @@ class Pair:
 
 
 def disagreement(recording: Recording, sensor: str, many: int) -> str | None:
-    """What is wrong with the poses or the axes of a recording, by scans of a sensor.
-
-    Args:
-        recording: The recording.
-        sensor: Name of the sensor that sees most.
-        many: How many of its frames are looked at, from the first on.
-    """
+    """What is wrong with the poses or the axes of the first `many` frames, by the scans of a sensor."""
     stretches = list(_stretches(recording, many))
     if (held := _held([poses for _, poses, _ in stretches])) is not None:
         return held

@@ -7,14 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.geometry import (
-    euler_from_rotation,
-    invert,
-    quaternion_from_rotation,
-    rigid,
-    rotation_from_euler,
-    rotation_from_quaternion,
-)
+from torchcover import geometry
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.corrections import Corrections
 from torchcover.recordings.recording import Recording, Scan
@@ -66,10 +59,10 @@ def corrected_poses(world_T_vehicle: Matrix, times_s: NDArray[np.float64], corre
     """(N, 4, 4) poses of N instants in a row, put right; beyond the first and the last they go on as before."""
     poses = world_T_vehicle.copy()
     if corrections.quaternions == "xyzw":  # what was read as w, x, y, z
-        wxyz = [quaternion_from_rotation(rotation) for rotation in poses[:, :3, :3]]
-        poses[:, :3, :3] = rotation_from_quaternion(np.roll(wxyz, 1, axis=1))
+        wxyz = [geometry.quaternion_from_rotation(rotation) for rotation in poses[:, :3, :3]]
+        poses[:, :3, :3] = geometry.rotation_from_quaternion(np.roll(wxyz, 1, axis=1))
     if corrections.poses == "inverse":
-        poses = invert(poses)
+        poses = geometry.invert(poses)
     elif corrections.poses == "yx":
         poses[:, :3, 3] = poses[:, [1, 0, 2], 3]
     new = np.append(True, (np.diff(poses, axis=0) != 0).any(axis=(1, 2)) | (corrections.poses != "held"))
@@ -78,7 +71,7 @@ def corrected_poses(world_T_vehicle: Matrix, times_s: NDArray[np.float64], corre
     known, known_s, wanted_s = poses[new], times_s[new], times_s + corrections.lag_s
     after = np.searchsorted(known_s, wanted_s, side="right").clip(1, len(known) - 1)
     share = ((wanted_s - known_s[after - 1]) / np.diff(known_s)[after - 1])[:, None]
-    angles_deg, places_m = euler_from_rotation(known[:, :3, :3]), known[:, :3, 3]
+    angles_deg, places_m = geometry.euler_from_rotation(known[:, :3, :3]), known[:, :3, 3]
     turns_deg = ((np.diff(angles_deg, axis=0) + 180) % 360 - 180)[after - 1]
-    rotations = rotation_from_euler(*(angles_deg[after - 1] + share * turns_deg).T)
-    return rigid(rotations, places_m[after - 1] + share * np.diff(places_m, axis=0)[after - 1])
+    rotations = geometry.rotation_from_euler(*(angles_deg[after - 1] + share * turns_deg).T)
+    return geometry.rigid(rotations, places_m[after - 1] + share * np.diff(places_m, axis=0)[after - 1])
