@@ -226,6 +226,7 @@ def check(
 
 @with_options([*of_criterion(), *of_evaluate("vehicle", "sensor_model", "seed")])
 def encounter(
+    context: typer.Context,
     rigs: Annotated[
         list[str] | None,
         typer.Argument(help="Rigs: built-in names (see `list`) or YAML files; with --frames those of the recording."),
@@ -256,12 +257,18 @@ def encounter(
     from torchcover.report import Terminal, check_film, print_whole, write_film
 
     criterion = Criterion(**{name: settings.pop(name) for name in Criterion.__annotations__})
-    if frames is not None and (rigs or scenario is not None):
-        raise ValueError("--frames: a recording has its own rigs and traffic; leave out rigs and --scenario")
+    what, unused = "a set", {"worlds", "within_s"}
+    if frames is not None:
+        what = "--frames, which has rigs and traffic of its own"
+        unused = {"rigs", "encounters", "scenario", "phases", "worlds", "film", "pixels", *settings}
+    elif scenario is not None:
+        what, unused = "--scenario, whose traffic nobody stages", {"encounters", "phases", "film"}
+    for each in context.command.params:
+        source = context.get_parameter_source(each.name or "")
+        if each.name in unused and source is not None and source.name == "COMMANDLINE":
+            raise ValueError(f"{each.opts[0]}: of no use with {what}; leave it out")
     if film is not None:
         check_film(film)
-        if frames is not None or scenario is not None:
-            raise ValueError("--film: of a set only; leave out --frames and --scenario")
     with claimed(out):
         if frames is not None:
             found = met_in_recording(frames, criterion)
