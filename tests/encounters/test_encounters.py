@@ -379,7 +379,10 @@ MISTAKES = [
     ({"ego": {"speed_kmh": list(range(1, 201))}, "seconds": list(range(1, 60))},
      "11,800 encounters of a family, of at most 10,000"),
     ({"obstacle": []}, "obstacle"),
-    ({"name": None, "ego": {"speed_kmh": 10, "radius_m": [8, 9]}}, "encounters.0: name: Input should be a valid string"),
+    (
+        {"name": None, "ego": {"speed_kmh": 10, "radius_m": [8, 9]}},
+        "encounters.0: name: Input should be a valid string",
+    ),
     ({"name": ["f", "g"]}, "encounters.0: name: Input should be a valid string"),
     ({"ego": {"speed_kmh": [-10, 0, 10]}}, "'f' has speeds forward and in reverse"),
     ({"ego": {"speed_kmh": {"from": -10, "to": 10}}}, "'f' has speeds forward and in reverse"),
