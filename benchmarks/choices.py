@@ -5,8 +5,9 @@ import time
 import numpy as np
 
 from benchmarks.timing import table
-from torchcover.placement import Candidates, ChoiceSpace, CommonInstants, Limits, best, subsets
+from torchcover.placement import ChoiceSpace, CommonInstants, subsets
 from torchcover.placement.choosing import seen_by, worth_of
+from torchcover.placement.subsets import Candidates, Limits, best
 from torchcover.simulation import Rig
 
 REGIONS = ["roof", "fender_left", "fender_right", "mirror_left", "mirror_right", "grille", "rear_bumper"]

@@ -59,7 +59,6 @@ RESULTS = {
     "search": ("search", "space.yaml", "--evaluations", "2"),
     "search, a choice": ("search", "choice.yaml", "--rays", "256", "--per-world", "1"),
     "study": ("study", "rig.yaml", *WORLD, "--rays", "64", "--rays", "32", "--steps", "8"),
-    "agree": ("agree", "place3d2024", "--scenario", "courtyard", "--metrics", "point_density", "--steps", "1"),
 }
 RECORDINGS = {
     "record": ("record", "rig.yaml", *WORLD, "--rays", "64", "--steps", "2"),

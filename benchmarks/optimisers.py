@@ -6,8 +6,8 @@ import time
 import numpy as np
 
 from benchmarks.timing import table
-from torchcover.placement import OPTIMISERS, CommonInstants, Cube, SearchSpace, race
-from torchcover.placement.racing import gains
+from torchcover.placement import OPTIMISERS, CommonInstants, Cube, SearchSpace
+from torchcover.placement.racing import gains, race
 
 # The roof, and the roof with all angles of the LiDAR: 3 and 5 numbers.
 FREE = {"x_m": (-0.6, 0.8), "z_m": (1.68, 1.85), "pitch_deg": (-10.0, 15.0)}

@@ -5,8 +5,8 @@ import time
 import numpy as np
 
 from benchmarks.timing import table
-from torchcover.placement import CommonInstants, Objective, Prefix, race
-from torchcover.placement.racing import MIN_WORLDS, TOGETHER, gains
+from torchcover.placement import CommonInstants, Objective
+from torchcover.placement.racing import MIN_WORLDS, TOGETHER, Prefix, gains, race
 from torchcover.simulation import Rig
 
 # What the random mounts of the roof LiDAR are drawn from.

@@ -75,8 +75,8 @@ def main(arguments=()):
     result = run_search(search)
     seconds = time.process_time() - start
     spent = [f"{name} {len(arm.evaluations) - 1}" for name, arm in search.arms.items()]
-    print(f"{search.optimiser_name}, {len(search.instants)} instants; candidates: {', '.join(spent)}; {seconds:.0f} s "
-          f"of processor time in this process; racing saved {search.share_saved:.0%}.\n")  # fmt: skip
+    print(f"{search.plan.optimiser_name}, {len(search.instants)} instants; candidates: {', '.join(spent)}; "
+          f"{seconds:.0f} s of processor time in this process; racing saved {search.share_saved:.0%}.\n")  # fmt: skip
     table(
         ("found by", "estimate", "x, z (m), pitch (°)", "search", "fresh (points)", "t", "better"), list(gains(result))
     )

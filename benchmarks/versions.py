@@ -29,7 +29,7 @@ SCRIPTS = Path("/usr/share/debootstrap/scripts")
 LOWEST = "lowest"
 PACKAGES = "python3,python3-venv,python3-dev,ca-certificates,gcc,g++,git,libgl1,libgomp1,make"
 # What a system needs of the one around it.
-MOUNTS = ("proc", "dev", "dev/shm")
+MOUNTS = ("proc", "dev", "dev/shm", "dev/pts")
 COPIES = ("etc/resolv.conf", "etc/ssl/certs/ca-certificates.crt")
 INSTALL = ".venv/bin/python -m pip install --quiet --prefer-binary"
 NEWEST = f"{INSTALL} '.[dev]' && .venv/bin/python -m pip check"

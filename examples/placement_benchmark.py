@@ -35,7 +35,7 @@ from examples.train_detector import (
 from torchcover import Region
 from torchcover.data import Augmentation, SimulatedFrames
 from torchcover.detection import RecallByVisibility
-from torchcover.evaluation import relation, score_placements
+from torchcover.evaluation import score_placements
 from torchcover.published import Judged, agreement_of, lead, metric_names
 from torchcover.published.ranks import LEAST
 from torchcover.simulation import PaperReference, Rig
@@ -227,7 +227,7 @@ def ranks(judged, rankings):
         above = lead(one, height, judged, placements=True)
         leads += [one.name] if above.low > 0 else []
         name = f"{row.metric}{'' if row.over_worlds else ' *'}"
-        text += f"| {name} | {relation(row.spearman)} | {relation(row.kendall)} | {row.p:.2g} | {relation(above)} |\n"
+        text += f"| {name} | {row.spearman.words} | {row.kendall.words} | {row.p:.2g} | {above.words} |\n"
     ahead = ", ".join(f"`{name}`" for name in leads) or "No metric"
     return f"{text}\n{ahead}: ahead of the mean mounting height with an interval above 0.\n"
 

@@ -5,9 +5,12 @@ import os
 import shutil
 import signal
 import sys
+import threading
 
 # A fork may wait without end for a thread that only its parent has.
 LONGEST_S = 300
+# Two at once are more than what locks files can bear.
+FORKING = threading.Lock()
 # Of Python's audit events.
 OPERATIONS = ("open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.truncate")
 
@@ -26,7 +29,9 @@ def operations_of(act, at=None, number=signal.SIGKILL, *, copied=None):
         How many operations there were, and the exit code, minus the signal's number if that has ended it.
     """
     there, here = os.pipe()
-    if pid := os.fork():
+    with FORKING:
+        pid = os.fork()
+    if pid:
         os.close(here)
         with open(there, "rb") as told:
             count = len(told.read())

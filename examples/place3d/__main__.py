@@ -1,7 +1,7 @@
 """Do metrics rank the placements of Place3D as its detectors do: `python -m examples.place3d --steps 200 --every-s 10`.
 
-What `torchcover agree place3d2024` measures, as a page in Markdown, with one metric more: the LiDAR occupancy boards
-(LOB) of Kim and Park 2020, which hang on the rig alone.
+Its rigs `place3d2024_*` in the same frames, by torchcover's numbers, by those of others, and by the LiDAR occupancy
+boards (LOB) of Kim and Park 2020, which hang on the rig alone: a page in Markdown.
 """
 
 import argparse
@@ -10,9 +10,8 @@ from pathlib import Path
 
 from examples.place3d.boards import DISTANCES_M, cells_hit
 from examples.place3d.page import page
+from examples.place3d.study import agree, agreements
 from torchcover.estimation import Quantity
-from torchcover.evaluation import agree
-from torchcover.evaluation.agreeing import agreements
 from torchcover.published import Ranking, metric_names
 from torchcover.simulation import Rig
 
@@ -25,7 +24,7 @@ def with_boards(study):
         name = f"lob_{distance_m:g}m"
         boards.append(Ranking.of_values(Quantity(name, name, "share", lower_is_better=False), shares, "lob"))
     scores = replace(study.scores, rankings=(*study.scores.rankings, *boards))
-    return replace(study, scores=scores, found=agreements(scores))
+    return study._replace(scores=scores, found=agreements(scores))
 
 
 def main():
@@ -49,7 +48,7 @@ def main():
         progress=True,
     )
     study = with_boards(study)
-    study.save(options.out)
+    options.out.mkdir(parents=True, exist_ok=True)
     text = page(study)
     (options.out / "agreement.md").write_text(text, encoding="utf-8")
     print(text)

@@ -2,8 +2,7 @@
 
 import math
 
-from torchcover.evaluation import relation, verdict
-from torchcover.evaluation.agreeing import NOTES, READINGS
+from examples.place3d.study import NOTES, READINGS, verdict
 
 
 def page(study):
@@ -29,7 +28,7 @@ def ranks(found):
     columns = [f"{name}, {reading}" for reading in found for name in ("Spearman", "tau-b", "p")]
     text = f"| metric | {' | '.join(columns)} |\n|---|{'---:|' * len(columns)}\n"
     for rows in zip(*(one.ranked for one in found.values()), strict=True):
-        cells = [cell for row in rows for cell in (relation(row.spearman), relation(row.kendall), short(row.p))]
+        cells = [cell for row in rows for cell in (row.spearman.words, row.kendall.words, short(row.p))]
         text += f"| {rows[0].metric}{'' if rows[0].over_worlds else ' *'} | {' | '.join(cells)} |\n"
     return text
 

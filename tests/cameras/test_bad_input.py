@@ -26,6 +26,7 @@ SHEARED = np.eye(4) + 0.1 * np.eye(4, k=1)
         ({"model": "eucm", "coefficients": [1.5, 1.0]}, r"alpha must lie in \[0, 1\]; got 1.5"),
         ({"model": "eucm", "coefficients": [0.5, 0.0]}, "beta must lie in"),
         ({"model": "double_sphere", "coefficients": [2.0, 0.5]}, "xi must lie in"),
+        ({"model": "double_sphere", "coefficients": [-1.0, 0.5]}, "xi must lie in"),
         ({"model": "mei", "coefficients": [-0.1]}, "xi must lie in"),
         ({"model": "theta_polynomial", "coefficients": [0.0, 1.0, 0.0, 0.0]}, "k1 must be positive"),
         ({"vehicle_T_camera": SHEARED, "name": "front"}, "front: vehicle_T_camera.*deviates from the identity by 0.1"),

@@ -3,6 +3,7 @@
 import builtins
 import struct
 import zlib
+from inspect import unwrap
 
 import numpy as np
 import OpenEXR
@@ -13,7 +14,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from torchcover.cameras import decode_carla, read_depth
-from torchcover.files import BadFileError
+from torchcover.files import BadFileError, exr_image
 
 
 def encode_carla(metres, order):
@@ -77,7 +78,7 @@ def test_exr_without_its_package(tmp_path, monkeypatch):
     (tmp_path / "depth.exr").write_bytes(b"v/1")
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(ImportError, match=r"torchcover\[exr\]"):
-        read_depth(tmp_path / "depth.exr")
+        unwrap(exr_image)(tmp_path / "depth.exr", 1)
 
 
 def png_header(width, height, bits=8, colour=6):

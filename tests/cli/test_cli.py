@@ -241,6 +241,9 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
             "recorded reference has none",
         ),
         (["evaluate", "front_roof_128", "--sensors", "roof"], "--sensors: for a recording, which --frames gives"),
+        (["evaluate", "front_roof_128", "--units", "mm"], "--units mm: for a recording, which --frames gives"),
+        (["evaluate", "--frames", "recording", "--lag", "3"], "lag: at most 1 s are undone; got 3"),
+        (["compare", "--frames", "recording", "--poses", "wrong"], "is not one of 'given', 'inverse', 'yx', 'held'"),
         (["measure"], "No such command 'measure'"),
     ],
 )

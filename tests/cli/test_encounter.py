@@ -49,14 +49,33 @@ def test_rigs_side_by_side_in_words_and_files(torchcover, worlds):
         (SET, ["--latency-s", "-1"], "latency_s: seconds of 0 or more"),
         (SET, ["--set", "crosing_like"], "is 'crossing_like' meant?"),
         (SET, ["--film", "a.png"], "a film is a .gif or .mp4 file"),
-        (SET, ["--film", "a.gif", "--scenario", "urban"], "--film: of a set only"),
-        (SET, ["--frames", "drive"], "a recording has its own rigs"),
-        (SET, ["--scenario", "courtyard"], "nothing ever moves in it"),
+        (SET, ["--worlds", "16"], "--worlds: of no use with a set; leave it out"),
+        (SET, ["--within-s", "4"], "--within-s: of no use with a set"),
+        (SET, ["--scenario", "urban"], "--set: of no use with --scenario"),
     ],
 )
 def test_a_mistake_is_one_line(torchcover, worlds, text, arguments, message):
     (worlds / "two.yaml").write_text(text)
     given = ("--set", worlds / "two.yaml", "--phases", "1", "--vehicle", "suv", *arguments)
     ended, _, error = torchcover("encounter", worlds / "low.yaml", *given)
+    assert ended == 2
+    assert message in error.strip().splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["low.yaml", "--scenario", "courtyard"], "nothing ever moves in it"),
+        (["low.yaml", "--scenario", "urban", "--film", "a.gif"], "--film: of no use with --scenario"),
+        (["low.yaml", "--scenario", "urban", "--phases", "10"], "--phases: of no use with --scenario"),
+        (["low.yaml", "--frames", "drive"], "rigs: of no use with --frames, which has rigs and traffic of its own"),
+        (["--frames", "drive", "--scenario", "urban"], "--scenario: of no use with --frames"),
+        (["--frames", "drive", "--vehicle", "suv"], "--vehicle: of no use with --frames"),
+        (["--frames", "drive"], "drive"),
+        ([], "rigs with different names are needed; got none"),
+    ],
+)
+def test_what_would_not_be_read_is_a_mistake(torchcover, worlds, arguments, message):
+    ended, _, error = torchcover("encounter", *(worlds / one if one == "low.yaml" else one for one in arguments))
     assert ended == 2
     assert message in error.strip().splitlines()[-1]

@@ -433,3 +433,15 @@ def test_bad_clouds_are_refused_before_anything_is_added(sensor, reference, erro
     with pytest.raises(error, match=message):
         metric.update(sensor, reference)
     assert all(torch.equal(before[name], value) for name, value in metric.state_dict().items())
+
+
+def test_clouds_that_are_coarser_than_cells_are_refused():
+    near = torch.rand(50, 3)
+    for far, kind, refused in ((1e3, torch.float32, False), (1e6, torch.float32, True), (1e6, torch.float64, False)):
+        grid = BevGrid(x=(far - 5.0, far + 5.0), y=(-5.0, 5.0), cell=0.5, heights={"all": (-1.0, 2.0)})
+        cloud = (near.double() + torch.tensor([far, 0.0, 0.0])).to(kind)
+        if not refused:
+            assert CoverageMetric(grid).update(cloud, cloud) is None
+            continue
+        with pytest.raises(ValueError, match=r"sensor\[0\]: float32 coordinates are 0.12 m apart at 1,000,005 m"):
+            CoverageMetric(grid).update(cloud, near)

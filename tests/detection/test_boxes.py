@@ -298,7 +298,6 @@ def test_boxes_move_with_their_frame():
     ("call", "name"),
     [
         (lambda a, t, boxes: Boxes.from_rows(a), "rows"),
-        (lambda a, t, boxes: Boxes.from_mmdet3d(a), "rows"),
         (lambda a, t, boxes: points_in_boxes(a, boxes), "points"),
         (lambda a, t, boxes: match(a, t[:, 0], t, "distance", 2.0), "detections"),
         (lambda a, t, boxes: match(t, a[:, 0], t, "distance", 2.0), "scores"),

@@ -1,6 +1,7 @@
 """When a rig detects whom it meets: geometry, and the same as looking all the time."""
 
 import math
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from matplotlib.text import Text
 
 from tests.targets.worlds import EGO, FLOOR, lidar, on_target
 from torchcover.encounters import Criterion, Encounter, EncounterSet, Staged, sight_encounter
-from torchcover.encounters.sighting import NEVER, Looks, MountedRig, channels, first_run, kinds_of, look_steps
+from torchcover.encounters.sighting import NEVER, Looks, MountedRig, channels, first_run, look_steps
 from torchcover.evaluation import encounter, encounter_film, free_space
 from torchcover.geometry import euler_from_rotation, overlapping
 from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, with_ego
@@ -41,6 +42,10 @@ def mounted(*sensors):
     return MountedRig(rig(*sensors), with_ego(world, {}))
 
 
+def sighted(mounted_rig, case, criterion, **keys):
+    return sight_encounter(mounted_rig, Staged(case, mounted_rig.ego), criterion, **keys)
+
+
 def ahead(name="ahead", **keys):
     """A dense LiDAR in the middle of the front."""
     return lidar(name, mount={"x_m": 1.9, "z_m": 1.2}, columns=900, channels=11, vertical_fov_deg=[-12, 0], **keys)
@@ -58,7 +63,7 @@ def test_the_sight_opens_when_the_line_past_the_corner_of_a_wall_meets_the_walke
     }  # fmt: skip
     walls = [{"body": WALL, "beside_m": 0.6, "gap_m": 1.0}]
     walker = {"body": WALKER, "from_m": 2.1}
-    one = sight_encounter(
+    one = sighted(
         mounted(scanner), crossing(speed_kmh, walker, obstacles=walls), Criterion(points=1, looks=1), phases=1
     )
     # Seconds before the ego's front is at the walker's way, which the line past (-1.01, -1.6) meets at y = ..
@@ -67,6 +72,21 @@ def test_the_sight_opens_when_the_line_past_the_corner_of_a_wall_meets_the_walke
     opens_s = before_s[-1.5 * before_s + 0.01 >= -1.6 * sensor_m / (sensor_m + 1.01)].max()
     assert 1.1 < opens_s < 1.35
     assert one.ttc_s[0] == pytest.approx(opens_s - 0.01 / (speed_kmh / 3.6), abs=0.005)
+
+
+@pytest.mark.parametrize("kmh", [(50, 0), (50, 50), (20, 90), (90, 3), (90, -54), (0, 30), (-15, 20), (-15, -6)])
+def test_what_braking_needs_is_what_a_braking_vehicle_needs(kmh):
+    ego, other = kmh
+    case = crossing(float(ego), {"yaw_deg": 0 if other < 0 else 180, "speed_kmh": abs(other) * math.copysign(1.0, ego)})
+    criterion = Criterion(deceleration_mps2=6.0, latency_s=0.4)
+    speed_mps, towards_mps = abs(ego) / 3.6, case.towards_mps
+    assert towards_mps == pytest.approx(other / 3.6)
+    # The least gap from which none is lost until the ego stands, or is no faster than who drives ahead.
+    times_s = np.linspace(0.0, 0.4 + speed_mps / 6, 100_001)
+    own_mps = np.maximum(speed_mps - 6 * np.maximum(times_s - 0.4, 0.0), 0.0)
+    lost_m = np.cumsum(own_mps + towards_mps) * times_s[1]
+    expected_s = lost_m.max() / (speed_mps + towards_mps)
+    assert criterion.needed_s(speed_mps, towards_mps) == pytest.approx(expected_s, abs=1e-4)
 
 
 def test_outlines_touch_when_the_front_has_come_to_the_side():
@@ -109,6 +129,13 @@ def test_rows_of_obstacles_lie_where_the_ego_comes_from_or_beyond(speed_kmh):
     assert placed["boxright0.5"] == pytest.approx([back * (0.5 + 0.5 + 1.0), -1.0 - 1.0 - 0.5])
     assert placed["boxright0.4"] == pytest.approx([back * (0.5 + 0.5 + 2.0 + 0.4 + 1.5), -1.0 - 2.0 - 0.25])
     assert placed["boxleft0.3"] == pytest.approx([-back * (0.5 + 0.3 + 0.5), 1.0 + 0.7 + 1.0])
+
+
+@pytest.mark.parametrize("speed_kmh", [36.0, -31.7])
+@pytest.mark.parametrize("yaw_deg", [0.0, 17.0])
+def test_bodies_may_touch(speed_kmh, yaw_deg):
+    row = [{"body": body, "gap_m": 0.0, "beside_m": 0.0, "yaw_deg": yaw_deg} for body in ("van", "suv", WALL, BOX)]
+    assert len(Staged(crossing(speed_kmh, {"from_m": 0.7}, obstacles=row), SOLID).obstacles) == 4
 
 
 def test_a_bend_ends_at_the_meeting_and_is_as_long_as_its_angle():
@@ -192,7 +219,7 @@ def test_points_are_those_of_a_simulation_with_the_other_in_the_world():
 def test_the_answer_is_that_of_looking_all_the_time():
     case, criterion = crossing(obstacles=HIDDEN), Criterion(points=12, pixels=150)
     small = mounted(ahead(dropout=0.3), ahead("noisy", rate_hz=20, range_noise_m=0.3), CAMERA)
-    found = sight_encounter(small, case, criterion, phases=4, seed=3)
+    found = sighted(small, case, criterion, phases=4, seed=3)
     staged = Staged(case, small.ego)
     looks, sensors = Looks(small, staged, 3), small.rig.sensors
     for k, sensor in enumerate(sensors):
@@ -212,19 +239,29 @@ def test_the_answer_is_that_of_looking_all_the_time():
     assert (found.without_ttc_s[0] == found.sensor_ttc_s[1:].max(axis=0)).all()
 
 
-def test_lidars_of_one_rate_count_together_and_a_loss_is_never_a_gain():
-    sensors = rig(lidar("a"), lidar("b"), lidar("c", rate_hz=20), CAMERA, RADAR).sensors
-    assert channels(kinds_of(sensors), range(5)) == [(0, 1), (2,), (3,), (4,)]
+def test_lidars_count_together_at_the_looks_of_the_slower_and_a_loss_is_never_a_gain():
+    assert channels([0.1, None, 0.05, 0.1, None, 0.2], range(6)) == [(1,), (4,), (0, 3, 2), (2,), (5, 0, 3, 2)]
+    assert channels([2, None, 1], [2]) == [(2,)]
     few = lidar("few", columns=180, channels=8, vertical_fov_deg=[-20, 0])
-    found = sight_encounter(mounted(few, few | {"name": "same"}), crossing(), Criterion(points=6), phases=3)
+    found = sighted(mounted(few, few | {"name": "same"}), crossing(), Criterion(points=6), phases=3)
     assert (found.without_ttc_s <= found.ttc_s).all()
     assert (found.without_ttc_s == found.sensor_ttc_s[::-1]).all()
     assert (found.ttc_s > found.sensor_ttc_s[0]).any()
+    for rate_hz in (10.001, 13, 20):
+        faster = sighted(
+            mounted(few, few | {"name": "fast", "rate_hz": rate_hz}), crossing(), Criterion(points=6), phases=3
+        )
+        assert (faster.ttc_s >= found.ttc_s).all()
 
 
 def test_a_sensor_that_is_slower_than_the_encounter_is_too_late():
     with pytest.warns(UserWarning, match=r"3 looks of sensor 'top' take 3 s, .* ends after 0.98"):
-        found = sight_encounter(mounted(lidar(rate_hz=1)), crossing(), Criterion(), phases=2)
+        found = sighted(mounted(lidar(rate_hz=1)), crossing(), Criterion(), phases=2)
+    assert not found.ttc_s.any()
+    assert not found.from_the_beginning.any()
+    unseen = crossing(20.0, {"from_m": None, "speed_kmh": 0}, seconds=2)
+    with pytest.warns(UserWarning, match="too late, whatever it sees"):
+        found = sighted(mounted(lidar(rate_hz=1)), unseen, Criterion(), phases=2)
     assert not found.ttc_s.any()
     assert not found.from_the_beginning.any()
 
@@ -232,7 +269,7 @@ def test_a_sensor_that_is_slower_than_the_encounter_is_too_late():
 def test_fog_hides_what_is_beyond_and_it_is_said_what_was_there_from_the_beginning():
     far = crossing(72.0, {"from_m": None, "speed_kmh": 0}, seconds=3)
     sensor = lidar(channels=60, vertical_fov_deg=[-4, 0], columns=7200, max_range_m=80)
-    found = [sight_encounter(mounted(sensor), case, Criterion(points=1), phases=2) for case in (
+    found = [sighted(mounted(sensor), case, Criterion(points=1), phases=2) for case in (
         far, far.model_copy(update={"weather": crossing(weather="fog_50m").weather}))]  # fmt: skip
     assert found[0].from_the_beginning.all()
     assert found[0].ttc_s.min() > 2.5
@@ -292,20 +329,42 @@ def test_in_time_up_to_a_speed_is_in_time_at_all_that_are_slower():
     found = encounter(rig(high("ahead")), these, between, phases=5)
     assert [row.in_time for row in found.rows][-1] == 0.6
     assert list(found.up_to_kmh().values()) == [30.0]
-    for brakes, expected in ((1e6, 50.0), (1.0, 0.0)):
+    for brakes, expected, words in ((1e6, 50.0, "50"), (1.0, math.nan, "none")):
         found = encounter(rig(high("ahead")), these, Criterion(deceleration_mps2=brakes, latency_s=0.1), phases=5)
-        assert list(found.up_to_kmh().values()) == [expected]
+        assert list(found.up_to_kmh().values()) == pytest.approx([expected], nan_ok=True)
+        assert found.tables()[0].rows[0][1].text == words
+    standing = [crossing(float(kmh), {"from_m": 3}) for kmh in (-50, 0, -20)]
+    both = EncounterSet(name="s", encounters=tuple(standing))
+    found = encounter(rig(high("ahead")), both, Criterion(deceleration_mps2=1.0), phases=2)
+    assert (list(found.up_to_kmh().values()), found.tables()[0].rows[0][1].text) == ([0.0], "0")
+    assert [row.speed_kmh for row in found.rows] == [0, -20, -50]
 
 
 def test_a_film_shows_where_everybody_is_and_what_is_on_the_other():
-    other = {"body": "child", "speed_kmh": 5, "from_m": 1.5}
-    these = EncounterSet.model_validate({"name": "s", "encounters": [FAMILY | {"other": other}]})
+    other = {"body": "child", "speed_kmh": 5, "from_m": 2.0}
+    these = EncounterSet.model_validate(
+        {"name": "s", "encounters": [FAMILY | {"ego": {"speed_kmh": [20, 90]}, "other": other}]}
+    )
     two = rig(high("ahead"), high("top", columns=40))
-    picture = next(encounter_film(two, encounter([two], these, phases=2, vehicle="suv"), vehicle="suv"))
+    pictures = list(islice(encounter_film(two, encounter([two], these, phases=2, vehicle="suv"), vehicle="suv"), 2))
+    picture, (axes,) = pictures[0], pictures[0].axes
+    child, parked, ego = (patch.get_xy() for patch in axes.patches)
+    for (low_m, high_m), of_axis in zip((axes.get_xlim(), axes.get_ylim()), range(2), strict=True):
+        assert all(low_m < patch[:, of_axis].min() < patch[:, of_axis].max() < high_m for patch in (child, parked, ego))
+    assert {(one.axes[0].get_xlim(), one.axes[0].get_ylim()) for one in pictures} == {
+        (axes.get_xlim(), axes.get_ylim())
+    }
     words = " ".join(text.get_text() for text in picture.findobj(Text))
-    assert "s to the collision; points on it: ahead 10, top 0" in words
-    for told in ("at 40 km/h: detected", "first ahead, without ahead", "in time up to", "child (1)", "hatchback (1)"):
+    assert "s to the collision; points on it: ahead 1, top 0" in words
+    for told in (
+        "at 90 km/h: detected",
+        "first ahead, without ahead",
+        "in time up to 20 km/h",
+        "child (1)",
+        "hatchback (1)",
+    ):
         assert told in words
+    assert "reference points" not in words
 
 
 MISTAKES = [
@@ -320,6 +379,13 @@ MISTAKES = [
     ({"ego": {"speed_kmh": list(range(1, 201))}, "seconds": list(range(1, 60))},
      "11,800 encounters of a family, of at most 10,000"),
     ({"obstacle": []}, "obstacle"),
+    (
+        {"name": None, "ego": {"speed_kmh": 10, "radius_m": [8, 9]}},
+        "encounters.0: name: Input should be a valid string",
+    ),
+    ({"name": ["f", "g"]}, "encounters.0: name: Input should be a valid string"),
+    ({"ego": {"speed_kmh": [-10, 0, 10]}}, "'f' has speeds forward and in reverse"),
+    ({"ego": {"speed_kmh": {"from": -10, "to": 10}}}, "'f' has speeds forward and in reverse"),
 ]  # fmt: skip
 
 
@@ -333,6 +399,14 @@ def test_a_family_that_makes_no_sense_is_told_once(keys, told, tmp_path):
     assert len(str(failure.value)) < 1000
 
 
+def test_families_of_one_name_are_told():
+    families = [
+        {"name": "f", "ego": {"speed_kmh": kmh}, "other": {"body": "child", "speed_kmh": 5}} for kmh in (10, 20)
+    ]
+    with pytest.raises(ValueError, match=r"encounters.1: encounters.0 is called 'f', too"):
+        EncounterSet.model_validate({"name": "s", "encounters": families})
+
+
 @pytest.mark.parametrize(
     ("case", "told"),
     [
@@ -341,8 +415,19 @@ def test_a_family_that_makes_no_sense_is_told_once(keys, told, tmp_path):
         (crossing(36, {"body": BOX, "yaw_deg": 0, "speed_kmh": 36}), "overlap from the beginning"),
         (crossing(36, obstacles=[{"body": WALL, "beside_m": -1.0}]), "'box' is in the way of the ego"),
         (crossing(36, {"from_m": 3}, obstacles=[{"body": WALL, "gap_m": -1.0}]), "'box' is in the way of the other"),
+        (
+            crossing(36, obstacles=[{"body": WALL}, {"body": "van", "gap_m": -0.1}]),
+            "'box' and 'van' are inside one anot",
+        ),
     ],
 )
 def test_ways_that_never_meet_or_are_blocked_are_mistakes(case, told):
     with pytest.raises(ValueError, match=told):
         Staged(case, SOLID)
+
+
+def test_mistakes_of_the_last_encounter_are_told_before_the_first_look(monkeypatch):
+    monkeypatch.setattr(MountedRig, "mounted", None)
+    both = crossing(), crossing(36, {"at_width": 3.0, "yaw_deg": 0, "from_m": 4})
+    with pytest.raises(ValueError, match="never touch"):
+        encounter(rig(), EncounterSet(name="s", encounters=both))

@@ -383,7 +383,7 @@ def test_what_there_is_outlives_a_worker_that_is_killed(frames):
 
 @pytest.mark.parametrize(("method", "tells"), [("fork", False), ("spawn", True), ("forkserver", True)])
 def test_a_program_that_starts_itself_is_told_how_it_should(method, tells, monkeypatch):
-    monkeypatch.setattr(multiprocessing, "get_start_method", lambda: method)
+    monkeypatch.setattr(multiprocessing, "get_start_method", lambda **_: method)
     died = RuntimeError("DataLoader worker (pid(s) 7) exited unexpectedly")
     assert ("__main__" in str(pipeline.killed_worker(died, workers=2, steps=0))) == tells
 

@@ -245,7 +245,7 @@ def test_times_to_collision_are_the_latest_of_all_phases(tmp_path):
     ttc, spare = check(THREE, requirements, vehicle=box).verdicts["small"]
     seen = encounter(THREE, requirements.requirements[0].encounters, Criterion(**looks), vehicle=box).sightings
     latest_s = [min(one.ttc_s.min(), one.without_ttc_s[1].min()) for one in seen]
-    needed_s = [one.encounter.closing_mps / 8 + 1.0 for one in seen]
+    needed_s = [abs(one.encounter.ego.speed_mps) / 8 + 1.0 for one in seen]
     assert (ttc.value, ttc.count) == (min(latest_s), 4)
     assert 0.0 < ttc.value < min(one.ttc_s.max() for one in seen)
     assert spare.value == pytest.approx(min(np.subtract(latest_s, needed_s)))

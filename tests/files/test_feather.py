@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from torchcover.files.bad_file import BadFileError
-from torchcover.files.feather import read_feather
+from torchcover.files import BadFileError, read_feather
 
 pa = pytest.importorskip("pyarrow")
 

@@ -1,8 +1,9 @@
 """Where a body is at and between the times of its poses."""
 
 import numpy as np
+import pytest
 
-from torchcover.geometry import rotation_from_euler
+from torchcover.geometry import rigid, rotation_from_euler
 from torchcover.geometry.trajectory import Trajectory, poses_at
 
 
@@ -49,3 +50,16 @@ def test_poses_of_many_bodies_are_those_of_each():
     for time_s in (-1.0, 0.0, 0.3, 1.0, 2.4, 9.0):
         np.testing.assert_array_equal(poses_at(tracks, time_s), [track.at(time_s) for track in tracks])
     assert poses_at([], 0.0).shape == (0, 4, 4)
+
+
+@pytest.mark.parametrize("pitch_deg", [(85.0, 95.0), (60.5, 80.0), (-90.0, -70.0), (89.0, 90.0)])
+@pytest.mark.parametrize("others_deg", [(0.0, 0.0), (170.0, -30.0)])
+def test_between_steep_poses_a_body_turns_about_one_axis(pitch_deg, others_deg):
+    yaw_deg, roll_deg = others_deg
+    ends = np.stack([rigid(rotation_from_euler(yaw_deg, pitch, roll_deg), np.zeros(3)) for pitch in pitch_deg])
+    body = Trajectory.from_poses([0.0, 1.0], ends)
+    for share in (0.0, 0.25, 0.5, 1.0):
+        between = rotation_from_euler(yaw_deg, pitch_deg[0] + share * (pitch_deg[1] - pitch_deg[0]), roll_deg)
+        assert body.at(share)[:3, :3] == pytest.approx(between, abs=1e-9)
+        assert poses_at([body, body], share)[1, :3, :3] == pytest.approx(between, abs=1e-9)
+        assert body.at_each(np.array([0.1, share]))[1, :3, :3] == pytest.approx(between, abs=1e-9)

@@ -228,7 +228,7 @@ def test_a_utm_offset_in_float64_costs_no_precision(backend):
 
 @backends
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("limit", [0.0, 1e-25, 0.1, 0.4, 1.0, 3.3e7])
+@pytest.mark.parametrize("limit", [0.0, 1e-45, 1e-25, 0.1, 0.4, 1.0, 3.3e7])
 def test_max_distance_is_inclusive(backend, limit, dtype):
     points = cloud([limit, 0, 0], [9e7, 0, 0], dtype=dtype)
     at, index = nearest(cloud([0, 0, 0], dtype=dtype), points, max_distance=limit, backend=backend)

@@ -3,7 +3,8 @@
 import numpy as np
 
 from tests.placement.worlds import estimate_of
-from torchcover.placement import Objective, Prefix, SearchPlan, SearchSpace, racing_order
+from torchcover.placement import Objective, SearchPlan, SearchSpace
+from torchcover.placement.racing import Prefix, racing_order
 from torchcover.simulation import Scenario
 
 QUESTIONS = 2

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from torchcover.placement import OPTIMISERS, Cube, Optimiser
-from torchcover.placement.optimisers import optimiser_for
 from torchcover.placement.optimisers.gaussian_process import log_expected_improvement
 from torchcover.placement.optimisers.gp_model import GaussianProcess, _learnt, _loss
 
@@ -32,7 +31,7 @@ def doubles(values):
     return torch.tensor(values, dtype=torch.float64)
 
 
-@pytest.mark.parametrize(("name", "cube"), [("gp", MIXED), ("random", MIXED), ("gp", CHOICES), ("enumerate", CHOICES)])
+@pytest.mark.parametrize(("name", "cube"), [("gp", MIXED), ("random", MIXED), ("gp", CHOICES)])
 def test_what_is_asked_for_depends_on_the_seed_and_on_what_was_told(name, cube):
     """So a search that is resumed tells it all again, without asking."""
     first, again = OPTIMISERS[name](cube, 7), OPTIMISERS[name](cube, 7)
@@ -42,7 +41,7 @@ def test_what_is_asked_for_depends_on_the_seed_and_on_what_was_told(name, cube):
     for unit in units:
         again.tell(unit, math.nan if unit[0] > 0.7 else hill(unit), 1e-3)
     assert np.array_equal(first.ask(), first.ask())
-    assert len(np.unique(units, axis=0)) == len(units) or cube is CHOICES
+    assert len(np.unique(units, axis=0)) == len(units)
     assert np.array_equal(first.ask(), again.ask())
     assert np.array_equal(units, cube.snapped(units))
     assert ((units >= 0) & (units <= 1)).all()
@@ -78,19 +77,11 @@ def test_places_where_no_rig_can_be_are_avoided():
 
 
 def test_every_combination_is_asked_for_once_but_the_start():
-    each = OPTIMISERS["enumerate"](CHOICES, 0)
+    each = OPTIMISERS["gp"](CHOICES, 0)
     units = run(each, 11)
     assert each.ask() is None
     assert len(np.unique(units, axis=0)) == 11
     assert not (units == CHOICES.start).all(axis=1).any()
-    with pytest.raises(ValueError, match="choices only, 1,000,000 combinations at most; got a free number"):
-        OPTIMISERS["enumerate"](MIXED, 0)
-
-
-def test_auto_is_by_numbers_and_choices():
-    assert optimiser_for((0,) * 16) == "gp"
-    assert optimiser_for((200,)) == "enumerate"
-    assert optimiser_for((201,)) == "gp"
 
 
 def twin(model, x, y, noise, at):

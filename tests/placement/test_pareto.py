@@ -5,8 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from torchcover.placement import hypervolume, non_dominated
-from torchcover.placement.pareto import chebyshev
+from torchcover.placement.pareto import chebyshev, hypervolume, non_dominated
 
 
 def drawn(seed, count=12, objectives=3):

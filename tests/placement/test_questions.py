@@ -8,7 +8,8 @@ from tests.placement.worlds import held, lidar, rig
 from torchcover.coverage import CoverageMetric, Maximum, Quantiles
 from torchcover.estimation import Estimate
 from torchcover.evaluation import CoverageObserver
-from torchcover.placement import Objective, Questions
+from torchcover.placement import Objective
+from torchcover.placement.questions import Questions
 from torchcover.placement.racing import gains
 from torchcover.published import PUBLISHED, Setup
 

@@ -5,9 +5,9 @@ import pytest
 from scipy import stats
 
 from tests.placement.worlds import estimate_of, held, lidar, prefixes_of, rig, yard
-from torchcover.placement import Objective, fresh, fresh_test, race, racing_order
-from torchcover.placement.fresh import SideEffect, _others, holm
-from torchcover.placement.racing import gains
+from torchcover.placement import Objective, fresh
+from torchcover.placement.fresh import SideEffect, _others, fresh_test, holm
+from torchcover.placement.racing import gains, race, racing_order
 
 WORLDS, PER_WORLD = 6, 3
 WORLD = np.repeat(np.arange(WORLDS), PER_WORLD)

@@ -9,8 +9,8 @@ import pytest
 from tests.placement.surfaces import plan, space
 from torchcover.coverage.quantity import RADIUS, detection
 from torchcover.estimation import Difference
-from torchcover.placement import FreshGain, PlacementSearch, run_search
-from torchcover.placement.fresh import told
+from torchcover.placement import PlacementSearch, run_search
+from torchcover.placement.fresh import FreshGain, told
 from torchcover.simulation import Rig
 
 

@@ -6,9 +6,8 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from torchcover.placement import Candidates, Limits, best, best_of_several
 from torchcover.placement import subsets as module
-from torchcover.placement.subsets import random_subsets
+from torchcover.placement.subsets import Candidates, Limits, best, best_of_several, random_subsets
 
 POINTS, COUNT = 37, 8
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from torchcover.placement import FreeChoice, FreeNumber
+from torchcover.placement.variables import FreeChoice, FreeNumber
 
 
 @pytest.mark.parametrize(("low", "high"), [(-10.0, 15.0), (0.0, 1.0), (1.68, 1.85), (-1e6, 1e6), (0.1234567891, 0.2)])

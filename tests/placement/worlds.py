@@ -4,7 +4,8 @@ import numpy as np
 import torch
 
 from torchcover.estimation import Estimate, Quantity
-from torchcover.placement import CommonInstants, Objective, Prefix
+from torchcover.placement import CommonInstants, Objective
+from torchcover.placement.racing import Prefix
 from torchcover.simulation import Rig, Scenario
 
 EGO = {"shape": {"type": "box", "size_m": [4, 2, 1.5]}}

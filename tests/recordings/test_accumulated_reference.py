@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from tests.recordings.drives import Drive
-from torchcover.data import AccumulatedReference, RecordedFrames
+from torchcover.data import AccumulatedReference, BadFrameError, RecordedFrames
 from torchcover.detection import Boxes
+from torchcover.evaluation import evaluate
 from torchcover.geometry import BoundingBox, invert, rigid, transform
 
 FAR_M = (513_248.0, 5_403_655.0, 260.0)
@@ -179,3 +180,25 @@ def test_memory_does_not_grow_with_the_drive():
     assert len(sweeps._kept) <= kept
     assert len(sweeps._votes._counted) <= kept
     assert len(sweeps._votes._images) <= kept
+
+
+def test_one_bad_sweep_costs_its_own_frame():
+    def gone(sensor, index):
+        if index == 2:
+            raise ValueError("f2.bin: truncated")
+        return scan(sensor, index)
+
+    drive = Drive(steps=6)
+    scan, drive.scan = drive.scan, gone
+    frames = RecordedFrames(drive, reference=AccumulatedReference(1.0))
+    with pytest.raises(BadFrameError, match=r"^f2: f2.bin: truncated; it is in the window of f0 .*--skip-bad-frames"):
+        frames[0]
+    with pytest.raises(BadFrameError, match=r"^f2 \(frame 2\): f2.bin: truncated$"):
+        frames[2]
+    result = evaluate(frames=frames, skip_bad_frames=True, cell_m=8.0)
+    assert (result.run.steps, result.run.skipped) == (5, ["f2 (frame 2): f2.bin: truncated"])
+    assert pickle.loads(pickle.dumps(frames.reference)).sweeps.skip_bad
+    assert all(len(frames[each].reference) for each in (0, 1, 3, 5))
+    assert frames[0].counts["reference_sweeps_skipped"] == 2  # both sensors
+    whole = RecordedFrames(Drive(steps=6), reference=AccumulatedReference(1.0))[0]
+    assert frames[0].counts["reference_sweeps"] == whole.counts["reference_sweeps"] - 2

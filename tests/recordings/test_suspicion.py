@@ -161,3 +161,13 @@ def test_a_run_warns_before_it_begins():
     with pytest.warns(UserWarning, match=r"^street: the ground lies at z = -1.[78] m \(lidar\)") as caught:
         torchcover.evaluate(frames=frames, cell_m=8.0)
     assert [warning.filename for warning in caught] == [__file__]
+
+
+def test_a_recording_that_does_not_say_that_it_is_whole(tmp_path):
+    street = Street(steps=2)
+    street.path, street.instants = tmp_path, [0, 1]
+    assert [doubt.partition(": ")[2] for doubt in doubts(street)] == [
+        "torchcover wrote it, and it has no recording.json: is it whole, with its 2 frames?"
+    ]
+    (tmp_path / "recording.json").write_text('{"frames": ["f0", "f1"]}')
+    assert doubts(street) == []

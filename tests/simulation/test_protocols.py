@@ -19,6 +19,7 @@ from torchcover.simulation import (
     Pose,
     RayHits,
     ReferenceScan,
+    RegionsOfInterest,
     Scenario,
     Simulator,
     builtin_names,
@@ -30,7 +31,7 @@ from torchcover.simulation.sensor import Ranging
 from torchcover.targets import Raster, Target, survey
 
 EGO = BoundingBox((-2.4, -1.0, 0.0), (2.4, 1.0, 1.6))
-AREAS = (((0.0, 20.0), (-5.0, 5.0)), ((-40.0, 160.0), (-40.0, 40.0)))
+ASKED = RegionsOfInterest(regions={"20m": {"x_m": (0.0, 20.0), "y_m": (-5.0, 5.0)}}).around()
 MOUNT = {"x_m": 2.6, "z_m": 1.0, "yaw_deg": 30.0}
 RANGES = {"min_range_m": 1.0, "max_range_m": 60.0, "range_noise_m": 0.02, "dropout": 0.1}
 
@@ -63,7 +64,7 @@ class DownReference:
     max_range_m: float = 30.0
 
     @classmethod
-    def from_rays(cls, areas, rays):
+    def from_rays(cls, asked, rays):
         if rays is not None and rays < 1:
             raise ValueError(f"rays: at least 1 is needed; got {rays}")
         return cls(8 if rays is None else rays)
@@ -109,7 +110,7 @@ def sensor(request, monkeypatch):
 def reference_sensor(request, monkeypatch):
     """A reference sensor of each pattern, from areas and a number of rays."""
     monkeypatch.setitem(REFERENCE_SENSORS, "down", DownReference)
-    made = REFERENCE_SENSORS[request.param].from_rays(AREAS, 900)
+    made = REFERENCE_SENSORS[request.param].from_rays(ASKED, 900)
     assert made.name == request.param
     return made
 
@@ -269,15 +270,15 @@ def test_a_reference_sensors_place_is_in_the_shell_around_the_ego(sensor):
 
 
 def test_a_reference_sensor_without_a_number_of_rays_has_one_of_its_own(reference_sensor):
-    own = type(reference_sensor).from_rays(AREAS, None)
-    assert own == type(reference_sensor).from_rays(AREAS, None)
+    own = type(reference_sensor).from_rays(ASKED, None)
+    assert own == type(reference_sensor).from_rays(ASKED, None)
     assert own != reference_sensor
 
 
 @pytest.mark.parametrize("rays", [0, -4])
 def test_a_reference_sensor_without_rays_is_refused(reference_sensor, rays):
     with pytest.raises(ValueError, match=f"rays: at least .*; got {rays}"):
-        type(reference_sensor).from_rays(AREAS, rays)
+        type(reference_sensor).from_rays(ASKED, rays)
 
 
 def test_a_reference_sensor_survives_pickling(reference_sensor):

@@ -151,7 +151,9 @@ def sights():
     walls = [{"body": {"type": "box", "size_m": [3.0, 0.5, 3.0]}, "beside_m": 0.6, "gap_m": 1.0}]
     other = {"body": {"type": "box", "size_m": [0.02, 0.02, 2.0]}, "speed_kmh": 5.4, "from_m": 2.1}
     one = {"name": "e", "ego": {"speed_kmh": FASTEST_KMH}, "other": other, "obstacles": walls}
-    sighting = sight_encounter(one_rig, Encounter.model_validate(one), Criterion(points=1, looks=1), phases=1)
+    sighting = sight_encounter(
+        one_rig, Staged(Encounter.model_validate(one), one_rig.ego), Criterion(points=1, looks=1), phases=1
+    )
     before_s = np.linspace(0.0, 1.39, 1_000_001)
     sensor_m = -0.5 - FASTEST_KMH / 3.6 * before_s
     # The line past the corner of the wall, 1.01 m before and 1.6 m aside, meets the far one of the walker.

@@ -12,7 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchcover.cameras.lens import Array, Linear, Scalar, number, positive_roots
+from torchcover.cameras.lens import Linear, Scalar, number, positive_roots
+from torchcover.geometry.arrays import Float64
 
 
 def as_vector(values: Sequence[Scalar], like: Tensor) -> Tensor:
@@ -51,7 +52,7 @@ class BrownConrady:
         distorted = distort_points(points, identity, as_vector(self.coefficients, a))
         return distorted[..., 0], distorted[..., 1]
 
-    def linearise(self, a: Array, b: Array) -> Linear:
+    def linearise(self, a: Float64, b: Float64) -> Linear:
         """Value and Jacobian; the terms of coefficients that are zero are left out."""
         _, _, p1, p2, *_ = self._padded
         s = a * a + b * b
@@ -69,7 +70,7 @@ class BrownConrady:
             v_a, v_b = v_a + cross, v_b + shift + (4.0 * p1) * b
         return self._with_prism(Linear(u, v, u_a, u_b, v_a, v_b), a, b, s)
 
-    def _with_prism(self, bare: Linear, a: Array, b: Array, s: Array) -> Linear:
+    def _with_prism(self, bare: Linear, a: Float64, b: Float64, s: Float64) -> Linear:
         s1, s2, s3, s4 = self._padded[8:]
         if not any((s1, s2, s3, s4)):
             return bare
@@ -83,7 +84,7 @@ class BrownConrady:
             bare.v_b + b * v_slope,
         )
 
-    def _gain(self, s: Array) -> tuple[Array, Array]:
+    def _gain(self, s: Float64) -> tuple[Float64, Float64]:
         """g(s) and dg/ds."""
         k1, k2, _, _, k3, k4, k5, k6, *_ = self._padded
         gain = 1.0 + s * (k1 + s * (k2 + s * k3))
@@ -94,13 +95,13 @@ class BrownConrady:
         gain = gain / below
         return gain, (slope - gain * (k4 + s * (2.0 * k5 + s * (3.0 * k6)))) / below
 
-    def radial(self, radius: Array) -> Array:
+    def radial(self, radius: Float64) -> Float64:
         """The radius times g."""
         k1, k2, _, _, k3, k4, k5, k6, *_ = self._padded
         s = radius * radius
         return radius * (1.0 + s * (k1 + s * (k2 + s * k3))) / (1.0 + s * (k4 + s * (k5 + s * k6)))
 
-    def critical_radii(self) -> Array:
+    def critical_radii(self) -> Float64:
         """Where d(r g)/dr is 0, where g is, and the poles."""
         k1, k2, _, _, k3, k4, k5, k6, *_ = self._padded
         above = np.polynomial.Polynomial([1.0, k1, k2, k3])

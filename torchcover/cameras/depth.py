@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchcover.files import DEFLATE_MAX_RATIO, NpyHeader, check_memory, read_npy, reads
+from torchcover.files import DEFLATE_MAX_RATIO, NpyHeader, check_memory, exr_image, read_npy, reads
 
 CARLA_FAR_M = 1000.0
 _CARLA_FULL_CODE = 2**24 - 1
@@ -142,25 +142,7 @@ def _read_npy(path: Path) -> NDArray[Any]:
 
 
 def _read_exr(path: Path) -> NDArray[Any]:
-    try:
-        import OpenEXR  # type: ignore[import-not-found, unused-ignore]
-    except ImportError as error:
-        raise ImportError(f"{path}: reading EXR needs the package OpenEXR: pip install 'torchcover[exr]'") from error
-    # The header alone first: with the pixels, memory is reserved for as many as it claims.
-    with OpenEXR.File(str(path), header_only=True) as file:
-        headers = [file.header(part) for part in range(len(file.parts))]
-        channels = [channel.name for header in headers for channel in header["channels"]]
-        if len(channels) != 1:
-            raise ValueError(f"a depth EXR has one channel; got {', '.join(channels)[:80] or 'none'}")
-        low, high = headers[0]["dataWindow"]
-        width, height = (int(last) - int(first) + 1 for first, last in zip(low, high, strict=True))
-    check_memory(width * height * _BYTES_PER_PIXEL)
-    with OpenEXR.File(str(path)) as file:
-        # It prints what is wrong with the pixels, and leaves them out.
-        values = [np.array(channel.pixels) for part in file.parts for channel in part.channels.values()]
-    if len(values) != 1 or values[0].shape != (height, width):
-        raise ValueError(f"truncated or damaged: {width}x{height} pixels are claimed and cannot be read")
-    return values[0]
+    return exr_image(path, _BYTES_PER_PIXEL)["pixels"]
 
 
 _READERS: dict[str, Callable[[Path], NDArray[Any]]] = {".png": _read_png, ".npy": _read_npy, ".exr": _read_exr}

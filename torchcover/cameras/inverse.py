@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from torchcover.cameras.lens import Array, Distortion, Linear
+from torchcover.cameras.lens import Distortion, Linear
 from torchcover.cameras.start import StartTable, nearest_seeds
 from torchcover.cameras.valid_region import ValidRegion
+from torchcover.geometry.arrays import Bools, Float64
 
 # What became of a pixel.
 ANSWERED, OUTSIDE, UNCONVERGED = 0, 1, 2
@@ -46,10 +47,10 @@ class _Search:
         distortion: Distortion,
         region: ValidRegion,
         focal: tuple[float, float],
-        u: Array,
-        v: Array,
-        a: Array,
-        b: Array,
+        u: Float64,
+        v: Float64,
+        a: Float64,
+        b: Float64,
     ) -> None:
         self.distortion, self.region, self.focal = distortion, region, focal
         self.u, self.v, self.a, self.b = u, v, a, b
@@ -64,7 +65,7 @@ class _Search:
                 return
             self._advance(slice(None) if len(going) == len(self.a) else going)
 
-    def retry(self, lost: NDArray[np.intp], a: Array, b: Array) -> None:
+    def retry(self, lost: NDArray[np.intp], a: Float64, b: Float64) -> None:
         """Start again from other points where the first start led nowhere."""
         second = _Search(self.distortion, self.region, self.focal, self.u[lost], self.v[lost], a, b)
         second.run(_MAX_STEPS)
@@ -88,7 +89,7 @@ class _Search:
             kept = getattr(self, name)
             kept[going] = np.where(better, value, kept[going])
 
-    def _newton(self, a: Array, b: Array, u: Array, v: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    def _newton(self, a: Float64, b: Float64, u: Float64, v: Float64) -> tuple[Float64, Float64, Float64, Bools]:
         """Full Newton step, residual in pixels, and whether the point lies in the region."""
         at = self.distortion.linearise(a, b)
         du, dv = at.u - u, at.v - v
@@ -98,31 +99,26 @@ class _Search:
         return step_a, step_b, np.sqrt(du * du + dv * dv), self.region.contains(a, b, determinant)
 
 
-def _solve_linear(at: Linear, determinant: Array, du: Array, dv: Array) -> tuple[Array, Array]:
+def _solve_linear(at: Linear, determinant: Float64, du: Float64, dv: Float64) -> tuple[Float64, Float64]:
     """The inverse Jacobian applied to (du, dv)."""
     inverse = 1.0 / determinant
     return (at.v_b * du - at.u_b * dv) * inverse, (at.u_a * dv - at.v_a * du) * inverse
 
 
 def solve(
-    distortion: Distortion, region: ValidRegion, table: StartTable, u: Array, v: Array, focal: tuple[float, float]
-) -> tuple[Array, Array, Status]:
+    distortion: Distortion, region: ValidRegion, table: StartTable, u: Float64, v: Float64, focal: tuple[float, float]
+) -> tuple[Float64, Float64, Status]:
     """Find the points of the valid region whose distorted images are (u, v), on as many threads as torch may use.
 
-    Args:
-        distortion: With coefficients that are floats.
-        region: Its valid region.
-        table: Its start table.
-        u: (N,) float64 normalised image coordinate.
-        v: (N,) likewise.
-        focal: Pixels per unit of u and of v; the residual is measured in pixels.
+    `u` and `v` are (N,) float64 normalised image coordinates, `focal` is pixels per unit of both, for the residual is
+    measured in pixels; the coefficients of `distortion` are floats.
 
     Returns:
-        `a`, `b` (N,) float64, 0 where there is no answer, and (N,) uint8: `ANSWERED`, `OUTSIDE` (no point of the
-        valid region has this image) or `UNCONVERGED`.
+        `a`, `b` (N,) float64, 0 where there is no answer, and (N,) uint8: `ANSWERED`, `OUTSIDE` (no point of the valid
+            region has this image) or `UNCONVERGED`.
     """
 
-    def quick(u: Array, v: Array) -> tuple[Array, ...]:
+    def quick(u: Float64, v: Float64) -> tuple[Float64, ...]:
         distorted = np.sqrt(u * u + v * v)
         reached = np.flatnonzero(region.reach.holds(distorted, u, v))
         if len(reached) < len(u):
@@ -131,7 +127,7 @@ def solve(
         search.run(_QUICK_STEPS)
         return search.a, search.b, search.error
 
-    def thorough(u: Array, v: Array, a: Array, b: Array) -> tuple[Array, ...]:
+    def thorough(u: Float64, v: Float64, a: Float64, b: Float64) -> tuple[Float64, ...]:
         search = _Search(distortion, region, focal, u, v, a, b)
         search.run(_MAX_STEPS)
         lost = np.flatnonzero(search.error > ACCEPT_PX)
@@ -147,10 +143,10 @@ def solve(
     return np.where(status == ANSWERED, a, 0.0), np.where(status == ANSWERED, b, 0.0), status
 
 
-def _in_chunks(function: Callable[..., tuple[Array, ...]], *arrays: Array) -> tuple[Array, ...]:
+def _in_chunks(function: Callable[..., tuple[Float64, ...]], *arrays: Float64) -> tuple[Float64, ...]:
     """Apply a function to pieces of its arguments, side by side, and put the pieces of its results together."""
 
-    def run(start: int) -> tuple[Array, ...]:
+    def run(start: int) -> tuple[Float64, ...]:
         with np.errstate(all="ignore"):  # steps that fly off are caught by their residual
             return function(*(array[start : start + _CHUNK] for array in arrays))
 
@@ -161,7 +157,7 @@ def _in_chunks(function: Callable[..., tuple[Array, ...]], *arrays: Array) -> tu
         return tuple(np.concatenate(parts) for parts in zip(*pool.map(run, starts), strict=True))
 
 
-def _scatter(count: int, reached: NDArray[np.intp], found: tuple[Array, ...]) -> tuple[Array, ...]:
+def _scatter(count: int, reached: NDArray[np.intp], found: tuple[Float64, ...]) -> tuple[Float64, ...]:
     """Points and errors of the reached pixels among all; the others lie nowhere, with an error that is NaN."""
     result = np.zeros(count), np.zeros(count), np.full(count, np.nan)
     for whole, part in zip(result, found, strict=False):
@@ -169,7 +165,7 @@ def _scatter(count: int, reached: NDArray[np.intp], found: tuple[Array, ...]) ->
     return result
 
 
-def _status(region: ValidRegion, a: Array, b: Array, error: Array) -> Status:
+def _status(region: ValidRegion, a: Float64, b: Float64, error: Float64) -> Status:
     status = np.full(error.shape, ANSWERED, np.uint8)
     failed = np.flatnonzero(~(error <= ACCEPT_PX))
     # Stuck at the edge of the region: the image lies behind the fold.
@@ -178,7 +174,9 @@ def _status(region: ValidRegion, a: Array, b: Array, error: Array) -> Status:
     return status
 
 
-def _first_guess(region: ValidRegion, table: StartTable, u: Array, v: Array, distorted: Array) -> tuple[Array, Array]:
+def _first_guess(
+    region: ValidRegion, table: StartTable, u: Float64, v: Float64, distorted: Float64
+) -> tuple[Float64, Float64]:
     """The answer of the radial part alone, pulled inside the region."""
     radius = table(distorted)
     if not (radius <= 0.999 * region.edge.least).all():
@@ -205,18 +203,10 @@ class _ImplicitSolution(torch.autograd.Function):
 def attach_gradients(
     solver: Distortion, distortion: Distortion, a: Tensor, b: Tensor, u: Tensor, v: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Make a solution a function of the coefficients in `distortion` and of the images (u, v).
+    """Make answered points `a`, `b` (N,) a function of the coefficients in `distortion` and of their images (u, v).
 
-    Args:
-        solver: The distortion with coefficients that are floats.
-        distortion: The same with coefficients that may require gradients.
-        a: (N,) answered points, from `solve`.
-        b: (N,) likewise.
-        u: (N,) their images, with their graph.
-        v: (N,) likewise.
-
-    Returns:
-        `a`, `b` (N,) with first-order gradients; second-order ones raise.
+    `solver` is the same distortion with coefficients that are floats. Gradients are of first order; second-order ones
+    raise.
     """
     at = solver.linearise(a.numpy(force=True), b.numpy(force=True))
     rows = np.stack((at.u_a, at.u_b, at.v_a, at.v_b), axis=-1).reshape(-1, 2, 2)

@@ -13,7 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchcover.cameras.lens import Array, Linear, Scalar, number, positive_roots
+from torchcover.cameras.lens import Linear, Scalar, number, positive_roots
+from torchcover.geometry.arrays import Float64
 
 # Below this squared angle sine and cosine are taken from their series: exact in float64, and smooth at the axis.
 _SERIES = 1e-8
@@ -46,7 +47,7 @@ class AngleChart:
         return torch.stack((a * ratio, b * ratio, forward), dim=-1)
 
 
-def _stretched(a: Array, b: Array, gain: Array, slope: Array) -> Linear:
+def _stretched(a: Float64, b: Float64, gain: Float64, slope: Float64) -> Linear:
     """A radial map (a, b) * gain whose gain has the gradient slope * (a, b)."""
     twist = slope * a * b
     return Linear(a * gain, b * gain, gain + slope * a * a, twist, twist, gain + slope * b * b)
@@ -66,7 +67,7 @@ class KannalaBrandt:
         gain = 1.0 + s * (k1 + s * (k2 + s * (k3 + s * k4)))
         return a * gain, b * gain
 
-    def linearise(self, a: Array, b: Array) -> Linear:
+    def linearise(self, a: Float64, b: Float64) -> Linear:
         """Value and Jacobian."""
         k1, k2, k3, k4 = (number(k) for k in self.coefficients)
         s = a * a + b * b
@@ -74,13 +75,13 @@ class KannalaBrandt:
         slope = 2.0 * (k1 + s * (2.0 * k2 + s * (3.0 * k3 + s * (4.0 * k4))))
         return _stretched(a, b, gain, slope)
 
-    def radial(self, radius: Array) -> Array:
+    def radial(self, radius: Float64) -> Float64:
         """Distorted angle."""
         k1, k2, k3, k4 = (number(k) for k in self.coefficients)
         s = radius * radius
         return radius * (1.0 + s * (k1 + s * (k2 + s * (k3 + s * k4))))
 
-    def critical_radii(self) -> Array:
+    def critical_radii(self) -> Float64:
         """Where the derivative of the distorted angle is 0."""
         k1, k2, k3, k4 = (number(k) for k in self.coefficients)
         return np.sqrt(positive_roots([1.0, 3.0 * k1, 5.0 * k2, 7.0 * k3, 9.0 * k4]))
@@ -100,19 +101,19 @@ class ThetaPolynomial:
         gain = k1 + angle * (k2 + angle * (k3 + angle * k4))
         return a * gain, b * gain
 
-    def linearise(self, a: Array, b: Array) -> Linear:
+    def linearise(self, a: Float64, b: Float64) -> Linear:
         """Value and Jacobian."""
         k1, k2, k3, k4 = (number(k) for k in self.coefficients)
         angle = np.sqrt(np.maximum(a * a + b * b, _KINK))
         gain = k1 + angle * (k2 + angle * (k3 + angle * k4))
         return _stretched(a, b, gain, (k2 + angle * (2.0 * k3 + angle * (3.0 * k4))) / angle)
 
-    def radial(self, radius: Array) -> Array:
+    def radial(self, radius: Float64) -> Float64:
         """Distorted angle."""
         k1, k2, k3, k4 = (number(k) for k in self.coefficients)
         return radius * (k1 + radius * (k2 + radius * (k3 + radius * k4)))
 
-    def critical_radii(self) -> Array:
+    def critical_radii(self) -> Float64:
         """Where the derivative of the distorted angle is 0."""
         k1, k2, k3, k4 = (number(k) for k in self.coefficients)
         return positive_roots([k1, 2.0 * k2, 3.0 * k3, 4.0 * k4])

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor
+
+from torchcover.geometry.arrays import Float64
 
 # A coefficient is a float where a lens is only evaluated, and a 0-d tensor where gradients flow into it.
 Scalar = float | Tensor
-Array = NDArray[np.float64]
 
 
 class Chart(Protocol):
@@ -35,15 +35,15 @@ class Chart(Protocol):
 class Linear(NamedTuple):
     """A distortion at a point: the value (`u`, `v`) and the four partial derivatives."""
 
-    u: Array
-    v: Array
-    u_a: Array
-    u_b: Array
-    v_a: Array
-    v_b: Array
+    u: Float64
+    v: Float64
+    u_a: Float64
+    u_b: Float64
+    v_a: Float64
+    v_b: Float64
 
     @property
-    def determinant(self) -> Array:
+    def determinant(self) -> Float64:
         """Area that the distortion makes of a unit of area; it changes sign at a fold."""
         return self.u_a * self.v_b - self.u_b * self.v_a
 
@@ -62,13 +62,13 @@ class Distortion(Protocol):
     def distort(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
         """The map, differentiable in the points and in the coefficients."""
 
-    def linearise(self, a: Array, b: Array) -> Linear:
+    def linearise(self, a: Float64, b: Float64) -> Linear:
         """The map with its exact Jacobian; for coefficients that are floats."""
 
-    def radial(self, radius: Array) -> Array:
+    def radial(self, radius: Float64) -> Float64:
         """Distorted radius of the radial part; for coefficients that are floats."""
 
-    def critical_radii(self) -> Array:
+    def critical_radii(self) -> Float64:
         """Every radius at which the radial part may stop being monotonic, in any order."""
 
 
@@ -102,7 +102,7 @@ def number(value: Scalar) -> float:
     return float(value.detach()) if isinstance(value, Tensor) else float(value)
 
 
-def positive_roots(coefficients: Sequence[float]) -> Array:
+def positive_roots(coefficients: Sequence[float]) -> Float64:
     """Positive real roots of a polynomial whose coefficients start with the constant term.
 
     Nearly real pairs are kept: a double root comes out of the eigenvalue solver as a pair with a tiny imaginary part,

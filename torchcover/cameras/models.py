@@ -56,7 +56,8 @@ _BUILD: dict[str, Callable[[Sequence[Scalar], bool], Lens]] = {
 _RANGES = {
     "mei": [(0, "xi", 0.0, float("inf"))],
     "eucm": [(0, "alpha", 0.0, 1.0), (1, "beta", 1e-12, float("inf"))],
-    "double_sphere": [(0, "xi", -1.0, 1.0), (1, "alpha", 0.0, 1.0)],
+    # At xi = -1 the second centre is where the optical axis meets the sphere, which has no pixel then.
+    "double_sphere": [(0, "xi", -1.0 + 1e-12, 1.0), (1, "alpha", 0.0, 1.0)],
 }
 
 

@@ -8,10 +8,11 @@ from torch import Tensor
 
 from torchcover.cameras import inverse
 from torchcover.cameras.inverse import ANSWERED, OUTSIDE
-from torchcover.cameras.lens import Array, Distortion
+from torchcover.cameras.lens import Distortion
 from torchcover.cameras.models import build_lens
 from torchcover.cameras.start import StartTable, make_start_table
 from torchcover.cameras.valid_region import HORIZON, ValidRegion, find_region
+from torchcover.geometry.arrays import Float64
 
 
 class Optics:
@@ -28,13 +29,9 @@ class Optics:
         self._start_tables: dict[int, StartTable] = {}
 
     def directions(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        """Directions that the lens maps to pixels.
+        """(N, 3) float64 unit directions that the lens maps to (N, 2) columns and rows; status of `inverse.solve`.
 
-        Args:
-            pixels: (N, 2) float64 columns and rows.
-
-        Returns:
-            (N, 3) float64 unit directions, NaN where there is none, and (N,) uint8 status of `inverse.solve`.
+        Directions are NaN where there is none.
         """
         fx, fy, cx, cy = self.intrinsics.to(pixels.device).unbind()
         u, v = (pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy
@@ -72,7 +69,7 @@ class Optics:
             self._found_region = find_region(solver, self._solver.chart.limit)
         return self._found_region
 
-    def _start_table(self, solver: Distortion, distorted: Array) -> StartTable:
+    def _start_table(self, solver: Distortion, distorted: Float64) -> StartTable:
         """A table up to the next power of two: what a pixel gets must not depend on what was asked before."""
         farthest = float(distorted[np.isfinite(distorted)].max(initial=0.0))
         exponent = max(frexp(farthest)[1], -60)
@@ -81,14 +78,7 @@ class Optics:
         return self._start_tables[exponent]
 
     def pixels(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels that points are seen at.
-
-        Args:
-            points: (N, 3) float64 in the camera frame.
-
-        Returns:
-            (N, 2) float64 pixels, NaN for points that the lens cannot show, and (N,) bool: those that it can.
-        """
+        """(N, 2) float64 pixels that (N, 3) points are seen at, NaN if at none; (N,) bool if at any."""
         finite = torch.isfinite(points).all(dim=1)
         safe = torch.where(finite[:, None], points, points.new_tensor([0.0, 0.0, 1.0]))
         a, b, shown = self._lens.chart.draw(*safe.unbind(dim=1))

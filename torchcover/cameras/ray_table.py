@@ -28,15 +28,10 @@ class RayTable:
         return {**self.__dict__, "_tables": {}}
 
     def points(self, device: str, dtype: torch.dtype, kind: DepthKind) -> tuple[Tensor, Tensor]:
-        """Points and mask; made once unless gradients flow through them.
+        """(H, W, 3) points, NaN where there is none, and (H, W) bool; made once unless gradients flow through them.
 
-        Args:
-            device: Where they are made and kept.
-            dtype: float32 or float64; the lens is solved in float64 either way.
-            kind: "distance" for depth 1 along the ray, "z" for depth 1 along the axis.
-
-        Returns:
-            (H, W, 3) points, NaN where there is none, and (H, W) bool.
+        They are at depth 1 along the ray ("distance") or along the axis ("z"). The lens is solved in float64 whatever
+        the type.
         """
         trace = self._trace_image if kind == "distance" else self._plane
         if self._optics.differentiable and torch.is_grad_enabled():

@@ -4,8 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchcover.cameras.lens import Array, Distortion
+from torchcover.cameras.lens import Distortion
 from torchcover.cameras.valid_region import HORIZON, ValidRegion
+from torchcover.geometry.arrays import Float64
 
 _ENTRIES = 4096
 # Seeds stop a tenth of a degree short of the horizon of the plane z = 1.
@@ -22,9 +23,9 @@ class StartTable:
     """
 
     step: float
-    radii: Array
+    radii: Float64
 
-    def __call__(self, distorted: Array) -> Array:
+    def __call__(self, distorted: Float64) -> Float64:
         """Undistorted radius, linearly interpolated and held at the end."""
         place = np.minimum(distorted / self.step, len(self.radii) - 1.001)
         low = place.astype(np.int64)
@@ -63,7 +64,7 @@ def _radius_for(distortion: Distortion, distorted: float) -> float:
     return radius
 
 
-def nearest_seeds(distortion: Distortion, region: ValidRegion, u: Array, v: Array) -> tuple[Array, Array]:
+def nearest_seeds(distortion: Distortion, region: ValidRegion, u: Float64, v: Float64) -> tuple[Float64, Float64]:
     """The second try: of points spread over the valid region, those whose images lie nearest.
 
     Strong tangential terms bend the region so far from round that Newton's method, coming from the radial part's

@@ -7,9 +7,9 @@ not positive, or where the chart ends. Behind a fold the same pixels are met a s
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from torchcover.cameras.lens import Array, Distortion
+from torchcover.cameras.lens import Distortion
+from torchcover.geometry.arrays import Bools, Float64
 
 # A ray at this radius of the plane z = 1 runs along the plane z = 0: infinity, for tables that have to be interpolated.
 HORIZON = 1e9
@@ -24,26 +24,25 @@ _PLANE_RADII = np.concatenate([np.tan(np.linspace(0.0, np.pi / 2, 512, endpoint=
 class Polar:
     """A positive function of the azimuth: one number, or a table over -pi..pi whose last entry repeats the first."""
 
-    values: Array
+    values: Float64
 
     @property
     def least(self) -> float:
         """Its minimum."""
         return float(self.values.min())
 
-    def __call__(self, a: Array, b: Array) -> Array:
+    def __call__(self, a: Float64, b: Float64) -> Float64:
         """Value in the direction of each (a, b), linearly interpolated."""
         if len(self.values) == 1:
             return np.broadcast_to(self.values, a.shape)
         place = (np.arctan2(b, a) + np.pi) * ((len(self.values) - 1) / (2.0 * np.pi))
         low = np.nan_to_num(place).astype(np.int64).clip(0, len(self.values) - 2)
         left = self.values[low]
-        interpolated: Array = left + (place - low) * (self.values[low + 1] - left)
-        return interpolated
+        return np.asarray(left + (place - low) * (self.values[low + 1] - left))
 
-    def holds(self, radius: Array, a: Array, b: Array) -> NDArray[np.bool_]:
+    def holds(self, radius: Float64, a: Float64, b: Float64) -> Bools:
         """Whether the radii of (a, b) are at most the function; it is looked up only where its minimum is passed."""
-        held: NDArray[np.bool_] = radius <= self.least
+        held: Bools = radius <= self.least
         unsure = np.flatnonzero(~held)
         if len(unsure) and len(self.values) > 1:
             held[unsure] = radius[unsure] <= self(a[unsure], b[unsure])
@@ -52,20 +51,17 @@ class Polar:
 
 @dataclass(frozen=True)
 class ValidRegion:
-    """The valid region of a distortion.
+    """The valid region of a distortion, which ends at the radius `edge` over the azimuth.
 
-    Args:
-        edge: Radius at which it ends, over the azimuth.
-        guard: Radius up to which a positive determinant means "inside"; it lies behind the edge, so that the
-            determinant itself decides, not the table.
-        reach: Largest distorted radius of any pixel worth solving, over the azimuth of the distorted point.
+    Up to `guard`, which lies behind the edge, a positive determinant means "inside", so that it decides, not the table.
+    `reach` is the largest distorted radius of any pixel worth solving, over the azimuth of the distorted point.
     """
 
     edge: Polar
     guard: Polar
     reach: Polar
 
-    def contains(self, a: Array, b: Array, determinant: Array) -> NDArray[np.bool_]:
+    def contains(self, a: Float64, b: Float64, determinant: Float64) -> Bools:
         """Whether drawn points lie in the region; `determinant` is that of the Jacobian at them."""
         return (determinant > 0.0) & self.guard.holds(np.sqrt(a * a + b * b), a, b)
 
@@ -89,7 +85,7 @@ def find_region(distortion: Distortion, limit: float) -> ValidRegion:
     return ValidRegion(Polar(edge), Polar(guard), Polar(_reach(distortion, edge * cosine, edge * sine)))
 
 
-def _radii(distortion: Distortion, limit: float) -> Array:
+def _radii(distortion: Distortion, limit: float) -> Float64:
     """Radii to look at: critical ones, the middles between them so that no fold is stepped over, and a plain grid."""
     critical = np.sort(distortion.critical_radii())
     middles = (critical[:-1] + critical[1:]) / 2.0
@@ -98,12 +94,12 @@ def _radii(distortion: Distortion, limit: float) -> Array:
     return radii[radii <= limit]
 
 
-def _determinant(distortion: Distortion, a: Array, b: Array) -> Array:
+def _determinant(distortion: Distortion, a: Float64, b: Float64) -> Float64:
     with np.errstate(all="ignore"):
         return np.nan_to_num(distortion.linearise(a, b).determinant, nan=-1.0)
 
 
-def _bisect(distortion: Distortion, cosine: Array, sine: Array, low: Array, high: Array) -> Array:
+def _bisect(distortion: Distortion, cosine: Float64, sine: Float64, low: Float64, high: Float64) -> Float64:
     """Radius of the sign change between `low` and `high`, to the last bits."""
     for _ in range(64):
         middle = (low + high) / 2.0
@@ -112,7 +108,7 @@ def _bisect(distortion: Distortion, cosine: Array, sine: Array, low: Array, high
     return low
 
 
-def _reach(distortion: Distortion, a: Array, b: Array) -> Array:
+def _reach(distortion: Distortion, a: Float64, b: Float64) -> Float64:
     """Distorted radius of the edge over the azimuth of the image, a little widened for what lies between entries."""
     if np.hypot(a, b).max() >= HORIZON:
         return np.array([np.inf])

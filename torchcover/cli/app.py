@@ -15,7 +15,6 @@ from torchcover.cli import commands
 from torchcover.cli.evaluate import compare, evaluate
 from torchcover.evaluation.cores import set_threads
 from torchcover.evaluation.progress import terminable
-from torchcover.files.shown import shown
 
 app = typer.Typer(
     name="torchcover",
@@ -110,17 +109,23 @@ def version(show: Annotated[bool, typer.Option("--version", help="Print the vers
 
 
 for command in (evaluate, compare, commands.study, commands.record, commands.rig, commands.calibrate, commands.show,
-                commands.targets, commands.check, commands.encounter, commands.search, commands.agree):  # fmt: skip
+                commands.targets, commands.check, commands.encounter, commands.search):  # fmt: skip
     app.command()(command)
 app.command("list")(commands.list_builtin)
 
 
 def _warn(message: Warning | str, *_: Any, **__: Any) -> None:  # noqa: ANN401  (where in our code: of no use to a user)
-    typer.echo(f"torchcover: warning: {shown(' '.join(str(message).split()))}", err=True)
+    typer.echo(f"torchcover: warning: {_one_line(str(message))}", err=True)
 
 
 def _fail(message: str, code: int = MISTAKE) -> None:
-    line = shown(" ".join(message.split()))
+    line = _one_line(message)
     if line:  # none where no command was given: the help has been printed
         typer.echo(f"torchcover: {line if len(line) <= MAX_LINE_CHARS else line[:MAX_LINE_CHARS] + ' ...'}", err=True)
     sys.exit(code)
+
+
+def _one_line(words: str) -> str:
+    from torchcover.files import shown  # with NumPy, which nobody needs who asks for help
+
+    return shown(" ".join(words.split()))

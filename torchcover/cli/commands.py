@@ -226,6 +226,7 @@ def check(
 
 @with_options([*of_criterion(), *of_evaluate("vehicle", "sensor_model", "seed")])
 def encounter(
+    context: typer.Context,
     rigs: Annotated[
         list[str] | None,
         typer.Argument(help="Rigs: built-in names (see `list`) or YAML files; with --frames those of the recording."),
@@ -256,12 +257,18 @@ def encounter(
     from torchcover.report import Terminal, check_film, print_whole, write_film
 
     criterion = Criterion(**{name: settings.pop(name) for name in Criterion.__annotations__})
-    if frames is not None and (rigs or scenario is not None):
-        raise ValueError("--frames: a recording has its own rigs and traffic; leave out rigs and --scenario")
+    what, unused = "a set", {"worlds", "within_s"}
+    if frames is not None:
+        what = "--frames, which has rigs and traffic of its own"
+        unused = {"rigs", "encounters", "scenario", "phases", "worlds", "film", "pixels", *settings}
+    elif scenario is not None:
+        what, unused = "--scenario, whose traffic nobody stages", {"encounters", "phases", "film"}
+    for each in context.command.params:
+        source = context.get_parameter_source(each.name or "")
+        if each.name in unused and source is not None and source.name == "COMMANDLINE":
+            raise ValueError(f"{each.opts[0]}: of no use with {what}; leave it out")
     if film is not None:
         check_film(film)
-        if frames is not None or scenario is not None:
-            raise ValueError("--film: of a set only; leave out --frames and --scenario")
     with claimed(out):
         if frames is not None:
             found = met_in_recording(frames, criterion)
@@ -286,9 +293,7 @@ def search(
     evaluations: Annotated[
         int | None, typer.Option(min=1, help="Candidates instead of a time: the same ones whatever the machine.")
     ] = None,
-    optimiser: Annotated[
-        str, typer.Option(help="auto, gp (Gaussian process), enumerate (choices) or random.")
-    ] = "auto",
+    optimiser: Annotated[str, typer.Option(help="gp (Gaussian process) or random.")] = "gp",
     estimate: Annotated[
         Literal["area", "known"],
         typer.Option(help="What a score is: `area`, the share of the visible surface, or `known`, of the known cells."),
@@ -348,31 +353,6 @@ def parsed_budget(text: str) -> float:
     if match is None:
         raise ValueError(f"--budget: a time is needed, as in 90s, 30min or 2h; got {text!r}")
     return float(match[1]) * UNITS_S[match[2]]
-
-
-@with_options(of_evaluate("sensor_model", "seed", "every_s", "workers"))
-def agree(
-    paper: Annotated[str, typer.Argument(help="Published placements: place3d2024.")],
-    scenario: Annotated[str, typer.Option(help="Scenario: a built-in name or a YAML file.")] = "urban",
-    metrics: Annotated[
-        str, typer.Option(help="Metrics of others, as in `k_cover,point_density`, or `all`; see `compare --metrics`.")
-    ] = "all",
-    steps: Annotated[int, typer.Option(min=1, help="Steps to simulate.")] = 64,
-    out: options.Out = Path("out/agree"),
-    **settings: Any,  # noqa: ANN401
-) -> None:
-    """Rank published placements by metrics, and by the detectors that were trained on them; say what that is worth."""
-    from torchcover.cli.printing import print_agreement
-    from torchcover.evaluation import agree, rank_count
-    from torchcover.files import claimed
-    from torchcover.published import metric_names
-
-    if rank_count() > 1:
-        raise ValueError("agree: ranks do not share it; run it without torchrun, with --workers")
-    with claimed(out):
-        study = agree(paper, scenario, metrics=metric_names(metrics), steps=steps, progress=True, **settings)
-        files = study.save(out)
-    print_agreement(study, files, out)
 
 
 def list_builtin(

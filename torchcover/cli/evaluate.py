@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from torchcover.cli import options
-from torchcover.cli.options import of_evaluate, parameters_of, with_options
+from torchcover.cli.options import of_corrections, of_evaluate, parameters_of, with_options
 from torchcover.evaluation.settings import OPTIONS, Settings
+from torchcover.recordings.corrections import Corrections
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -77,7 +78,8 @@ def _measure(
     """Measure rigs in the same frames, save what was measured, and print it."""
     from torchcover.evaluation import evaluate as evaluate_
 
-    recording = opened(frames, recording_format, sensors, settings.get("reference"), window_s)
+    corrections = Corrections(**{name: settings.pop(name) for name in Corrections.__annotations__})
+    recording = opened(frames, recording_format, sensors, settings.get("reference"), window_s, corrections)
     if recording is not None:
         settings.pop("reference", None)
     named = list(rigs or (() if recording is None else recording.rigs))
@@ -107,6 +109,7 @@ def _measure(
 
 MEASURING = [
     *(each for each in parameters_of(_measure) if each.default is not inspect.Parameter.empty),
+    *of_corrections(),
     *of_evaluate(*OPTIONS),
 ]
 USUAL = {each.name: each.default for each in MEASURING}
@@ -171,6 +174,7 @@ def opened(
     sensors: list[str] | None,
     reference: str | None,
     window_s: float | None,
+    corrections: Corrections,
 ) -> "FrameSource | None":
     """The recording of a command line, if it names one.
 
@@ -181,6 +185,8 @@ def opened(
         for option, given in (("format", recording_format), ("sensors", sensors), ("window-s", window_s)):
             if given is not None:
                 raise ValueError(f"--{option}: for a recording, which --frames gives")
+        if corrections.words:
+            raise ValueError(f"{corrections.words}: for a recording, which --frames gives")
         return None
     from rich.markup import escape
 
@@ -193,6 +199,7 @@ def opened(
         recording,
         rigs={names: names.split(",") for names in sensors} if sensors else None,
         reference=reference_of_recording(reference, window_s),
+        corrections=corrections,
     )
 
 

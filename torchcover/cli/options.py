@@ -11,6 +11,7 @@ import typer
 
 from torchcover.encounters.criterion import Criterion
 from torchcover.evaluation.settings import FILES, OPTIONS, Settings, wanted_files
+from torchcover.recordings.corrections import Corrections
 
 if TYPE_CHECKING:
     from torchcover.simulation import RegionsOfInterest
@@ -47,11 +48,21 @@ def of_evaluate(*names: str) -> list[inspect.Parameter]:
 
 def of_criterion() -> list[inspect.Parameter]:
     """What `Criterion` declares."""
+    return _of_document(Criterion)
+
+
+def of_corrections() -> list[inspect.Parameter]:
+    """What `Corrections` declares."""
+    return _of_document(Corrections, ending="_s")
+
+
+def _of_document(document: type, ending: str = "") -> list[inspect.Parameter]:
     found = []
-    for name, said in Criterion.__annotations__.items():
+    for name, said in document.__annotations__.items():
         kind, words = get_args(said)
-        annotation: Any = Annotated[kind, typer.Option(f"--{name.replace('_', '-')}", help=words)]
-        usual = getattr(Criterion, name)
+        option = f"--{name.removesuffix(ending).replace('_', '-')}"
+        annotation: Any = Annotated[kind, typer.Option(option, help=words)]
+        usual = getattr(document, name)
         found.append(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=usual, annotation=annotation))
     return found
 

@@ -6,14 +6,12 @@ from pathlib import Path
 
 from rich.markup import escape
 
-from torchcover.evaluation import AgreementStudy, MixedResult, Result, Study, relation, verdict
-from torchcover.evaluation.agreeing import NOTES
+from torchcover.evaluation import MixedResult, Result, Study
 from torchcover.evaluation.mixed import MIXTURE
-from torchcover.evaluation.result import sensor_model_words
 from torchcover.evaluation.result_page import left_out_table
 from torchcover.evaluation.study import WANTED
 from torchcover.published.comparison import page_tables
-from torchcover.report import PageTable, Terminal, Words, print_table, print_whole
+from torchcover.report import Terminal, print_table, print_whole
 
 
 def print_result(result: Result, files: Sequence[Path], out: Path, *, explain: bool) -> None:
@@ -63,29 +61,4 @@ def print_study(study: Study, files: Sequence[Path], out: Path) -> None:
     print_whole(study.tables)
     for wanted in WANTED:
         console.print(study.advice(wanted), markup=False, soft_wrap=True)
-    print_files(files, out, console)
-
-
-DETECTORS_ONLY = "* an interval over detectors only: of worlds there are none, or too few"
-
-
-def print_agreement(study: AgreementStudy, files: Sequence[Path], out: Path) -> None:
-    """How metrics rank the placements, for each thing that detectors say of them, and the notes."""
-    console = Terminal()
-    truths = list(dict.fromkeys(truth for truth, _ in study.found))
-    readings = list(dict.fromkeys(reading for _, reading in study.found))
-    tables = []
-    for reading in readings:
-        each = [study.found[truth, reading].ranked for truth in truths]
-        rows = [
-            [Words(of[0].metric + " *" * (not of[0].over_worlds)), *(Words(relation(row.spearman)) for row in of)]
-            for of in zip(*each, strict=True)
-        ]
-        title = f"Spearman correlation with what detectors reached, rolls in {reading}; 95 % intervals"
-        tables.append(PageTable(title, ("metric", *truths), rows, notes=[DETECTORS_ONLY]))
-    print_whole(tables)
-    for truth in truths:
-        console.print(verdict(truth, {one: study.found[truth, one] for one in readings}), markup=False, soft_wrap=True)
-    for note in (*sensor_model_words(study.scores.sensor_models), *NOTES):
-        console.print(note, markup=False, soft_wrap=True)
     print_files(files, out, console)

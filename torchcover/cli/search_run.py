@@ -75,7 +75,7 @@ def _chosen(path: Path, out: Path, *, resume: bool, **settings: Any) -> SensorCh
     asked = {
         "--budget": settings["budget_s"] is not None,
         "--evaluations": settings["evaluations"] is not None,
-        "--optimiser": settings["optimiser"] != "auto",
+        "--optimiser": settings["optimiser"] != "gp",
         "--resume": resume,
     }
     if useless := [option for option, given in asked.items() if given]:

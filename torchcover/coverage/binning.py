@@ -14,14 +14,10 @@ MAX_BORDERS_COMPARED = 32
 
 
 class CellMeans(NamedTuple):
-    """Means over the points of one step.
+    """Means over the points of one step in those K cells that have points, ascending.
 
-    Args:
-        cell: (K,) int64 numbers of the cells that have points, ascending.
-        of_point: (N,) int64 which of these each point lies in.
-        points: (K,) int64 points in each of them.
-        weight: (K,) float64 sum of their weights; the number of points where there are none.
-        mean: (V, K) float64 mean of each of the V values.
+    `of_point` (N,) is which of these each point lies in, `weight` (K,) the sum of their weights, or their number where
+    there are none, `mean` (V, K) that of each of the V values.
     """
 
     cell: Tensor
@@ -32,12 +28,7 @@ class CellMeans(NamedTuple):
 
 
 def mean_per_cell(cell: Tensor, values: Tensor, weights: Tensor | None = None) -> CellMeans:
-    """Mean of each value over the points of each cell, summed in float64.
-
-    Args:
-        cell: (N,) int64 cell numbers.
-        values: (V, N) one row a value, one column a point.
-        weights: (N,) positive weight of each point; all the same if not given.
+    """Mean of each of (V, N) values over the points of each cell, summed in float64; all weigh alike if not told.
 
     Example:
         >>> means = mean_per_cell(torch.tensor([4, 4, 7]), torch.tensor([[1.0, 3.0, 5.0]]))
@@ -63,16 +54,9 @@ def _sum_per_cell(cell: Tensor, values: Tensor, cells: int) -> Tensor:
 def edges_below(values: Tensor, bounds: Tensor, low: float, high: float) -> Tensor:
     """How many edges at equal distances are not above each value: what `torch.bucketize` gives, sooner.
 
-    Divided by their distance first, then compared with, so that no rounding moves a point over a border.
-
-    Args:
-        values: (N,) float64.
-        bounds: (B + 3,) float64 edges between two NaN, which are never less, nor more.
-        low: The first edge; as a number, for which a GPU need not be waited for.
-        high: The last edge.
-
-    Returns:
-        (N,) int32.
+    Divided by their distance first, then compared with, so that no rounding moves a point over a border. `bounds` are
+    (B + 3,) float64 edges between two NaN, which are never less, nor more. `low` and `high`, the first and the last
+    edge, are numbers, for which a GPU need not be waited for. The counts are (N,) int32.
     """
     cells = len(bounds) - 3
     fine = high - low <= MIN_CELL_SHARE * cells * max(abs(low), abs(high))  # the quotient would be off by more than one

@@ -90,13 +90,7 @@ class BlockSums:
         return totals.view(-1, *self.shape[1:])
 
     def moved(self, to: Callable[[Tensor], Tensor], cells: int, shape: tuple[int, ...] | None = None) -> Self:
-        """What lies in a cell added to that of another one.
-
-        Args:
-            to: (N,) cells -> the others.
-            cells: How many of these there are.
-            shape: Theirs, if it is not that of the cells.
-        """
+        """What lies in a cell added to that of another one, by (N,) cells -> the others, `cells` of which there are."""
         at = self.at // self._cells * cells + to(self.at % self._cells)
         at, base, *listed = added_up(torch.stack([at, self.base, *self.listed], dim=1).double()).T
         return type(self)(

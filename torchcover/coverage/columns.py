@@ -29,15 +29,7 @@ class CellSums(NamedTuple):
 
 
 class Columns:
-    """Steps and points, then the sums of aggregations, at last those that keep the largest.
-
-    Args:
-        aggregations: Whose sums.
-
-    Attributes:
-        count: How many columns there are.
-        maxima: How many of the last keep the largest.
-    """
+    """Steps and points, then the sums of aggregations: `count` columns, of which the last `maxima` keep the largest."""
 
     def __init__(self, aggregations: Sequence[Aggregation]) -> None:
         self.aggregations = tuple(aggregations)
@@ -50,10 +42,7 @@ class Columns:
     def of_step(self, cell: Tensor, values: Tensor, weight: Tensor | None) -> Tensor:
         """(1 + count, K) float64: the cells that the points of a step lie in, ascending, and what it adds to them.
 
-        Args:
-            cell: (N,) cell of each point.
-            values: (V, N) as in `BinnedStep`.
-            weight: (N,) likewise.
+        The cell of each point, (N,), its values (V, N) and weights (N,) are as in `BinnedStep`.
         """
         means = mean_per_cell(cell, values, weight)
         step, columns = BinnedStep(means.of_point, values, weight, means), dict[tuple[str, str], Tensor]()

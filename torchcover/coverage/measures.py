@@ -20,11 +20,7 @@ Measure = Literal["area", "known", "places"]
 
 
 def estimate_known(coverage: "Coverage", region: Region, height: str) -> Estimate:
-    """The unweighted means over the known cells of a region, and what they become without each block.
-
-    Returns:
-        NaN where no cell is known.
-    """
+    """Unweighted means over the known cells of a region, NaN without any, and what they become without each block."""
     cells, band, blocks = coverage.cells_of(region), coverage.band_of(height), coverage.blocks
     known = coverage.known.within(cells, band)
     probed = coverage.known.probed_steps[known]
@@ -109,12 +105,7 @@ def errors_of_cells(quantities: Sequence[Quantity], known: KnownCells, blocks: B
 
 
 def known_mean(probed: Tensor, sums: Tensor) -> Tensor:
-    """(Q,) unweighted means over the known cells; NaN if none is known.
-
-    Args:
-        probed: (K,) steps that had a reference point in each cell.
-        sums: (Q, K) sums over these steps.
-    """
+    """(Q,) unweighted means over K known cells of sums (Q, K) over the (K,) steps that probed them; NaN without any."""
     known = probed > 0
     return (sums[:, known] / probed[known]).mean(dim=1)
 

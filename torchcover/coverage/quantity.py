@@ -7,11 +7,7 @@ MEASURED_WITHIN_M = 0.4
 
 
 def radius(which: str = "", title: str = "mean") -> Quantity:
-    """A blind spot radius in metres.
-
-    Args:
-        which: Part of the key that tells it from others; none for the mean of means.
-        title: Which one, in words.
+    """A blind spot radius in metres: which one, as a part of its key, and in words.
 
     Example:
         >>> radius("maximum", "largest")

@@ -86,12 +86,10 @@ class SensorFailures(Aggregation):
             sums["m2"].add_(weight)
 
     def values(self, of_sensors: Sequence[Tensor], max_radius: float) -> Tensor:
-        """(V, N) float64 what there is to say of each point.
+        """(V, N) float64 what there is to say of each point, with radii that saturate.
 
-        Args:
-            of_sensors: (S, N) distances to the nearest point of each sensor, infinite where none is near: for the
-                radius, then for each threshold.
-            max_radius: Saturation of the radius in metres.
+        `of_sensors` (S, N) are distances to the nearest point of each sensor, infinite where none is near: for the
+        radius, then for each threshold.
         """
         rows = []
         for distance, threshold in zip(of_sensors[1:], self.thresholds, strict=True):

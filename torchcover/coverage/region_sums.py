@@ -41,14 +41,9 @@ class PlaceSums(NamedTuple):
 
 
 def numbers_of_places(sums: CellSums, aggregations: Sequence[Aggregation], max_radius: float) -> PlaceNumbers:
-    """What aggregations say of P places, as of maps, but for one cell a region and band.
+    """What aggregations say of P places, from (..., B, P) sums in blocks: as of maps, of one cell a region and band.
 
     Of a largest value no error is known, for it is the same whichever block is left out but one.
-
-    Args:
-        sums: (..., B, P) in blocks of steps.
-        aggregations: Whose numbers.
-        max_radius: Saturation of the radius in metres.
     """
     every = list(range(len(sums.probed_steps)))
     choices = [every, *(every[:block] + every[block + 1 :] for block in every if len(every) > 1)]

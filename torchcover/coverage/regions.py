@@ -187,9 +187,7 @@ class Places:
     def of_points(self, points: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
         """For each place that a point lies in, (K,) the place and (K,) which point; a point may lie in several.
 
-        Args:
-            points: (N, 3) points in metres, or (N, 2).
-            cell: (N,) int64 cell of each point, which says in which band it is.
+        Its band is that of its cell, (N,) int64.
         """
         band = cell // math.prod(self.grid.shape[1:])
         x, y = points[:, 0].double(), points[:, 1].double()

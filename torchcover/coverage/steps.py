@@ -21,6 +21,9 @@ BUILT_IN = frozenset({MeanOfMeans.name, VisibleArea.name, SensorFailures.name})
 # Steps are numbered in int64, and blocks double until one holds the last.
 MAX_NUMBER = 10**15
 
+# What rounding may move a point by, as a share of a cell.
+MOST_OF_A_CELL = 0.05
+
 # One step, or a list with an entry for each.
 Clouds: TypeAlias = Tensor | Sequence[Tensor]
 # Of a rig whose sensors are told apart: by their names.
@@ -147,14 +150,27 @@ def checked_steps(
     for at, (clouds, off, *parts) in enumerate(each):
         for name, cloud in clouds.items():
             check_cloud(cloud, f"sensor[{at}]" + f"[{name!r}]" * bool(name))
+            _check_resolution(cloud, grid, f"sensor[{at}]" + f"[{name!r}]" * bool(name))
         step = CheckedStep(clouds, None if off is None else _by_sensor(off, rigs[at], clouds, f"error[{at}]"), *parts)
         steps.append(step)
         check_cloud(step.reference, f"reference[{at}]")
+        _check_resolution(step.reference, grid, f"reference[{at}]")
         _check_weights(step.weights, len(step.reference), f"weights[{at}]")
         _check_height(step.height, step.reference, grid, f"height[{at}]")
         if not 0 <= step.number <= MAX_NUMBER:
             raise ValueError(f"place_in_time[{at}]: a number from 0 to {MAX_NUMBER:,} is needed; got {step.number}")
     return steps
+
+
+def _check_resolution(cloud: Tensor, grid: BevGrid, name: str) -> None:
+    """Of the usual type: who chooses a shorter one knows that it is short."""
+    farthest_m = max(map(abs, (*grid.x, *grid.y)))
+    apart_m = farthest_m * torch.finfo(torch.float32).eps
+    if cloud.dtype == torch.float32 and apart_m > MOST_OF_A_CELL * grid.cell:
+        raise ValueError(
+            f"{name}: float32 coordinates are {apart_m:.2g} m apart at {farthest_m:,.0f} m, where the grid ends, and "
+            f"its cells are {grid.cell:g} m; subtract a place near the vehicle from clouds and grid, or give float64"
+        )
 
 
 def _by_sensor(

@@ -13,6 +13,7 @@ from torchcover.frames import scale as scale
 from torchcover.recordings import FORMATS as FORMATS
 from torchcover.recordings import RECORDERS as RECORDERS
 from torchcover.recordings import AccumulatedReference as AccumulatedReference
+from torchcover.recordings import Corrections as Corrections
 from torchcover.recordings import RecordedFrames as RecordedFrames
 from torchcover.recordings import RecordedReference as RecordedReference
 from torchcover.recordings import Recording as Recording

@@ -2,21 +2,17 @@
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from torch import Tensor
 
-from torchcover.geometry import rotation_from_quaternion
+from torchcover.geometry.arrays import Float64
 from torchcover.geometry.rigid import Matrix, transform
 
 
 def upright_rows(centre_m: ArrayLike, size_m: ArrayLike, heading: ArrayLike, vehicle_T_source: Matrix | None) -> Tensor:
-    """(K, 7) rows of boxes in the vehicle frame; what leans is put upright, its heading kept.
+    """(K, 7) rows of boxes in the vehicle frame; what leans is put upright, its heading, (K, 3) vectors, kept.
 
-    Args:
-        centre_m: (K, 3) centres in the source frame.
-        size_m: (K, 3) length, width, height.
-        heading: (K, 3) vectors along the length, in the source frame.
-        vehicle_T_source: (4, 4) where that frame is; None: it is the vehicle frame.
+    `vehicle_T_source` is where the frame of the centres and headings is; None: it is the vehicle frame.
 
     Raises:
         ValueError: Numbers that are not finite, or shapes that do not fit.
@@ -31,13 +27,7 @@ def upright_rows(centre_m: ArrayLike, size_m: ArrayLike, heading: ArrayLike, veh
     return torch.from_numpy(np.column_stack([centre, size, yaw])).float()
 
 
-def headings(quaternions_wxyz: ArrayLike) -> NDArray[np.float64]:
-    """(K, 3) the first axes of K rotations given as quaternions."""
-    given = np.asarray(quaternions_wxyz, dtype=np.float64).reshape(-1, 4)
-    return rotation_from_quaternion(given)[..., 0]
-
-
-def _rows(name: str, given: ArrayLike) -> NDArray[np.float64]:
+def _rows(name: str, given: ArrayLike) -> Float64:
     array = np.asarray(given, dtype=np.float64)
     array = array.reshape(0, 3) if array.size == 0 else array
     if array.ndim != 2 or array.shape[1] != 3:

@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from torch import Tensor
 
-from torchcover.detection.box_layouts import headings, upright_rows
+from torchcover.detection.box_layouts import upright_rows
+from torchcover.geometry.arrays import Float64
 from torchcover.neighbors import check_tensor
 
 
@@ -118,26 +119,7 @@ class Boxes:
         return cls(rows[:, :3], rows[:, 3:6], rows[:, 6], **others)  # type: ignore[arg-type]
 
     @classmethod
-    def from_mmdet3d(cls, rows: Tensor, **others: object) -> "Boxes":
-        """From MMDetection3D's `LiDARInstance3DBoxes.tensor`: z is that of the bottom; columns 7 and 8 are velocities.
-
-        Example:
-            >>> Boxes.from_mmdet3d(torch.tensor([[5.0, 0.0, -1.6, 0.8, 0.6, 1.8, 0.0]])).centre_m[0, 2].item()
-            -0.7...
-        """
-        check_tensor(rows, "rows")
-        if rows.ndim != 2 or rows.shape[1] not in (7, 9):
-            raise ValueError(f"rows: shape (K, 7) or (K, 9) is needed; got {tuple(rows.shape)}")
-        centred = rows[:, :7].clone()
-        centred[:, 2] += rows[:, 5] / 2
-        if rows.shape[1] == 9:
-            others = {"velocity_mps": rows[:, 7:], **others}
-        return cls.from_rows(centred, **others)
-
-    @classmethod
-    def from_kitti_label(
-        cls, numbers: ArrayLike, vehicle_T_camera: NDArray[np.float64] | None = None, **others: object
-    ) -> "Boxes":
+    def from_kitti_label(cls, numbers: ArrayLike, vehicle_T_camera: Float64 | None = None, **others: object) -> "Boxes":
         """From the numbers of KITTI's `label_2`: places in the rectified camera frame, at the bottom of the box.
 
         Args:
@@ -156,30 +138,6 @@ class Boxes:
         ahead = np.column_stack([np.cos(turn), np.zeros_like(turn), -np.sin(turn)])
         rows = upright_rows(centre, np.column_stack([length, width, height]), ahead, vehicle_T_camera)
         return cls.from_rows(rows, **others)
-
-    @classmethod
-    def from_nuscenes(
-        cls,
-        translation: ArrayLike,
-        size: ArrayLike,
-        rotation: ArrayLike,
-        vehicle_T_global: NDArray[np.float64] | None = None,
-        **others: object,
-    ) -> "Boxes":
-        """From nuScenes' `sample_annotation`.
-
-        Args:
-            translation: (K, 3) centres in the global frame.
-            size: (K, 3) width, length, height.
-            rotation: (K, 4) quaternions w, x, y, z.
-            vehicle_T_global: (4, 4) the inverse of the vehicle's pose.
-            others: As `from_rows`.
-
-        Raises:
-            ValueError: Shapes that do not fit, or as the constructor.
-        """
-        lengthwise = np.asarray(size, dtype=np.float64).reshape(-1, 3)[:, [1, 0, 2]]
-        return cls.from_rows(upright_rows(translation, lengthwise, headings(rotation), vehicle_T_global), **others)
 
     @property
     def rows(self) -> Tensor:

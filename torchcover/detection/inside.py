@@ -123,12 +123,9 @@ def _numbered(counts: Tensor) -> Tensor:
 
 
 def with_hits(boxes: Boxes, clouds: Mapping[str, Tensor], counts_as: Mapping[str, Tensor] | None = None) -> Boxes:
-    """The same boxes with `hits`: how many points of each rig lie in each.
+    """The same boxes with `hits`: how many points of each rig, (N, 3) in the vehicle frame, lie in each.
 
-    Args:
-        boxes: K boxes.
-        clouds: Name of each rig -> (N, 3) its points in the vehicle frame.
-        counts_as: Name of a rig -> (N,) how many points each of its points is counted as; one if not given.
+    `counts_as` says how many points each point of a rig, (N,), is counted as; one if not given.
     """
     of_all, hits = _BoxMap(boxes), dict[str, Tensor]()
     for rig, cloud in clouds.items():

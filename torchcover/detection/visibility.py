@@ -118,13 +118,7 @@ def box_visibility(
 
 
 def mean_by_box(values: Tensor, box: Tensor, boxes: int, weights: Tensor | None) -> Tensor:
-    """(K,) weighted mean over the points in each of K boxes; NaN for a box without any.
-
-    Args:
-        values: (P,) float64, one for each point in a box.
-        box: (P,) int64 number of the box.
-        boxes: K.
-        weights: (P,) positive weights; None if all weigh the same.
+    """(K,) weighted mean over the points in each of K boxes, all alike without weights; NaN for a box without any.
 
     Example:
         >>> mean_by_box(torch.tensor([1.0, 0.0]).double(), torch.tensor([1, 1]), 2, torch.tensor([1.0, 3.0]))

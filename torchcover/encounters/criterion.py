@@ -13,7 +13,7 @@ class Criterion:
         ValueError: A number out of its bounds.
     """
 
-    points: Annotated[int, "Points that are enough, of all LiDARs with the same rate together; of a radar one is."] = 5
+    points: Annotated[int, "Points that are enough, of all LiDARs together; of a radar one is."] = 5
     pixels: Annotated[int, "Pixels of the full image that are enough, of a camera alone."] = 200
     looks: Annotated[int, "In so many looks in a row."] = 3
     deceleration_mps2: Annotated[float, "Of the brakes, in m/s2."] = 9.0
@@ -30,14 +30,25 @@ class Criterion:
         if not 0 <= self.latency_s < math.inf:
             raise ValueError(f"latency_s: seconds of 0 or more are needed; got {self.latency_s}")
 
-    def needed_s(self, closing_mps: float) -> float:
-        """The time to collision at which braking still prevents it: v / (2 a) + latency.
+    def needed_s(self, speed_mps: float, towards_mps: float = 0.0) -> float:
+        """The time to collision at which braking still prevents it; only the ego brakes, the other goes on.
+
+        After the latency, an ego of speed v that brakes with a stands v / a later, v^2 / (2 a) farther on. Who comes
+        towards it with u >= 0 goes u v / a in that time, of a gap that two who do not brake close with v + u:
+        latency + (v / a) (v / 2 + u) / (v + u); of who crosses, latency + v / (2 a). From who drives ahead, u < 0, it
+        keeps clear once it is no faster: latency + (v + u) / (2 a).
+
+        Args:
+            speed_mps: Of the ego, along its way.
+            towards_mps: Of the other, along the same way towards the ego; negative if it drives ahead.
 
         Example:
-            >>> round(Criterion().needed_s(50 / 3.6), 2)
-            1.27
+            >>> [round(Criterion().needed_s(50 / 3.6, towards_kmh / 3.6), 2) for towards_kmh in (0, 50, -20)]
+            [1.27, 1.66, 0.96]
         """
-        return closing_mps / (2 * self.deceleration_mps2) + self.latency_s
+        closing_mps, towards = speed_mps + towards_mps, towards_mps > 0
+        mps = speed_mps * (speed_mps / 2 + towards_mps) / closing_mps if towards else max(closing_mps, 0.0) / 2
+        return self.latency_s + mps / self.deceleration_mps2
 
     @property
     def words(self) -> str:

@@ -164,17 +164,16 @@ class Encounter(Document):
         return f"encounter {self.name!r} at {self.speed_kmh:g} km/h"
 
     @property
-    def closing_mps(self) -> float:
-        """What the brakes must take away: the ego's speed, less that of the other in the same direction.
+    def towards_mps(self) -> float:
+        """How fast the other comes towards the ego, along the ego's way; negative if it drives ahead.
 
         Example:
-            >>> ways = {"ego": {"speed_kmh": 90}, "other": {"body": "hatchback", "speed_kmh": 54, "yaw_deg": 0}}
-            >>> round(Encounter.model_validate({"name": "ahead", **ways}).closing_mps, 9)
-            10.0
+            >>> ways = {"ego": {"speed_kmh": 90}, "other": {"body": "hatchback", "speed_kmh": 54, "yaw_deg": 180}}
+            >>> round(Encounter.model_validate({"name": "oncoming", **ways}).towards_mps, 9)
+            15.0
         """
         along_mps = self.other.speed_mps * math.cos(math.radians(self.other.yaw_deg))
-        speed_mps = self.ego.speed_mps
-        return max(abs(speed_mps) - max(math.copysign(along_mps, along_mps * speed_mps), 0.0), 0.0)
+        return -math.copysign(1.0, self.ego.speed_mps) * along_mps
 
     @property
     def before_s(self) -> float:
@@ -218,7 +217,7 @@ class EncounterSet(BuiltIn):
         sound = isinstance(draws, int) and isinstance(seed, int) and 1 <= draws <= MOST and seed >= 0
         if not isinstance(families, list | tuple) or not sound:
             return content  # which is told field by field
-        found: list[Any] = []
+        found, first = list[Any](), dict[str, int]()
         for number, family in enumerate(families):
             if not isinstance(family, dict):
                 found.append(family)
@@ -226,9 +225,19 @@ class EncounterSet(BuiltIn):
             try:
                 for one in expanded(family, draws, np.random.default_rng([seed, number])):
                     found.append(Encounter.model_validate(one, context=info.context))
+                    name = found[-1].name
+                    if first.setdefault(name, number) < number:
+                        raise ValueError(f"encounters.{number}: encounters.{first[name]} is called {name!r}, too")
             except ValidationError as error:
                 raise ValueError(f"encounters.{number}: {explain(error)}") from error
         return {**content, "encounters": tuple(found)}
+
+    @model_validator(mode="after")
+    def _check_directions(self) -> Self:
+        forward = {one.name for one in self.encounters if one.speed_kmh > 0}
+        if both := next((one.name for one in self.encounters if one.speed_kmh < 0 and one.name in forward), None):
+            raise ValueError(f"encounters: {both!r} has speeds forward and in reverse; make an encounter of each")
+        return self
 
 
 def expanded(family: dict[str, Any], draws: int, generator: np.random.Generator) -> Iterator[dict[str, Any]]:
@@ -258,8 +267,8 @@ def expanded(family: dict[str, Any], draws: int, generator: np.random.Generator)
         for draw in range(draws if drawn else 1):
             values = of_swept | {place: each[draw] for place, each in drawn.items()}
             one = _with(family, values, ())
-            if words:
-                one["name"] = f"{family.get('name')}: {', '.join(words)}"
+            if words and isinstance(family.get("name"), str):
+                one["name"] = f"{family['name']}: {', '.join(words)}"
             if SPEED in drawn:
                 one["speed_is_swept"] = False
             yield one
@@ -277,7 +286,7 @@ def _leaves(value: Any, place: Place) -> Iterator[tuple[Place, Any]]:  # noqa: A
         if any(isinstance(each, dict) for each in value):
             for number, inner in enumerate(value):
                 yield from _leaves(inner, (*place, number))
-        elif place != ("obstacles",):
+        elif place not in (("obstacles",), ("name",)):
             yield place, value
 
 

@@ -29,8 +29,9 @@ class EncounterRow(NamedTuple):
     """A rig in one encounter at one speed, or in all that were drawn or met; 0 s if it was too late.
 
     `ttc_s` is the mean time to collision at detection over phases and draws, of which `ttc_s_low` is the least and
-    `ttc_s_high` the most. `needed_s` is the most of any draw, `in_time` the share of phases and draws, `never` that
-    without detection, `from_the_beginning` that in which it was seen as soon as it began, and may have been before.
+    `ttc_s_high` the most. `needed_s` is the most of any draw, `in_time` the share of phases and draws, in traffic of
+    the `to_brake` for whom braking was needed; `never` the share without detection, `from_the_beginning` that in which
+    it was seen as soon as it began, and may have been before.
     `first` is the sensor that alone is first in the mean; of the sensors that may fail, one at a time, `worst` is that
     without which the least time is left, `without_worst_s`: the least of all, of traffic the mean. Of traffic,
     `per_hour` says how many were met. Intervals of 95 % are over draws or worlds, NaN of fewer than 8: `interval_low`
@@ -48,6 +49,7 @@ class EncounterRow(NamedTuple):
     ttc_s_high: float
     interval_low: float
     interval_high: float
+    to_brake: int
     in_time: float
     never: float
     from_the_beginning: float
@@ -91,7 +93,7 @@ class Sightings:
         groups: dict[tuple[int, float, int], list[Sighting]] = {}
         rigs = {name: k for k, name in enumerate(self.sensors)}
         for one in self.sightings:
-            speed_kmh = one.encounter.speed_kmh if one.encounter.speed_is_swept else -math.inf
+            speed_kmh = abs(one.encounter.speed_kmh) if one.encounter.speed_is_swept else -math.inf
             groups.setdefault((order[one.encounter.name], speed_kmh, rigs[one.rig]), []).append(one)
         if self.hours:
             together = [[one for one in self.sightings if one.rig == rig] for rig in rigs]
@@ -106,6 +108,7 @@ class Sightings:
         least = np.mean if self.hours else np.min
         without_s = least([one.without_ttc_s for one in draws] or none, axis=(0, 2))
         numbers = self._numbers(draws)
+        in_time = np.array([one.in_time for one in draws if not np.isnan(one.in_time).any()])
         swept = bool(draws) and draws[0].encounter.speed_is_swept
         return EncounterRow(
             rig=rig,
@@ -113,13 +116,14 @@ class Sightings:
             speed_kmh=draws[0].encounter.speed_kmh if swept else math.nan,
             draws=len(draws),
             phases=self.phases,
-            needed_s=max((self.criterion.needed_s(one.encounter.closing_mps) for one in draws), default=math.nan),
+            needed_s=max((one.needed_s for one in draws), default=math.nan),
             ttc_s=numbers["ttc_s"].value,
             ttc_s_low=float(ttc_s.min()),
             ttc_s_high=float(ttc_s.max()),
             interval_low=numbers["ttc_s"].low,
             interval_high=numbers["ttc_s"].high,
-            in_time=float(np.mean([one.in_time for one in draws])) if draws else math.nan,
+            to_brake=len(in_time),
+            in_time=float(in_time.mean()) if len(in_time) else math.nan,
             never=float((ttc_s == 0).mean()),
             from_the_beginning=numbers["from_the_beginning"].value,
             from_the_beginning_low=numbers["from_the_beginning"].low,
@@ -144,15 +148,14 @@ class Sightings:
         return Estimate.of_ratios(NUMBERS, base, sums, torch.ones(len(blocks), dtype=torch.int64)).numbers()
 
     def up_to_kmh(self) -> dict[tuple[str, str], float]:
-        """Encounter and rig -> the speed up to which it is in time in every phase and draw, of those that were swept.
+        """Encounter and rig -> the speed up to which it is in time in every phase and draw, where speeds were swept.
 
-        0 if it is too late at the least; NaN where the speed was drawn.
+        NaN if it is too late at the least.
         """
-        found: dict[tuple[str, str], float] = {}
-        late = set[tuple[str, str]]()
-        for row in sorted(self.rows, key=lambda row: abs(row.speed_kmh)):
+        swept, late = [row for row in self.rows if row.speed_kmh == row.speed_kmh], set[tuple[str, str]]()
+        found = dict.fromkeys(((row.encounter, row.rig) for row in swept), math.nan)
+        for row in swept:
             key = row.encounter, row.rig
-            found.setdefault(key, math.nan if math.isnan(row.speed_kmh) else 0.0)
             if row.in_time < 1:
                 late.add(key)
             elif key not in late:
@@ -171,17 +174,17 @@ class Sightings:
         rows = [row._asdict() for row in self.rows]
         met = [{"rig": one.rig, "world": one.world, "who": one.encounter.name, "name": one.encounter.track.name,
                 "step": one.encounter.step, "least_s": float(one.encounter.ttc_s.min()),
-                "ttc_s": float(one.ttc_s[0]), "in_time": bool(one.in_time[0])}
+                "ttc_s": float(one.ttc_s[0]), "in_time": None if np.isnan(one.in_time[0]) else bool(one.in_time[0])}
                for one in self.sightings if isinstance(one.encounter, Approach)]  # fmt: skip
-        listed = {"rows": rows, "speeds": [] if self.hours else up_to, "met": met}
+        listed = {"rows": rows, "speeds": up_to, "met": met}
         return self.settings() | {name: list(map(json_record, each)) for name, each in listed.items()}
 
     def tables(self) -> list[PageTable]:
         """Up to which speed, when, and by which sensor."""
         rows, rigs = self.rows, list(self.sensors)
         tables = [self._met(rows, rigs) if self.hours else self._times(rows, rigs)]
-        if any(one.encounter.speed_is_swept for one in self.sightings):
-            tables.insert(0, _speeds(self.up_to_kmh(), rigs))
+        if up_to_kmh := self.up_to_kmh():
+            tables.insert(0, _speeds(up_to_kmh, rigs))
         several = [row for row in rows if len(self.sensors[row.rig]) > 1]
         return [*tables, _sensors(several)] if several else tables
 
@@ -211,7 +214,7 @@ class Sightings:
             f"Met: came within {within_s:g} s of a collision, if both had gone straight on, in "
             f"{60 * sum(self.hours.values()):.0f} minutes. Detected before that, with a 95 % interval over "
             f"{len(self.hours)} worlds (of 8 or more), or at the least time to collision, or never.",
-            f"{self.criterion.words} Too late: it was needed before.",
+            f"{self.criterion.words} Braking was needed for {rows[-1].to_brake} of them; too late: before detection.",
             *([] if self.sightings else ["Nobody was met: drive longer (--worlds), or elsewhere."]),
         ]
         return PageTable("Met, and detected before", ("who", "met", "an hour", *rigs), cells, notes=notes)
@@ -235,8 +238,8 @@ class Sightings:
                     if one.rig == rig:
                         times.setdefault(abs(one.encounter.speed_kmh), []).extend(one.ttc_s.tolist())
                 bands[rig] = [(speed, min(each), max(each)) for speed, each in sorted(times.items())]
-            cases = {abs(one.encounter.speed_kmh): one.encounter.closing_mps for one in of_names[name]}
-            yield name, bands, [(speed, self.criterion.needed_s(mps)) for speed, mps in sorted(cases.items())]
+            most_last = sorted(of_names[name], key=lambda one: one.needed_s)
+            yield name, bands, sorted({abs(one.encounter.speed_kmh): one.needed_s for one in most_last}.items())
 
 
 def _cells(row: EncounterRow) -> list[str]:
@@ -266,17 +269,15 @@ def _met(row: EncounterRow) -> str:
     if row.draws == 0:
         return "-"
     least = f", least {row.ttc_s_low:.2f} s" if row.from_the_beginning < 1 and row.never == 0 else ""
-    counts = ((row.never, "never"), (1 - row.in_time, "too late"))
-    told = [f", {round(share * row.draws)} {word}" for share, word in counts if share]
-    return f"{_with_interval(row, 'from_the_beginning', percent)} %{least}{''.join(told)}"
+    never = f", {round(row.never * row.draws)} never" if row.never else ""
+    late = f", {round((1 - row.in_time) * row.to_brake)} of {row.to_brake} too late" if row.in_time < 1 else ""
+    return f"{_with_interval(row, 'from_the_beginning', percent)} %{least}{never}{late}"
 
 
 def _speeds(up_to_kmh: dict[tuple[str, str], float], rigs: Sequence[str]) -> PageTable:
-    def words(kmh: float) -> str:
-        return "drawn" if math.isnan(kmh) else f"{kmh:g}" if kmh else "none"
-
     names = dict.fromkeys(name for name, _ in up_to_kmh)
-    rows = [tuple(map(Words, (name, *(words(up_to_kmh[name, rig]) for rig in rigs)))) for name in names]
+    speeds = {key: "none" if math.isnan(kmh) else f"{kmh:g}" for key, kmh in up_to_kmh.items()}
+    rows = [tuple(map(Words, (name, *(speeds[name, rig] for rig in rigs)))) for name in names]
     headings = ("encounter", *(f"{rig}\n(km/h)" for rig in rigs))
     return PageTable("In time up to, of the speeds that were swept", headings, rows)
 

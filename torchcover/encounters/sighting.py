@@ -44,15 +44,17 @@ NEVER = np.iinfo(np.int64).max
 class Sighting(NamedTuple):
     """What a rig had of an encounter, for P phases of its looks and S sensors; 0 is not before the collision.
 
-    `ttc_s` (P,) time to collision at detection, `in_time` (P,) whether that was in time; `sensor_ttc_s` (S, P) of each
-    sensor alone, `without_ttc_s` (S, P) of all others; `from_the_beginning` (P,) whether it was seen as soon as the
-    encounter began, and the other may have been there before.
+    `needed_s` is what braking needs, in traffic the most of all the while; `ttc_s` (P,) time to collision at detection,
+    `in_time` (P,) 1 if that was in time, 0 if not, NaN if nobody knows; `sensor_ttc_s` (S, P) of each sensor alone,
+    `without_ttc_s` (S, P) of all others; `from_the_beginning` (P,) whether it was seen as soon as the encounter began,
+    and the other may have been there before.
     """
 
     encounter: "Encounter | Approach"
     rig: str
+    needed_s: float
     ttc_s: Float64
-    in_time: Bools
+    in_time: Float64
     sensor_ttc_s: Float64
     without_ttc_s: Float64
     from_the_beginning: Bools
@@ -111,7 +113,7 @@ def _at_once(sensor: Sensor) -> Sensor:
 
 
 def sight_encounter(
-    mounted_rig: MountedRig, encounter: Encounter, criterion: Criterion, *, phases: int = 10, seed: int = 0
+    mounted_rig: MountedRig, staged: Staged, criterion: Criterion, *, phases: int = 10, seed: int = 0
 ) -> Sighting:
     """When a rig detects whom it meets.
 
@@ -120,20 +122,19 @@ def sight_encounter(
 
     Args:
         mounted_rig: The rig.
-        encounter: What happens.
+        staged: What happens, with its ego.
         criterion: What is detected.
         phases: How many phases there are.
         seed: Of noise and drop-out.
 
     Raises:
-        ValueError: What `Staged` and `MountedRig.mounted` refuse.
+        ValueError: What `MountedRig.mounted` refuses.
     """
-    staged = Staged(encounter, mounted_rig.ego)
-    looks = Looks(mounted_rig, staged, seed)
+    encounter, looks = staged.encounter, Looks(mounted_rig, staged, seed)
     sensors = mounted_rig.rig.sensors
     mounted_rig.check_rates(criterion.looks, staged)
     found = detections(
-        kinds_of(sensors),
+        [1 / sensor.rate_hz if isinstance(sensor, Lidar) else None for sensor in sensors],
         [enough_of(criterion, sensor) for sensor in sensors],
         looks.points,
         lambda is_enough, k: first_run(
@@ -142,13 +143,14 @@ def sight_encounter(
     )
     ttc_s, alone_s, without_s = (np.where(steps < NEVER, staged.contact_s - STEP_S * steps, 0.0) for steps in found)
     longest_s = max((criterion.looks / sensor.rate_hz for sensor in sensors), default=0.0)
-    from_the_beginning = (ttc_s > staged.contact_s - longest_s) & (encounter.before_s == encounter.seconds)
-    in_time = ttc_s >= criterion.needed_s(encounter.closing_mps)
-    return Sighting(encounter, mounted_rig.rig.name, ttc_s, in_time, alone_s, without_s, from_the_beginning)
+    from_the_beginning = (ttc_s > max(staged.contact_s - longest_s, 0.0)) & (encounter.before_s == encounter.seconds)
+    needed_s = criterion.needed_s(abs(encounter.ego.speed_mps), encounter.towards_mps)
+    in_time = (ttc_s >= needed_s).astype(np.float64)
+    return Sighting(encounter, mounted_rig.rig.name, needed_s, ttc_s, in_time, alone_s, without_s, from_the_beginning)
 
 
 def detections(
-    kinds: Sequence[object],
+    periods: Sequence[float | None],
     enough: Sequence[int],
     points: Callable[[Sequence[int], Numbers], Numbers],
     first: Callable[[IsEnough, int], Numbers],
@@ -156,12 +158,12 @@ def detections(
     """At which step S sensors detect somebody, or `NEVER`: together (P,), each alone (S, P), and without each (S, P).
 
     Args:
-        kinds: Of each sensor: those of one kind count together.
-        enough: How many points are, of each sensor's kind.
+        periods: Of the looks of each sensor, as `channels` has them.
+        enough: How many points are, of each sensor.
         points: What some sensors have together at (N,) steps.
-        first: (P,) the steps at which looks in a row were enough first, by what is enough and who looks.
+        first: (P,) the steps at which looks in a row were enough first, by what is enough and whose looks they are.
     """
-    everything, known = range(len(kinds)), dict[tuple[int, ...], Numbers]()
+    everything, known = range(len(periods)), dict[tuple[int, ...], Numbers]()
 
     def first_of(channel: tuple[int, ...]) -> Numbers:
         if channel not in known:
@@ -169,7 +171,7 @@ def detections(
         return known[channel]
 
     def of(sensors: Sequence[int]) -> Numbers:
-        each = [first_of(channel) for channel in channels(kinds, sensors)]
+        each = [first_of(channel) for channel in channels(periods, sensors)]
         return np.min(each, axis=0) if each else np.full_like(together, NEVER)
 
     together = of(everything)
@@ -184,17 +186,16 @@ def enough_of(criterion: Criterion, sensor: Sensor) -> int:
     return RADAR_POINTS if isinstance(sensor, Radar) else criterion.points
 
 
-def kinds_of(sensors: Sequence[Sensor]) -> list[object]:
-    """Which sensors count together: LiDARs of one rate do; each other sensor is alone."""
-    return [one.rate_hz if isinstance(one, Lidar) else ("alone", k) for k, one in enumerate(sensors)]
+def channels(periods: Sequence[float | None], numbers: Sequence[int]) -> list[tuple[int, ...]]:
+    """Those of some sensors that count together at the looks of the first of them.
 
-
-def channels(kinds: Sequence[object], numbers: Sequence[int]) -> list[tuple[int, ...]]:
-    """Those of some sensors that count together."""
-    found: dict[object, list[int]] = {}
-    for k in numbers:
-        found.setdefault(kinds[k], []).append(k)
-    return [tuple(channel) for channel in found.values()]
+    LiDARs count at the looks of each of them, of all that look as often at least: a faster one adds looks of its own
+    and loses none that it had with others. A sensor whose period is None counts alone.
+    """
+    lidars = {k: period for k in numbers if (period := periods[k]) is not None}
+    alone, slowest_first = [(k,) for k in numbers if k not in lidars], sorted(lidars, key=lambda k: -lidars[k])
+    longest = dict.fromkeys(lidars.values())
+    return [*alone, *(tuple(k for k in slowest_first if lidars[k] <= period) for period in longest)]
 
 
 def look_steps(rate_hz: float, phases: int, contact_s: float) -> Numbers:

@@ -2,7 +2,7 @@
 
 import math
 from functools import lru_cache
-from itertools import groupby
+from itertools import combinations, groupby
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,8 @@ BEND_S = 0.01
 # The meeting is of middles: outlines may touch later, as where one drives into the side of the other's end.
 AFTER_S = 2.0
 GROUND_M = 2000.0
+# So far inside is beside: a gap may be 0.
+TOUCH_M = 1e-6
 
 
 @lru_cache(maxsize=64)
@@ -139,13 +141,19 @@ class Staged:
         return contact_s(self.ego.box.outline_m, outlines_at(self.other.box.outline_m, there[:-1]), velocity_mps)
 
     def _check_ways(self) -> None:
-        """Until they touch, nobody drives or walks through an obstacle."""
+        """Until they touch, nobody drives or walks through an obstacle, and none is inside another."""
+        for (one, pose), (other, there) in combinations(self.obstacles, 2):
+            if _inside(solid_of(other.body), (np.linalg.inv(pose) @ there)[None], solid_of(one.body)).any():
+                raise ValueError(
+                    f"{self.encounter.words}: the obstacles {called(one.body)!r} and {called(other.body)!r} are inside "
+                    "one another; change their gap_m or beside_m"
+                )
         times_s = np.append(np.arange(0.0, self.contact_s, BEND_S), self.contact_s)
         ways = (("the ego", self.ego, self.world_T_ego), ("the other", self.other, self.world_T_other))
         for obstacle, pose in self.obstacles:
             for who, solid, way in ways:
                 there = np.linalg.inv(way(times_s)) @ pose
-                on_way = overlapping(solid_of(obstacle.body).box, there, solid.box.corners_m)
+                on_way = _inside(solid_of(obstacle.body), there, solid)
                 if on_way.any():
                     at_s = times_s[on_way.argmax()] - self.contact_s
                     raise ValueError(
@@ -153,6 +161,12 @@ class Staged:
                         f"{-at_s:.2f} s before the two touch; change its beside_m or gap_m, or let the encounter begin "
                         "later (from_m, seconds)"
                     )
+
+
+def _inside(solid: Solid, there: Float64, other: Solid) -> NDArray[np.bool_]:
+    """(P,) whether the box of a body at (P, 4, 4) poses is inside that of another, by more than a touch."""
+    corners_m = other.box.corners_m
+    return overlapping(solid.box, there, corners_m - TOUCH_M * np.sign(corners_m - corners_m.mean(axis=0)))
 
 
 def _along(way: Way, before_s: Float64, at_m: tuple[float, float], heading: float) -> Float64:

@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 from torchcover.coverage.quantity import MEASURED_WITHIN_M
 from torchcover.detection.inside import SKIN_M
 from torchcover.encounters.criterion import Criterion
-from torchcover.encounters.sighting import NEVER, IsEnough, Sighting, detections, enough_of, first_run, kinds_of
+from torchcover.encounters.sighting import NEVER, IsEnough, Sighting, detections, enough_of, first_run
 from torchcover.geometry import BoundingBox, contact_s, invert, outlines_at
 from torchcover.recordings.in_vehicle import in_vehicle
 from torchcover.recordings.objects import Track, class_of, objects_of
 from torchcover.recordings.recording import Recording
+from torchcover.simulation.lidar import Lidar
 from torchcover.simulation.rays import Balls
 from torchcover.simulation.simulator import Simulator
 from torchcover.simulation.traffic.fleet import REAR_OF
@@ -36,6 +37,8 @@ WHO = {
 }
 # A vehicle of which all labels lie so near to each other was parked.
 PARKED_M = 2.0
+# Poses of an ego that stands may still move so fast.
+STANDS_MPS = 0.1
 # Scans that are kept: of those who are met at the same time.
 SCANS = 8
 
@@ -102,7 +105,8 @@ class Approach(NamedTuple):
     """A road user who comes within a time to collision, from the first such step to the last.
 
     `ttc_s` and `needed_s` (K,) are those of each of these steps, which begin with `step`: both outlines go straight on
-    as they do, and nobody brakes; and what the brakes need then. The rest as an `Encounter` has it.
+    as they do, and nobody brakes; and what the brakes need then, 0 where they would not help. The rest as an
+    `Encounter` has it.
     """
 
     track: Track
@@ -111,7 +115,6 @@ class Approach(NamedTuple):
     needed_s: Float64
     name: str
     speed_kmh: float
-    closing_mps: float
     speed_is_swept: bool = False
 
 
@@ -127,27 +130,27 @@ def approaches(drive: Drive, criterion: Criterion) -> list[Approach]:
     for track in drive.tracks:
         places_m = track.trajectory.positions_at(drive.times_s)
         own_mps = _velocities_mps(drive.times_s, places_m[:, :2])
-        towards_mps = own_mps - ego_mps
+        closing_mps = own_mps - ego_mps
         reach_m = np.linalg.norm(drive.ego.outline_m, axis=1).max() + np.linalg.norm(track.size_m[:2]) / 2
         away_m = np.linalg.norm(places_m[:, :2] - drive.world_T_ego[:, :2, 3], axis=1) - reach_m
-        near = np.flatnonzero(away_m <= criterion.within_s * np.linalg.norm(towards_mps, axis=1))
+        near = np.flatnonzero(away_m <= criterion.within_s * np.linalg.norm(closing_mps, axis=1))
         world_T_ego = drive.world_T_ego[near]
         there = invert(world_T_ego) @ track.trajectory.at_each(drive.times_s[near])
         outline_m = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * track.size_m[:2] / 2
-        in_ego_mps = np.einsum("tji,tj->ti", world_T_ego[:, :2, :2], towards_mps[near])
+        in_ego_mps = np.einsum("tji,tj->ti", world_T_ego[:, :2, :2], closing_mps[near])
         ttc_s = np.full(len(drive.times_s), np.inf)
         ttc_s[near] = contact_s(drive.ego.outline_m, outlines_at(outline_m, there), in_ego_mps)
         met = np.flatnonzero(ttc_s <= criterion.within_s)
         if len(met) and met[0] >= criterion.looks - 1:
             some, first = slice(met[0], met[-1] + 1), int(met[0])
-            along_mps = np.maximum((own_mps[some] * ahead[some]).sum(axis=1), 0.0)
-            closing_mps = np.maximum(speed_mps[some] - along_mps, 0.0)
-            needed_s = np.array([criterion.needed_s(mps) for mps in closing_mps.tolist()])
+            towards_mps = -(own_mps[some] * ahead[some]).sum(axis=1)
             behind = there[np.searchsorted(near, first), 0, 3] < drive.ego.lower_m[0]
+            helps = ~behind & (speed_mps[some] > STANDS_MPS) & (speed_mps[some] + towards_mps > 0)
+            needed_s = np.where(helps, list(map(criterion.needed_s, speed_mps[some], towards_mps)), 0.0)
             name = "from behind" if behind else who(track)
             kmh, owner = 3.6 * float(speed_mps[first]), track.name.removeprefix(REAR_OF)
             if owner not in found or first < found[owner].step:
-                found[owner] = Approach(track, first, ttc_s[some], needed_s, name, kmh, float(closing_mps[0]))
+                found[owner] = Approach(track, first, ttc_s[some], needed_s, name, kmh)
     return list(found.values())
 
 
@@ -164,14 +167,14 @@ class Eyes(NamedTuple):
     """The S sensors of a rig in one drive.
 
     Args:
-        kinds: As `detections` has them.
+        periods: As `channels` has them, in steps.
         enough: How many points are.
         counts_as: How many points each of their points is.
         every: They look at every so-manieth step.
         clouds: Of a step, the points (N, 3) of each in the vehicle frame that lie in some balls, and maybe others.
     """
 
-    kinds: Sequence[object]
+    periods: Sequence[float | None]
     enough: Sequence[int]
     counts_as: Sequence[int]
     every: Sequence[int]
@@ -192,7 +195,8 @@ class Eyes(NamedTuple):
         sensors = rig.sensors
         every = [max(1, round(1 / (one.rate_hz * simulator.every_s))) for one in sensors]
         enough, counts_as = [enough_of(criterion, one) for one in sensors], [one.counts_as for one in sensors]
-        return cls(kinds_of(sensors), enough, counts_as, every, clouds)
+        periods = [steps if isinstance(one, Lidar) else None for one, steps in zip(sensors, every, strict=True)]
+        return cls(periods, enough, counts_as, every, clouds)
 
     @classmethod
     def of_recording(cls, recording: Recording, sensors: Sequence[str], criterion: Criterion) -> Self:
@@ -223,7 +227,7 @@ class Watch:
         """(S,) the points in his box, which stands as he does; sides and top as `points_in_boxes` has them."""
         time_s, way, size_m = self._drive.times_s[step], self._track.trajectory, np.array(self._track.size_m)
         if np.isnan(way.positions_at(np.array([time_s]))).any():
-            return np.zeros(len(self._eyes.kinds), dtype=np.int64)
+            return np.zeros(len(self._eyes.periods), dtype=np.int64)
         pose = invert(self._drive.world_T_ego[step]) @ way.at(time_s)
         middle_m = pose[:3, 3] + size_m[2] / 2 * pose[:3, 2]
         clouds = self._eyes.clouds(step, Balls(middle_m[None], float(np.linalg.norm(size_m / 2 + SKIN_M))))
@@ -237,29 +241,33 @@ class Watch:
 
 
 def sight_approach(rig: str, drive: Drive, approach: Approach, eyes: Eyes, criterion: Criterion) -> Sighting:
-    """When a rig had enough of somebody, of looks that begin as long before as the time that is asked about.
+    """When a rig had enough of somebody, of looks from as long before as is asked about, or the last few of a slow one.
 
     The time to collision is the least until he is detected, and that asked about if he is by then. Whether he is, is
-    asked first, and more only of those sensors that this leaves open.
+    asked first, and more only of those sensors that this leaves open. Nobody knows who is in time if braking never was
+    needed, or needed more than was asked about.
     """
     begin, end = approach.step, approach.step + len(approach.ttc_s)
     first = int(np.searchsorted(drive.times_s, drive.times_s[begin] - criterion.within_s))
     watch = Watch(drive, approach.track, eyes)
 
     def first_run_of(is_enough: IsEnough, k: int) -> Numbers:
-        steps = np.arange(first, end)
-        steps = steps[steps % eyes.every[k] == 0]
+        steps = np.arange(0, end, eyes.every[k])
         latest = steps[steps <= begin][-criterion.looks :]
         if first_run(is_enough, latest[None], criterion.looks)[0] < NEVER:
             return np.array([begin])
-        return np.maximum(first_run(is_enough, steps[None], criterion.looks), begin)
+        since = steps[steps >= min(first, latest[0])]
+        return np.maximum(first_run(is_enough, since[None], criterion.looks), begin)
 
-    found = detections(eyes.kinds, eyes.enough, watch.points, first_run_of)
+    found = detections(eyes.periods, eyes.enough, watch.points, first_run_of)
     # By the steps of the approach; last for who was never detected.
     least_s = np.append(np.minimum.accumulate(approach.ttc_s), 0.0)
     least_s[0] = criterion.within_s
     ttc_s, alone_s, without_s = (least_s[np.minimum(steps, end) - begin] for steps in found)
     seen = found[0] - begin
     until = int(min(seen[0], end)) + 1 if seen[0] else 0
-    in_time = np.array([(approach.ttc_s >= approach.needed_s)[:until].all()])
-    return Sighting(approach, rig, ttc_s, in_time, alone_s, without_s, seen == 0, drive.name)
+    late = approach.ttc_s < approach.needed_s
+    unknown = not late.any() or (until == 0 and approach.needed_s[0] > criterion.within_s)
+    in_time = np.array([np.nan if unknown else float(not late[:until].any())])
+    needed_s = float(approach.needed_s.max())
+    return Sighting(approach, rig, needed_s, ttc_s, in_time, alone_s, without_s, seen == 0, drive.name)

@@ -115,15 +115,7 @@ def student_p(t: float, degrees_of_freedom: int) -> float:
 
 
 def is_significant(difference: float, error: float, degrees_of_freedom: int) -> bool | None:
-    """Whether a difference is more than chance, by Student's t at 95 %.
-
-    Args:
-        difference: The difference.
-        error: Its standard error; NaN if unknown.
-        degrees_of_freedom: Blocks that the error comes from, less one.
-
-    Returns:
-        None if the error is unknown.
+    """Whether a difference is more than chance, by Student's t at 95 %; None if its standard error is NaN.
 
     Example:
         >>> is_significant(0.3, 0.1, 15), is_significant(0.2, 0.1, 15), is_significant(0.2, float("nan"), 3)

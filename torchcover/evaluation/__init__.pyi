@@ -1,7 +1,3 @@
-from .agreeing import AgreementStudy as AgreementStudy
-from .agreeing import agree as agree
-from .agreeing import relation as relation
-from .agreeing import verdict as verdict
 from .checking import Checked as Checked
 from .checking import check as check
 from .checkpoint import Checkpoint as Checkpoint

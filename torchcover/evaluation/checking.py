@@ -219,7 +219,7 @@ def _of_encounters(one: EncounterRequirement, rig: Rig, **given: Any) -> dict[st
     for case, each in zip(one.encounters.encounters, found.sightings, strict=True):
         lost = {f", without {name}": each.without_ttc_s[names.index(name)] for name in one.failing(names)}
         for words, ttc_s in ({"": each.ttc_s} | lost).items():
-            times_s.append((ttc_s.min(), ttc_s.min() - one.criterion.needed_s(case.closing_mps)))
+            times_s.append((ttc_s.min(), ttc_s.min() - each.needed_s))
             where.append(f"{case.words}{words}")
     return {key: _exact(of_key, where) for key, of_key in zip(("ttc_s", "spare_s"), np.array(times_s).T, strict=True)}
 

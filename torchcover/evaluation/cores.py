@@ -3,6 +3,7 @@
 import inspect
 import multiprocessing
 import os
+import sys
 import warnings
 from functools import cache
 from pathlib import Path
@@ -55,6 +56,16 @@ def set_threads() -> None:
     os.environ.setdefault("OMP_NUM_THREADS", str(cores()))
 
 
+def start_method() -> str:
+    """How workers start: as the program said, else forked where that can be, also since Python 3.14.
+
+    A forked worker has what was loaded, and takes frames that cannot be pickled. What else is in its way, threads that
+    hold locks, is not there: Embree has none (see `raycaster`), and torch has its own from its first parallel sum on.
+    """
+    usual = "fork" if sys.platform == "linux" else multiprocessing.get_all_start_methods()[0]
+    return multiprocessing.get_start_method(allow_none=True) or usual
+
+
 def usual_workers(frames: int, worlds: int, *, whole: bool) -> int:
     """Processes that make the frames of a simulation, if nobody says how many.
 
@@ -69,8 +80,7 @@ def usual_workers(frames: int, worlds: int, *, whole: bool) -> int:
         >>> usual_workers(frames=64, worlds=1, whole=False)
         0
     """
-    forks = (multiprocessing.get_start_method(allow_none=True) or multiprocessing.get_all_start_methods()[0]) == "fork"
-    if not forks or multiprocessing.current_process().daemon:  # which may start none
+    if start_method() != "fork" or multiprocessing.current_process().daemon:  # which may start none
         return 0
     workers = min(cores(), worlds, frames // LEAST_FRAMES, int(MOST_MEMORY * machine_bytes() / BYTES_PER_WORKER))
     if whole and os.path.isdir(SHARED_MEMORY):

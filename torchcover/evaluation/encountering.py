@@ -1,5 +1,6 @@
 """In time or too late: names and defaults in, what rigs had of encounters and its files out."""
 
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
@@ -33,8 +34,8 @@ from torchcover.report import (
 from torchcover.simulation import Draws, PaperReference, Rig, Scenario, Simulator, with_ego
 from torchcover.simulation.bodies import called
 
-# Of a film: seconds, steps between two pictures, and what they show.
-FILM_S, FILM_STEPS, FILM_M = 3.0, 100, ((-30.0, 30.0), (-15.0, 15.0))
+# Of a film: seconds, steps between two pictures, and what they show around all bodies.
+FILM_S, FILM_STEPS, FILM_AROUND_M = 3.0, 100, 3.0
 
 
 def encounter(
@@ -81,7 +82,8 @@ def encounter(
     with Progress(len(sensing) * len(these.encounters), "encounters", shown=progress) as bar:
         for name, rig in sensing.items():
             mounted = MountedRig(rig, with_ego(free_space(), {name: rig}, vehicle))
-            for one in these.encounters:
+            # Their mistakes are told before the first look.
+            for one in [Staged(one, mounted.ego) for one in these.encounters]:
                 sightings.append(sight_encounter(mounted, one, criterion, phases=phases, seed=seed))
                 bar.advance(len(sensing) * len(these.encounters))
     return Sightings(these.name, criterion, phases, seed, _sensors(sensing), sightings)
@@ -186,32 +188,37 @@ def encounter_film(
         sensor_model: As it was told.
     """
     ((name, sensing),) = _sensing(rig, sensor_model).items()
-    needed_s = {id(one): found.criterion.needed_s(one.encounter.closing_mps) for one in found.sightings}
-    latest = min((one for one in found.sightings if one.rig == name), key=lambda o: o.ttc_s.min() - needed_s[id(o)])
+    latest = min((one for one in found.sightings if one.rig == name), key=lambda one: one.ttc_s.min() - one.needed_s)
     case, without_s = cast(Encounter, latest.encounter), latest.without_ttc_s.min(axis=1)
     mounted = MountedRig(sensing, with_ego(free_space(), {name: sensing}, vehicle))
     staged = Staged(case, mounted.ego)
     scene, looks = staged.scene(mounted.solids, whole=True), Looks(mounted, staged, found.seed)
     sensors, names = mounted.mounted(case, scene), found.sensors[name]
-    first, worst, up_to_kmh = latest.sensor_ttc_s.mean(axis=1).argmax(), without_s.argmin(), found.up_to_kmh()
-    told = f"{case.words}: detected {latest.ttc_s.min():.2f} s before, needed {needed_s[id(latest)]:.2f} s"
+    first, worst = latest.sensor_ttc_s.mean(axis=1).argmax(), without_s.argmin()
+    told = f"{case.words}: detected {latest.ttc_s.min():.2f} s before, needed {latest.needed_s:.2f} s"
     told += f"; first {names[first]}, without {names[worst]} {without_s[worst]:.2f} s" if len(names) > 1 else ""
-    told += f"; in time up to {up_to_kmh[case.name, name]:g} km/h" if case.speed_is_swept else ""
-    for step in range(max(int((staged.contact_s - FILM_S) / STEP_S), 0), int(staged.contact_s / STEP_S), FILM_STEPS):
+    if case.speed_is_swept:
+        kmh = found.up_to_kmh()[case.name, name]
+        told += "; in time at none of the speeds" if math.isnan(kmh) else f"; in time up to {kmh:g} km/h"
+    steps = np.arange(max(int((staged.contact_s - FILM_S) / STEP_S), 0), int(staged.contact_s / STEP_S), FILM_STEPS)
+    times_s = STEP_S * steps.astype(np.float64)
+    vehicle_T_world = invert(staged.world_T_ego(times_s))
+    bodies = [(one.body, vehicle_T_world @ pose) for one, pose in staged.obstacles]
+    bodies.append((case.other.body, staged.vehicle_T_other(times_s)))
+    outlines_m = np.stack([outlines_at(solid_of(body).box.outline_m, there) for body, there in bodies], axis=1)
+    ego_m = mounted.ego.box.outline_m
+    all_m = np.concatenate([outlines_m.reshape(-1, 2), ego_m])
+    low_m, high_m = all_m.min(axis=0) - FILM_AROUND_M, all_m.max(axis=0) + FILM_AROUND_M
+    for step, now_m in zip(steps.tolist(), outlines_m, strict=True):
         instant, at = scene.at(step), np.array([step])
         scans = [one.scan(instant, Draws(np.random.default_rng(step), one.sensor.rays)) for one in sensors]
         seen = ", ".join(f"{sensor} {looks.points([k], at)[0]}" for k, sensor in enumerate(names))
-        bodies = [(one.body, pose) for one, pose in staged.obstacles]
-        bodies.append((case.other.body, staged.world_T_other(STEP_S * at)[0]))
-        vehicle_T_world = invert(staged.world_T_ego(STEP_S * at)[0])
-        outlines_m = [outlines_at(solid_of(body).box.outline_m, vehicle_T_world @ pose) for body, pose in bodies]
         yield draw_scene(
-            *FILM_M,
+            *zip(low_m.tolist(), high_m.tolist(), strict=True),
             standing=StandingFaces(np.empty((0, 3, 2)), np.empty(0)),
-            ego_outline_m=mounted.ego.box.outline_m,
-            actors=[ActorMark(called(body), there) for (body, _), there in zip(bodies, outlines_m, strict=True)],
+            ego_outline_m=ego_m,
+            actors=[ActorMark(called(body), there) for (body, _), there in zip(bodies, now_m, strict=True)],
             sensor=np.concatenate([scan.points for scan in scans]),
-            reference=np.empty((0, 3)),
             title=f"{staged.contact_s - STEP_S * step:.2f} s to the collision; points on it: {seen}",
             subtitle=told,
         )

@@ -20,11 +20,9 @@ class Stateful(Protocol):
 
     def state_dict(self) -> Mapping[str, Any]:
         """All that the frames so far have left; it is written at once, so that it need not be a copy."""
-        ...
 
     def load_state_dict(self, state_dict: Mapping[str, Any], /) -> object:
         """Be what the other was; the tensors are on the CPU, and nobody else's."""
-        ...
 
 
 class Observer(Protocol[ResultT]):
@@ -48,15 +46,12 @@ class Observer(Protocol[ResultT]):
 
     def update(self, frame: Frame) -> None:
         """Add a frame; its tensors are on the device of the run."""
-        ...
 
     def compute(self) -> ResultT:
         """What the frames so far say."""
-        ...
 
     def merge_state(self, other: Self, /) -> None:
         """Add the frames of another observer, which is left as it was."""
-        ...
 
 
 class CoverageObserver:

@@ -1,6 +1,5 @@
 """The one loop: frames in order, and every observer is fed with each of them."""
 
-import multiprocessing
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -14,7 +13,7 @@ import torch
 from torch.utils.data import DataLoader, Dataset, get_worker_info
 
 from torchcover.evaluation.checkpoint import Journal
-from torchcover.evaluation.cores import cores, warn_of_spinning
+from torchcover.evaluation.cores import cores, start_method, warn_of_spinning
 from torchcover.evaluation.observers import AnyObserver, CoverageObserver
 from torchcover.evaluation.progress import ENDS, Progress, held_back
 from torchcover.evaluation.ranks import Ranks
@@ -105,16 +104,13 @@ class StoppingRule(Protocol):
 
     def is_reached(self, steps: int) -> bool:
         """Whether the run may end after so many steps."""
-        ...
 
     def expected_steps(self, most: int) -> int:
         """Steps that the run is thought to take, of so many at most."""
-        ...
 
     @property
     def words(self) -> str:
         """How far it is, for the progress bar."""
-        ...
 
 
 def observe(
@@ -244,7 +240,7 @@ def killed_worker(error: BaseException, workers: int, steps: int) -> ChildProces
     if not (told or cut_off):
         return None
     # A process that is not forked imports the program, which then starts workers of its own, and may not.
-    forked = multiprocessing.get_start_method() == "fork"
+    forked = start_method() == "fork"
     why = "for want of memory" + ("" if forked else ', or of `if __name__ == "__main__":` around what the program runs')
     return ChildProcessError(f"a worker was killed after step {steps:,}, perhaps {why}; use fewer workers ({error!r})")
 
@@ -308,6 +304,7 @@ def _each(
         collate_fn=list,
         num_workers=workers,
         worker_init_fn=end_with_parent(),
+        multiprocessing_context=start_method() if workers else None,
         prefetch_factor=1 if workers else None,  # what is made ahead waits in shared memory
     )
     for batch in loader:

@@ -26,7 +26,7 @@ from torchcover.simulation import (
     reference_called,
     with_ego,
 )
-from torchcover.simulation.reference_sensor import DEFAULT_BAND_FRAME
+from torchcover.simulation.regions_of_interest import DEFAULT_BAND_FRAME
 from torchcover.simulation.simulated_frames import DEFAULT_REFERENCE
 
 AnyRig = Rig | str | Path
@@ -112,6 +112,8 @@ def task_of(settings: Settings) -> Task[FrameSource]:
             f"which has no {', '.join(missing)}; for a list of frames, or a dataset, feed observers: "
             "torchcover.evaluation.observe(frames, observers)"
         )
+    if settings.skip_bad_frames and isinstance(source, RecordedFrames):
+        source.leave_out_bad_sweeps()
     for doubt in source.doubts(settings.steps):
         warnings.warn(doubt, stacklevel=CALLER)
     return _recording(source, settings)

@@ -1,65 +1,39 @@
 """What the system gives: the door of all readers, its error, files that are whole, NumPy's, tables, processes."""
 
-from torchcover.files.bad_file import (
-    BadFileError,
-    TooLargeError,
-    check_memory,
-    decode,
-    naming,
-    read_short_text,
-    reads,
-    said_gb,
-)
-from torchcover.files.csv_tables import csv_text, read_csv
-from torchcover.files.feather import read_feather
-from torchcover.files.json_tables import read_json_table
-from torchcover.files.numpy_files import DEFLATE_MAX_RATIO, NpyHeader, npz_headers, read_npy, read_npz, write_npz
-from torchcover.files.processes import end_with_parent
-from torchcover.files.publishing import (
-    RECORDING,
-    SUMMARY,
-    Publication,
-    claimed,
-    noted,
-    settled,
-    write_durably,
-    written_since,
-)
-from torchcover.files.shown import shown
-from torchcover.files.xml_text import feed_xml, parse_xml
-from torchcover.files.yaml_text import as_yaml, parse_yaml
-
-__all__ = [
-    "DEFLATE_MAX_RATIO",
-    "RECORDING",
-    "SUMMARY",
-    "BadFileError",
-    "NpyHeader",
-    "Publication",
-    "TooLargeError",
-    "as_yaml",
-    "check_memory",
-    "claimed",
-    "csv_text",
-    "decode",
-    "end_with_parent",
-    "feed_xml",
-    "naming",
-    "noted",
-    "npz_headers",
-    "parse_xml",
-    "parse_yaml",
-    "read_csv",
-    "read_feather",
-    "read_json_table",
-    "read_npy",
-    "read_npz",
-    "read_short_text",
-    "reads",
-    "said_gb",
-    "settled",
-    "shown",
-    "write_durably",
-    "write_npz",
-    "written_since",
-]
+from torchcover.files.bad_file import BadFileError as BadFileError
+from torchcover.files.bad_file import TooLargeError as TooLargeError
+from torchcover.files.bad_file import check_memory as check_memory
+from torchcover.files.bad_file import check_regular as check_regular
+from torchcover.files.bad_file import decode as decode
+from torchcover.files.bad_file import most_gb as most_gb
+from torchcover.files.bad_file import naming as naming
+from torchcover.files.bad_file import read_short_text as read_short_text
+from torchcover.files.bad_file import reads as reads
+from torchcover.files.bad_file import said_gb as said_gb
+from torchcover.files.csv_tables import csv_text as csv_text
+from torchcover.files.csv_tables import read_csv as read_csv
+from torchcover.files.json_tables import read_json_table as read_json_table
+from torchcover.files.native import exr_image as exr_image
+from torchcover.files.native import laz_points as laz_points
+from torchcover.files.native import read_feather as read_feather
+from torchcover.files.numpy_files import DEFLATE_MAX_RATIO as DEFLATE_MAX_RATIO
+from torchcover.files.numpy_files import NpyHeader as NpyHeader
+from torchcover.files.numpy_files import npz_headers as npz_headers
+from torchcover.files.numpy_files import read_npy as read_npy
+from torchcover.files.numpy_files import read_npz as read_npz
+from torchcover.files.numpy_files import write_npz as write_npz
+from torchcover.files.own_process import apart as apart
+from torchcover.files.processes import end_with_parent as end_with_parent
+from torchcover.files.publishing import RECORDING as RECORDING
+from torchcover.files.publishing import SUMMARY as SUMMARY
+from torchcover.files.publishing import Publication as Publication
+from torchcover.files.publishing import claimed as claimed
+from torchcover.files.publishing import noted as noted
+from torchcover.files.publishing import settled as settled
+from torchcover.files.publishing import write_durably as write_durably
+from torchcover.files.publishing import written_since as written_since
+from torchcover.files.shown import shown as shown
+from torchcover.files.xml_text import feed_xml as feed_xml
+from torchcover.files.xml_text import parse_xml as parse_xml
+from torchcover.files.yaml_text import as_yaml as as_yaml
+from torchcover.files.yaml_text import parse_yaml as parse_yaml

@@ -22,6 +22,7 @@ VARIABLE = "TORCHCOVER_MAX_FILE_GB"
 # A scan takes megabytes; a saved result with eight thresholds in the command line's grid, which is much, twice a
 # thousand of them.
 DEFAULT_GB = 2.0
+LIBRARIES_GB = 1.0
 # A calibration has kilobytes; what is parsed slowly must not be long.
 MAX_SHORT_BYTES = 1_000_000
 
@@ -80,7 +81,7 @@ def reads(
                 if place != path:
                     with suppress(FileNotFoundError):  # another process is just putting it in its place
                         return read(place, *args, **kwargs)
-                _check_regular(path, content)
+                check_regular(path, content)
                 return read(path, *args, **kwargs)
 
         return door  # type: ignore[return-value]  # which would have the path without a name
@@ -109,7 +110,8 @@ def naming(path: Path, content: str) -> Iterator[None]:
         raise BadFileError(f"{path}: {reason}") from error
 
 
-def _check_regular(path: Path, content: str) -> None:
+def check_regular(path: Path, content: str) -> None:
+    """Refuse what is no file, or an empty one."""
     status = path.stat() if path.exists() else None
     if status is None:
         raise FileNotFoundError(f"{path}: no such file; {content} is needed")
@@ -148,6 +150,11 @@ def check_memory(needed_bytes: int) -> None:
             f"reading it takes {needed_gb} GB of memory, more than the {allowed_gb:g} GB that one file may take; "
             f"use a smaller one, or set the environment variable {VARIABLE}"
         )
+
+
+def most_gb() -> float:
+    """What a process of its own may take that reads a file: beside what a file may take, its libraries."""
+    return said_gb(VARIABLE, DEFAULT_GB) + LIBRARIES_GB
 
 
 def said_gb(variable: str, usual_gb: float) -> float:

@@ -1,19 +1,31 @@
 """Processes that do not outlive the one that has started them."""
 
 import ctypes
+import math
 import os
 import signal
 import sys
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
+
+if sys.platform == "linux":
+    import resource
+else:
+    resource = None
 
 # Of Linux: the signal that a process gets when the thread that has started it ends, or its whole process does.
 PR_SET_PDEATHSIG = 1
+# Libraries are files, too.
+MOST_FILES = 256
 _prctl = ctypes.CDLL(None).prctl if sys.platform == "linux" else None
 
 
-def end_with_parent() -> Callable[..., None] | None:
+def end_with_parent(memory_gb: float = math.inf) -> Callable[..., None] | None:
     """What a process that this one starts has to call first, to be killed when this one ends, however that ends.
+
+    Args:
+        memory_gb: What it may take in all.
 
     Returns:
         For the `preexec_fn` of `subprocess` and the `worker_init_fn` of a `DataLoader`; None where the system, any but
@@ -24,11 +36,28 @@ def end_with_parent() -> Callable[..., None] | None:
         >>> subprocess.run([sys.executable, "-c", ""], preexec_fn=end_with_parent()).returncode
         0
     """
-    return partial(_end_with, os.getpid()) if _prctl else None
+    return partial(_end_with, os.getpid(), memory_gb) if _prctl else None
 
 
-def _end_with(parent: int, *_: object) -> None:
+def limit(memory_gb: float) -> None:
+    """Limit what this process may take from now on: memory beyond what it has, files that are open; and write none."""
+    if resource is not None:
+        now_bytes = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        _lower(resource.RLIMIT_AS, now_bytes + int(memory_gb * 1e9))
+        _lower(resource.RLIMIT_NOFILE, MOST_FILES)
+        _lower(resource.RLIMIT_CORE, 0)
+        _lower(resource.RLIMIT_FSIZE, 0)
+
+
+def _lower(what: int, most: int) -> None:
+    _, hard = resource.getrlimit(what)
+    resource.setrlimit(what, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))
+
+
+def _end_with(parent: int, memory_gb: float, *_: object) -> None:
     assert _prctl is not None  # or nobody would have been given this
+    if memory_gb < math.inf:
+        _lower(resource.RLIMIT_AS, int(memory_gb * 1e9))
     _prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:  # which has ended before this was asked for
         os.kill(os.getpid(), signal.SIGKILL)

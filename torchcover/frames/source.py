@@ -51,32 +51,26 @@ class FrameSource(Protocol):
     @property
     def rigs(self) -> Collection[str]:
         """The names under which `Frame.clouds` has the rigs."""
-        ...
 
     @property
     def sensors(self) -> Mapping[str, "Sequence[Sensor]"]:
         """The sensors of the rigs that they are known of, for drawings; may be empty."""
-        ...
 
     @property
     def sensor_names(self) -> Mapping[str, Sequence[str]]:
         """The names of the sensors of those rigs whose `Frame.sensor_points` says which points are of which sensor."""
-        ...
 
     @property
     def ego_outline_m(self) -> NDArray[np.float64] | None:
         """(K, 2) corners x, y of the ego in the vehicle frame in metres; None if unknown."""
-        ...
 
     @property
     def description(self) -> Mapping[str, object]:
         """Where the frames come from, for `summary.json`: `scenario`, `vehicle` and `seed`, or `frames`; else None."""
-        ...
 
     @property
     def square_metres(self) -> bool:
         """Whether all frames have `Frame.reference_weights`, the square metres of reference points; else none has."""
-        ...
 
     @property
     def reference_record(self) -> Mapping[str, object] | None:
@@ -84,7 +78,6 @@ class FrameSource(Protocol):
 
         It has `notes`, sentences that a reader of the numbers has to know, and if it was simulated `every_s`.
         """
-        ...
 
     @property
     def content(self) -> Mapping[str, object]:
@@ -93,34 +86,27 @@ class FrameSource(Protocol):
         A checkpoint is of frames of this content: it changes if, and only if, a frame may be another one. What is large
         may be a hash.
         """
-        ...
 
     def world_of(self, index: int, /) -> int:
         """Which world a frame is of, by any number: frames of one are made by one process, which builds it once.
 
         The index itself where nothing has to be built, so that any process may make any frame.
         """
-        ...
 
     def has_boxes(self) -> bool:
         """Whether frames have `Frame.boxes`."""
-        ...
 
     def has_heights(self) -> bool:
         """Whether frames have `Frame.reference_heights_m`: then height bands are over the ground by default."""
-        ...
 
     def ego_mesh(self) -> "Mesh | None":
         """The body of the ego in the vehicle frame; None if unknown."""
-        ...
 
     def doubts(self, steps: int | None, /) -> Sequence[str]:
         """What looks wrong about so many frames (None: all), a sentence each: warnings before they are measured."""
-        ...
 
     def __len__(self) -> int:
         """Number of frames."""
-        ...
 
     def __getitem__(self, index: int, /) -> Frame:
         """One frame.
@@ -128,7 +114,6 @@ class FrameSource(Protocol):
         Raises:
             BadFrameError: It cannot be used; the others can.
         """
-        ...
 
 
 def worlds_of(frames: object) -> Callable[[int], int]:

@@ -6,6 +6,8 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.geometry.arrays import Bools, Float64
+
 
 @dataclass(frozen=True)
 class BoundingBox:
@@ -38,12 +40,12 @@ class BoundingBox:
         )
 
     @property
-    def corners_m(self) -> NDArray[np.float64]:
+    def corners_m(self) -> Float64:
         """(8, 3) corners."""
         return np.array(list(product(*zip(self.lower_m, self.upper_m, strict=True))))
 
     @property
-    def outline_m(self) -> NDArray[np.float64]:
+    def outline_m(self) -> Float64:
         """(4, 2) corners x, y seen from above, counter-clockwise."""
         (x0, y0, _), (x1, y1, _) = self.lower_m, self.upper_m
         return np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
@@ -55,9 +57,7 @@ class BoundingBox:
         return (x1 - x0, y1 - y0, z1 - z0)
 
 
-def overlapping(
-    box: BoundingBox, there_T_box: NDArray[np.float64], corners_m: NDArray[np.float64]
-) -> NDArray[np.bool_]:
+def overlapping(box: BoundingBox, there_T_box: Float64, corners_m: Float64) -> Bools:
     """(P,) whether a box at (P, 4, 4) poses shares space with another one that stands on about the same ground.
 
     By separating axes, of their outlines from above and of heights; touching is not sharing.
@@ -78,5 +78,4 @@ def overlapping(
     axes = np.concatenate([np.broadcast_to(sides, (len(ours_m), 3, 3)), there_T_box[:, :3, :2].swapaxes(1, 2)], 1)
     ours_m, theirs_m = np.einsum("pak,pck->pac", axes, ours_m), np.einsum("pak,ck->pac", axes, corners_m)
     apart = (ours_m.min(axis=2) >= theirs_m.max(axis=2)) | (theirs_m.min(axis=2) >= ours_m.max(axis=2))
-    overlaps: NDArray[np.bool_] = ~apart.any(axis=1)
-    return overlaps
+    return np.asarray(~apart.any(axis=1))

@@ -1,15 +1,13 @@
 """When two outlines that move straight on touch."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float64 = NDArray[np.float64]
+from torchcover.geometry.arrays import Float64
 
 
 def outlines_at(outline_m: Float64, poses: Float64) -> Float64:
     """(..., 4, 2) corners x, y of an outline, (4, 2), at (..., 4, 4) poses, seen from above."""
-    turned: Float64 = outline_m @ poses[..., :2, :2].swapaxes(-1, -2) + poses[..., None, :2, 3]
-    return turned
+    return np.asarray(outline_m @ poses[..., :2, :2].swapaxes(-1, -2) + poses[..., None, :2, 3])
 
 
 def contact_s(a_m: Float64, b_m: Float64, velocity_mps: Float64) -> Float64:
@@ -44,5 +42,4 @@ def contact_s(a_m: Float64, b_m: Float64, velocity_mps: Float64) -> Float64:
     for_good = np.where((before < 0) & (behind > 0), -np.inf, np.inf)
     begin = np.where(speed == 0, for_good, first).max(axis=-1)
     end = np.where(speed == 0, -for_good, last).min(axis=-1)
-    seconds: Float64 = np.where((begin < end) & (end > 0), np.maximum(begin, 0.0), np.inf)
-    return seconds
+    return np.asarray(np.where((begin < end) & (end > 0), np.maximum(begin, 0.0), np.inf))

@@ -4,9 +4,8 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Numbers = NDArray[np.float64]
+from torchcover.geometry.arrays import Bools, Float64
 
 # The next but one corner has this share of a place, which counts for nothing where any other has one.
 VERGE_SHARE = 1e-3
@@ -34,22 +33,22 @@ class HeightField(NamedTuple):
         array([0.5, 1. , 3. ])
     """
 
-    lower_m: Numbers
-    corners_m: Numbers
+    lower_m: Float64
+    corners_m: Float64
     cell_m: float
 
     @property
-    def places_m(self) -> Numbers:
+    def places_m(self) -> Float64:
         """(rows x columns, 2) of the corners."""
         rows, columns = self.corners_m.shape
         y, x = np.indices((rows, columns)).reshape(2, -1)
         return self.lower_m + self.cell_m * np.stack([x, y], axis=1)
 
-    def above(self, base: Callable[[Numbers], Numbers]) -> "HeightField":
+    def above(self, base: Callable[[Float64], Float64]) -> "HeightField":
         """The same above heights that are not 0."""
         return self._replace(corners_m=self.corners_m + base(self.places_m).reshape(self.corners_m.shape))
 
-    def heights_m(self, places_m: Numbers) -> Numbers:
+    def heights_m(self, places_m: Float64) -> Float64:
         """(N,) at (N, 2) places; beyond its border those of the border."""
         cells = (places_m - self.lower_m) / self.cell_m
         rows, columns = self.corners_m.shape
@@ -61,13 +60,12 @@ class HeightField(NamedTuple):
         right = x >= y
         side = corners_m[np.where(right, here + 1, here + columns)]
         far, near = np.maximum(x, y), np.minimum(x, y)
-        heights_m: Numbers = first + far * (side - first) + near * (across - side)
-        return heights_m
+        return np.asarray(first + far * (side - first) + near * (across - side))
 
 
 def spread(
-    cells: Numbers, heights_m: Numbers, rows: int, columns: int, weights: Numbers | float = 1.0
-) -> tuple[Numbers, Numbers]:
+    cells: Float64, heights_m: Float64, rows: int, columns: int, weights: Float64 | float = 1.0
+) -> tuple[Float64, Float64]:
     """(rows, columns) sums of weighted heights, and of weights, of (N, 2) places for the corners around each.
 
     The next but one have a share, too, that counts for nothing where anything else does: the verges of a street.
@@ -97,12 +95,12 @@ def spread(
 
 
 def fitted(
-    across_m: Numbers,
-    heights_m: Numbers,
-    size_m: Numbers,
+    across_m: Float64,
+    heights_m: Float64,
+    size_m: Float64,
     scales_m: Sequence[float],
     *,
-    trusted: NDArray[np.bool_] | None = None,
+    trusted: Bools | None = None,
     beneath: float = 0.5,
     on: HeightField | None = None,
 ) -> HeightField:
@@ -144,7 +142,7 @@ def fitted(
     return layers.above(base)
 
 
-def _weights(left_m: Numbers, trusted: NDArray[np.bool_], scale_m: float, beneath: float) -> Numbers:
+def _weights(left_m: Float64, trusted: Bools, scale_m: float, beneath: float) -> Float64:
     """Tukey's: (N,) 1 for whom nothing is left over, 0 for whom it is too much; fewer for those above if so asked."""
     weights = np.clip(1.0 - (left_m / (STEEPEST * scale_m)) ** 2, 0.0, 1.0) ** 2
     weights *= np.where(left_m > 0, 2 * beneath, 2 * (1 - beneath))
@@ -152,7 +150,7 @@ def _weights(left_m: Numbers, trusted: NDArray[np.bool_], scale_m: float, beneat
     return weights
 
 
-def _plane(across_m: Numbers, heights_m: Numbers, weights: Numbers) -> Callable[[Numbers], Numbers]:
+def _plane(across_m: Float64, heights_m: Float64, weights: Float64) -> Callable[[Float64], Float64]:
     """Least squares; level beyond the places."""
     middle_m = np.average(across_m, axis=0, weights=weights)
     height_m = float(np.average(heights_m, weights=weights))
@@ -163,7 +161,7 @@ def _plane(across_m: Numbers, heights_m: Numbers, weights: Numbers) -> Callable[
     return lambda places_m: height_m + (np.clip(places_m, lower_m, upper_m) - middle_m) @ slope
 
 
-def _layer(across_m: Numbers, left_m: Numbers, weights: Numbers, scale_m: float, size_m: Numbers) -> HeightField:
+def _layer(across_m: Float64, left_m: Float64, weights: Float64, scale_m: float, size_m: Float64) -> HeightField:
     """The raster of one scale: 0 where nobody stands."""
     first_m = np.full(2, -2 * scale_m)
     columns, rows = (np.ceil(size_m / scale_m).astype(np.int64) + 5).tolist()

@@ -91,8 +91,7 @@ def euler_from_rotation(rotation: Matrix) -> Matrix:
     left = sine * r[..., 0, 2] - cosine * r[..., 1, 2], cosine * r[..., 1, 1] - sine * r[..., 0, 1]
     roll = np.where(upright, 0.0, np.arctan2(*left))
     pitch = np.arctan2(-r[..., 2, 0], horizontal)
-    angles: Matrix = np.rad2deg(np.stack([yaw, pitch, roll], axis=-1))
-    return angles
+    return np.asarray(np.rad2deg(np.stack([yaw, pitch, roll], axis=-1)))
 
 
 def rotation_from_quaternion(wxyz: ArrayLike) -> Matrix:
@@ -145,6 +144,19 @@ def quaternion_from_rotation(rotation: Matrix) -> Matrix:
     wxyz = np.linalg.eigh(matrix)[1][:, -1]
     found: Matrix = np.copysign(1.0, wxyz[0]) * wxyz + 0.0  # no -0
     return found
+
+
+def slerp(first_wxyz: Matrix, second_wxyz: Matrix, share: Matrix) -> Matrix:
+    """(N, 4) unit quaternions at (N, 1) shares of the shorter way between two of (N, 4) each, at an even rate."""
+    cosine = (first_wxyz * second_wxyz).sum(axis=1, keepdims=True)
+    second_wxyz, cosine = np.where(cosine < 0, -second_wxyz, second_wxyz), np.abs(cosine).clip(max=1.0)
+    angle = np.arccos(cosine)
+    straight = angle < 1e-6
+    sine = np.where(straight, 1.0, np.sin(angle))
+    of_first = np.where(straight, 1 - share, np.sin((1 - share) * angle) / sine)
+    of_second = np.where(straight, share, np.sin(share * angle) / sine)
+    between: Matrix = of_first * first_wxyz + of_second * second_wxyz
+    return between
 
 
 def check_rigid(matrix: ArrayLike, name: str) -> Matrix:

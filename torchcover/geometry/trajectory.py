@@ -4,19 +4,28 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from torchcover.geometry import euler_from_rotation, rigid, rotation_from_euler
+from torchcover.geometry import (
+    euler_from_rotation,
+    quaternion_from_rotation,
+    rigid,
+    rotation_from_euler,
+    rotation_from_quaternion,
+    slerp,
+)
+from torchcover.geometry.rigid import Matrix
 
-Matrix = NDArray[np.float64]
+# Of pitch.
+STEEP_DEG = 60.0
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
     """Poses at times.
 
-    In between it moves on a straight line, and yaw, pitch and roll each turn the shorter way: sample finely where a
-    body pitches to beyond 80 degrees.
+    In between it moves on a straight line, and yaw, pitch and roll each turn the shorter way; beyond a pitch of 60
+    degrees, where angles say little, it turns about one axis.
 
     Args:
         times_s: (K,) ascending times in seconds.
@@ -124,8 +133,7 @@ class Trajectory:
         if first >= end or not self.times_s[0] <= time_s <= self.times_s[-1]:
             return np.zeros(3)
         way, taken = np.diff(self.positions_m[first : end + 1], axis=0), np.diff(self.times_s[first : end + 1])
-        velocity: Matrix = (way / taken[:, None]).mean(axis=0)
-        return velocity
+        return np.asarray((way / taken[:, None]).mean(axis=0))
 
 
 def poses_at(trajectories: Sequence[Trajectory], time_s: float) -> Matrix:
@@ -160,5 +168,11 @@ def _moment(times_s: Matrix, time_s: float) -> tuple[int, int, float]:
 def _between(from_m: Matrix, to_m: Matrix, from_deg: Matrix, to_deg: Matrix, share: float | Matrix) -> Matrix:
     """(..., 4, 4) poses at shares of the way from one to the other, of (..., 3) places and angles."""
     turn_deg = (to_deg - from_deg + 180.0) % 360.0 - 180.0
-    yaw_deg, pitch_deg, roll_deg = (from_deg + share * turn_deg).T
-    return rigid(rotation_from_euler(yaw_deg, pitch_deg, roll_deg), from_m + share * (to_m - from_m))
+    rotation = rotation_from_euler(*(from_deg + share * turn_deg).T)
+    steep = np.maximum(np.abs(from_deg[..., 1]), np.abs(to_deg[..., 1])) > STEEP_DEG
+    if steep.any():
+        ends = [np.reshape([quaternion_from_rotation(rotation_from_euler(*each)) for each in np.reshape(ends, (-1, 3))],
+                           (-1, 4)) for ends in (from_deg[steep], to_deg[steep])]  # fmt: skip
+        shares = np.broadcast_to(share, (*steep.shape, 1))[steep].reshape(-1, 1)
+        rotation[steep] = rotation_from_quaternion(slerp(ends[0], ends[1], shares)).reshape(rotation[steep].shape)
+    return rigid(rotation, from_m + share * (to_m - from_m))

@@ -9,8 +9,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.geometry.bounding_box import BoundingBox
 
 # In voxels. A ray that passes an edge or a corner this closely goes through it: what it has of the voxel beside it is
@@ -68,17 +69,17 @@ class VoxelGrid:
         """How many there are in all."""
         return math.prod(self.shape)
 
-    def centres_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def centres_m(self) -> tuple[Float64, Float64, Float64]:
         """(X,), (Y,) and (Z,) coordinates of the voxels' centres."""
         bounds = zip(self.region.lower_m, self.region.upper_m, self.shape, strict=True)
         x, y, z = (_centres(low, high, count) for low, high, count in bounds)
         return x, y, z
 
-    def in_voxels(self, points_m: ArrayLike) -> NDArray[np.float64]:
+    def in_voxels(self, points_m: ArrayLike) -> Float64:
         """Points (..., 3) in voxels from the lower corner of the region."""
         return (np.asarray(points_m, dtype=np.float64) - self.region.lower_m) * self._voxels_per_m
 
-    def number_of(self, points_m: ArrayLike) -> NDArray[np.int64]:
+    def number_of(self, points_m: ArrayLike) -> Int64:
         """(N,) number of the voxel that each of (N, 3) points is in; -1 if it is in none.
 
         Example:
@@ -92,11 +93,11 @@ class VoxelGrid:
         return np.where(inside, number, -1)
 
     @property
-    def _voxels_per_m(self) -> NDArray[np.float64]:
+    def _voxels_per_m(self) -> Float64:
         return np.divide(self.shape, self.region.size_m)
 
     @property
-    def _strides(self) -> NDArray[np.float64]:
+    def _strides(self) -> Float64:
         return np.array([self.shape[1] * self.shape[2], self.shape[2], 1.0])
 
 
@@ -106,8 +107,8 @@ def crossed_voxels(
     directions: ArrayLike,
     ends: ArrayLike = math.inf,
     *,
-    crossed: NDArray[np.bool_] | None = None,
-) -> NDArray[np.bool_]:
+    crossed: Bools | None = None,
+) -> Bools:
     """Which voxels are crossed by any of a bundle of rays.
 
     A voxel is crossed if a piece of a ray, and not just a point of it, lies in it: a ray through a corner or an edge
@@ -160,31 +161,24 @@ def crossed_voxels(
 class _Upwards:
     """Rays within the region, in voxels, each seen in mirrors in which it moves upwards on every axis.
 
-    Args:
-        place: (3, n) where they start.
-        way: (3, n) where they go, nowhere below 0.
-        first: (3, n) voxel that each is in first.
-        last: (3, n) and last.
-        strides: (3, n) how a voxel's number grows along the mirrored axes.
-        number: (n,) number of the voxel at 0, 0, 0, in the mirrors.
+    `place` and `way`, nowhere below 0, are (3, n) where they start and go, `first` and `last` the voxels at both ends,
+    `strides` how a voxel's number grows along the mirrored axes, and `number` (n,) that of the voxel at 0, 0, 0 there.
     """
 
-    place: NDArray[np.float64]
-    way: NDArray[np.float64]
-    first: NDArray[np.float64]
-    last: NDArray[np.float64]
-    strides: NDArray[np.float64]
-    number: NDArray[np.float64]
+    place: Float64
+    way: Float64
+    first: Float64
+    last: Float64
+    strides: Float64
+    number: Float64
 
-    def numbers(self, voxel: NDArray[np.float64]) -> NDArray[np.int64]:
+    def numbers(self, voxel: Float64) -> Int64:
         """(n,) numbers of the voxels (3, n), one of each ray."""
-        numbers: NDArray[np.float64] = self.number + (voxel * self.strides).sum(axis=0)
+        numbers: Float64 = self.number + (voxel * self.strides).sum(axis=0)
         return numbers.astype(np.int64)
 
 
-def _upwards(
-    grid: VoxelGrid, start_m: NDArray[np.float64], way: NDArray[np.float64], end: NDArray[np.float64]
-) -> _Upwards:
+def _upwards(grid: VoxelGrid, start_m: Float64, way: Float64, end: Float64) -> _Upwards:
     """The rays that have a piece in the region."""
     shape, strides = np.array(grid.shape, dtype=np.float64)[:, None], grid._strides[:, None]
     place, way = grid.in_voxels(start_m).T, (way * grid._voxels_per_m).T
@@ -209,7 +203,7 @@ def _upwards(
     return _Upwards(place, way, first, last, strides[:, kept], number[kept])
 
 
-def _cross_planes(rays: _Upwards, axis: int, crossed: NDArray[np.bool_]) -> None:
+def _cross_planes(rays: _Upwards, axis: int, crossed: Bools) -> None:
     """Mark the voxels that rays enter through planes across one axis: first the first plane of every ray, and so on."""
     planes = (rays.last[axis] - rays.first[axis]).astype(np.int64)
     # Those with many planes to the front: the rays that are still on their way are the first ones.
@@ -241,12 +235,12 @@ def _cross_planes(rays: _Upwards, axis: int, crossed: NDArray[np.bool_]) -> None
         crossed[now.astype(np.int64)] = True
 
 
-def _centres(low: float, high: float, count: int) -> NDArray[np.float64]:
+def _centres(low: float, high: float, count: int) -> Float64:
     odd = 2 * np.arange(count, dtype=np.float64) + 1
     return (low * (2 * count - odd) + high * odd) / (2 * count)
 
 
-def _check(origins_m: NDArray[np.float64], directions: NDArray[np.float64], ends: NDArray[np.float64]) -> None:
+def _check(origins_m: Float64, directions: Float64, ends: Float64) -> None:
     if directions.ndim != 2 or directions.shape[1] != 3:
         raise ValueError(f"directions: shape (N, 3) is needed; got {directions.shape}")
     count = len(directions)

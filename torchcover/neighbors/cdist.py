@@ -9,16 +9,10 @@ from torch import Tensor
 
 
 def search(query: Tensor, points: Tensor, max_distance: float, memory_mb: float) -> Tensor:
-    """Index of a nearest point for each query.
+    """(N,) int64 index of a nearest point for each query; any, if none is in reach.
 
-    Args:
-        query: (N, 3) finite coordinates.
-        points: (M, 3) finite coordinates, M > 0, of the same type and device.
-        max_distance: Queries without a point in reach may return any index.
-        memory_mb: Most memory in megabytes for the pairs under comparison, beside a few arrays as long as the clouds.
-
-    Returns:
-        (N,) int64 indices into `points`.
+    The clouds are finite, of one type and device, and there is a point. Pairs under comparison take `memory_mb` at
+    most.
     """
     budget = int(memory_mb * 1e6) // query.element_size()
     columns = max(1, min(len(points), budget // 2))

@@ -116,6 +116,7 @@ def nearest(
 
 def _nearest(query: Tensor, points: Tensor, max_distance: float, backend: str, memory_mb: float) -> Nearest:
     query, points = _check_together(query, points, max_distance, memory_mb)
+    max_distance = float(torch.tensor(max_distance, dtype=query.dtype))
     search = choose_search(query, points, backend)
 
     def found(query: Tensor, memory_mb: float) -> Nearest:

@@ -4,10 +4,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from torchcover.geometry.arrays import Float64
 from torchcover.placement.evaluation import Evaluation
 from torchcover.placement.optimisers import Cube, MakesOptimiser, Optimiser
 from torchcover.placement.pareto import chebyshev, non_dominated
-from torchcover.placement.racing import Float64, Prefix, gains
+from torchcover.placement.racing import Prefix, gains
 
 # Of an objective's value at the start, for each such share that a number which must not be worse has lost: so much more
 # than could be gained by it that an optimiser turns away, and no more than it can learn from.
@@ -19,17 +20,9 @@ ROUNDING = 1e-9
 class Arm:
     """One of the two that share a budget. The start is evaluation 0 of both.
 
-    An optimiser knows one number. Of several objectives it is told the augmented Chebyshev value, with other random
-    weights each time (ParEGO, Knowles 2006).
-
-    Args:
-        name: "optimiser" or "random".
-        makes: Of the optimiser.
-        cube: What is free.
-        seed: Of the optimiser, and of the weights.
-        start: Evaluation 0, scored at all instants.
-        objectives: How many of the first numbers are made better.
-        floors: What all of them must not be worse than; NaN for anything.
+    An optimiser knows one number. Of several objectives, the first numbers of each estimate, it is told the augmented
+    Chebyshev value, with other random weights each time (ParEGO, Knowles 2006). `floors` are what all numbers must not
+    be worse than; NaN for anything.
     """
 
     def __init__(
@@ -147,8 +140,7 @@ class Arm:
 
     def _told(self) -> Float64:
         """(evaluations, objectives) what optimisers are told of: gains, less what the lacks cost."""
-        told: Float64 = self.gains - PENALTY * self._scale[: self._objectives] * self.lacks[:, None]
-        return told
+        return np.asarray(self.gains - PENALTY * self._scale[: self._objectives] * self.lacks[:, None])
 
     def _lacking(self, evaluation: Evaluation) -> float:
         prefixes = evaluation.prefixes

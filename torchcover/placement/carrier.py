@@ -5,12 +5,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import AfterValidator, BeforeValidator, Field, PlainValidator, ValidationInfo
 
 from torchcover.evaluation.requirements import RegionRequirement, Requirements
 from torchcover.geometry import BoundingBox
+from torchcover.geometry.arrays import Float64
 from torchcover.placement.objective import Name, Objective
 from torchcover.simulation import Rig, Scenario, with_ego
 from torchcover.simulation.bodies import mount_regions_of
@@ -64,20 +63,14 @@ NamedVehicle = Annotated[NameOrFile, AfterValidator(_vehicle)]
 
 
 class Carrier(NamedTuple):
-    """The vehicle that all candidates are mounted on.
-
-    Args:
-        name: What messages call it.
-        skin: Of its body.
-        regions: By name, where sensors can be mounted.
-    """
+    """The vehicle that all candidates are mounted on: its name, its skin, and by name where sensors can be mounted."""
 
     name: str
     skin: Skin
     regions: dict[str, MountRegion]
 
     @property
-    def outline_m(self) -> NDArray[np.float64]:
+    def outline_m(self) -> Float64:
         """(4, 2) corners x, y of the vehicle."""
         return BoundingBox.around(self.skin.mesh.vertices_m).outline_m
 

@@ -7,7 +7,6 @@ from itertools import product
 from typing import Annotated, Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import (
     Field,
     NonNegativeFloat,
@@ -18,6 +17,7 @@ from pydantic import (
     model_validator,
 )
 
+from torchcover.geometry.arrays import Float64
 from torchcover.placement.carrier import Carrier, NamedRig, VehicleSpace
 from torchcover.placement.constraints import APART_M, MOUNT
 from torchcover.placement.free_sensor import HEIGHT_M, pose_of
@@ -107,11 +107,7 @@ class CandidateGroup(Document):
         return self
 
     def sensors(self, group: str, carrier: Carrier) -> Iterator[Sensor]:
-        """A sensor at each place, called after the group and the place.
-
-        Args:
-            group: Name of the group.
-            carrier: What it is mounted on.
+        """A sensor at each place on a vehicle, called after the group and the place.
 
         Raises:
             ValueError: The vehicle has no such region.
@@ -281,9 +277,7 @@ class ChoiceSpace(VehicleSpace):
     def too_close(self, one: Sensor) -> bool:
         """Whether a candidate would be where a sensor is that is always there."""
         place_m = one.mount.matrix()[:3, 3]
-        others: list[NDArray[np.float64]] = [
-            other.mount.matrix()[:3, 3] for other in (self.always.sensors if self.always else ())
-        ]
+        others: list[Float64] = [other.mount.matrix()[:3, 3] for other in (self.always.sensors if self.always else ())]
         return any(np.linalg.norm(place_m - other) < self.choose.min_distance_m for other in others)
 
     def rig(self, chosen: tuple[Sensor, ...], name: str) -> Rig:

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from torchcover import __version__
 from torchcover.coverage import Measure
@@ -20,15 +19,16 @@ from torchcover.evaluation.progress import Progress
 from torchcover.evaluation.result import sensor_model_words
 from torchcover.evaluation.settings import FILES
 from torchcover.frames import Frame
+from torchcover.geometry.arrays import Bools, Float64
 from torchcover.neighbors import nearest
 from torchcover.placement.choice_space import ChoiceSpace
 from torchcover.placement.common_instants import CommonInstants
 from torchcover.placement.fresh import FreshGain, FreshTest, fresh_test, told
 from torchcover.placement.report_files import PlacementReport
-from torchcover.placement.subsets import Bools, Candidates, Limits, Subset, best, best_of_several, random_subsets
+from torchcover.placement.subsets import Candidates, Limits, Subset, best, best_of_several, random_subsets
 from torchcover.report import ChoiceSize, PageTable, Words, draw_choice, file_stems
 from torchcover.simulation import Rig, Sensor
-from torchcover.simulation.reference_sensor import DEFAULT_BAND_FRAME
+from torchcover.simulation.regions_of_interest import DEFAULT_BAND_FRAME
 
 # Random choices that keep to the limits, as a control.
 DRAWN = 1000
@@ -293,7 +293,7 @@ def seen_by(rig: Rig, instants: CommonInstants) -> tuple[Bools, float]:
     return np.concatenate([np.concatenate(found) for found in near]), self_hits / rays
 
 
-def worth_of(instants: CommonInstants) -> NDArray[np.float64]:
+def worth_of(instants: CommonInstants) -> Float64:
     """(Q, T P) what each reference point adds to each number: the same numbers as those of `CoverageMetric`.
 
     By area, a point is worth its share of the square metres that are seen. Over known cells it is worth its share of
@@ -313,9 +313,7 @@ def worth_of(instants: CommonInstants) -> NDArray[np.float64]:
     return worth.reshape(len(worth), -1)
 
 
-def _worth_in(
-    place: tuple[str, str], name: str, instants: CommonInstants, frames: Sequence[Frame]
-) -> NDArray[np.float64]:
+def _worth_in(place: tuple[str, str], name: str, instants: CommonInstants, frames: Sequence[Frame]) -> Float64:
     """(P,) what each point is worth in a region and band."""
     (region, band), questions, grid = place, instants.questions, instants.questions.grid
     where = Places([questions.regions[region]], grid)

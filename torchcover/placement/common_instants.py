@@ -10,6 +10,7 @@ from torch.utils.data import DataLoader, Dataset
 from torchcover.coverage import Measure
 from torchcover.estimation import Estimate
 from torchcover.evaluation import CoverageObserver
+from torchcover.evaluation.cores import start_method
 from torchcover.evaluation.pipeline import FramesOrErrors, MeasuredFrame, killed_worker
 from torchcover.frames import Frame
 from torchcover.placement.carrier import Carrier
@@ -41,12 +42,9 @@ class HeldInstant(NamedTuple):
 
 
 class AskedInstant(NamedTuple):
-    """What is asked of an instant.
+    """What is asked of an instant: the frame of a rig, or without one the reference, with the bytes of its world.
 
-    Args:
-        rig: Whose frame; of no rig: the reference, and in the counts the bytes of its world.
-        number: Of the instant.
-        measures: What its coverage is summed up by, where the frame is made; the frame itself if by none.
+    With `measures` the coverage is summed up where the frame is made, and the frame itself stays there.
     """
 
     rig: Rig | None
@@ -58,11 +56,7 @@ class HeldWorlds(Dataset[Frame | MeasuredFrame]):
     """What any rig sees at some instants, whose worlds and references are kept in the process that is asked.
 
     Frames are measured there, too, so that sums travel and not clouds; published metrics need the frame itself.
-
-    Args:
-        simulations: Of the scenarios, without rigs.
-        instants: Which instants.
-        questions: What is asked about: of the reference only these points are kept.
+    Simulations have no rigs; of the reference only the points are kept that questions are about.
     """
 
     def __init__(
@@ -222,6 +216,7 @@ class CommonInstants:
             batch_sampler=self._batches,
             collate_fn=list,
             num_workers=self._processes,
+            multiprocessing_context=start_method() if self._processes else None,
             prefetch_factor=1 if workers else None,
             persistent_workers=workers > 0,
         )

@@ -39,10 +39,7 @@ class Constraints(Document):
     def broken_by(self, rig: Rig, free: Collection[str], cost_eur: float | None) -> tuple[str, ...]:
         """What of it a rig does not keep to, in words; not its self-hits, which only a scan knows.
 
-        Args:
-            rig: The rig.
-            free: Names of the sensors that a search may place.
-            cost_eur: What it costs.
+        `free` are the names of the sensors that a search may place.
         """
         return (*self._too_close(rig, free), *self._lopsided(rig), *self._too_dear(cost_eur))
 
@@ -81,12 +78,7 @@ def misplaced(sensor: Sensor, skin: Skin) -> str | None:
 
 
 def price_eur(cost: Mapping[str, float], sensor: str, model: str | None) -> float:
-    """What a sensor costs, with its mount.
-
-    Args:
-        cost: Prices, by model, by the name of a sensor, and of `mount`.
-        sensor: Its name.
-        model: Its model; None if it has none.
+    """What a sensor costs, with its mount, by its model or by its name.
 
     Raises:
         ValueError: It has no price.
@@ -107,13 +99,7 @@ def check_prices(
     sensors: Sequence[Sensor],
     free: Mapping[str, FreeSensor],
 ) -> None:
-    """Whether all that may be chosen has a price, and the cheapest of it is not too dear.
-
-    Args:
-        cost: Prices; none at all is nothing to check, unless there is a limit.
-        max_cost_eur: The limit, if there is one.
-        sensors: Of the rig that the search starts from.
-        free: What of them is free.
+    """Whether all that may be chosen has a price, and the cheapest of it is not dearer than a limit, if there is one.
 
     Raises:
         ValueError: A price is missing, is one of nothing, or the limit is below the cheapest rig.

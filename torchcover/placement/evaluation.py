@@ -8,7 +8,8 @@ import numpy as np
 import torch
 
 from torchcover.estimation import Estimate, Quantity
-from torchcover.placement.racing import Float64, Prefix
+from torchcover.geometry.arrays import Float64
+from torchcover.placement.racing import Prefix
 from torchcover.placement.variables import Value
 from torchcover.simulation import Rig
 

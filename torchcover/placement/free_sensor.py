@@ -110,11 +110,7 @@ class FreeSensor(Document):
         return self
 
     def variables(self, sensor: str) -> tuple[Variable, ...]:
-        """What is free of it.
-
-        Args:
-            sensor: Name of the sensor.
-        """
+        """What is free of it, under the name of the sensor."""
         free: list[Variable] = []
         for key, given in self._given().items():
             if key in ("present", "model") or (key == "region" and isinstance(given, tuple)):
@@ -132,12 +128,7 @@ class FreeSensor(Document):
         return usual | given
 
     def made(self, start: Sensor, values: Mapping[str, Value], carrier: Carrier) -> Sensor | None:
-        """The sensor that values make, or None where they leave it out.
-
-        Args:
-            start: The sensor in the rig that the search starts from.
-            values: By the names of `variables`.
-            carrier: What it is mounted on.
+        """The sensor that values make of that of the start, by the names of `variables`; None where they leave it out.
 
         Raises:
             ValueError: Nothing of the body is at its place.
@@ -170,10 +161,6 @@ class FreeSensor(Document):
         """What the variables are in the rig that the search starts from, whether they may be that or not.
 
         On an unknown region: the sensor may be anywhere.
-
-        Args:
-            start: The sensor in that rig.
-            carrier: What it is mounted on.
         """
         known: dict[str, Value] = {"present": True}
         if isinstance(start, Lidar) and start.model is not None:

@@ -30,13 +30,10 @@ CHANGE_HEADINGS = ("what", "gain on\nfresh worlds", "unit", "p (Holm)", "share o
 
 
 class FreshGain(NamedTuple):
-    """What the winner has better than the start, of one objective by one estimate.
+    """What the winner has better than the start, of one objective by one estimate; "-" where there is no such choice.
 
-    Args:
-        objective: Its name.
-        estimate: What its number is a mean over: "area", "known", or "-" where there is no such choice.
-        test: The difference on fresh worlds, paired.
-        search_gain: The gain on the instants of the search, which chose the winner by it.
+    `test` is the difference on fresh worlds, paired; `search_gain` that on the instants of the search, which chose by
+    it.
     """
 
     objective: str
@@ -78,13 +75,10 @@ class FreshGain(NamedTuple):
 
 
 class SideEffect(NamedTuple):
-    """What else the winner has better or worse than the start, whether anybody asked for it or not.
+    """What else the winner has better or worse than the start on fresh worlds, whether anybody asked for it or not.
 
-    Args:
-        what: Which number.
-        test: The difference on fresh worlds, paired; of a target over the cells around the vehicle.
-        p: Probability of a difference as large to either side by chance, with all other changes looked at (Holm 1979).
-        shares: Name of an objective -> what share of its gain on fresh worlds this is, if it is a part of it.
+    `p` is the probability of a difference as large to either side by chance, with all other changes looked at (Holm
+    1979), `shares` what share of an objective's gain this is, if it is a part of it.
     """
 
     what: str
@@ -107,10 +101,8 @@ class SideEffect(NamedTuple):
 class FreshTest(NamedTuple):
     """Winners of a search in worlds that it has never seen.
 
-    Args:
-        gains: By the names of the winners: in each objective by the estimate of the search, then by the other one where
-            that is a choice.
-        changes: What else the first of them changed, what got worse beyond chance first.
+    `gains` are by the names of the winners: in each objective by the estimate of the search, then by the other one
+    where that is a choice; `changes` what else the first of them changed, what got worse beyond chance first.
     """
 
     gains: Mapping[str, tuple[FreshGain, ...]]
@@ -153,15 +145,9 @@ class FreshTest(NamedTuple):
 def fresh_test(
     winners: Mapping[str, Rig], start: Rig, searched: CommonInstants, *, test_seed: int, worlds: int
 ) -> FreshTest:
-    """Score rigs in worlds of another seed, instant by instant against the same reference.
+    """Score winners of a search, by name, in worlds of another seed, instant by instant against the same reference.
 
-    Args:
-        winners: What the search has found, by name; all are tested in the same worlds.
-        start: What it started from.
-        searched: The instants of the search.
-        test_seed: Seed of the fresh worlds; another one than that of the search, so that no world is in both.
-        worlds: Fresh worlds of each scenario with traffic; a scenario without is the same world for any seed, and is
-            left out.
+    A scenario without traffic is the same world for any seed, and is left out.
 
     Raises:
         ValueError: The seed of the search; no scenario with traffic; a rig that cannot be mounted in a fresh world.
@@ -277,10 +263,6 @@ def unit_words(unit: str) -> str:
 
 def told(gain: FreshGain, *, optimism: bool = False) -> str:
     """A gain in words, which call it one only where it is told from chance: by Student's t at 95 %.
-
-    Args:
-        gain: It.
-        optimism: Whether to say how much more the search had promised.
 
     Example:
         >>> from torchcover.coverage.quantity import detection

@@ -1,18 +1,17 @@
 """Several objectives: which candidates no other beats, and how much they beat together. Higher is better."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-Values = NDArray[np.float64]
+from torchcover.geometry.arrays import Bools, Float64
+
 # Of the sum beside the smallest: without it, weakly dominated candidates would be worth as much (Knowles 2006).
 AUGMENTATION = 0.05
 
 
-def non_dominated(values: Values) -> NDArray[np.bool_]:
-    """Which candidates no other is as good as everywhere and better than somewhere; equal ones stay together.
+def non_dominated(values: Float64) -> Bools:
+    """Which of (candidates, objectives) no other is as good as everywhere and better than somewhere; equal ones stay.
 
-    Args:
-        values: (candidates, objectives); a row with NaN is not among them.
+    A row with NaN is not among them.
 
     Example:
         >>> non_dominated(np.array([[1.0, 0.0], [0.0, 1.0], [0.5, 0.5], [0.4, 0.5]]))
@@ -21,18 +20,15 @@ def non_dominated(values: Values) -> NDArray[np.bool_]:
     known = np.logical_not(np.isnan(values).any(axis=1))
     as_good = np.all(values[:, None] >= values[None], axis=2)
     better = np.any(values[:, None] > values[None], axis=2)
-    beaten: NDArray[np.bool_] = (known[:, None] & as_good & better).any(axis=0)
+    beaten: Bools = (known[:, None] & as_good & better).any(axis=0)
     return known & ~beaten
 
 
-def hypervolume(values: Values, reference: Values) -> float:
-    """Volume of what lies between the candidates and a point that they are measured from.
+def hypervolume(values: Float64, reference: Float64) -> float:
+    """Volume of what lies between (candidates, objectives) and a point that they are measured from, (objectives,).
 
-    By slices along the last objective, whose number is that of the candidates: exact, and quick for two or three.
-
-    Args:
-        values: (candidates, objectives); what is not above the reference in all of them adds nothing.
-        reference: (objectives,).
+    What is not above that in all of them adds nothing. By slices along the last objective, whose number is that of the
+    candidates: exact, and quick for two or three.
 
     Example:
         >>> hypervolume(np.array([[2.0, 1.0], [1.0, 2.0]]), np.zeros(2))
@@ -55,20 +51,15 @@ def hypervolume(values: Values, reference: Values) -> float:
     )
 
 
-def chebyshev(values: Values, weights: Values) -> Values:
-    """One number of several objectives: the least weighted one, and a little of their sum.
+def chebyshev(values: Float64, weights: Float64) -> Float64:
+    """(candidates,) one number of several objectives: the least weighted one, and a little of their sum.
 
-    Args:
-        values: (candidates, objectives), in units that can be compared.
-        weights: (objectives,), positive; they add up to 1.
-
-    Returns:
-        (candidates,). Higher is better; whatever has the highest is dominated by none.
+    `values` (candidates, objectives) are in units that can be compared; weights are positive and add up to 1. Higher is
+    better; whatever has the highest is dominated by none.
 
     Example:
         >>> chebyshev(np.array([[1.0, 0.0], [0.4, 0.4]]), np.array([0.5, 0.5]))
         array([0.025, 0.22 ])
     """
     weighted = values * weights
-    least: Values = weighted.min(axis=1) + AUGMENTATION * weighted.sum(axis=1)
-    return least
+    return np.asarray(weighted.min(axis=1) + AUGMENTATION * weighted.sum(axis=1))

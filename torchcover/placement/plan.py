@@ -10,10 +10,10 @@ from torchcover import __version__
 from torchcover.coverage import Measure
 from torchcover.placement.choice_space import ChoiceSpace
 from torchcover.placement.common_instants import EVERY_S, MEASURES, PER_WORLD, RAYS, WORLDS, CommonInstants
-from torchcover.placement.optimisers import AUTO, OPTIMISERS, MakesOptimiser, optimiser_for
+from torchcover.placement.optimisers import OPTIMISERS, MakesOptimiser
 from torchcover.placement.space import SearchSpace
 from torchcover.placement.variables import FreeChoice
-from torchcover.simulation.reference_sensor import DEFAULT_BAND_FRAME
+from torchcover.simulation.regions_of_interest import DEFAULT_BAND_FRAME
 
 FRESH_WORLDS = 16
 
@@ -44,7 +44,7 @@ class SearchPlan:
     Args:
         evaluations: Candidates to look at after the start, those of the control included; or
         budget_s: seconds for all of it, the instants and the test on fresh worlds included. One of the two is needed.
-        optimiser: "auto", a name in `OPTIMISERS`, or whatever makes an `Optimiser` from a `Cube` and a seed.
+        optimiser: A name in `OPTIMISERS`, or whatever makes an `Optimiser` from a `Cube` and a seed.
         seed: Of the worlds that candidates are scored in, and of all that is drawn; fresh worlds have the next.
         estimate: What a score is: "area", the share of the visible surface, or "known", the mean of the known cells.
         sensor_model: What sensors make of their hits, "ideal" or "real"; not given: real where that is known of them.
@@ -62,7 +62,7 @@ class SearchPlan:
 
     evaluations: int | None = None
     budget_s: float | None = None
-    optimiser: str | MakesOptimiser = AUTO
+    optimiser: str | MakesOptimiser = "gp"
     seed: int = 0
     estimate: Measure = "area"
     sensor_model: Literal["ideal", "real"] | None = None
@@ -84,20 +84,24 @@ class SearchPlan:
             raise ValueError(f"budget: more than 0 s is needed; got {self.budget_s:g}")
         if self.estimate not in MEASURES:
             raise ValueError(f"estimate: one of {', '.join(MEASURES)} is needed; got {self.estimate!r}")
-        if isinstance(self.optimiser, str) and self.optimiser not in (AUTO, *OPTIMISERS):
-            raise ValueError(f"optimiser: one of {', '.join((AUTO, *OPTIMISERS))} is needed; got {self.optimiser!r}")
+        if isinstance(self.optimiser, str) and self.optimiser not in OPTIMISERS:
+            raise ValueError(f"optimiser: one of {', '.join(OPTIMISERS)} is needed; got {self.optimiser!r}")
 
     @property
     def seed_of_test(self) -> int:
         """Of the fresh worlds: another one than that of the search."""
         return self.seed + 1
 
-    def optimiser_in(self, space: SearchSpace) -> tuple[str, MakesOptimiser]:
-        """The optimiser and its name."""
-        if not isinstance(self.optimiser, str):
-            return getattr(self.optimiser, "__name__", str(self.optimiser)), self.optimiser
-        name = optimiser_for(levels_of(space)) if self.optimiser == AUTO else self.optimiser
-        return name, OPTIMISERS[name]
+    @property
+    def optimiser_name(self) -> str:
+        """What the optimiser is called."""
+        name = self.optimiser if isinstance(self.optimiser, str) else getattr(self.optimiser, "__name__", None)
+        return name or str(self.optimiser)
+
+    @property
+    def makes_optimiser(self) -> MakesOptimiser:
+        """What makes it."""
+        return OPTIMISERS[self.optimiser] if isinstance(self.optimiser, str) else self.optimiser
 
     def settings(self, space: SearchSpace) -> dict[str, Any]:
         """All that decides which candidates are asked for, for JSON.
@@ -111,7 +115,7 @@ class SearchPlan:
             "torchcover": __version__,
             "space": space.name,
             "space_sha256": hashlib.sha256(text.encode()).hexdigest(),
-            "optimiser": self.optimiser_in(space)[0],
+            "optimiser": self.optimiser_name,
             "estimate": self.estimate,
             "sensor_model": space.start.sensing(self.sensor_model).sensor_model,
             "band_frame": DEFAULT_BAND_FRAME,

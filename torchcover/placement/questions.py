@@ -8,9 +8,7 @@ from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from typing import Any, NamedTuple, Self
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.coverage import AGGREGATIONS, Aggregation, BevGrid, CoverageMetric, MeanOfMeans, Measure, Region
@@ -20,6 +18,7 @@ from torchcover.estimation import Estimate
 from torchcover.evaluation import CoverageObserver
 from torchcover.evaluation.measuring import BLOCKS
 from torchcover.evaluation.pipeline import MeasuredFrame
+from torchcover.geometry.arrays import Float64
 from torchcover.placement.objective import THRESHOLD_M, Objective, published_numbers
 from torchcover.published import PUBLISHED, FrameMetric, Setup, Sights
 from torchcover.simulation import Areas, RegionsOfInterest, Rig, SurfaceReference
@@ -52,12 +51,8 @@ class Questions(NamedTuple):
     thresholds_m: tuple[float, ...]
 
     @classmethod
-    def around(cls, ego_outline_m: NDArray[np.float64], objectives: Mapping[str, Objective]) -> Self:
-        """What follows for one vehicle.
-
-        Args:
-            ego_outline_m: (K, 2) its corners x, y.
-            objectives: By name.
+    def around(cls, ego_outline_m: Float64, objectives: Mapping[str, Objective]) -> Self:
+        """What follows for a vehicle with (K, 2) corners x, y.
 
         Raises:
             ValueError: A region or a band that is none; two regions of one name; one that holds no cell centre.
@@ -109,15 +104,12 @@ class Questions(NamedTuple):
 
     def reference_sensor(self, rays: int) -> SurfaceReference:
         """One that is aimed at what is asked about."""
-        return SurfaceReference.from_rays(self.areas, rays, tuple(self.grid.heights.values()), self.grid.band_frame)
+        return SurfaceReference(
+            self.areas, rays, bands_m=tuple(self.grid.heights.values()), band_frame=self.grid.band_frame
+        )
 
     def asked(self, points: Tensor, height: Tensor | None = None) -> Tensor:
-        """(M,) bool: which of (M, 3) points lie in a region and band that is asked about, or any for other metrics.
-
-        Args:
-            points: In the vehicle frame.
-            height: As in `BevGrid.bins`.
-        """
+        """(M,) bool: which of (M, 3) points lie in a region and band that is asked about, or any for other metrics."""
         if self.metrics:
             return torch.ones(len(points), dtype=torch.bool)
         inside, of, cell = self.grid.bins(points, height)
@@ -131,11 +123,7 @@ class Questions(NamedTuple):
         return kept
 
     def check(self, rig: Rig, ego: Mesh | None = None) -> None:
-        """Refuse objectives that are numbers of no result.
-
-        Args:
-            rig: One that may be scored.
-            ego: The body that carries it.
+        """Refuse objectives that are numbers of no result of such a rig on its ego.
 
         Raises:
             ValueError: Such a one; the message has the nearest name.
@@ -162,13 +150,7 @@ class Questions(NamedTuple):
         return tuple(one for kind in AGGREGATIONS if (one := kind.of_keys(keys)))
 
     def numbers_of(self, rig: Rig, ego: Mesh | None = None, measures: Sequence[Measure] = ("area",)) -> "RigNumbers":
-        """What observes a rig, fed with nothing yet.
-
-        Args:
-            rig: The sensors.
-            ego: The body that carries it.
-            measures: What numbers of the coverage are means over.
-        """
+        """What observes a rig on its ego, fed with nothing yet, for numbers by these measures."""
         setup = Setup(
             rig=rig.name,
             sensors=rig.sensors,
@@ -212,11 +194,8 @@ class Questions(NamedTuple):
 class RigNumbers:
     """What observes a rig for its objectives: those who observe it in `evaluate`.
 
-    Args:
-        questions: What is asked.
-        rig: The sensors.
-        coverage: Its coverage, by what its numbers are means over; one for both where that knows both.
-        others: Published metrics, by name.
+    `coverage` is by what its numbers are means over; one for both where that knows both. `others` are published
+    metrics.
     """
 
     questions: Questions
@@ -233,11 +212,7 @@ class RigNumbers:
             metric.update(seen.frame)
 
     def estimate(self, measure: Measure) -> Estimate:
-        """The objectives so far, each a quantity under its own name.
-
-        Args:
-            measure: What numbers of the coverage are means over; one of those that it was made for.
-        """
+        """The objectives so far, each a quantity under its own name, by one of the measures that it was made for."""
         answers = self._answers(measure)
         steps = max((one.steps for each in answers.values() for one in each), key=len)
         quantities, values, left_out = [], [], []

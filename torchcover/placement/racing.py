@@ -4,12 +4,9 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchcover.estimation import Estimate
-
-Float64 = NDArray[np.float64]
-Numbers = NDArray[np.int64]
+from torchcover.geometry.arrays import Float64, Int64
 
 TOGETHER = 3
 ERRORS_BELOW = 2.0
@@ -20,10 +17,7 @@ MIN_WORLDS = 3
 class Prefix(NamedTuple):
     """What is known of a rig after the first instants, in the one order that all rigs are scored in.
 
-    Args:
-        instants: How many these are.
-        estimate: Of the objectives.
-        self_hit_share: Share of the rig's rays that the vehicle itself took.
+    `self_hit_share` is the share of the rig's rays that the vehicle itself took.
     """
 
     instants: int
@@ -32,26 +26,17 @@ class Prefix(NamedTuple):
 
 
 def gains(estimate: Estimate, other: Estimate) -> tuple[Float64, Float64]:
-    """What one rig has better than another after the same instants, and the standard errors of that.
+    """(O,) what one rig has better than another after the same instants, and (O,) standard errors of that over worlds.
 
-    Returns:
-        (O,) gains in the units of the objectives, more is better; NaN where one is unknown. (O,) errors over worlds;
-        NaN for fewer than 3.
+    In the units of the objectives, more is better; NaN where one is unknown, and errors for fewer than 3 worlds.
     """
     between = estimate.minus(other)
     sign = [quantity.gain(1.0) for quantity in between.quantities]
     return between.value.numpy() * sign, between.errors(MIN_WORLDS).numpy()
 
 
-def racing_order(world_of: Sequence[int] | Numbers, seed: int) -> Numbers:
-    """All instants in an order drawn at random, round by round of one instant of each world.
-
-    Args:
-        world_of: World of each instant.
-        seed: Decides it.
-
-    Returns:
-        (n,) numbers of the instants.
+def racing_order(world_of: Sequence[int] | Int64, seed: int) -> Int64:
+    """(n,) all instants in an order drawn at random, round by round of one instant of each world.
 
     Example:
         >>> worlds = np.array([0, 0, 1, 1, 2, 2])
@@ -64,8 +49,7 @@ def racing_order(world_of: Sequence[int] | Numbers, seed: int) -> Numbers:
     worlds = np.asarray(world_of)[shuffled]
     # How many instants of its world come before each.
     rounds = np.array([np.count_nonzero(worlds[:k] == world) for k, world in enumerate(worlds)], dtype=np.int64)
-    order: Numbers = shuffled[np.argsort(rounds, kind="stable")]
-    return order
+    return np.asarray(shuffled[np.argsort(rounds, kind="stable")])
 
 
 def race(
@@ -73,15 +57,8 @@ def race(
 ) -> tuple[Prefix, ...]:
     """Score a rig on until it is clearly below an incumbent after the same instants, or was scored at all of them.
 
-    Clearly is two standard errors of their paired difference, over worlds, in every objective.
-
-    Args:
-        prefixes: What is known of it after more and more instants; no more of them is asked for than is needed.
-        incumbents: The best so far, at all instants; of several objectives there may be several.
-        objectives: How many of the first numbers these are; all if not given.
-
-    Returns:
-        What was asked for.
+    Clearly is two standard errors of their paired difference, over worlds, in every objective: of so many numbers, or
+    all. Of `prefixes` no more is asked for than is needed. Of several objectives there may be several incumbents.
     """
     known: list[Prefix] = []
     for prefix in prefixes:

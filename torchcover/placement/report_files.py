@@ -8,9 +8,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from torchcover import __version__
 from torchcover.evaluation import sensor_views
@@ -18,6 +16,7 @@ from torchcover.evaluation.progress import held_back
 from torchcover.evaluation.result_page import rig_document, words_of
 from torchcover.evaluation.settings import FILES, wanted_files
 from torchcover.files import Publication, csv_text
+from torchcover.geometry.arrays import Float64
 from torchcover.placement.fresh import finite
 from torchcover.report import Page, PagePicture, PageRig, PageTable, page_html
 from torchcover.simulation import Rig
@@ -51,19 +50,13 @@ class PlacementReport:
     tables: Sequence[PageTable]
     rows: Mapping[str, Iterable[Iterable[object]]]
     pictures: Callable[[], Iterator[tuple[str, str, Figure]]]
-    ego_outline_m: NDArray[np.float64]
+    ego_outline_m: Float64
 
     def save(self, folder: str | Path, *, files: str | Iterable[str] = FILES) -> list[Path]:
         """Write the files of the command line: first what was found, then the pictures and the page.
 
-        Args:
-            folder: Where to write the rigs, the tables, `search.json`, the pictures, `report.html`, and, last,
-                `summary.json`. Made if it does not exist; files of an earlier run that its `summary.json` lists are
-                deleted.
-            files: What to write beside `summary.json`, as in `Result.save`; "maps" are the pictures.
-
-        Returns:
-            The files.
+        A folder is made if it does not exist; files of an earlier run that its `summary.json` lists are deleted.
+        `files` is as in `Result.save`; "maps" are the pictures.
         """
         wanted = wanted_files(files)
         summary = {"torchcover": __version__, "complete": True, "sentence": self.sentence}

@@ -30,14 +30,10 @@ HEADINGS = ("found by", "objective", "estimate", "gain in\nthe search", "gain on
 
 @dataclass(frozen=True, eq=False)
 class Pick:
-    """A rig that was found.
+    """A rig that was found by an arm, "optimiser" or "random".
 
-    Args:
-        arm: Who found it: "optimiser" or "random".
-        role: Of several objectives, "middle" of the front, or the name of the objective that it is best in; else empty.
-        evaluation: It.
-        rig: It, as it can be evaluated.
-        gains: On fresh worlds, by the estimate of the search first; empty if it was not tested, as the start itself.
+    `role` is, of several objectives, "middle" of the front, or the name of the objective that it is best in. `gains`
+    are on fresh worlds, by the estimate of the search first; empty if it was not tested, as the start itself.
     """
 
     arm: str

@@ -5,8 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from torchcover.geometry.arrays import Float64
 from torchcover.placement.arm import Arm
 from torchcover.placement.evaluation import Evaluation
 from torchcover.placement.fresh import unit_words
@@ -18,8 +18,6 @@ from torchcover.placement.variables import FreeChoice
 from torchcover.report import Slice, draw_fronts, draw_progress, draw_slices
 from torchcover.report.wording import shown_unit
 
-Float64 = NDArray[np.float64]
-
 PLACES = 65
 # Beyond, a picture would take longer than the search.
 MOST_VALUES, MOST_SLICES = 1000, 12
@@ -28,8 +26,7 @@ MOST_VALUES, MOST_SLICES = 1000, 12
 def search_pictures(search: PlacementSearch, best: Evaluation | None) -> Iterator[tuple[str, str, Figure]]:
     """How the search went, what each variable does to each objective, and what objectives cost each other.
 
-    Returns:
-        Stem of the file, what it shows, and a figure of its own, outside pyplot.
+    Each is the stem of its file, what it shows, and a figure of its own, outside pyplot.
     """
     names, title = list(search.space.objectives), search.space.name
     quantities = search.evaluations[0].prefixes[-1].estimate.quantities[: len(names)]

@@ -114,13 +114,10 @@ class _Journal:
 
 
 class _Budget:
-    """What a search may still spend. Of seconds, as many are kept as the test will take.
+    """What a search, whose start is scored, may still spend. Of seconds, as many are kept as the test will take.
 
-    Args:
-        search: It, with the start scored.
-        clock: Seconds.
-        began: When, by that clock; earlier, by what a search that is resumed has spent.
-        build_s: Seconds that each of its instants took.
+    `began` is when, by the clock, and earlier, by what a search that is resumed has spent; `build_s` what each of its
+    instants took.
     """
 
     def __init__(self, search: PlacementSearch, clock: Clock, began: float, build_s: float) -> None:

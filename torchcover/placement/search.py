@@ -11,13 +11,14 @@ import numpy as np
 
 from torchcover.evaluation.checking import check
 from torchcover.evaluation.target_survey import free_space
+from torchcover.geometry.arrays import Float64
 from torchcover.placement.arm import Arm
 from torchcover.placement.common_instants import CommonInstants
 from torchcover.placement.evaluation import OPTIMISER, RANDOM, START, Evaluation
 from torchcover.placement.optimisers import Cube, RandomSearch
 from torchcover.placement.optimisers.optimiser import Unit
 from torchcover.placement.plan import SearchPlan, levels_of
-from torchcover.placement.racing import ERRORS_BELOW, Float64, Prefix, race
+from torchcover.placement.racing import ERRORS_BELOW, Prefix, race
 from torchcover.placement.space import SearchSpace
 
 # What is drawn by the control is nothing that the optimiser draws.
@@ -55,12 +56,11 @@ class PlacementSearch:
     def __init__(self, space: SearchSpace, plan: SearchPlan | None = None, **settings: Any) -> None:  # noqa: ANN401
         self.space = space
         self.plan = SearchPlan(**settings) if plan is None else plan
-        self.optimiser_name, self._makes_optimiser = self.plan.optimiser_in(space)
         self.evaluations: list[Evaluation] = []
         self.arms: dict[str, Arm] = {}
         self._exhausted = False
         self.until = math.inf  # by the monotonic clock: when nothing more is asked for
-        self._makes_optimiser(self._cube(), self.plan.seed)  # fails now, if it does
+        self.plan.makes_optimiser(self._cube(), self.plan.seed)  # fails now, if it does
 
     @cached_property
     def instants(self) -> CommonInstants:
@@ -221,7 +221,7 @@ class PlacementSearch:
                 if metric := self.space.asked[name].metric:
                     why = f"what {metric} is about is never there; take another scenario, or more worlds"
                 raise ValueError(f"objectives.{name}: unknown at all {start.instants} instants: {why}")
-        makes = {OPTIMISER: self._makes_optimiser, RANDOM: RandomSearch}
+        makes = {OPTIMISER: self.plan.makes_optimiser, RANDOM: RandomSearch}
         for name, each in makes.items():
             seed = int(np.random.SeedSequence([self.plan.seed, SEEDS[name]]).generate_state(1)[0])
             cube = self._cube(start.infeasible)

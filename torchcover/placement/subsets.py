@@ -11,10 +11,9 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Float64 = NDArray[np.float64]
-Bools = NDArray[np.bool_]
+from torchcover.geometry.arrays import Bools, Float64
 
 # Shares closer than this are equal: a ten-thousandth of a percentage point. Then the price decides.
 SAME = 1e-6
@@ -34,14 +33,10 @@ HALVINGS = 7
 
 @dataclass(frozen=True)
 class Limits:
-    """What a subset must keep to.
+    """What a subset must keep to: so many candidates, which cost so much, at most.
 
-    Args:
-        most: The most candidates in it.
-        prices: Of each candidate.
-        most_to_pay: In all.
-        apart: (C, C) bool whether two candidates may both be there; all may if not given.
-        least: What the numbers of `Candidates.worth` must be at least; anything, -inf, if not given.
+    `apart` (C, C) is whether two candidates may both be there; all may if not given. `least` is what the numbers of
+    `Candidates.worth` must be at least; anything, -inf, if not given.
     """
 
     most: int
@@ -64,13 +59,11 @@ class Limits:
 
 
 class Subset(NamedTuple):
-    """A choice of candidates.
+    """A choice of candidates by their numbers, and what they are worth together with what is always there.
 
-    Args:
-        chosen: Their numbers.
-        values: What they are worth together with what is always there: the numbers of `Candidates.worth`.
-        gap: No subset that keeps to the limits is better by more, in what was made better.
-        short: How much it lacks of `Limits.least`, in all; unless there is a gap, no subset lacks less.
+    `values` are the numbers of `Candidates.worth`. No subset that keeps to the limits is better by more than the `gap`
+    in what was made better. `short` is how much it lacks of `Limits.least`, in all; unless there is a gap, no subset
+    lacks less.
     """
 
     chosen: tuple[int, ...]
@@ -88,10 +81,8 @@ class Subset(NamedTuple):
 class Candidates:
     """Candidates by what they see, of points that are grouped by who sees them.
 
-    Args:
-        sees: (G, C) bool which candidates see a group; no two rows are the same.
-        worth: (Q, G) float64 what the points of each group are worth, one row for each number that counts.
-        always: (Q,) what is seen without any of them.
+    `sees` is (G, C) bool, which candidates see a group, without two equal rows; `worth` (Q, G) float64 what the points
+    of each group are worth, one row for each number that counts; `always` (Q,) what is seen without any of them.
     """
 
     sees: Bools
@@ -100,12 +91,7 @@ class Candidates:
 
     @classmethod
     def grouped(cls, worth: ArrayLike, seen: Sequence[Bools], always: Bools) -> Self:
-        """Group points.
-
-        Args:
-            worth: (Q, P) what each point is worth.
-            seen: (P,) which of them each candidate sees.
-            always: (P,) which are seen anyway.
+        """Group P points by what each is worth, (Q, P), which candidates see it, and whether it is seen anyway.
 
         Example:
             >>> seen = [np.array(each, dtype=bool) for each in ([1, 1, 0, 0], [1, 1, 1, 0])]
@@ -132,12 +118,9 @@ class Candidates:
 
 
 def best(candidates: Candidates, limits: Limits, weights: Sequence[float] | Float64 = (1.0,)) -> Subset:
-    """The best subset, and of equal ones the cheapest.
+    """The best subset, and of equal ones the cheapest. Where none is worth `least`, what lacks the least in all.
 
-    Args:
-        candidates: What there is.
-        limits: What to keep to. Where no subset is worth `least`, what lacks the least in all.
-        weights: Of the first numbers of `Candidates.worth`, whose sum is made as large as it gets.
+    `weights` are of the first numbers of `Candidates.worth`, whose sum is made as large as it gets.
 
     Example:
         >>> seen = [np.array(each, dtype=bool) for each in ([1, 1, 0, 0], [0, 1, 1, 1], [1, 0, 0, 0])]
@@ -200,8 +183,7 @@ class _Goal:
     def of_values(self, values: Float64) -> Float64:
         """Of (Q, ...) values, without the price."""
         lacks = np.minimum(values.T - self.least, 0.0)
-        worth: Float64 = values.T @ self.weights + FIRST * lacks.sum(axis=-1)
-        return worth
+        return np.asarray(values.T @ self.weights + FIRST * lacks.sum(axis=-1))
 
 
 def _searched(goal: _Goal) -> tuple[tuple[int, ...], float]:
@@ -302,14 +284,7 @@ def _cliques(apart: Bools) -> Iterable[list[int]]:
 
 
 def random_subsets(candidates: Candidates, limits: Limits, count: int, seed: int) -> list[Subset]:
-    """Subsets that are drawn: candidates in a random order, each added if it may be.
-
-    Args:
-        candidates: What there is.
-        limits: What to keep to.
-        count: How many subsets.
-        seed: Seed of the orders.
-    """
+    """Subsets that are drawn: candidates in a random order, each added if it may be."""
     generator, found = np.random.default_rng(seed), []
     for _ in range(count):
         chosen: list[int] = []

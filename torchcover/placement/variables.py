@@ -9,12 +9,7 @@ DECIMALS = 6
 
 
 class FreeNumber(NamedTuple):
-    """A number between two others.
-
-    Args:
-        name: Sensor and key, as "roof.pitch_deg".
-        low: The lowest.
-        high: The highest.
+    """A number between two others, under the name of its sensor and key, as "roof.pitch_deg".
 
     Example:
         >>> FreeNumber("roof.pitch_deg", -10.0, 15.0).at(0.5)
@@ -50,11 +45,7 @@ class FreeNumber(NamedTuple):
 
 
 class FreeChoice(NamedTuple):
-    """One of several, between which there is nothing: each has an equal part of the way from 0 to 1.
-
-    Args:
-        name: Sensor and key, as "roof.model".
-        options: What there is to choose from.
+    """One of several options, between which there is nothing: each has an equal part of the way from 0 to 1.
 
     Example:
         >>> model = FreeChoice("roof.model", ("a", "b"))

@@ -5,17 +5,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
-from typing import Literal, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchcover.files import read_csv, reads
+from torchcover.geometry.arrays import Float64, Int64
 from torchcover.published.ranks import (
-    BASELINE,
     DRAWS,
-    OWN,
-    Array,
     Ranking,
     kendall_tau_b,
     permutation_p,
@@ -23,8 +20,6 @@ from torchcover.published.ranks import (
     strongest_by_chance,
 )
 
-# coverage: torchcover's own numbers; published: those of others; baseline: what takes no simulation to know, or little.
-Kind = Literal["coverage", "published", "baseline"]
 # Ends of the intervals.
 LEVELS = 0.025, 0.975
 # What the best of several metrics that mean nothing exceeds in one of twenty orders.
@@ -55,7 +50,7 @@ class Judged:
     name: str
     placements: tuple[str, ...]
     judges: tuple[str, ...]
-    values: Array
+    values: Float64
 
     def __post_init__(self) -> None:
         if self.values.shape != (len(self.judges), len(self.placements)) or not np.isfinite(self.values).all():
@@ -65,7 +60,7 @@ class Judged:
             )
 
     @property
-    def mean(self) -> Array:
+    def mean(self) -> Float64:
         """(n,) mean over the judges."""
         return np.asarray(self.values.mean(axis=0))
 
@@ -88,11 +83,6 @@ class Judged:
             raise ValueError(f"{self.name}: nothing is known of {', '.join(missing)}")
         columns = [self.placements.index(name) for name in placements]
         return type(self)(self.name, tuple(placements), self.judges, self.values[:, columns])
-
-
-def kind_of(one: Ranking) -> Kind:
-    """Whose number it is."""
-    return "coverage" if one.metric == OWN else "baseline" if one.metric == BASELINE else "published"
 
 
 @reads("a table of published results")
@@ -129,6 +119,16 @@ class Relation(NamedTuple):
     low: float
     high: float
 
+    @property
+    def words(self) -> str:
+        """Both.
+
+        Example:
+            >>> Relation(0.857, 0.5, 0.95).words
+            '+0.86 [+0.50, +0.95]'
+        """
+        return "-" if math.isnan(self.value) else f"{self.value:+.2f} [{self.low:+.2f}, {self.high:+.2f}]"
+
 
 @dataclass(frozen=True)
 class Ranked:
@@ -136,7 +136,6 @@ class Ranked:
 
     Args:
         metric: Its name.
-        kind: Whose it is.
         spearman: Spearman's rank correlation with the mean of the judges.
         kendall: Kendall's tau-b with it.
         p: Probability of a Spearman correlation as strong, of either sign, by chance; of this metric alone.
@@ -144,7 +143,6 @@ class Ranked:
     """
 
     metric: str
-    kind: Kind
     spearman: Relation
     kendall: Relation
     p: float
@@ -245,7 +243,7 @@ def lead(one: Ranking, other: Ranking, judged: Judged, *, draws: int = DRAWS, pl
     return _with_ends(float(found[0] - found[1]), drawn[0] - drawn[1])
 
 
-def _drawn(judged: Judged, draws: int, *, placements: bool) -> tuple[Array, NDArray[np.int64]]:
+def _drawn(judged: Judged, draws: int, *, placements: bool) -> tuple[Float64, Int64]:
     """(R, n) the mean of judges that are drawn anew, and which placements are drawn."""
     generator, count = np.random.default_rng(0), len(judged.placements)
     chosen = generator.integers(len(judged.judges), size=(draws, len(judged.judges)))
@@ -253,21 +251,21 @@ def _drawn(judged: Judged, draws: int, *, placements: bool) -> tuple[Array, NDAr
     return judged.values[chosen].mean(axis=1), columns
 
 
-def _along(one: Ranking, truths: Array, columns: NDArray[np.int64]) -> tuple[Array, Array]:
+def _along(one: Ranking, truths: Float64, columns: Int64) -> tuple[Float64, Float64]:
     """(R, n) what a metric and the judges say in each draw."""
     drawn = np.broadcast_to(one.gains, truths.shape) if one.drawn_gains is None else one.drawn_gains[: len(truths)]
     return np.take_along_axis(drawn, columns, axis=1), np.take_along_axis(truths, columns, axis=1)
 
 
-def _ranked(one: Ranking, truth: Array, truths: Array, columns: NDArray[np.int64]) -> Ranked:
+def _ranked(one: Ranking, truth: Float64, truths: Float64, columns: Int64) -> Ranked:
     drawn = _along(one, truths, columns)
     rho, tau = (
         _with_ends(float(statistic(one.gains, truth)), statistic(*drawn)) for statistic in (spearman, kendall_tau_b)
     )
-    return Ranked(one.name, kind_of(one), rho, tau, permutation_p(one.gains, truth), one.draws is not None)
+    return Ranked(one.name, rho, tau, permutation_p(one.gains, truth), one.draws is not None)
 
 
-def _with_ends(value: float, drawn: Array) -> Relation:
+def _with_ends(value: float, drawn: Float64) -> Relation:
     known = drawn[~np.isnan(drawn)]
     if math.isnan(value) or not known.size:
         return Relation(value, math.nan, math.nan)

@@ -103,12 +103,7 @@ def tau_of(first: Ranking, second: Ranking) -> Tau:
 
 
 def page_tables(comparison: MetricComparison, *, parts: bool = True) -> list[PageTable]:
-    """The numbers, and the taus, if there are any.
-
-    Args:
-        comparison: What the metrics say.
-        parts: Whether to tell those too that are about a category or a region only.
-    """
+    """The numbers, those about a category or a region only among them if so asked, and the taus, if there are any."""
     rows = [list(map(Words, _row(one))) for one in (comparison.rankings if parts else comparison.main)]
     headings = ["metric", "unit", "better", *comparison.rigs]
     title = f"{TITLE} (rank)" if len(comparison.rigs) > 1 else TITLE

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.coverage import BevGrid
 from torchcover.frames import Frame
 from torchcover.geometry import BoundingBox, VoxelGrid, crossed_voxels
+from torchcover.geometry.arrays import Float64
 from torchcover.published.frame_metric import WorldRatios, said
 from torchcover.published.sights import rig_of
 from torchcover.simulation import Sensor
@@ -150,8 +150,8 @@ def field_of_view(sensors: Sequence[Sensor], grid: BevGrid, ego: Mesh | None = N
 
 
 def _within(
-    band: tuple[float, float], height_m: float, up: NDArray[np.float64], begin_m: float, ends_m: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    band: tuple[float, float], height_m: float, up: Float64, begin_m: float, ends_m: Float64
+) -> tuple[Float64, Float64]:
     """(n,) where rays enter a height band, and (n,) leave it; the end first where they do not."""
     rises = np.where(up == 0, 1.0, up)
     low, high = ((edge - height_m) / rises for edge in band)
@@ -161,14 +161,12 @@ def _within(
     return np.maximum(first, begin_m), np.minimum(last, ends_m)
 
 
-def _ends_m(
-    origin_m: NDArray[np.float64], directions: NDArray[np.float64], range_m: float, ego: RayCaster | None
-) -> NDArray[np.float64]:
+def _ends_m(origin_m: Float64, directions: Float64, range_m: float, ego: RayCaster | None) -> Float64:
     """(n,) where the rays end."""
     down = directions[2] < 0
     to_ground = np.full(directions.shape[1], np.inf)
     to_ground[down] = origin_m[2] / -directions[2, down]
-    ends_m: NDArray[np.float64] = np.minimum(to_ground, range_m)
+    ends_m: Float64 = np.minimum(to_ground, range_m)
     if ego is None:
         return ends_m
     hits = ego.cast(origin_m, directions.astype(np.float32), ends_m.astype(np.float32))

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchcover.detection import Boxes
 from torchcover.geometry import BoundingBox, VoxelGrid
+from torchcover.geometry.arrays import Bools, Float64, Int32, Int64
 
 # Columns of the table: the place in time of the frame, what stands for its content, the number of the category (of the
 # frame itself: -1), and the box as in `Boxes.rows`.
@@ -49,29 +50,21 @@ def occupancy_rows(boxes: Boxes, place_in_time: int, categories: Sequence[str], 
 class Occupancy:
     """In how many frames each voxel was inside a box of one category, in blocks of contiguous worlds.
 
-    Args:
-        voxels: (K,) numbers of the voxels that were in any, ascending.
-        pattern: (K,) which row of `counts` is that of the voxel: many have the same.
-        counts: (P, B) frames of each block.
-        steps: (B,) frames of each block in all.
-        boxes: How many boxes there were that hold the centre of a voxel.
+    `voxels` (K,) are those that were in any, ascending; `pattern` (K,) is which row of `counts` (P, B), frames of each
+    block, is theirs: many have the same. `steps` (B,) are all frames, `boxes` how many held the centre of a voxel.
     """
 
-    voxels: NDArray[np.int64]
-    pattern: NDArray[np.int64]
-    counts: NDArray[np.int64]
-    steps: NDArray[np.int64]
+    voxels: Int64
+    pattern: Int64
+    counts: Int64
+    steps: Int64
     boxes: int
 
-    def entropy_nats(self, times: NDArray[np.float64 | np.bool_], weights: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(R,) sum over the voxels of Hb(p) = -p ln p - (1 - p) ln(1 - p).
+    def entropy_nats(self, times: NDArray[np.float64 | np.bool_], weights: Float64) -> Float64:
+        """(R,) sum over the voxels of Hb(p) = -p ln p - (1 - p) ln(1 - p); NaN where no frame counts.
 
-        Args:
-            times: (voxels of the grid,) how often each voxel counts.
-            weights: (R, B) how often each block of worlds does.
-
-        Returns:
-            NaN where no frame counts.
+        `times` (voxels of the grid,) is how often each voxel counts, `weights` (R, B) how often each block of worlds
+        does.
         """
         of_pattern = np.bincount(self.pattern, weights=times[self.voxels], minlength=len(self.counts))
         steps = weights @ self.steps
@@ -83,7 +76,7 @@ class Occupancy:
         return np.where(steps > 0, total, np.nan)
 
 
-def binary_entropy(p: NDArray[np.float64]) -> NDArray[np.float64]:
+def binary_entropy(p: Float64) -> Float64:
     """-p ln p - (1 - p) ln(1 - p) in nats; 0 at 0 and 1.
 
     Example:
@@ -95,22 +88,16 @@ def binary_entropy(p: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(inside, -p * np.log(p) - (1 - p) * np.log1p(-p), 0.0)
 
 
-def occupancy_of(table: NDArray[np.float64], category: int, grid: VoxelGrid, blocks: int) -> Occupancy:
-    """The occupancy by the boxes of one category.
+def occupancy_of(table: Float64, category: int, grid: VoxelGrid, blocks: int) -> Occupancy:
+    """The occupancy by the boxes of one category, from (N, 10) rows of `occupancy_rows` in ascending order.
 
     A voxel is inside a box if its centre is; of a box that leaves the region, the voxels in the region count. Boxes of
-    one frame that overlap count once.
-
-    Args:
-        table: (N, 10) rows of frames, from `occupancy_rows`, in ascending order.
-        category: Number of the category.
-        grid: The voxels.
-        blocks: Number of blocks, an even number.
+    one frame that overlap count once. The number of blocks is even.
     """
     own, centres_m = table[:, CATEGORY] == FRAME, grid.centres_m()
     block_of = (table[:, PLACE] // block_length(table[own, PLACE], blocks)).astype(np.int64)
     in_frame, counted = np.zeros(grid.voxels, dtype=bool), np.zeros(grid.voxels, dtype=np.int32)
-    found: list[tuple[NDArray[np.int64], NDArray[np.int32]]] = []
+    found: list[tuple[Int64, Int32]] = []
     boxes = 0
     for block in range(blocks):
         touched = [np.empty(0, dtype=np.int64)]
@@ -138,10 +125,10 @@ def occupancy_of(table: NDArray[np.float64], category: int, grid: VoxelGrid, blo
 
 
 def _patterns(
-    every: NDArray[np.int64],
-    found: Sequence[tuple[NDArray[np.int64], NDArray[np.int32]]],
-    marks: NDArray[np.bool_],
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    every: Int64,
+    found: Sequence[tuple[Int64, Int32]],
+    marks: Bools,
+) -> tuple[Int64, Int64]:
     """(K,) pattern of each voxel and (P, B) what the patterns are, from the voxels and their counts in each block."""
     pattern, counts = np.zeros(len(every), dtype=np.int64), np.zeros((1, 0), dtype=np.int64)
     for voxels, count in found:
@@ -159,7 +146,7 @@ def _patterns(
     return pattern, counts
 
 
-def block_length(places: NDArray[np.float64], blocks: int) -> int:
+def block_length(places: Float64, blocks: int) -> int:
     """How many places in time are in a block, as `CoverageMetric` doubles it."""
     length = 1
     while len(places) and places.max() >= blocks * length:
@@ -167,12 +154,10 @@ def block_length(places: NDArray[np.float64], blocks: int) -> int:
     return length
 
 
-def voxels_in_box(centres_m: Sequence[NDArray[np.float64]], box: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Numbers of the voxels whose centre is in a box, half-open: boxes side by side share none.
+def voxels_in_box(centres_m: Sequence[Float64], box: Float64) -> Int64:
+    """Numbers of the voxels whose centre, as of `VoxelGrid.centres_m`, is in a box, a row of `Boxes.rows`.
 
-    Args:
-        centres_m: (X,), (Y,) and (Z,) from `VoxelGrid.centres_m`.
-        box: x, y, z of the centre, length, width, height, yaw.
+    Half-open: boxes side by side share none.
 
     Example:
         >>> grid = VoxelGrid(BoundingBox((0.0, 0.0, 0.0), (4.0, 4.0, 1.0)), 1.0)
@@ -188,16 +173,15 @@ def voxels_in_box(centres_m: Sequence[NDArray[np.float64]], box: NDArray[np.floa
     x, y = (_within(ahead, box[3]) & _within(left, box[4])).nonzero()
     z = np.flatnonzero(_within(z_m - box[2], box[5]))
     column = (x + x0) * len(y_m) + y + y0
-    voxels: NDArray[np.int64] = (column[:, None] * len(z_m) + z).reshape(-1)
-    return voxels
+    return np.asarray((column[:, None] * len(z_m) + z).reshape(-1))
 
 
-def _within(offset_m: NDArray[np.float64], extent_m: float) -> NDArray[np.bool_]:
+def _within(offset_m: Float64, extent_m: float) -> Bools:
     offset_m = offset_m + ROUNDING_M
     return np.asarray((offset_m >= -extent_m / 2) & (offset_m < extent_m / 2))
 
 
-def _frames(table: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+def _frames(table: Float64) -> list[Float64]:
     """The rows of each frame, from those of several in ascending order."""
     borders = np.flatnonzero((np.diff(table[:, : CONTENT + 1], axis=0) != 0).any(axis=1)) + 1
     return np.split(table, borders) if len(table) else []

@@ -21,13 +21,10 @@ PRECISIONS = (0.001, 0.999)
 
 
 def standard_deviation(measurements: Tensor, kind: str) -> Tensor:
-    """The sigma of an object with so many measurements of one kind of sensor: 1 / AP - 1, AP = a ln m + b.
+    """The sigma of objects with (K,) measurements of one kind of sensor: 1 / AP - 1, AP = a ln m + b.
 
-    AP is kept within [0.001, 0.999], as GO4ROBO does; with the constants of LiDARs it is 0.999 from 10 points on.
-
-    Args:
-        measurements: (K,) points or pixels on each object, m; none are as bad as can be.
-        kind: "lidar" or "camera".
+    AP is kept within [0.001, 0.999], as GO4ROBO does; with the constants of LiDARs it is 0.999 from 10 points on. No
+    measurement is as bad as can be.
 
     Example:
         >>> standard_deviation(torch.tensor([0, 1, 100]), "lidar")

@@ -4,15 +4,14 @@ import math
 from collections.abc import Sequence
 from functools import lru_cache
 from itertools import permutations
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from torchcover.estimation import MIN_BLOCKS, Estimate, Number, Quantity
-
-Array: TypeAlias = NDArray[np.float64]
+from torchcover.geometry.arrays import Float64, Int64
 
 # Two things have two orders, and are alike or opposite by chance.
 LEAST = 3
@@ -42,11 +41,11 @@ class Ranking(NamedTuple):
     name: str
     metric: str
     numbers: tuple[Number, ...]
-    draws: Array | None = None
+    draws: Float64 | None = None
 
     @classmethod
     def of_values(
-        cls, quantity: Quantity, values: Sequence[float] | Array, metric: str = BASELINE, draws: Array | None = None
+        cls, quantity: Quantity, values: Sequence[float] | Float64, metric: str = BASELINE, draws: Float64 | None = None
     ) -> "Ranking":
         """Of values (rigs,) without errors."""
         return cls(quantity.key, metric, tuple(Number(quantity, float(value)) for value in values), draws)
@@ -62,17 +61,17 @@ class Ranking(NamedTuple):
         return ":" in self.name
 
     @property
-    def gains(self) -> Array:
+    def gains(self) -> Float64:
         """(rigs,) the values, with the sign turned so that more is better; NaN where unknown."""
         return np.array([number.quantity.gain(number.value) for number in self.numbers])
 
     @property
-    def drawn_gains(self) -> Array | None:
+    def drawn_gains(self) -> Float64 | None:
         """(R, rigs) likewise those of the draws."""
         return None if self.draws is None else self.quantity.gain(1.0) * self.draws
 
     @property
-    def ranks(self) -> Array:
+    def ranks(self) -> Float64:
         """(rigs,) 1 for the best; equal ones share the mean of theirs, NaN where unknown."""
         return midranks(-self.gains)
 
@@ -85,13 +84,9 @@ class Ranking(NamedTuple):
 def rankings(
     metric: str, numbers: Sequence[Sequence[Number]], estimates: Sequence[Estimate], seed: int
 ) -> list[Ranking]:
-    """A ranking by each number of a metric.
+    """A ranking by each number of a metric, the same of each rig, with draws of worlds from what they come from.
 
-    Args:
-        metric: As in `Ranking`.
-        numbers: What it says of each rig, the same numbers of all.
-        estimates: What these come from, of each rig.
-        seed: Of the worlds that are drawn again, the same for all metrics of a run.
+    The seed is the same for all metrics of a run.
     """
     draws = [drawn_again(estimate, seed) for estimate in estimates]
     known = [each for each in draws if each is not None]
@@ -102,7 +97,7 @@ def rankings(
     ]
 
 
-def drawn_again(estimate: Estimate, seed: int) -> Array | None:
+def drawn_again(estimate: Estimate, seed: int) -> Float64 | None:
     """(R, Q) numbers over worlds that are drawn with replacement; None if too few, or what that gives, are known."""
     worlds = len(estimate.steps)
     if worlds < MIN_BLOCKS:
@@ -112,14 +107,8 @@ def drawn_again(estimate: Estimate, seed: int) -> Array | None:
     return None if again is None else again.cpu().numpy()
 
 
-def midranks(values: ArrayLike) -> Array:
-    """Ranks from 1, the smallest, on; equal values share the mean of theirs, and what is unknown has none.
-
-    Args:
-        values: (..., n), NaN where unknown.
-
-    Returns:
-        (..., n) ranks, NaN where the value is.
+def midranks(values: ArrayLike) -> Float64:
+    """(..., n) ranks from 1, the smallest, on; equal values share the mean of theirs, and what is NaN stays so.
 
     Example:
         >>> midranks([3.0, float("nan"), 1.0, 3.0]).tolist()
@@ -131,7 +120,7 @@ def midranks(values: ArrayLike) -> Array:
     return np.where(np.isnan(own), math.nan, smaller + (equal + 1) / 2)
 
 
-def kendall_tau_b(first: ArrayLike, second: ArrayLike) -> Array:
+def kendall_tau_b(first: ArrayLike, second: ArrayLike) -> Float64:
     """Kendall's tau-b: 1 for the same order, -1 for the opposite one; ties count for neither.
 
         tau_b = (C - D) / sqrt((P - T_1) (P - T_2))
@@ -156,15 +145,8 @@ def kendall_tau_b(first: ArrayLike, second: ArrayLike) -> Array:
     return _ratio(agreement, np.sqrt(apart[0] * apart[1]), one)
 
 
-def spearman(first: ArrayLike, second: ArrayLike) -> Array:
-    """Spearman's rank correlation: Pearson's of the midranks, so that ties are right.
-
-    Args:
-        first: As in `kendall_tau_b`.
-        second: Likewise.
-
-    Returns:
-        (...); NaN for fewer than three that are known, or if all of one are equal.
+def spearman(first: ArrayLike, second: ArrayLike) -> Float64:
+    """Spearman's rank correlation: Pearson's of the midranks, so that ties are right; else as `kendall_tau_b`.
 
     Example:
         >>> float(spearman([1, 2, 3, 4], [10, 20, 40, 30]))
@@ -178,7 +160,7 @@ def spearman(first: ArrayLike, second: ArrayLike) -> Array:
 
 
 @lru_cache(maxsize=8)  # each metric asks for the same ones
-def orders(count: int, seed: int = 0) -> NDArray[np.int64]:
+def orders(count: int, seed: int = 0) -> Int64:
     """(P, n) orders of n things, to be read only: all of them up to n = 8, else as many as 8 have, drawn."""
     if math.factorial(count) <= MOST_TRIED:
         found = np.array(list(permutations(range(count))), dtype=np.int64)
@@ -192,14 +174,8 @@ def orders(count: int, seed: int = 0) -> NDArray[np.int64]:
 def permutation_p(first: ArrayLike, second: ArrayLike) -> float:
     """Probability that chance gives so strong a rank correlation (`spearman`), of either sign: two-sided.
 
-    With several first series it is that of the best of them: of k metrics that were looked at, one is always good.
-
-    Args:
-        first: (n,) or (k, n), NaN where unknown.
-        second: (n,) what their orders are held against.
-
-    Returns:
-        The share of orders of the second with as strong a correlation; NaN if none is known.
+    It is the share of orders of the second with as strong a one, NaN if none is known. With several first series, (k,
+    n), it is that of the best of them: of k metrics that were looked at, one is always good.
 
     Example:
         >>> permutation_p([1, 2, 3, 4], [1, 2, 3, 4])           # 2 of 24 orders
@@ -215,15 +191,10 @@ def permutation_p(first: ArrayLike, second: ArrayLike) -> float:
     return (as_strong + drawn) / (len(best) + drawn)
 
 
-def strongest_by_chance(first: ArrayLike, second: ArrayLike) -> Array:
-    """The strongest rank correlation of several series, of either sign, to each of many orders of the second.
+def strongest_by_chance(first: ArrayLike, second: ArrayLike) -> Float64:
+    """(P,) the strongest rank correlation of (k, n) series, of either sign, to each of many orders of the second.
 
-    Args:
-        first: (n,) or (k, n), NaN where unknown.
-        second: (n,) what is put in other orders.
-
-    Returns:
-        (P,) from 0 to 1: what the best of k metrics that mean nothing reaches.
+    From 0 to 1: what the best of k metrics that mean nothing reaches.
 
     Example:
         >>> float(strongest_by_chance([1, 2, 3], [1, 2, 3]).mean())             # of six orders two have 1, four 0.5
@@ -238,24 +209,24 @@ def strongest_by_chance(first: ArrayLike, second: ArrayLike) -> Array:
     return best
 
 
-def _spearman_of_orders(one: Array, target: Array, numbers: NDArray[np.int64]) -> Array:
+def _spearman_of_orders(one: Float64, target: Float64, numbers: Int64) -> Float64:
     """(P,) what `spearman` gives for each order of the second, where all is known: ranks move with what they are of."""
     own, other = (ranks - ranks.mean() for ranks in (midranks(one), midranks(target)))
     spread = np.sqrt((own**2).sum() * (other**2).sum())
     return _ratio(other[numbers] @ own, np.full(len(numbers), spread), np.broadcast_to(one, numbers.shape))
 
 
-def _signs(one: Array, other: Array) -> Array:
+def _signs(one: Float64, other: Float64) -> Float64:
     # No difference: of two that are infinite there is none, and what is unknown is neither more nor less.
     return (one > other).astype(np.float64) - (one < other)
 
 
-def _known_in_both(first: ArrayLike, second: ArrayLike) -> tuple[Array, Array]:
+def _known_in_both(first: ArrayLike, second: ArrayLike) -> tuple[Float64, Float64]:
     one, other = np.broadcast_arrays(np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64))
     unknown = np.isnan(one) | np.isnan(other)
     return np.where(unknown, math.nan, one), np.where(unknown, math.nan, other)
 
 
-def _ratio(above: Array, below: Array, values: Array) -> Array:
+def _ratio(above: Float64, below: Float64, values: Float64) -> Float64:
     enough = ((~np.isnan(values)).sum(axis=-1) >= LEAST) & (below > 0)
     return np.where(enough, above / np.where(below > 0, below, 1.0), math.nan)

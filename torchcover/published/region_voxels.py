@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchcover.frames import Frame
 from torchcover.geometry import BoundingBox, VoxelGrid, crossed_voxels
+from torchcover.geometry.arrays import Bools
 from torchcover.simulation import Sensor
 from torchcover.simulation.memory import check_fits
 
@@ -41,7 +41,7 @@ def ray_count(sensors: Sequence[Sensor]) -> int:
     return sum(int((~np.isnan(sensor.directions()[0])).sum()) for sensor in sensors)
 
 
-def crossed_by(sensors: Sequence[Sensor], grid: VoxelGrid) -> NDArray[np.bool_]:
+def crossed_by(sensors: Sequence[Sensor], grid: VoxelGrid) -> Bools:
     """(X, Y, Z) whether any of their rays crosses a voxel, up to the wall of the region or the end of its range.
 
     Nothing hides anything.
@@ -54,7 +54,7 @@ def crossed_by(sensors: Sequence[Sensor], grid: VoxelGrid) -> NDArray[np.bool_]:
     return crossed
 
 
-def crossed_on_the_way(sensors: Sequence[Sensor], frame: Frame, rig: str | None, grid: VoxelGrid) -> NDArray[np.bool_]:
+def crossed_on_the_way(sensors: Sequence[Sensor], frame: Frame, rig: str | None, grid: VoxelGrid) -> Bools:
     """(X, Y, Z) whether a voxel is crossed on the way from a sensor to a point that it measured.
 
     A ray that gave no point is not known to a frame, and crosses nothing: what it passed through the open sky, or with

@@ -1,5 +1,6 @@
 from .accumulated_reference import AccumulatedReference as AccumulatedReference
 from .clouds.readers import read_cloud as read_cloud
+from .corrections import Corrections as Corrections
 from .formats import FORMATS as FORMATS
 from .formats import RecordingFormat as RecordingFormat
 from .formats import open_recording as open_recording

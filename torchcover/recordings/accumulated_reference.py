@@ -108,7 +108,7 @@ class AccumulatedReference:
         within = set(sweeps.instants(recording, index))
         boxes, dropped = _by_name(recording.boxes(index)), Counter[str]()
         used = [key for key in scans if key[1] in within]
-        dropped["sweeps"] = len(used)
+        dropped["sweeps"] = sum(not scans[key].dropped["sweeps_skipped"] for key in used)
         if skipped := sweeps.skipped(recording, index):
             dropped["sweeps_skipped"] = len(sensors) * skipped
         of_box: dict[str, list[NDArray[np.float64]]] = {}

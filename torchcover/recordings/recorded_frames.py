@@ -18,6 +18,8 @@ from torchcover.frames.frame import Frame
 from torchcover.frames.source import BadFrameError, FrameDataset
 from torchcover.geometry import transform
 from torchcover.recordings.accumulated_reference import AccumulatedReference
+from torchcover.recordings.corrected import corrected
+from torchcover.recordings.corrections import Corrections
 from torchcover.recordings.in_vehicle import InVehicle, in_vehicle, joined
 from torchcover.recordings.recorded_reference import RecordedReference, Reference
 from torchcover.recordings.recording import Recording
@@ -43,6 +45,8 @@ class RecordedFrames(FrameDataset):
             else an `AccumulatedReference`.
         ground: Whether heights above the ground that were not recorded, also of boxes, come from a `GroundModel` of
             what all sensors saw: within the window of the reference if it is accumulated, else at the instant.
+        corrections: How the recording is to be read other than its format says; what looks wrong about it, and which
+            correction would mend it, is what `doubts` says.
 
     Raises:
         FileNotFoundError: There is no such recording, or a part of it is missing.
@@ -66,12 +70,14 @@ class RecordedFrames(FrameDataset):
         rigs: Mapping[str, Sequence[str]] | None = None,
         reference: Reference | None = None,
         ground: bool = True,
+        corrections: Corrections = Corrections(),  # noqa: B008  (it is frozen)
     ) -> None:
         if isinstance(recording, str | os.PathLike):
             from torchcover.recordings.formats import open_recording  # all formats, for a path only
 
             recording = open_recording(recording)
-        self.recording = recording
+        self.recording = corrected(recording, corrections)
+        self.corrections = corrections
         self.sensors_of_rigs = {name: tuple(of) for name, of in (rigs or self.recording.rigs).items()}
         self._check_sensors()
         if reference is None:
@@ -82,6 +88,10 @@ class RecordedFrames(FrameDataset):
         self._sweeps = self.reference.sweeps if isinstance(self.reference, AccumulatedReference) else Sweeps(0.0)
         self._has_heights: bool | None = None
         self._modelled = False
+
+    def leave_out_bad_sweeps(self) -> None:
+        """A scan that cannot be read costs its own frame, and not all whose window it is in; those count it."""
+        self._sweeps.skip_bad = True
 
     @property
     def names(self) -> Sequence[str]:
@@ -127,7 +137,7 @@ class RecordedFrames(FrameDataset):
             break
         return bool(self._has_heights)
 
-    def doubts(self, steps: int | None) -> Sequence[str]:
+    def doubts(self, steps: int | None = None) -> Sequence[str]:
         """As `torchcover.recordings.suspicion` says."""
         from torchcover.recordings.suspicion import suspicions  # only before a measurement
 
@@ -154,6 +164,9 @@ class RecordedFrames(FrameDataset):
     def reference_record(self) -> Mapping[str, object]:
         """Where the reference comes from, and the ground, if it was looked for to choose what bands are over."""
         record = self.reference.record(self.recording, self._judged)
+        if self.corrections.words:
+            notes = [*record["notes"], f"Read as asked: {self.corrections.words}."]  # type: ignore[misc]  # as below
+            record = {**record, "notes": notes}
         if self._has_heights is None or not self._modelled:
             return record
         words = SEEN_GROUND if self._has_heights else NO_GROUND
@@ -173,6 +186,7 @@ class RecordedFrames(FrameDataset):
             "sensors": self.sensors_of_rigs,
             "reference": [type(self.reference).__name__, reference],
             "ground": self.ground,
+            "corrections": self.corrections.words,
         }
 
     def __len__(self) -> int:
@@ -195,6 +209,9 @@ class RecordedFrames(FrameDataset):
             scans = {sensor: self._read(sensor, instant) for sensor in self._judged}
             reference = self.reference.cloud(self.recording, instant, self._judged)
             heights_m, boxes = self._above_ground(instant, reference, self.recording.boxes(instant))
+        except BadFrameError as error:
+            window = f"it is in the window of {name} (frame {position}); --skip-bad-frames leaves it out"
+            raise BadFrameError(f"{error}; {window}") from error
         except (OSError, ValueError) as error:
             raise BadFrameError(f"{name} (frame {position}): {error}") from error
         dropped = sum((scan.dropped for scan in scans.values()), Counter[str]())

@@ -8,13 +8,15 @@ import torch
 from numpy.typing import NDArray
 
 from torchcover.detection import Boxes, points_in_boxes
+from torchcover.files import RECORDING
 from torchcover.geometry import invert
 from torchcover.neighbors import nearest
 from torchcover.recordings.accumulated_reference import AccumulatedReference
+from torchcover.recordings.agreement import disagreement
 from torchcover.recordings.ground_model import GroundModel, low_surfaces
 from torchcover.recordings.in_vehicle import in_vehicle
 from torchcover.recordings.recorded_reference import RecordedReference, Reference
-from torchcover.recordings.recording import Recording
+from torchcover.recordings.recording import Recording, whole_recording
 
 # What is looked at, evenly spread over what will be measured.
 FRAMES, POSES = 5, 64
@@ -32,6 +34,8 @@ BOX_POINTS, FULLER, BOXES, MORE, MOST_BOXES = 5, 5, 5, 4, 0.6
 # Steps that say where the vehicle goes; in a bend it points elsewhere by far less than this.
 STEP_M, WAY_M, SIDEWAYS_DEG, MOST_OF_WAY = (0.05, 20.0), 5.0, (45.0, 135.0), 0.8
 FASTEST_MPS = 100.0
+# Half of the points of a LiDAR are nearer, in metres; and in centimetres.
+FARTHEST_USUAL_M, FARTHEST_USUAL_CM = 300.0, 4000.0
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,8 @@ def suspicions(recording: Recording, reference: Reference, rigs: Mapping[str, Se
         many: How many of its frames will be measured, from the first on.
     """
     judged = dict.fromkeys(sensor for of in rigs.values() for sensor in of)
+    if many and (doubt := wrong_units(recording, next(iter(judged)))) is not None:
+        return [f"{recording.path}: {doubt}"]
     recorded = recording.reference_sensors if isinstance(reference, RecordedReference) else ()
     sensors = tuple(dict.fromkeys((*judged, *recorded)))
     looks = [
@@ -61,6 +67,8 @@ def suspicions(recording: Recording, reference: Reference, rigs: Mapping[str, Se
         for position in _spread(many, FRAMES)
         if (look := _look(recording, sensors, recording.frames[position])) is not None
     ]
+    widest = max(judged, key=lambda sensor: sum(len(look.clouds[sensor]) for look in looks))
+    disagreeing = disagreement(recording, widest, many)
     doubts = [
         ground_is_elsewhere({sensor: [look.clouds[sensor] for look in looks] for sensor in sensors}),
         *(mirrored(sensor, [(look.clouds[sensor], look.boxes) for look in looks]) for sensor in sensors),
@@ -68,10 +76,47 @@ def suspicions(recording: Recording, reference: Reference, rigs: Mapping[str, Se
             same_clouds(rig, [(_joined(look, of), _joined(look, recorded)) for look in looks])
             for rig, of in rigs.items()
         ),
-        *wrong_motion(recording),
+        *(wrong_motion(recording) if disagreeing is None else [disagreeing]),
+        nothing_labelled(recording, many),
+        unmarked(recording),
         alone_in_window(recording, reference) if isinstance(reference, AccumulatedReference) else None,
     ]
     return [f"{recording.path}: {doubt}" for doubt in doubts if doubt is not None]
+
+
+def wrong_units(recording: Recording, sensor: str) -> str | None:
+    """Whether coordinates are too large for metres."""
+    try:
+        range_m = np.linalg.norm(recording.scan(sensor, recording.frames[0]).points_m, axis=1)
+    except (OSError, ValueError, IndexError):
+        return None
+    usual_m = float(np.median(np.append(range_m[np.isfinite(range_m)], 0.0)))
+    if usual_m < FARTHEST_USUAL_M:
+        return None
+    unit = "mm" if usual_m > FARTHEST_USUAL_CM else "cm"
+    return f"half of the points of {sensor} are beyond {usual_m:,.0f} m: is it {unit}? (--units {unit})"
+
+
+def nothing_labelled(recording: Recording, many: int) -> str | None:
+    """Whether a recording with labels has none in any frame; of one that says that it is whole, that is so."""
+    try:
+        labelled = [recording.boxes(recording.frames[position]) for position in _spread(many, POSES)]
+    except (OSError, ValueError):
+        return None
+    if not labelled or any(boxes is None or len(boxes) for boxes in labelled) or _is_whole(recording):
+        return None
+    return f"it has labels, and none in {len(labelled)} frames: do their names and times fit those of its clouds?"
+
+
+def unmarked(recording: Recording) -> str | None:
+    """Whether it is one of torchcover's, whose frames have instants, that does not say that it is whole."""
+    if recording.instants is None or _is_whole(recording):
+        return None
+    return f"torchcover wrote it, and it has no {RECORDING}: is it whole, with its {len(recording.names):,} frames?"
+
+
+def _is_whole(recording: Recording) -> bool:
+    return recording.path.is_dir() and whole_recording(recording.path) is not None
 
 
 def ground_is_elsewhere(clouds: Mapping[str, Sequence[NDArray[np.float32]]]) -> str | None:

@@ -10,11 +10,12 @@ import torch
 from numpy.typing import NDArray
 
 from torchcover.detection import Boxes, points_in_boxes
+from torchcover.frames.source import BadFrameError
 from torchcover.geometry import invert, rigid, rotation_from_euler, transform
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.ground_model import GroundModel, low_surfaces
 from torchcover.recordings.in_vehicle import in_vehicle
-from torchcover.recordings.recording import Recording
+from torchcover.recordings.recording import Recording, Scan
 from torchcover.recordings.seen_past import Key, RangeImage, Votes
 
 # Voxels are numbered with so many bits an axis: 200 km at 0.1 m.
@@ -72,9 +73,13 @@ class Sweeps:
     Args:
         window_s: Time between the first scan and the last, half of it before the instant; 0: of the instant alone.
         voxel_m: Side of a voxel in metres.
+
+    Attributes:
+        skip_bad: Whether a scan that cannot be read is one without points, counted, and not an error.
     """
 
     def __init__(self, window_s: float = 2.0, voxel_m: float = 0.1) -> None:
+        self.skip_bad = False
         self.window_s = window_s
         self.voxel_m = voxel_m
         self._forget()
@@ -86,7 +91,7 @@ class Sweeps:
         self._ground: tuple[int, GroundModel | None] | None = None
 
     def __getstate__(self) -> dict[str, object]:
-        return {"window_s": self.window_s, "voxel_m": self.voxel_m}
+        return {name: value for name, value in vars(self).items() if not name.startswith("_")}
 
     def __setstate__(self, state: dict[str, object]) -> None:
         vars(self).update(state)
@@ -156,10 +161,16 @@ class Sweeps:
         key = (sensor, index)
         if key in self._kept:
             return self._kept[key]
-        stored = recording.scan(sensor, index)
-        scan = in_vehicle(stored, recording.body)
+        try:
+            stored = recording.scan(sensor, index)
+            scan, boxes = in_vehicle(stored, recording.body), recording.boxes(index)
+        except (OSError, ValueError) as error:
+            if not self.skip_bad:
+                raise BadFrameError(f"{recording.names[index]}: {error}") from error
+            stored, boxes = Scan(np.empty((0, 3)), None, ""), None
+            scan = in_vehicle(stored)
+            scan.dropped["sweeps_skipped"] = 1
         points_m = scan.points_m.astype(np.float64)
-        boxes = recording.boxes(index)
         in_box = np.zeros(len(points_m), dtype=bool)
         of_box, unnamed = {}, 0
         if boxes is not None:

@@ -16,13 +16,13 @@ from .rays import into_tiles as into_tiles
 from .recorded_returns import LidarCalibration as LidarCalibration
 from .recorded_returns import calibrate as calibrate
 from .recorded_rig import rig_document as rig_document
-from .reference_sensor import Areas as Areas
 from .reference_sensor import ReferenceScan as ReferenceScan
 from .reference_sensor import ReferenceSensor as ReferenceSensor
 from .reference_sensor import Surroundings as Surroundings
 from .reference_sensor import position_in_shell as position_in_shell
 from .regions_of_interest import GRID_X_M as GRID_X_M
 from .regions_of_interest import GRID_Y_M as GRID_Y_M
+from .regions_of_interest import Areas as Areas
 from .regions_of_interest import Asked as Asked
 from .regions_of_interest import RegionsOfInterest as RegionsOfInterest
 from .rig import Rig as Rig

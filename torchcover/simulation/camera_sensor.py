@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchcover.cameras import Camera
 from torchcover.geometry import rigid
+from torchcover.geometry.arrays import Float64
 from torchcover.simulation.documents import Document, Pose
 from torchcover.simulation.sensor import Ranging, ScanTimes
 
@@ -98,8 +99,7 @@ class CameraSensor(Ranging):
             focal_px = float(self.camera().intrinsics[0])
             per_m2 = self.stereo.subpixel_px / (focal_px * self.stereo.baseline_m)
             squared = squared + (per_m2 * range_m**2) ** 2
-        noise_m: NDArray[np.floating] = np.sqrt(squared)
-        return noise_m
+        return np.asarray(np.sqrt(squared))
 
     @property
     def counts_as(self) -> int:
@@ -154,19 +154,19 @@ class CameraSensor(Ranging):
             name=self.name,
         )
 
-    def directions(self) -> NDArray[np.float64]:
+    def directions(self) -> Float64:
         """(3, rows, columns) unit directions in the frame of the mount; NaN where a pixel has no ray."""
         rows, columns = (torch.arange(0, size, self.stride, dtype=torch.float64) for size in (self.height, self.width))
         return self._directions(torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=2))
 
-    def times_s(self) -> NDArray[np.float64] | None:
+    def times_s(self) -> Float64 | None:
         """(rows, columns) when each ray is cast, after the time of the frame; None if all are at that time."""
         if self.scan is None:
             return None
         of_rows_s = self.scan.times_s(self.height)[:: self.stride]
         return np.repeat(of_rows_s[:, None], -(-self.width // self.stride), axis=1)
 
-    def _directions(self, pixels: Tensor) -> NDArray[np.float64]:
+    def _directions(self, pixels: Tensor) -> Float64:
         """(3, rows, columns) of (rows, columns, 2) pixels."""
         camera = self.camera()
         # Only the pixels that are used, and not all at once: the solver needs many times their memory.

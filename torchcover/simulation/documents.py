@@ -9,7 +9,6 @@ from reprlib import Repr
 from typing import Annotated, Any, ClassVar, Self, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -25,6 +24,7 @@ from pydantic_core import ErrorDetails
 
 from torchcover.files import BadFileError, parse_yaml, read_short_text, reads
 from torchcover.geometry import rigid, rotation_from_euler, rotation_from_quaternion
+from torchcover.geometry.arrays import Float64
 from torchcover.simulation.builtin import builtin_folder, builtin_names
 
 # Mistakes of one document that a message tells, and characters of what arrived.
@@ -113,7 +113,7 @@ class Pose(Document):
             rotation_from_quaternion(self.quaternion_wxyz)
         return self
 
-    def matrix(self) -> NDArray[np.float64]:
+    def matrix(self) -> Float64:
         """The (4, 4) transform."""
         if self.quaternion_wxyz is not None:
             rotation = rotation_from_quaternion(self.quaternion_wxyz)

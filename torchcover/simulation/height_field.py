@@ -3,13 +3,11 @@
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchcover.geometry import HeightField
+from torchcover.geometry.arrays import Bools, Float64
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.scenery import ground
-
-Numbers = NDArray[np.float64]
 
 CELL_M = 5.0
 # Beyond what may be seen, so that nobody looks past its end.
@@ -20,7 +18,7 @@ MAX_CORNERS = 4_000_000
 class Ground(Protocol):
     """Has a height everywhere."""
 
-    def heights_m(self, places_m: Numbers) -> Numbers:
+    def heights_m(self, places_m: Float64) -> Float64:
         """(N,) at (N, 2) places."""
 
     def mesh(self) -> Mesh:
@@ -31,10 +29,10 @@ class Plain(NamedTuple):
     """Ground of one height between two corners, (2,) each."""
 
     height_m: float
-    lower_m: Numbers
-    upper_m: Numbers
+    lower_m: Float64
+    upper_m: Float64
 
-    def heights_m(self, places_m: Numbers) -> Numbers:
+    def heights_m(self, places_m: Float64) -> Float64:
         """(N,) at (N, 2) places."""
         return np.full(len(places_m), self.height_m)
 
@@ -47,17 +45,15 @@ class Plain(NamedTuple):
 class Slopes(NamedTuple):
     """Ground with a height at each corner of a raster; two triangles are between four of them.
 
-    Args:
-        lower_m: (2,) the first corner.
-        corners_m: (rows, columns) heights, rows along y.
-        wanted: (rows - 1, columns - 1) which squares rays may hit.
+    `lower_m` (2,) is the first corner; `corners_m` (rows, columns) are heights, rows along y; `wanted` (rows - 1,
+    columns - 1) which squares rays may hit.
     """
 
-    lower_m: Numbers
-    corners_m: Numbers
-    wanted: NDArray[np.bool_]
+    lower_m: Float64
+    corners_m: Float64
+    wanted: Bools
 
-    def heights_m(self, places_m: Numbers) -> Numbers:
+    def heights_m(self, places_m: Float64) -> Float64:
         """(N,) at (N, 2) places."""
         return HeightField(self.lower_m, self.corners_m, CELL_M).heights_m(places_m)
 
@@ -73,7 +69,7 @@ class Slopes(NamedTuple):
         return Mesh(np.column_stack([places_m, self.corners_m.reshape(-1)[used]]), faces.reshape(-1, 3)).made_of("road")
 
 
-def corners_of(lower_m: Numbers, upper_m: Numbers) -> tuple[int, int]:
+def corners_of(lower_m: Float64, upper_m: Float64) -> tuple[int, int]:
     """Rows and columns of the corners of a raster between two of them.
 
     Raises:
@@ -88,6 +84,6 @@ def corners_of(lower_m: Numbers, upper_m: Numbers) -> tuple[int, int]:
     return rows, columns
 
 
-def middles_m(lower_m: Numbers, rows: int, columns: int) -> Numbers:
+def middles_m(lower_m: Float64, rows: int, columns: int) -> Float64:
     """(squares, 2) the middles of the squares of a raster, row after row."""
     return lower_m + CELL_M * (np.indices((rows - 1, columns - 1))[::-1].reshape(2, -1).T + 0.5)

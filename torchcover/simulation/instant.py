@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.geometry import transform
+from torchcover.geometry.arrays import Bools, Float32, Float64, Int32, Int64
+from torchcover.geometry.rigid import Matrix
 from torchcover.simulation.local_ground import LocalGround
 from torchcover.simulation.moving import Moving
 from torchcover.simulation.raycaster import Hits, RayCaster, Struck, cast_from
@@ -25,8 +27,6 @@ BURIED_SHARE = 0.25
 # Seen from farther than this many radii, fewer of those directions than that share point at a ball.
 CLEAR_RADII = 2.0
 
-Matrix = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 
 # Sweeps begin and end at whole ones of these.
 WHOLE_S = 0.005
@@ -46,7 +46,7 @@ class SensorScan(NamedTuple):
     """
 
     points: Float32
-    ray: NDArray[np.int64]
+    ray: Int64
     range_m: Float32
     rays: int
     self_hits: int
@@ -57,7 +57,7 @@ class SensorScan(NamedTuple):
     ways: Callable[[], Float32] | None = None
     rays_spared: int = 0
 
-    def some(self, which: NDArray[np.int64]) -> "SensorScan":
+    def some(self, which: Int64) -> "SensorScan":
         """Some of its points."""
         names = ("points", "ray", "range_m", "landed")
         given = {name: value[which] for name in names if (value := getattr(self, name)) is not None}
@@ -66,17 +66,11 @@ class SensorScan(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Instant:
-    """A scene at one time. Its bodies are numbered: what never moves, then what moves.
+    """A scene at one time. Its bodies are numbered: what never moves, then what moves and is near.
 
-    Args:
-        static: What never moves.
-        static_T_vehicle: From the vehicle frame to that of what never moves.
-        moving: The bodies that move and are near.
-        ego: Number of the ego.
-        out_of_range: How many bodies that move are not near, or not there.
-        ground: What one drives or walks on; none if not given.
-        world_T_vehicle: (4, 4) where the vehicle is in the frame that the ground is given in.
-        motion: Where everything is from a time before this one to another.
+    `out_of_range` says how many others that move are not near, or not there; `ground` what one drives or walks on,
+    `world_T_vehicle` where the vehicle is in its frame, and `motion` where everything is from a time before this one to
+    another.
     """
 
     static: RayCaster
@@ -93,16 +87,11 @@ class Instant:
         """(N,) heights above the local ground of (N, 3) points of the vehicle frame; see `LocalGround.heights_m`."""
         return self.ground.heights_m(points_m, self.world_T_vehicle)
 
-    def first_faces(self, points_m: Float32, normals: Float32, within_m: float) -> NDArray[np.int64]:
-        """Which face that never moves lies at each of some points of such faces, or above it.
+    def first_faces(self, points_m: Float32, normals: Float32, within_m: float) -> Int64:
+        """Which face that never moves lies at (N, 3) points of such faces, or above them: (N,) numbers, -1 for none.
 
-        Args:
-            points_m: (N, 3) in the vehicle frame.
-            normals: (N, 3) of length one, on the side that is looked at.
-            within_m: How far above at most.
-
-        Returns:
-            (N,) numbers of the faces, as `RayCaster.faces_met` counts them, -1 for none.
+        It is within so much above, towards the (N, 3) `normals` of length one, and counted as `RayCaster.faces_met`
+        does.
         """
         starts_m = transform(self.static_T_vehicle, points_m + np.float32(within_m) * normals)
         towards = -(normals @ self.static_T_vehicle[:3, :3].T)
@@ -121,18 +110,9 @@ class Instant:
     ) -> SensorScan:
         """Cast the rays of one sensor. The ego occludes, but its own points are left out unless they are wanted.
 
-        Args:
-            vehicle_T_sensor: (4, 4) pose of the sensor.
-            tiles: Its rays, from `into_tiles`.
-            max_range_m: Farther hits give no point.
-            own_m: Of a sensor that is fixed to the ego: where the ego's body ends the rays of each tile, from
-                `Scene.own_m`. They are not cast at it again. The result is the same.
-            ego_points: Whether hits on the ego give points too.
-            times: When the rays of each tile are cast; all at once if not given.
-            threads: Number of threads; the result does not depend on it.
-
-        Returns:
-            A `SensorScan`, the points in the order of the tiles.
+        Points are in the order of `tiles`, its rays from `into_tiles`, whatever the number of threads. `own_m` is where
+        the ego's body, which is not cast at again then, ends the rays of each tile, from `Scene.own_m`; `times` when
+        the rays of each tile are cast, all at once if not given.
         """
         origin_m = vehicle_T_sensor[:3, 3]
         sweep = self._sweep(times) if times else None
@@ -185,9 +165,8 @@ class Instant:
             landed=np.concatenate(landed) if any(map(operator.is_not, landed, points)) else None,
         )
 
-    def _seen(self, hits: Hits, ego_points: bool) -> NDArray[np.bool_]:
-        seen: NDArray[np.bool_] = (hits.body >= 0) & (ego_points | (hits.body != self.ego))
-        return seen
+    def _seen(self, hits: Hits, ego_points: bool) -> Bools:
+        return np.asarray((hits.body >= 0) & (ego_points | (hits.body != self.ego)))
 
     def _sweep(self, times: Sequence[RayTimes]) -> Sweep | None:
         """How everything moves meanwhile; for sensors that take as long it is the same."""
@@ -199,7 +178,7 @@ class Instant:
             self._sweeps[ends_s] = Sweep.of(self.static, now, self.moving, *self.motion(*ends_s))
         return self._sweeps[ends_s]
 
-    def struck(self, body: NDArray[np.int32], triangle: NDArray[np.int32], directions: Float32) -> Struck:
+    def struck(self, body: Int32, triangle: Int32, directions: Float32) -> Struck:
         """What the rays hit that ended on some faces, as `RayCaster.struck`; directions in the vehicle frame."""
         moved = np.flatnonzero(body >= self.static.bodies)
         # What moves is looked up as any face of what does not, and then put right.
@@ -212,18 +191,10 @@ class Instant:
             found.cos_incidence[moved], found.material[moved] = others.cos_incidence, others.material
         return found._replace(body=body, triangle=triangle)
 
-    def range_image(
-        self, vehicle_T_sensor: Matrix, directions: NDArray[np.float64], *, max_range_m: float = np.inf
-    ) -> Float32:
-        """Distance along the ray of every pixel, the ego's body included.
+    def range_image(self, vehicle_T_sensor: Matrix, directions: Float64, *, max_range_m: float = np.inf) -> Float32:
+        """(rows, columns) metres along (3, rows, columns) directions to what they hit, the ego's body included.
 
-        Args:
-            vehicle_T_sensor: (4, 4) pose of the frame of the directions.
-            directions: (3, rows, columns) unit directions; NaN for a pixel that has no ray.
-            max_range_m: Hits farther than this are none.
-
-        Returns:
-            (rows, columns) metres; infinite where a ray hits nothing, NaN where there is none.
+        Infinite where a ray hits nothing within the range, NaN where there is no ray.
         """
         image = np.full(directions.shape[1:], np.nan, dtype=np.float32)
         bodies = self.outlines(vehicle_T_sensor[:3, 3])
@@ -270,17 +241,10 @@ class Instant:
         bodies: Outlines,
         own_m: Float32 | None = None,
     ) -> tuple[Float32, Hits, int]:
-        """Cast the rays of one tile.
+        """Cast n rays of a tile: (3, n) directions in the vehicle frame, hits, and how many were cast at what moves.
 
-        Args:
-            vehicle_T_sensor: (4, 4) pose of the sensor.
-            tile: n of its rays.
-            limit_m: (n,) distance at which each of them ends; finite.
-            bodies: The bodies that move as they look from there, from `outlines`.
-            own_m: (n,) where the ego's body ends them, if that is known.
-
-        Returns:
-            (3, n) directions in the vehicle frame, their hits, and how many rays were cast at bodies that move.
+        Each ends at its (n,) `limit_m`, which is finite, and at (n,) `own_m`, the ego's body, if that is known;
+        `bodies` are those that move as they look from the sensor, from `outlines`.
         """
         origin_m, vehicle_R_sensor = vehicle_T_sensor[:3, 3], vehicle_T_sensor[:3, :3]
         directions = rotate(vehicle_R_sensor, tile.directions)
@@ -319,7 +283,7 @@ class _TileScan(NamedTuple):
 
     points: Float32
     landed: Float32
-    seen: NDArray[np.bool_]
+    seen: Bools
     range_m: Float32
     directions: Float32
     hits: Hits
@@ -330,7 +294,7 @@ def _limit(tile: Tile, max_range_m: float) -> Float32:
     return np.full(tile.directions.shape[1], min(max_range_m, np.finfo(np.float32).max), dtype=np.float32)
 
 
-def _points(origin_m: Float32, directions: Float32, range_m: Float32, seen: NDArray[np.bool_]) -> Float32:
+def _points(origin_m: Float32, directions: Float32, range_m: Float32, seen: Bools) -> Float32:
     """(K, 3) where the rays that saw something ended, which start at a (3,) place or at (3, n) of their own."""
     points = np.empty((np.count_nonzero(seen), 3), dtype=np.float32)
     for axis in range(3):

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat, ValidationInfo, model_validator
 
+from torchcover.geometry.arrays import Float32, Float64
 from torchcover.simulation.documents import BuiltIn, Pose, beside, is_file_name
 from torchcover.simulation.material import material_number, materials, tone
 from torchcover.simulation.rays import unit_directions
@@ -86,7 +87,7 @@ class ScanPattern(Ranging):
         if weather.road == "wet":
             material = np.where(material == material_number("road"), material_number("wet_road"), material)
         known = materials()
-        reach_m: float | NDArray[np.float32] = range_at_10_percent_m
+        reach_m: float | Float32 = range_at_10_percent_m
         if self.range_factors is not None:
             of_rows_m = range_at_10_percent_m * np.array(self.range_factors, dtype=np.float32)
             reach_m = of_rows_m[hits.pixel // self.columns]
@@ -106,7 +107,7 @@ class ScanPattern(Ranging):
         """How many rays there are: rows times columns."""
         return (self.channels or len(self.elevations_deg or ())) * self.columns
 
-    def rows_deg(self) -> NDArray[np.float64]:
+    def rows_deg(self) -> Float64:
         """(rows,) elevation of each row."""
         if self.elevations_deg is not None:
             return np.array(self.elevations_deg)
@@ -114,12 +115,12 @@ class ScanPattern(Ranging):
         assert self.vertical_fov_deg is not None
         return np.linspace(*self.vertical_fov_deg, self.channels)
 
-    def times_s(self) -> NDArray[np.float64] | None:
+    def times_s(self) -> Float64 | None:
         """(rows, columns) when each ray is cast, after the time of the frame; None if all are at that time."""
         rows = len(self.rows_deg())
         return None if self.scan is None else np.tile(self.scan.times_s(self.columns), (rows, 1))
 
-    def directions(self) -> NDArray[np.float64]:
+    def directions(self) -> Float64:
         """(3, rows, columns) unit directions in the LiDAR's frame."""
         middle = (np.arange(self.columns) + 0.5) / self.columns - 0.5
         offsets = np.zeros(len(self.rows_deg())) if self.azimuth_offsets_deg is None else self.azimuth_offsets_deg

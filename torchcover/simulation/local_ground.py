@@ -9,14 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.geometry import transform
+from torchcover.geometry.arrays import Bools, Float32, Float64, Int64
 from torchcover.simulation.patches import connected, edges_of, outward_faces
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.shapes import Mesh, parts_of
-
-Bools = NDArray[np.bool_]
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Numbers = NDArray[np.int64]
 
 # Nothing steeper is driven or walked on.
 STEEPEST_DEG = 45.0
@@ -107,7 +103,7 @@ def ground_under(meshes: Sequence[Mesh], places_m: Float64) -> list[Bools]:
     return level
 
 
-def _stood_on(caster: RayCaster, places_m: Float64, is_sheet: Bools) -> Numbers:
+def _stood_on(caster: RayCaster, places_m: Float64, is_sheet: Bools) -> Int64:
     """Numbers of the bodies that places stand on; if none is near, of those far below, or of sheets above them."""
     near = _met(caster, places_m, NEAR_M)
     if (near >= 0).any():
@@ -121,7 +117,7 @@ def _stood_on(caster: RayCaster, places_m: Float64, is_sheet: Bools) -> Numbers:
     return np.empty(0, dtype=np.int64)
 
 
-def _probes_m(corners_m: Float64, border: Numbers) -> Float64:
+def _probes_m(corners_m: Float64, border: Int64) -> Float64:
     """(edges x 3, 3) places a little beyond some edges, which are counted through all faces."""
     face, side = np.divmod(border, 3)
     start_m, end_m, apex_m = (corners_m[face, (side + k) % 3] for k in range(3))
@@ -131,11 +127,10 @@ def _probes_m(corners_m: Float64, border: Numbers) -> Float64:
     across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), np.finfo(np.float64).tiny)
     probes_m = start_m[:, None] + PROBES[:, None] * (end_m - start_m)[:, None]
     probes_m[..., :2] += BEYOND_M * across[:, None]
-    probes: Float64 = probes_m.reshape(-1, 3)
-    return probes
+    return np.asarray(probes_m.reshape(-1, 3))
 
 
-def _met(caster: RayCaster, places_m: Float64, near_m: float) -> Numbers:
+def _met(caster: RayCaster, places_m: Float64, near_m: float) -> Int64:
     """(N,) number of the highest body no farther above or below each place than this, -1 for none."""
     starts_m = (places_m + np.array([0.0, 0.0, near_m])).astype(np.float32)
     limit_m = np.full(len(starts_m), 2 * near_m, dtype=np.float32)
@@ -151,11 +146,8 @@ def _vertical(count: int, up: float) -> Float32:
 class LocalGround:
     """The ground below each place: the highest surface of it at or below the place, a few centimetres above included.
 
-    Heights are measured along the world's vertical, not along the z axis of a vehicle that pitches.
-
-    Args:
-        meshes: What is ground, and no other face, in the world frame; none at all where there is no ground.
-        origin_m: (3,) what is subtracted of world coordinates, in float64: they become float32.
+    Heights are measured along the world's vertical, not along the z axis of a vehicle that pitches. Meshes are of
+    ground alone, in the world frame; `origin_m` (3,) is subtracted in float64: coordinates become float32.
 
     Example:
         >>> from torchcover.simulation.shapes import Plane
@@ -174,14 +166,10 @@ class LocalGround:
         return sum(len(mesh.faces) for mesh in self._meshes)
 
     def heights_m(self, points_m: NDArray[np.floating], world_T_points: Float64 | None = None) -> Float32:
-        """How high above the ground points are.
+        """(N,) how high above the ground (N, 3) points are, in metres; NaN where there is none at or below.
 
-        Args:
-            points_m: (N, 3) points.
-            world_T_points: (4, 4) where their frame lies in the world; they are in its own frame if not given.
-
-        Returns:
-            (N,) metres, not less than -0.05, 0 where rounding alone tells; NaN where there is no ground at or below.
+        Not less than -0.05, and 0 where rounding alone tells. `world_T_points` is where their frame lies in the world;
+        they are in its own frame if it is not given.
         """
         places_m = self._local(points_m, world_T_points)
         places_m[:, 2] += TOLERANCE_M
@@ -269,11 +257,7 @@ class GroundSquares(NamedTuple):
         return cls(first_m, square_m, levels)
 
     def between_m(self, lower_m: NDArray[np.floating], upper_m: NDArray[np.floating]) -> tuple[Float32, Float32]:
-        """The lowest and the highest ground anywhere in N upright rectangles between (2, N) corners.
-
-        Returns:
-            (N,) and (N,); infinite and minus infinite where there is none.
-        """
+        """(N,) lowest and (N,) highest ground in rectangles between (2, N) corners; inf, -inf where there is none."""
         if math.isinf(self.square_m):
             lowest_m, highest_m = (np.full(lower_m.shape[1], bound) for bound in self.levels[0].ravel())
             return lowest_m, highest_m
@@ -297,13 +281,10 @@ class GroundSquares(NamedTuple):
         return lowest_m, highest_m
 
     def heights_m(self, triangles_m: NDArray[np.floating]) -> Float32:
-        """(2, N) between which heights above the ground all points of triangles lie that have ground below them.
+        """(2, N) between which heights above ground points of (3, 3, N) triangles lie that have ground below them.
 
-        Args:
-            triangles_m: (3, 3, N) corners, coordinates, triangles, in the frame of the squares.
-
-        Returns:
-            The lowest and the highest; infinite and minus infinite where there is no ground.
+        Triangles are corners, coordinates, triangles, in the frame of the squares; inf and -inf where there is no
+        ground.
         """
         lower_m, upper_m = triangles_m.min(axis=0), triangles_m.max(axis=0)
         lowest_m, highest_m = self.between_m(lower_m[:2], upper_m[:2])
@@ -312,11 +293,10 @@ class GroundSquares(NamedTuple):
 
 def height_bounds(low_m: Float64, high_m: Float64) -> Float32:
     """(2, N) bounds of heights that float32 does not break; none is less than what counts as the ground below."""
-    bounds_m: Float32 = np.stack([np.maximum(low_m, -TOLERANCE_M) - SLACK_M, high_m + SLACK_M]).astype(np.float32)
-    return bounds_m
+    return np.asarray(np.stack([np.maximum(low_m, -TOLERANCE_M) - SLACK_M, high_m + SLACK_M]).astype(np.float32))
 
 
-def _squares_of(first: Numbers, count: Numbers, at_once: int = 2_000_000) -> list[tuple[Numbers, Numbers, Numbers]]:
+def _squares_of(first: Int64, count: Int64, at_once: int = 2_000_000) -> list[tuple[Int64, Int64, Int64]]:
     """Pairs of a triangle and a square: (K,) triangles, columns and rows, a few million at a time."""
     total = count.prod(axis=0)
     found = []

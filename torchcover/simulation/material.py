@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, NonNegativeFloat
 
+from torchcover.geometry.arrays import Float32
 from torchcover.simulation.builtin import builtin_names
 from torchcover.simulation.documents import BuiltIn
 
@@ -63,17 +64,14 @@ class Material(BuiltIn):
 class Materials(NamedTuple):
     """What all materials are, by number: `reflectivity`, `exponent`, and `spread` of ln reflectivity by what varies."""
 
-    reflectivity: NDArray[np.float32]
-    exponent: NDArray[np.float32]
-    spread_of_places: NDArray[np.float32]
-    spread_of_bodies: NDArray[np.float32]
+    reflectivity: Float32
+    exponent: Float32
+    spread_of_places: Float32
+    spread_of_bodies: Float32
 
 
 def material_number(name: str) -> int:
-    """The number of a material, which meshes have in this process; 0 is where none was said.
-
-    Args:
-        name: Of a built-in material, or the path of a YAML file.
+    """The number of a material by name or YAML file, which meshes have in this process; 0 is where none was said.
 
     Raises:
         FileNotFoundError: There is none; the message lists those that there are.
@@ -107,7 +105,6 @@ def materials() -> Materials:
     return Materials._make(np.array(column, dtype=np.float32) for column in columns)
 
 
-def tone(body: NDArray[np.integer]) -> NDArray[np.float32]:
+def tone(body: NDArray[np.integer]) -> Float32:
     """(N,) by how many spreads each body is brighter than its material, by its number; 0 for what is no body, -1."""
-    tones: NDArray[np.float32] = TONES[body % len(TONES)]
-    return tones
+    return np.asarray(TONES[body % len(TONES)])

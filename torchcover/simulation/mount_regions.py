@@ -48,14 +48,10 @@ class Skin:
         return Skin, (self.mesh,)
 
     def seen_from(self, side: Side, across_m: tuple[float, float]) -> SkinPoint | None:
-        """Where a line along an axis first meets the body: exactly on the mesh, in float64.
+        """Where a line along an axis first meets the body, and the normal of that face; None if it meets nothing.
 
-        Args:
-            side: Where the line comes from.
-            across_m: Its coordinates on the two other axes, in the order x, y, z.
-
-        Returns:
-            The place, and the normal of the face that it lies on; None if the line meets nothing.
+        Exactly on the mesh, in float64. The line comes from the side, at `across_m` on the two other axes in the order
+        x, y, z.
 
         Example:
             >>> from torchcover.simulation.shapes import Box
@@ -139,12 +135,7 @@ class MountRegion(Document):
         return FACING_DEG[self.seen_from] if self.facing_deg is None else self.facing_deg
 
     def on(self, skin: Skin, u: float, v: float) -> SkinPoint:
-        """A place on the skin.
-
-        Args:
-            skin: Of the vehicle.
-            u: From 0 to 1 along the first of the window's axes in the order x, y, z: forward, or to the left.
-            v: From 0 to 1 along the second: to the left, or upwards.
+        """A place on the skin, `u` and `v` from 0 to 1 along the window's axes in the order x, y, z.
 
         Raises:
             ValueError: Nothing of the body is there.

@@ -7,9 +7,9 @@ from itertools import pairwise
 from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchcover.geometry import BoundingBox, invert
+from torchcover.geometry.arrays import Bools, Float32, Float64, Int32, Int64
 from torchcover.simulation.patches import Patches
 from torchcover.simulation.raycaster import Hits, RayCaster, Struck
 from torchcover.simulation.rays import (
@@ -24,19 +24,12 @@ from torchcover.simulation.rays import (
 )
 from torchcover.simulation.shapes import Mesh
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Numbers = NDArray[np.int64]
-
 
 class Solid:
     """The geometry of one kind of body in its own frame.
 
     `outline_m` (9, 3) has the corners of its box, grown a little, and the centre; no vertex is farther from that than
     `radius_m`, nor from the origin of the frame than `reach_m`.
-
-    Args:
-        mesh: Its form.
     """
 
     def __init__(self, mesh: Mesh) -> None:
@@ -80,34 +73,29 @@ class Meetings(NamedTuple):
     `triangle` (L,) says on which face of the body.
     """
 
-    part: Numbers
-    ray: Numbers
+    part: Int64
+    ray: Int64
     range_m: Float32
-    triangle: NDArray[np.int32]
+    triangle: Int32
 
 
 @dataclass(frozen=True, eq=False)
 class Moving:
-    """P bodies that move, placed at one instant.
+    """P bodies that move, placed at one instant: casters in their own frames, which one kind shares, and numbers.
 
-    Args:
-        casters: Of each, in its own frame; bodies of one kind share one.
-        vehicle_T_part: (P, 4, 4) where they are.
-        body: (P,) their numbers.
-        corners_m: (P, 8, 3) of the boxes around them in the vehicle frame.
-        centre_m: (P, 3) of balls around them, likewise.
-        radius_m: (P,) of these balls.
+    In the vehicle frame, `corners_m` (P, 8, 3) are of boxes around them; of balls around them `centre_m` is (P, 3),
+    `radius_m` (P,).
     """
 
     casters: Sequence[RayCaster]
     vehicle_T_part: Float64
-    body: Numbers
+    body: Int64
     corners_m: Float64
     centre_m: Float64
     radius_m: Float64
 
     @classmethod
-    def placed(cls, solids: Sequence[Solid], vehicle_T_part: Float64, body: Numbers) -> Self:
+    def placed(cls, solids: Sequence[Solid], vehicle_T_part: Float64, body: Int64) -> Self:
         """Bodies of these kinds, (P,), where they are, (P, 4, 4), with their numbers, (P,)."""
         outlines_m = np.array([solid.outline_m for solid in solids]).reshape(-1, 9, 3)
         outlines_m = outlines_m @ vehicle_T_part[:, :3, :3].swapaxes(1, 2) + vehicle_T_part[:, None, :3, 3]
@@ -129,15 +117,15 @@ class Moving:
         return invert(self.vehicle_T_part)
 
     @cached_property
-    def kinds(self) -> tuple[Sequence[RayCaster], Numbers]:
+    def kinds(self) -> tuple[Sequence[RayCaster], Int64]:
         """The different casters, and (P,) which of them each body has."""
         different = list(dict.fromkeys(self.casters))
         number = {caster: k for k, caster in enumerate(different)}
         return different, np.array([number[caster] for caster in self.casters], dtype=np.int64)
 
-    def touched_by(self, place_m: Float64, places_m: Float64) -> NDArray[np.bool_]:
+    def touched_by(self, place_m: Float64, places_m: Float64) -> Bools:
         """(P,) whether a (3,) place of the vehicle frame, `places_m` (P, 3) from there, lies on a face of each body."""
-        touched: NDArray[np.bool_] = np.linalg.norm(self.centre_m - place_m, axis=1) <= self.radius_m + SLACK_M
+        touched: Bools = np.linalg.norm(self.centre_m - place_m, axis=1) <= self.radius_m + SLACK_M
         for k in np.flatnonzero(touched).tolist():
             touched[k] = len(self.casters[k].touched(places_m[k])) > 0
         return touched
@@ -146,8 +134,7 @@ class Moving:
         """(P, 3) a (3,) place of the vehicle frame in the frame of each body, as `transform` has it."""
         rotation, translation = self.part_T_vehicle[:, :3, :3], self.part_T_vehicle[:, :3, 3:]
         back = rotation.swapaxes(1, 2)
-        place: Float64 = ((place_m + (back @ translation)[..., 0])[:, None] @ back)[:, 0]
-        return place
+        return np.asarray(((place_m + (back @ translation)[..., 0])[:, None] @ back)[:, 0])
 
     def pairs(
         self,
@@ -158,16 +145,11 @@ class Moving:
         bodies: Outlines,
         *,
         leaving_out: int | None = None,
-    ) -> tuple[Numbers, Numbers]:
-        """Which rays of one tile may meet which body before they end: (K,) bodies and (K,) rays.
+    ) -> tuple[Int64, Int64]:
+        """Which rays of a tile may meet which body before their (n,) limits: (K,) bodies and (K,) rays.
 
-        Args:
-            vehicle_R_sensor: (3, 3) rotation of the sensor.
-            tile: n of its rays.
-            directions: (3, n) the same in the vehicle frame.
-            limit_m: (n,) where they end.
-            bodies: These bodies as they look from there, from `outlines`.
-            leaving_out: Number of a body that they are not cast at.
+        `directions` (3, n) are those of the tile in the vehicle frame, `bodies` what they look like from there, from
+        `outlines`; `leaving_out` is the number of a body that they are not cast at.
         """
         near = boxes_in_cone(bodies, vehicle_R_sensor @ tile.axis, tile.half_angle, float(limit_m.max(initial=0.0)))
         if leaving_out is not None:
@@ -198,7 +180,7 @@ class Moving:
         met = hits.body >= 0
         return Meetings(part[met], ray[met], hits.range_m[met], hits.triangle[met]), len(met)
 
-    def struck(self, part: Numbers, triangle: NDArray[np.int32], directions: Float32) -> Struck:
+    def struck(self, part: Int64, triangle: Int32, directions: Float32) -> Struck:
         """What the rays hit that met some of the bodies, as `RayCaster.struck`."""
         towards = rotate_each(self.part_T_vehicle[:, :3, :3].astype(np.float32)[part], directions)
         casters, kind = self.kinds
@@ -211,7 +193,7 @@ class Moving:
 
     def cast_pairs(
         self,
-        part: Numbers,
+        part: Int64,
         starts_m: Float32,
         towards: Float32,
         limit_m: Float32,
@@ -219,13 +201,9 @@ class Moving:
     ) -> Hits:
         """Cast K pairs of a ray and a body, each as if it were alone.
 
-        Args:
-            part: (K,) the bodies.
-            starts_m: (K, 3) where the rays start, each in the frame of its body.
-            towards: (3, K) their directions, likewise.
-            limit_m: (K,) where they end.
-            common: If they start at one place: (3,) that, and (P, 3) the same in the frame of each body. It may lie on
-                a face.
+        Starts (K, 3) and directions (3, K) are in the frames of the (K,) bodies, `limit_m` (K,) is where rays end. If
+        they start at one place, which may lie on a face, `common` is that, (3,), and the same in the frame of each
+        body, (P, 3).
         """
         casters, kind = self.kinds
         touched = np.zeros(len(self), dtype=bool) if common is None else self.touched_by(*common)

@@ -6,26 +6,16 @@ from functools import lru_cache
 from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchcover.coverage.grid import BandFrame
 from torchcover.geometry import BoundingBox, rigid, rotation_from_euler
+from torchcover.geometry.arrays import Float64
 from torchcover.simulation.rays import Tile, into_tiles, unit_directions
-from torchcover.simulation.reference_sensor import (
-    DEFAULT_BAND_FRAME,
-    PAPER_BANDS_M,
-    Areas,
-    Bands,
-    ReferenceScan,
-    Surroundings,
-    check_reach,
-    position_in_shell,
-)
+from torchcover.simulation.reference_sensor import ReferenceScan, Surroundings, check_reach, position_in_shell
+from torchcover.simulation.regions_of_interest import Asked
 
 # Pitch and roll of the paper's sensor are uniform between minus this and this.
 MAX_TILT_DEG = 45.0
-
-Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -74,13 +64,7 @@ class PaperReference:
         check_reach(self.shell_m, self.max_range_m)
 
     @classmethod
-    def from_rays(
-        cls,
-        areas: Areas,
-        rays: int | None,
-        bands_m: Bands = PAPER_BANDS_M,
-        band_frame: BandFrame = DEFAULT_BAND_FRAME,
-    ) -> Self:
+    def from_rays(cls, asked: Asked, rays: int | None) -> Self:
         """The paper's 1024 x 1024 rays, or a square of about as many; it looks everywhere, whatever is asked about."""
         if rays is None:
             return cls()

@@ -6,15 +6,11 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.geometry.arrays import Bools, Float32, Float64, Int32, Int64
 from torchcover.simulation.rays import rotate
 from torchcover.simulation.shapes import Mesh
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 Int8 = NDArray[np.int8]
-Int32 = NDArray[np.int32]
-Int64 = NDArray[np.int64]
 
 # No edge of a patch is longer,
 LONGEST_M = 4.0
@@ -28,7 +24,7 @@ SURE_M2 = 1e-4
 VOLUME_ROUNDING = 1e-9
 
 
-def outward_faces(mesh: Mesh) -> NDArray[np.bool_]:
+def outward_faces(mesh: Mesh) -> Bools:
     """(F,) whether each face belongs to a closed surface that is turned outwards: nobody outside sees its back.
 
     Faces that share an edge belong to one surface. It is closed if every edge is run through as often one way as the
@@ -64,8 +60,7 @@ def outward_by(mesh: Mesh, edge: Int64, way: Int8, surface: Int64) -> Bools:
         volumes[part] = (first * np.cross(second, third, axis=0)).sum(axis=0)
     volume = np.bincount(surface, weights=volumes, minlength=len(mesh.faces))
     rounding = VOLUME_ROUNDING * np.bincount(surface, weights=np.abs(volumes), minlength=len(mesh.faces))
-    outward: NDArray[np.bool_] = ((open_edges == 0) & (volume >= -rounding))[surface]
-    return outward
+    return np.asarray(((open_edges == 0) & (volume >= -rounding))[surface])
 
 
 def edges_of(mesh: Mesh) -> tuple[Int64, Int8]:
@@ -87,7 +82,7 @@ def edges_of(mesh: Mesh) -> tuple[Int64, Int8]:
     return edge, way
 
 
-def _welded(vertices_m: NDArray[np.float64]) -> Int64:
+def _welded(vertices_m: Float64) -> Int64:
     """(V,) number of the place of each vertex; `np.unique` along an axis takes five times as long."""
     order = np.lexsort(vertices_m.T)
     differs = (np.diff(vertices_m[order], axis=0) != 0).any(axis=1)
@@ -198,7 +193,7 @@ class Patches(NamedTuple):
         parts = [Patches(none, none, none, np.empty(0, dtype=bool), nobodys, none[:rows], no_face), *parts]
         return cls._make(np.concatenate(column, axis=-1) for column in zip(*parts, strict=True))
 
-    def taken(self, numbers: NDArray[np.int64]) -> Self:
+    def taken(self, numbers: Int64) -> Self:
         """Some of them."""
         return type(self)._make(column.take(numbers, axis=-1) for column in self)
 
@@ -218,21 +213,18 @@ class Patches(NamedTuple):
     @property
     def lower_m(self) -> Float32:
         """(3, N) smallest coordinates."""
-        lower: Float32 = self.corner_m + np.minimum(np.minimum(self.first_m, self.second_m), 0)
-        return lower
+        return np.asarray(self.corner_m + np.minimum(np.minimum(self.first_m, self.second_m), 0))
 
     @property
     def upper_m(self) -> Float32:
         """(3, N) largest coordinates."""
-        upper: Float32 = self.corner_m + np.maximum(np.maximum(self.first_m, self.second_m), 0)
-        return upper
+        return np.asarray(self.corner_m + np.maximum(np.maximum(self.first_m, self.second_m), 0))
 
     @property
     def normals_m2(self) -> Float32:
         """(3, N) normals, as long as twice the area."""
         (ax, ay, az), (bx, by, bz) = self.first_m, self.second_m
-        normals: Float32 = np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
-        return normals
+        return np.asarray(np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx]))
 
 
 def _cut(
@@ -286,5 +278,4 @@ def _halved(triangles: Float64, longest: Int64) -> Float64:
 
 def _areas(triangles: Float64) -> Float64:
     a, b, c = triangles
-    areas: Float64 = np.linalg.norm(np.cross(b - a, c - a, axis=0), axis=0) / 2
-    return areas
+    return np.asarray(np.linalg.norm(np.cross(b - a, c - a, axis=0), axis=0) / 2)

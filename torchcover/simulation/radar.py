@@ -4,12 +4,12 @@ import math
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from torchcover.geometry.arrays import Float64, Int64
 from torchcover.simulation.documents import Pose
 from torchcover.simulation.rays import unit_directions
-from torchcover.simulation.sensor import Draws, Elevation, Numbers, Ranging, RayHits, Returns
+from torchcover.simulation.sensor import Draws, Elevation, Ranging, RayHits, Returns
 
 # What rounding adds to a quotient makes no cell more.
 ROUNDING = 1e-9
@@ -90,7 +90,7 @@ class Radar(Ranging):
         rows, columns = (math.ceil(opening / spacing_deg - ROUNDING) for opening in (high_deg - low_deg, cell_deg))
         return max(rows, 1), max(columns, 1)
 
-    def directions(self) -> NDArray[np.float64]:
+    def directions(self) -> Float64:
         """(3, rows, columns) unit directions in the radar's frame."""
         rows, in_a_cell = self._raster()
         columns = self.azimuth_cells * in_a_cell
@@ -99,7 +99,7 @@ class Radar(Ranging):
             low_deg + (high_deg - low_deg) * up[:, None], self.horizontal_fov_deg * (left - 0.5)[None]
         )
 
-    def beams(self) -> Numbers:
+    def beams(self) -> Int64:
         """(rows, columns) the cell of azimuth of each ray: rays with the same share the cells behind each other."""
         rows, in_a_cell = self._raster()
         return np.tile(np.arange(self.azimuth_cells).repeat(in_a_cell), (rows, 1))

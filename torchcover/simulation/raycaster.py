@@ -20,12 +20,11 @@ from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
 from torchcover.geometry import transform
+from torchcover.geometry.arrays import Bools, Float32, Float64, Int32, Int64
+from torchcover.geometry.rigid import Matrix
 from torchcover.simulation.patches import outward_faces
 from torchcover.simulation.rays import rotate
 from torchcover.simulation.shapes import Mesh, corners_of, normals_of, parts_of
-
-Float32 = NDArray[np.float32]
-Matrix = NDArray[np.float64]
 
 # Farther from the origin float32 resolves no better than 64 m, and at 2e18 Embree drops faces without a word.
 MAX_M = 1e9
@@ -84,7 +83,7 @@ class Faces:
             normals[:, faces] = normals_of(corners_m)
         return normals
 
-    def holding(self, place_m: NDArray[np.floating]) -> NDArray[np.int64]:
+    def holding(self, place_m: NDArray[np.floating]) -> Int64:
         """Numbers of those that a (3,) place lies on."""
         if ((place_m < self._least_m) | (place_m > self._most_m)).any():
             return np.empty(0, dtype=np.int64)
@@ -95,14 +94,12 @@ class Faces:
             near = near[(self._lower_m[axis, near] <= coordinate_m) & (coordinate_m <= self._upper_m[axis, near])]
         if len(near) == 0:
             return near
-        held: NDArray[np.int64] = near[self.from_plane_m(place_m, near) <= 2 * self.contact_m[near]]
-        return held
+        return np.asarray(near[self.from_plane_m(place_m, near) <= 2 * self.contact_m[near]])
 
-    def from_plane_m(self, place_m: NDArray[np.floating], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+    def from_plane_m(self, place_m: NDArray[np.floating], faces: Int64) -> Float64:
         """Distance of a (3,) place from the planes of some of them."""
         corners_m = corners_of(self._bodies, faces)
-        distance_m: Matrix = np.abs(((place_m[:, None] - corners_m[0]) * normals_of(corners_m)).sum(axis=0))
-        return distance_m
+        return np.asarray(np.abs(((place_m[:, None] - corners_m[0]) * normals_of(corners_m)).sum(axis=0)))
 
 
 def _contact_m(corners_m: Matrix) -> Matrix:
@@ -115,8 +112,7 @@ def _contact_m(corners_m: Matrix) -> Matrix:
     largest = np.abs(corners_m).max(axis=0)
     rounding_m = (products * largest).sum(axis=0) / np.where(length == 0, np.inf, length)
     # The plane of a sliver is anybody's guess, but the sliver is not far from where it is.
-    contact_m: Matrix = np.minimum(rounding_m, largest.max(axis=0)) * (CONTACT_ROUNDINGS * np.finfo(np.float32).eps)
-    return contact_m
+    return np.asarray(np.minimum(rounding_m, largest.max(axis=0)) * (CONTACT_ROUNDINGS * np.finfo(np.float32).eps))
 
 
 class Hits(NamedTuple):
@@ -126,22 +122,18 @@ class Hits(NamedTuple):
     """
 
     range_m: Float32
-    body: NDArray[np.int32]
-    triangle: NDArray[np.int32]
+    body: Int32
+    triangle: Int32
 
 
 class Struck(NamedTuple):
-    """What N rays hit.
+    """What N rays hit: the number of the body, see `Instant`, or -1, the face of its mesh, and what that is made of.
 
-    Args:
-        body: (N,) its number, see `Instant`; -1 for what is no body of a scene.
-        triangle: (N,) which face of its mesh.
-        cos_incidence: (N,) float32 cosine of the angle between the ray and the normal of the face, on either side.
-        material: (N,) uint8 what the face is made of, as `Mesh.material` has it.
+    `cos_incidence` is the cosine of the angle between the ray and the normal of the face, on either side.
     """
 
-    body: NDArray[np.int32]
-    triangle: NDArray[np.int32]
+    body: Int32
+    triangle: Int32
     cos_incidence: Float32
     material: NDArray[np.uint8]
 
@@ -168,8 +160,8 @@ class RayCaster:
         self._reach_m = reach_m
         self._first_face = np.cumsum([0] + [len(body.faces) for body in bodies])
         self._bodies = bodies
-        self._closed: dict[int, NDArray[np.bool_]] = {}  # asked of few: hardly any ray meets a face from behind
-        self._last_asked: tuple[bytes, NDArray[np.int64]] = b"", np.empty(0, dtype=np.int64)
+        self._closed: dict[int, Bools] = {}  # asked of few: hardly any ray meets a face from behind
+        self._last_asked: tuple[bytes, Int64] = b"", np.empty(0, dtype=np.int64)
         _have_no_threads()
         # Robust: a ray through a shared edge hits one of the two faces instead of slipping between them.
         self._scene = EmbreeScene(robust=True)
@@ -194,15 +186,9 @@ class RayCaster:
         return len(self._bodies)
 
     def cast(self, origin_m: NDArray[np.floating], directions: Float32, limit_m: Float32) -> Hits:
-        """Cast rays from one origin. A ray that starts on a face does not hit that face.
+        """Cast (3, N) unit directions from one origin, up to (N,) limits, which may be infinite.
 
-        Args:
-            origin_m: (3,) common origin of the rays.
-            directions: (3, N) unit directions.
-            limit_m: (N,) distance at which each ray ends; may be infinite.
-
-        Returns:
-            `Hits(range_m, body)`: the nearest hit within the limit; else the limit, and -1.
+        A ray that starts on a face does not hit that face. What hits nothing has its limit as range, and body -1.
         """
         # One origin for all rays: an array that steps over no memory from row to row.
         origins = np.ndarray(
@@ -215,54 +201,29 @@ class RayCaster:
         return hits
 
     def cast_from_each(self, origins_m: Float32, directions: Float32, limit_m: Float32) -> Hits:
-        """Cast rays with an origin each, none of which lies on a face; see `touched`.
-
-        Args:
-            origins_m: (N, 3) where they start.
-            directions: (3, N) unit directions.
-            limit_m: (N,) distance at which each ray ends; may be infinite.
-        """
+        """Cast (3, N) unit directions from (N, 3) origins up to (N,) limits; none starts on a face, see `touched`."""
         answer = self._scene.run(origins_m, directions.T, dists=limit_m.copy(), output=True)
         return Hits(answer["tfar"], answer["geomID"], answer["primID"])
 
-    def struck(self, body: NDArray[np.int32], triangle: NDArray[np.int32], directions: Float32) -> Struck:
-        """What the rays hit that ended on some faces.
-
-        Args:
-            body: (N,) of `Hits`, none of them -1.
-            triangle: (N,) likewise.
-            directions: (3, N) unit directions of these rays.
-        """
+    def struck(self, body: Int32, triangle: Int32, directions: Float32) -> Struck:
+        """What N rays with (3, N) unit directions hit that ended on some faces, as `Hits` has them, none of them -1."""
         face = self._first_face.take(body) + triangle
         (nx, ny, nz), (x, y, z) = self._faces.normals.take(face, axis=1), directions
         cosine = np.abs(nx * x + ny * y + nz * z)
         return Struck(body, triangle, np.minimum(cosine, 1.0, out=cosine), self._materials.take(face))
 
-    def faces_met(
-        self, origins_m: NDArray[np.floating], directions: NDArray[np.floating], limit_m: float
-    ) -> NDArray[np.int64]:
-        """Which face each of some rays meets first, counted through the faces of all bodies.
-
-        Args:
-            origins_m: (N, 3) where they start.
-            directions: (N, 3) unit directions.
-            limit_m: Where they end.
-
-        Returns:
-            (N,) numbers, -1 for none.
-        """
+    def faces_met(self, origins_m: NDArray[np.floating], directions: NDArray[np.floating], limit_m: float) -> Int64:
+        """(N,) which face each ray meets first within a limit, counted through those of all bodies; -1 for none."""
         starts_m, towards = origins_m.astype(np.float32), directions.astype(np.float32)
         ends_m = np.full(len(starts_m), limit_m, dtype=np.float32)
         answer = self._scene.run(starts_m, towards, dists=ends_m, output=True)
-        met: NDArray[np.int64] = np.where(answer["geomID"] >= 0, self._numbers(answer), -1)
-        return met
+        return np.asarray(np.where(answer["geomID"] >= 0, self._numbers(answer), -1))
 
-    def _numbers(self, answer: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
+    def _numbers(self, answer: dict[str, NDArray[Any]]) -> Int64:
         """(N,) which of all faces each ray hit; any number where it hit none."""
-        numbers: NDArray[np.int64] = self._first_face[np.maximum(answer["geomID"], 0)] + np.maximum(answer["primID"], 0)
-        return numbers
+        return np.asarray(self._first_face[np.maximum(answer["geomID"], 0)] + np.maximum(answer["primID"], 0))
 
-    def touched(self, place_m: NDArray[np.floating]) -> NDArray[np.int64]:
+    def touched(self, place_m: NDArray[np.floating]) -> Int64:
         """Numbers of the bodies on whose faces a place lies: hardly any does, and the faces are sooner asked than rays.
 
         The last answer is kept, for all tiles of a scan start at one place.
@@ -279,13 +240,12 @@ class RayCaster:
         directions: Float32,
         limit_m: Float32,
         hits: Hits,
-        faces: NDArray[np.int64],
+        faces: Int64,
     ) -> None:
         """Let the rays go on that hit a face whose plane they start on: by rounding alone, as they leave it."""
 
-        def starts_on_plane(faces: NDArray[np.int64]) -> NDArray[np.bool_]:
-            near: NDArray[np.bool_] = self._faces.from_plane_m(origin_m, faces) <= self._faces.contact_m[faces]
-            return near
+        def starts_on_plane(faces: Int64) -> Bools:
+            return np.asarray(self._faces.from_plane_m(origin_m, faces) <= self._faces.contact_m[faces])
 
         rays, travelled_m = np.flatnonzero(hits.body >= 0), 0.0
         rays = rays[starts_on_plane(faces[rays])]
@@ -304,22 +264,17 @@ class RayCaster:
             again = hit & starts_on_plane(faces)
             rays, travelled_m, range_m, faces = rays[again], travelled_m[again], range_m[again], faces[again]
 
-    def met_from_behind(self, origin_m: NDArray[np.floating], directions: Float32) -> NDArray[np.int32]:
-        """Which closed bodies rays first meet from behind, as those do that start inside: a sheet has no inside.
+    def met_from_behind(self, origin_m: NDArray[np.floating], directions: Float32) -> Int32:
+        """(N,) which closed bodies rays first meet from behind, as those do that start inside; else -1.
 
-        Args:
-            origin_m: (3,) common origin of the rays, or (N, 3) of each.
-            directions: (3, N) unit directions.
-
-        Returns:
-            (N,) number of the body of which a ray first hits the back of a face, if that face is one of a closed
-            surface that is turned outwards; else -1.
+        A sheet has no inside: the face is one of a closed surface that is turned outwards. Rays have (3, N) unit
+        directions and one (3,) origin, or (N, 3).
         """
         origins = np.ascontiguousarray(np.broadcast_to(origin_m.astype(np.float32), (directions.shape[1], 3)))
         answer = self._scene.run(origins, directions.T, output=True)
         # Embree's Ng points to where the corners of the face turn counter-clockwise.
         behind = (answer["Ng"] * directions.T).sum(axis=1) > 0
-        bodies: NDArray[np.int32] = np.where(behind, answer["geomID"], -1)
+        bodies: Int32 = np.where(behind, answer["geomID"], -1)
         for number in np.unique(bodies[behind]).tolist():
             if number not in self._closed:
                 self._closed[number] = outward_faces(self._bodies[number])

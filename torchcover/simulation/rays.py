@@ -12,6 +12,8 @@ from typing import NamedTuple, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.geometry.arrays import Bools, Float32, Float64, Int64
+
 # Rows and columns in a tile. A constant, so that the order of points depends on the sensor alone.
 TILE_ROWS = 128
 TILE_COLUMNS = 256
@@ -37,8 +39,6 @@ PAIRS_AT_ONCE = 1 << 20
 FEW = 800
 TOGETHER_RAD = 0.2
 
-Float64 = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 
 AnyFloat = TypeVar("AnyFloat", np.float32, np.float64)
 
@@ -59,11 +59,11 @@ class Tile:
     directions: Float32
     axis: Float64
     half_angle: float
-    blocks: NDArray[np.int64]
+    blocks: Int64
     block_lower: Float64
     block_upper: Float64
 
-    def some(self, which: NDArray[np.bool_]) -> "Tile":
+    def some(self, which: Bools) -> "Tile":
         """The tile of those of its rays for which (n,) is true, in the same cone."""
         filled = which[self.blocks]
         kept = filled.any(axis=1)
@@ -105,7 +105,7 @@ class Balls(NamedTuple):
         of_each = np.repeat(centres_m, np.diff(first, append=len(points)), axis=0)
         return cls(centres_m, np.maximum.reduceat(np.linalg.norm(points - of_each, axis=1), first) + radius_m)
 
-    def met_by(self, tile: Tile, vehicle_T_sensor: Float64) -> NDArray[np.bool_]:
+    def met_by(self, tile: Tile, vehicle_T_sensor: Float64) -> Bools:
         """(n,) whether each ray of a tile may pass through one of them, and of the others some."""
         ways_m = (self.centres_m - vehicle_T_sensor[:3, 3]) @ vehicle_T_sensor[:3, :3]
         distance_m = np.linalg.norm(ways_m, axis=1)
@@ -133,15 +133,7 @@ class Balls(NamedTuple):
 
 
 def unit_directions(elevation_deg: Float64, azimuth_deg: Float64) -> Float64:
-    """Directions from angles.
-
-    Args:
-        elevation_deg: Angle above the x-y plane, of a shape that broadcasts to (rows, columns).
-        azimuth_deg: Angle from x towards y, likewise.
-
-    Returns:
-        (3, rows, columns) float64 unit vectors.
-    """
+    """(3, rows, columns) float64 unit vectors, of elevations above x-y and azimuths from x towards y, in degrees."""
     elevation, azimuth = np.broadcast_arrays(np.deg2rad(elevation_deg), np.deg2rad(azimuth_deg))
     horizontal = np.cos(elevation)
     return np.stack([horizontal * np.cos(azimuth), horizontal * np.sin(azimuth), np.sin(elevation)])
@@ -161,7 +153,7 @@ def into_tiles(directions: Float64, tile_rows: int = TILE_ROWS, tile_columns: in
     return tuple(_tile(directions[:, *cut]) for cut in _cuts(directions.shape, tile_rows, tile_columns))
 
 
-def pixels_in_tiles(directions: Float64) -> NDArray[np.int64]:
+def pixels_in_tiles(directions: Float64) -> Int64:
     """(rays,) where each ray, counted over the tiles of `into_tiles`, stands in (3, rows, columns), row by row."""
     has_ray = ~np.isnan(directions[0])
     pixel = np.arange(has_ray.size).reshape(has_ray.shape)
@@ -195,7 +187,7 @@ def _tile(directions: Float64) -> Tile:
     return Tile(rounded, axis, half_angle, blocks, lower, upper)
 
 
-def _blocks(has_ray: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _blocks(has_ray: Bools) -> Int64:
     """(B, m) numbers of the rays in each block of the pixels of a tile, where (rows, columns) pixels have a ray."""
     rows, columns = has_ray.shape
     high, wide = min(BLOCK, rows), min(BLOCK, columns)
@@ -207,8 +199,7 @@ def _blocks(has_ray: NDArray[np.bool_]) -> NDArray[np.int64]:
     # Pixels without a ray repeat the first one of their block that has one.
     first = np.take_along_axis(pixels, filled.argmax(axis=1)[:, None], axis=1)
     pixels = np.where(filled, pixels, first)[filled.any(axis=1)]
-    numbers: NDArray[np.int64] = has_ray.cumsum()[pixels] - 1
-    return numbers
+    return np.asarray(has_ray.cumsum()[pixels] - 1)
 
 
 def rotate(rotation: Float64, directions: Float32) -> Float32:
@@ -241,12 +232,7 @@ class Outlines(NamedTuple):
 
 
 def outlines(corners_m: Float64, origin_m: Float64) -> Outlines:
-    """How boxes look from a place.
-
-    Args:
-        corners_m: (P, 8, 3) their corners; or (P, C, 3), those at several times one after the other.
-        origin_m: (3,) the place, in the same frame.
-    """
+    """How boxes with (P, 8, 3) corners, or (P, C, 3) at several times, look from a (3,) place in their frame."""
     ways_m = corners_m - origin_m
     forward = _unit(ways_m.mean(axis=1))
     # Upright bodies fill a pyramid whose sides are upright.
@@ -270,10 +256,9 @@ def outlines(corners_m: Float64, origin_m: Float64) -> Outlines:
 
 
 def _faces_towards(ways_m: Float64) -> Float64:
-    """(P, 4, 3) normals of those faces of boxes whose outer side the place is on: no ray that leaves it turns back.
+    """(P, 4, 3) normals of the faces of boxes whose outer side the place is on: no ray that leaves it turns back.
 
-    Args:
-        ways_m: (P, 8, 3) from the place to the corners, in the order of `Box.corners_m`.
+    `ways_m` (P, 8, 3) lead from the place to the corners, in the order of `Box.corners_m`.
     """
     normals = np.zeros((len(ways_m), 4, 3))
     for axis, across in enumerate((4, 2, 1)):
@@ -285,13 +270,9 @@ def _faces_towards(ways_m: Float64) -> Float64:
 
 
 def boxes_in_cone(outlines: Outlines, axis: Float64, half_angle: float, range_m: float) -> NDArray[np.intp]:
-    """Numbers of the boxes that a ray of a cone may meet before it ends.
+    """Numbers of the boxes that a ray of a cone, `half_angle` radians about its axis, may meet before it ends.
 
-    Args:
-        outlines: The boxes, seen from the tip of the cone.
-        axis: (3,) middle of the cone, in the frame of the boxes.
-        half_angle: Half its opening in radians.
-        range_m: Where its longest ray ends.
+    The boxes are seen from its tip, in whose frame the axis is.
     """
     wider = half_angle + ROUNDING
     # Beyond a right angle no plane has a cone on one side of it.
@@ -299,39 +280,24 @@ def boxes_in_cone(outlines: Outlines, axis: Float64, half_angle: float, range_m:
     return np.flatnonzero(~outside & (outlines.nearest_m <= range_m))
 
 
-def blocks_towards(outlines: Outlines, tile: Tile, vehicle_R_sensor: Float64, range_m: Float32) -> NDArray[np.bool_]:
-    """(P, B) whether a ray of each block of a tile may meet each box before it ends.
-
-    Args:
-        outlines: The boxes, seen from the sensor.
-        tile: Rays of the sensor.
-        vehicle_R_sensor: (3, 3) rotation from the sensor's frame to that of the boxes.
-        range_m: (n,) where each of the tile's rays ends.
-    """
+def blocks_towards(outlines: Outlines, tile: Tile, vehicle_R_sensor: Float64, range_m: Float32) -> Bools:
+    """(P, B) whether a ray of each block of a tile may meet each box, seen from the sensor, before its (n,) range."""
     ends_m = range_m.take(tile.blocks).max(axis=1)
     normals = (outlines.normals @ vehicle_R_sensor).reshape(-1, 3)
     # No direction between the lower and the upper bounds of a block has a smaller product with a normal.
     bounds = np.vstack([tile.block_lower, tile.block_upper]).astype(np.float32)
     towards = np.hstack([np.maximum(normals, 0.0), np.minimum(normals, 0.0)]).astype(np.float32)
     least = (towards @ bounds).reshape(len(outlines.normals), 4, bounds.shape[1])
-    reached: NDArray[np.bool_] = (least.max(axis=1) <= ROUNDING) & (outlines.nearest_m[:, None] <= ends_m)
-    return reached
+    return np.asarray((least.max(axis=1) <= ROUNDING) & (outlines.nearest_m[:, None] <= ends_m))
 
 
 def rays_towards(
-    outlines: Outlines, box: NDArray[np.intp], rays: NDArray[np.int64], directions: Float32, range_m: Float32
-) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
-    """Which rays of some blocks may meet a box before they end.
+    outlines: Outlines, box: NDArray[np.intp], rays: Int64, directions: Float32, range_m: Float32
+) -> tuple[NDArray[np.intp], Int64]:
+    """Which rays of some blocks may meet a box before they end: (L,) boxes and (L,) rays, in the order of the blocks.
 
-    Args:
-        outlines: The boxes.
-        box: (K,) number of a box for each block.
-        rays: (K, m) numbers of the rays in the blocks.
-        directions: (3, n) all rays, in the frame of the boxes.
-        range_m: (n,) where they end.
-
-    Returns:
-        Pairs, in the order of the blocks: (L,) number of the box, and (L,) number of the ray.
+    `box` (K,) is the box of each block, `rays` (K, m) those in it; `directions` (3, n) of all are in the frame of the
+    boxes, and `range_m` (n,) is where they end.
     """
     normals, nearest_m = outlines.normals.astype(np.float32), outlines.nearest_m.astype(np.float32)
     across = normals[box] @ directions.take(rays, axis=1).swapaxes(0, 1)
@@ -348,5 +314,4 @@ def _cross(a: Float64, b: Float64) -> Float64:
 def _unit(vectors: Float64) -> Float64:
     # A vector of length 0 has no direction; it is left as it is.
     length = np.sqrt((vectors * vectors).sum(axis=-1, keepdims=True))
-    unit: Float64 = vectors / np.maximum(length, np.finfo(np.float64).tiny)
-    return unit
+    return np.asarray(vectors / np.maximum(length, np.finfo(np.float64).tiny))

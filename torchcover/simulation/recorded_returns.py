@@ -7,14 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.geometry import invert, transform
+from torchcover.geometry.arrays import Bools, Float32, Float64, Int64
 from torchcover.recordings.in_vehicle import in_vehicle
 from torchcover.recordings.recording import Recording
 from torchcover.simulation.lidar import Lidar
 from torchcover.simulation.material import Material
 from torchcover.simulation.returns import SURE, log_excess
 from torchcover.simulation.rig import Rig
-
-Float64 = NDArray[np.float64]
 
 # Of a road that is straight ahead; beside it there are kerbs and grass. Its height is fitted to the inner part.
 HALF_ROAD_M, HALF_LANES_M = 10.0, 7.0
@@ -43,13 +42,9 @@ NOISE_WITHIN_M = 12.0
 class GroundRays(NamedTuple):
     """Rays that point at the road, nothing being in their way, by (C,) cells: one row in one sector of one sweep.
 
-    Args:
-        range_m: (C,) how far the ground is there.
-        cos_incidence: (C,) of the rays on it.
-        rays: (C,) how many rays there are.
-        returned: (C,) how many of them returned from there; too many where a row is taken for its neighbour.
-        azimuth_deg: (C,) middle of the sector, in the sensor's frame.
-        sweep: (C,) number of the sweep.
+    How far the ground is there and how the rays meet it, how many rays there are, and how many of them returned from
+    there: too many where a row is taken for its neighbour. `azimuth_deg` is the middle of the sector in the sensor's
+    frame.
     """
 
     range_m: Float64
@@ -57,9 +52,9 @@ class GroundRays(NamedTuple):
     rays: Float64
     returned: Float64
     azimuth_deg: Float64
-    sweep: NDArray[np.int64]
+    sweep: Int64
 
-    def some(self, which: NDArray[np.bool_]) -> "GroundRays":
+    def some(self, which: Bools) -> "GroundRays":
         """Those of some cells."""
         return GroundRays._make(column[which] for column in self)
 
@@ -71,8 +66,7 @@ class RoadProfile(NamedTuple):
 
     def height_m(self, points_m: Float64) -> Float64:
         """(N,) z of the road below N points."""
-        height_m: Float64 = _terms(points_m) @ self.coefficients
-        return height_m
+        return np.asarray(_terms(points_m) @ self.coefficients)
 
 
 def _terms(points_m: Float64) -> Float64:
@@ -131,7 +125,7 @@ def _of_sweep(points_m: Float64, lidar: Lidar, number: int) -> GroundRays:
     cell = row * sectors + sector
     share = range_m / expected_m.reshape(-1)[cell]
 
-    def counted(which: NDArray[np.bool_]) -> Float64:
+    def counted(which: Bools) -> Float64:
         return np.bincount(cell[which], minlength=expected_m.size).reshape(expected_m.shape).astype(np.float64)
 
     returned, beyond = counted((share > ABOUT[0]) & (share < ABOUT[1])), counted(share >= ABOUT[1])
@@ -161,7 +155,7 @@ def _in_rows(points_m: Float64, lidar: Lidar) -> tuple[NDArray[np.intp], Float64
     return row, np.rad2deg(np.arctan2(y, x)), np.linalg.norm(in_sensor_m, axis=1)
 
 
-def _blocked(expected_m: Float64, height_m: float, range_m: Float64, above_m: Float64) -> NDArray[np.bool_]:
+def _blocked(expected_m: Float64, height_m: float, range_m: Float64, above_m: Float64) -> Bools:
     """(rows,) whether what stands in a sector, (K,) points of it, is in the way of rays to the road.
 
     A ray passes over what is lower than the ray is there. Two points are needed, for one may be rain or dust.
@@ -202,14 +196,9 @@ def _expected(
 
 
 class ReturnFit(NamedTuple):
-    """Range at 10 % and spread of a LiDAR, from rays to a road.
+    """Range at 10 % and spread of ln range of a LiDAR, the likeliest from rays to a road, and errors of ln of both.
 
-    Args:
-        range_at_10_percent_m: The likeliest.
-        spread: The likeliest, of ln range.
-        range_error: Standard error of ln of the range.
-        spread_error: Of ln of the spread.
-        fades: Whether the recording tells: twice the range would have left other returns.
+    `fades` says whether the recording tells: twice the range would have left other returns.
     """
 
     range_at_10_percent_m: float
@@ -356,7 +345,7 @@ def _check_drive(recording: Recording) -> None:
             )
 
 
-def _check_different(sweeps: Sequence[NDArray[np.float32]], source: str) -> None:
+def _check_different(sweeps: Sequence[Float32], source: str) -> None:
     """Refuse a sweep that is there again, as it may be where no poses tell that the vehicle stands."""
     first: dict[bytes, int] = {}
     for number, sweep in enumerate(sweeps):
@@ -368,7 +357,7 @@ def _check_different(sweeps: Sequence[NDArray[np.float32]], source: str) -> None
             )
 
 
-def _calibration(lidar: Lidar, sweeps: Sequence[NDArray[np.float32]], road: Material, source: str) -> LidarCalibration:
+def _calibration(lidar: Lidar, sweeps: Sequence[Float32], road: Material, source: str) -> LidarCalibration:
     rays = ground_rays(sweeps, lidar)
     if rays.rays.sum() < FEWEST_RAYS:
         raise ValueError(
@@ -380,7 +369,7 @@ def _calibration(lidar: Lidar, sweeps: Sequence[NDArray[np.float32]], road: Mate
     return LidarCalibration(lidar.name, float(rays.rays.sum()), float(rays.range_m.max()), fit, noise_m)
 
 
-def _noise_m(sweeps: Sequence[NDArray[np.float32]], lidar: Lidar) -> float:
+def _noise_m(sweeps: Sequence[Float32], lidar: Lidar) -> float:
     """Noise of ranges to near road: second differences of three neighbours in a row are sqrt(6) of it."""
     off_m, step_deg = [np.empty(0)], lidar.horizontal_fov_deg / lidar.columns
     for sweep in sweeps:

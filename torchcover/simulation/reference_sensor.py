@@ -3,32 +3,22 @@
 Another pattern is a class with the members of `ReferenceSensor` and a line in `kinds.py`.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple, Protocol, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchcover.coverage.grid import BandFrame
 from torchcover.geometry import BoundingBox
+from torchcover.geometry.arrays import Float32, Float64, Int64
 from torchcover.simulation.instant import Instant
+from torchcover.simulation.regions_of_interest import Asked
 from torchcover.simulation.scene import Scene
 
-# A rectangle of the ground in the vehicle frame in metres: ((x_low, x_high), (y_low, y_high)).
-Area = tuple[tuple[float, float], tuple[float, float]]
-Areas = tuple[Area, ...]
-# Heights in the vehicle frame in metres: (low, high) of each.
-Bands = tuple[tuple[float, float], ...]
-
 # From the ego's bounding box and the random numbers to a (4, 4) pose in the vehicle frame.
-DrawPose = Callable[[BoundingBox, np.random.Generator], NDArray[np.float64]]
+DrawPose = Callable[[BoundingBox, np.random.Generator], Float64]
 
-# What height bands are over, where nothing else is said.
-DEFAULT_BAND_FRAME: BandFrame = "ground"
-# The paper's heights: ground, and what stands on it.
-PAPER_BANDS_M: Bands = ((-0.5, 0.5), (0.5, 2.0))
 # A place inside a body is drawn again, at most this often.
 MAX_DRAWS = 100
 
@@ -51,7 +41,7 @@ class Surroundings:
     name: str
     threads: int = 1
 
-    def free_pose(self, draw: DrawPose) -> tuple[NDArray[np.float64], int]:
+    def free_pose(self, draw: DrawPose) -> tuple[Float64, int]:
         """Draw a pose until it lies inside no body.
 
         Args:
@@ -90,14 +80,14 @@ class ReferenceScan(NamedTuple):
         places: From how many places it has looked.
     """
 
-    points: NDArray[np.float32]
-    weights: NDArray[np.float32] | None
+    points: Float32
+    weights: Float32 | None
     rays: int
     self_hits: int
     body_casts: int
     redrawn: int
-    drawn: NDArray[np.int64] | None = None
-    heights_m: NDArray[np.float32] | None = None
+    drawn: Int64 | None = None
+    heights_m: Float32 | None = None
     places: int = 1
 
 
@@ -116,43 +106,30 @@ class ReferenceSensor(Protocol):
     @property
     def band_frame(self) -> BandFrame:
         """What its height bands are over: "ground" if all of its scans have heights, "vehicle" if none has."""
-        ...
 
     @classmethod
-    def from_rays(
-        cls,
-        areas: Areas,
-        rays: int | None,
-        bands_m: Bands = PAPER_BANDS_M,
-        band_frame: BandFrame = DEFAULT_BAND_FRAME,
-    ) -> Self:
+    def from_rays(cls, asked: Asked, rays: int | None) -> Self:
         """The sensor for a question.
 
         Args:
-            areas: The rectangles of the ground that are asked about; they may overlap.
+            asked: Its areas, heights and what these are measured from.
             rays: About how many rays it casts at a step; None for the number that it does best with.
-            bands_m: The heights that are asked about; they may overlap too.
-            band_frame: What they are measured from: "ground", the local ground, or "vehicle", z = 0 of its frame.
 
         Raises:
             ValueError: Areas or a number of rays that it cannot do with.
         """
-        ...
 
     @property
     def rays(self) -> int:
         """About how many rays it casts at a step: asked before it is made to scan."""
-        ...
 
     @property
     def shell_m(self) -> float:
         """How far its places lie from the ego's bounding box in metres, at most."""
-        ...
 
     @property
     def max_range_m(self) -> float:
         """What is farther from its place, in metres, gives no point."""
-        ...
 
     def scan(self, surroundings: Surroundings) -> ReferenceScan:
         """What it sees at one step.
@@ -166,16 +143,6 @@ class ReferenceSensor(Protocol):
         Raises:
             ValueError: There is no place for it that is not inside a body.
         """
-        ...
-
-
-def check_areas(areas: Areas) -> None:
-    """Refuse areas that ask nothing."""
-    if not areas:
-        raise ValueError("areas: at least one rectangle ((x_low, x_high), (y_low, y_high)) is needed")
-    for area in areas:
-        if not all(-math.inf < low < high < math.inf for low, high in area):
-            raise ValueError(f"areas: finite bounds, lower first, are needed; got {area}")
 
 
 def check_reach(shell_m: float, max_range_m: float) -> None:
@@ -186,7 +153,7 @@ def check_reach(shell_m: float, max_range_m: float) -> None:
         raise ValueError(f"max_range_m: a positive distance in metres is needed; got {max_range_m}")
 
 
-def position_in_shell(ego: BoundingBox, shell_m: float, generator: np.random.Generator) -> NDArray[np.float64]:
+def position_in_shell(ego: BoundingBox, shell_m: float, generator: np.random.Generator) -> Float64:
     """(3,) place in metres, uniform between the ego's bounding box and that box grown sideways and upwards.
 
     Args:

@@ -5,21 +5,25 @@ import warnings
 from dataclasses import replace
 from typing import Annotated, NamedTuple, Self
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat, model_validator
 
 from torchcover.coverage import BevGrid, Region, check_regions, forward_regions, near_field_regions
 from torchcover.coverage.grid import PAPER_HEIGHTS, BandFrame
+from torchcover.geometry.arrays import Float64
 from torchcover.simulation.documents import Bounds, Coordinate, Document, Readable
-from torchcover.simulation.reference_sensor import DEFAULT_BAND_FRAME, Areas, Bands
 
 # Holds the paper's regions, and the space beside and behind the vehicle.
 GRID_X_M = (-40.0, 160.0)
 GRID_Y_M = (-40.0, 40.0)
 CELL_M = 0.25
+# What height bands are over, where nothing else is said.
+DEFAULT_BAND_FRAME: BandFrame = "ground"
 
-
+# A rectangle of the ground in the vehicle frame in metres: ((x_low, x_high), (y_low, y_high)).
+Area = tuple[tuple[float, float], tuple[float, float]]
+Areas = tuple[Area, ...]
+# Heights in metres: (low, high) of each.
+Bands = tuple[tuple[float, float], ...]
 Name = Annotated[str, Field(min_length=1)]
 
 
@@ -92,7 +96,7 @@ class RegionsOfInterest(Readable):
 
     def around(
         self,
-        ego_outline_m: NDArray[np.float64] | None = None,
+        ego_outline_m: Float64 | None = None,
         cell_m: float | None = None,
         band_frame: BandFrame = DEFAULT_BAND_FRAME,
     ) -> "Asked":
@@ -142,7 +146,7 @@ class Asked(NamedTuple):
         regions: Those that numbers are given for.
         areas: The rectangles that the reference sensor is aimed at, which hold them and the grid.
         awaited: The regions whose errors a target error waits for: all that were asked for by name; in the usual table
-            not the near field, of which in traffic many steps see nothing that stands.
+            those in front.
     """
 
     grid: BevGrid
@@ -156,22 +160,22 @@ class Asked(NamedTuple):
         return tuple(self.grid.heights.values())
 
 
-def near_field(ego_outline_m: NDArray[np.float64]) -> tuple[Region, ...]:
+def near_field(ego_outline_m: Float64) -> tuple[Region, ...]:
     """That of a vehicle with (K, 2) corners x, y; see `near_field_regions`."""
     return near_field_regions(*_bounds(ego_outline_m))
 
 
-def _bounds(outline_m: NDArray[np.float64]) -> tuple[tuple[float, float], tuple[float, float]]:
+def _bounds(outline_m: Float64) -> Area:
     """The bounds x and y of a vehicle, to the millimetre."""
     lower, upper = outline_m.min(axis=0).round(3).tolist(), outline_m.max(axis=0).round(3).tolist()
     return (lower[0], upper[0]), (lower[1], upper[1])
 
 
-def _area(region: Region) -> tuple[tuple[float, float], tuple[float, float]]:
+def _area(region: Region) -> Area:
     return region.x, region.y
 
 
-def _around(regions: tuple[Region, ...]) -> tuple[tuple[float, float], tuple[float, float]]:
+def _around(regions: tuple[Region, ...]) -> Area:
     """One rectangle around all of them: it takes fewer rays from the others than each would for itself."""
     x, y = zip(*map(_area, regions), strict=True)
     return (
@@ -187,9 +191,7 @@ def _holding(usual: tuple[float, float], wanted: list[tuple[float, float]], cell
     return usual[0] - math.ceil(below / cell_m) * cell_m, usual[1] + math.ceil(above / cell_m) * cell_m
 
 
-def _warn_of_hidden(
-    regions: tuple[Region, ...], vehicle: tuple[tuple[float, float], tuple[float, float]] | None
-) -> None:
+def _warn_of_hidden(regions: tuple[Region, ...], vehicle: Area | None) -> None:
     for region in regions:
         if vehicle and all(
             low <= own[0] and own[1] <= high for own, (low, high) in zip(_area(region), vehicle, strict=True)

@@ -55,12 +55,9 @@ def log_excess(
 def return_probability(
     log_excess: float | Floats, spread: float | Floats, reflectivity_spread: float | Floats = 0.0
 ) -> Floats:
-    """(N,) P(return) of hits with these ln q.
+    """(N,) P(return) of hits with (N,) ln q, `spread` the standard deviation of ln range of the sensor.
 
-    Args:
-        log_excess: (N,) ln q.
-        spread: s of the sensor, the standard deviation of ln range.
-        reflectivity_spread: (N,) standard deviation of ln reflectivity between places of the material.
+    `reflectivity_spread` (N,) is that of ln reflectivity between places of the material.
 
     Example:
         >>> float(return_probability(0.0, 0.3)) == SURE / 2
@@ -72,13 +69,9 @@ def return_probability(
 
 
 def extinction_per_m(visibility_m: float | None, rain_mm_h: float = 0.0) -> float:
-    """Extinction of light of 905 nm in air, one way: of fog by Koschmieder's law, and of rain.
+    """Extinction of light of 905 nm in air, one way: of fog by Koschmieder's law, if there is any, and of rain.
 
     Rain: 1.076 R^0.67 dB/km, R in mm/h (Carbonneau & Wisely 1998, Proc. SPIE 3232).
-
-    Args:
-        visibility_m: Meteorological optical range; None if it is clear.
-        rain_mm_h: Rate of the rain.
 
     Example:
         >>> round(extinction_per_m(50.0), 4), round(1e3 * extinction_per_m(None, 10.0), 2)

@@ -6,6 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.geometry.arrays import Float64, Int64
+
 # Elevations are counted in bins of this width and blurred with one width after the other.
 BIN_DEG, FINEST_DEG, COARSEST_DEG, GROWTH = 0.005, 0.01, 1.0, 1.15
 # As long as a blur is wider than a row and narrower than the space between two, the number of peaks is that of rows; it
@@ -18,18 +20,13 @@ BLIND_DEG = 30.0
 
 
 class ScanEstimate(NamedTuple):
-    """A scan pattern.
+    """A scan pattern: (R,) elevations of the rows that returned anything, the highest first, and how many columns.
 
-    Args:
-        elevations_deg: (R,) of the rows that returned anything, the highest first.
-        columns: How many.
-        horizontal_fov_deg: Field of view, 360 for a full turn.
-        centre_deg: Azimuth of its middle.
-        min_range_m: Range of the nearest return.
-        max_range_m: Range of the farthest return.
+    `horizontal_fov_deg` is 360 for a full turn, `centre_deg` the azimuth of its middle; ranges are of the nearest and
+    the farthest return.
     """
 
-    elevations_deg: NDArray[np.float64]
+    elevations_deg: Float64
     columns: int
     horizontal_fov_deg: float
     centre_deg: float
@@ -37,13 +34,10 @@ class ScanEstimate(NamedTuple):
     max_range_m: float
 
 
-def estimate_scan(scans: Sequence[NDArray[np.float64]]) -> ScanEstimate | None:
-    """Estimate the scan pattern of a LiDAR; None if its points do not lie in rows.
+def estimate_scan(scans: Sequence[Float64]) -> ScanEstimate | None:
+    """Estimate a LiDAR's pattern from (N, 3) points of scans in its frame; None if they do not lie in rows.
 
-    A row whose rays all miss everything is not found.
-
-    Args:
-        scans: (N, 3) points of several scans in the frame of the LiDAR, z along the axis that it turns about.
+    The LiDAR turns about z. A row whose rays all miss everything is not found.
 
     Example:
         >>> azimuth, elevation = np.meshgrid(np.deg2rad(np.arange(0.0, 360.0)), np.deg2rad([-20.0, -10.0, -7.0]))
@@ -77,7 +71,7 @@ def estimate_scan(scans: Sequence[NDArray[np.float64]]) -> ScanEstimate | None:
     )
 
 
-def rows_of(elevation_deg: NDArray[np.float64]) -> NDArray[np.float64] | None:
+def rows_of(elevation_deg: Float64) -> Float64 | None:
     """(R,) the elevations that points gather at, ascending, to a bin; None if that depends on how closely one looks."""
     lowest = float(elevation_deg.min()) - 4 * COARSEST_DEG
     number = ((elevation_deg - lowest) / BIN_DEG).astype(np.int64)
@@ -98,11 +92,10 @@ def rows_of(elevation_deg: NDArray[np.float64]) -> NDArray[np.float64] | None:
     longest = int(lengths.argmax())
     if lengths[longest] < SAME_THROUGH:
         return None
-    rows_deg: NDArray[np.float64] = lowest + BIN_DEG * (found[starts[longest] + lengths[longest] // 2] + 0.5)
-    return rows_deg
+    return np.asarray(lowest + BIN_DEG * (found[starts[longest] + lengths[longest] // 2] + 0.5))
 
 
-def _column_step_deg(azimuth_deg: NDArray[np.float64], of_row: NDArray[np.int64]) -> float | None:
+def _column_step_deg(azimuth_deg: Float64, of_row: Int64) -> float | None:
     """The angle from a column to the next: most points have a neighbour in their row."""
     order = np.lexsort((azimuth_deg, of_row))
     gaps_deg = np.diff(azimuth_deg[order])[np.diff(of_row[order]) == 0]
@@ -115,7 +108,7 @@ def _column_step_deg(azimuth_deg: NDArray[np.float64], of_row: NDArray[np.int64]
     return step_deg
 
 
-def _field_of_view(azimuth_deg: NDArray[np.float64], step_deg: float) -> tuple[float, float]:
+def _field_of_view(azimuth_deg: Float64, step_deg: float) -> tuple[float, float]:
     """How wide it is and where its middle is; full turns have theirs ahead."""
     ordered = np.sort(azimuth_deg)
     gaps_deg = np.diff(ordered, append=ordered[0] + 360.0)

@@ -7,6 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.geometry import BoundingBox, invert, overlapping
+from torchcover.geometry.arrays import Bools, Float32, Int32, Int64
+from torchcover.geometry.rigid import Matrix
 from torchcover.geometry.trajectory import poses_at
 from torchcover.simulation.instant import ALL_AROUND_RAYS, Instant
 from torchcover.simulation.local_ground import LocalGround, ground_under, level_faces, looks_down
@@ -19,9 +21,6 @@ from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.surface import AboveGround, SceneSurface, bounds_along
 from torchcover.simulation.sweep import SAMPLES, Poses
 from torchcover.simulation.world import Actor, World
-
-Matrix = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 
 # Three float64, and the copies that are made on the way to them.
 BYTES_PER_POSITION = 96
@@ -36,13 +35,9 @@ INSTANTS_KEPT = 4
 class Scene:
     """The geometry of a world, built once; `at` places what moves.
 
-    What never moves is one ray casting scene. A body that moves has a scene of its own kind, in its own frame, which
-    is never built again: only the rays that point at the body are cast at it. An ego that rests belongs to what never
-    moves.
-
-    Args:
-        world: Meshes, actors and the ego.
-        solids: Those of other worlds whose bodies may be of the same kinds; its own if not given.
+    What never moves is one ray casting scene. A body that moves has a scene of its own kind, which it may share with
+    those of other worlds, in its own frame, which is never built again: only the rays that point at the body are cast
+    at it. An ego that rests belongs to what never moves.
     """
 
     def __init__(self, world: World, solids: Solids | None = None) -> None:
@@ -86,7 +81,7 @@ class Scene:
         return LocalGround(meshes, self._world_T_local[:3, 3])
 
     @cached_property
-    def is_ground(self) -> Sequence[NDArray[np.bool_]]:
+    def is_ground(self) -> Sequence[Bools]:
         """For each static mesh (F,) which of its faces are ground."""
         static, known = self.world.static, self.world.ground
         if known is None:
@@ -99,19 +94,15 @@ class Scene:
         ]
 
     @cached_property
-    def _outward(self) -> Sequence[NDArray[np.bool_]]:
+    def _outward(self) -> Sequence[Bools]:
         """For each static mesh what `outward_faces` says of it."""
         return [outward_faces(mesh) for mesh in self.world.static]
 
     def surface(self, lower_m: Matrix, upper_m: Matrix, heights_m: tuple[float, float] | None = None) -> SceneSurface:
         """The surface of everything but the ego, for questions about a box that the vehicle carries along.
 
-        It is cut when first asked for, once for each box.
-
-        Args:
-            lower_m: (3,) smallest coordinates of the box in the vehicle frame.
-            upper_m: (3,) largest.
-            heights_m: Lowest and highest above the local ground that are asked about in it; all if not given.
+        It is cut when first asked for, once for each box. `heights_m` are the lowest and highest above the local ground
+        that are asked about in it; all if not given.
         """
         box = (*lower_m.tolist(), *upper_m.tolist(), *(heights_m or ()))
         if box not in self._surfaces:
@@ -137,7 +128,7 @@ class Scene:
         return self._surfaces[box]
 
     @cached_property
-    def coincident(self) -> Sequence[NDArray[np.int32]]:
+    def coincident(self) -> Sequence[Int32]:
         """For each static mesh (F,) numbers of its faces that coincide with others among all that never move, or -1."""
         first = sum(len(actor.mesh.faces) for actor in self._resting)
         ends = first + np.cumsum([len(mask) for mask in self.world.coincident])
@@ -155,9 +146,7 @@ class Scene:
     def at(self, step: int, within_m: float = np.inf) -> "Instant":
         """Place everything for one step; the last few are kept, for other rigs that look at them.
 
-        Args:
-            step: Number of time steps since the start of the world.
-            within_m: Moving bodies whose origin is farther from the vehicle than this and their size are left out.
+        Moving bodies whose origin is farther from the vehicle than `within_m` and their size are left out.
 
         Raises:
             ValueError: The bounding box of an actor overlaps that of the ego.
@@ -186,7 +175,7 @@ class Scene:
         motion = partial(self._motion, near, time_s)
         return Instant(self._static, static_T_vehicle, moving, ego, out_of_range, self.ground, world_T_vehicle, motion)
 
-    def check_apart(self, steps: NDArray[np.int64]) -> None:
+    def check_apart(self, steps: Int64) -> None:
         """Refuse time steps at which an actor overlaps the ego, as `at` does for one."""
         ego = self.world.ego
         bodies = self._resting + self._moving
@@ -200,8 +189,7 @@ class Scene:
 
     def _distance_m(self, step: int, world_T_vehicle: Matrix) -> Matrix:
         """(bodies,) how far each is from the vehicle at least."""
-        distance_m: Matrix = np.linalg.norm(self._positions_m[step] - world_T_vehicle[:3, 3], axis=1) - self._reach_m
-        return distance_m
+        return np.asarray(np.linalg.norm(self._positions_m[step] - world_T_vehicle[:3, 3], axis=1) - self._reach_m)
 
     @property
     def _first_moving(self) -> int:
@@ -232,14 +220,8 @@ class Scene:
     ) -> tuple[Float32, ...]:
         """Where the ego's own body ends the rays of a sensor that is fixed to it, for `Instant.scan`.
 
-        Args:
-            vehicle_T_sensor: (4, 4) pose of the sensor.
-            tiles: Its rays, from `into_tiles`.
-            max_range_m: Farther hits are none.
-
-        Returns:
-            For each tile (n,) distances in metres, infinite where the ego is not hit. Nothing at all for an ego that
-            rests: it is part of what never moves, at which the rays are cast anyway.
+        For each tile (n,) metres, infinite where the ego is not hit within the range. Nothing at all for an ego that
+        rests: it is part of what never moves, at which the rays are cast anyway.
         """
         if not self.world.ego.trajectory.moves:
             return ()

@@ -13,13 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
+from torchcover.geometry.arrays import Float64, Int64
 from torchcover.simulation.bodies import Body
 from torchcover.simulation.documents import Document, Pose
 from torchcover.simulation.raycaster import Struck
 from torchcover.simulation.weather import CLEAR, Weather
 
-Float64 = NDArray[np.float64]
-Numbers = NDArray[np.int64]
 Elevation = Annotated[float, Field(ge=-90.0, le=90.0)]
 
 
@@ -36,18 +35,17 @@ class RayHits:
         weather: What they went through.
     """
 
-    ray: Numbers
+    ray: Int64
     range_m: NDArray[np.floating]
-    pixel_of_ray: Numbers
-    place: Numbers | None = None
+    pixel_of_ray: Int64
+    place: Int64 | None = None
     find: Callable[[], Struck] | None = None
     weather: Weather = CLEAR
 
     @property
-    def pixel(self) -> Numbers:
+    def pixel(self) -> Int64:
         """(N,) row * columns + column of each ray in `Sensor.directions`."""
-        pixels: Numbers = self.pixel_of_ray[self.ray]
-        return pixels
+        return np.asarray(self.pixel_of_ray[self.ray])
 
     @cached_property
     def struck(self) -> Struck:
@@ -67,7 +65,7 @@ class Returns(NamedTuple):
     None for `hit`: of each, in order. None for `error_m`: they are exact.
     """
 
-    hit: Numbers | None
+    hit: Int64 | None
     error_m: Float64 | None
 
 
@@ -94,23 +92,22 @@ class Draws:
         self._of_rays: dict[str, Float64] = {}
         self._lock = Lock()
 
-    def normal(self, ray: Numbers) -> Float64:
+    def normal(self, ray: Int64) -> Float64:
         """(N,) of a normal distribution with standard deviation 1, for hits of these rays."""
         return np.zeros(len(ray)) if self._generator is None else self._drawn("error", "standard_normal", ray)
 
-    def uniform(self, ray: Numbers) -> Float64:
+    def uniform(self, ray: Int64) -> Float64:
         """(N,) evenly from [0, 1), for hits of these rays; 1 where there is no source."""
         return np.ones(len(ray)) if self._generator is None else self._drawn("dropout", "random", ray)
 
-    def chance(self, ray: Numbers) -> Float64:
+    def chance(self, ray: Int64) -> Float64:
         """(N,) evenly from [0, 1), others than `uniform`, for hits of these rays; 1/2 where there is no source."""
         return np.full(len(ray), 0.5) if self._generator is None else self._drawn("return", "random", ray)
 
-    def _drawn(self, purpose: str, kind: str, ray: Numbers) -> Float64:
+    def _drawn(self, purpose: str, kind: str, ray: Int64) -> Float64:
         draw = getattr(self._generator, kind)
         if self._rays is None:
-            drawn: Float64 = draw(len(ray))
-            return drawn
+            return np.asarray(draw(len(ray)))
         with self._lock:  # whichever thread asks first draws for all
             if purpose not in self._of_rays:
                 self._of_rays[purpose] = draw(self._rays)
@@ -126,67 +123,54 @@ class Sensor(Protocol):
     @property
     def name(self) -> str:
         """What maps and messages call it; another one for each sensor of a rig."""
-        ...
 
     @property
     def mount(self) -> Pose:
         """`vehicle_T_sensor`; the sensor's frame is x forward, y left, z up."""
-        ...
 
     @property
     def horizontal_fov_deg(self) -> float:
         """Angle that its rays span, seen from above; 360 for a full turn."""
-        ...
 
     @property
     def min_range_m(self) -> float:
         """Closer hits give no point."""
-        ...
 
     @property
     def max_range_m(self) -> float:
         """Farther hits give no point; so far its rays are cast."""
-        ...
 
     @property
     def rate_hz(self) -> float:
         """How often it looks in a second."""
-        ...
 
     @property
     def housing(self) -> Sequence[Body]:
         """What it is built into, in its own frame: the other sensors of its rig see that, and it looks out of it."""
-        ...
 
     @property
     def is_exact(self) -> bool:
         """Whether it measures the same thing alike at any time: its measuring draws no random numbers."""
-        ...
 
     @property
     def rays(self) -> int:
         """How many rays `directions` has, NaN ones included: asked before it is called."""
-        ...
 
     def directions(self) -> Float64:
         """(3, rows, columns) unit directions in the sensor's frame; NaN where there is no ray."""
-        ...
 
     @property
     def counts_as(self) -> int:
         """How many points each of its points is counted as on a body: of a camera, pixels of the full image."""
-        ...
 
     def times_s(self) -> Float64 | None:
         """(rows, columns) when each ray is cast, after the time of the frame; None if all are at that time."""
-        ...
 
-    def beams(self) -> Numbers | None:
+    def beams(self) -> Int64 | None:
         """(rows, columns) the number of the beam that each ray is part of; None if each is a beam of its own.
 
         What the rays of one beam hit is measured together; what those of others hit changes nothing about it.
         """
-        ...
 
     def measure(self, hits: RayHits, draws: Draws) -> Returns:
         """What it makes of the hits of its rays.
@@ -195,7 +179,6 @@ class Sensor(Protocol):
             hits: All hits of each beam that has one.
             draws: Source of all random numbers.
         """
-        ...
 
 
 class ScanTimes(Document):
@@ -215,8 +198,7 @@ class ScanTimes(Document):
     def times_s(self, count: int) -> Float64:
         """(count,) when each is cast, after the time of the frame."""
         start_s = -self.period_s if self.start_s is None else self.start_s
-        times_s: Float64 = start_s + self.period_s * (np.arange(count) + 0.5) / count
-        return times_s
+        return np.asarray(start_s + self.period_s * (np.arange(count) + 0.5) / count)
 
 
 class Ranging(Document):
@@ -268,7 +250,7 @@ class Ranging(Document):
         """None: all rays are cast at the time of the frame."""
         return None
 
-    def beams(self) -> Numbers | None:
+    def beams(self) -> Int64 | None:
         """None: every ray measures alone."""
         return None
 
@@ -279,14 +261,8 @@ class Ranging(Document):
         far_enough = hits.range_m >= self.min_range_m
         return self.erring(hits, None if far_enough.all() else np.flatnonzero(far_enough), draws)
 
-    def erring(self, hits: RayHits, hit: Numbers | None, draws: Draws) -> Returns:
-        """Points at some of N hits, with noise and drop-out.
-
-        Args:
-            hits: All of them.
-            hit: (K,) which hits would give a point; None for all.
-            draws: Source of the random numbers.
-        """
+    def erring(self, hits: RayHits, hit: Int64 | None, draws: Draws) -> Returns:
+        """Points at some of N hits, (K,) `hit` of them or all, with noise and drop-out."""
         if not self._errs:
             return Returns(hit, None)
         ray, range_m = (hits.ray, hits.range_m) if hit is None else (hits.ray[hit], hits.range_m[hit])

@@ -1,6 +1,5 @@
 """Shapes: primitives, and meshes from files."""
 
-import gc
 from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
@@ -12,8 +11,10 @@ from pydantic import Field, PositiveFloat
 
 from torchcover.files import check_memory, reads
 from torchcover.geometry import transform
+from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.simulation.documents import Document, PathBeside
 from torchcover.simulation.material import material_number
+from torchcover.simulation.mesh_files import mesh_arrays
 
 CYLINDER_SIDES = 24
 MAX_SIDES = 10_000
@@ -34,21 +35,21 @@ class Mesh(NamedTuple):
     `outward` (F,) is what `outward_faces` says, where that is known.
     """
 
-    vertices_m: NDArray[np.float64]
-    faces: NDArray[np.int64]
+    vertices_m: Float64
+    faces: Int64
     material: NDArray[np.uint8] | None = None
-    outward: NDArray[np.bool_] | None = None
+    outward: Bools | None = None
 
-    def moved(self, destination_T_source: NDArray[np.float64]) -> "Mesh":
+    def moved(self, destination_T_source: Float64) -> "Mesh":
         """The mesh in another frame."""
         return self._replace(vertices_m=transform(destination_T_source, self.vertices_m))
 
-    def with_faces(self, which: NDArray[np.bool_] | NDArray[np.int64]) -> "Mesh":
+    def with_faces(self, which: Bools | Int64) -> "Mesh":
         """Some of its faces, of what they were made of."""
         material = None if self.material is None else self.material[which]
         return Mesh(self.vertices_m, self.faces[which], material)
 
-    def parts(self) -> Iterator[tuple[slice, NDArray[np.float64]]]:
+    def parts(self) -> Iterator[tuple[slice, Float64]]:
         """Which faces, and their (3, 3, N) corners, coordinates, faces: as many at a time as there is memory for."""
         return parts_of([self])
 
@@ -62,9 +63,9 @@ class Mesh(NamedTuple):
         return np.zeros(len(self.faces), dtype=np.uint8) if self.material is None else self.material
 
 
-def parts_of(meshes: Sequence[Mesh]) -> Iterator[tuple[slice, NDArray[np.float64]]]:
+def parts_of(meshes: Sequence[Mesh]) -> Iterator[tuple[slice, Float64]]:
     """As `Mesh.parts`, of faces that are counted through all meshes: of small ones several together."""
-    first, held = 0, list[NDArray[np.float64]]()
+    first, held = 0, list[Float64]()
     for number, mesh in enumerate(meshes, 1):
         for start in range(0, max(len(mesh.faces), 1), PART):
             held.append(mesh.vertices_m[mesh.faces[start : start + PART]])
@@ -74,7 +75,7 @@ def parts_of(meshes: Sequence[Mesh]) -> Iterator[tuple[slice, NDArray[np.float64
                 first, held = first + count, []
 
 
-def corners_of(meshes: Sequence[Mesh], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+def corners_of(meshes: Sequence[Mesh], faces: Int64) -> Float64:
     """(3, 3, N) corners, coordinates, faces, of some that are counted through all meshes."""
     starts = np.cumsum([0] + [len(mesh.faces) for mesh in meshes])
     corners_m, of_mesh = np.empty((3, 3, len(faces))), np.searchsorted(starts, faces, side="right") - 1
@@ -84,13 +85,12 @@ def corners_of(meshes: Sequence[Mesh], faces: NDArray[np.int64]) -> NDArray[np.f
     return corners_m
 
 
-def normals_of(corners_m: NDArray[np.float64]) -> NDArray[np.float64]:
+def normals_of(corners_m: Float64) -> Float64:
     """(3, N) normals of (3, 3, N) corners, coordinates, faces; 0 without an area, for Embree does not hit that."""
     first, second, third = corners_m
     across = np.cross(second - first, third - first, axis=0)
     length = np.linalg.norm(across, axis=0)
-    normals: NDArray[np.float64] = across / np.where(length == 0, np.inf, length)
-    return normals
+    return np.asarray(across / np.where(length == 0, np.inf, length))
 
 
 class Plane(Document):
@@ -209,21 +209,10 @@ class MeshFile(Document):
 
 @reads("a mesh")
 def _read_mesh(path: Path) -> Mesh:
-    import trimesh
-
     with path.open("rb") as file:
         is_binary = b"\0" in file.read(PART)
-    size = path.stat().st_size
-    check_memory((_BYTES_PER_BINARY_BYTE if is_binary else _BYTES_PER_TEXT_BYTE) * size)
-    try:
-        loaded = trimesh.load_mesh(path, process=False)
-    except Exception as error:  # trimesh raises whatever the reader of the format raises
-        raise ValueError(f"trimesh cannot read it as a mesh ({error})") from error
-    vertices = np.asarray(getattr(loaded, "vertices", ()), dtype=np.float64)
-    faces = np.asarray(getattr(loaded, "faces", ()), dtype=np.int64)
-    del loaded
-    if size > PART:
-        gc.collect()  # it stood in a circle with what it was read from, four times as large as the mesh
+    check_memory((_BYTES_PER_BINARY_BYTE if is_binary else _BYTES_PER_TEXT_BYTE) * path.stat().st_size)
+    vertices, faces = mesh_arrays(path).values()
     if len(faces) == 0:
         raise ValueError(f"a mesh with faces is needed; it has {len(vertices)} vertices and no face")
     if not np.isfinite(vertices).all():
@@ -234,19 +223,19 @@ def _read_mesh(path: Path) -> Mesh:
     return Mesh(vertices, faces)
 
 
-def _rectangle(size_m: tuple[float, float], z_m: float) -> NDArray[np.float64]:
+def _rectangle(size_m: tuple[float, float], z_m: float) -> Float64:
     x, y = size_m[0] / 2, size_m[1] / 2
     return np.array([[-x, -y, z_m], [x, -y, z_m], [x, y, z_m], [-x, y, z_m]])
 
 
 @cache
-def circle(corners: int) -> NDArray[np.float64]:
+def circle(corners: int) -> Float64:
     """(corners, 2) points of the unit circle, counter-clockwise from (1, 0)."""
     angle = 2 * np.pi * np.arange(corners) / corners
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
-def _ball_faces(rings: int, corners: int) -> NDArray[np.int64]:
+def _ball_faces(rings: int, corners: int) -> Int64:
     """Triangles over vertices in the order lower pole, rings from below, upper pole."""
     here = np.arange(corners)
     following = (here + 1) % corners
@@ -258,7 +247,7 @@ def _ball_faces(rings: int, corners: int) -> NDArray[np.int64]:
     return np.concatenate(faces)
 
 
-def band(here: NDArray[np.int64], following: NDArray[np.int64], upwards: int) -> NDArray[np.int64]:
+def band(here: Int64, following: Int64, upwards: int) -> Int64:
     """Two triangles for each side between a ring and the one above it, whose indices are larger by `upwards`."""
     return np.concatenate(
         [
@@ -268,13 +257,13 @@ def band(here: NDArray[np.int64], following: NDArray[np.int64], upwards: int) ->
     )
 
 
-def _prism(bottom: NDArray[np.float64], top: NDArray[np.float64]) -> Mesh:
+def _prism(bottom: Float64, top: Float64) -> Mesh:
     """Close the space between two convex polygons with K corners each, given counter-clockwise from above."""
     return Mesh(np.concatenate([bottom, top]), prism_faces(2, len(bottom)))
 
 
 @cache
-def prism_faces(levels: int, corners: int) -> NDArray[np.int64]:
+def prism_faces(levels: int, corners: int) -> Int64:
     """Sides, bottom and top of a prism through so many outlines, which share them: nobody may write into them."""
     here = np.arange(corners)
     side = band(here, (here + 1) % corners, corners)

@@ -5,9 +5,9 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchcover.geometry import rigid
+from torchcover.geometry.arrays import Bools, Float32, Float64, Int32, Int64
 from torchcover.simulation.instant import Instant, SensorScan
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.rays import BLOCK, Balls, Tile, into_tiles, pixels_in_tiles, rotate
@@ -27,22 +27,16 @@ SHORTER = 1e-6
 class Ends(NamedTuple):
     """Where n rays end, in the order of the tiles: `range_m` (n,); `is_hit` (n,) whether on something but the ego."""
 
-    range_m: NDArray[np.float32]
-    is_hit: NDArray[np.bool_]
+    range_m: Float32
+    is_hit: Bools
 
 
 class MountedSensor:
-    """What a sensor of a rig sees.
+    """What a sensor of a rig sees, whose rays are cast `reach_m` far (`Scenario.reach_m`) through some weather.
 
-    Its place on the ego is fixed, so the rays that the ego's own body ends are the same at every step: it is not cast
-    at again. Where nothing moves at all, the rays are cast once for every step.
-
-    Args:
-        sensor: The sensor.
-        scene: Where it is.
-        reach_m: How far its rays are cast there; `Scenario.reach_m`.
-        weather: What they go through.
-        others: The other sensors of its rig, whose housings may be in the way.
+    Its place on the ego is fixed, so the rays that the ego's own body ends are the same at every step, as are those
+    that the housings of others end: these are not cast at again. Where nothing moves at all, the rays are cast once for
+    every step.
     """
 
     def __init__(
@@ -78,13 +72,10 @@ class MountedSensor:
         self._scanned: tuple[Instant, SensorScan] | None = None
 
     def scan(self, instant: Instant, draws: Draws, *, threads: int = 1, within: Balls | None = None) -> SensorScan:
-        """What it makes of what its rays hit at one time of the scene.
+        """What it makes of what its rays hit at one time of the scene; no number depends on `threads`.
 
-        Args:
-            instant: The scene then.
-            draws: Source of the random numbers, which each ray has of its own if some are not cast.
-            threads: Number of threads; the result does not depend on it.
-            within: What is asked about: rays that hit nothing there need not be cast. The points within are the same.
+        Rays that hit nothing `within` what is asked about need not be cast. The points within are the same: each ray
+        has random numbers of its own in `draws` then.
         """
         scan, hits = self._cast(instant, threads, within)
         if self._is_raw:
@@ -140,7 +131,7 @@ class MountedSensor:
             self._resting = scan, hits
         return scan, hits
 
-    def _met(self, within: Balls) -> list[NDArray[np.bool_]]:
+    def _met(self, within: Balls) -> list[Bools]:
         """For each tile (n,) which of its rays have to be cast: all of a beam, or none."""
         met = [within.met_by(tile, self.vehicle_T_sensor) for tile in self.tiles]
         beams = self.sensor.beams()
@@ -167,7 +158,7 @@ class MountedSensor:
         return Ends(np.concatenate(range_m), np.concatenate(is_hit))
 
 
-def ray_times(sensor: Sensor, tiles: Sequence[Tile], pixel_of_ray: NDArray[np.int64]) -> list[RayTimes] | None:
+def ray_times(sensor: Sensor, tiles: Sequence[Tile], pixel_of_ray: Int64) -> list[RayTimes] | None:
     """When the rays of each tile of a sensor are cast; None if all are at once."""
     times_s = sensor.times_s()
     if times_s is None:
@@ -180,19 +171,15 @@ def ray_times(sensor: Sensor, tiles: Sequence[Tile], pixel_of_ray: NDArray[np.in
 class Sight(NamedTuple):
     """What a place sees of N points: `seen` (N,); `self_hits` were hidden by the ego; the rest as in `SensorScan`."""
 
-    seen: NDArray[np.bool_]
+    seen: Bools
     self_hits: int
     body_casts: int
 
 
-def sight(instant: Instant, place_m: NDArray[np.float64], targets_m: NDArray[np.float32], *, threads: int = 1) -> Sight:
-    """Cast one ray from a place to each of some points; a point is seen if nothing lies in between.
+def sight(instant: Instant, place_m: Float64, targets_m: Float32, *, threads: int = 1) -> Sight:
+    """Cast a ray from a (3,) place to each of (N, 3) targets; one is seen if nothing lies in between.
 
-    Args:
-        instant: The scene.
-        place_m: (3,) in the vehicle frame.
-        targets_m: (N, 3) likewise; a little above the surface that they lie on, lest it hides them.
-        threads: Number of threads; the result does not depend on it.
+    Targets lie a little above their surface, lest it hides them. The result does not depend on the number of threads.
     """
     vehicle_T_place, bodies = rigid(np.eye(3), place_m), instant.outlines(place_m)
     way_m = targets_m.T - place_m[:, None]
@@ -203,7 +190,7 @@ def sight(instant: Instant, place_m: NDArray[np.float64], targets_m: NDArray[np.
     limit_m = (distance_m * (1 - SHORTER)).astype(np.float32)
     order = _neighbours(directions)
 
-    def cast(first: int) -> tuple[NDArray[np.int64], NDArray[np.int32], int]:
+    def cast(first: int) -> tuple[Int64, Int32, int]:
         rays = order[first : first + TILE_RAYS]
         tile = _tile(directions[:, rays])
         _, hits, casts = instant.cast(vehicle_T_place, tile, limit_m[rays], bodies)
@@ -222,7 +209,7 @@ def sight(instant: Instant, place_m: NDArray[np.float64], targets_m: NDArray[np.
     return Sight(hidden_by < 0, self_hits, sum(casts for _, _, casts in answers))
 
 
-def _neighbours(directions: NDArray[np.float64]) -> NDArray[np.int64]:
+def _neighbours(directions: Float64) -> Int64:
     """An order in which as many directions as a block of a tile has are close to each other."""
     by_azimuth = np.argsort(np.arctan2(directions[1], directions[0]))
     sectors = max(1, round(np.sqrt(len(by_azimuth)) / BLOCK))
@@ -231,7 +218,7 @@ def _neighbours(directions: NDArray[np.float64]) -> NDArray[np.int64]:
     return by_azimuth[np.argsort(4.0 * sector + directions[2, by_azimuth])]
 
 
-def _tile(directions: NDArray[np.float64]) -> Tile:
+def _tile(directions: Float64) -> Tile:
     """The tile of (3, n) directions; those that follow each other are a block, the last one repeats its last ray."""
     rays = directions.shape[1]
     blocks = np.minimum(np.arange(-(-rays // BLOCK**2) * BLOCK**2), rays - 1).reshape(-1, BLOCK**2)

@@ -10,13 +10,13 @@ from typing import Any, Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from torchcover.coverage.quantity import MEASURED_WITHIN_M
 from torchcover.detection.boxes import Boxes
 from torchcover.detection.inside import with_hits
 from torchcover.frames.frame import Frame, Measured
 from torchcover.frames.source import FrameDataset
+from torchcover.geometry.arrays import Float32, Float64, Int64
 from torchcover.simulation.instant import SensorScan
 from torchcover.simulation.kinds import REFERENCE_SENSORS
 from torchcover.simulation.reference_sensor import ReferenceSensor
@@ -166,7 +166,7 @@ class SimulatedFrames(FrameDataset):
         return self.scenario.ego_mesh()
 
     @property
-    def ego_outline_m(self) -> NDArray[np.float64]:
+    def ego_outline_m(self) -> Float64:
         """(4, 2) corners x, y of the ego as seen from above, counter-clockwise; no world is built for it."""
         return self.scenario.ego_box().outline_m
 
@@ -242,7 +242,7 @@ class SimulatedFrames(FrameDataset):
         )
         return with_boxes(frame, self._boxes(index, seen.drawn), self.rigs) if self.boxes else frame
 
-    def _boxes(self, index: int, drawn: NDArray[np.int64] | None) -> Boxes:
+    def _boxes(self, index: int, drawn: Int64 | None) -> Boxes:
         found = self.simulator.labels(index)
         rows = [[*label.centre_m, *label.size_m, label.yaw_rad] for label in found]
         velocities = np.array([label.velocity_mps for label in found])
@@ -286,7 +286,7 @@ def with_boxes(frame: Frame, boxes: Boxes, rigs: Mapping[str, Rig]) -> Frame:
     return replace(frame, boxes=with_hits(boxes, clouds, counts_as))
 
 
-def _error_m(scan: SensorScan) -> NDArray[np.float32]:
+def _error_m(scan: SensorScan) -> Float32:
     return np.zeros(len(scan.points), dtype=np.float32) if scan.error_m is None else scan.error_m
 
 
@@ -310,8 +310,7 @@ def reference_called(name: str | None = None, rays: int | None = None, asked: As
     kind = REFERENCE_SENSORS.get(DEFAULT_REFERENCE if name is None else name)
     if kind is None:
         raise ValueError(f"reference {name}: {' or '.join(f'`{known}`' for known in REFERENCE_SENSORS)} is needed")
-    asked = asked or RegionsOfInterest().around()
-    return kind.from_rays(asked.areas, rays, asked.bands_m, asked.grid.band_frame)
+    return kind.from_rays(asked or RegionsOfInterest().around(), rays)
 
 
 def reference_of_objects(asked: Asked | None = None) -> SurfaceReference:
@@ -324,10 +323,7 @@ def reference_of_objects(asked: Asked | None = None) -> SurfaceReference:
         >>> reference_of_objects().object_points
         64
     """
-    asked = asked or RegionsOfInterest().around()
-    return SurfaceReference(
-        asked.areas, bands_m=asked.bands_m, object_points=OBJECT_POINTS, band_frame=asked.grid.band_frame
-    )
+    return replace(SurfaceReference.from_rays(asked or RegionsOfInterest().around(), None), object_points=OBJECT_POINTS)
 
 
 def _rigs(rig: Rig | str | Path | None, rigs: Mapping[str, Rig | str | Path] | None) -> dict[str, Rig]:

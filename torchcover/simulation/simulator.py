@@ -9,9 +9,9 @@ from typing import Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from torchcover.geometry import BoundingBox
+from torchcover.geometry.arrays import Float32, Int64
 from torchcover.simulation.instant import Instant, SensorScan
 from torchcover.simulation.memory import check_fits
 from torchcover.simulation.rays import Balls
@@ -27,8 +27,6 @@ from torchcover.simulation.world import Label, labels
 
 # What a step takes at its largest: 73 to 246 were measured, for a LiDAR, a camera and the reference sensors.
 BYTES_PER_RAY = 300
-
-Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +46,7 @@ class Observation:
     reference: Float32
     reference_weights: Float32 | None
     reference_heights_m: Float32 | None
-    drawn: NDArray[np.int64] | None
+    drawn: Int64 | None
     counts: Mapping[str, int]
 
     @cached_property

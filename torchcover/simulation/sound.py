@@ -6,12 +6,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.simulation.patches import edges_of, outward_by, outward_faces, surfaces_of
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.shapes import Mesh, corners_of, normals_of, parts_of
-
-Bools = NDArray[np.bool_]
-Float64 = NDArray[np.float64]
 
 # Surfaces that are nearer to each other are one; nearer than the other, float32 cannot tell that they are two.
 COINCIDE_M = 1e-3
@@ -68,14 +66,8 @@ def coincident_faces(meshes: Sequence[Mesh], within: Sequence[bool]) -> list[Boo
     """Which faces coincide with another one that looks the same way, or may be seen from both sides, within 1 mm.
 
     Points of the faces are asked; of two surfaces that cover each other in a small part only, that may be overlooked.
-
-    Args:
-        meshes: What never moves, near the origin.
-        within: For each mesh, whether its faces may coincide with each other, too: parts of a vehicle that end in one
-            plane are no lie.
-
-    Returns:
-        One (F,) mask for each mesh.
+    Meshes never move and are near the origin; `within` says of each whether its faces may coincide with each other,
+    too, as of parts of a vehicle that end in one plane. One (F,) mask for each.
     """
     outward = np.concatenate([outward_faces(mesh) for mesh in meshes])
     number = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
@@ -120,7 +112,7 @@ def warn_of_coincidence(names: Sequence[str], coincident: Sequence[Bools]) -> No
         )
 
 
-def _first_of_each(edge: NDArray[np.int64], way: NDArray[np.int8]) -> NDArray[np.int64]:
+def _first_of_each(edge: Int64, way: NDArray[np.int8]) -> Int64:
     """Numbers of the faces but those that have the same edges as one before, run through the same way."""
     triples = np.sort(edge.reshape(-1, 3) * 3 + 1 + way.reshape(-1, 3), axis=1)
     # Hardly ever are any alike; then no two have the same number, and the slow comparison is not needed.
@@ -131,15 +123,14 @@ def _first_of_each(edge: NDArray[np.int64], way: NDArray[np.int8]) -> NDArray[np
     return np.sort(first)
 
 
-def _encloses(mesh: Mesh, surface: NDArray[np.int64]) -> Bools:
+def _encloses(mesh: Mesh, surface: Int64) -> Bools:
     """(F,) whether the surface of that number looks like a body: its normals point to all sides."""
     normals = np.empty((3, len(mesh.faces)))
     for part, (first, second, third) in mesh.parts():
         normals[:, part] = np.cross(second - first, third - first, axis=0)
     sums = np.stack([np.bincount(surface, axis, minlength=len(mesh.faces)) for axis in normals])
     area = np.bincount(surface, np.linalg.norm(normals, axis=0), minlength=len(mesh.faces))
-    encloses: Bools = np.linalg.norm(sums, axis=0) < BODY_SHARE * area
-    return encloses
+    return np.asarray(np.linalg.norm(sums, axis=0) < BODY_SHARE * area)
 
 
 def _inner_points(side: int) -> Float64:

@@ -8,9 +8,9 @@ from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 from torch.utils.data import get_worker_info
 
+from torchcover.geometry.arrays import Float64
 from torchcover.simulation.instant import Instant
 from torchcover.simulation.memory import machine_bytes
 from torchcover.simulation.moving import Solids
@@ -60,7 +60,7 @@ class Stage:
         self.mounts.free_for_good = not self.scene.moves
 
 
-def _check_place(sensor: str, place_m: NDArray[np.float64], instant: Instant) -> None:
+def _check_place(sensor: str, place_m: Float64, instant: Instant) -> None:
     where = f"{sensor} at {place_m.round(3).tolist()} m"
     on_a_face = instant.on_a_face(place_m)
     if instant.buried(place_m + LIFT_M if on_a_face else place_m):
@@ -79,13 +79,8 @@ class Scenes:
     """The geometry of a scenario's runs: each is built when first needed, and a few are kept, in case they are again.
 
     In each process, that is: Embree's scenes cannot be pickled, so that a DataLoader worker builds its own. The bodies
-    of each kind, which runs have in common, are made once.
-
-    Args:
-        scenario: What plays.
-        seed: Seed of procedural traffic.
-        kept_bytes: What all that are kept may take; a small share of the machine's memory if not given.
-        no_cache: As in `StoredWorlds`.
+    of each kind, which runs have in common, are made once. All that are kept may take `kept_bytes`; a small share of
+    the machine's memory if not given.
     """
 
     def __init__(

@@ -3,9 +3,9 @@
 import warnings
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchcover.geometry import transform
+from torchcover.geometry.arrays import Float64, Int64
 from torchcover.simulation.instant import Instant
 from torchcover.simulation.scene import Scene
 
@@ -19,7 +19,7 @@ OWN_FACES = 16
 LIFT_M = 1e-3
 
 
-def warn_of_floating(name: str, scene: Scene, steps: NDArray[np.int64]) -> None:
+def warn_of_floating(name: str, scene: Scene, steps: Int64) -> None:
     """Warn if the ego, or more than half of the others that move, have no ground near the bottoms of their bodies."""
     found = np.concatenate([_grounded(scene, step) for step in steps[:: -(-len(steps) // LOOKS)].tolist()])
     of_ego, of_others = found[found[:, 0] > 0, 1], found[found[:, 0] == 0, 1]
@@ -35,7 +35,7 @@ def warn_of_floating(name: str, scene: Scene, steps: NDArray[np.int64]) -> None:
             )
 
 
-def _grounded(scene: Scene, step: int) -> NDArray[np.int64]:
+def _grounded(scene: Scene, step: int) -> Int64:
     """(bodies, 2) whether each that is there at a step is the ego, and whether it has ground."""
     instant = scene.at(step, within_m=WITHIN_M)
     up = scene.world.ego.trajectory.at(step * scene.world.time_step_s)[2, :3]
@@ -45,7 +45,7 @@ def _grounded(scene: Scene, step: int) -> NDArray[np.int64]:
     return np.column_stack([is_ego, [_has_ground(instant, place_m, up) for place_m in places_m]]).astype(np.int64)
 
 
-def _has_ground(instant: Instant, place_m: NDArray[np.float64], up: NDArray[np.float64]) -> bool:
+def _has_ground(instant: Instant, place_m: Float64, up: Float64) -> bool:
     """Whether a ray from above a place to below it meets what never moves, the ego itself aside."""
     down = -(instant.static_T_vehicle[:3, :3] @ up).astype(np.float32)[:, None]
     left_m = 2 * NEAR_M

@@ -49,12 +49,7 @@ class StoredWorlds:
     """The worlds of a scenario. Those that are drawn are kept in torchcover/worlds of $XDG_CACHE_HOME or ~/.cache.
 
     Where they take more than the budget, those go that were not asked for longest, but none of this run: else a long
-    one would leave nothing to the next.
-
-    Args:
-        scenario: What plays.
-        seed: Seed of procedural traffic.
-        no_cache: Whether every world is built.
+    one would leave nothing to the next. With `no_cache` every world is built.
     """
 
     def __init__(self, scenario: Scenario, seed: int, *, no_cache: bool = False) -> None:
@@ -67,12 +62,7 @@ class StoredWorlds:
         self._drawn_from = ""
 
     def world(self, run: int, ego: Mesh | None) -> World:
-        """That of one run, to the bit as `Scenario.world` builds it.
-
-        Args:
-            run: Which; see `Scenario.locate`.
-            ego: The body of the ego in traffic.
-        """
+        """That of one run, see `Scenario.locate`, to the bit as `Scenario.world` builds it with an ego in traffic."""
         if self._folder is None or ego is None:
             return self._scenario.world(self._seed, run, ego)
         self._drawn_from = self._drawn_from or _drawn_from(self._scenario)

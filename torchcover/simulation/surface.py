@@ -4,20 +4,15 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchcover.geometry import invert, transform
+from torchcover.geometry.arrays import Bools, Float32, Float64, Int32, Int64
 from torchcover.simulation.instant import Instant
 from torchcover.simulation.local_ground import SLACK_M as HEIGHT_SLACK_M
 from torchcover.simulation.local_ground import TOLERANCE_M, GroundSquares, height_bounds
 from torchcover.simulation.patches import Bounds, Patches
 from torchcover.simulation.rays import rotate_each
 from torchcover.simulation.shapes import Mesh
-
-Bools = NDArray[np.bool_]
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Numbers = NDArray[np.int64]
 
 # Between which heights above the ground the ground itself lies.
 OF_GROUND_M = np.array([[-TOLERANCE_M - HEIGHT_SLACK_M], [HEIGHT_SLACK_M]], dtype=np.float32)
@@ -37,10 +32,10 @@ class Groups(NamedTuple):
     `first` (G + 1,) number of the first patch of each, and of all; `bounds` (G boxes) what they fill.
     """
 
-    first: Numbers
+    first: Int64
     bounds: Bounds
 
-    def members(self, groups: Numbers) -> Numbers:
+    def members(self, groups: Int64) -> Int64:
         """The numbers of the patches of some groups, one after the other."""
         first, count = self.first[groups], np.diff(self.first)[groups]
         return np.repeat(first - np.concatenate([[0], np.cumsum(count)[:-1]]), count) + np.arange(count.sum())
@@ -61,7 +56,7 @@ class AboveGround(NamedTuple):
     lowest_m: float
     highest_m: float
 
-    def of_scenery(self, number: int) -> Callable[[Float64, Numbers], tuple[Float32, Bools]]:
+    def of_scenery(self, number: int) -> Callable[[Float64, Int64], tuple[Float32, Bools]]:
         """From triangles of a mesh that never moves and their faces to (2, N) heights, and (N,) whether any is wanted.
 
         That of the ground itself is none, but for other ground a few centimetres above it. What lies below the ground
@@ -69,7 +64,7 @@ class AboveGround(NamedTuple):
         """
         is_ground, is_down = self.ground[number], self.down[number]
 
-        def heights(triangles_m: Float64, face: Numbers) -> tuple[Float32, Bools]:
+        def heights(triangles_m: Float64, face: Int64) -> tuple[Float32, Bools]:
             heights_m = OF_GROUND_M.repeat(len(face), axis=1)
             others = np.flatnonzero(~is_ground[face])
             wanted = np.full(len(face), self.lowest_m <= OF_GROUND_M[1, 0])
@@ -83,14 +78,11 @@ class AboveGround(NamedTuple):
 
         return heights
 
-    def of_objects(self, patches: Patches, static_T_patches: Float64, corners_m: Float64, count: Numbers) -> Patches:
-        """Patches of objects with their heights above the ground that is anywhere below the object.
+    def of_objects(self, patches: Patches, static_T_patches: Float64, corners_m: Float64, count: Int64) -> Patches:
+        """Patches of objects, one after the other, with heights above the ground anywhere below the object.
 
-        Args:
-            patches: All of one object, then all of the next.
-            static_T_patches: Where their frame is.
-            corners_m: (J, 8, 3) of boxes around the objects in that frame.
-            count: (J,) how many patches each has.
+        `static_T_patches` is where their frame is, in which `corners_m` (J, 8, 3) are of boxes around the objects;
+        `count` (J,) how many patches each has.
         """
         squares_T_patches = self.squares_T_static @ static_T_patches
         corners_m = transform(squares_T_patches, corners_m.reshape(-1, 3)).reshape(-1, 8, 3)
@@ -126,7 +118,7 @@ class SceneSurface:
         bounds: Bounds,
         outward: Sequence[Bools],
         above: AboveGround | None = None,
-        coincident: Sequence[NDArray[np.int32]] = (),
+        coincident: Sequence[Int32] = (),
     ) -> None:
         self._above = above
         self._moving = {body: (objects[number], number) for body, number in moving.items()}
@@ -159,12 +151,9 @@ class SceneSurface:
         return sum(column.nbytes for column in self._static)
 
     def near(self, instant: Instant, boxes: Bounds, objects_within_m: float = -np.inf) -> Patches:
-        """The patches that may meet boxes of the vehicle frame, in that frame, and some that do not.
+        """The patches that may meet boxes of the vehicle frame at an instant, in that frame, and some that do not.
 
-        Args:
-            instant: The scene at one time.
-            boxes: In the vehicle frame.
-            objects_within_m: All patches of an object are there, too, if it may come this near to the vehicle's origin.
+        All patches of an object are there, too, if it may come within `objects_within_m` of the vehicle's origin.
         """
         vehicle_T_static = invert(instant.static_T_vehicle)
         wanted = np.zeros(len(self._static.outward), dtype=bool)
@@ -207,12 +196,7 @@ def placed_each(kinds: Sequence[tuple[Patches, int]], destination_T_source: Floa
 
 
 def bounds_along(static_T_vehicle: Float64, box: Bounds) -> Bounds:
-    """Upright boxes in a frame that holds the drive of a vehicle, around all places of a box that it carries along.
-
-    Args:
-        static_T_vehicle: (T, 4, 4) poses of the vehicle, one after the other.
-        box: One box in the vehicle frame.
-    """
+    """Upright boxes around all places of a box that a vehicle carries along its drive, (T, 4, 4) poses in a row."""
     rotation, half_m = static_T_vehicle[:, :3, :3], (box.upper_m - box.lower_m)[0] / 2
     middle_m = rotation @ (box.lower_m + half_m)[0] + static_T_vehicle[:, :3, 3]
     lower_m, upper_m = middle_m - np.abs(rotation) @ half_m, middle_m + np.abs(rotation) @ half_m
@@ -222,7 +206,7 @@ def bounds_along(static_T_vehicle: Float64, box: Bounds) -> Bounds:
     return Bounds(lower_m - SLACK_M, upper_m + SLACK_M)
 
 
-def _by_place(patches: Patches) -> tuple[Numbers, Numbers]:
+def _by_place(patches: Patches) -> tuple[Int64, Int64]:
     """The order in which neighbours on the ground follow each other, and the cell of each patch in that order."""
     if patches.outward.size == 0:
         return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
@@ -234,18 +218,17 @@ def _by_place(patches: Patches) -> tuple[Numbers, Numbers]:
     return order, place[order] // CELL_M**2
 
 
-def _interleaved(place: Numbers) -> Numbers:
+def _interleaved(place: Int64) -> Int64:
     """(N,) numbers along a curve on which (2, N) places with coordinates below 2^21 are near what is near to them."""
     spread = place
     for bits, mask in ((16, 0x0000FFFF0000FFFF), (8, 0x00FF00FF00FF00FF), (4, 0x0F0F0F0F0F0F0F0F)):
         spread = (spread | (spread << bits)) & mask
     for bits, mask in ((2, 0x3333333333333333), (1, 0x5555555555555555)):
         spread = (spread | (spread << bits)) & mask
-    interleaved: Numbers = spread[0] | (spread[1] << 1)
-    return interleaved
+    return np.asarray(spread[0] | (spread[1] << 1))
 
 
-def _groups(patches: Patches, group: Numbers | NDArray[np.int32]) -> Groups:
+def _groups(patches: Patches, group: Int64 | Int32) -> Groups:
     """The groups of (N,) patches that are in their order."""
     first = np.flatnonzero(np.diff(group, prepend=-1))
     if len(first) == 0:
@@ -255,7 +238,7 @@ def _groups(patches: Patches, group: Numbers | NDArray[np.int32]) -> Groups:
     return Groups(np.append(first, len(group)), Bounds(lower_m - SLACK_M, upper_m + SLACK_M))
 
 
-def _boxes_around(patches: Patches, count: Numbers) -> Float64:
+def _boxes_around(patches: Patches, count: Int64) -> Float64:
     """(J, 8, 3) corners of J upright boxes, each around as many patches as (J,) say."""
     first = np.cumsum(count) - count
     lower_m, upper_m = np.minimum.reduceat(patches.lower_m, first, 1), np.maximum.reduceat(patches.upper_m, first, 1)

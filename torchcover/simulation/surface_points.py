@@ -4,16 +4,10 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from torchcover.geometry.arrays import Bools, Float32, Float64, Int32, Int64
 from torchcover.simulation.local_ground import SLACK_M as HEIGHT_SLACK_M
 from torchcover.simulation.patches import Bounds, Patches
-
-Bools = NDArray[np.bool_]
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Int32 = NDArray[np.int32]
-Numbers = NDArray[np.int64]
 
 # Patches are looked up with this much to spare: drawn points are rounded to float32.
 SLACK_M = 1e-3
@@ -52,7 +46,7 @@ class Stratum(NamedTuple):
     All three are (K,).
     """
 
-    patch: Numbers
+    patch: Int64
     m2: Float64
     inside_m2: Float64
 
@@ -63,20 +57,17 @@ class Objects(NamedTuple):
     `number` (J,) of each object, and `first` (J,) of its patches among these.
     """
 
-    patch: Numbers
+    patch: Int64
     m2: Float64
     number: Int32
-    first: Numbers
+    first: Int64
 
 
 class SurfaceStrata:
     """A surface, ready to draw points from: evenly within each of some boxes, which may overlap, and on each object.
 
-    Args:
-        patches: The surface in the frame of the boxes.
-        boxes: Strata, half-open: lower bounds belong to them.
-        heights_m: From (K, 3) points to (K,) heights, NaN for none, which the third bounds of the boxes are about, as
-            `Patches.heights_m` are; their z if not given.
+    Boxes are half-open, in the frame of the patches; their third bounds are about what `heights_m` makes of (K, 3)
+    points, (K,), NaN for none, as `Patches.heights_m` are, or about z if it is not given.
     """
 
     def __init__(self, patches: Patches, boxes: Bounds, heights_m: Callable[[Float32], Float32] | None = None) -> None:
@@ -96,14 +87,10 @@ class SurfaceStrata:
     def draw(
         self, place_m: Float64, each: float, generator: np.random.Generator, *, on_objects: int = 0
     ) -> SurfacePoints:
-        """Points on the patches that a place is in front of.
+        """Points on patches that a place is in front of, about `each` a box; below 1, one with that probability.
 
-        Args:
-            place_m: (3,) the place.
-            each: About how many points each box gets; if it is below 1, one with this probability.
-            generator: Source of the random numbers.
-            on_objects: How many more each object gets, wherever it is. One that turns no face to the place gets them
-                on the outer side of all its faces, which hide them.
+        Each object gets `on_objects` more, wherever it is. One that turns no face to the place gets them on the outer
+        side of all its faces, which hide them.
         """
         x, y, z = place_m.tolist()
         height_m = x * self._normals[0] + y * self._normals[1] + z * self._normals[2] - self._plane_m
@@ -130,25 +117,23 @@ class SurfaceStrata:
             self._patches.face.take(patch, axis=1),
         )
 
-    def _heights_of(self, points_m: Float32, patch: Numbers) -> Float32:
+    def _heights_of(self, points_m: Float32, patch: Int64) -> Float32:
         """(K,) what the third bounds of the boxes are about, of (3, K) points on the patches."""
         if self._heights_m is None:
-            z_m: Float32 = points_m[2]
-            return z_m
+            return np.asarray(points_m[2])
         asked = np.flatnonzero(self._patches.heights_m[1].take(patch) > HEIGHT_SLACK_M)  # the others are the ground
         heights_m = np.zeros(len(patch), dtype=np.float32)
         heights_m[asked] = self._heights_m(points_m.take(asked, axis=1).T)
         return heights_m
 
-    def _points(self, patch: Numbers, generator: np.random.Generator) -> Float32:
+    def _points(self, patch: Int64, generator: np.random.Generator) -> Float32:
         """(3, K) one point on each of the patches."""
         start = generator.random((2, 1))
         a, b = ((start + np.arange(len(patch)) * np.array(PLANE_STEPS)[:, None]) % 1).astype(np.float32)
         beyond = a + b > 1
         a, b = np.where(beyond, 1 - a, a), np.where(beyond, 1 - b, b)
         taken = self._patches.taken(patch)
-        points_m: Float32 = taken.corner_m + a * taken.first_m + b * taken.second_m
-        return points_m
+        return np.asarray(taken.corner_m + a * taken.first_m + b * taken.second_m)
 
 
 def _inside(placed_m: Sequence[Float32], low: Float64, high: Float64) -> Bools:
@@ -160,7 +145,7 @@ def _inside(placed_m: Sequence[Float32], low: Float64, high: Float64) -> Bools:
 
 def _strata(m2: Float32, lower_m: Float32, upper_m: Float32, boxes: Bounds) -> list[Stratum]:
     # What lies in an area, whatever its height, and how much of it: several bands ask about it.
-    above: dict[bytes, tuple[Numbers, Float32, Float32]] = {}
+    above: dict[bytes, tuple[Int64, Float32, Float32]] = {}
     strata = []
     for low, high in zip(*boxes, strict=True):
         area = np.stack([low[:2], high[:2]]).tobytes()
@@ -182,11 +167,10 @@ def _strata(m2: Float32, lower_m: Float32, upper_m: Float32, boxes: Bounds) -> l
 
 def _share(from_m: Float32, to_m: Float32, low: float, high: float) -> Float32:
     """Which share of each stretch lies between two bounds, of those that meet them."""
-    share: Float32 = (np.minimum(to_m, high) - np.maximum(from_m, low)) / (to_m - from_m)
-    return share
+    return np.asarray((np.minimum(to_m, high) - np.maximum(from_m, low)) / (to_m - from_m))
 
 
-def _drawn(stratum: Stratum, front: Bools, each: float, generator: np.random.Generator) -> tuple[Numbers, float]:
+def _drawn(stratum: Stratum, front: Bools, each: float, generator: np.random.Generator) -> tuple[Int64, float]:
     """Patches, drawn by their area so that about `each` points lie in the stratum, and points per square metre."""
     seen = front.take(stratum.patch)
     up_to_m2 = np.cumsum(stratum.m2 * seen)
@@ -213,7 +197,7 @@ def _objects(of_object: Int32, m2: Float32) -> Objects:
 
 def _drawn_on_objects(
     objects: Objects, front: Bools, each: int, generator: np.random.Generator
-) -> tuple[Numbers, Float64]:
+) -> tuple[Int64, Float64]:
     """Patches, `each` for every object, drawn by their area, and points per square metre by the object's number.
 
     The last density is for what is no object.

@@ -5,29 +5,18 @@ from dataclasses import dataclass
 from typing import ClassVar, Self, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
-from torchcover.coverage.grid import BandFrame
+from torchcover.coverage.grid import PAPER_HEIGHTS, BandFrame
 from torchcover.geometry import BoundingBox, rigid
+from torchcover.geometry.arrays import Float64
 from torchcover.simulation.local_ground import TOLERANCE_M
 from torchcover.simulation.patches import Bounds
-from torchcover.simulation.reference_sensor import (
-    DEFAULT_BAND_FRAME,
-    PAPER_BANDS_M,
-    Areas,
-    Bands,
-    ReferenceScan,
-    Surroundings,
-    check_areas,
-    check_reach,
-    position_in_shell,
-)
+from torchcover.simulation.reference_sensor import ReferenceScan, Surroundings, check_reach, position_in_shell
+from torchcover.simulation.regions_of_interest import DEFAULT_BAND_FRAME, Areas, Asked, Bands
 from torchcover.simulation.sight import Sight, sight
 from torchcover.simulation.sound import COINCIDE_M
 from torchcover.simulation.surface_points import SurfacePoints, SurfaceStrata
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 DEFAULT_RAYS = 16_384
 # How far above the surface a ray to it ends, in metres, and as a share of the coordinates that casting rounds.
 ABOVE_M = 1e-3
@@ -82,14 +71,18 @@ class SurfaceReference:
     areas: Areas
     rays: int = DEFAULT_RAYS
     places: int = 4
-    bands_m: Bands = PAPER_BANDS_M
+    bands_m: Bands = tuple(PAPER_HEIGHTS.values())
     shell_m: float = 0.5
     max_range_m: float = 250.0
     object_points: int = 0
     band_frame: BandFrame = DEFAULT_BAND_FRAME
 
     def __post_init__(self) -> None:
-        check_areas(self.areas)
+        if not self.areas:
+            raise ValueError("areas: at least one rectangle ((x_low, x_high), (y_low, y_high)) is needed")
+        for area in self.areas:
+            if not all(-math.inf < low < high < math.inf for low, high in area):
+                raise ValueError(f"areas: finite bounds, lower first, are needed; got {area}")
         if not self.bands_m or not all(-math.inf < low < high < math.inf for low, high in self.bands_m):
             raise ValueError(f"bands_m: at least one (low, high) with finite bounds is needed; got {self.bands_m}")
         if self.rays < 1:
@@ -106,15 +99,10 @@ class SurfaceReference:
         check_reach(self.shell_m, self.max_range_m)
 
     @classmethod
-    def from_rays(
-        cls,
-        areas: Areas,
-        rays: int | None,
-        bands_m: Bands = PAPER_BANDS_M,
-        band_frame: BandFrame = DEFAULT_BAND_FRAME,
-    ) -> Self:
+    def from_rays(cls, asked: Asked, rays: int | None) -> Self:
         """One that asks about some areas, with 16,384 rays if it is not told how many."""
-        return cls(areas, DEFAULT_RAYS if rays is None else rays, bands_m=bands_m, band_frame=band_frame)
+        rays = DEFAULT_RAYS if rays is None else rays
+        return cls(asked.areas, rays, bands_m=asked.bands_m, band_frame=asked.grid.band_frame)
 
     def scan(self, surroundings: Surroundings) -> ReferenceScan:
         """Draw points, and keep those that are seen; see `ReferenceSensor.scan`."""

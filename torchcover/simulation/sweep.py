@@ -10,16 +10,12 @@ from dataclasses import dataclass
 from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchcover.geometry import invert, transform
+from torchcover.geometry.arrays import Float32, Float64, Int64
 from torchcover.simulation.moving import Meetings, Moving
 from torchcover.simulation.raycaster import Hits, RayCaster, cast_from
 from torchcover.simulation.rays import SLACK_M, Outlines, Tile, outlines, rotate, rotate_each
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Numbers = NDArray[np.int64]
 
 # Poses at the begin, in the middle and at the end: parabolas, off by the cube of what a body turns in the meantime.
 SAMPLES = 3
@@ -29,7 +25,7 @@ class RayTimes(NamedTuple):
     """When the rays of a tile are cast, after the frame's time: `at_s` (g,) ascending, `of_ray` (n,) which of these."""
 
     at_s: Float64
-    of_ray: Numbers
+    of_ray: Int64
 
 
 class Poses(NamedTuple):
@@ -49,21 +45,17 @@ def no_motion(*_: float) -> tuple[Float64, Sequence[Poses]]:
 
 
 class SweptHits(NamedTuple):
-    """What n rays of a tile hit.
+    """What n rays of a tile hit, and at how many pairs of a ray and a moving body they were cast.
 
-    Args:
-        hits: Of each.
-        directions: (3, n) in the vehicle frame at the frame's time.
-        starts_m: (3, n) where they start, likewise, or (3, 1) if all start there.
-        on_body: (K,) the rays that hit a body that moves, and is not the ego.
-        points: (K, 3) where these points are at the frame's time: they have travelled with their body.
-        casts: How many rays were cast at bodies that move.
+    `directions` (3, n) and `starts_m` (3, n), or (3, 1) if all start there, are in the vehicle frame at the frame's
+    time. `on_body` (K,) are the rays that hit a body that moves, and is not the ego; `points` (K, 3) where these points
+    are at the frame's time: they have travelled with their body.
     """
 
     hits: Hits
     directions: Float32
     starts_m: Float32
-    on_body: Numbers
+    on_body: Int64
     points: Float32
     casts: int
 
@@ -72,14 +64,9 @@ class SweptHits(NamedTuple):
 class Sweep:
     """How everything moves while rays are cast one after the other.
 
-    Args:
-        static: What never moves.
-        now: Where everything is at the frame's time.
-        moving: The bodies that move, as they are then.
-        samples_s: (3,) times after that.
-        static_T_vehicle: (3, 4, 4) at these times.
-        part_T_vehicle: (3, P, 4, 4) likewise.
-        corners_m: (P, 24, 3) of boxes around the bodies at these times, as the vehicle sees them.
+    `now` says where everything is at the frame's time. At three times after that, `samples_s` (3,), are
+    `static_T_vehicle` (3, 4, 4), `part_T_vehicle` (3, P, 4, 4), and `corners_m` (P, 24, 3) of boxes around the bodies
+    as the vehicle sees them.
     """
 
     static: RayCaster
@@ -160,7 +147,7 @@ class Sweep:
         return SweptHits(hits, turned, from_m, on_body, points, len(ray))
 
     def _cast_at_static(
-        self, weights: Float64, of_ray: Numbers, origin_m: Float64, directions: Float32, limit_m: Float32
+        self, weights: Float64, of_ray: Int64, origin_m: Float64, directions: Float32, limit_m: Float32
     ) -> tuple[Hits, Float32, Float32]:
         """What n rays hit of what never moves; their (3, n) directions and starts in the vehicle frame of now."""
         now_T_static = invert(self.now.static_T_vehicle)
@@ -174,10 +161,9 @@ class Sweep:
         starts_m = transform(now_T_static, starts_m).T
         return hits, rotate(now_T_static[:3, :3], towards), starts_m.astype(np.float32).take(of_ray, axis=1)
 
-    def _parts(self, weights: Float64, part: Numbers) -> Float64:
+    def _parts(self, weights: Float64, part: Int64) -> Float64:
         """(K, 4, 4) `part_T_vehicle` of some bodies at times with these weights, (K, 3)."""
-        poses: Float64 = np.einsum("ks,skij->kij", weights, self.part_T_vehicle[:, part])
-        return poses
+        return np.asarray(np.einsum("ks,skij->kij", weights, self.part_T_vehicle[:, part]))
 
 
 def parabola_weights(samples_s: Float64, times_s: Float64) -> Float64:
@@ -201,11 +187,10 @@ def parabola_weights(samples_s: Float64, times_s: Float64) -> Float64:
 
 def _moved(poses: Float64, places_m: Float64) -> Float64:
     """(K, 3) places, each moved by its own of (K, 4, 4) poses."""
-    moved: Float64 = (poses[:, :3, :3] @ places_m[:, :, None])[:, :, 0] + poses[:, :3, 3]
-    return moved
+    return np.asarray((poses[:, :3, :3] @ places_m[:, :, None])[:, :, 0] + poses[:, :3, 3])
 
 
-def _turned(poses: Float64, of_ray: Numbers, directions: Float32) -> Float32:
+def _turned(poses: Float64, of_ray: Int64, directions: Float32) -> Float32:
     """(3, n) directions, each turned by the pose of its time."""
     rotations, (x, y, z) = poses[:, :3, :3].astype(np.float32), directions
     rows = rotations.transpose(1, 2, 0)

@@ -4,13 +4,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchcover.geometry import BoundingBox, euler_from_rotation, invert, transform
+from torchcover.geometry.arrays import Bools
+from torchcover.geometry.rigid import Matrix
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.shapes import Mesh
-
-Matrix = NDArray[np.float64]
 
 # A day at ten to a second.
 MAX_STEPS = 1_000_000
@@ -59,7 +58,7 @@ class World:
     duration_s: float = 0.0
     parked: tuple[Actor, ...] = ()
     ground: tuple[int, ...] | None = None
-    coincident: tuple[NDArray[np.bool_], ...] = ()
+    coincident: tuple[Bools, ...] = ()
     left_out: int = 0
 
     @property
@@ -100,16 +99,10 @@ class Label(NamedTuple):
 
 
 def labels(world: World, step: int, within_m: float) -> list[Label]:
-    """All objects near the ego at one step, the ego itself left out.
+    """All objects near the ego at one step, in the order of the world; the ego itself is left out.
 
-    Args:
-        world: The world.
-        step: Number of time steps since its start.
-        within_m: An object is near if the origin of its frame is, measured over ground.
-
-    Returns:
-        One label an object, in the order of the world. Boxes stand upright in the vehicle frame: a body that tilts
-        against the ego by a degree leaves its box by a few centimetres.
+    An object is near if the origin of its frame is, over ground. Boxes stand upright in the vehicle frame: a body that
+    tilts against the ego by a degree leaves its box by a few centimetres.
     """
     time_s = step * world.time_step_s
     world_T_vehicle = world.ego.trajectory.at(time_s)

@@ -14,7 +14,7 @@ from tests.simulation.recorded.drives import EGO, OTHERS, write_argoverse2, writ
 from tests.simulation.recorded.test_tracks import FEW, RIG, scenario
 from torchcover import Scenario
 from torchcover.cli.app import main
-from torchcover.files import BadFileError
+from torchcover.files import BadFileError, own_process
 from torchcover.simulation import Simulator
 
 
@@ -190,15 +190,21 @@ def test_logs_that_lack_something(tmp_path, monkeypatch):
     (log / "annotations.feather").rename(log / "annotations_with_ego.feather")
     assert "ego" not in [actor.name for actor in scenario(log).world().actors]
     fails(scenario(log, scene="a"), "scene: is for tables of nuScenes")
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    lack_pyarrow(monkeypatch)
     fails(scenario(log), r"annotations_with_ego.feather: .*pip install 'torchcover\[av2\]'", ImportError)
     monkeypatch.undo()
     (log / "city_SE3_egovehicle.feather").unlink()
     fails(scenario(log), r"city_SE3_egovehicle\.feather: no such file", FileNotFoundError)
 
 
+def lack_pyarrow(monkeypatch):
+    """Of the process that reads."""
+    monkeypatch.setattr(own_process, "_processes", {})
+    monkeypatch.setattr(own_process, "PROGRAM", f"import sys; sys.modules['pyarrow'] = None; {own_process.PROGRAM}")
+
+
 def test_a_missing_package_is_one_line_of_the_command_line(monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    lack_pyarrow(monkeypatch)
     monkeypatch.setattr(sys, "argv", ["torchcover", "evaluate", "front_roof_32", "--scenario", "tracks_argoverse2"])
     with pytest.raises(SystemExit) as ended:
         main()

@@ -1,9 +1,15 @@
 """Aggregations: how radii become maps and numbers of regions. A new one is a class and a line here."""
 
-from torchcover.coverage.aggregations.aggregation import Aggregation, BinnedStep, Layer, State
-from torchcover.coverage.aggregations.maximum import Maximum
-from torchcover.coverage.aggregations.means import MeanOfMeans, PooledMean, VisibleArea
-from torchcover.coverage.aggregations.quantiles import Quantiles, StepQuantiles
+from torchcover.coverage.aggregations.aggregation import Aggregation as Aggregation
+from torchcover.coverage.aggregations.aggregation import BinnedStep as BinnedStep
+from torchcover.coverage.aggregations.aggregation import Layer as Layer
+from torchcover.coverage.aggregations.aggregation import State as State
+from torchcover.coverage.aggregations.maximum import Maximum as Maximum
+from torchcover.coverage.aggregations.means import MeanOfMeans as MeanOfMeans
+from torchcover.coverage.aggregations.means import PooledMean as PooledMean
+from torchcover.coverage.aggregations.means import VisibleArea as VisibleArea
+from torchcover.coverage.aggregations.quantiles import Quantiles as Quantiles
+from torchcover.coverage.aggregations.quantiles import StepQuantiles as StepQuantiles
 
 # Those that a metric may have besides the mean of means.
 AGGREGATIONS: tuple[type[Aggregation], ...] = (Maximum, Quantiles, StepQuantiles, PooledMean)
@@ -28,19 +34,3 @@ def aggregation_named(words: str) -> Aggregation:
         return kind.parse(parameters)
     except ValueError as error:
         raise ValueError(f"aggregation {words}: {error}") from error
-
-
-__all__ = [
-    "AGGREGATIONS",
-    "Aggregation",
-    "BinnedStep",
-    "Layer",
-    "Maximum",
-    "MeanOfMeans",
-    "PooledMean",
-    "Quantiles",
-    "State",
-    "StepQuantiles",
-    "VisibleArea",
-    "aggregation_named",
-]

@@ -21,14 +21,7 @@ RADIUS_EDGES_M = torch.cat([torch.tensor([0.0]), torch.logspace(-2, 2, 81), torc
 
 
 def bin_of(values: Tensor, edges: Tensor) -> Tensor:
-    """Index of the half-open bin [edges[i], edges[i + 1]) of each value.
-
-    Args:
-        values: (N,) float64.
-        edges: (B + 1,) float64, ascending; a bin between equal edges is empty.
-
-    Returns:
-        (N,) int64 bin indices in [0, B), -1 outside.
+    """(N,) int64 which half-open bin [edges[i], edges[i + 1]) each value is in, -1 outside; of equal edges none is.
 
     Example:
         >>> bin_of(torch.tensor([-0.1, 0.0, 0.9, 2.0]).double(), torch.tensor([0.0, 1.0, 2.0]).double())
@@ -39,15 +32,9 @@ def bin_of(values: Tensor, edges: Tensor) -> Tensor:
 
 
 def histogram_quantiles(histogram: Tensor, edges: Tensor, levels: Sequence[float]) -> Tensor:
-    """Quantiles from weights in bins, linear within a bin.
+    """(Q, C) quantiles from (B, C) weights in bins between (B + 1,) ascending edges, linear within a bin.
 
-    Args:
-        histogram: (B, C) weight in each bin, one column a cell.
-        edges: (B + 1,) bin edges, ascending; the last may be infinite.
-        levels: Q levels in [0, 1].
-
-    Returns:
-        (Q, C) quantiles; infinite in the last bin if its upper edge is; NaN in a column without weight.
+    The last edge may be infinite, and then are the quantiles in that bin; NaN in a column without weight.
     """
     edges, cumulative = edges.to(histogram.device), histogram.cumsum(dim=0)
     total = cumulative[-1]

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import product
 
 import numpy as np
 import torch
@@ -17,6 +18,8 @@ FIRST = 3
 HIGHEST, LAST = 200, 600
 SCATTERED, KEPT, AROUND, ROUNDS = 512, 8, 32, 4
 FIRST_WIDTH, OTHER_OPTION = 0.1, 0.2
+# Of choices. Beyond, a list of all of them would take longer to rank than to scatter places.
+MOST_COMBINATIONS = 4096
 # How many more values there are when the hyperparameters are learnt again.
 GROWTH = 1.2
 # From the median down, in units of what the best is above it.
@@ -29,7 +32,7 @@ class GaussianProcessSearch:
     """Looks where the expected improvement over the best mean so far is largest (Jones et al. 1998).
 
     Its noise is the squared error that it is told, and a little that it learns. A place where no rig can be counts as
-    the lowest value so far, so that little is expected nearby.
+    the lowest value so far, so that little is expected nearby. Where all are choices, each combination comes once.
 
     Args:
         cube: What is free.
@@ -57,13 +60,14 @@ class GaussianProcessSearch:
         """A value more for the model."""
         self._note(unit, value, error)
 
-    def ask(self) -> Unit:
-        """The place of the largest expected improvement; scattered places first."""
+    def ask(self) -> Unit | None:
+        """The place of the largest expected improvement; scattered places first; None when there is none left."""
         turn, width = len(self._places) - self._before, len(self._cube.levels)
         known = np.isfinite(self._values)
         if turn < FIRST + width or not known.any():
-            scattered: Unit = self._scattered(turn + 1, self._seed)[-1]
-            return scattered
+            scattered = self._scattered(turn + 1, self._seed)
+            left = self._untried(np.vstack([scattered[-1:], self._anywhere(self._seed)]))
+            return left[0] if len(left) else None
         with _one_thread(), torch.no_grad():
             return self._best(turn)
 
@@ -100,25 +104,32 @@ class GaussianProcessSearch:
         )
         return self._cube.snapped(sobol.draw(count, dtype=torch.float64).numpy())
 
-    def _best(self, turn: int) -> Unit:
+    def _anywhere(self, seed: int) -> Unit:
+        """Places all over the cube; of choices all combinations, unless they are very many."""
+        count, levels = self._cube.combinations, self._cube.levels
+        if count is None or count > MOST_COMBINATIONS:
+            return self._scattered(SCATTERED, seed)
+        options = (tuple((option + 0.5) / level for option in range(level)) for level in levels)
+        every = np.array(list(product(*options)), dtype=np.float64).reshape(count, len(levels))
+        return self._cube.snapped(np.random.default_rng(seed).permutation(every))
+
+    def _best(self, turn: int) -> Unit | None:
         model = self.model()
         assert model is not None  # there are values
         means, _ = model.predict(model.places)
         best = float(means.max())
         draws = np.random.default_rng([self._seed, turn])
         tops = model.places[means.argsort(descending=True)[:KEPT]].numpy()
-        places = np.vstack([self._scattered(SCATTERED, int(draws.integers(2**31))), self._around(tops, 0, draws)])
+        places = np.vstack([self._anywhere(int(draws.integers(2**31))), self._around(tops, 0, draws)])
         for again in range(ROUNDS + 1):
             places = self._untried(places)
             if not len(places):
-                places = self._scattered(1, int(draws.integers(2**31)))  # all of them are known: once more, then
-                break
+                return None
             worth = log_expected_improvement(*model.predict(torch.from_numpy(places)), best, model.scale)
             places = places[worth.argsort(descending=True, stable=True)[:KEPT].numpy()]
             if again < ROUNDS:
                 places = np.vstack([places, self._around(places, again, draws)])
-        chosen: Unit = places[0]
-        return chosen
+        return np.asarray(places[0])
 
     def _around(self, places: Unit, narrower: int, draws: np.random.Generator) -> Unit:
         """Places near others; some with another option."""
@@ -137,11 +148,7 @@ class GaussianProcessSearch:
 def log_expected_improvement(mean: Tensor, deviation: Tensor, best: float, scale: float) -> Tensor:
     """The logarithm of E[max(f - best, 0)] / scale for normally distributed f, without underflow (Ament et al. 2023).
 
-    Args:
-        mean: (m,).
-        deviation: (m,), 0 or more.
-        best: What is to be beaten.
-        scale: Of the values; deviations below a trillionth of it count as that.
+    Means and deviations are (m,); deviations below a trillionth of the scale count as that.
 
     Example:
         >>> float(log_expected_improvement(torch.zeros(1), torch.ones(1), 0.0, 1.0).exp() * math.sqrt(2 * math.pi))

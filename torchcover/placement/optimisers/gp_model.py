@@ -53,14 +53,9 @@ class GaussianProcess:
     ) -> Self:
         """Learn the hyperparameters: the maximum of the marginal likelihood with a weak prior, from several starts.
 
-        Rasmussen and Williams 2006, Gaussian Processes for Machine Learning, algorithm 2.1 and section 5.4.
-
-        Args:
-            levels: As of `Cube`.
-            places: (n, variables) float64, n of 1 or more; duplicates may be among them.
-            values: (n,) float64, finite.
-            errors: (n,) float64, the standard error of each; 0 for an exact one.
-            like: One whose hyperparameters are taken instead.
+        Rasmussen and Williams 2006, Gaussian Processes for Machine Learning, algorithm 2.1 and section 5.4. `places`
+        are (n, variables) float64, n of 1 or more, with duplicates or without; `values` (n,) and finite; `errors` (n,)
+        the standard error of each, 0 for an exact one. Those of `like` are taken instead of learned, if it is given.
 
         Example:
             >>> x = torch.linspace(0, 1, 9, dtype=torch.float64)[:, None]

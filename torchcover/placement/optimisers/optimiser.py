@@ -55,7 +55,6 @@ class Optimiser(Protocol):
 
     def ask(self) -> Unit | None:
         """The next place, (variables,); None when there is none left."""
-        ...
 
     def tell(self, unit: Unit, value: float, error: float) -> None:
         """What a place is worth.
@@ -65,4 +64,3 @@ class Optimiser(Protocol):
             value: Its gain over the start; NaN: no rig can be there.
             error: Standard error of the gain, as far as it comes from instants that were left out; 0: of none.
         """
-        ...

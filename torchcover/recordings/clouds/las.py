@@ -7,7 +7,7 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.files import check_memory
+from torchcover.files import check_memory, laz_points
 
 HEADER_BYTES, HEADER_BYTES_1_4 = 227, 375
 COMPRESSED = 0x80  # of the point format
@@ -35,7 +35,7 @@ def read_las(path: Path) -> NDArray[np.float64]:
         if header.compressed:
             _check_chunks(file, header, size_bytes)
     if header.compressed:
-        return _whole_numbers_of_laz(path, header.points) * header.scale + header.offset
+        return laz_points(path, header.points)["xyz"] * header.scale + header.offset
     claimed_bytes = header.points * header.record_bytes
     if header.first_byte + claimed_bytes > size_bytes:
         raise ValueError(
@@ -84,15 +84,3 @@ def _check_chunks(file: BinaryIO, header: _Header, size_bytes: int) -> None:
     _, chunks = struct.unpack("<II", file.read(8))
     if chunks > header.points + 1:
         raise ValueError(f"the header claims {header.points} points, the table of chunks {chunks} chunks of them")
-
-
-def _whole_numbers_of_laz(path: Path, points: int) -> NDArray[np.int32]:
-    try:
-        import laspy
-    except ImportError as error:
-        raise ImportError(f"{path}: LAZ needs laspy: pip install 'torchcover[las]'") from error
-    with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False) as reader:
-        found = reader.read_points(points)
-    if len(found) != points:
-        raise ValueError(f"the header claims {points} points; {len(found)} are there")
-    return np.column_stack([found.X, found.Y, found.Z])

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.files import naming
-from torchcover.geometry import quaternion_from_rotation, rigid, rotation_from_quaternion
+from torchcover.geometry import quaternion_from_rotation, rigid, rotation_from_quaternion, slerp
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.formats.bag import Bag
 from torchcover.recordings.formats.frame_tree import FrameTree, frame_name, pose_of
@@ -53,7 +53,7 @@ class PoseSeries(NamedTuple):
             )
         share = (since_s / gap_s)[:, None]
         first_m, second_m = self.places_m[after - 1], self.places_m[after]
-        rotations = rotation_from_quaternion(_slerp(self.wxyz[after - 1], self.wxyz[after], share))
+        rotations = rotation_from_quaternion(slerp(self.wxyz[after - 1], self.wxyz[after], share))
         return rigid(rotations, first_m + share * (second_m - first_m))
 
 
@@ -179,15 +179,3 @@ def _series(poses: Mapping[int, Matrix]) -> PoseSeries:
     sorted_poses = np.array([poses[int(time_ns)] for time_ns in times_ns])
     wxyz = np.array([quaternion_from_rotation(pose[:3, :3]) for pose in sorted_poses])
     return PoseSeries(times_ns, sorted_poses[:, :3, 3], wxyz)
-
-
-def _slerp(first: Matrix, second: Matrix, share: Matrix) -> Matrix:
-    cosine = (first * second).sum(axis=1, keepdims=True)
-    second, cosine = np.where(cosine < 0, -second, second), np.abs(cosine).clip(max=1.0)
-    angle = np.arccos(cosine)
-    straight = angle < 1e-6
-    sine = np.where(straight, 1.0, np.sin(angle))
-    of_first = np.where(straight, 1 - share, np.sin((1 - share) * angle) / sine)
-    of_second = np.where(straight, share, np.sin(share * angle) / sine)
-    between: Matrix = of_first * first + of_second * second
-    return between

@@ -86,7 +86,7 @@ def draw_scene(
     ego_outline_m: Points,
     actors: Sequence[ActorMark],
     sensor: Points,
-    reference: Points,
+    reference: Points | None = None,
     title: str,
     subtitle: str = "",
     path_m: Points | None = None,
@@ -100,7 +100,7 @@ def draw_scene(
         ego_outline_m: (K, 2) corners of the ego in the vehicle frame in metres.
         actors: The others; what lies beyond the bounds is left out.
         sensor: (N, 3) points of the rig.
-        reference: (M, 3) points of the reference sensor.
+        reference: (M, 3) points of the reference sensor, if there is one.
         title: First line.
         subtitle: Second line, smaller.
         path_m: (T, 2) the ego's way in the vehicle frame in metres; not drawn if it does not move.
@@ -113,7 +113,7 @@ def draw_scene(
     inside = [actor for actor in actors if _is_inside(actor.outline_m, x, y)]
     entries = [
         *_draw_standing(axes, standing),
-        *_draw_cloud(axes, reference, REFERENCE, "reference points"),
+        *([] if reference is None else _draw_cloud(axes, reference, REFERENCE, "reference points")),
         *_draw_cloud(axes, sensor, SENSOR, "points of the rig"),
         *_draw_actors(axes, inside),
         *([] if path_m is None else axes.plot(*path_m.T, color=PATH, linewidth=1.2, label="way of the ego", zorder=3)),

@@ -5,14 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from torchcover.geometry import fitted
+from torchcover.geometry.arrays import Float64
 from torchcover.simulation.height_field import CELL_M, MARGIN_M, Plain, Slopes, corners_of, middles_m
 from torchcover.simulation.traffic.assemble import HORIZON_M
 from torchcover.simulation.world import Actor
-
-Numbers = NDArray[np.float64]
 
 # Squares a little beyond what is seen are built, so that none ends in sight; bodies are as long as this.
 BEYOND_M = 25.0
@@ -24,12 +22,10 @@ LEFT_OF = np.array([[0.0, 1.0], [-1.0, 0.0]])
 SCALES_M = tuple(CELL_M * factor for factor in (16.0, 8.0, 4.0, 2.0, 1.0))
 
 
-def ground_below(places_m: Numbers, ego_m: Numbers) -> Plain | Slopes:
+def ground_below(places_m: Float64, ego_m: Float64) -> Plain | Slopes:
     """The ground around the ego's way: plain if everybody stands at one height.
 
-    Args:
-        places_m: (N, 3) on which others stood; some may be wrong.
-        ego_m: (T, 3) on which the ego stood: these are believed.
+    The (T, 3) places on which the ego stood are believed; of the (N, 3) of others some may be wrong.
     """
     margin_m = HORIZON_M + MARGIN_M
     lower_m, upper_m = ego_m[:, :2].min(axis=0) - margin_m, ego_m[:, :2].max(axis=0) + margin_m
@@ -43,7 +39,7 @@ def ground_below(places_m: Numbers, ego_m: Numbers) -> Plain | Slopes:
     across_m, over_m = places_m[inside, :2] - lower_m, places_m[inside, 2] - base_m
     rows, columns = corners_of(lower_m, upper_m)
     field = fitted(across_m, over_m, upper_m - lower_m, SCALES_M, trusted=trusted[inside])
-    corners: Numbers = CELL_M * np.indices((rows, columns))[::-1].reshape(2, -1).T.astype(np.float64)
+    corners: Float64 = CELL_M * np.indices((rows, columns))[::-1].reshape(2, -1).T.astype(np.float64)
     way_m = ego_m[:, :2] if len(ego_m) > 1 else np.repeat(ego_m[:, :2], 2, axis=0)
     way = shapely.LineString(way_m - lower_m).simplify(0.5)
     shapely.prepare(way)
@@ -53,17 +49,16 @@ def ground_below(places_m: Numbers, ego_m: Numbers) -> Plain | Slopes:
     )
 
 
-def thinned(places_m: Numbers) -> Numbers:
+def thinned(places_m: Float64) -> Float64:
     """(N, 3) the middle of each stay of (K, 3) places that follow each other."""
     way_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(places_m[:, :2], axis=0), axis=1))])
     stay = np.cumsum(np.diff(way_m // STAYS_M, prepend=0.0) > 0)
     count = np.bincount(stay)
     sums = [np.bincount(stay, axis) for axis in (places_m - places_m[0]).T]
-    middles: Numbers = places_m[0] + np.stack(sums, axis=1) / count[:, None]
-    return middles
+    return np.asarray(places_m[0] + np.stack(sums, axis=1) / count[:, None])
 
 
-def stood_on(tracks: Sequence[Numbers]) -> Numbers:
+def stood_on(tracks: Sequence[Float64]) -> Float64:
     """(N, 3) all the places of some tracks, (K, 3) each, that say something new."""
     return np.concatenate([np.empty((0, 3)), *map(thinned, tracks)])
 

@@ -30,14 +30,7 @@ class Cast(NamedTuple):
 
 
 class Excerpt(NamedTuple):
-    """What is shown of a recording.
-
-    Args:
-        begin_s: The first instant, in the time of the recording.
-        duration_s: From there to the last.
-        drive: Of the ego, in the time of the recording.
-        others: Everybody else.
-    """
+    """What is shown of a recording: `drive` of the ego and all `others`, in its time, from `begin_s` on."""
 
     begin_s: float
     duration_s: float
@@ -46,12 +39,9 @@ class Excerpt(NamedTuple):
 
 
 def cast_of(recording: RecordedObjects, ego_id: str | None, ego_T_vehicle: Matrix | None) -> Cast:
-    """Choose the ego.
+    """Choose the ego: the track or the recording's own ego of an id, the first of these without one.
 
-    Args:
-        recording: Who there is.
-        ego_id: The id of a track, or of one of its own egos; the first of these if None.
-        ego_T_vehicle: The vehicle frame in that of the poses of its own ego, if not as published.
+    `ego_T_vehicle` is the vehicle frame in that of the poses of its own ego, if not as published.
     """
     egos = {ego.name: ego for ego in recording.egos}
     if ego_id is None and not egos:
@@ -73,12 +63,6 @@ def excerpt_of(cast: Cast, begin_s: float, duration_s: float | None, max_gap_s: 
     """Choose the times: those at which the ego and the others are known, or of them what is asked for.
 
     An ego of which one pose is known stands there; that instant alone is shown, unless a duration is given.
-
-    Args:
-        cast: Who is who.
-        begin_s: After the first such time.
-        duration_s: To the last such time if None.
-        max_gap_s: See `pieces`.
     """
     drive_s = cast.drive.times_s
     stands = len(drive_s) == 1

@@ -4,13 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from torchcover.simulation.traffic.assemble import HORIZON_M
 from torchcover.simulation.traffic.frontage import Side, sides_around
 from torchcover.simulation.world import Actor
-
-Numbers = NDArray[np.float64]
 
 # From the middle of a track to the kerb; what lies between tracks that are nearer to each other is street, too.
 TO_KERB_M, BETWEEN_M, SIDEWALK_M = 5.0, 12.0, 3.0
@@ -21,17 +18,7 @@ CLEAR_M, TREMBLE_M = 0.5, 0.3
 def sides_of(
     ego: Actor, others: Sequence[Actor], built_share: float, generator: np.random.Generator
 ) -> tuple[list[Side], list[shapely.Geometry], list[shapely.Geometry]]:
-    """The sides of what was driven, as far as the ego sees.
-
-    Args:
-        ego: The ego.
-        others: Everybody else.
-        built_share: Share of the sides that are built up.
-        generator: Draws which.
-
-    Returns:
-        The sides, and where nothing may stand: at kerbs, and behind sidewalks.
-    """
+    """The sides of what was driven, as far as the ego sees; where nothing may stand at kerbs, and behind sidewalks."""
     everybody = (ego, *others)
     places_m = [actor.trajectory.positions_m[:, :2] for actor in everybody]
     ways = [shapely.LineString(np.concatenate([way_m, way_m[-1:]])).simplify(TREMBLE_M) for way_m in places_m]

@@ -109,10 +109,9 @@ class RecordedTraffic(Traffic):
         }
 
     def world(self, seed: int, ego: Mesh | None = None) -> World:
-        """Build the world: nothing in it is drawn but what stands beside streets, if it is asked for.
+        """Build the world in the frame of the recording, and draw what stands beside streets if that is asked for.
 
-        Returns:
-            The world, in the frame of the recording. Who is where the ego is at an instant is left out, with a warning.
+        Who is where the ego is at an instant is left out, with a warning.
         """
         # A box is all of a truck.
         run, bodies = self._run, {**load_bodies(), "truck": Vehicle.load("truck").mesh()}

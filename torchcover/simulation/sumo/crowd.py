@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchcover.files import feed_xml, reads
 from torchcover.simulation.sumo.floating import Recorded, SumoTrack
@@ -13,8 +12,6 @@ from torchcover.simulation.sumo.motion import RoadUser
 from torchcover.simulation.traffic.assemble import HORIZON_M
 from torchcover.simulation.traffic.fleet import CATEGORIES, EGO, Fleet
 from torchcover.simulation.traffic.vehicle_class import VehicleType
-
-Numbers = NDArray[np.float64]
 
 PIECE_BYTES = 1 << 18
 
@@ -88,14 +85,8 @@ def crowd(
 ) -> Crowd:
     """Choose the ego, and leave out whoever never comes near.
 
-    Args:
-        recorded: What the simulation had.
-        known: Its types.
-        fleet: Our bodies.
-        ego_name: Which one the ego is; drawn if not given.
-        ego_type: Of which type it is, if it is drawn; any car if not given.
-        duration_s: Of the run.
-        generator: Draws the ego, in proportion to the ways that vehicles drive.
+    The ego is the one of a name; else it is drawn in proportion to the ways that vehicles drive, of one type or of all
+    cars.
 
     Raises:
         ValueError: Nobody who may be the ego is there for the whole run.

@@ -7,11 +7,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchcover.files import feed_xml, reads
-
-Numbers = NDArray[np.float64]
+from torchcover.geometry.arrays import Float64
 
 ATTRIBUTES = "id,x,y,z,angle,slope,type"
 # Who is not heard of for longer than this many usual steps, or moves faster than this from one to the next, is gone in
@@ -23,25 +21,19 @@ TIME_SLACK_S = 1e-6
 
 
 class SumoTrack(NamedTuple):
-    """One vehicle or person, for as long as it was there without a gap.
+    """One vehicle or person, for as long as it was there without a gap; `kind` is the name of its type.
 
-    Args:
-        name: Of the simulation.
-        kind: Name of its type.
-        on_foot: Whether it is a person.
-        times_s: (K,) from the first time of the run.
-        places_m: (K, 3) the middle of its front, float64: they may be of UTM size.
-        yaw_deg: (K,) heading, counter-clockwise from x; SUMO's own angles are clockwise from north.
-        slope_deg: (K,) upwards.
+    At (K,) times from the first of the run: (K, 3) the middle of its front, float64, for they may be of UTM size; its
+    heading, counter-clockwise from x, where SUMO's own angles are clockwise from north; and its slope upwards.
     """
 
     name: str
     kind: str
     on_foot: bool
-    times_s: Numbers
-    places_m: Numbers
-    yaw_deg: Numbers
-    slope_deg: Numbers
+    times_s: Float64
+    places_m: Float64
+    yaw_deg: Float64
+    slope_deg: Float64
 
     def covers(self, duration_s: float) -> bool:
         """Whether it is there from the first time to so much later."""
@@ -49,13 +41,7 @@ class SumoTrack(NamedTuple):
 
 
 class TimeWindow(NamedTuple):
-    """What of the data is meant.
-
-    Args:
-        begin_s: Its first time, in that of the simulation.
-        duration_s: Its length.
-        from_name: It begins when this one is heard of, if that is later.
-    """
+    """What of the data is meant: from `begin_s` of the simulation, or from when `from_name` is heard of, if later."""
 
     begin_s: float
     duration_s: float
@@ -77,7 +63,7 @@ class _Collector:
         self.kinds: list[str] = []
         self.times_s: list[float] = []
         self.of: list[int] = []
-        self.rows: list[Numbers] = []
+        self.rows: list[Float64] = []
         self.counts: list[int] = []
 
     def start(self, name: str, attributes: list[str]) -> None:
@@ -146,12 +132,9 @@ class _Collector:
 
 
 class Recorded(NamedTuple):
-    """What there is in a window.
+    """What there is in a window that begins at `begin_s` of the simulation; `last_s` is the last time read, or -inf.
 
-    Args:
-        tracks: All, in the order of their first appearance; somebody who was gone in between has several.
-        begin_s: When it begins, in the time of the simulation.
-        last_s: The last time that was read; minus infinity if there was none.
+    The tracks are in the order of their first appearance; somebody who was gone in between has several.
     """
 
     tracks: tuple[SumoTrack, ...]
@@ -160,11 +143,7 @@ class Recorded(NamedTuple):
 
 
 def record(pieces: Iterable[bytes], window: TimeWindow) -> Recorded:
-    """Read floating car data.
-
-    Args:
-        pieces: XML as SUMO writes it; no more of it is asked for than the window needs.
-        window: What is kept of it.
+    """Read floating car data from pieces of XML, no more of which are asked for than the window needs.
 
     Raises:
         ValueError: Not such data, or without angles.

@@ -2,8 +2,8 @@
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from torchcover.geometry.arrays import Bools, Float64
 from torchcover.simulation.sumo.vicinity import Vicinity
 from torchcover.simulation.traffic.frontage import Side, sides_around
 
@@ -23,7 +23,7 @@ def sides_of(
     )
     shapely.prepare(bridges)
 
-    def sees(places_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def sees(places_m: Float64) -> Bools:
         return np.asarray(vicinity.sees(places_m) & ~shapely.contains_xy(bridges, *places_m.T))
 
     taken = shapely.buffer(vicinity.covered, CLEAR_M).tolist()

@@ -4,15 +4,13 @@ from itertools import pairwise
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from torchcover.geometry import spread
+from torchcover.geometry.arrays import Bools, Float64
 from torchcover.simulation.height_field import CELL_M, MARGIN_M, Ground, Plain, Slopes, corners_of, middles_m
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.sumo.vicinity import Vicinity
 from torchcover.simulation.traffic.scenery import plateau
-
-Numbers = NDArray[np.float64]
 
 # Rounds of smoothing between the streets, at each scale; the streets' own heights stay.
 SMOOTHINGS = 4
@@ -34,10 +32,10 @@ def ground_of(vicinity: Vicinity) -> Plain | Slopes:
     return Slopes(lower_m, _filled(total, weight), wanted)
 
 
-def _filled(total: Numbers, weight: Numbers) -> Numbers:
+def _filled(total: Float64, weight: Float64) -> Float64:
     """Means where there is a weight; elsewhere what a raster of half the size has, smoothed."""
     known = weight > 0
-    means: Numbers = total / np.where(known, weight, 1.0)
+    means: Float64 = total / np.where(known, weight, 1.0)
     if known.all() or min(means.shape) < 2:
         return means if known.any() else np.zeros_like(means)
     padding = [(0, size % 2) for size in means.shape]
@@ -54,7 +52,7 @@ def _filled(total: Numbers, weight: Numbers) -> Numbers:
     return found
 
 
-def tilts_deg(ground: Ground, places_m: Numbers, yaw_deg: Numbers, size_m: tuple[float, float]) -> Numbers:
+def tilts_deg(ground: Ground, places_m: Float64, yaw_deg: Float64, size_m: tuple[float, float]) -> Float64:
     """(N, 2) pitch and roll of bodies of a length and width, with the middle at (N, 2) places, on the ground."""
     yaw = np.deg2rad(yaw_deg)
     forward = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
@@ -65,8 +63,7 @@ def tilts_deg(ground: Ground, places_m: Numbers, yaw_deg: Numbers, size_m: tuple
     ]
     # Up at the front is a negative pitch; up at the left lowers the right side.
     pitch, roll = np.arctan2(-rises[0], 2 * size_m[0] / 3), np.arctan2(rises[1], size_m[1])
-    tilts: Numbers = np.rad2deg(np.stack([pitch, roll], axis=1))
-    return tilts
+    return np.asarray(np.rad2deg(np.stack([pitch, roll], axis=1)))
 
 
 class Pavement:
@@ -89,7 +86,7 @@ class Pavement:
         pieces = self.parts if isinstance(self._ground, Plain) else shapely.segmentize(self.parts, CELL_M)
         return [plateau(piece, self._ground.heights_m) for piece in pieces]
 
-    def holds(self, places_m: Numbers) -> NDArray[np.bool_]:
+    def holds(self, places_m: Float64) -> Bools:
         """(N,) whether (N, 2) places are on it."""
         held = np.zeros(len(places_m), dtype=bool)
         held[self._tree.query(shapely.points(places_m), predicate="intersects")[0]] = True
@@ -111,7 +108,7 @@ def decks(vicinity: Vicinity) -> list[Mesh]:
     return found
 
 
-def _strip(line_m: Numbers, width_m: float) -> Mesh:
+def _strip(line_m: Float64, width_m: float) -> Mesh:
     """A closed slab of a width whose upper side has a line in its middle."""
     along = np.gradient(line_m[:, :2], axis=0)
     left = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.linalg.norm(along, axis=1, keepdims=True)

@@ -7,10 +7,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.simulation.sumo.floating import TIME_SLACK_S, SumoTrack
 from torchcover.simulation.traffic.articulated import DRAWS, rears_of, together, tractrix
-
-Numbers = NDArray[np.float64]
 
 # Bodies have a pose this often, and places are means over so much time before and after.
 FINE_S, SMOOTH_S = 0.1, 1.0
@@ -33,13 +32,9 @@ BODIES_AT_ONCE = 256
 
 
 class RoadUser(NamedTuple):
-    """Somebody, and the body that stands for it.
+    """Somebody, where their front is, the length that the simulation takes them for, and the body that stands for them.
 
-    Args:
-        track: Where its front is.
-        kind: Of its body.
-        length_m: That the simulation takes it for.
-        sizes_m: Lengths and widths of the body, and of what it draws along.
+    `sizes_m` are lengths and widths of the body, and of what it draws along.
     """
 
     track: SumoTrack
@@ -64,25 +59,20 @@ class RoadUser(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Where a body is.
+    """Where a body is, at (K,) evenly spaced times; those who are there all the time share them.
 
-    Args:
-        user: Whose.
-        times_s: (K,) evenly spaced; those who are there all the time share them.
-        poses: (K, 3) x and y of its middle, and its heading in radians, without leaps; of its front, if it is in two
-            parts.
-        over_kerb_m: How far its outline reaches over a kerb at the worst.
-        rear: (K, 3) likewise what it draws along.
+    `poses` are (K, 3) x and y of its middle, of its front if it is in two parts, and its heading in radians, without
+    leaps; `rear` is likewise what it draws along; `over_kerb_m` how far its outline reaches over a kerb at the worst.
     """
 
     user: RoadUser
-    times_s: Numbers
-    poses: Numbers
+    times_s: Float64
+    poses: Float64
     over_kerb_m: float = 0.0
-    rear: Numbers | None = None
+    rear: Float64 | None = None
 
     @property
-    def parts(self) -> list[tuple[Numbers, tuple[float, float]]]:
+    def parts(self) -> list[tuple[Float64, tuple[float, float]]]:
         """Poses of its parts, one or two, and their lengths and widths."""
         poses = [self.poses] if self.rear is None else [self.poses, self.rear]
         return list(zip(poses, self.user.sizes_m, strict=True))
@@ -98,22 +88,18 @@ class Motion(NamedTuple):
 def motions(
     users: Sequence[RoadUser],
     duration_s: float,
-    origin_m: Numbers,
+    origin_m: Float64,
     obstacles: NDArray[np.object_] | None = None,
     walked: shapely.Geometry | None = None,
 ) -> list[Motion]:
-    """Move bodies along their tracks, without those who are there for no time.
+    """Move bodies along their tracks, without those who are there for no time; `origin_m` is subtracted of all places.
 
-    Args:
-        users: Who.
-        duration_s: Of the run, from 0 on.
-        origin_m: (2,) what is subtracted of all places.
-        obstacles: Polygons in plan, of pavements and what is parked: vehicles swing out for them where they can.
-        walked: Likewise what people walk on: who is beside it goes along its edge instead, where there is time to.
+    Vehicles swing out for `obstacles`, polygons in plan of pavements and what is parked, where they can. Who is beside
+    what people walk on goes along its edge instead, where there is time to.
     """
     shapely.prepare(walked)
     times_s = np.linspace(0.0, duration_s, int(np.ceil(duration_s / FINE_S - TIME_SLACK_S)) + 1)
-    there: list[tuple[RoadUser, Numbers]] = []
+    there: list[tuple[RoadUser, Float64]] = []
     for user in users:
         first, end = np.searchsorted(times_s, user.track.times_s[[0, -1]] + [-TIME_SLACK_S, TIME_SLACK_S]).tolist()
         if end - first > 1:
@@ -129,7 +115,7 @@ def motions(
     return found
 
 
-def _lead_m(user: RoadUser, times_s: Numbers, origin_m: Numbers, walked: shapely.Geometry | None) -> Numbers:
+def _lead_m(user: RoadUser, times_s: Float64, origin_m: Float64, walked: shapely.Geometry | None) -> Float64:
     """(K, 2) where the point goes that leads, at (K,) times."""
     track = user.track
     told_m = (_without_jumps(track) if track.on_foot else track.places_m[:, :2]) - origin_m
@@ -143,7 +129,7 @@ def _lead_m(user: RoadUser, times_s: Numbers, origin_m: Numbers, walked: shapely
     return _behind(smooth_m, behind_m, np.deg2rad(track.yaw_deg[0]))
 
 
-def _poses(users: Sequence[RoadUser], ways_m: Sequence[Numbers]) -> list[Numbers]:
+def _poses(users: Sequence[RoadUser], ways_m: Sequence[Float64]) -> list[Float64]:
     """(K, 3) of each, along the (K, 2) way of its point that leads."""
     lead_m = together(ways_m)
     start = np.deg2rad([user.track.yaw_deg[0] for user in users])
@@ -153,7 +139,7 @@ def _poses(users: Sequence[RoadUser], ways_m: Sequence[Numbers]) -> list[Numbers
     return [poses[: len(way_m), number].copy() for number, way_m in enumerate(ways_m)]
 
 
-def _rears(users: Sequence[RoadUser], poses: Sequence[Numbers]) -> dict[int, Numbers]:
+def _rears(users: Sequence[RoadUser], poses: Sequence[Float64]) -> dict[int, Float64]:
     """(K, 3) poses of what some draw along, by their numbers, along those of fronts."""
     fronts = [number for number, user in enumerate(users) if user.kind in DRAWS]
     rears = rears_of([users[number].kind for number in fronts], [poses[number] for number in fronts])
@@ -161,14 +147,14 @@ def _rears(users: Sequence[RoadUser], poses: Sequence[Numbers]) -> dict[int, Num
 
 
 def _keep_off(
-    users: Sequence[RoadUser], ways_m: Sequence[Numbers], poses: list[Numbers], obstacles: NDArray[np.object_]
-) -> Numbers:
+    users: Sequence[RoadUser], ways_m: Sequence[Float64], poses: list[Float64], obstacles: NDArray[np.object_]
+) -> Float64:
     """Let vehicles swing out where the inner side of a turn would come over a kerb; (N,) how far they still do."""
     over_m, moved_m, aside_m = np.zeros(len(users)), list(ways_m), [np.zeros(len(way_m)) for way_m in ways_m]
     left = [np.stack([-np.sin(own[:, 2]), np.cos(own[:, 2])], axis=1) for own in poses]
     rears = _rears(users, poses)
     # When bodies are looked at, and what they draw along.
-    look: dict[tuple[int, bool], NDArray[np.int64]] = {}
+    look: dict[tuple[int, bool], Int64] = {}
     for number, (user, way_m, own) in enumerate(zip(users, ways_m, poses, strict=True)):
         if not user.track.on_foot:
             astray_m = _lengths(2 * own[:, :2] - way_m - _behind(way_m, user.drawn_m, own[0, 2]))
@@ -216,8 +202,7 @@ def _keep_off(
 def possible(bodies: Sequence[Motion]) -> list[Motion]:
     """Those that can be, and are never where another one is: of two that meet the one stays that meets fewer.
 
-    Args:
-        bodies: Some, of which the first is there all the time, and stays.
+    The first is there all the time, and stays.
     """
     bodies = [bodies[0], *(body for body in bodies[1:] if body.can_be)]
     meets = np.zeros((len(bodies), len(bodies)), dtype=bool)
@@ -252,7 +237,7 @@ def possible(bodies: Sequence[Motion]) -> list[Motion]:
     return [body for body, kept in zip(bodies, stays.tolist(), strict=True) if kept]
 
 
-def _overlap(one: Numbers, size_m: Numbers, other: Numbers, other_size_m: Numbers) -> NDArray[np.bool_]:
+def _overlap(one: Float64, size_m: Float64, other: Float64, other_size_m: Float64) -> Bools:
     """(T, K) whether K pairs of rectangles with poses (T, K, 3) do, as no axis of either separates them."""
     between_m, turn = other[..., :2] - one[..., :2], other[..., 2] - one[..., 2]
     cos, sin = np.abs(np.cos(turn)), np.abs(np.sin(turn))
@@ -265,7 +250,7 @@ def _overlap(one: Numbers, size_m: Numbers, other: Numbers, other_size_m: Number
     return meet
 
 
-def _push_m(obstacles: NDArray[np.object_], poses: Numbers, size_m: Numbers) -> Numbers:
+def _push_m(obstacles: NDArray[np.object_], poses: Float64, size_m: Float64) -> Float64:
     """(K,) how far K rectangles have to go to their left to be off obstacles, or to their right if that is negative."""
     outlines = shapely.polygons(corners_m(poses, size_m))
     part, body = shapely.STRtree(outlines).query(obstacles, predicate="intersects")
@@ -287,35 +272,33 @@ def _push_m(obstacles: NDArray[np.object_], poses: Numbers, size_m: Numbers) -> 
     return pushed
 
 
-def corners_m(poses: Numbers, size_m: Numbers) -> Numbers:
+def corners_m(poses: Float64, size_m: Float64) -> Float64:
     """(K, 4, 2) corners of K rectangles with poses x, y and a heading in radians, and a length and width."""
     forward = np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=1)
     left = np.stack([-forward[:, 1], forward[:, 0]], axis=1)
     half = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]]) / 2
     along_m, aside_m = (half[:, k] * size_m[:, k, None] for k in (0, 1))
-    found: Numbers = poses[:, None, :2] + along_m[..., None] * forward[:, None] + aside_m[..., None] * left[:, None]
-    return found
+    return np.asarray(poses[:, None, :2] + along_m[..., None] * forward[:, None] + aside_m[..., None] * left[:, None])
 
 
-def _lengths(vectors: Numbers) -> Numbers:
+def _lengths(vectors: Float64) -> Float64:
     """(...) lengths in plan of (..., 2) vectors, or of what else begins with x and y."""
-    lengths: Numbers = np.hypot(vectors[..., 0], vectors[..., 1])
-    return lengths
+    return np.asarray(np.hypot(vectors[..., 0], vectors[..., 1]))
 
 
-def _along_m(way_m: Numbers) -> Numbers:
+def _along_m(way_m: Float64) -> Float64:
     """(K,) the length of a (K, 2) way up to each place."""
     return np.concatenate([[0.0], _lengths(np.diff(way_m, axis=0)).cumsum()])
 
 
-def rounded(places_m: Numbers, half: int) -> Numbers:
+def rounded(places_m: Float64, half: int) -> Float64:
     """(K, 2) means over so many places before and after; beyond the ends it goes on as it came."""
     weights = np.hanning(2 * half + 3)[1:-1] / np.hanning(2 * half + 3).sum()
     padded_m = np.pad(places_m, ((half, half), (0, 0)), "reflect", reflect_type="odd")
     return np.stack([np.convolve(axis, weights, "valid") for axis in padded_m.T], axis=1)
 
 
-def _behind(way_m: Numbers, behind_m: float, yaw: float) -> Numbers:
+def _behind(way_m: Float64, behind_m: float, yaw: float) -> Float64:
     """(K, 2) the same way so much behind, with corners rounded; before its begin it has a heading."""
     along_m = _along_m(way_m)
     told_m = np.concatenate([[-behind_m], along_m])
@@ -326,7 +309,7 @@ def _behind(way_m: Numbers, behind_m: float, yaw: float) -> Numbers:
     return np.stack([np.interp(along_m - behind_m, at_m, axis) for axis in round_m.T], axis=1)
 
 
-def _without_jumps(track: SumoTrack) -> Numbers:
+def _without_jumps(track: SumoTrack) -> Float64:
     """(K, 2) places of somebody on foot; what was jumped is walked before and after, a little faster."""
     times_s, places_m = track.times_s, track.places_m[:, :2]
     steps_m = np.diff(places_m, axis=0)
@@ -340,7 +323,7 @@ def _without_jumps(track: SumoTrack) -> Numbers:
     return walked_m
 
 
-def _along_edges(way_m: Numbers, step_s: float, walked: shapely.Geometry) -> Numbers:
+def _along_edges(way_m: Float64, step_s: float, walked: shapely.Geometry) -> Float64:
     """(K, 2) places of somebody on foot, who goes along the edge of what is walked on instead of beside it.
 
     SUMO lets people walk straight through places where streets meet, even those that bend around a carriageway.

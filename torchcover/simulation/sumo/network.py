@@ -5,11 +5,9 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchcover.files import check_memory, feed_xml, reads
-
-Numbers = NDArray[np.float64]
+from torchcover.geometry.arrays import Float64
 
 # Of lanes without a width, as SUMO has it.
 LANE_WIDTH_M = 3.2
@@ -42,7 +40,7 @@ class NetworkLane(NamedTuple):
     edge: str
     use: Use
     width_m: float
-    line_m: Numbers
+    line_m: Float64
     speed_mps: float
     classes: frozenset[str]
     barred: frozenset[str]
@@ -63,7 +61,7 @@ class Network(NamedTuple):
     """
 
     lanes: tuple[NetworkLane, ...]
-    junctions: tuple[Numbers, ...]
+    junctions: tuple[Float64, ...]
     connections: tuple[tuple[int, int], ...]
     left_hand: bool
 
@@ -117,7 +115,7 @@ class _Collector:
 
     def __init__(self) -> None:
         self.lanes: dict[LaneName, NetworkLane] = {}
-        self.junctions: list[Numbers] = []
+        self.junctions: list[Float64] = []
         self.connections: list[tuple[LaneName, LaneName]] = []
         self.left_hand = False
         self._edge: Attributes = {}
@@ -196,7 +194,7 @@ def _use(function: str, kind: str, classes: frozenset[str], barred: frozenset[st
     return "shoulder" if "all" in barred else "road"
 
 
-def _places(shape: str) -> Numbers:
+def _places(shape: str) -> Float64:
     """(K, 3) places of "x,y x,y,z ..."."""
     rows = [[float(number) for number in place.split(",")] for place in shape.split()]
     if any(len(row) not in (2, 3) for row in rows):
@@ -204,12 +202,11 @@ def _places(shape: str) -> Numbers:
     return np.array([row if len(row) == 3 else [*row, 0.0] for row in rows], dtype=np.float64).reshape(-1, 3)
 
 
-def _without_repeats(line_m: Numbers) -> Numbers:
+def _without_repeats(line_m: Float64) -> Float64:
     if len(line_m) == 0:
         return line_m
     steps = np.linalg.norm(np.diff(line_m[:, :2], axis=0), axis=1)
-    kept: Numbers = line_m[np.concatenate([[True], steps > SAME_PLACE_M])]
-    return kept
+    return np.asarray(line_m[np.concatenate([[True], steps > SAME_PLACE_M])])
 
 
 def _number(item: Attributes, key: str, otherwise: float) -> float:

@@ -7,6 +7,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from torchcover.geometry.arrays import Float64
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.height_field import Ground, Plain
 from torchcover.simulation.shapes import Mesh
@@ -19,8 +20,6 @@ from torchcover.simulation.traffic.fleet import CATEGORIES, EGO, REAR_OF, Fleet,
 from torchcover.simulation.traffic.roads import Polyline
 from torchcover.simulation.traffic.scenery import PAVEMENT_M
 from torchcover.simulation.world import Actor
-
-Numbers = NDArray[np.float64]
 
 # Who is so far above the ground is on a bridge.
 BRIDGE_M = 0.4
@@ -47,7 +46,7 @@ class Placing:
                 name = REAR_OF + name
         return tuple(found)
 
-    def ego(self, ego: Motion, times_s: Numbers, mesh: Mesh, generator: np.random.Generator) -> Actor:
+    def ego(self, ego: Motion, times_s: Float64, mesh: Mesh, generator: np.random.Generator) -> Actor:
         """The ego, with a body that tilts with braking and curves, too, at evenly spaced times."""
         columns = np.concatenate(self._poses(ego, *ego.parts[0]), axis=1).T
         x_m, y_m, z_m, yaw, pitch, roll = (np.interp(times_s, ego.times_s, column) for column in columns)
@@ -56,7 +55,7 @@ class Placing:
         angles[:, 1:] += np.stack([pitch, roll], axis=1)
         return Actor(EGO, "car", mesh, Trajectory(times_s, np.stack([x_m, y_m, z_m], axis=1), angles))
 
-    def _poses(self, motion: Motion, poses: Numbers, size_m: tuple[float, float]) -> tuple[Numbers, Numbers]:
+    def _poses(self, motion: Motion, poses: Float64, size_m: tuple[float, float]) -> tuple[Float64, Float64]:
         """(K, 3) places and (K, 3) angles of a part of a body."""
         middle_m, yaw_deg, track = poses[:, :2], np.rad2deg(poses[:, 2]), motion.user.track
         back_m = 0.0 if track.on_foot else motion.user.sizes_m[0][0] / 2
@@ -107,5 +106,4 @@ def park(
             places.tolist(), heights_m.tolist(), tilts.tolist(), strict=True
         ):
             fleet.park(kind, (x_m, y_m, yaw_deg), height_m, (pitch, roll))
-    parked: NDArray[np.object_] = shapely.polygons(np.concatenate(outlines_m))
-    return parked
+    return np.asarray(shapely.polygons(np.concatenate(outlines_m)))

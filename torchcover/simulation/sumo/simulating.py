@@ -10,7 +10,7 @@ from shutil import which
 from tempfile import TemporaryFile
 from xml.etree import ElementTree
 
-from torchcover.files import end_with_parent, parse_xml, reads
+from torchcover.files import end_with_parent, most_gb, parse_xml, reads
 from torchcover.simulation.sumo.floating import ATTRIBUTES
 from torchcover.simulation.traffic.assemble import HORIZON_M
 
@@ -48,7 +48,7 @@ def output_of(program: str, *options: str | Path) -> Iterator[bytes]:
             stdout=subprocess.PIPE,
             stderr=said,
             env=_environment(folder),
-            preexec_fn=end_with_parent(),  # noqa: PLW1509  (one call of the system, no lock)
+            preexec_fn=end_with_parent(most_gb()),  # noqa: PLW1509  (one call of the system, no lock)
         )
         assert process.stdout is not None  # as asked for
         try:
@@ -93,15 +93,9 @@ def _environment(folder: Path) -> dict[str, str]:
 def simulate(
     network: Path, routes: Sequence[Path], begin_s: float, seed: int, *, around: str | None, drawn: bool
 ) -> Iterator[bytes]:
-    """Floating car data of a simulation, from a time on and for as long as they are asked for.
+    """Floating car data of a simulation from `begin_s` on, of those near to the vehicle `around` if one is given.
 
-    Args:
-        network: A `.net.xml`.
-        routes: Who drives and walks.
-        begin_s: From when on it is told where they are.
-        seed: Of the simulation.
-        around: Only those near to this vehicle are told of.
-        drawn: Whether the traffic was drawn: then nobody is taken out of a jam, and ways may end anywhere.
+    Traffic that was `drawn` is not taken out of a jam, and its ways may end anywhere.
     """
     options = ["--time-to-teleport", "-1", "--ignore-route-errors"] if drawn else []
     if around is not None:

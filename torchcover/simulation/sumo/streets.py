@@ -8,16 +8,15 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from pydantic import Field
 
 from torchcover.files import parse_xml
+from torchcover.geometry.arrays import Float64
 from torchcover.simulation.documents import Document
 from torchcover.simulation.sumo.simulating import run
 from torchcover.simulation.traffic.hills import Hills
 from torchcover.simulation.traffic.procedural import MostPeople, MostVehicles
 
-Numbers = NDArray[np.float64]
 Plan = Literal["rand", "grid", "spider"]
 
 LANE_M, BICYCLE_LANE_M, BAY_M = 3.25, 1.8, 2.3
@@ -123,13 +122,12 @@ class DrawnStreets(Document):
                 )
         return f"<edges>{''.join(rows)}</edges>"
 
-    def _bent(self, start_m: Numbers, end_m: Numbers, generator: np.random.Generator) -> Numbers:
+    def _bent(self, start_m: Float64, end_m: Float64, generator: np.random.Generator) -> Float64:
         """(K, 2) a way that leaves both ends straight."""
         share = np.linspace(0.0, 1.0, BEND_PIECES + 1)[:, None]
         along = end_m - start_m
         aside = generator.uniform(-self.bend, self.bend) * np.sin(np.pi * share) ** 2
-        way_m: Numbers = start_m + share * along + aside * np.array([-along[1], along[0]])
-        return way_m
+        return np.asarray(start_m + share * along + aside * np.array([-along[1], along[0]]))
 
     def _lanes(self, generator: np.random.Generator) -> str:
         """One side of a street, from the houses inwards."""
@@ -144,7 +142,7 @@ class DrawnStreets(Document):
         return "".join(f'<lane index="{k}" {who} width="{width:.2f}"/>' for k, (who, width) in enumerate(lanes))
 
 
-def turning_mps(line_m: Numbers) -> float:
+def turning_mps(line_m: Float64) -> float:
     """How fast a turn, (K, 2) places of its lane, may be driven: where it is tightest, not on its average.
 
     Example:

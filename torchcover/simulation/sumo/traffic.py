@@ -6,9 +6,9 @@ from tempfile import TemporaryDirectory
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from torchcover.geometry.arrays import Float64
 from torchcover.simulation.documents import PathBeside
 from torchcover.simulation.sumo.crowd import crowd, types_of
 from torchcover.simulation.sumo.demand import EGO_TYPE, write_routes
@@ -26,8 +26,6 @@ from torchcover.simulation.traffic.frontage import Times, stand
 from torchcover.simulation.traffic.procedural import Procedural
 from torchcover.simulation.traffic.scenery import Scenery, few
 from torchcover.simulation.world import Actor
-
-Numbers = NDArray[np.float64]
 
 # Traffic that is drawn sets off everywhere at once, and needs some time to get into motion and to queue at lights.
 WARM_UP_S = 30.0
@@ -85,7 +83,7 @@ class Sumo(Procedural):
             home()  # or an ImportError
 
     def _build(
-        self, fleet: Fleet, times_s: Numbers, generator: np.random.Generator
+        self, fleet: Fleet, times_s: Float64, generator: np.random.Generator
     ) -> tuple[Scenery, Actor, tuple[Actor, ...]]:
         with TemporaryDirectory() as folder:
             network_file = self._network_file(Path(folder), generator)

@@ -7,10 +7,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.simulation.sumo.network import Network, Use
 from torchcover.simulation.traffic.assemble import HORIZON_M
-
-Numbers = NDArray[np.float64]
 
 # Lanes are asked for their height this often.
 SAMPLE_M = 2.0
@@ -31,15 +30,9 @@ OFF_STREET_M = 10.0
 
 
 class Vicinity:
-    """A piece of a network.
+    """A piece of a network, near the ego's (T, 2) way, of whose places `origin_m` (2,) was subtracted in float64."""
 
-    Args:
-        network: All of it.
-        way_m: (T, 2) the ego's way.
-        origin_m: (2,) what is subtracted of all coordinates, in float64; the way is given without it.
-    """
-
-    def __init__(self, network: Network, way_m: Numbers, origin_m: Numbers) -> None:
+    def __init__(self, network: Network, way_m: Float64, origin_m: Float64) -> None:
         self.way = shapely.LineString(way_m if len(way_m) > 1 else np.repeat(way_m, 2, axis=0)).simplify(WAY_WITHIN_M)
         shapely.prepare(self.way)
         self.lower_m, self.upper_m = way_m.min(axis=0) - HORIZON_M, way_m.max(axis=0) + HORIZON_M
@@ -51,7 +44,7 @@ class Vicinity:
         near = self._near(network.junctions, shift_m)
         self.junctions = tuple(network.junctions[number] - shift_m for number in near.tolist())
 
-    def _near(self, lines_m: Sequence[Numbers], shift_m: Numbers) -> NDArray[np.int64]:
+    def _near(self, lines_m: Sequence[Float64], shift_m: Float64) -> Int64:
         """Numbers of the lines that may be seen from the way."""
         if not lines_m:
             return np.empty(0, dtype=np.int64)
@@ -61,15 +54,13 @@ class Vicinity:
         meet = (low_m <= self.upper_m + BEYOND_M) & (high_m >= self.lower_m - BEYOND_M)
         near = np.flatnonzero(meet.all(axis=1))
         boxes = shapely.box(*low_m[near].T, *high_m[near].T)
-        seen: NDArray[np.int64] = near[shapely.dwithin(boxes, self.way, HORIZON_M + BEYOND_M)]
-        return seen
+        return np.asarray(near[shapely.dwithin(boxes, self.way, HORIZON_M + BEYOND_M)])
 
-    def sees(self, places_m: Numbers) -> NDArray[np.bool_]:
+    def sees(self, places_m: Float64) -> Bools:
         """(N,) whether (N, 2) places may be seen from the way."""
-        seen: NDArray[np.bool_] = shapely.dwithin(shapely.points(places_m), self.way, HORIZON_M + BEYOND_M)
-        return seen
+        return np.asarray(shapely.dwithin(shapely.points(places_m), self.way, HORIZON_M + BEYOND_M))
 
-    def on_streets(self, places_m: Numbers) -> NDArray[np.bool_]:
+    def on_streets(self, places_m: Float64) -> Bools:
         """(N,) whether (N, 2) places are on a street, or at least near to one."""
         on = np.zeros(len(places_m), dtype=bool)
         if self.lanes:
@@ -111,46 +102,43 @@ class Vicinity:
         pieces = pieces[(shapely.get_type_id(pieces) == 3) & (shapely.area(pieces) > SMALLEST_MEDIAN_M2)]
         outlines = shapely.get_exterior_ring(pieces)
         shared = shapely.intersection(outlines, shapely.buffer(driven, ALONGSIDE_M))
-        medians: NDArray[np.object_] = pieces[shapely.length(shared) > ENCLOSED * shapely.length(outlines)]
-        return medians
+        return np.asarray(pieces[shapely.length(shared) > ENCLOSED * shapely.length(outlines)])
 
     @cached_property
-    def samples_m(self) -> Numbers:
+    def samples_m(self) -> Float64:
         """(N, 3) places along all lanes."""
         return self._samples[0]
 
     @cached_property
-    def of_lane(self) -> NDArray[np.int64]:
+    def of_lane(self) -> Int64:
         """(N,) to which lane each sample belongs."""
         return self._samples[1]
 
     @cached_property
-    def _samples(self) -> tuple[Numbers, NDArray[np.int64]]:
+    def _samples(self) -> tuple[Float64, Int64]:
         lines = shapely.segmentize(_lines([lane.line_m for lane in self.lanes]), SAMPLE_M)
         places_m, of_lane = shapely.get_coordinates(lines, include_z=True, return_index=True)
         return places_m, of_lane
 
     @cached_property
-    def on_deck(self) -> NDArray[np.bool_]:
+    def on_deck(self) -> Bools:
         """(N,) which samples lie on bridges: there is a street below."""
         square = ((self.samples_m[:, :2] - self.samples_m[:, :2].min(axis=0)) / SQUARE_M).astype(np.int64) + 1
         lowest = np.full(square.max(axis=0) + 2, np.inf)
         np.minimum.at(lowest, tuple(square.T), self.samples_m[:, 2])
         for axis in (0, 1):
             lowest = np.minimum.reduce([lowest, np.roll(lowest, 1, axis), np.roll(lowest, -1, axis)])
-        above: NDArray[np.bool_] = self.samples_m[:, 2] > lowest[tuple(square.T)] + BRIDGE_M
-        return above
+        return np.asarray(self.samples_m[:, 2] > lowest[tuple(square.T)] + BRIDGE_M)
 
 
-def _lines(lines_m: Sequence[Numbers]) -> NDArray[np.object_]:
+def _lines(lines_m: Sequence[Float64]) -> NDArray[np.object_]:
     if not lines_m:
         return np.empty(0, dtype=object)
     count = [len(line) for line in lines_m]
     of_line = np.repeat(np.arange(len(count)), count)
-    found: NDArray[np.object_] = shapely.linestrings(np.concatenate(lines_m), indices=of_line)
-    return found
+    return np.asarray(shapely.linestrings(np.concatenate(lines_m), indices=of_line))
 
 
-def _polygon(outline_m: Numbers) -> shapely.Geometry:
+def _polygon(outline_m: Float64) -> shapely.Geometry:
     """What an outline encloses, also one that crosses itself."""
     return shapely.make_valid(shapely.Polygon(outline_m[:, :2]))

@@ -6,11 +6,9 @@ It has straights, and curves that begin and end gently, as road designers align 
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Numbers = NDArray[np.float64]
-Knots = NDArray[np.int64]
-Flags = NDArray[np.bool_]
+from torchcover.geometry.arrays import Bools, Float64, Int64
 
 KNOT_EVERY_M = 1.0
 # Gauss's rule with three places: over a metre of the tightest curve it errs by less than a nanometre.
@@ -47,14 +45,14 @@ class Alignment:
             for low, high, bends in zip(given[:-1], given[1:], curved, strict=True)
         ]
         # The first twice: what lies before it goes straight on.
-        self.stations_m: Numbers = np.concatenate([given[:1], *pieces, given[-1:]])
-        self.curvatures_per_m: Numbers = np.interp(self.stations_m, given, curvatures)
+        self.stations_m: Float64 = np.concatenate([given[:1], *pieces, given[-1:]])
+        self.curvatures_per_m: Float64 = np.interp(self.stations_m, given, curvatures)
         step = np.diff(self.stations_m)
         grows = np.diff(self.curvatures_per_m)
-        self._rates: Numbers = np.append(np.divide(grows, step, out=np.zeros_like(step), where=step > 0), 0.0)
+        self._rates: Float64 = np.append(np.divide(grows, step, out=np.zeros_like(step), where=step > 0), 0.0)
         turned = (self.curvatures_per_m[:-1] + self.curvatures_per_m[1:]) / 2 * step
-        self._headings: Numbers = start[2] + np.concatenate([[0.0], np.cumsum(turned)])
-        self._places_m: Numbers = np.zeros((len(self.stations_m), 2))
+        self._headings: Float64 = start[2] + np.concatenate([[0.0], np.cumsum(turned)])
+        self._places_m: Float64 = np.zeros((len(self.stations_m), 2))
         ways_m = self._ways(np.arange(len(step)), step)
         self._places_m[:] = np.array(start[:2]) + np.concatenate([[[0.0, 0.0]], np.cumsum(ways_m, axis=0)])
 
@@ -63,15 +61,15 @@ class Alignment:
         """Whether it never turns."""
         return not self.curvatures_per_m.any()
 
-    def headings(self, stations_m: ArrayLike) -> Numbers:
+    def headings(self, stations_m: ArrayLike) -> Float64:
         """(...) headings in radians, without jumps."""
         return self._heading(*self._knot(np.asarray(stations_m, dtype=np.float64)))
 
-    def curvatures(self, stations_m: ArrayLike) -> Numbers:
+    def curvatures(self, stations_m: ArrayLike) -> Float64:
         """(...) curvatures in 1/m."""
         return np.asarray(np.interp(np.asarray(stations_m, dtype=np.float64), self.stations_m, self.curvatures_per_m))
 
-    def poses(self, stations_m: ArrayLike, left_m: ArrayLike) -> Numbers:
+    def poses(self, stations_m: ArrayLike, left_m: ArrayLike) -> Float64:
         """(..., 3) x and y in metres and yaw in degrees of places beside the line."""
         stations, left = np.broadcast_arrays(np.asarray(stations_m, dtype=np.float64), left_m)
         knot, beyond_m = self._knot(stations)
@@ -83,47 +81,42 @@ class Alignment:
         poses[..., 2] = np.rad2deg(heading)
         return poses
 
-    def lengths_m(self, stations_m: ArrayLike, left_m: ArrayLike) -> Numbers:
+    def lengths_m(self, stations_m: ArrayLike, left_m: ArrayLike) -> Float64:
         """(...) ways from station 0 along the line that keeps to the left by so much; exact."""
         turned = self.headings(stations_m) - self.headings(0.0)
         return np.asarray(stations_m, dtype=np.float64) - np.asarray(left_m, dtype=np.float64) * turned
 
-    def _knot(self, stations_m: Numbers) -> tuple[Knots, Numbers]:
+    def _knot(self, stations_m: Float64) -> tuple[Int64, Float64]:
         """(...) numbers of the last knots before stations, and how far beyond these they are."""
         knot = np.maximum(np.searchsorted(self.stations_m, stations_m, side="right") - 1, 0)
         return knot, stations_m - self.stations_m[knot]
 
-    def _heading(self, knot: Knots, beyond_m: Numbers) -> Numbers:
+    def _heading(self, knot: Int64, beyond_m: Float64) -> Float64:
         """(...) headings so far beyond knots."""
-        heading: Numbers = self.curvatures_per_m[knot] + beyond_m / 2 * self._rates[knot]
+        heading: Float64 = self.curvatures_per_m[knot] + beyond_m / 2 * self._rates[knot]
         heading *= beyond_m
         heading += self._headings[knot]
         return heading
 
-    def _ways(self, knot: Knots, beyond_m: Numbers) -> Numbers:
+    def _ways(self, knot: Int64, beyond_m: Float64) -> Float64:
         """(..., 2) from knots to places beyond them."""
         first, middle, last = (self._heading(knot, share * beyond_m) for share in GAUSS_PLACES)
         mean = [(5 * turn(first) + 8 * turn(middle) + 5 * turn(last)) / 18 for turn in (np.cos, np.sin)]
-        ways_m: Numbers = np.stack(mean, axis=-1) * beyond_m[..., None]
-        return ways_m
+        return np.asarray(np.stack(mean, axis=-1) * beyond_m[..., None])
 
 
-def squared_distances(places_m: Numbers, others_m: Numbers) -> Numbers:
+def squared_distances(places_m: Float64, others_m: Float64) -> Float64:
     """(N, M) squared distances between (N, 2) and (M, 2) places."""
-    squares: Numbers = (places_m**2).sum(axis=1)[:, None] + (others_m**2).sum(axis=1)
+    squares: Float64 = (places_m**2).sum(axis=1)[:, None] + (others_m**2).sum(axis=1)
     squares -= 2 * places_m @ others_m.T
     np.maximum(squares, 0.0, out=squares)
     return squares
 
 
 class Beside:
-    """A line that keeps its distance from the middle of a street, with a way of its own.
+    """A line `left_m` to the left of the middle of a street, that follows it (`way` 1) or runs against it (-1).
 
-    Args:
-        street: The street.
-        left_m: How far to the left of its middle.
-        way: 1 to follow it, -1 to run against it.
-        reach_m: The line begins so far before station 0, and ends as far behind.
+    It begins `reach_m` before station 0, and ends as far behind.
     """
 
     closed = False
@@ -140,7 +133,7 @@ class Beside:
         self._steps_m = np.where(long, steps_m, np.inf)
 
     @cached_property
-    def _cubics(self) -> Numbers:
+    def _cubics(self) -> Float64:
         return _cubics(self.street.poses(self.street.stations_m, self.left_m), self._steps_m)
 
     @property
@@ -148,24 +141,23 @@ class Beside:
         """From its beginning to its end."""
         return 2 * self._reach_m
 
-    def places_at(self, stations_m: ArrayLike) -> Numbers:
+    def places_at(self, stations_m: ArrayLike) -> Float64:
         """(...) ways along the line at stations of the street."""
         return self.way * self.street.lengths_m(stations_m, self.left_m) + self._reach_m
 
-    def stations(self, place_m: ArrayLike) -> Numbers:
+    def stations(self, place_m: ArrayLike) -> Float64:
         """(...) stations of the street after ways along the line."""
         knot, beyond_m = self._knot(np.asarray(place_m, dtype=np.float64))
-        stations_m: Numbers = self.street.stations_m[knot] + beyond_m * self._stations_per_m[knot]
-        return stations_m
+        return np.asarray(self.street.stations_m[knot] + beyond_m * self._stations_per_m[knot])
 
-    def poses(self, place_m: ArrayLike) -> Numbers:
+    def poses(self, place_m: ArrayLike) -> Float64:
         """(..., 3) x and y in metres, and yaw in degrees, after ways along the line; to a hundredth of a millimetre."""
         place_m = np.asarray(place_m, dtype=np.float64)
         if self.street.is_straight:
             return self._poses_on_a_straight(place_m)
         knot, beyond_m = self._knot(place_m)
         beyond_m = beyond_m[..., None]
-        poses: Numbers = self._cubics[3].take(knot, axis=0)
+        poses: Float64 = self._cubics[3].take(knot, axis=0)
         for power in (2, 1, 0):
             poses *= beyond_m
             poses += self._cubics[power].take(knot, axis=0)
@@ -173,7 +165,7 @@ class Beside:
             poses[..., 2] += 180.0
         return poses
 
-    def _poses_on_a_straight(self, place_m: Numbers) -> Numbers:
+    def _poses_on_a_straight(self, place_m: Float64) -> Float64:
         x, y, yaw_deg = self.street.poses(0.0, self.left_m)
         along_m, yaw = self.way * (place_m - self._reach_m), np.deg2rad(yaw_deg)
         poses = np.empty((*place_m.shape, 3))
@@ -182,7 +174,7 @@ class Beside:
         poses[..., 2] = yaw_deg if self.way > 0 else yaw_deg + 180.0
         return poses
 
-    def _knot(self, place_m: Numbers) -> tuple[Knots, Numbers]:
+    def _knot(self, place_m: Float64) -> tuple[Int64, Float64]:
         """(...) numbers of the last knots before places, and how far along the line these are beyond them."""
         length_m = self.way * (place_m - self._reach_m)
         # One body after the other: the search is fast where the next place is near the last.
@@ -191,7 +183,7 @@ class Beside:
         return knot, length_m - self._knots_m[knot]
 
 
-def _cubics(poses: Numbers, steps_m: Numbers) -> Numbers:
+def _cubics(poses: Float64, steps_m: Float64) -> Float64:
     """(4, K, 3) the cubics between K poses that leave and reach each with its heading; straight on where no step is.
 
     Yaw, which comes third, is linear.
@@ -221,26 +213,26 @@ class Territory:
         self._samples_m = np.arange(*span_m, SAMPLE_EVERY_M)
         self._places_m = street.poses(self._samples_m, 0.0)[:, :2]
 
-    def stations_m(self, every_m: float) -> Numbers:
+    def stations_m(self, every_m: float) -> Float64:
         """(N,) stations of its street, at even distances."""
         return np.arange(*self._span_m, every_m)
 
-    def covers(self, stations_m: Numbers) -> Flags:
+    def covers(self, stations_m: Float64) -> Bools:
         """(N,) whether stations are among those that matter."""
         return (stations_m > self._span_m[0]) & (stations_m < self._span_m[1])
 
-    def owns(self, stations_m: Numbers, left_m: Numbers) -> Flags:
+    def owns(self, stations_m: Float64, left_m: Float64) -> Bools:
         """(N,) whether places beside the street are their own stretch's."""
         if self._street.is_straight:
             return np.ones(len(stations_m), dtype=bool)
         nearest = self.nearest(self._street.poses(stations_m, left_m)[:, :2])
         return np.asarray(np.abs(nearest - stations_m) <= SAMPLE_EVERY_M)
 
-    def nearest(self, places_m: Numbers) -> Numbers:
+    def nearest(self, places_m: Float64) -> Float64:
         """(N,) stations of the nearest samples."""
         return np.asarray(self._samples_m[squared_distances(places_m, self._places_m).argmin(axis=1)])
 
-    def reaches_m(self, stations_m: Numbers, side: int, near_m: float, far_m: float) -> Numbers:
+    def reaches_m(self, stations_m: Float64, side: int, near_m: float, far_m: float) -> Float64:
         """(N,) how far from the middle it goes, on the left (1) or on the right (-1), from near to far."""
         least, most = np.full(len(stations_m), near_m), np.full(len(stations_m), far_m)
         if self._street.is_straight:

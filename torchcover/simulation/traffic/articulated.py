@@ -4,20 +4,15 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Numbers = NDArray[np.float64]
+from torchcover.geometry.arrays import Float64
 
 
 class Hitch(NamedTuple):
-    """How a body draws another one along.
+    """How a body draws another one along, of kind `rear`, whose axles never slip sideways.
 
-    Args:
-        rear: Kind of the body that is drawn along; its axles never slip sideways.
-        ahead_m: How far the middle of the front is before that of both, on a straight.
-        hitch_m: How far the hitch is before the middle of the front; negative behind it.
-        rod_m: From the hitch back to the axles of the rear.
-        middle_m: From the hitch back to its middle.
+    The middle of the front is `ahead_m` before that of both, on a straight, and the hitch `hitch_m` before the middle
+    of the front, negative behind it. From the hitch, the axles of the rear are `rod_m` back, and its middle `middle_m`.
     """
 
     rear: str
@@ -26,7 +21,7 @@ class Hitch(NamedTuple):
     rod_m: float
     middle_m: float
 
-    def hitches_m(self, poses: Numbers) -> Numbers:
+    def hitches_m(self, poses: Float64) -> Float64:
         """(T, 2) where the hitch is, at (T, 3) poses x, y and heading in radians of the front."""
         return _shifted_m(poses, self.hitch_m)[:, :2]
 
@@ -36,13 +31,10 @@ class Hitch(NamedTuple):
 DRAWS: Mapping[str, Hitch] = {"truck": Hitch("trailer", 4.925, -1.175, 8.41, 5.2)}
 
 
-def rears_of(kinds: Sequence[str], poses: Sequence[Numbers], start: Sequence[float] | None = None) -> list[Numbers]:
-    """(T, 3) poses of what N bodies draw along, x, y and heading in radians.
+def rears_of(kinds: Sequence[str], poses: Sequence[Float64], start: Sequence[float] | None = None) -> list[Float64]:
+    """(T, 3) poses x, y and heading in radians of what N bodies of these kinds draw along, whose own are likewise.
 
-    Args:
-        kinds: Of the bodies, each of which draws something.
-        poses: Of each (T, 3) likewise; T may differ.
-        start: Headings of the rears at first; straight behind if not given.
+    T may differ. `start` are headings of the rears at first; straight behind if not given.
     """
     if not kinds:
         return []
@@ -56,22 +48,17 @@ def rears_of(kinds: Sequence[str], poses: Sequence[Numbers], start: Sequence[flo
     ]
 
 
-def together(ways_m: Sequence[Numbers]) -> Numbers:
+def together(ways_m: Sequence[Float64]) -> Float64:
     """(T, N, 2) N ways, of which each stays at its end until the longest is there."""
     longest = max(map(len, ways_m))
     return np.stack([np.pad(way_m, ((0, longest - len(way_m)), (0, 0)), "edge") for way_m in ways_m], axis=1)
 
 
-def tractrix(lead_m: Numbers, length_m: Numbers, yaw: Numbers) -> Numbers:
-    """Headings of rods that are drawn along at their front end, exactly for ways of straight pieces.
+def tractrix(lead_m: Float64, length_m: Float64, yaw: Float64) -> Float64:
+    """(T, N) headings in radians, without leaps, of N rods that are drawn along at their front ends, (T, N, 2).
 
-    Args:
-        lead_m: (T, N, 2) where the front ends go.
-        length_m: (N,) of the rods; their rear ends never slip sideways.
-        yaw: (N,) headings at first, in radians.
-
-    Returns:
-        (T, N) headings, without leaps: with the angle a between rod and way, tan(a / 2) falls by exp(-way / length).
+    Their rear ends never slip sideways. Exact for ways of straight pieces: with the angle a between rod and way, tan(a
+    / 2) falls by exp(-way / length).
     """
     ways_m = np.diff(lead_m, axis=0)
     towards = np.arctan2(ways_m[..., 1], ways_m[..., 0])
@@ -84,7 +71,7 @@ def tractrix(lead_m: Numbers, length_m: Numbers, yaw: Numbers) -> Numbers:
     return found
 
 
-def _shifted_m(poses: Numbers, ahead_m: float) -> Numbers:
+def _shifted_m(poses: Float64, ahead_m: float) -> Float64:
     """(T, 3) poses so much ahead."""
     yaw = poses[:, 2]
     return poses + ahead_m * np.stack([np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))], axis=1)

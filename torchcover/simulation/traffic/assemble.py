@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from torchcover.geometry.arrays import Float64, Int64
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.articulated import DRAWS, rears_of
@@ -13,8 +13,6 @@ from torchcover.simulation.traffic.fleet import CATEGORIES, EGO, REAR_OF, Fleet
 from torchcover.simulation.traffic.flow import Agent, Flow, Lane
 from torchcover.simulation.traffic.hills import Hills
 from torchcover.simulation.world import Actor
-
-Numbers = NDArray[np.float64]
 
 # Beyond the farthest range of a sensor: who never comes this close to the ego is left out of the world.
 HORIZON_M = 250.0
@@ -39,8 +37,8 @@ class Paths(NamedTuple):
     The last of them are drawn along, by those whose numbers are `fronts`.
     """
 
-    positions_m: Numbers
-    yaw_deg: Numbers
+    positions_m: Float64
+    yaw_deg: Float64
     kinds: tuple[str, ...]
     fronts: tuple[int, ...] = ()
 
@@ -56,7 +54,7 @@ class Paths(NamedTuple):
         return Paths(np.concatenate(positions_m, axis=1), np.concatenate(yaw_deg, axis=1), kinds, fronts)
 
 
-def paths(lanes: Sequence[Lane], agents: Sequence[Agent], place_m: Numbers) -> Paths:
+def paths(lanes: Sequence[Lane], agents: Sequence[Agent], place_m: Float64) -> Paths:
     """Follow the lanes, on the ground, to (T, N) places on them; what is drawn along comes behind."""
     positions_m, yaw_deg = np.zeros((*place_m.shape, 3)), np.empty(place_m.shape)
     lane_of, kinds = np.array([agent.lane for agent in agents]), tuple(agent.kind for agent in agents)
@@ -74,12 +72,12 @@ def paths(lanes: Sequence[Lane], agents: Sequence[Agent], place_m: Numbers) -> P
     return Paths(positions_m, yaw_deg, kinds).with_rears(start)
 
 
-def ahead_of(kinds: Sequence[str]) -> Numbers:
+def ahead_of(kinds: Sequence[str]) -> Float64:
     """(N,) how far the middles of bodies are before those of all that belongs to them."""
     return np.array([DRAWS[kind].ahead_m if kind in DRAWS else 0.0 for kind in kinds])
 
 
-def come_near(lanes: Sequence[Lane], agents: Sequence[Agent], place_m: Numbers) -> NDArray[np.int64]:
+def come_near(lanes: Sequence[Lane], agents: Sequence[Agent], place_m: Float64) -> Int64:
     """Numbers of those who may come near the first one, who is among them; they are looked at now and then only."""
     looks = np.unique(np.append(np.arange(0, len(place_m), LOOKS_EVERY), len(place_m) - 1))
     seen_m = place_m[looks]
@@ -92,7 +90,7 @@ def come_near(lanes: Sequence[Lane], agents: Sequence[Agent], place_m: Numbers) 
 
 
 def ego_actor(
-    times_s: Numbers,
+    times_s: Float64,
     found: Paths,
     flow: Flow,
     index: int,
@@ -112,17 +110,9 @@ def ego_actor(
 
 
 def actors(
-    times_s: Numbers, found: Sequence[Paths], ego: Actor, fleet: Fleet, hills: Hills | None = None
+    times_s: Float64, found: Sequence[Paths], ego: Actor, fleet: Fleet, hills: Hills | None = None
 ) -> tuple[Actor, ...]:
-    """All who ever come near the ego; the ego itself is left out.
-
-    Args:
-        times_s: (T,) times.
-        found: Who there is, in groups; NaN where somebody is not there.
-        ego: The ego.
-        fleet: Their bodies.
-        hills: What they stand on; on a plain if there are none.
-    """
+    """All who ever come near the ego, in groups; the ego itself is left out. NaN where somebody is not there."""
     near: list[Actor] = []
     for group in found:
         # On the level, and one axis after the other: hills come later, and this is done for very many.
@@ -156,23 +146,14 @@ def actors(
 
 
 def attitude(
-    times_s: Numbers, way_m: Numbers, speed_mps: Numbers, yaw_deg: Numbers, generator: np.random.Generator
-) -> Numbers:
-    """Yaw, pitch and roll of a car about the point on the road under its middle.
+    times_s: Float64, way_m: Float64, speed_mps: Float64, yaw_deg: Float64, generator: np.random.Generator
+) -> Float64:
+    """(T, 3) yaw, pitch and roll in degrees of a car about the point on the road under its middle.
 
     The wheels of a car pivot about a point midway between the axles, so a pitch of 1 degree lifts or lowers them by
     under 3 cm: the springs' stroke, which a rigid body has to show at its wheels. |pitch| < 2 and |roll| < 1.5 degrees.
-
-    Args:
-        times_s: (T,) evenly spaced times.
-        way_m: (T,) way driven; the road's unevenness depends on it alone, so a standing car does not rock.
-        speed_mps: (T,) speed.
-        yaw_deg: (T,) heading.
-        generator: Draws the unevenness of the road.
-
-    Returns:
-        (T, 3) yaw, pitch and roll in degrees. Braking turns the nose down (positive pitch); in a left-hand curve the
-        right side goes down (positive roll).
+    Braking turns the nose down (positive pitch); in a left-hand curve the right side goes down (positive roll). The
+    road's unevenness depends on the way alone, so a standing car does not rock. Times are evenly spaced.
     """
     forward = np.gradient(speed_mps, times_s)
     leftward = speed_mps * np.gradient(np.unwrap(np.deg2rad(yaw_deg)), times_s)
@@ -183,11 +164,11 @@ def attitude(
     return np.stack([yaw_deg, pitch, roll], axis=1)
 
 
-def _limit(angle_deg: Numbers, largest_deg: float) -> Numbers:
+def _limit(angle_deg: Float64, largest_deg: float) -> Float64:
     return largest_deg * np.tanh(angle_deg / largest_deg)
 
 
-def _settle(times_s: Numbers, wanted_deg: Numbers) -> Numbers:
+def _settle(times_s: Float64, wanted_deg: Float64) -> Float64:
     """Follow the wanted angle with the delay of a damped spring (a first-order low pass, exact for each step)."""
     share = 1.0 - np.exp(-np.diff(times_s) / SPRING_TIME_S)
     settled = wanted_deg.copy()
@@ -196,6 +177,6 @@ def _settle(times_s: Numbers, wanted_deg: Numbers) -> Numbers:
     return settled
 
 
-def _unevenness(way_m: Numbers, waves_deg: Numbers, generator: np.random.Generator) -> Numbers:
+def _unevenness(way_m: Float64, waves_deg: Float64, generator: np.random.Generator) -> Float64:
     phase = generator.uniform(0, 2 * np.pi, size=len(WAVELENGTHS_M))
     return np.asarray(np.sin(2 * np.pi * way_m[:, None] / WAVELENGTHS_M + phase) @ waves_deg)

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from torchcover.geometry.arrays import Float64
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.alignment import SAMPLE_EVERY_M, Alignment, Territory
 from torchcover.simulation.traffic.fleet import Fleet
@@ -16,8 +16,6 @@ from torchcover.simulation.traffic.hills import Hills
 from torchcover.simulation.traffic.scenery import Scenery, few, ground, plateau
 from torchcover.simulation.traffic.site import PIECE_M, Bounds, BuildingSite
 from torchcover.simulation.traffic.streets import GUTTER_M, Streets
-
-Numbers = NDArray[np.float64]
 
 BLOCK_DEPTH_M = 95.0
 # Crossings and the sight of those who wait there stay free: of parked cars, and of furniture.
@@ -147,18 +145,12 @@ class City:
                     "open" if number % 2 else zone, _beside(street, x_m, front.side * (front.kerb_m + sidewalk_m))
                 )
 
-    def _far_kerb(self, index: int, face_m: Numbers, inwards: int) -> Numbers:
-        """The kerb of a street that goes straight on where the main street turns away.
+    def _far_kerb(self, index: int, face_m: Float64, inwards: int) -> Float64:
+        """(K, 2) places at the kerb of a street that goes straight on where the main street turns away, at a junction.
 
-        People walk around the turn on the level, between what lies beside that street and the main street.
-
-        Args:
-            index: Number of the junction.
-            face_m: (K, 2) places along the end of the block beside it, away from the main street.
-            inwards: 1 at the beginning of that block, -1 at its end.
-
-        Returns:
-            (K, 2) places as far away from the main street.
+        People walk around the turn on the level, between what lies beside that street and the main street. They are as
+        far away from that as `face_m` (K, 2), at the end of the block beside it: `inwards` is 1 at its beginning, -1 at
+        its end.
         """
         street, turn = self._streets.crossing[index], int(self._streets.course.turns[index])
         kerb_m = float(self._streets.cross_lanes_each_way[index]) * self._section.lane_m + GUTTER_M
@@ -228,7 +220,7 @@ class City:
 
     def _park(self, cars: list[tuple[BuildingSite, list[tuple[str, float, float, float]]]]) -> None:
         kinds: list[str] = []
-        found: list[Numbers] = []
+        found: list[Float64] = []
         for site, of_front in cars:
             if of_front:
                 names, x_m, y_m, yaw_deg = zip(*of_front, strict=True)
@@ -251,15 +243,15 @@ class City:
         return float(self._generator.uniform(low, high))
 
 
-def _across(kerb_m: Numbers, sidewalk_m: float, zone: Zone) -> Iterator[Side]:
+def _across(kerb_m: Float64, sidewalk_m: float, zone: Zone) -> Iterator[Side]:
     """Along a cross street, whose kerb has the street on its left: at the kerb, and behind the sidewalk."""
     ahead = (kerb_m[1] - kerb_m[0]) / np.linalg.norm(kerb_m[1] - kerb_m[0])
     yield Side("kerb", kerb_m)
     yield Side(zone, kerb_m + sidewalk_m * np.array([ahead[1], -ahead[0]]))
 
 
-def _beside(street: Alignment, x_m: Bounds, left_m: float) -> Numbers:
+def _beside(street: Alignment, x_m: Bounds, left_m: float) -> Float64:
     """(K, 2) places beside a street, with the street on their left."""
     pieces = 1 if street.is_straight else int(np.ceil((x_m[1] - x_m[0]) / STREET_EVERY_M))
-    points_m: Numbers = street.poses(np.linspace(*x_m, pieces + 1), left_m)[:, :2]
+    points_m: Float64 = street.poses(np.linspace(*x_m, pieces + 1), left_m)[:, :2]
     return points_m if left_m < 0 else points_m[::-1]

@@ -3,11 +3,9 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from torchcover.geometry.arrays import Float64, Int64
 from torchcover.simulation.traffic.alignment import Alignment, squared_distances
-
-Numbers = NDArray[np.float64]
 
 # Between junctions no curve is tighter; crossings and stop lines lie on straights.
 SMALLEST_RADIUS_M = 110.0
@@ -30,29 +28,24 @@ class Course(NamedTuple):
     """
 
     street: Alignment
-    turns: NDArray[np.int64]
-    halves_m: Numbers
+    turns: Int64
+    halves_m: Float64
 
 
 def course(
-    junctions_m: Numbers,
-    halves_m: Numbers,
+    junctions_m: Float64,
+    halves_m: Float64,
     bend_deg: float,
     turn_share: float,
     radius_m: float,
     reach_m: float,
     generator: np.random.Generator,
 ) -> Course:
-    """Draw one that never comes near itself.
+    """Draw one that never comes near itself, and that begins and ends `reach_m` from the origin.
 
-    Args:
-        junctions_m: (J,) stations of the junctions.
-        halves_m: (J,) how far from its middle each ends where the street goes straight on.
-        bend_deg: How much the street may bend between two junctions, and from its first direction.
-        turn_share: Share of the junctions with a turn, of those that may have one: neither the first nor the last.
-        radius_m: Of the turns.
-        reach_m: How far from the origin the street begins and ends.
-        generator: Draws it.
+    Each of the junctions, at (J,) stations, ends `halves_m` from its middle where the street goes straight on. It bends
+    by `bend_deg` at most between two of them, and from its first direction. Of those that may have a turn, which is
+    neither the first nor the last, `turn_share` have one.
     """
     for _ in range(DRAWS):
         found = _draw(junctions_m, halves_m, np.deg2rad(bend_deg), turn_share, radius_m, generator)
@@ -62,8 +55,8 @@ def course(
 
 
 def _draw(
-    junctions_m: Numbers,
-    halves_m: Numbers,
+    junctions_m: Float64,
+    halves_m: Float64,
     bend: float,
     turn_share: float,
     radius_m: float,

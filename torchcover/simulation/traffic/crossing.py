@@ -3,12 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from torchcover.geometry.arrays import Bools, Float64
 from torchcover.simulation.traffic.scenery import PAVEMENT_M
-
-Numbers = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 # Probability to take the first chance after a stay, instead of waiting for another.
 EAGERNESS = 0.8
@@ -17,16 +14,10 @@ MAX_STAY_S = 12.0
 
 @dataclass(frozen=True, eq=False)
 class Footpath:
-    """A straight way from one waiting place to another.
+    """A straight way from one (2,) waiting place to another, with a kerb `kerb_m` behind both, or none."""
 
-    Args:
-        start_m: (2,) one waiting place.
-        end_m: (2,) the other.
-        kerb_m: How far behind a waiting place the kerb is, at both ends; without one the path is level.
-    """
-
-    start_m: Numbers
-    end_m: Numbers
+    start_m: Float64
+    end_m: Float64
     kerb_m: float | None = None
 
     @property
@@ -34,16 +25,10 @@ class Footpath:
         """From one waiting place to the other."""
         return float(np.linalg.norm(self.end_m - self.start_m))
 
-    def poses(self, share: Numbers, back: Flags, body_radius_m: float) -> tuple[Numbers, Numbers]:
-        """Where somebody is who has gone a share of the way.
+    def poses(self, share: Float64, back: Bools, body_radius_m: float) -> tuple[Float64, Float64]:
+        """(T, 3) positions and (T,) headings in degrees of who has gone (T,) shares of the way, forth or back.
 
-        Args:
-            share: (T,) 0 at the start, 1 at the end.
-            back: (T,) whether they face the start.
-            body_radius_m: How far the body reaches from its middle: it steps down when all of it is past the kerb.
-
-        Returns:
-            (T, 3) positions and (T,) headings in degrees.
+        The body steps down when all of it, so far from its middle, is past the kerb.
         """
         way = self.end_m - self.start_m
         yaw = np.rad2deg(np.arctan2(way[1], way[0])) + 180.0 * back
@@ -57,24 +42,15 @@ class Footpath:
 
 def walk(
     path: Footpath,
-    may_go: Flags,
+    may_go: Bools,
     crossing_s: float,
-    times_s: Numbers,
+    times_s: Float64,
     body_radius_m: float,
     generator: np.random.Generator,
-) -> tuple[Numbers, Numbers]:
-    """Go to and fro on a path, setting off only when one may.
+) -> tuple[Float64, Float64]:
+    """Go to and fro on a path, `crossing_s` each way: (T, 3) positions and (T,) headings in degrees at even times.
 
-    Args:
-        path: The path.
-        may_go: (T,) whether who sets off at this time finds the way free until the end.
-        crossing_s: How long it takes from one end to the other.
-        times_s: (T,) evenly spaced times.
-        body_radius_m: How far the body reaches from its middle.
-        generator: Draws the stays and which side is first.
-
-    Returns:
-        (T, 3) positions and (T,) headings in degrees.
+    One sets off only when one may, (T,), as who does then finds the way free until the end.
     """
     count, step_s = len(may_go), float(times_s[1] - times_s[0])
     chances = np.flatnonzero(may_go)
@@ -97,13 +73,13 @@ def walk(
             back, now = not back, arrived
 
 
-def step_height(beyond_kerb_m: Numbers, body_radius_m: float | Numbers) -> Numbers:
+def step_height(beyond_kerb_m: Float64, body_radius_m: float | Float64) -> Float64:
     """Height of the feet of somebody whose middle is so far beyond the kerb, on the carriageway's side."""
     stepping = (beyond_kerb_m - body_radius_m) / PAVEMENT_M
     return PAVEMENT_M * (1.0 - np.clip(stepping, 0.0, 1.0))
 
 
-def free_for(blocked: Flags, duration_s: float, step_s: float) -> Flags:
+def free_for(blocked: Bools, duration_s: float, step_s: float) -> Bools:
     """(T,) whether nothing is blocked from each time on for a duration; what is after the last time counts as free."""
     steps = int(np.ceil(duration_s / step_s))
     before = np.concatenate([[0], np.cumsum(blocked)])

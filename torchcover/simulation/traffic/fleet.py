@@ -149,17 +149,11 @@ class Fleet:
         spread: float = 0.12,
         heavy_spread: float = 0.12,
     ) -> list[Agent]:
-        """Fill a lane with agents at random gaps, nobody on a junction.
+        """Fill a lane with agents at random gaps, `per_km` as far as they fit at full speed; nobody on a junction.
 
-        Args:
-            lane: Index of the lane.
-            span_m: Where on it the fronts and rears of all lie.
-            per_km: How many to a kilometre, about, as far as they fit at full speed.
-            drivers: Weight and typical driver of each kind that uses the lane.
-            gates: The junctions on it.
-            keep_free: Agents that are there already.
-            spread: Of the desired speeds.
-            heavy_spread: Of those of lorries and buses.
+        The fronts and rears of all lie in `span_m` on it, clear of `keep_free`, who are there already. `drivers` are
+        the weight and the typical driver of each kind that uses the lane, `gates` the junctions on it; speeds spread by
+        `spread`, those of lorries and buses by `heavy_spread`.
         """
         mix = {kind: weight for kind, (weight, _) in drivers.items()}
         agents: list[Agent] = []

@@ -11,15 +11,13 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.simulation.memory import check_fits
 from torchcover.simulation.traffic.alignment import Beside
 from torchcover.simulation.traffic.idm import Driver, Quantity, acceleration_in, advance, tightness
 from torchcover.simulation.traffic.roads import Polyline
 from torchcover.simulation.traffic.signals import Gate, Gates, Signals
-
-Numbers = NDArray[np.float64]
 
 MAX_STEP_S = 0.1
 # Harder than comfortable, softer than an emergency: who would have to brake harder for a light goes on.
@@ -36,30 +34,19 @@ BYTES_PER_STATE = 128
 
 @dataclass(frozen=True, eq=False)
 class Lane:
-    """A line that is followed in one direction.
+    """A line that is followed in one direction, and the junctions on it, in their order.
 
-    Args:
-        line: The line.
-        gates: The junctions on it, in their order.
-        limits_mps: (K,) how fast its curves may be driven, at 0 m, `LIMIT_EVERY_M`, ...; any speed if not given.
+    `limits_mps` (K,) is how fast its curves may be driven, at 0 m, `LIMIT_EVERY_M`, ...; any speed if not given.
     """
 
     line: Polyline | Beside
     gates: tuple[Gate, ...] = ()
-    limits_mps: Numbers | None = None
+    limits_mps: Float64 | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Agent:
-    """Somebody who follows a lane.
-
-    Args:
-        kind: Which body.
-        length_m: Of the body, bumper to bumper.
-        lane: Index of the lane.
-        place_m: Where the centre is on it when the simulation begins.
-        driver: How they drive or walk.
-    """
+    """Somebody of a kind, so long bumper to bumper, whose centre is at a place on a lane at first; their driver."""
 
     kind: str
     length_m: float
@@ -71,19 +58,13 @@ class Agent:
 class Flow(NamedTuple):
     """What happened: `place_m` and `speed_mps` (T, N); `occupied` (T, J, 2), whether a phase is on a junction."""
 
-    place_m: Numbers
-    speed_mps: Numbers
-    occupied: NDArray[np.bool_]
+    place_m: Float64
+    speed_mps: Float64
+    occupied: Bools
 
 
 class Simulation:
-    """N agents on L lanes.
-
-    Args:
-        lanes: The lanes.
-        agents: Who follows them; they must not overlap, nor stand on a junction.
-        signals: The lights of all junctions that gates name.
-    """
+    """N agents, who must not overlap, nor stand on a junction, on L lanes."""
 
     def __init__(self, lanes: Sequence[Lane], agents: Sequence[Agent], signals: Signals) -> None:
         self.place_m = np.array([agent.place_m for agent in agents], dtype=np.float64)
@@ -111,7 +92,7 @@ class Simulation:
         self.speed_mps = self._first_speed()
         self._look()
 
-    def run(self, times_s: Numbers, warm_up_s: float = 0.0) -> Flow:
+    def run(self, times_s: Float64, warm_up_s: float = 0.0) -> Flow:
         """Simulate, first the warm-up before the first time, and keep the state at each time."""
         place_m, speed_mps = np.empty((2, len(times_s), len(self.place_m)))
         occupied = np.empty((len(times_s), len(self._signals.offset_s), 2), dtype=bool)
@@ -146,20 +127,20 @@ class Simulation:
             self._face(passed, self._gate[passed] + 1)
         self._look()
 
-    def _face(self, agents: NDArray[np.int64], gates: NDArray[np.int64]) -> None:
+    def _face(self, agents: Int64, gates: Int64) -> None:
         """Let some agents have these gates before them."""
         self._gate[agents] = gates
         self._enter_m[agents], self._exit_m[agents] = self._gates.enter_m[gates], self._gates.exit_m[gates]
         length_m, standstill_m = self._room_m
         self._clear_m[agents] = self._exit_m[agents] + length_m[agents] + standstill_m[agents]
 
-    def _leader_m(self) -> Numbers:
+    def _leader_m(self) -> Float64:
         """(N,) place of the one ahead; infinite for the first on a lane."""
         leader_m = self.place_m.take(self._leader)
         leader_m += self._lap
         return leader_m
 
-    def _gap_m(self, leader_m: Numbers) -> Numbers:
+    def _gap_m(self, leader_m: Float64) -> Float64:
         """(N,) free road to the one ahead, bumper to bumper."""
         gap_m = leader_m - self.place_m
         gap_m -= self._between_middles_m
@@ -177,7 +158,7 @@ class Simulation:
         self._occupied = np.zeros(2 * len(self._signals.offset_s), dtype=bool)
         self._occupied[self._gates.light[self._gate[self._committed]]] = True
 
-    def _held_up(self, time_s: float, leader_m: Numbers, leader_mps: Numbers) -> NDArray[np.bool_]:
+    def _held_up(self, time_s: float, leader_m: Float64, leader_mps: Float64) -> Bools:
         """(N,) whether one may not cross the next stop line, and need not."""
         gates = self._gates
         green = self._signals.green_left_s(time_s).ravel()[gates.light] > gates.green_needed_s
@@ -186,12 +167,12 @@ class Simulation:
         held &= ~self._committed
         return held
 
-    def _jammed_behind(self, leader_m: Numbers, leader_mps: Numbers) -> NDArray[np.bool_]:
+    def _jammed_behind(self, leader_m: Float64, leader_mps: Float64) -> Bools:
         """(N,) whether a queue behind the junction would force one to stop on it."""
         rear_m = leader_m - self._leaders_half_m
         return (rear_m > self._enter_m) & (rear_m < self._clear_m) & (leader_mps < self._queue_mps)
 
-    def _first_speed(self) -> Numbers:
+    def _first_speed(self) -> Float64:
         """(N,) fast, but slow enough to stop at the next line, and for the gap to the one ahead."""
         stoppable = np.sqrt(
             self._driver.deceleration_mps2 * np.maximum(self._enter_m - self.place_m - self._half_m, 0.0)
@@ -205,7 +186,7 @@ class Simulation:
 class _Limits:
     """What N agents may drive, on the lanes with these numbers, (N,)."""
 
-    def __init__(self, lanes: Sequence[Lane], lane: NDArray[np.int64]) -> None:
+    def __init__(self, lanes: Sequence[Lane], lane: Int64) -> None:
         # The first is of all lanes without limits.
         tables = [np.array([np.inf]), *(each.limits_mps for each in lanes if each.limits_mps is not None)]
         number = np.cumsum([each.limits_mps is not None for each in lanes])
@@ -215,7 +196,7 @@ class _Limits:
         self._table = np.concatenate(tables)
         self._first, self._last = first[of_lane][lane], first[of_lane + 1][lane] - 1
 
-    def at(self, place_m: Numbers, desired_mps: Quantity) -> Quantity:
+    def at(self, place_m: Float64, desired_mps: Quantity) -> Quantity:
         """(N,) what they want to drive at (N,) places, if that is allowed there."""
         if self._none:
             return desired_mps
@@ -235,7 +216,7 @@ def check_crowd(agents: float, steps: int) -> None:
     )
 
 
-def _leaders(lanes: Sequence[Lane], lane: NDArray[np.int64], place_m: Numbers) -> tuple[NDArray[np.int64], Numbers]:
+def _leaders(lanes: Sequence[Lane], lane: Int64, place_m: Float64) -> tuple[Int64, Float64]:
     """(N,) who is ahead, anybody for the first on a lane; and (N,) how much farther than their place that is.
 
     0; the length of a lap where the one ahead is the last one of a loop; infinite where there is nobody.

@@ -10,14 +10,13 @@ from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from pydantic import AfterValidator
 
+from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.simulation.bodies import merge
 from torchcover.simulation.shapes import Mesh, circle
 from torchcover.simulation.traffic.scenery import PAVEMENT_M, block, prism
 
-Numbers = NDArray[np.float64]
 Bounds = tuple[float, float]
 Zone = Literal["kerb", "built", "open"]
 
@@ -107,24 +106,20 @@ class Side(NamedTuple):
     """A side of a street in a zone: a line of (K, 2) places that has the street on its left."""
 
     zone: Zone
-    line_m: Numbers
+    line_m: Float64
 
 
 def sides_around(
     street: shapely.Geometry,
     off_m: tuple[float, float],
-    sees: Callable[[Numbers], NDArray[np.bool_]],
+    sees: Callable[[Float64], Bools],
     built_share: float,
     generator: np.random.Generator,
 ) -> list[Side]:
-    """The sides of all streets that are known in plan only.
+    """The sides of all streets that are known in plan only, a drawn share of them built up.
 
-    Args:
-        street: What is driven and walked on.
-        off_m: How far beyond its edge kerb furniture begins, and how far what stands behind it.
-        sees: Which of (N, 2) places matter.
-        built_share: Share of the sides that are built up.
-        generator: Draws which.
+    `off_m` is how far beyond its edge kerb furniture begins, and what stands behind it; `sees` which (N, 2) places
+    matter.
     """
     sides: list[Side] = []
     for number, away_m in enumerate(off_m):
@@ -143,9 +138,9 @@ def sides_around(
 class _Pieces(NamedTuple):
     """(N, 4, 2) outlines in plan, counter-clockwise from the far side on; (N,) heights, and which pieces are one."""
 
-    outlines_m: Numbers
-    high_m: Numbers
-    run: NDArray[np.int64]
+    outlines_m: Float64
+    high_m: Float64
+    run: Int64
 
 
 def stand(
@@ -153,23 +148,14 @@ def stand(
     driven: Sequence[shapely.Geometry],
     walked: Sequence[shapely.Geometry],
     pavements: Sequence[shapely.Geometry],
-    heights_m: Callable[[Numbers], Numbers],
+    heights_m: Callable[[Float64], Float64],
     times: float | Mapping[str, float],
     generator: np.random.Generator,
 ) -> tuple[list[Mesh], list[Mesh]]:
-    """Draw what stands along the sides of streets.
+    """Draw what stands along the sides of streets: houses and all else, each kind in one mesh; see `Times`.
 
-    Args:
-        sides: The sides.
-        driven: In plan: where nothing at kerbs may stand.
-        walked: In plan: where nothing behind sidewalks may stand.
-        pavements: In plan: what is a kerb higher than the ground.
-        heights_m: Of the ground, at (N, 2) places.
-        times: See `Times`.
-        generator: Draws it.
-
-    Returns:
-        Houses and all else, each kind in one mesh.
+    In plan, nothing at kerbs may stand on what is `driven`, nor anything behind sidewalks on what is `walked`;
+    `pavements` are a kerb higher than the ground, whose heights `heights_m` gives at (N, 2) places.
     """
     if not sides:
         return [], []
@@ -218,7 +204,7 @@ class _Lines:
         self._right = np.stack([ahead[:, 1], -ahead[:, 0]], axis=1)
         self.length_m = self._arc_m[self._last] - self._arc_m[self._first]
 
-    def along(self, number: NDArray[np.int64], ways_m: Numbers) -> tuple[Numbers, Numbers]:
+    def along(self, number: Int64, ways_m: Float64) -> tuple[Float64, Float64]:
         """(N, 2, 2) places, and the way to the right there, after (N, 2) ways along lines of some numbers."""
         way_m = self._arc_m[self._first[number]][:, None] + ways_m
         piece = np.searchsorted(self._arc_m, way_m, side="right") - 1
@@ -265,13 +251,13 @@ def _drawn(kind: _Kind, lines: _Lines, times: float, generator: np.random.Genera
 
 
 def _free(
-    outlines_m: Numbers,
-    kinds: NDArray[np.int64],
-    run: NDArray[np.int64],
+    outlines_m: Float64,
+    kinds: Int64,
+    run: Int64,
     driven: Sequence[shapely.Geometry],
     walked: Sequence[shapely.Geometry],
     pavements: Sequence[shapely.Geometry],
-) -> tuple[NDArray[np.bool_], Numbers]:
+) -> tuple[Bools, Float64]:
     """(N,) which pieces are in nobody's way, and how much higher than the ground they stand."""
     foot = np.array([kind.foot for kind in KINDS.values()])[kinds][:, None, None]
     middles_m = outlines_m.mean(axis=1, keepdims=True)
@@ -300,7 +286,7 @@ def _free(
     return free, PAVEMENT_M * within
 
 
-def _meeting(outlines_m: Numbers, group: NDArray[np.int64]) -> NDArray[np.int64]:
+def _meeting(outlines_m: Float64, group: Int64) -> Int64:
     """(2, P) pairs of (N, 4, 2) convex outlines of two groups that no side of the one or the other separates."""
     boxes = shapely.box(*outlines_m.min(axis=1).T, *outlines_m.max(axis=1).T)
     pairs = shapely.STRtree(boxes).query(boxes)
@@ -314,7 +300,7 @@ def _meeting(outlines_m: Numbers, group: NDArray[np.int64]) -> NDArray[np.int64]
     return np.asarray(pairs)
 
 
-def _copies(form: Mesh, outlines_m: Numbers, bottom_m: Numbers, base_m: Numbers, high_m: Numbers) -> Mesh:
+def _copies(form: Mesh, outlines_m: Float64, bottom_m: Float64, base_m: Float64, high_m: Float64) -> Mesh:
     """A form, once over each of (N, 4, 2) outlines: it stands on a base, and its lowest corners go on to a bottom."""
     x, y, z = form.vertices_m.T
     weights = np.stack([(1 - x) * (1 - y), x * (1 - y), x * y, (1 - x) * y], axis=1)

@@ -3,9 +3,9 @@
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
+from torchcover.geometry.arrays import Float64
 from torchcover.simulation.traffic.alignment import Alignment
 from torchcover.simulation.traffic.assemble import HORIZON_M, Paths, actors, ahead_of, ego_actor
 from torchcover.simulation.traffic.fleet import EGO, HEAVY, KIND_OF, Fleet
@@ -17,8 +17,6 @@ from torchcover.simulation.traffic.procedural import MostVehicles, Procedural
 from torchcover.simulation.traffic.roadside import LANE_CENTRES_M, SideLane, roadside
 from torchcover.simulation.traffic.scenery import Scenery
 from torchcover.simulation.world import Actor
-
-Numbers = NDArray[np.float64]
 
 # Platoons form behind the slower ones.
 WARM_UP_S = 30.0
@@ -69,7 +67,7 @@ class Highway(Procedural):
     hills_m: float = Field(default=3.0, ge=0.0, le=10.0)
 
     def _build(
-        self, fleet: Fleet, times_s: Numbers, generator: np.random.Generator
+        self, fleet: Fleet, times_s: Float64, generator: np.random.Generator
     ) -> tuple[Scenery, Actor, tuple[Actor, ...]]:
         (shapes,) = generator.spawn(1)
         hills = Hills(self.hills_m, shapes, HILLS_M, STEEPEST)
@@ -112,7 +110,7 @@ class Highway(Procedural):
         begin_m = LEADER_MPS * (WARM_UP_S + generator.uniform(0.0, 0.8) * self.duration_s)
         return SideLane(begin_m, begin_m + float(generator.uniform(*SIDE_LANE_M)))
 
-    def _traffic(self, side_m: Numbers, fleet: Fleet) -> list[Agent]:
+    def _traffic(self, side_m: Float64, fleet: Fleet) -> list[Agent]:
         """Everybody; the ego is the first, behind a leader in its lane."""
         own, lasts_s = 3 - self.ego_lane, self._lasts_s
         kind = fleet.draw_kind({kind: weight for kind, (weight, _) in LANE_USERS[own].items()})
@@ -176,7 +174,7 @@ def _near(middle: Alignment, sides: list[SideLane], agents: list[Agent], driving
     return Paths(positions_m, yaw_deg, kinds).with_rears()
 
 
-def _lane_at(stations: Numbers, lane: int, sides: list[SideLane]) -> tuple[Numbers | float, Numbers | float]:
+def _lane_at(stations: Float64, lane: int, sides: list[SideLane]) -> tuple[Float64 | float, Float64 | float]:
     """(T,) how far from the middle of the road a lane is at stations, and how much more after each metre driven."""
     centre_m = float(LANE_CENTRES_M[lane % LANES])
     if lane % LANES != SIDE_LANE:
@@ -185,7 +183,7 @@ def _lane_at(stations: Numbers, lane: int, sides: list[SideLane]) -> tuple[Numbe
     return centre_m + away_m, slope if lane < LANES else -slope
 
 
-def _poses(middle: Alignment, stations: Numbers) -> Numbers:
+def _poses(middle: Alignment, stations: Float64) -> Float64:
     """(..., 3) poses of the middle at stations, of which there are very many, to a third of a millimetre."""
     first = float(stations.min())
     table = middle.poses(np.arange(first, float(stations.max()) + 2 * POSE_EVERY_M, POSE_EVERY_M), 0.0)

@@ -3,12 +3,10 @@
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from torchcover.geometry.arrays import Float32, Float64
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.alignment import squared_distances
-
-Numbers = NDArray[np.float64]
 
 WAVELENGTHS_M = (250.0, 700.0)
 WAVES = 3
@@ -38,14 +36,14 @@ class Hills:
         """Whether there are none."""
         return bool(self._wave_m == 0.0)
 
-    def heights_m(self, places_m: Numbers) -> Numbers:
+    def heights_m(self, places_m: Float64) -> Float64:
         """(...) at (..., 2) places, rounded to some micrometres."""
         if self.are_flat:
             return np.zeros(places_m.shape[:-1])
         waves = sum((np.sin(phase) for phase in self._phases(places_m)), start=np.float32(0.0))
         return np.asarray(self._wave_m * np.asarray(waves, dtype=np.float64))
 
-    def stances(self, places_m: Numbers, yaw_deg: Numbers) -> Numbers:
+    def stances(self, places_m: Float64, yaw_deg: Float64) -> Float64:
         """(..., 3) height in metres, and pitch and roll in degrees, of who stands at (..., 2) places with headings."""
         if self.are_flat:
             return np.zeros((*places_m.shape[:-1], 3))
@@ -66,13 +64,13 @@ class Hills:
         stances[1:] *= np.float32(np.rad2deg(1.0)) * (1 - stances[1:] ** 2 / 3)
         return np.moveaxis(stances, 0, -1).astype(np.float64)
 
-    def _phases(self, places_m: Numbers) -> Iterator[NDArray[np.float32]]:
+    def _phases(self, places_m: Float64) -> Iterator[Float32]:
         """(...) of each wave. They are reduced in float64: sines and cosines of float32 take a fraction of the time."""
         x_m, y_m = places_m[..., 0], places_m[..., 1]
         for x_per_m, y_per_m, phase in zip(*self._waves_per_m, self._phase, strict=True):
             yield (x_per_m * x_m + y_per_m * y_m + phase).astype(np.float32)
 
-    def mesh(self, way_m: Numbers, within_m: float, square_m: float = SQUARE_M) -> Mesh:
+    def mesh(self, way_m: Float64, within_m: float, square_m: float = SQUARE_M) -> Mesh:
         """The ground near a way, (N, 2) places, as one sheet of squares."""
         lower = np.floor((way_m.min(axis=0) - within_m) / square_m)
         columns, rows = (np.ceil((way_m.max(axis=0) + within_m) / square_m) - lower).astype(np.int64).tolist()

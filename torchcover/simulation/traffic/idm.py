@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-Numbers = NDArray[np.float64]
-Quantity = float | Numbers
+from torchcover.geometry.arrays import Float64
+
+Quantity = float | Float64
 
 FREE_ROAD_EXPONENT = 4
 # What tyres give on a dry road; the model itself would ask for more when somebody appears right ahead.
@@ -55,14 +55,10 @@ class Driver:
         return 2 * np.sqrt(self.acceleration_mps2 * self.deceleration_mps2)
 
 
-def tightness(driver: Driver, speed_mps: Numbers, gap_m: Numbers, closing_mps: Numbers) -> Numbers:
-    """The gap that N drivers would like to have as a multiple of the one that they have.
+def tightness(driver: Driver, speed_mps: Float64, gap_m: Float64, closing_mps: Float64) -> Float64:
+    """The gap that N drivers would like to have as a multiple of the one that they have, which may be infinite.
 
-    Args:
-        driver: The drivers.
-        speed_mps: (N,) their speeds.
-        gap_m: (N,) free road to the one ahead, bumper to bumper; infinite on an empty road.
-        closing_mps: (N,) own speed minus that of the one ahead.
+    `closing_mps` (N,) is their own speed minus that of the one ahead.
     """
     # In place, here and below: what is written anew has to come from farther away than what was read just now.
     gaps = speed_mps * closing_mps
@@ -74,7 +70,7 @@ def tightness(driver: Driver, speed_mps: Numbers, gap_m: Numbers, closing_mps: N
     return gaps
 
 
-def acceleration_in(driver: Driver, speed_mps: Numbers, tightness: Numbers, desired_mps: Quantity) -> Numbers:
+def acceleration_in(driver: Driver, speed_mps: Float64, tightness: Float64, desired_mps: Quantity) -> Float64:
     """(N,) acceleration of N drivers, at least -9 m/s²; of several things ahead the largest tightness counts.
 
     `desired_mps` is what they want to drive here: less than elsewhere in a curve.
@@ -87,7 +83,7 @@ def acceleration_in(driver: Driver, speed_mps: Numbers, tightness: Numbers, desi
     return np.maximum(wanted, -HARDEST_BRAKING_MPS2, out=wanted)
 
 
-def laden_mps2(speed_mps: Numbers, slope: Numbers) -> Numbers:
+def laden_mps2(speed_mps: Float64, slope: Float64) -> Float64:
     """(N,) the hardest that laden lorries accelerate at (N,) speeds up (N,) slopes, by their power.
 
     Example:
@@ -95,25 +91,15 @@ def laden_mps2(speed_mps: Numbers, slope: Numbers) -> Numbers:
         True
     """
     resisted_mps2 = GRAVITY_MPS2 * (slope + ROLLING) + DRAG_PER_M * speed_mps**2
-    found: Numbers = LADEN_W_PER_KG / np.maximum(speed_mps, 1.0) - resisted_mps2
-    return found
+    return np.asarray(LADEN_W_PER_KG / np.maximum(speed_mps, 1.0) - resisted_mps2)
 
 
-def advance(speed_mps: Numbers, acceleration_mps2: Numbers, room_m: Numbers, step_s: float) -> tuple[Numbers, Numbers]:
-    """Move N drivers on by one step of constant acceleration (the ballistic update).
+def advance(speed_mps: Float64, acceleration_mps2: Float64, room_m: Float64, step_s: float) -> tuple[Float64, Float64]:
+    """(N,) ways in metres and (N,) new speeds after one step of constant acceleration (the ballistic update).
 
-    A driver who comes to a stop within the step stays there instead of driving backwards, and nobody goes farther
-    than the room that was free when the step began: those ahead do not drive backwards either, so no step of any
-    length leads through them.
-
-    Args:
-        speed_mps: (N,) speeds.
-        acceleration_mps2: (N,) accelerations.
-        room_m: (N,) how far each may go at most; infinite on an empty road.
-        step_s: Length of the step.
-
-    Returns:
-        (N,) ways in metres and (N,) new speeds.
+    A driver who comes to a stop within the step stays there instead of driving backwards, and nobody goes farther than
+    the room (N,) that was free when the step began: those ahead do not drive backwards either, so no step of any length
+    leads through them.
     """
     end_speed = acceleration_mps2 * step_s
     end_speed += speed_mps

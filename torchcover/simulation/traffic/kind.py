@@ -39,9 +39,4 @@ class Traffic(Document):
 
     @abstractmethod
     def world(self, seed: int, ego: Mesh | None = None) -> World:
-        """Build the world; the same for the same arguments.
-
-        Args:
-            seed: Seed of whatever is drawn.
-            ego: Body of the ego, in the vehicle frame; the built-in SUV if not given.
-        """
+        """Build the world; the same for the same seed of whatever is drawn, and ego, the built-in SUV if not given."""

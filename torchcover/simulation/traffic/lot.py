@@ -6,14 +6,12 @@ the island ends), an aisle, another row, a walkway along the edge.
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from torchcover.geometry.arrays import Float64
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.fleet import Fleet
 from torchcover.simulation.traffic.frontage import Times, sides_around, stand
 from torchcover.simulation.traffic.scenery import PAVEMENT_M, Scenery, block, box, few, ground, post, tree
-
-Numbers = NDArray[np.float64]
 
 STALL_WIDTH_M, STALL_DEPTH_M = 2.6, 5.0
 STALLS = 24
@@ -79,7 +77,7 @@ class Lot:
         around, market = self._surroundings()
         level, kerbs = ground((-300.0, -300.0), (300.0, 300.0)), few(islands)
 
-        def level_m(places_m: Numbers) -> Numbers:
+        def level_m(places_m: Float64) -> Float64:
             return np.zeros(len(places_m))
 
         sides = sides_around(LOT_M, AROUND_M, lambda _: np.array(True), self._built_share, self._generator)

@@ -11,15 +11,11 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.simulation.traffic.fleet import KIND_OF
 from torchcover.simulation.traffic.flow import MAX_STEP_S, Agent, Flow
 from torchcover.simulation.traffic.idm import Driver, acceleration_in, advance, laden_mps2, tightness
-
-Numbers = NDArray[np.float64]
-Indices = NDArray[np.int64]
-Flags = NDArray[np.bool_]
 
 # Of a direction, from the median outwards; on the last one enters and exits.
 LANES = 4
@@ -56,33 +52,28 @@ class Change(NamedTuple):
     place_m: float
     way_m: float
 
-    def share(self, place_m: Numbers) -> tuple[Numbers, Numbers]:
+    def share(self, place_m: Float64) -> tuple[Float64, Float64]:
         """(...) how much of it is done at places, from 0 to 1, and how much more after each metre."""
         part = np.clip((place_m - self.place_m) / self.way_m, 0.0, 1.0)
         return part**3 * (10 - 15 * part + 6 * part**2), 30 * (part * (1 - part)) ** 2 / self.way_m
 
 
 class Overtaking:
-    """N agents on the lanes of both directions: 0 to 3 of the first, 4 to 7 of the other.
+    """N agents on the lanes of both directions: 0 to 3 of the first, 4 to 7 of the other. They must not overlap.
 
-    Args:
-        agents: Who they are; they must not overlap.
-        heavy: (N,) who keeps out of the lane at the median.
-        exits: (N,) who takes the exit, from the lane beside it.
-        side_m: (2, 2) places between which the side lane of each direction lies beside the others: before, it is an
-            entry, behind, an exit.
-        generator: Draws how long changes take, and how evenly who drives.
-        climb: (2, K) ascending places of the first direction, and the slopes there.
+    Who is `heavy` keeps out of the lane at the median; who `exits` takes the exit, from the lane beside it. The side
+    lane of each direction lies beside the others between two places of `side_m` (2, 2): before, it is an entry, behind,
+    an exit. `climb` are (2, K) ascending places of the first direction, and the slopes there.
     """
 
     def __init__(
         self,
         agents: Sequence[Agent],
-        heavy: Flags,
-        exits: Flags,
-        side_m: Numbers,
+        heavy: Bools,
+        exits: Bools,
+        side_m: Float64,
         generator: np.random.Generator,
-        climb: Numbers,
+        climb: Float64,
     ) -> None:
         self.place_m = np.array([agent.place_m for agent in agents], dtype=np.float64)
         self.lane = np.array([agent.lane for agent in agents], dtype=np.int64)
@@ -110,7 +101,7 @@ class Overtaking:
         self.speed_mps = np.minimum(0.95 * self._desired_mps, room_m / self._driver.headway_s)
         self._wanted_mps2 = np.zeros(len(agents))
 
-    def run(self, times_s: Numbers, warm_up_s: float) -> Flow:
+    def run(self, times_s: Float64, warm_up_s: float) -> Flow:
         """Simulate, first the warm-up before the first time, and keep the state at each time."""
         place_m, speed_mps = np.empty((2, len(times_s), len(self.place_m)))
         spans_s = [warm_up_s, *(after - before for before, after in pairwise(times_s.tolist()))]
@@ -171,10 +162,10 @@ class Overtaking:
         self._between_m = (self._length_m[who] + self._length_m[self._leader]) / 2
         self._drivers = self._some(who)
 
-    def _some(self, who: Indices) -> Driver:
+    def _some(self, who: Int64) -> Driver:
         return Driver(*(getattr(self._driver, name)[who] for name in Driver.__dataclass_fields__))
 
-    def _gaps_m(self) -> Numbers:
+    def _gaps_m(self) -> Float64:
         """(P,) free road to the one ahead, bumper to bumper."""
         gap_m = self.place_m.take(self._leader)
         gap_m += self._no_leader_m
@@ -182,7 +173,7 @@ class Overtaking:
         gap_m -= self._between_m
         return gap_m
 
-    def _desired(self) -> Numbers:
+    def _desired(self) -> Float64:
         """(N,) what everybody wants to drive now and here: on ramps less."""
         per_s, phase = self._waves
         desired_mps = self._driver.desired_speed_mps * (1 + UNEVEN * np.sin(per_s * self._time_s + phase))
@@ -193,7 +184,7 @@ class Overtaking:
         desired_mps[beside] = np.minimum(desired_mps[beside], ramp_mps)
         return desired_mps
 
-    def _begin(self, who: Indices) -> list[Change]:
+    def _begin(self, who: Int64) -> list[Change]:
         """Let those of some agents change lanes who want to and may."""
         who = who[self.place_m[who] >= self._may_change_m[who]]
         left, right = who[self._may(who, -1)], who[self._may(who, 1)]
@@ -210,7 +201,7 @@ class Overtaking:
         self.changes += begun
         return begun
 
-    def _may(self, who: Indices, side: int) -> Flags:
+    def _may(self, who: Int64, side: int) -> Bools:
         """(K,) who of them has a lane on their left (-1) or right (1) that is for them."""
         lane, exits = self.lane[who] % LANES, self._exits[who]
         begin_m, end_m = self._side_m[self.lane[who] // LANES].T
@@ -220,7 +211,7 @@ class Overtaking:
             return np.asarray(~exits & (to_the_median | (lane == 2) | (beside & (lane == SIDE_LANE))))
         return np.asarray((lane < SIDE_LANE - 1) | (beside & exits & (lane == SIDE_LANE - 1)))
 
-    def _gains(self, who: Indices, side: Indices) -> Numbers:
+    def _gains(self, who: Int64, side: Int64) -> Float64:
         """(K,) what agents gain by changes to their left (-1) or right (1), in m/s²; below 0 where it is not safe."""
         lane, speed_mps = self.lane[who], self.speed_mps
         queue_m = NEXT_LANE_M * self._queue_lane + self.place_m[self._queue]
@@ -247,12 +238,12 @@ class Overtaking:
         is_safe = has_room & (then > -SAFE_MPS2) & (~has_behind | (have_room & (theirs > -SAFE_MPS2)))
         return np.where(is_safe, gain, -1.0)
 
-    def _of_queue(self, at: Indices, lane: Indices) -> tuple[Indices, Flags]:
+    def _of_queue(self, at: Int64, lane: Int64) -> tuple[Int64, Bools]:
         """(K,) who stands at places of the queue, and whether anybody of these lanes does."""
         inside = np.clip(at, 0, len(self._queue) - 1)
         return self._queue[inside], (inside == at) & (self._queue_lane[inside] == lane)
 
-    def _behind(self, who: Indices, leader: Indices, has_leader: Flags) -> tuple[Numbers, Flags]:
+    def _behind(self, who: Int64, leader: Int64, has_leader: Bools) -> tuple[Float64, Bools]:
         """(K,) how hard agents would accelerate behind others, and whether their gap is long enough."""
         gap_m = self.place_m[leader] - self.place_m[who] - (self._length_m[leader] + self._length_m[who]) / 2
         gap_m[~has_leader] = np.inf

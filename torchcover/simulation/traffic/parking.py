@@ -3,9 +3,9 @@
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
+from torchcover.geometry.arrays import Bools, Float64
 from torchcover.simulation.traffic.assemble import Paths, actors, ego_actor, paths
 from torchcover.simulation.traffic.crossing import Footpath, free_for, walk
 from torchcover.simulation.traffic.fleet import EGO, WALKING, Fleet
@@ -18,8 +18,6 @@ from torchcover.simulation.traffic.roads import loop
 from torchcover.simulation.traffic.scenery import Scenery
 from torchcover.simulation.traffic.signals import Signals
 from torchcover.simulation.world import Actor
-
-Numbers = NDArray[np.float64]
 
 WARM_UP_S = 10.0
 ROUND_M, CORNER_RADIUS_M = 84.0, 6.0
@@ -52,7 +50,7 @@ class Parking(Procedural):
     roadside: Times = 1.0
 
     def _build(
-        self, fleet: Fleet, times_s: Numbers, generator: np.random.Generator
+        self, fleet: Fleet, times_s: Float64, generator: np.random.Generator
     ) -> tuple[Scenery, Actor, tuple[Actor, ...]]:
         lanes = [Lane(loop(ROUND_M, 2 * AISLE_MIDDLE_M, CORNER_RADIUS_M))]
         agents = self._traffic(lanes[0].line.length_m, fleet, generator)
@@ -76,7 +74,7 @@ class Parking(Procedural):
         return agents
 
 
-def _people(lot: Lot, driving: Paths, times_s: Numbers, fleet: Fleet, generator: np.random.Generator) -> Paths:
+def _people(lot: Lot, driving: Paths, times_s: Float64, fleet: Fleet, generator: np.random.Generator) -> Paths:
     """People who cross the aisles between parked cars, and people on the walkways."""
     step_s = float(times_s[1] - times_s[0])
     positions, yaws, kinds = [], [], []
@@ -105,7 +103,7 @@ def _along_walkways() -> list[Footpath]:
     return [Footpath(np.array([-half, y]), np.array([half, y])) for y in WALKWAYS_M]
 
 
-def _car_near(driving: Paths, path: Footpath) -> NDArray[np.bool_]:
+def _car_near(driving: Paths, path: Footpath) -> Bools:
     """(T,) whether a car is on the piece of the aisle that a path crosses."""
     crossed = (path.start_m + path.end_m) / 2
     distance = np.linalg.norm(driving.positions_m[..., :2] - crossed, axis=2)

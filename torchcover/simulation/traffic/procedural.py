@@ -5,9 +5,9 @@ from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
+from torchcover.geometry.arrays import Float64
 from torchcover.simulation.documents import builtin_hashes
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.fleet import Fleet, load_bodies
@@ -35,16 +35,10 @@ class Procedural(Traffic):
     duration_s: Annotated[float, Field(gt=0.0, le=MAX_DURATION_S)] = 60.0
 
     def world(self, seed: int, ego: Mesh | None = None, bodies: Mapping[str, Mesh] | None = None) -> World:
-        """Build the world; the same for the same arguments.
+        """Build the world; the same for the same seed and meshes, of the ego and of each kind in `CATEGORIES`.
 
-        Args:
-            seed: Draws the place and everybody in it.
-            ego: Body of the ego, in the vehicle frame; the SUV of `bodies` if not given.
-            bodies: A mesh for each kind of body (`fleet.CATEGORIES`); the built-in ones if not given.
-
-        Returns:
-            The world: without hills the ground is z = 0; nobody ever overlaps anybody, and the ego is followed closely
-            enough for sensors of up to 250 m range.
+        Those that are not given are built in. Without hills the ground is z = 0; nobody ever overlaps anybody, and the
+        ego is followed closely enough for sensors of up to 250 m range.
         """
         generator = np.random.default_rng(seed)
         fleet = Fleet(load_bodies() if bodies is None else bodies, ego, generator)
@@ -73,6 +67,6 @@ class Procedural(Traffic):
 
     @abstractmethod
     def _build(
-        self, fleet: Fleet, times_s: NDArray[np.float64], generator: np.random.Generator
+        self, fleet: Fleet, times_s: Float64, generator: np.random.Generator
     ) -> tuple[Scenery, Actor, tuple[Actor, ...]]:
         """What rests, the ego, and who else moves, at (T,) times from 0 to the end, T >= 2."""

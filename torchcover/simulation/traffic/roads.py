@@ -4,30 +4,28 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Numbers = NDArray[np.float64]
+from torchcover.geometry.arrays import Float64
 
 
 @dataclass(frozen=True, eq=False)
 class Polyline:
-    """A polyline on the ground that goes on straight beyond its ends, or a loop.
+    """A polyline through (K, 2) corners on the ground that goes on straight beyond its ends, or a loop.
 
-    Args:
-        points_m: (K, 2) corners, K >= 2. Curves need corners close to each other.
-        closed: Whether the last corner, which then equals the first, leads on to the first. The seam must lie on a
-            straight part.
+    Curves need corners close to each other. The seam of a loop, whose last corner equals the first, lies on a straight
+    part.
 
     Example:
         >>> Polyline(np.array([[0.0, 5.0], [0.0, 105.0]])).poses(20.0)
         array([ 0., 25., 90.])
     """
 
-    points_m: Numbers
+    points_m: Float64
     closed: bool = False
 
     @cached_property
-    def arc_m(self) -> Numbers:
+    def arc_m(self) -> Float64:
         """(K,) way along the line at each corner."""
         return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self.points_m, axis=0), axis=1))])
 
@@ -36,15 +34,8 @@ class Polyline:
         """Length, of a loop once around."""
         return float(self.arc_m[-1])
 
-    def poses(self, place_m: ArrayLike) -> Numbers:
-        """Where one is after a way along the line.
-
-        Args:
-            place_m: (...) ways from the start; on a loop of any size.
-
-        Returns:
-            (..., 3) x and y in metres, and yaw in degrees.
-        """
+    def poses(self, place_m: ArrayLike) -> Float64:
+        """(..., 3) x and y in metres, and yaw in degrees, after (...) ways along the line; on a loop of any size."""
         place = np.asarray(place_m, dtype=np.float64)
         place = np.mod(place, self.length_m) if self.closed else place
         segment = np.clip(np.searchsorted(self.arc_m, place, side="right") - 1, 0, len(self.arc_m) - 2)
@@ -54,12 +45,12 @@ class Polyline:
         return np.concatenate([position, yaw[..., None]], axis=-1)
 
     @cached_property
-    def _directions(self) -> Numbers:
+    def _directions(self) -> Float64:
         steps = np.diff(self.points_m, axis=0)
         return np.asarray(steps / np.linalg.norm(steps, axis=1, keepdims=True))
 
     @cached_property
-    def headings(self) -> Numbers:
+    def headings(self) -> Float64:
         """(K,) heading at each corner in radians, halfway between the pieces that meet there, without jumps."""
         pieces = np.unwrap(np.arctan2(self._directions[:, 1], self._directions[:, 0]))
         return np.concatenate([pieces[:1], (pieces[:-1] + pieces[1:]) / 2, pieces[-1:]])

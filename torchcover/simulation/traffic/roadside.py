@@ -3,16 +3,14 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from torchcover.geometry.arrays import Bools, Float64
 from torchcover.simulation.shapes import Mesh, prism_faces
 from torchcover.simulation.traffic.alignment import Alignment
 from torchcover.simulation.traffic.hills import Hills
 from torchcover.simulation.traffic.scenery import Scenery, block, few, ground, post, tree
 from torchcover.simulation.traffic.site import bent
-
-Numbers = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 # Across the road, from the middle of the median; the last is the side lane, on which one enters and exits.
 LANE_M = 3.6
@@ -45,7 +43,7 @@ class SideLane(NamedTuple):
     begin_m: float
     end_m: float
 
-    def away_m(self, stations_m: ArrayLike) -> tuple[Numbers, Numbers]:
+    def away_m(self, stations_m: ArrayLike) -> tuple[Float64, Float64]:
         """(...) how much farther out than that it is at stations, and how much more after each metre."""
         stations = np.asarray(stations_m, dtype=np.float64)
         beyond = np.maximum(np.maximum(self.begin_m - stations, stations - self.end_m), 0.0)
@@ -54,11 +52,11 @@ class SideLane(NamedTuple):
         away = RAMP_PER_M * bent**3 / (6 * RAMP_BENDS_M) + slope * straight_on
         return away, np.copysign(slope, stations - self.end_m)
 
-    def is_inside(self, stations_m: ArrayLike, left_m: ArrayLike) -> Flags:
+    def is_inside(self, stations_m: ArrayLike, left_m: ArrayLike) -> Bools:
         """(...) whether what reaches so far from the middle stays between the other lanes and the ramp."""
         return np.asarray(self.away_m(stations_m)[0] > np.asarray(left_m) - LANES_END_M + 1.0)
 
-    def kept_off(self, stations_m: ArrayLike, left_m: ArrayLike, wide_m: float = 0.5) -> Numbers:
+    def kept_off(self, stations_m: ArrayLike, left_m: ArrayLike, wide_m: float = 0.5) -> Float64:
         """(...) how far from the middle things stand: on the outside of the ramp if there is no room before it."""
         outside_m = np.asarray(left_m) + LANE_M + self.away_m(stations_m)[0]
         return np.where(self.is_inside(stations_m, np.asarray(left_m) + wide_m), left_m, outside_m)
@@ -71,14 +69,9 @@ def roadside(
     span_m: tuple[float, float],
     generator: np.random.Generator,
 ) -> Scenery:
-    """The ground, and what stands along the part of the road that the ego gets to see.
+    """The ground, and what stands along the part of the road from one station to another.
 
-    Args:
-        middle: Of the median.
-        sides: The side lanes, on the left (1) and on the right (-1).
-        hills: The ground.
-        span_m: The stations of that part.
-        generator: Draws what stands there.
+    `middle` is that of the median, `sides` are the side lanes on the left (1) and on the right (-1).
     """
     way_m = middle.poses(np.arange(span_m[0], span_m[1] + 50.0, 50.0), 0.0)[:, :2]
     plain = (way_m.min(axis=0) - GROUND_M, way_m.max(axis=0) + GROUND_M)
@@ -94,7 +87,7 @@ def roadside(
     return Scenery((level, *few(*(bent(middle, hills, pieces) for pieces in stands))), (0,))
 
 
-def _prisms(outlines_m: Numbers, z_m: tuple[float, float]) -> Mesh:
+def _prisms(outlines_m: Float64, z_m: tuple[float, float]) -> Mesh:
     """Closed bodies over (N, K, 2) convex outlines, counter-clockwise."""
     count, corners, _ = outlines_m.shape
     vertices = np.empty((count, 2, corners, 3))
@@ -104,7 +97,7 @@ def _prisms(outlines_m: Numbers, z_m: tuple[float, float]) -> Mesh:
     return Mesh(vertices.reshape(-1, 3), faces.reshape(-1, 3)).made_of("metal")
 
 
-def _wall(x_m: Numbers, y_m: Numbers, there: Flags, width_m: float, z_m: tuple[float, float]) -> list[Mesh]:
+def _wall(x_m: Float64, y_m: Float64, there: Bools, width_m: float, z_m: tuple[float, float]) -> list[Mesh]:
     """A rail or wall through (K,) places: a straight piece between each two that are there."""
     here, ahead = (np.stack([x_m, y_m], axis=1)[ends] for ends in (slice(-1), slice(1, None)))
     aside = np.array([0.0, width_m / 2])

@@ -5,13 +5,12 @@ from typing import NamedTuple
 
 import numpy as np
 import shapely
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from torchcover.geometry import rigid, rotation_from_euler
+from torchcover.geometry.arrays import Float64
 from torchcover.simulation.bodies import merge
 from torchcover.simulation.shapes import Mesh, band, circle, prism_faces
-
-Numbers = NDArray[np.float64]
 
 PAVEMENT_M = 0.15
 # Kerbs go on below the ground, as far as it may rise between two of their corners.
@@ -36,12 +35,7 @@ def ground(lower_m: ArrayLike, upper_m: ArrayLike) -> Mesh:
 
 
 def prism(outlines_m: Sequence[ArrayLike], heights_m: Sequence[float]) -> Mesh:
-    """A closed body through convex outlines at ascending heights.
-
-    Args:
-        outlines_m: One (K, 2) outline for each height, counter-clockwise from above.
-        heights_m: Their z.
-    """
+    """A closed body through convex (K, 2) outlines, counter-clockwise from above, at ascending heights."""
     outlines = np.array(outlines_m, dtype=np.float64)
     levels, corners, _ = outlines.shape
     rings = np.empty((levels, corners, 3))
@@ -50,7 +44,7 @@ def prism(outlines_m: Sequence[ArrayLike], heights_m: Sequence[float]) -> Mesh:
     return Mesh(rings.reshape(-1, 3), prism_faces(levels, corners))
 
 
-def rectangle(x_m: tuple[float, float], y_m: tuple[float, float]) -> Numbers:
+def rectangle(x_m: tuple[float, float], y_m: tuple[float, float]) -> Float64:
     """(4, 2) outline."""
     return np.array([[x_m[0], y_m[0]], [x_m[1], y_m[0]], [x_m[1], y_m[1]], [x_m[0], y_m[1]]])
 
@@ -61,13 +55,10 @@ def block(x_m: tuple[float, float], y_m: tuple[float, float], z_m: tuple[float, 
     return prism([outline, outline], z_m)
 
 
-def slab(corners_m: Numbers, z_m: tuple[float, float]) -> Mesh:
-    """A closed body between two heights over a net.
+def slab(corners_m: Float64, z_m: tuple[float, float]) -> Mesh:
+    """A closed body between two heights over a net with (rows, columns, 2) corners, which may bend.
 
-    Args:
-        corners_m: (rows, columns, 2) corners of the net, which may bend; seen from above, columns are to the left of
-            rows.
-        z_m: Its lower and its upper side.
+    Seen from above, columns are to the left of rows.
     """
     rows, columns, _ = corners_m.shape
     number = np.arange(rows * columns).reshape(rows, columns)
@@ -81,7 +72,7 @@ def slab(corners_m: Numbers, z_m: tuple[float, float]) -> Mesh:
     return Mesh(np.column_stack([places_m, np.repeat(z_m, up)]), np.concatenate([over[:, ::-1], over + up, sides]))
 
 
-def plateau(piece: shapely.Geometry, heights_m: Callable[[Numbers], Numbers]) -> Mesh:
+def plateau(piece: shapely.Geometry, heights_m: Callable[[Float64], Float64]) -> Mesh:
     """Pavement of any outline: a closed body from above the ground, whose heights are given, to below it."""
     triangles = shapely.get_coordinates(shapely.get_parts(shapely.constrained_delaunay_triangles(piece)))
     corners_m = np.round(triangles.reshape(-1, 4, 2)[:, :3].reshape(-1, 2) / PLACES_ALIKE_M) * PLACES_ALIKE_M

@@ -5,10 +5,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Numbers = NDArray[np.float64]
-Indices = NDArray[np.int64]
+from torchcover.geometry.arrays import Float64, Int64
 
 # Whoever follows the main street, on wheels or on foot, goes in one phase; whoever crosses it goes in the other.
 MAIN, CROSS = 0, 1
@@ -18,14 +17,11 @@ MAIN, CROSS = 0, 1
 class Signals:
     """The lights of J junctions: main green, amber, all red, cross green, amber, all red, and again.
 
-    Args:
-        offset_s: (J,) how far into its cycle each junction is at time 0.
-        green_s: Length of the main and of the cross green.
-        amber_s: Time after green in which those who cannot stop any more still enter.
-        clear_s: Time after amber in which all have red.
+    `offset_s` (J,) is how far into its cycle each is at time 0. In amber those still enter who cannot stop any more;
+    then for `clear_s` all have red.
     """
 
-    offset_s: NDArray[np.float64]
+    offset_s: Float64
     green_s: tuple[float, float] = (26.0, 18.0)
     amber_s: float = 3.0
     clear_s: float = 3.0
@@ -40,7 +36,7 @@ class Signals:
         """Time after which the lights repeat."""
         return sum(self.green_s) + 2 * (self.amber_s + self.clear_s)
 
-    def green_left_s(self, time_s: ArrayLike) -> NDArray[np.float64]:
+    def green_left_s(self, time_s: ArrayLike) -> Float64:
         """(..., J, 2) seconds of green left to the main and the cross phase at (...) times; negative without green."""
         now = np.mod(np.asarray(time_s)[..., None] + self.offset_s, self.cycle_s)
         cross_start = self.green_s[MAIN] + self.amber_s + self.clear_s
@@ -52,14 +48,9 @@ class Signals:
 
 @dataclass(frozen=True)
 class Gate:
-    """Where a lane passes a junction.
+    """Where a lane passes a junction in a phase: from its stop line to where a rear end has left the junction.
 
-    Args:
-        enter_m: Place of the stop line.
-        exit_m: Place after which a rear end has left the junction.
-        junction: Index of the junction.
-        phase: `MAIN` or `CROSS`.
-        green_needed_s: Who enters must have this much green left (people on foot, who are slow to cross).
+    Who enters must have so much green left; people on foot are slow to cross.
     """
 
     enter_m: float
@@ -76,12 +67,12 @@ class Gates(NamedTuple):
     `other_light` is the other one there. `first` (L,) is the number of the first gate of each lane.
     """
 
-    enter_m: Numbers
-    exit_m: Numbers
-    light: Indices
-    other_light: Indices
-    green_needed_s: Numbers
-    first: Indices
+    enter_m: Float64
+    exit_m: Float64
+    light: Int64
+    other_light: Int64
+    green_needed_s: Float64
+    first: Int64
 
     @classmethod
     def from_lanes(cls, lanes: Sequence[tuple[Gate, ...]]) -> "Gates":
@@ -97,9 +88,8 @@ class Gates(NamedTuple):
             np.cumsum([0, *(len(of_lane) + 1 for of_lane in lanes[:-1])]),
         )
 
-    def next_on(self, lane: int, rear_m: Numbers) -> Indices:
+    def next_on(self, lane: int, rear_m: Float64) -> Int64:
         """(N,) numbers of the first gate of a lane that each of N rear ends has not left."""
         first = self.first[lane]
         last = first + int(np.argmax(np.isinf(self.exit_m[first:])))
-        numbers: Indices = first + np.searchsorted(self.exit_m[first:last], rear_m)
-        return numbers
+        return np.asarray(first + np.searchsorted(self.exit_m[first:last], rear_m))

@@ -4,15 +4,14 @@ from collections.abc import Sequence
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from torchcover.geometry.arrays import Float64
 from torchcover.simulation.bodies import merge
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.alignment import Alignment, Territory
 from torchcover.simulation.traffic.hills import Hills
 from torchcover.simulation.traffic.scenery import PAVEMENT_M, slab
 
-Numbers = NDArray[np.float64]
 Bounds = tuple[float, float]
 
 # What bends is cut into such pieces, and on hills across the street, too.
@@ -41,21 +40,14 @@ def bent(street: Alignment, hills: Hills, pieces: Sequence[Mesh]) -> list[Mesh]:
 
 
 class BuildingSite:
-    """The places along a street: a station, and how far to the left.
-
-    Args:
-        street: The street.
-        territory: What belongs to it.
-        hills: The ground.
-        deep_m: How far from its middle it is built at most.
-    """
+    """The places along a street, up to `deep_m` from its middle: a station, and how far to the left."""
 
     def __init__(self, street: Alignment, territory: Territory, hills: Hills, deep_m: float) -> None:
         self.street = street
         self._territory = territory
         self._hills = hills
         self._deep_m = deep_m
-        self._reaches_m: dict[int, tuple[Numbers, Numbers]] = {}
+        self._reaches_m: dict[int, tuple[Float64, Float64]] = {}
 
     def block(self, x_m: Bounds, side: int, kerb_m: float, depth_m: float) -> tuple[Mesh, shapely.Geometry]:
         """Pavement from a kerb on, on the left (1) or the right (-1), as far as the site goes there; and in plan."""
@@ -73,7 +65,7 @@ class BuildingSite:
             mesh.vertices_m[:, 2] = above_m
         return mesh.made_of("pavement"), outline
 
-    def depth_m(self, x_m: Numbers, side: int, kerb_m: float, depth_m: float) -> Numbers:
+    def depth_m(self, x_m: Float64, side: int, kerb_m: float, depth_m: float) -> Float64:
         """(N,) how deep a block is there that is not deeper than given."""
         if self.street.is_straight:
             return np.full(len(x_m), depth_m)

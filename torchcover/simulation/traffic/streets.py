@@ -4,14 +4,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.simulation.traffic.alignment import Alignment, Beside, Territory
 from torchcover.simulation.traffic.course import Course, course
 from torchcover.simulation.traffic.flow import LIMIT_EVERY_M, Lane
 from torchcover.simulation.traffic.signals import CROSS, MAIN, Gate, Signals
-
-Numbers = NDArray[np.float64]
 
 BICYCLE_LANE_M = 1.8
 GUTTER_M = 0.5
@@ -44,14 +42,7 @@ BUS_HALF_M, BUS_M = 6.0, 2.65
 
 @dataclass(frozen=True)
 class Section:
-    """The main street from its middle to the houses; all streets have lanes of one width.
-
-    Args:
-        lanes_each_way: For motor traffic.
-        lane_m: Their width.
-        bay_m: Width of the parking bays; 0 if there are none.
-        sidewalk_m: Width of the sidewalk.
-    """
+    """The main street from its middle to the houses: lanes of one width, as all streets have, bays (or 0), sidewalk."""
 
     lanes_each_way: int
     lane_m: float = 3.25
@@ -95,8 +86,8 @@ class Streets:
     """
 
     section: Section
-    junctions_m: Numbers
-    cross_lanes_each_way: NDArray[np.int64]
+    junctions_m: Float64
+    cross_lanes_each_way: Int64
     signals: Signals
     reach_m: float
     course: Course
@@ -112,12 +103,12 @@ class Streets:
         return self.section.kerb_m
 
     @property
-    def cross_kerbs_m(self) -> Numbers:
+    def cross_kerbs_m(self) -> Float64:
         """(J,) from the middle of each cross street to its kerb; of a junction with a turn to its end."""
         return self.course.halves_m
 
     @property
-    def has_lights(self) -> NDArray[np.bool_]:
+    def has_lights(self) -> Bools:
         """(J,) whether somebody crosses the main street there: not where it turns, and others give way."""
         return np.asarray(self.course.turns == 0)
 
@@ -143,7 +134,7 @@ class Streets:
             streets.append(Alignment(knots[of_turn] - station, self.main.curvatures_per_m[of_turn], start))
         return streets
 
-    def cross_ends_m(self) -> Numbers:
+    def cross_ends_m(self) -> Float64:
         """(J, 2) stations between which a cross street, in all its width, is far from all others of its kind."""
         whole = Territory(self.main, (-self.reach_m, self.reach_m))
         edges_m = self.junctions_m + np.array([[-1.0], [1.0]]) * (self.cross_kerbs_m + 1.0)
@@ -198,7 +189,7 @@ class Streets:
         return Lane(line, tuple(gates), None if walks or self.main.is_straight else _limits_mps(line))
 
 
-def _limits_mps(line: Beside) -> Numbers:
+def _limits_mps(line: Beside) -> Float64:
     """(K,) how fast a lane may be driven, at each `LIMIT_EVERY_M`: in curves, and before them."""
     places = np.arange(0.0, line.length_m, LIMIT_EVERY_M)
     curvature = line.street.curvatures(line.stations(places))

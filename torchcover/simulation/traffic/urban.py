@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
+from torchcover.geometry.arrays import Float64
 from torchcover.simulation.traffic.alignment import Beside, Territory
 from torchcover.simulation.traffic.assemble import HORIZON_M, Paths, actors, come_near, ego_actor, paths
 from torchcover.simulation.traffic.city import City
@@ -27,8 +27,6 @@ from torchcover.simulation.traffic.streets import (
     plan,
 )
 from torchcover.simulation.world import Actor
-
-Numbers = NDArray[np.float64]
 
 WARM_UP_S = 20.0
 # What is built up or has traffic, behind and ahead of all places the ego gets to.
@@ -93,7 +91,7 @@ class Urban(Procedural):
     hills_m: float = Field(default=1.0, ge=0.0, le=2.0)
 
     def _build(
-        self, fleet: Fleet, times_s: Numbers, generator: np.random.Generator
+        self, fleet: Fleet, times_s: Float64, generator: np.random.Generator
     ) -> tuple[Scenery, Actor, tuple[Actor, ...]]:
         # What the streets are like is drawn apart from what happens in them.
         (shapes,) = generator.spawn(1)
@@ -191,7 +189,7 @@ def _in_place(
     found: Paths,
     lanes: Sequence[Lane],
     agents: Sequence[Agent],
-    place_m: Numbers,
+    place_m: Float64,
     streets: Streets,
     built_m: tuple[float, float],
     fleet: Fleet,
@@ -230,7 +228,7 @@ def _in_place(
 def _crossers(
     streets: Streets,
     flow: Flow,
-    times_s: Numbers,
+    times_s: Float64,
     seen_m: tuple[float, float],
     fleet: Fleet,
     generator: np.random.Generator,

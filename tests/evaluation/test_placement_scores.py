@@ -1,0 +1,50 @@
+"""What metrics say of placements, each number that of `evaluate`."""
+
+import numpy as np
+import pytest
+
+from torchcover import Region, evaluate
+from torchcover.data import RegionsOfInterest
+from torchcover.evaluation import score_placements
+from torchcover.evaluation.placement_scores import circle
+
+RIGS = {name: f"place3d2024_{name}" for name in ("center", "line", "pyramid")}
+
+
+def test_own_numbers_are_those_of_compare_over_both_measures():
+    region = Region("front", (0.0, 20.0), (-10.0, 10.0))
+    scores = score_placements(RIGS, "courtyard", region=region, metrics=[], steps=8, seed=3)
+    asked = {
+        "regions": {"front": {"x_m": (0, 20), "y_m": (-10, 10)}},
+        "grid": {"x_m": (0, 20), "y_m": (-10, 10), "cell_m": 1.0},
+    }
+    result = evaluate(list(RIGS.values()), "courtyard", ask=RegionsOfInterest.model_validate(asked), steps=8, seed=3)
+    found = {one.name: one for one in scores.rankings}
+    for measure, words in (("area", "visible surface"), ("known", "known cells")):
+        each = [
+            [float(coverage.estimate(region, band, measure).value[1]) for coverage in result.coverages.values()]
+            for band in ("ground", "obstacle")
+        ]
+        for name, expected in zip(("ground", "obstacle", "both bands"), (*each, np.mean(each, axis=0)), strict=True):
+            one = found[f"detection 0.4 m, {name}, front, {words}"]
+            np.testing.assert_array_equal(one.gains, expected)  # one number, not two of one name
+            # Draws of worlds are around the number that all of them give.
+            assert one.draws.shape[1] == 3
+            np.testing.assert_allclose(one.draws.mean(axis=0), expected, atol=4 * one.draws.std(axis=0).max() + 1e-3)
+
+
+def test_the_region_is_a_circle():
+    area_m2 = sum(
+        x * next_y - y * next_x
+        for (x, y), (next_x, next_y) in zip(
+            circle().corners_m, (*circle().corners_m[1:], circle().corners_m[0]), strict=True
+        )
+    )
+    assert area_m2 / 2 == pytest.approx(np.pi * 50**2, rel=1e-3)
+
+
+def test_two_placements_and_metrics_that_there_are_none_of_are_refused():
+    with pytest.raises(ValueError, match="three or more"):
+        score_placements({"a": "kitti", "b": "waymo"})
+    with pytest.raises(ValueError, match="s_mag"):
+        score_placements(RIGS, metrics=["s_mag"])

@@ -1,0 +1,52 @@
+"""Readers whose libraries misbehave, for a process of their own."""
+
+import ctypes
+import os
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from torchcover.files.own_process import apart
+
+
+@apart
+def good(path: Path, factor: float):
+    return {"numbers": factor * np.arange(6.0).reshape(2, 3), "words": np.array(["a", path.name], dtype=object),
+            "none": np.empty((0, 3), np.float32), "one": np.array(7, np.int8)}  # fmt: skip
+
+
+@apart
+def loud(path: Path):
+    sys.stdout.write("library: hello\n")
+    os.write(1, b"from below")
+    return {"process": np.array([os.getpid(), "torch" in sys.modules])}
+
+
+@apart
+def wrong(path: Path, kind: str):
+    raise {"value": ValueError, "key": KeyError, "import": ImportError}[kind]("said")
+
+
+@apart
+def crashing(path: Path):
+    ctypes.string_at(0)
+    return {}
+
+
+@apart
+def hanging(path: Path):
+    time.sleep(60)
+    return {}
+
+
+@apart
+def greedy(path: Path, gb: float):
+    return {"bytes": np.ones(int(gb * 1e9), np.uint8)[:1]}
+
+
+@apart
+def writing(path: Path):
+    path.with_suffix(".new").write_text("x")
+    return {}

@@ -1,0 +1,115 @@
+"""Whatever a library does with a file, the run goes on, and the file is named."""
+
+import json
+import os
+import threading
+from multiprocessing import get_context
+
+import numpy as np
+import pytest
+
+from tests.files import apart_readers
+from torchcover.files import BadFileError, own_process, reads
+from torchcover.simulation.mesh_files import mesh_arrays
+
+
+@pytest.fixture
+def path(tmp_path):
+    path = tmp_path / "file.x"
+    path.write_text("content")
+    return path
+
+
+def test_what_is_read_comes_as_it_was(path):
+    read = apart_readers.good(path, 2.5)
+    assert np.array_equal(read["numbers"], 2.5 * np.arange(6.0).reshape(2, 3))
+    assert read["words"].tolist() == ["a", "file.x"]
+    assert (read["none"].shape, read["none"].dtype, read["one"].item()) == ((0, 3), np.float32, 7)
+    read["numbers"][0] = 1.0  # it is ours
+
+
+def test_a_library_that_prints_does_not_answer_and_the_process_stays(path):
+    (first, torch), (second, _) = (apart_readers.loud(path)["process"] for _ in range(2))
+    assert first == second != os.getpid()
+    assert not torch
+
+
+@pytest.mark.parametrize(("kind", "error", "words"), [
+    ("value", ValueError, "^said$"), ("key", ValueError, "^KeyError: 'said'$"), ("import", ImportError, "^said$"),
+])  # fmt: skip
+def test_errors_are_raised_here(path, kind, error, words):
+    with pytest.raises(error, match=words):
+        apart_readers.wrong(path, kind)
+
+
+def test_a_crash_is_a_bad_file_and_the_next_one_is_read(path):
+    door = reads("a thing")(apart_readers.crashing)
+    for _ in range(2):
+        with pytest.raises(BadFileError, match=r"file\.x: the library that reads it crashed; the file is damaged"):
+            door(path)
+    assert apart_readers.good(path, 1.0)
+
+
+def test_a_library_that_never_ends_is_ended(path, monkeypatch):
+    monkeypatch.setattr(own_process, "MOST_S", 0.3)
+    with pytest.raises(ValueError, match="it took more than 0 s"):
+        apart_readers.hanging(path)
+    monkeypatch.undo()
+    assert apart_readers.good(path, 1.0)
+
+
+def test_memory_is_what_files_may_take(path, monkeypatch):
+    assert apart_readers.greedy(path, 0.01)["bytes"][0] == 1
+    with pytest.raises(MemoryError):
+        apart_readers.greedy(path, 40.0)
+    with pytest.raises(ValueError, match="OSError"):
+        apart_readers.writing(path)
+    assert path.with_suffix(".new").stat().st_size == 0
+
+
+def test_threads_and_forks_read_too(path):
+    found = []
+    threads = [threading.Thread(target=lambda: found.append(apart_readers.good(path, 3.0)["one"])) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(found) == 4
+    here = apart_readers.loud(path)["process"][0]
+    queue = get_context("fork").SimpleQueue()
+    worker = get_context("fork").Process(
+        target=lambda: queue.put(int(apart_readers.loud(path)["process"][0])), daemon=True
+    )
+    worker.start()
+    assert queue.get() != here
+    worker.join()
+    assert apart_readers.loud(path)["process"][0] == here
+
+
+def test_parts_of_a_mesh_are_looked_at_as_the_mesh_is(tmp_path):
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4")
+    (tmp_path / "good.bin").write_bytes(corners.tobytes())
+    os.mkfifo(tmp_path / "pipe.bin")
+    (tmp_path.parent / "outside.bin").write_bytes(corners.tobytes())
+    path = tmp_path / "mesh.gltf"
+    for name, words in (
+        ("good.bin", None),
+        ("pipe.bin", "a pipe, a socket"),
+        ("../outside.bin", "outside of its folder"),
+    ):
+        content = {
+            "asset": {"version": "2.0"},
+            "buffers": [{"uri": name, "byteLength": 36}],
+            "bufferViews": [{"buffer": 0, "byteOffset": 0, "byteLength": 36}],
+            "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}],
+            "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+            "nodes": [{"mesh": 0}],
+            "scenes": [{"nodes": [0]}],
+            "scene": 0,
+        }
+        path.write_text(json.dumps(content))
+        if words is None:
+            assert mesh_arrays(path)["vertices"].shape == (3, 3)
+        else:
+            with pytest.raises(ValueError, match=words):
+                mesh_arrays(path)

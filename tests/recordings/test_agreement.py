@@ -1,0 +1,193 @@
+"""Scans that a drive's poses should bring together: each way to read them wrongly is found, with what mends it."""
+
+import pickle
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+
+from torchcover.data import AccumulatedReference, Corrections, RecordedFrames, Scan
+from torchcover.detection import Boxes
+from torchcover.geometry import (
+    euler_from_rotation,
+    invert,
+    quaternion_from_rotation,
+    rigid,
+    rotation_from_euler,
+    rotation_from_quaternion,
+    transform,
+)
+from torchcover.recordings.agreement import _late, disagreement
+from torchcover.recordings.corrected import corrected
+
+MOUNT = rigid(rotation_from_euler(2.0, 1.0, -1.0), [0.5, 0.1, 1.73])
+GROUND, SIDES = 3000, 6000
+AWAY_M = np.array([300.0, -40.0, 7.0])
+
+
+@dataclass
+class Yard:
+    """A LiDAR that drives in an S between crates on flat ground, and speeds up. What it is told of it may be wrong."""
+
+    fault: str = ""
+    steps: int = 12
+    speed_mps: float = 6.0
+    noise_m: float = 0.0
+    pose_noise: float = 0.0
+    path = Path("yard")
+    sensors = ("lidar",)
+    reference_sensors = ()
+    square_metres = False
+    instants = None
+    body = None
+
+    def __post_init__(self):
+        self.names = [f"f{step}" for step in range(self.steps)]
+        self.frames = range(self.steps)
+        self.times_s = 0.1 * np.arange(self.steps)
+        self.rigs = {"one": self.sensors}
+        random = np.random.default_rng(3)
+        self.crates_m = random.uniform([-25, -25, 0], [35, 25, 0], (30, 3))
+        self.sizes_m = random.uniform(1.0, 3.5, (30, 3))
+
+    def true(self, step):
+        time_s = 0.1 * step
+        way_m = self.speed_mps * (time_s + 0.4 * time_s**2)
+        turn_deg = 25.0 + 4.0 * np.sin(2.5 * time_s) * (self.speed_mps > 0)
+        place_m = AWAY_M + np.array([0.9, 0.4, 0.02]) * way_m
+        return rigid(rotation_from_euler(turn_deg, 0.3 * way_m, 0.0), place_m)
+
+    def scan(self, sensor, index):
+        index = 0 if self.fault == "same" else index
+        random = np.random.default_rng(index)
+        crate = random.integers(len(self.crates_m), size=SIDES)
+        on_side = random.uniform(-0.5, 0.5, (SIDES, 3))
+        axis = random.integers(2, size=SIDES)
+        on_side[np.arange(SIDES), axis] = np.sign(on_side[np.arange(SIDES), axis]) / 2
+        world_m = self.crates_m[crate] + (on_side + np.array([0, 0, 0.5])) * self.sizes_m[crate]
+        ground_m = random.uniform([-40, -40, 0], [40, 40, 0.02], (GROUND, 3))
+        world_m = AWAY_M + np.concatenate([world_m, ground_m])
+        seen_m = transform(invert(self.true(index) @ MOUNT), world_m)
+        seen_m += random.normal(0, self.noise_m, seen_m.shape) if self.noise_m else 0.0
+        if self.fault == "axes":
+            seen_m = seen_m[:, [1, 0, 2]]
+        return Scan(seen_m * {"mm": 1000.0, "cm": 100.0}.get(self.fault, 1.0), MOUNT, sensor)
+
+    def world_T_vehicle(self, index):
+        late = {"late": index - 1, "held": index // 2 * 2, "stuck": 0}
+        pose = self.true(late.get(self.fault, index))
+        if self.pose_noise:
+            random = np.random.default_rng(index)
+            angles_deg, place_m = random.normal(0, self.pose_noise * 2, 3), random.normal(0, self.pose_noise, 3)
+            pose = pose @ rigid(rotation_from_euler(*angles_deg), place_m)
+        if self.fault == "xyzw":
+            wxyz = quaternion_from_rotation(pose[:3, :3])
+            return rigid(rotation_from_quaternion(np.roll(wxyz, -1)), pose[:3, 3])
+        if self.fault == "yx":
+            return rigid(pose[:3, :3], pose[[1, 0, 2], 3])
+        return invert(pose) if self.fault == "inverse" else pose
+
+    def boxes(self, index):
+        return Boxes.from_rows(torch.zeros((0, 7))) if self.fault == "unlabelled" else None
+
+
+def doubts(yard):
+    return disagreement(yard, "lidar", len(yard.frames)) or ""
+
+
+@pytest.mark.parametrize(
+    "right",
+    [
+        Yard(),
+        Yard(steps=2),
+        Yard(steps=1),
+        Yard(speed_mps=0.0),
+        Yard(noise_m=0.03),
+        Yard(pose_noise=0.05),
+    ],
+)
+def test_what_is_right_is_left_alone(right):
+    assert not doubts(right)
+
+
+MENDED = {
+    "xyzw": "--quaternions xyzw",
+    "inverse": "--poses inverse",
+    "yx": "--poses yx",
+    "axes": "--axes yxz",
+    "late": "--lag 0.10",
+    "held": "--poses held",
+}
+
+
+@pytest.mark.parametrize("fault", MENDED)
+def test_what_would_mend_a_fault_is_named_and_mends_it(fault):
+    doubt = doubts(Yard(fault))
+    assert MENDED[fault] in doubt
+    names = {"quaternions": str, "poses": str, "axes": str, "lag": float}
+    option, value = MENDED[fault].removeprefix("--").split()
+    corrections = Corrections(**{option.replace("lag", "lag_s"): names[option](value)})
+    mended = corrected(Yard(fault), corrections)
+    assert corrections.words in (MENDED[fault], "--lag 0.1")
+    assert not doubts(mended)
+    off = [invert(Yard().true(step)) @ pickle.loads(pickle.dumps(mended)).world_T_vehicle(step) for step in range(10)]
+    # The last poses, and those between two, are not there: where the vehicle went on evenly they would be right.
+    exact = fault not in ("late", "held")
+    assert max(np.linalg.norm(each[:3, 3]) for each in off) < (1e-9 if exact else 0.05)
+    assert max(np.abs(euler_from_rotation(each[:3, :3])).max() for each in off) < (1e-9 if exact else 0.5)
+    points_m = transform(MOUNT, mended.scan("lidar", 3).points_m)
+    assert np.abs(points_m - transform(MOUNT, Yard().scan("lidar", 3).points_m)).max() < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("fault", "says"),
+    [("stuck", r"does not stand, but has moved \+[12]\.\d m"), ("same", "same cloud again and again")],
+)
+def test_what_nothing_mends_is_said(fault, says):
+    doubt = doubts(Yard(fault))
+    assert re.search(says, doubt)
+
+
+@pytest.mark.parametrize("unit", ["mm", "cm"])
+def test_units_of_clouds(unit):
+    frames = RecordedFrames(Yard(unit), reference=AccumulatedReference(1.0))
+    (doubt,) = frames.doubts()
+    assert f"(--units {unit})" in doubt
+    mended = RecordedFrames(frames.recording, corrections=Corrections(units=unit))
+    assert mended.doubts() == []
+    assert f"Read as asked: --units {unit}." in mended.reference_record["notes"]
+    assert mended.content != frames.content
+
+
+def test_labels_of_which_none_fits():
+    (doubt,) = RecordedFrames(Yard("unlabelled")).doubts()
+    assert "labels, and none in 12 frames" in doubt
+
+
+def test_lags_that_are_none():
+    with pytest.raises(ValueError, match="lag: at most 1 s"):
+        Corrections(lag_s=3.0)
+    untimed = Yard()
+    untimed.times_s = None
+    with pytest.raises(ValueError, match=r"yard: --lag 0\.1 needs the times"):
+        corrected(untimed, Corrections(lag_s=0.1)).world_T_vehicle(0)
+    assert corrected(untimed, Corrections()) is untimed
+    assert replace(Corrections(), units="mm").words == "--units mm"
+
+
+def test_poses_with_noise_are_not_late():
+    """Many lags are better, with worse ones in between."""
+
+    class Noisy(NamedTuple):
+        better_s: float
+        width_s: float
+
+        def agreement(self, corrections):
+            return 0.7 + 0.2 * np.exp(-(((corrections.lag_s - self.better_s) / self.width_s) ** 2))
+
+    assert "--lag 0.10" in _late([Noisy(0.1, 0.2)], 0.75)
+    assert _late([Noisy(0.1, 0.2), Noisy(-0.2, 0.03)], 0.75) is None

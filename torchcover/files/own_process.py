@@ -1,0 +1,187 @@
+"""Libraries that are not Python read in a process of their own: a damaged file ends that one, and not the run.
+
+The process is a plain one that imports no torch, reads file after file for as long as its parent lives, and has limits
+of memory, time and open files for each. What goes through the pipes is JSON and the bytes of arrays.
+"""
+
+import atexit
+import json
+import os
+import select
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from functools import wraps
+from importlib import import_module
+from inspect import unwrap
+from pathlib import Path
+from typing import IO, Any, Concatenate, ParamSpec
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.files.bad_file import VARIABLE, most_gb
+from torchcover.files.processes import end_with_parent, limit
+
+Arguments = ParamSpec("Arguments")
+Arrays = dict[str, NDArray[Any]]
+Reader = Callable[Concatenate[Path, Arguments], Arrays]
+
+# A file may take so long, and a second more for each megabyte.
+MOST_S = 60.0
+BYTES_PER_S = 1e6
+KNOWN_ERRORS = {kind.__name__: kind for kind in (ValueError, MemoryError, ImportError, FileNotFoundError)}
+# As much as a scan has: or both wait for each other, again and again.
+PIPE_BYTES = 1 << 20
+# The same modules as here, whatever folder this one was started in.
+PROGRAM = "import sys; sys.path[:] = {path!r}; from torchcover.files.own_process import serve; serve()"
+
+
+def apart(read: Reader[Arguments]) -> Reader[Arguments]:
+    """Let a function of a module without torch do its work in the process for such files.
+
+    Args:
+        read: It gets the path, and what JSON can carry; it returns arrays by name. A `ValueError`, `MemoryError`,
+            `ImportError` or `FileNotFoundError` of it is raised here, anything else as a `ValueError` with its name.
+
+    Returns:
+        The same function. It raises a ValueError, too, if the process crashes or takes longer than 60 s and a second a
+        megabyte.
+    """
+
+    @wraps(read)
+    def asked(path: Path, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Arrays:
+        assert not kwargs
+        limit_s = MOST_S + path.stat().st_size / BYTES_PER_S
+        request = [os.environ.get(VARIABLE), read.__module__, read.__name__, str(path.absolute()), *args]
+        return _own_process().ask(request, limit_s)
+
+    return asked  # type: ignore[return-value]  # which would have the path without a name
+
+
+class _Process:
+    """One that reads."""
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+        self._popen = subprocess.Popen(
+            [sys.executable, "-c", PROGRAM.format(path=sys.path)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,  # where OpenEXR says what is wrong
+            env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+            preexec_fn=end_with_parent(),  # noqa: PLW1509  (it calls prctl only)
+            pipesize=PIPE_BYTES,
+        )
+
+    def is_alive(self) -> bool:
+        return self._popen.poll() is None
+
+    def ask(self, request: list[Any], limit_s: float) -> Arrays:
+        requests, answers = self._popen.stdin, self._popen.stdout
+        assert requests is not None
+        assert answers is not None
+        with self.lock:
+            try:
+                _send(requests, request)
+                answer, arrays = _received(answers, limit_s)
+            except (BrokenPipeError, EOFError, TimeoutError) as error:
+                late = isinstance(error, TimeoutError)
+                self.end()
+                ended = f"it took more than {limit_s:.0f} s" if late else "the library that reads it crashed"
+                raise ValueError(f"{ended}; the file is damaged, or not what its name says") from error
+            except BaseException:  # such as Ctrl-C: an answer that nobody waits for must not be the next one's
+                self.end()
+                raise
+        if answer is not None:
+            name, words = answer
+            raise KNOWN_ERRORS[name](words) if name in KNOWN_ERRORS else ValueError(words)
+        return arrays
+
+    def end(self) -> None:
+        self._popen.kill()
+        for pipe in (self._popen.stdin, self._popen.stdout):
+            with suppress(BrokenPipeError):
+                assert pipe is not None
+                pipe.close()
+        self._popen.wait()
+
+
+_processes: dict[int, _Process] = {}
+_starting = threading.Lock()
+
+
+def _own_process() -> _Process:
+    """That of this process: a forked one, such as a worker of a DataLoader, has its own."""
+    with _starting:
+        found = _processes.get(os.getpid())
+        if found is None or not found.is_alive():
+            _processes[os.getpid()] = found = _Process()
+            atexit.register(found.end)
+        return found
+
+
+def serve() -> None:
+    """What the process does: answer until nobody asks."""
+    requests, answers = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # a library that prints must not answer
+    with suppress(EOFError):
+        while True:
+            allowed_gb, module, name, path, *args = _received_json(requests)
+            os.environ.pop(VARIABLE, None)
+            os.environ |= {} if allowed_gb is None else {VARIABLE: allowed_gb}
+            limit(most_gb())
+            try:
+                read = unwrap(getattr(import_module(module), name))  # or it would ask another process
+                arrays = {key: _plain(array) for key, array in read(Path(path), *args).items()}
+            except Exception as error:
+                known = next((kind.__name__ for kind in type(error).__mro__ if kind.__name__ in KNOWN_ERRORS), "")
+                told = str(error) if known else f"{type(error).__name__}: {error}"
+                _send(answers, [[known, told], []])
+            else:
+                _send(answers, [None, [[key, array.dtype.str, array.shape] for key, array in arrays.items()]])
+                for array in arrays.values():
+                    answers.write(array.reshape(-1).view(np.uint8).data)
+                answers.flush()
+
+
+def _plain(array: NDArray[Any]) -> NDArray[Any]:
+    """Of numbers or text, in one piece."""
+    return np.ascontiguousarray(array.astype(str) if array.dtype.hasobject else array)
+
+
+def _send(pipe: IO[bytes], message: object) -> None:
+    data = json.dumps(message).encode()
+    pipe.write(len(data).to_bytes(8, "little") + data)
+    pipe.flush()
+
+
+def _received(pipe: IO[bytes], limit_s: float) -> tuple[list[str] | None, Arrays]:
+    if not select.select([pipe], [], [], limit_s)[0]:
+        raise TimeoutError
+    error, listed = _received_json(pipe)
+    arrays = {}
+    for name, dtype, shape in listed:
+        arrays[name] = np.empty(shape, dtype)
+        _fill(pipe, arrays[name].reshape(-1).view(np.uint8).data)
+    return error, arrays
+
+
+def _received_json(pipe: IO[bytes]) -> Any:  # noqa: ANN401
+    return json.loads(_whole(pipe, int.from_bytes(_whole(pipe, 8), "little")))
+
+
+def _whole(pipe: IO[bytes], size: int) -> bytearray:
+    data = bytearray(size)
+    _fill(pipe, memoryview(data))
+    return data
+
+
+def _fill(pipe: IO[bytes], room: memoryview) -> None:
+    while room:
+        count = pipe.readinto(room)  # type: ignore[attr-defined]
+        if not count:
+            raise EOFError
+        room = room[count:]

@@ -1,0 +1,77 @@
+"""Recordings that are read as their users say."""
+
+from dataclasses import replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover import geometry
+from torchcover.geometry.rigid import Matrix
+from torchcover.recordings.corrections import Corrections
+from torchcover.recordings.recording import Recording, Scan
+
+METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+
+
+class Corrected:
+    """A recording with corrections; all else is as it is there."""
+
+    def __init__(self, recording: Recording, corrections: Corrections) -> None:
+        self.recording, self.corrections = recording, corrections
+
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401  (what the recording has)
+        if name == "recording":  # while it is made from a pickle
+            raise AttributeError(name)
+        return getattr(self.recording, name)
+
+    def scan(self, sensor: str, index: int) -> Scan:
+        """What the recording has, put right."""
+        scan, columns = self.recording.scan(sensor, index), ["xyz".index(axis) for axis in self.corrections.axes]
+        return replace(scan, points_m=scan.points_m[:, columns] * METRES[self.corrections.units])
+
+    def world_T_vehicle(self, index: int) -> Matrix | None:
+        """Where the vehicle was, put right."""
+        return None if self._poses is None else self._poses[index]
+
+    @cached_property
+    def _poses(self) -> Matrix | None:
+        poses = [self.recording.world_T_vehicle(instant) for instant in range(len(self.recording.names))]
+        if any(pose is None for pose in poses):
+            return None
+        times_s = self.recording.times_s
+        if times_s is None and (self.corrections.lag_s or self.corrections.poses == "held"):
+            raise ValueError(f"{self.recording.path}: {self.corrections.words} needs the times of its instants")
+        return corrected_poses(
+            np.array(poses), np.arange(0.0, len(poses)) if times_s is None else times_s, self.corrections
+        )
+
+
+def corrected(recording: Recording, corrections: Corrections) -> Recording:
+    """A recording as its user says that it is to be read."""
+    read: Any = Corrected(recording, corrections)  # which has what the recording has
+    found: Recording = read if corrections.words else recording
+    return found
+
+
+def corrected_poses(world_T_vehicle: Matrix, times_s: NDArray[np.float64], corrections: Corrections) -> Matrix:
+    """(N, 4, 4) poses of N instants in a row, put right; beyond the first and the last they go on as before."""
+    poses = world_T_vehicle.copy()
+    if corrections.quaternions == "xyzw":  # what was read as w, x, y, z
+        wxyz = [geometry.quaternion_from_rotation(rotation) for rotation in poses[:, :3, :3]]
+        poses[:, :3, :3] = geometry.rotation_from_quaternion(np.roll(wxyz, 1, axis=1))
+    if corrections.poses == "inverse":
+        poses = geometry.invert(poses)
+    elif corrections.poses == "yx":
+        poses[:, :3, 3] = poses[:, [1, 0, 2], 3]
+    new = np.append(True, (np.diff(poses, axis=0) != 0).any(axis=(1, 2)) | (corrections.poses != "held"))
+    if (corrections.poses != "held" and not corrections.lag_s) or new.sum() < 2:
+        return poses
+    known, known_s, wanted_s = poses[new], times_s[new], times_s + corrections.lag_s
+    after = np.searchsorted(known_s, wanted_s, side="right").clip(1, len(known) - 1)
+    share = ((wanted_s - known_s[after - 1]) / np.diff(known_s)[after - 1])[:, None]
+    angles_deg, places_m = geometry.euler_from_rotation(known[:, :3, :3]), known[:, :3, 3]
+    turns_deg = ((np.diff(angles_deg, axis=0) + 180) % 360 - 180)[after - 1]
+    rotations = geometry.rotation_from_euler(*(angles_deg[after - 1] + share * turns_deg).T)
+    return geometry.rigid(rotations, places_m[after - 1] + share * np.diff(places_m, axis=0)[after - 1])
