@@ -71,11 +71,8 @@ def test_every_metric_of_the_package_is_asked():
             importlib.import_module(module.name)
     bases = {MergeableMetric, SumsInBlocks, FrameMetric, WorldRatios}
     kinds = {kind for base in bases for kind in base.__subclasses__()} - bases
-    rooms = (
-        "torchcover.coverage.",
-        "torchcover.detection.",
-        "torchcover.published.",
-    )  # what needs a world is asked there
+    # Who needs a world is asked in its own room.
+    rooms = ("torchcover.coverage.", "torchcover.detection.", "torchcover.published.")
     own = {kind for kind in kinds if kind.__module__.startswith(rooms)}
     assert {type(case.make()) for case in CASES.values()} == own
 
