@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from tests.recordings.bags import ros2, ros2_database
+from tests.recordings.bags import ros, ros1, ros_database
 from torchcover.geometry import euler_from_rotation, invert, rigid, rotation_from_euler, transform
 from torchcover.recordings.formats import argoverse2, kitti_files, nuscenes
 
@@ -245,6 +245,7 @@ LAYOUTS = {
     "argoverse2": argoverse2_log,
     "carla": carla_folder,
     "folder": plain_folder,
-    "ros2": ros2,
-    "ros2 database": ros2_database,
+    "ros": ros,
+    "ros database": ros_database,
+    "ros 1": ros1,
 }

@@ -209,11 +209,11 @@ def test_lidars_are_where_calibrations_say(tmp_path):
     assert lidar["model"] == "velodyne_vlp32c"
     drive = Drive(steps=3)
     rig = rig_document(
-        open_recording(bags.ros2(drive, tmp_path)), models=dict.fromkeys(drive.sensors, "velodyne_vlp16")
+        open_recording(bags.ros(drive, tmp_path)), models=dict.fromkeys(drive.sensors, "velodyne_vlp16")
     )
     for lidar in Rig.model_validate(rig).sensors:
         np.testing.assert_allclose(lidar.mount.matrix(), drive.vehicle_T_sensor(lidar.name), atol=1e-5)
-    assert "static transforms to base_link" in rig["description"]
+    assert "transforms to base_link" in rig["description"]
 
 
 def test_what_no_rig_can_be_made_of(tmp_path):

@@ -66,7 +66,12 @@ class Recording(Protocol):
 
     Instants are numbered in time. What a reader opens at once is small: names, times, calibrations. Scans are read one
     by one.
+
+    Args:
+        body: The vehicle itself, in its own frame; None if unknown. Whoever knows it may say so.
     """
+
+    body: BoundingBox | None
 
     @property
     def path(self) -> Path:
@@ -104,11 +109,6 @@ class Recording(Protocol):
         ...
 
     @property
-    def body(self) -> BoundingBox | None:
-        """The vehicle itself, in its own frame; None if unknown."""
-        ...
-
-    @property
     def square_metres(self) -> bool:
         """Whether the scans of the reference sensors have weights, the square metres that their points stand for."""
         ...
@@ -143,6 +143,7 @@ class Layout:
     reference_sensors: Sequence[str] = ()
     square_metres = False
     instants: Sequence[int] | None = None
+    body: BoundingBox | None = None
 
     @property
     def frames(self) -> range:

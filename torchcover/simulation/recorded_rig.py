@@ -3,20 +3,26 @@
 import math
 import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from torchcover.cameras.calibration import Calibration
-from torchcover.geometry import euler_from_rotation, invert, rigid, rotation_from_euler, transform
+from torchcover.geometry import BoundingBox, euler_from_rotation, invert, rigid, rotation_from_euler, transform
 from torchcover.geometry.rigid import Matrix
+from torchcover.recordings.formats.ros import RosBag
 from torchcover.recordings.in_vehicle import in_vehicle
+from torchcover.recordings.recorders.folder import CLEARANCE_M
 from torchcover.recordings.recording import CalibratedRecording, Recording, SensorCalibrations
+from torchcover.simulation.bodies import body_called, mover_mesh
 from torchcover.simulation.camera_sensor import MOUNT_T_CAMERA
 from torchcover.simulation.lidar import LidarModel
 from torchcover.simulation.rig import Rig
 from torchcover.simulation.scan_estimate import ScanEstimate, estimate_scan
 
+# What is on a roof reaches so far above the highest LiDAR.
+ABOVE_SENSOR_M = 0.2
 # Scans that are looked at, evenly spread.
 SCANS = 5
 # As in the built-in rigs of cameras; no data set tells the depth that a camera gives.
@@ -67,6 +73,31 @@ def rig_document(
     }
     Rig.model_validate(rig)
     return rig
+
+
+def recorded_body(recording: Recording, vehicle: str | Path) -> BoundingBox:
+    """The body of the vehicle that recorded something, and what is mounted on it.
+
+    Args:
+        recording: The recording.
+        vehicle: A built-in vehicle, the YAML file of one or a mesh file; or `x0,x1,y0,y1,z0,z1`, the sides of the body
+            in metres of the vehicle frame.
+
+    Raises:
+        ValueError: Other numbers, or what is no vehicle.
+        FileNotFoundError: No such vehicle.
+    """
+    sides = str(vehicle).split(",")
+    if len(sides) > 1:
+        try:
+            x0, x1, y0, y1, z0, z1 = map(float, sides)
+            return BoundingBox((x0, y0, z0), (x1, y1, z1))
+        except ValueError as error:
+            raise ValueError(f"vehicle {vehicle}: x0,x1,y0,y1,z0,z1 in metres are needed, x0 < x1: {error}") from error
+    ego = BoundingBox.around(mover_mesh("vehicle", body_called(vehicle)).vertices_m)
+    mounts = recording.calibrations().mounts if isinstance(recording, RosBag) else {}
+    top_m = max([ego.upper_m[2], *(float(mount[2, 3]) + ABOVE_SENSOR_M for mount in mounts.values())])
+    return BoundingBox((*ego.lower_m[:2], CLEARANCE_M), (*ego.upper_m[:2], top_m))
 
 
 def _lidar(recording: Recording, name: str, known: SensorCalibrations, model: str | None) -> tuple[dict[str, Any], str]:

@@ -72,7 +72,6 @@ class Argoverse2(Layout):
     sensors = tuple(LASERS)
     body = BODY
     classes = CLASSES
-    classes = CLASSES
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)

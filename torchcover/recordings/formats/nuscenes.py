@@ -64,7 +64,7 @@ class NuScenes:
     reference_sensors = ()
     square_metres = False
     instants = None
-    body = BODY
+    body: BoundingBox | None = BODY
 
     def __init__(self, path: str | os.PathLike[str], scenes: Sequence[str] | None = None) -> None:
         tables = _tables(Path(path))
