@@ -137,7 +137,8 @@ def argoverse2_log(drive, root):
         clouds = [transform(invert(argoverse2.vehicle_T_ego), cloud) for cloud in seen(drive, index)]
         points_m, laser = np.concatenate(clouds), np.repeat([3, 40], [len(cloud) for cloud in clouds]).astype(np.uint8)
         columns = {axis: points_m[:, k].astype(np.float32) for k, axis in enumerate("xyz")}
-        feather.write_feather(pa.table({**columns, "laser_number": laser}), str(sweeps / f"{time_ns}.feather"))
+        columns |= {"laser_number": laser, "offset_ns": np.zeros(len(laser), np.int32)}
+        feather.write_feather(pa.table(columns), str(sweeps / f"{time_ns}.feather"))
         pose = drive.world_T_vehicle(index) @ argoverse2.vehicle_T_ego
         poses.append({"timestamp_ns": time_ns, **posed(pose)})
         car = invert(pose) @ drive.world_T_car(index)

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from torchcover.cameras.calibration import Calibration
-from torchcover.geometry import BoundingBox, euler_from_rotation, invert, rigid, rotation_from_euler, transform
+from torchcover.geometry import BoundingBox, euler_from_rotation, invert, rigid, rotation_from_euler
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.formats.ros import RosBag
-from torchcover.recordings.in_vehicle import in_vehicle
 from torchcover.recordings.recorders.folder import CLEARANCE_M
 from torchcover.recordings.recording import CalibratedRecording, Recording, SensorCalibrations
+from torchcover.simulation.as_cast import as_cast
 from torchcover.simulation.bodies import body_called, mover_mesh
 from torchcover.simulation.camera_sensor import MOUNT_T_CAMERA
 from torchcover.simulation.lidar import LidarModel
@@ -116,17 +116,19 @@ def _lidar(recording: Recording, name: str, known: SensorCalibrations, model: st
     if model is not None:
         LidarModel.load(model)
         return {"type": "lidar", "name": name, "mount": _pose(mount), "model": model}, f"{mounted}; scans as {model}"
-    clouds = [in_vehicle(recording.scan(name, index), recording.body).points_m for index in chosen]
-    found = estimate_scan([transform(invert(mount), cloud) for cloud in clouds])
+    clouds, lasers, undone = as_cast(recording, name, chosen, mount)
+    found = estimate_scan(clouds, lasers)
     if found is None:
         raise ValueError(
             f"{recording.path}: the points of {name} do not lie in rows that can be told apart; name its model (see "
             f"`torchcover list`): --lidar {name}=MODEL"
         )
-    mount = mount @ rigid(rotation_from_euler(found.centre_deg, 0.0, 0.0), np.zeros(3))
+    mount = mount @ rigid(rotation_from_euler(found.centre_deg, 0.0, 0.0), [0.0, 0.0, found.origin_m])
+    mounted += f", its rays' origin {found.origin_m:+.2f} m higher" if found.origin_m else ""
     return {"type": "lidar", "name": name, "mount": _pose(mount), **_pattern(found)}, (
         f"{mounted}; estimated from {count} scan{'s' * (count > 1)}: {len(found.elevations_deg)} rows (those that "
         f"returned anything), {found.columns:,} columns, ranges of the nearest and the farthest return"
+        + (undone and f"; {undone}")
     )
 
 

@@ -105,12 +105,12 @@ class RosBag(Layout):
         cloud, stamp_ns = self._cloud(sensor, index)
         source, mount = f"{self.path}: {sensor} at {self._logged_ns[sensor][index]}", self._mounts[sensor]
         if self._poses is None:
-            return Scan(cloud.points_m, mount, source)
+            return Scan(cloud.points_m, mount, source, rows=cloud.rows)
         vehicle_T_world = invert(self._world_T_vehicle(self._poses, index))
         logged_ns = int(self._logged_ns[sensor][index])
         if cloud.offsets_s is None:
             world_T_then = self._poses.at(np.array([stamp_ns]), logged_ns)[0]
-            return Scan(cloud.points_m, vehicle_T_world @ world_T_then @ mount, source)
+            return Scan(cloud.points_m, vehicle_T_world @ world_T_then @ mount, source, rows=cloud.rows)
         # Only what came back: zeros stay zeros, which say that nothing did.
         came = np.flatnonzero((np.abs(cloud.points_m) > NO_RETURN_M).any(axis=1))
         tick, of_point = np.unique(np.rint(cloud.offsets_s[came] / TICK_S).astype(np.int64), return_inverse=True)
@@ -118,7 +118,8 @@ class RosBag(Layout):
         sensor_T_then = (invert(mount) @ vehicle_T_world @ self._poses.at(times_ns, logged_ns) @ mount)[of_point]
         points_m = cloud.points_m.astype(np.float64)
         points_m[came] = np.einsum("nij,nj->ni", sensor_T_then[:, :3, :3], points_m[came]) + sensor_T_then[:, :3, 3]
-        return Scan(points_m, mount, source)
+        offsets_s = cloud.offsets_s + (stamp_ns - self._stamp_ns(index)) * 1e-9
+        return Scan(points_m, mount, source, rows=cloud.rows, offsets_s=offsets_s)
 
     def world_T_vehicle(self, index: int) -> Matrix | None:
         """Where the vehicle was at the stamp of the instant; None in a bag without poses."""
