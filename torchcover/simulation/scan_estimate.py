@@ -22,9 +22,9 @@ LASERS, LASER_POINTS = (8, 256), 100
 STEPS = 3.0
 # How closely it is looked at how far points lie from rows.
 SPREAD_DEG = 0.05
-# Lasers leave from one height, within so much or so, as far as their points do not say it to so many degrees; less than
-# so much above or below the origin is none.
-ORIGIN_M, LINE_DEG, LEAST_ORIGIN_M = 0.05, 0.01, 0.05
+# Lasers leave from one height, within so much or so, as far as their points do not say it to so many degrees; not from
+# farther above or below the origin, and only if points lie so much closer to what they say then.
+ORIGIN_M, LINE_DEG, HIGHEST_M, CLOSER = 0.05, 0.01, 0.3, 0.5
 
 # The number of the laser of each point, scan by scan; None if unknown.
 Lasers = list[NDArray[np.integer]] | None
@@ -40,7 +40,7 @@ class ScanEstimate(NamedTuple):
         centre_deg: Azimuth of its middle.
         min_range_m: Range of the nearest return.
         max_range_m: Range of the farthest return.
-        origin_m: Height above the origin of the frame that the rays leave from, on average; 0 for a few centimetres.
+        origin_m: Height above the origin of the frame that the rays leave from, on average; 0 if they need no other.
     """
 
     elevations_deg: NDArray[np.float64]
@@ -79,11 +79,14 @@ def estimate_scan(scans: Sequence[NDArray[np.float64]], lasers: Lasers = None) -
         if rows_deg is None:
             return None
         row = np.searchsorted((rows_deg[1:] + rows_deg[:-1]) / 2, elevation_deg)
-        found_deg = np.array([np.median(elevation_deg[row == number]) for number in range(len(rows_deg))])
     else:
         _, row = np.unique(np.concatenate(lasers), return_inverse=True)
-        found_deg, origins_m, _ = _lines(points_m, row)
-        origin_m = float(np.average(origins_m, weights=np.bincount(row)))
+    found_deg = np.array([np.median(elevation_deg[row == number]) for number in range(int(row.max()) + 1)])
+    if lasers is not None:
+        lines_deg, origins_m, off_deg = _lines(points_m, row)
+        closer = np.median(np.abs(off_deg)) < CLOSER * np.median(np.abs(elevation_deg - found_deg[row]))
+        if closer and np.abs(origins_m).max() < HIGHEST_M:  # on flat ground a tilt looks like an origin far below
+            found_deg, origin_m = lines_deg, float(np.average(origins_m, weights=np.bincount(row)))
     scan = np.repeat(np.arange(len(scans)), [len(one) for one in scans])
     step_deg = _column_step_deg(azimuth_deg, scan * len(found_deg) + row)
     if step_deg is None:
@@ -97,7 +100,7 @@ def estimate_scan(scans: Sequence[NDArray[np.float64]], lasers: Lasers = None) -
         centre_deg,
         float(range_m.min()),
         float(range_m.max()),
-        origin_m if abs(origin_m) > LEAST_ORIGIN_M else 0.0,
+        origin_m,
     )
 
 
