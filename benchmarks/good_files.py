@@ -30,7 +30,7 @@ from torchcover.recordings.formats.folder_settings import read_folder_settings
 from torchcover.recordings.formats.folder_tables import PoseTable
 from torchcover.recordings.formats.folder_tables import read_boxes as read_labels
 from torchcover.recordings.formats.kitti_raw import read_tracklets
-from torchcover.recordings.formats.ros2 import Ros2
+from torchcover.recordings.formats.ros import RosBag
 from torchcover.recordings.formats.track_tables import read_trajectory
 from torchcover.simulation import Rig, Scenario
 from torchcover.simulation.recorded.bodies import read_boxes
@@ -265,13 +265,13 @@ def recording_files(folder):
     ):
         yield Kind(path.name, path.read_bytes(), read)
     yield Kind("label_2.txt", KITTI_LABEL, kitti_files.read_labels)
-    yield Kind("drive.mcap", (places["ros2"] / "drive.mcap").read_bytes(), bag)
-    yield Kind("drive.db3", (places["ros2 database"] / "drive.db3").read_bytes(), bag)
+    yield Kind("drive.mcap", (places["ros"] / "drive.mcap").read_bytes(), bag)
+    yield Kind("drive.db3", (places["ros database"] / "drive.db3").read_bytes(), bag)
 
 
 def bag(path):
     """Read all of a bag."""
-    recording = Ros2(path)
+    recording = RosBag(path)
     for index in recording.frames:
         for sensor in recording.sensors:
             recording.scan(sensor, index)

@@ -33,7 +33,7 @@ def test_what_rig_refuses(torchcover, worlds, tmp_path):
     for options, told in (
         (("--frames", tmp_path / "none"), "none: no such recording"),
         (("--frames", tmp_path, "--lidar", "roof"), "--lidar roof: SENSOR=MODEL is needed"),
-        (("--frames", tmp_path, "--format", "ros"), "no such format of recordings; there are"),
+        (("--frames", tmp_path, "--format", "bag"), "no such format of recordings; there are"),
     ):
         code, printed, error = torchcover("rig", *options)
         assert (code, printed, len(error.splitlines())) == (2, "", 1)

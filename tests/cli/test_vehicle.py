@@ -52,8 +52,15 @@ def test_pictures_and_recordings_are_of_the_vehicle_too(torchcover, free, monkey
     recorded = ("record", free / "low.yaml", "--scenario", free / "free.yaml", "--steps", 1, "--rays", 64)
     assert torchcover(*recorded, "--vehicle", "suv", "--out", free / "drive")[0] == 0
     assert '"lower_m": [-2.45' in (free / "drive" / "frames.yaml").read_text()
-    code, _, error = torchcover("evaluate", "--frames", free / "drive", "--vehicle", "suv", "--out", free / "out")
-    assert (code, "vehicle: for simulations; a recording has its own" in error) == (2, True)
+    dropped = []
+    for vehicle in ("suv", "-20,20,-20,20,-1,1"):
+        evaluated = ("evaluate", "--frames", free / "drive", f"--vehicle={vehicle}", "--out", free / "out")
+        assert torchcover(*evaluated, "--files", "numbers")[0] == 0
+        summary = json.loads((free / "out" / "summary.json").read_text())
+        dropped.append(summary["frame_counts"]["sensor_own_vehicle"])
+    assert dropped[1] > 100 > dropped[0] == 0
+    code, _, error = torchcover("evaluate", "--frames", free / "drive", "--vehicle", "1,2,3", "--out", free / "out")
+    assert (code, "x0,x1,y0,y1,z0,z1 in metres are needed" in error) == (2, True)
 
 
 class Blank:

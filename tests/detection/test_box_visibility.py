@@ -44,8 +44,9 @@ def test_against_a_slow_twin(weighted):
     weights = torch.rand(1500, generator=generator).double() + 0.1 if weighted else torch.ones(1500).double()
     found = box_visibility(sensor, reference, boxes, threshold=0.7, reference_weights=weights if weighted else None)
     share, mean, count = slow_visibility(sensor, reference, boxes, 0.7, weights.numpy())
-    np.testing.assert_allclose(found.share.numpy(), share, atol=1e-12)
-    np.testing.assert_allclose(found.mean_radius_m.numpy(), mean, rtol=1e-6)
+    sampled = count > 0
+    np.testing.assert_allclose(found.share.numpy()[sampled], share[sampled], atol=1e-12)
+    np.testing.assert_allclose(found.mean_radius_m.numpy()[sampled], mean[sampled], rtol=1e-6)
     np.testing.assert_array_equal(found.reference_points.numpy(), count)
     assert 0.0 < np.nanquantile(share, 0.2) < np.nanquantile(share, 0.8) < 1.0
     assert found.threshold_m == 0.7
@@ -59,16 +60,30 @@ def test_weights_that_are_all_equal_change_nothing():
     torch.testing.assert_close(plain.share, weighted.share, equal_nan=True)
 
 
-def test_a_box_without_reference_points_is_unknown_whatever_the_rig_saw_in_it():
-    sensor, reference = torch.tensor([[30.0, 0.0, 1.0]] * 5), torch.tensor([[10.0, 0.0, 1.0]])
-    seen = unweighted(sensor, reference, TWO)
-    assert seen.share[0] == 0.0
-    assert seen.mean_radius_m[0] == 20.0
-    assert seen.share[1].isnan()
-    assert seen.mean_radius_m[1].isnan()
-    assert seen.known.tolist() == [True, False]
-    assert seen.reference_points.tolist() == [1, 0]
-    assert seen.sensor_points.tolist() == [0, 5]
+def test_a_box_that_only_the_rig_saw_is_known_by_the_sides_that_face_the_vehicle():
+    # Ahead, to the left and turned, low enough to be seen from above; and one that nobody saw.
+    rows = [
+        [10.0, 0, 1, 4, 2, 2, 0],
+        [0, 20.0, 1, 2, 4, 2, 0.5 * math.pi],
+        [30.0, 0, 0.5, 4, 2, 1, 0],
+        [60, 0, 1, 4, 2, 2, 0],
+    ]
+    boxes = Boxes.from_rows(torch.tensor(rows))
+    # In the middle of the side towards the vehicle; in that of the third's top.
+    sensor = torch.tensor([[8.0, 0.0, 1.0], [0.0, 19.0, 1.0], [30.0, 0.0, 1.0], [90.0, 0.0, 0.0]])
+    seen = unweighted(sensor, torch.tensor([[90.0, 0.0, 1.0]]), boxes, threshold=0.5)
+    circle = math.pi * 0.5**2
+    expected = [circle / (2 * 2), circle / (4 * 2), circle / (4 * 2 + 2 * 1), math.nan]
+    np.testing.assert_allclose(seen.share, expected, atol=0.03)
+    # From the middle of a square of side 2, the mean distance is 0.7652 times half of it.
+    assert seen.mean_radius_m[0] == pytest.approx(0.7652, rel=0.01)
+    assert seen.known.tolist() == [True, True, True, False]
+    assert (seen.reference_points.tolist(), seen.sensor_points.tolist()) == ([0] * 4, [1, 1, 1, 0])
+    # Where the reference saw anything, that decides; and beside it nothing changes.
+    reference = torch.cat([boxes.centre_m[1:2], boxes.centre_m[1:2] + 0.1])
+    both = box_visibility(sensor, reference, boxes, 0.5, reference_weights=torch.ones(2))
+    assert both.share[1] == 0.0
+    torch.testing.assert_close(both.share[[0, 2]], seen.share[[0, 2]])
 
 
 def test_the_nearest_sensor_point_may_lie_outside_the_box():
@@ -128,12 +143,12 @@ def test_a_frame_without_a_reference_is_an_error_that_says_what_to_do():
         unweighted(torch.rand(5, 3), None, TWO)
 
 
-def test_without_a_reference_point_every_box_is_unknown_and_the_points_of_the_rig_count():
-    seen = unweighted(TWO.centre_m[:1].repeat(5, 1), torch.empty(0, 3), TWO)
+def test_without_a_point_in_it_a_box_is_unknown_and_so_is_one_that_the_vehicle_stands_in():
+    around = Boxes.from_rows(torch.cat([TWO.rows, torch.tensor([[0.0, 0.0, 1.0, 4.0, 4.0, 4.0, 0.0]])]))
+    seen = unweighted(torch.tensor([[0.5, 0.5, 1.0]]), torch.empty(0, 3), around)
     assert seen.share.isnan().all()
     assert seen.mean_radius_m.isnan().all()
-    assert seen.reference_points.tolist() == [0] * len(TWO)
-    assert seen.sensor_points[0] == 5
+    assert seen.sensor_points.tolist() == [0, 0, 1]
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,16 @@
-"""Bags of ROS 2, written with rosbags."""
+"""Bags of ROS 1 and 2, written with rosbags."""
+
+from dataclasses import fields, is_dataclass
 
 import numpy as np
+from rosbags import rosbag1
 from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from torchcover.geometry import invert, quaternion_from_rotation, rigid, rotation_from_euler
 
-TYPES = get_typestore(Stores.ROS2_HUMBLE)
+TYPES, TYPES_OF_1 = get_typestore(Stores.ROS2_HUMBLE), get_typestore(Stores.ROS1_NOETIC)
+TYPES_OF_1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
 T0_NS = 1_700_000_000_000_000_000
 CODES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 
@@ -93,6 +97,28 @@ def bag(path, messages, storage="mcap"):
     return path
 
 
+def bag1(path, messages):
+    """The same as a file of ROS 1."""
+    with rosbag1.Writer(path) as writer:
+        connections = {}
+        for topic, time_ns, message in messages:
+            kind = message.__msgtype__
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=TYPES_OF_1)
+            writer.write(connections[topic], int(time_ns), TYPES_OF_1.serialize_ros1(as_ros1(message), kind))
+    return path
+
+
+def as_ros1(message):
+    if isinstance(message, list):
+        return [as_ros1(one) for one in message]
+    if not is_dataclass(message):
+        return message
+    values = {field.name: as_ros1(getattr(message, field.name)) for field in fields(message)}
+    kind = message.__msgtype__
+    return TYPES_OF_1.types[kind](**values, **({"seq": 0} if kind.endswith("/Header") else {}))
+
+
 # A sensor stands on a mast, which is turned, on the roof.
 roof_T_mast = rigid(rotation_from_euler(30.0, 0.0, 0.0), [0.1, 0.0, 0.4])
 vehicle_T_roof = rigid(np.eye(3), [0.0, 0.0, 1.4])
@@ -121,7 +147,7 @@ def of_drive(drive, poses=odometry, topic="/poses"):
     return messages
 
 
-def ros2(drive, root):
+def ros(drive, root):
     return bag(root / "drive", of_drive(drive))
 
 
@@ -129,5 +155,9 @@ def in_map(pose, time_ns):
     return tree(link("map", "base_link", pose, time_ns))
 
 
-def ros2_database(drive, root):
+def ros_database(drive, root):
     return bag(root / "drive", of_drive(drive, in_map, "/tf"), "sqlite3")
+
+
+def ros1(drive, root):
+    return bag1(root / "drive.bag", of_drive(drive))

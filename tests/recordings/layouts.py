@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from tests.recordings.bags import ros2, ros2_database
+from tests.recordings.bags import ros, ros1, ros_database
 from torchcover.geometry import euler_from_rotation, invert, rigid, rotation_from_euler, transform
 from torchcover.recordings.formats import argoverse2, kitti_files, nuscenes
 
@@ -137,7 +137,8 @@ def argoverse2_log(drive, root):
         clouds = [transform(invert(argoverse2.vehicle_T_ego), cloud) for cloud in seen(drive, index)]
         points_m, laser = np.concatenate(clouds), np.repeat([3, 40], [len(cloud) for cloud in clouds]).astype(np.uint8)
         columns = {axis: points_m[:, k].astype(np.float32) for k, axis in enumerate("xyz")}
-        feather.write_feather(pa.table({**columns, "laser_number": laser}), str(sweeps / f"{time_ns}.feather"))
+        columns |= {"laser_number": laser, "offset_ns": np.zeros(len(laser), np.int32)}
+        feather.write_feather(pa.table(columns), str(sweeps / f"{time_ns}.feather"))
         pose = drive.world_T_vehicle(index) @ argoverse2.vehicle_T_ego
         poses.append({"timestamp_ns": time_ns, **posed(pose)})
         car = invert(pose) @ drive.world_T_car(index)
@@ -245,6 +246,7 @@ LAYOUTS = {
     "argoverse2": argoverse2_log,
     "carla": carla_folder,
     "folder": plain_folder,
-    "ros2": ros2,
-    "ros2 database": ros2_database,
+    "ros": ros,
+    "ros database": ros_database,
+    "ros 1": ros1,
 }

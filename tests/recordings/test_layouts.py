@@ -24,7 +24,7 @@ def layout(request):
 @pytest.fixture
 def written(layout, tmp_path):
     """A drive, and the same as its reader gives it."""
-    drive = Drive(steps=5, labelled=not layout.startswith("ros2"))  # bags have no boxes
+    drive = Drive(steps=5, labelled=not layout.startswith("ros"))  # bags have no boxes
     return drive, open_recording(LAYOUTS[layout](drive, tmp_path))
 
 

@@ -81,6 +81,8 @@ def _with_a_bar(steps: range) -> Iterator[int]:
 def rig(
     frames: Annotated[Path, typer.Option("--frames", help="The recording, of any layout in docs/recordings.md.")],
     recording_format: options.Format = None,
+    vehicle_frame: options.VehicleFrame = None,
+    mount: options.Mount = None,
     sensors: Annotated[
         list[str] | None,
         typer.Option("--sensors", help="Its sensors, as in `roof,left`. Not given: all of the recording."),
@@ -92,12 +94,12 @@ def rig(
 ) -> None:
     """Print the sensors of a recording as a rig: mounts, LiDARs and cameras for `show` and `evaluate`."""
     from torchcover.files import as_yaml
-    from torchcover.recordings import open_recording
     from torchcover.simulation import rig_document
 
     models = dict(_pair(text) for text in lidar or ())
     names = [name for of in sensors or () for name in of.split(",")]
-    document = rig_document(open_recording(frames, recording_format), sensors=names or None, models=models)
+    recording = options.opened(frames, recording_format, None, vehicle_frame, mount)
+    document = rig_document(recording, sensors=names or None, models=models)
     typer.echo(as_yaml(document), nl=False)
 
 

@@ -28,6 +28,8 @@ def _measure(
         Path | None, typer.Option(help="A recording instead of a simulation, of any layout in docs/recordings.md.")
     ] = None,
     recording_format: options.Format = None,
+    vehicle_frame: options.VehicleFrame = None,
+    mount: options.Mount = None,
     sensors: Annotated[
         list[str] | None,
         typer.Option(
@@ -79,9 +81,8 @@ def _measure(
     from torchcover.evaluation import evaluate as evaluate_
 
     corrections = Corrections(**{name: settings.pop(name) for name in Corrections.__annotations__})
-    recording = opened(frames, recording_format, sensors, settings.get("reference"), window_s, corrections)
-    if recording is not None:
-        settings.pop("reference", None)
+    told = {"recording_format": recording_format, "vehicle_frame": vehicle_frame, "mount": mount}
+    recording = opened(frames, told, settings, sensors, window_s, corrections)
     named = list(rigs or (() if recording is None else recording.rigs))
     if len(named) == 1 and at_least > 1 and len(settings.get("weather") or ()) == 1:
         settings["weather"] = ["clear", *settings["weather"]]
@@ -170,35 +171,36 @@ def _compare_saved(files: list[str], given: dict[str, Any], *, only: bool) -> No
 
 def opened(
     frames: Path | None,
-    recording_format: str | None,
+    told: dict[str, Any],
+    settings: dict[str, Any],
     sensors: list[str] | None,
-    reference: str | None,
     window_s: float | None,
     corrections: Corrections,
 ) -> "FrameSource | None":
-    """The recording of a command line, if it names one.
+    """The recording of a command line, if it names one; `vehicle` and `reference` are taken out of the settings then.
 
     Raises:
         ValueError: Options for recordings without one; what `open_recording` raises.
     """
     if frames is None:
-        for option, given in (("format", recording_format), ("sensors", sensors), ("window-s", window_s)):
+        for option, given in {**told, "sensors": sensors, "window_s": window_s}.items():
             if given is not None:
-                raise ValueError(f"--{option}: for a recording, which --frames gives")
+                name = option.removeprefix("recording_").replace("_", "-")
+                raise ValueError(f"--{name}: for a recording, which --frames gives")
         if corrections.words:
             raise ValueError(f"{corrections.words}: for a recording, which --frames gives")
         return None
     from rich.markup import escape
 
-    from torchcover.recordings import RecordedFrames, open_recording, reference_of_recording
+    from torchcover.recordings import RecordedFrames, reference_of_recording
     from torchcover.report import Terminal
 
     with Terminal(stderr=True).status(f"opening {escape(str(frames))}"):  # seconds, where there are 100,000 frames
-        recording = open_recording(frames, recording_format)
+        recording = options.opened(frames, vehicle=settings.pop("vehicle", None), **told)
     return RecordedFrames(
         recording,
         rigs={names: names.split(",") for names in sensors} if sensors else None,
-        reference=reference_of_recording(reference, window_s),
+        reference=reference_of_recording(settings.pop("reference", None), window_s),
         corrections=corrections,
     )
 

@@ -14,6 +14,7 @@ from torchcover.evaluation.settings import FILES, OPTIONS, Settings, wanted_file
 from torchcover.recordings.corrections import Corrections
 
 if TYPE_CHECKING:
+    from torchcover.recordings import Recording
     from torchcover.simulation import RegionsOfInterest
 
 Command = Callable[..., None]
@@ -106,11 +107,44 @@ def _check_files(files: str) -> str:
 
 Rig = Annotated[str, typer.Argument(help="Rig: a built-in name (see `list`) or a YAML file.")]
 Format = Annotated[str | None, typer.Option("--format", help="Format of the recording, if it is not recognised.")]
+VehicleFrame = Annotated[
+    str | None, typer.Option("--vehicle-frame", help="Of a bag: the vehicle's frame (base_footprint, else base_link).")
+]
+Mount = Annotated[
+    list[str] | None,
+    typer.Option(help="Of a bag: SENSOR=x,y,z or SENSOR=x,y,z,yaw,pitch,roll on the vehicle, metres and degrees."),
+]
 Out = Annotated[Path, typer.Option(help="Folder for the results.", callback=check_out)]
 ALL_FILES = ",".join(FILES)
 Files = Annotated[
     str, typer.Option(help="What to write beside `summary.json`: any of numbers, maps, page.", callback=_check_files)
 ]
+
+
+def opened(
+    frames: Path,
+    recording_format: str | None,
+    vehicle: str | None,
+    vehicle_frame: str | None,
+    mount: Sequence[str] | None,
+) -> "Recording":
+    """The recording that a command line names, with what it tells of it."""
+    from torchcover.geometry import rigid, rotation_from_euler
+    from torchcover.recordings import open_recording
+
+    told = {}
+    for text in mount or ():
+        sensor, _, numbers = text.partition("=")
+        x, y, z, *turn = _numbers(
+            "--mount", text, numbers, ("x", "y", "z", "yaw", "pitch", "roll")[: 6 if numbers.count(",") > 2 else 3]
+        )
+        told[sensor] = rigid(rotation_from_euler(*(turn or (0.0, 0.0, 0.0))), [x, y, z])
+    recording = open_recording(frames, recording_format, vehicle_frame=vehicle_frame, mounts=told)
+    if vehicle is not None:
+        from torchcover.simulation.recorded_rig import recorded_body
+
+        recording.body = recorded_body(recording, vehicle)
+    return recording
 
 
 def asked(

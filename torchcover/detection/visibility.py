@@ -9,14 +9,18 @@ from torchcover.detection.boxes import Boxes, check_boxes
 from torchcover.detection.inside import points_in_boxes
 from torchcover.neighbors import blind_spot_radius, check_cloud, check_tensor
 
+# The sides of a box that face this height above the vehicle's origin can be seen; so many points across each.
+SEEN_FROM_M, SIDE_POINTS = 1.7, 12
+
 
 @dataclass(frozen=True, eq=False)
 class BoxVisibility:
-    """What the rig saw of each of K boxes, in float64. A box without a reference point is unknown: NaN.
+    """What the rig saw of each of K boxes, in float64. A box without a point of reference or rig is unknown: NaN.
 
     Args:
-        share: (K,) share of what the reference saw in the box whose blind spot radius is within the threshold.
-        mean_radius_m: (K,) mean blind spot radius of what the reference saw in the box.
+        share: (K,) share of what the reference saw in the box whose blind spot radius is within the threshold; of the
+            sides that face the vehicle where it saw nothing and the rig did.
+        mean_radius_m: (K,) mean blind spot radius of the same.
         reference_points: (K,) int64 reference points in the box.
         drawn_points: (K,) int64 points that the reference drew on the object, from `Boxes`.
         sensor_points: (K,) int64 points of the rig in the box.
@@ -32,8 +36,8 @@ class BoxVisibility:
 
     @property
     def known(self) -> Tensor:
-        """(K,) bool whether any reference point fell into the box."""
-        return self.reference_points > 0
+        """(K,) bool whether any point of the reference or of the rig fell into the box."""
+        return ~self.share.isnan()
 
     @property
     def hidden(self) -> Tensor:
@@ -71,9 +75,12 @@ def box_visibility(
     right beside a wall that is seen counts as seen as far as the threshold reaches. `sensor_points` are those in the
     box itself; see `points_in_boxes`.
 
-    The reference sensor is itself occluded: it looks from beside the ego, so a box that nothing can see from there is
-    unknown, and of a box that is known the far side is missing. `SurfaceReference(object_points=...)` asks about every
-    object, so that such a box is `hidden`; other references leave it open.
+    A rig may hit what the reference has no point of. What can be seen of such a box is at most its sides that face the
+    vehicle (from 1.7 m above its origin), with their square metres: the share of these is a lower bound.
+
+    The reference sensor is itself occluded: it looks from beside the ego, so a box that nothing can see from there, nor
+    the rig, is unknown, and of a box that is known the far side is missing. `SurfaceReference(object_points=...)` asks
+    about every object, so that such a box is `hidden`; other references leave it open.
 
     Args:
         sensor: (N, 3) points of the rig in the vehicle frame in metres, all of them. N = 0: nothing was seen, so the
@@ -103,18 +110,51 @@ def box_visibility(
     _check(sensor, reference, threshold, reference_weights)
     sensor, boxes = sensor.to(reference.device), boxes.to(reference.device)
     box, point = points_in_boxes(reference, boxes)
+    asked, weights = reference[point], None if reference_weights is None else reference_weights[point]
+    reference_points = torch.bincount(box, minlength=len(boxes))
+    sensor_points = torch.bincount(points_in_boxes(sensor, boxes).box, minlength=len(boxes))
+    if only := ((reference_points == 0) & (sensor_points > 0)).nonzero().squeeze(1).tolist():
+        sides, side_of, square_metres = _facing_sides(boxes, only)
+        weights = torch.ones_like(asked[:, 0]) if weights is None else weights
+        asked, box = torch.cat([asked, sides.to(asked)]), torch.cat([box, side_of])
+        weights = torch.cat([weights.double(), square_metres])
     # Only the reference may be cropped to the boxes.
-    radius = blind_spot_radius(reference[point], sensor).double()
-    weights = None if reference_weights is None else reference_weights[point]
+    radius = blind_spot_radius(asked, sensor).double()
     return BoxVisibility(
         # A GPU adds weights up in any order, so that even all of them may come to a trifle over the total.
         share=mean_by_box((radius <= threshold).double(), box, len(boxes), weights).clamp(max=1.0),
         mean_radius_m=mean_by_box(radius, box, len(boxes), weights),
-        reference_points=torch.bincount(box, minlength=len(boxes)),
+        reference_points=reference_points,
         drawn_points=boxes.drawn_points,
-        sensor_points=torch.bincount(points_in_boxes(sensor, boxes).box, minlength=len(boxes)),
+        sensor_points=sensor_points,
         threshold_m=float(threshold),
     )
+
+
+def _facing_sides(boxes: Boxes, which: list[int]) -> tuple[Tensor, Tensor, Tensor]:
+    """Points on the sides of some boxes that face the vehicle, the number of the box of each, and its square metres."""
+    number = torch.tensor(which, device=boxes.yaw_rad.device)
+    centre_m, half_m, yaw_rad = (of.double()[number] for of in (boxes.centre_m, boxes.size_m / 2, boxes.yaw_rad))
+    turn = torch.stack([yaw_rad.cos(), yaw_rad.sin()], dim=1)
+    along, across = turn, torch.stack([-turn[:, 1], turn[:, 0]], dim=1)
+    from_m = centre_m.new_tensor([0.0, 0.0, SEEN_FROM_M]) - centre_m
+    seen_from_m = torch.stack([(from_m[:, :2] * along).sum(1), (from_m[:, :2] * across).sum(1), from_m[:, 2]], dim=1)
+    steps = (torch.arange(SIDE_POINTS, device=number.device).double() + 0.5) * 2 / SIDE_POINTS - 1
+    first, second = (grid.reshape(-1) for grid in torch.meshgrid(steps, steps, indexing="ij"))
+    points, owners, areas = [], [], []
+    for axis, (one, other) in enumerate(((1, 2), (0, 2), (0, 1))):
+        facing = (seen_from_m[:, axis].abs() > half_m[:, axis]).nonzero().squeeze(1)
+        if axis == 2:  # what stands on the ground has no underside
+            facing = facing[seen_from_m[facing, 2] > 0]
+        local_m = centre_m.new_empty(len(facing), len(first), 3)
+        local_m[..., axis] = (half_m[facing, axis] * seen_from_m[facing, axis].sign())[:, None]
+        local_m[..., one], local_m[..., other] = half_m[facing, one, None] * first, half_m[facing, other, None] * second
+        flat_m = local_m[..., :1] * along[facing, None] + local_m[..., 1:2] * across[facing, None]
+        points.append((torch.cat([flat_m, local_m[..., 2:]], dim=2) + centre_m[facing, None]).reshape(-1, 3))
+        owners.append(number[facing].repeat_interleave(len(first)))
+        side_m2 = 4 * half_m[facing, one] * half_m[facing, other]
+        areas.append((side_m2 / len(first)).repeat_interleave(len(first)))
+    return torch.cat(points), torch.cat(owners), torch.cat(areas)
 
 
 def mean_by_box(values: Tensor, box: Tensor, boxes: int, weights: Tensor | None) -> Tensor:

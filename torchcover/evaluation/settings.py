@@ -220,7 +220,8 @@ class Settings:
         str | Path | None,
         Option(
             "What carries the rigs: a built-in vehicle, a YAML file or a mesh in metres. Not given: the scenario's own "
-            "ego, else the vehicle that the rigs name, else an SUV.",
+            "ego, else the vehicle that the rigs name, else an SUV. Of a recording: what is no return from the world, "
+            "where it does not say it; or x0,x1,y0,y1,z0,z1 in metres.",
             str,
             in_study=True,
         ),
@@ -438,8 +439,8 @@ class Settings:
             raise ValueError("sensor_model and weather are for simulations; a recording has the points that returned")
         if self.only_detection:
             raise ValueError("only_detection: for simulations; a recording has all its points")
-        if self.vehicle is not None:
-            raise ValueError("vehicle: for simulations; a recording has its own")
+        if self.vehicle is not None and not isinstance(self.frames, str | Path):
+            raise ValueError("vehicle: for simulations and paths of recordings; frames have their own (recording.body)")
         if self.probe:
             raise ValueError("probe: not for recordings, which have no scene to put a body into")
         if any(setting is not None for setting in (self.reference, self.rays, self.every_s)):

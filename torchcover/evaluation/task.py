@@ -13,7 +13,7 @@ from torchcover.coverage.grid import BandFrame
 from torchcover.evaluation.observers import AnyObserver
 from torchcover.evaluation.settings import DEFAULT_STEPS, OPTIONS, Settings
 from torchcover.frames import ChosenRigs, FrameSource
-from torchcover.recordings import RecordedFrames
+from torchcover.recordings import RecordedFrames, open_recording
 from torchcover.simulation import (
     Asked,
     RegionsOfInterest,
@@ -26,6 +26,7 @@ from torchcover.simulation import (
     reference_called,
     with_ego,
 )
+from torchcover.simulation.recorded_rig import recorded_body
 from torchcover.simulation.regions_of_interest import DEFAULT_BAND_FRAME
 from torchcover.simulation.simulated_frames import DEFAULT_REFERENCE
 
@@ -103,7 +104,10 @@ def task_of(settings: Settings) -> Task[FrameSource]:
         raise ValueError("scenario and frames exclude each other: simulate a scenario or read a recording")
     settings.check_recording()
     if isinstance(frames, str | Path):
-        source: FrameSource = RecordedFrames(frames, ground=settings.band_frame != "vehicle")
+        recording = open_recording(frames)
+        if settings.vehicle is not None:
+            recording.body = recorded_body(recording, settings.vehicle)
+        source: FrameSource = RecordedFrames(recording, ground=settings.band_frame != "vehicle")
     else:
         source = frames
     if missing := [name for name in vars(FrameSource) if not name.startswith("_") and not hasattr(source, name)]:

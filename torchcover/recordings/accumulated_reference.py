@@ -155,7 +155,7 @@ class AccumulatedReference:
         times_s = np.zeros(len(recording.names)) if recording.times_s is None else recording.times_s
         lengths = [len(scan.cells[0]) for scan in scans.values()]
         cells = np.concatenate([np.empty(0, np.int64), *(scan.cells[0] for scan in scans.values())])
-        instants, rank = np.unique([instant for _, instant in scans], return_inverse=True)
+        instants, rank = np.unique(np.array([instant for _, instant in scans], dtype=np.int64), return_inverse=True)
         number, of_cell = np.unique(cells, return_inverse=True)
         seen = np.unique(of_cell * len(instants) + np.repeat(rank, lengths))
         start = np.searchsorted(seen, np.arange(len(number)) * len(instants))

@@ -184,6 +184,7 @@ class RecordedFrames(FrameDataset):
             "recording": list(_stamps(self.recording.path)),
             "instants": [list(self.recording.names), list(self.recording.frames)],
             "sensors": self.sensors_of_rigs,
+            "told": [repr(self.recording.body), getattr(self.recording, "told", {})],
             "reference": [type(self.reference).__name__, reference],
             "ground": self.ground,
             "corrections": self.corrections.words,

@@ -33,6 +33,9 @@ class Scan:
         weights: (N,) what each point of a reference counts for, positive; None if all count the same.
         heights_m: (N,) height of each point of a reference above the local ground, NaN where there is none at or below;
             None if it is unknown.
+        rows: (N,) number of the laser of each point; None if it is unknown.
+        offsets_s: (N,) when each point was measured, after the instant that it was moved to; None: as measured, or
+            nobody says it.
     """
 
     points_m: Points
@@ -41,6 +44,8 @@ class Scan:
     min_range_m: float = 0.0
     weights: NDArray[np.float64] | None = None
     heights_m: NDArray[np.float32] | None = None
+    rows: NDArray[np.integer] | None = None
+    offsets_s: NDArray[np.float64] | None = None
 
 
 def check_times(times_s: NDArray[np.float64], count: int, source: str) -> NDArray[np.float64]:
@@ -66,7 +71,12 @@ class Recording(Protocol):
 
     Instants are numbered in time. What a reader opens at once is small: names, times, calibrations. Scans are read one
     by one.
+
+    Args:
+        body: The vehicle itself, in its own frame; None if unknown. Whoever knows it may say so.
     """
+
+    body: BoundingBox | None
 
     @property
     def path(self) -> Path:
@@ -104,11 +114,6 @@ class Recording(Protocol):
         ...
 
     @property
-    def body(self) -> BoundingBox | None:
-        """The vehicle itself, in its own frame; None if unknown."""
-        ...
-
-    @property
     def square_metres(self) -> bool:
         """Whether the scans of the reference sensors have weights, the square metres that their points stand for."""
         ...
@@ -143,6 +148,7 @@ class Layout:
     reference_sensors: Sequence[str] = ()
     square_metres = False
     instants: Sequence[int] | None = None
+    body: BoundingBox | None = None
 
     @property
     def frames(self) -> range:

@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from torchcover.detection import Boxes, points_in_boxes
 from torchcover.files import RECORDING
-from torchcover.geometry import invert
+from torchcover.geometry import BoundingBox, invert
 from torchcover.neighbors import nearest
-from torchcover.recordings.accumulated_reference import AccumulatedReference
+from torchcover.recordings.accumulated_reference import USUAL_BODY, AccumulatedReference
 from torchcover.recordings.agreement import disagreement
 from torchcover.recordings.ground_model import GroundModel, low_surfaces
-from torchcover.recordings.in_vehicle import in_vehicle
+from torchcover.recordings.in_vehicle import in_vehicle, within
 from torchcover.recordings.recorded_reference import RecordedReference, Reference
 from torchcover.recordings.recording import Recording, whole_recording
 
@@ -36,6 +36,8 @@ STEP_M, WAY_M, SIDEWAYS_DEG, MOST_OF_WAY = (0.05, 20.0), 5.0, (45.0, 135.0), 0.8
 FASTEST_MPS = 100.0
 # Half of the points of a LiDAR are nearer, in metres; and in centimetres.
 FARTHEST_USUAL_M, FARTHEST_USUAL_CM = 300.0, 4000.0
+# So high above the ground, so many points are the vehicle's own.
+OWN_ABOVE_M, OWN_POINTS = 0.3, 20
 
 
 @dataclass(frozen=True)
@@ -69,8 +71,11 @@ def suspicions(recording: Recording, reference: Reference, rigs: Mapping[str, Se
     ]
     widest = max(judged, key=lambda sensor: sum(len(look.clouds[sensor]) for look in looks))
     disagreeing = disagreement(recording, widest, many)
+    elsewhere = ground_is_elsewhere({sensor: [look.clouds[sensor] for look in looks] for sensor in sensors})
+    known = elsewhere is not None or recording.body is not None
     doubts = [
-        ground_is_elsewhere({sensor: [look.clouds[sensor] for look in looks] for sensor in sensors}),
+        elsewhere,
+        None if known else own_returns([_joined(look, sensors) for look in looks]),
         *(mirrored(sensor, [(look.clouds[sensor], look.boxes) for look in looks]) for sensor in sensors),
         *(
             same_clouds(rig, [(_joined(look, of), _joined(look, recorded)) for look in looks])
@@ -187,6 +192,18 @@ def mirrored(sensor: str, looks: Iterable[tuple[NDArray[np.float32], Boxes | Non
     return (
         f"{fuller_mirrored} of {sightings} labelled boxes have points of {sensor} only if its left and right are "
         f"exchanged, and {fuller} the way it is: turn its y axis round (flip_y), as for a left-handed simulator"
+    )
+
+
+def own_returns(clouds: Sequence[NDArray[np.float32]]) -> str | None:
+    """Whether there are returns at each instant where a vehicle of usual size stands: they are its own."""
+    above = BoundingBox((*USUAL_BODY.lower_m[:2], OWN_ABOVE_M), USUAL_BODY.upper_m)
+    counts = [len(within(cloud, above)) for cloud in clouds]
+    if min(counts, default=0) < OWN_POINTS:
+        return None
+    return (
+        f"{int(np.median(counts)):,} points an instant lie where the vehicle itself stands, and trail through the "
+        "reference if they are its own: say how large it is (--vehicle NAME, or x0,x1,y0,y1,z0,z1)"
     )
 
 

@@ -3,20 +3,26 @@
 import math
 import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from torchcover.cameras.calibration import Calibration
-from torchcover.geometry import euler_from_rotation, invert, rigid, rotation_from_euler, transform
+from torchcover.geometry import BoundingBox, euler_from_rotation, invert, rigid, rotation_from_euler
 from torchcover.geometry.rigid import Matrix
-from torchcover.recordings.in_vehicle import in_vehicle
+from torchcover.recordings.formats.ros import RosBag
+from torchcover.recordings.recorders.folder import CLEARANCE_M
 from torchcover.recordings.recording import CalibratedRecording, Recording, SensorCalibrations
+from torchcover.simulation.as_cast import as_cast
+from torchcover.simulation.bodies import body_called, mover_mesh
 from torchcover.simulation.camera_sensor import MOUNT_T_CAMERA
 from torchcover.simulation.lidar import LidarModel
 from torchcover.simulation.rig import Rig
 from torchcover.simulation.scan_estimate import ScanEstimate, estimate_scan
 
+# What is on a roof reaches so far above the highest LiDAR.
+ABOVE_SENSOR_M = 0.2
 # Scans that are looked at, evenly spread.
 SCANS = 5
 # As in the built-in rigs of cameras; no data set tells the depth that a camera gives.
@@ -69,6 +75,31 @@ def rig_document(
     return rig
 
 
+def recorded_body(recording: Recording, vehicle: str | Path) -> BoundingBox:
+    """The body of the vehicle that recorded something, and what is mounted on it.
+
+    Args:
+        recording: The recording.
+        vehicle: A built-in vehicle, the YAML file of one or a mesh file; or `x0,x1,y0,y1,z0,z1`, the sides of the body
+            in metres of the vehicle frame.
+
+    Raises:
+        ValueError: Other numbers, or what is no vehicle.
+        FileNotFoundError: No such vehicle.
+    """
+    sides = str(vehicle).split(",")
+    if len(sides) > 1:
+        try:
+            x0, x1, y0, y1, z0, z1 = map(float, sides)
+            return BoundingBox((x0, y0, z0), (x1, y1, z1))
+        except ValueError as error:
+            raise ValueError(f"vehicle {vehicle}: x0,x1,y0,y1,z0,z1 in metres are needed, x0 < x1: {error}") from error
+    ego = BoundingBox.around(mover_mesh("vehicle", body_called(vehicle)).vertices_m)
+    mounts = recording.calibrations().mounts if isinstance(recording, RosBag) else {}
+    top_m = max([ego.upper_m[2], *(float(mount[2, 3]) + ABOVE_SENSOR_M for mount in mounts.values())])
+    return BoundingBox((*ego.lower_m[:2], CLEARANCE_M), (*ego.upper_m[:2], top_m))
+
+
 def _lidar(recording: Recording, name: str, known: SensorCalibrations, model: str | None) -> tuple[dict[str, Any], str]:
     """The keys of a LiDAR, and where they are from."""
     count = min(SCANS, len(recording.frames))
@@ -85,17 +116,19 @@ def _lidar(recording: Recording, name: str, known: SensorCalibrations, model: st
     if model is not None:
         LidarModel.load(model)
         return {"type": "lidar", "name": name, "mount": _pose(mount), "model": model}, f"{mounted}; scans as {model}"
-    clouds = [in_vehicle(recording.scan(name, index), recording.body).points_m for index in chosen]
-    found = estimate_scan([transform(invert(mount), cloud) for cloud in clouds])
+    clouds, lasers, undone = as_cast(recording, name, chosen, mount)
+    found = estimate_scan(clouds, lasers)
     if found is None:
         raise ValueError(
             f"{recording.path}: the points of {name} do not lie in rows that can be told apart; name its model (see "
             f"`torchcover list`): --lidar {name}=MODEL"
         )
-    mount = mount @ rigid(rotation_from_euler(found.centre_deg, 0.0, 0.0), np.zeros(3))
+    mount = mount @ rigid(rotation_from_euler(found.centre_deg, 0.0, 0.0), [0.0, 0.0, found.origin_m])
+    mounted += f", its rays' origin {found.origin_m:+.2f} m higher" if found.origin_m else ""
     return {"type": "lidar", "name": name, "mount": _pose(mount), **_pattern(found)}, (
         f"{mounted}; estimated from {count} scan{'s' * (count > 1)}: {len(found.elevations_deg)} rows (those that "
         f"returned anything), {found.columns:,} columns, ranges of the nearest and the farthest return"
+        + (undone and f"; {undone}")
     )
 
 

@@ -117,6 +117,20 @@ def test_open_drive_brings_its_heights_and_sidewalks(tmp_path):
     assert len(world.static) == 4  # ground, sidewalk, houses, trees
 
 
+def test_links_of_open_drive_that_lead_nowhere_are_named_and_may_be_left_out(tmp_path):
+    link = '<link><predecessor elementType="road" elementId="7" contactPoint="end"/></link>'
+    nowhere = '<junction id="8" type="direct"><connection id="0" incomingRoad="1" linkedRoad="1"/></junction>'
+    (tmp_path / "road.xodr").write_text(
+        XODR.replace("<planView>", f"{link}<planView>").replace("</OpenDRIVE>", f"{nowhere}</OpenDRIVE>")
+    )
+    (tmp_path / "r.xml").write_text(ROUTES.format(name="me", more=""))
+    made = Sumo(net=tmp_path / "road.xodr", routes=(tmp_path / "r.xml",), ego_id="me", begin_s=0.0, duration_s=2.0)
+    told = "road 1, predecessor road 7; junction 8, connection 0, connectingRoad .none.; `leave_out_links: true`"
+    with pytest.raises(BadFileError, match=f"road.xodr: SUMO's netconvert fails: .*{told}"):
+        made.world(0)
+    assert made.model_copy(update={"leave_out_links": True}).world(0).ego.trajectory.moves
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -24,6 +24,14 @@ def read_records(path: Path, columns: int) -> Points:
     return check_records(path.read_bytes(), columns)[:, :3]
 
 
+@reads("a point cloud with rings")
+def read_ringed_cloud(path: Path) -> tuple[Points, NDArray[np.int64]]:
+    """(N, 3) points and (N,) rings of rows x y z intensity ring, as those of nuScenes."""
+    check_memory(2 * path.stat().st_size)
+    records = check_records(path.read_bytes(), 5)
+    return records[:, :3], np.nan_to_num(records[:, 4]).astype(np.int64)
+
+
 def read_array(path: Path) -> Points:
     """Read a `.npy` file of shape (N, 3) or wider, x y z first."""
     return _coordinates(read_npy(path, _check))

@@ -1,11 +1,12 @@
 """The layouts of recordings, by name: a new one is a class and a line here."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from torchcover.files import RECORDING, noted
+from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.formats import argoverse2, commonroad, nuscenes
 from torchcover.recordings.formats.argoverse2 import Argoverse2
 from torchcover.recordings.formats.carla import Carla
@@ -13,7 +14,7 @@ from torchcover.recordings.formats.folder import FolderRecording
 from torchcover.recordings.formats.kitti_object import KittiObject
 from torchcover.recordings.formats.kitti_raw import KittiRaw
 from torchcover.recordings.formats.nuscenes import NuScenes
-from torchcover.recordings.formats.ros2 import Ros2
+from torchcover.recordings.formats.ros import RosBag
 from torchcover.recordings.formats.track_tables import read_box_tracks
 from torchcover.recordings.objects import RecordedObjects, objects_of
 from torchcover.recordings.recording import Recording, whole_recording
@@ -36,6 +37,8 @@ class RecordingFormat(Protocol):
         ...
 
 
+# So many recordings in a folder are named, or in folders of it.
+BELOW, DEEP = 6, 3
 # The first that recognises a path reads it.
 FORMATS: dict[str, RecordingFormat] = {
     "nuscenes": NuScenes,
@@ -43,17 +46,25 @@ FORMATS: dict[str, RecordingFormat] = {
     "kitti_raw": KittiRaw,
     "kitti_object": KittiObject,
     "carla": Carla,
-    "ros2": Ros2,
+    "ros": RosBag,
     "folder": FolderRecording,
 }
 
 
-def open_recording(path: str | os.PathLike[str], format_name: str | None = None) -> Recording:
+def open_recording(
+    path: str | os.PathLike[str],
+    format_name: str | None = None,
+    *,
+    vehicle_frame: str | None = None,
+    mounts: Mapping[str, Matrix] | None = None,
+) -> Recording:
     """Open a recording; `RecordedFrames` makes frames of it.
 
     Args:
         path: Where it is.
         format_name: A name in `FORMATS`; the first that recognises it if not given.
+        vehicle_frame: Of a bag, see `RosBag`.
+        mounts: Of a bag, see `RosBag`.
 
     Raises:
         FileNotFoundError: There is nothing at the path.
@@ -66,10 +77,28 @@ def open_recording(path: str | os.PathLike[str], format_name: str | None = None)
         raise ValueError(f"format {format_name!r}: no such format of recordings; there are {', '.join(FORMATS)}")
     names = _frames_written(path)
     for name, recording_format in FORMATS.items():
-        if name == format_name or (format_name is None and recording_format.recognises(path)):
-            return _checked(recording_format(path), names)
+        if name != format_name and (format_name is not None or not recording_format.recognises(path)):
+            continue
+        if recording_format is RosBag:
+            return RosBag(path, vehicle_frame, mounts)
+        if vehicle_frame is not None or mounts:
+            raise ValueError(
+                f"{path}: vehicle_frame and mounts are for bags; {name} has its own (a plain folder in frames.yaml)"
+            )
+        return _checked(recording_format(path), names)
     known = "; ".join(f"{name}: {recording_format.layout}" for name, recording_format in FORMATS.items())
-    raise ValueError(f"{path}: a recording of no known format; known are {known}")
+    raise ValueError(f"{path}: a recording of no known format{_below(path)}; known are {known}")
+
+
+def _below(folder: Path) -> str:
+    """The recordings in a folder, and in folders of it, for a message."""
+    places, found = [folder], list[Path]()
+    for _ in range(DEEP * folder.is_dir()):
+        places = [inner for place in places if place.is_dir() for inner in sorted(place.iterdir())]
+        if found := [place for place in places if any(one.recognises(place) for one in FORMATS.values())]:
+            break
+    told = ", ".join(map(str, found[:BELOW])) + (f" and {len(found) - BELOW} more" if len(found) > BELOW else "")
+    return f"; name one of those in it: {told}" if found else ""
 
 
 def _frames_written(path: Path) -> set[str] | None:

@@ -70,8 +70,7 @@ class Argoverse2(Layout):
 
     layout: ClassVar[str] = "sensors/lidar/TIME.feather, city_SE3_egovehicle.feather"
     sensors = tuple(LASERS)
-    body = BODY
-    classes = CLASSES
+    body: BoundingBox | None = BODY
     classes = CLASSES
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -92,12 +91,13 @@ class Argoverse2(Layout):
 
     def scan(self, sensor: str, index: int) -> Scan:
         """The points of one LiDAR in a sweep."""
-        columns = read_feather(self._files[index], ("x", "y", "z", "laser_number"))
+        columns = read_feather(self._files[index], ("x", "y", "z", "laser_number", "offset_ns"))
         low, high = LASERS[sensor]
         laser = columns["laser_number"]
         own = (laser >= low) & (laser < high)
         points_m = np.column_stack([columns[axis][own].astype(np.float32) for axis in "xyz"])
-        return Scan(points_m, vehicle_T_ego, str(self._files[index]))
+        offsets_s = columns["offset_ns"][own] * 1e-9
+        return Scan(points_m, vehicle_T_ego, str(self._files[index]), rows=laser[own], offsets_s=offsets_s)
 
     def world_T_vehicle(self, index: int) -> Matrix:
         """The pose of the ego in the city."""

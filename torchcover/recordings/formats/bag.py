@@ -1,9 +1,11 @@
-"""The files of a ROS 2 bag: which messages there are and when, and single ones of them."""
+"""The files of a bag of ROS 1 or 2: which messages there are and when, and single ones of them."""
 
 import os
 import sqlite3
 import weakref
 from collections import Counter
+from collections.abc import Callable
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -15,16 +17,20 @@ from torchcover.files import check_memory, naming, parse_yaml, read_short_text, 
 
 METADATA = "metadata.yaml"
 SUFFIXES = {"sqlite3": ".db3", "mcap": ".mcap"}
+ROS1 = ".bag"
+# What the standard definitions of ROS 1 lack, and what it was called before.
+TREE = "tf2_msgs/msg/TFMessage"
+RENAMED = {"tf/msg/tfMessage": TREE}
 # Of MCAP's records: a code, a size, the channel, the size of the entries.
 INDEX_CODE, INDEX_HEAD = 0x07, 15
 INDEX_ENTRY = np.dtype([("time_ns", "<u8"), ("offset", "<u8")])
 
 
 class Bag:
-    """A folder with `metadata.yaml` and `.db3` or `.mcap` files, or one such file. Needs `torchcover[ros]`.
+    """A folder with `metadata.yaml` and `.db3` or `.mcap` files or with `.bag` files of ROS 1, or one such file.
 
-    Opening reads the index only. Messages are read as what the standard definitions say of their types; those that are
-    in the bag, of which code would be made, are left aside.
+    Needs `torchcover[ros]`. Opening reads the index only. Messages are read as what the standard definitions say of
+    their types; those that are in the bag, of which code would be made, are left aside.
 
     Raises:
         FileNotFoundError: A file is missing.
@@ -34,15 +40,20 @@ class Bag:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        if path.is_dir():
+        self._files = ros1_files(path)
+        if not self._files and path.is_dir():
             check_metadata(path / METADATA)
-        else:
+        elif not self._files:
             check_suffix(path)
-        self._opened: tuple[int, Any, Any] | None = None
-        with naming(path, "a ROS 2 bag"):
-            connections, _ = self._reader()
-            self.types: dict[str, str] = {one.topic: one.msgtype for one in connections.connections}
-            self._times_ns = _times_ns(connections)
+        self._opened: tuple[int, list[Any], Callable[..., Any]] | None = None
+        with naming(path, "a bag"):
+            readers, _ = self._readers()
+            self.types = {one.topic: _type(one) for reader in readers for one in reader.connections}
+            times_ns = [_times_in_bag(reader) if self._files else _times_ns(reader) for reader in readers]
+            self._times_ns = {
+                topic: np.sort(np.concatenate([of[topic] for of in times_ns if topic in of]))
+                for topic in set().union(*times_ns)
+            }
 
     def __getstate__(self) -> dict[str, object]:
         return {**vars(self), "_opened": None}
@@ -57,42 +68,59 @@ class Bag:
 
     def messages(self, topic: str, start_ns: int | None = None, stop_ns: int | None = None) -> list[Any]:
         """The messages of a topic that were recorded from a time on, until before another."""
-        with naming(self.path, f"a ROS 2 bag, in {topic}"), np.errstate(all="ignore"):
-            reader, types = self._reader()
-            own = [one for one in reader.connections if one.topic == topic]
-            return [types.deserialize_cdr(raw, one.msgtype) for one, _, raw in reader.messages(own, start_ns, stop_ns)]
+        with naming(self.path, f"a bag, in {topic}"), np.errstate(all="ignore"):
+            readers, deserialize = self._readers()
+            own = [(reader, [one for one in reader.connections if one.topic == topic]) for reader in readers]
+            found = [
+                (time_ns, deserialize(raw, _type(one)))
+                for reader, connections in own
+                if connections
+                for one, time_ns, raw in reader.messages(connections, start_ns, stop_ns)
+            ]
+            return [message for _, message in sorted(found, key=itemgetter(0))]
 
     def message(self, topic: str, time_ns: int) -> Any:  # noqa: ANN401  (of a type that rosbags has made)
         """The message of a topic that was recorded at a time."""
         found = self.messages(topic, time_ns, time_ns + 1)
         if not found:
-            with naming(self.path, "a ROS 2 bag"):
+            with naming(self.path, "a bag"):
                 raise ValueError(f"{topic}: the message at {time_ns} is in the index only; is the bag damaged?")
         return found[0]
 
-    def _reader(self) -> tuple[Any, Any]:
+    def _readers(self) -> tuple[list[Any], Callable[..., Any]]:
         """The files, opened by this process: one that was forked must not share their positions."""
         if self._opened is None or self._opened[0] != os.getpid():
             try:
-                from rosbags.rosbag2 import Reader
-                from rosbags.typesys import Stores, get_typestore
+                from rosbags import rosbag1, rosbag2
+                from rosbags.typesys import Stores, get_types_from_msg, get_typestore
             except ImportError as error:
-                raise ImportError(f"{self.path}: ROS 2 bags need rosbags: pip install 'torchcover[ros]'") from error
-            reader = Reader(self.path)
-            reader.open()
-            weakref.finalize(self, reader.close)
-            self._opened = os.getpid(), reader, get_typestore(Stores.ROS2_HUMBLE)
+                raise ImportError(f"{self.path}: bags need rosbags: pip install 'torchcover[ros]'") from error
+            types = get_typestore(Stores.ROS1_NOETIC if self._files else Stores.ROS2_HUMBLE)
+            if self._files:
+                types.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TREE))
+            readers = [rosbag1.Reader(file) for file in self._files] or [rosbag2.Reader(self.path)]
+            for reader in readers:
+                reader.open()
+                weakref.finalize(self, reader.close)
+            self._opened = os.getpid(), readers, types.deserialize_ros1 if self._files else types.deserialize_cdr
         return self._opened[1:]
 
 
-@reads("a ROS 2 bag")
+def ros1_files(path: Path) -> list[Path]:
+    """The files of ROS 1 at a path: it, or those in a folder that is no bag of ROS 2."""
+    if path.is_dir():
+        return [] if (path / METADATA).exists() else sorted(path.glob(f"*{ROS1}"))
+    return [path] if path.suffix == ROS1 else []
+
+
+@reads("a bag")
 def check_suffix(path: Path) -> None:
     """Whether a file is called as bags are."""
     if path.suffix not in SUFFIXES.values():
-        raise ValueError(f"a folder with {METADATA}, or a file of {' or '.join(SUFFIXES.values())} is needed")
+        raise ValueError(f"a folder with {METADATA}, or a file of {', '.join((*SUFFIXES.values(), ROS1))} is needed")
 
 
-@reads("the metadata of a ROS 2 bag")
+@reads("the metadata of a bag")
 def check_metadata(path: Path) -> None:
     """Whether the files that `metadata.yaml` names can be read one message at a time.
 
@@ -118,7 +146,19 @@ def check_metadata(path: Path) -> None:
             raise FileNotFoundError(f"{path.parent / name}: no such file; {path} names it")
 
 
-def _times_ns(reader: Any) -> dict[str, NDArray[np.int64]]:  # noqa: ANN401  (of rosbags, which has no types)
+def _type(connection: Any) -> str:  # noqa: ANN401  (of rosbags, which has no types)
+    name = str(connection.msgtype)
+    return RENAMED.get(name, name)
+
+
+def _times_in_bag(reader: Any) -> dict[str, NDArray[np.int64]]:  # noqa: ANN401
+    found: dict[str, list[int]] = {}
+    for one in reader.connections:
+        found.setdefault(one.topic, []).extend(entry.time for entry in reader.indexes[one.id])
+    return {topic: np.array(times_ns, dtype=np.int64) for topic, times_ns in found.items()}
+
+
+def _times_ns(reader: Any) -> dict[str, NDArray[np.int64]]:  # noqa: ANN401
     """Topic -> when its messages were recorded; no message is read."""
     storages = getattr(reader.storage, "storages", [reader.storage])
     found: dict[str, list[NDArray[np.int64]]] = {}
@@ -126,7 +166,7 @@ def _times_ns(reader: Any) -> dict[str, NDArray[np.int64]]:  # noqa: ANN401  (of
         of_file = _times_in_database(storage.path) if storage.path.suffix == ".db3" else _times_in_mcap(storage)
         for topic, times_ns in of_file.items():
             found.setdefault(topic, []).append(times_ns)
-    return {topic: np.sort(np.concatenate(parts)) for topic, parts in found.items()}
+    return {topic: np.concatenate(parts) for topic, parts in found.items()}
 
 
 def _times_in_database(path: Path) -> dict[str, NDArray[np.int64]]:

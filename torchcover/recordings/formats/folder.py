@@ -85,7 +85,11 @@ class FolderRecording(Layout):
     @classmethod
     def recognises(cls, path: Path) -> bool:
         """Whether it is a folder with clouds of a sensor, of sensors, of rigs or of a reference in it."""
-        return any((path / place).is_dir() for place in ("sensor", "sensors", "rigs", REFERENCE))
+        if any((path / place).is_dir() for place in ("sensors", "rigs", REFERENCE)):
+            return True
+        # Argoverse 2 has its logs in folders of `sensor`.
+        clouds = path / "sensor"
+        return clouds.is_dir() and (any(one.is_file() for one in clouds.iterdir()) or not any(clouds.iterdir()))
 
     def scan(self, sensor: str, index: int) -> Scan:
         """Read a file."""

@@ -17,12 +17,15 @@ class FrameTree:
     """
 
     def __init__(self, transforms: Iterable[Any]) -> None:
-        self._parents: dict[str, tuple[str, Matrix]] = {}
-        for one in transforms:
-            child, parent = frame_name(one.child_frame_id), frame_name(one.header.frame_id)
-            self._parents[child] = (parent, pose_of(one.transform.translation, one.transform.rotation, child))
+        self._parents = {frame_name(one.child_frame_id): parent_of(one) for one in transforms}
         for frame in self._parents:
             self._way(frame)
+
+    def add(self, parent: str, frame: str, parent_T_frame: Matrix) -> None:
+        """Mount a frame, with all that it is mounted together with, if it is not mounted with this one yet."""
+        if self.between(parent, frame) is None:
+            root, root_T_frame = list(self._way(frame).items())[-1]
+            self._parents[root] = (parent, parent_T_frame @ invert(root_T_frame))
 
     @property
     def frames(self) -> set[str]:
@@ -55,6 +58,12 @@ class FrameTree:
 def frame_name(stored: str) -> str:
     """The name of a frame; older tools begin it with a slash."""
     return str(stored).removeprefix("/")
+
+
+def parent_of(one: Any) -> tuple[str, Matrix]:  # noqa: ANN401  (of a type that rosbags has made)
+    """What a message `TransformStamped` mounts its frame on, and `that_T_frame`."""
+    child = frame_name(one.child_frame_id)
+    return frame_name(one.header.frame_id), pose_of(one.transform.translation, one.transform.rotation, child)
 
 
 def pose_of(place: Any, rotation: Any, name: str) -> Matrix:  # noqa: ANN401  (of types that rosbags has made)

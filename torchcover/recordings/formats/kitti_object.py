@@ -8,7 +8,7 @@ import numpy as np
 
 from torchcover.cameras.calibration import read_kitti
 from torchcover.detection.boxes import Boxes
-from torchcover.geometry import invert
+from torchcover.geometry import BoundingBox, invert
 from torchcover.recordings.clouds.readers import read_cloud
 from torchcover.recordings.formats.file_names import check_same_names, frame_files
 from torchcover.recordings.formats.kitti_files import (
@@ -36,7 +36,7 @@ class KittiObject(Layout):
     layout: ClassVar[str] = "velodyne/FRAME.bin, calib/FRAME.txt, label_2/FRAME.txt"
     sensors = ("velodyne",)
     times_s = None
-    body = BODY
+    body: BoundingBox | None = BODY
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = _split(Path(path))

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from torchcover.detection.boxes import Boxes
 from torchcover.files import parse_xml, reads
+from torchcover.geometry import BoundingBox
 from torchcover.geometry.rigid import Matrix, euler_from_rotation, invert, rotation_from_euler, transform
 from torchcover.recordings.clouds.readers import read_cloud
 from torchcover.recordings.formats.file_names import check_same_names, frame_files
@@ -39,7 +40,7 @@ class KittiRaw(Layout):
 
     layout: ClassVar[str] = "DATE/DRIVE/velodyne_points/data/FRAME.bin, oxts/data/FRAME.txt"
     sensors = ("velodyne",)
-    body = BODY
+    body: BoundingBox | None = BODY
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)

@@ -16,7 +16,7 @@ from torchcover.detection.boxes import Boxes
 from torchcover.files import naming, read_json_table
 from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_quaternion
 from torchcover.geometry.rigid import Matrix
-from torchcover.recordings.clouds.readers import read_cloud
+from torchcover.recordings.clouds.arrays import read_ringed_cloud
 from torchcover.recordings.objects import Ego, RecordedObjects, track_of
 from torchcover.recordings.recording import Scan, SensorCalibrations, check_times
 from torchcover.recordings.seen import Seen, SeenObjects, by_name
@@ -64,7 +64,7 @@ class NuScenes:
     reference_sensors = ()
     square_metres = False
     instants = None
-    body = BODY
+    body: BoundingBox | None = BODY
 
     def __init__(self, path: str | os.PathLike[str], scenes: Sequence[str] | None = None) -> None:
         tables = _tables(Path(path))
@@ -81,7 +81,8 @@ class NuScenes:
     def scan(self, sensor: str, index: int) -> Scan:
         """Read a sweep."""
         path = self.path / self._files[index]
-        return Scan(read_cloud(path), vehicle_T_ego @ self._mounts[index], str(path))
+        points_m, rows = read_ringed_cloud(path)
+        return Scan(points_m, vehicle_T_ego @ self._mounts[index], str(path), rows=rows)
 
     def world_T_vehicle(self, index: int) -> Matrix:
         """The pose of the ego when the sweep was made."""

@@ -10,8 +10,9 @@ from torchcover.recordings.clouds.arrays import Points
 # The data types of fields, by their numbers.
 TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 # What drivers call the time of a point: whole numbers are nanoseconds, others seconds, unless they are too large for
-# that; since the time of the message, or since 1970.
+# that; since the time of the message, or since 1970. And the number of its laser.
 TIME_FIELDS = ("t", "time", "timestamp", "time_stamp", "offset_time", "time_offset")
+ROW_FIELDS = ("ring", "channel", "laser_number", "laser_id", "line")
 ABSOLUTE_S, ABSOLUTE_NS = 1e6, 1e15
 # No LiDAR takes longer for a turn.
 LONGEST_TURN_S = 1.0
@@ -24,11 +25,13 @@ class CloudMessage(NamedTuple):
         points_m: (N, 3) in the frame of the sensor, those that are not finite included.
         stamp_ns: The time of the message, 0 if its sender gave none.
         offsets_s: (N,) when each point was measured, since then; None if unknown.
+        rows: (N,) number of the laser of each; None if unknown.
     """
 
     points_m: Points
     stamp_ns: int
     offsets_s: NDArray[np.float64] | None
+    rows: NDArray[np.integer] | None
 
 
 def cloud_of(message: Any) -> CloudMessage:  # noqa: ANN401  (of a type that rosbags has made)
@@ -39,14 +42,17 @@ def cloud_of(message: Any) -> CloudMessage:  # noqa: ANN401  (of a type that ros
     if len(wanted) < 3 or any(field.datatype not in (7, 8) for field in wanted):
         told = ", ".join(f"{field.name} ({TYPES.get(field.datatype, field.datatype)})" for field in message.fields)
         raise ValueError(f"fields x, y, z of float32 or float64 are needed; got {told or 'none'}")
-    table = _table(message, [*wanted, *([times] if times is not None else [])])
+    ring = next((fields[name] for name in ROW_FIELDS if name in fields), None)
+    table = _table(message, [*wanted, *(field for field in (times, ring) if field is not None)])
+    rows = table[ring.name].astype(np.int64) if ring is not None and ring.datatype < 7 else None
     points_m: Points = np.stack([table[axis] for axis in "xyz"], axis=1)
     if points_m.dtype.byteorder == ">":
         points_m = points_m.astype(points_m.dtype.newbyteorder("="))
     stamp_ns = stamp_of(message.header)
     if times is None:
-        return CloudMessage(points_m, stamp_ns, None)
-    return CloudMessage(points_m, stamp_ns, _checked(_offsets_s(table[times.name], stamp_ns), points_m, times.name))
+        return CloudMessage(points_m, stamp_ns, None, rows)
+    offsets_s = _checked(_offsets_s(table[times.name], stamp_ns), points_m, times.name)
+    return CloudMessage(points_m, stamp_ns, offsets_s, rows)
 
 
 def stamp_of(header: Any) -> int:  # noqa: ANN401

@@ -1,4 +1,4 @@
-"""Where the vehicle of a ROS 2 bag was: from odometry, a tree of frames or poses, between two of them."""
+"""Where the vehicle of a bag was: from odometry, a tree of frames or poses, between two of them."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -10,7 +10,7 @@ from torchcover.files import naming
 from torchcover.geometry import quaternion_from_rotation, rigid, rotation_from_quaternion, slerp
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.formats.bag import Bag
-from torchcover.recordings.formats.frame_tree import FrameTree, frame_name, pose_of
+from torchcover.recordings.formats.frame_tree import FrameTree, frame_name, parent_of, pose_of
 from torchcover.recordings.formats.point_cloud2 import stamp_of
 
 ODOMETRY, TF, POSE = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage", "geometry_msgs/msg/PoseStamped"
@@ -21,6 +21,8 @@ WINDOW_NS = 1_000_000_000
 # Where the vehicle was is unknown between two poses that are farther apart; before the first and after the last
 # it goes on as before for a little.
 LONGEST_GAP_S, EDGE_S = 1.0, 0.15
+# What is mounted is written down again and again, to rounding.
+SAME = 1e-6
 
 
 class PoseSeries(NamedTuple):
@@ -91,7 +93,7 @@ class VehiclePoses:
             times_ns: (N,) when.
             logged_ns: About when such messages were recorded.
         """
-        with naming(self._bag.path, "a ROS 2 bag"):
+        with naming(self._bag.path, "a bag"):
             series = self._around(logged_ns)
             world_T_here = np.broadcast_to(np.eye(4), (len(times_ns), 4, 4))
             for link in self._links:
@@ -126,6 +128,27 @@ def series_of(messages: Sequence[Any], kind: str, name: str) -> dict[str, PoseSe
             pose = message.pose.pose if kind == ODOMETRY else message.pose
             found.setdefault(kind, {})[stamp_of(message.header)] = pose_of(pose.position, pose.orientation, name)
     return {child: _series(poses) for child, poses in found.items()}
+
+
+def mounted_transforms(bag: Bag) -> list[Any]:
+    """Messages `TransformStamped` of what is mounted: all of tf_static, and those of tf that never change."""
+    statics, links = [], dict[str, list[Any]]()
+    for topic in bag.topics(TF):
+        if topic.endswith("tf_static"):
+            statics += [one for message in bag.messages(topic) for one in message.transforms]
+            continue
+        logged_ns, read_ns = bag.times_ns(topic), 0
+        for about_ns in (logged_ns[0], logged_ns[len(logged_ns) // 2], logged_ns[-1]):
+            start_ns, read_ns = max(int(about_ns) - WINDOW_NS // 2, read_ns), int(about_ns) + WINDOW_NS // 2
+            for message in bag.messages(topic, start_ns, read_ns):
+                for one in message.transforms:
+                    links.setdefault(frame_name(one.child_frame_id), []).append(one)
+    return [*(of[0] for of in links.values() if len(of) > 1 and _never_changes(of)), *statics]
+
+
+def _never_changes(transforms: Sequence[Any]) -> bool:
+    (parent, mount), *others = map(parent_of, transforms)
+    return all(other == parent and np.abs(pose - mount).max() < SAME for other, pose in others)
 
 
 def vehicle_poses(bag: Bag, tree: FrameTree, vehicle_frame: str) -> list[VehiclePoses]:

@@ -21,6 +21,8 @@ LANE_CHANGE_S = 3.0
 # Places are those of fronts, of bodies that may be as long as this.
 BEYOND_M = 50.0
 PIECE_BYTES = 1 << 18
+# So many links are named.
+SHOWN = 5
 MAX_TOLD_CHARS = 500
 # They would look for schemas on the network.
 ALWAYS = ("--xml-validation", "never")
@@ -110,19 +112,50 @@ def simulate(
 
 
 @reads("an OpenDRIVE road")
-def from_opendrive(path: Path, folder: Path) -> Path:
-    """Let SUMO turn an OpenDRIVE file into a network in a folder."""
+def from_opendrive(path: Path, folder: Path, *, leave_out_links: bool) -> Path:
+    """Let SUMO turn an OpenDRIVE file into a network in a folder; links to what is not there may be left out."""
     root = parse_xml(path)
     if root.tag != "OpenDRIVE":
         raise ValueError(f"an OpenDRIVE file begins with <OpenDRIVE>; got <{root.tag}>")
-    network = folder / "converted.net.xml"
-    run(
-        "netconvert", "--opendrive-files", path, "--output-file", network, "--precision", "3",
-        "--opendrive.import-all-lanes", "--opendrive.curve-resolution", "2", "--walkingareas", "--crossings.guess",
-    )  # fmt: skip
+    network, lost = folder / "converted.net.xml", list(_lost_links(root))
+    if lost and leave_out_links:
+        for parent, link, _ in lost:
+            parent.remove(link)
+        path = folder / "linked.xodr"
+        ElementTree.ElementTree(root).write(path)
+    try:
+        run(
+            "netconvert", "--opendrive-files", path, "--output-file", network, "--precision", "3",
+            "--opendrive.import-all-lanes", "--opendrive.curve-resolution", "2", "--walkingareas", "--crossings.guess",
+        )  # fmt: skip
+    except ValueError as error:
+        if not lost or leave_out_links:
+            raise
+        told = "; ".join(words for *_, words in lost[:SHOWN]) + (
+            f"; and {len(lost) - SHOWN} more" * (len(lost) > SHOWN)
+        )
+        raise ValueError(
+            f"{error}; links lead to what is not there: {told}; `leave_out_links: true` goes on without"
+        ) from error
     converted = parse_xml(network)
     for lane in converted.iter("lane"):
         if lane.get("type") == "sidewalk" and lane.get("allow") is None:
             lane.set("allow", "pedestrian")  # netconvert lets cars onto sidewalks that lead to no crossing
     ElementTree.ElementTree(converted).write(network)
     return network
+
+
+def _lost_links(root: ElementTree.Element) -> Iterator[tuple[ElementTree.Element, ElementTree.Element, str]]:
+    """Links of roads and of junctions to roads and junctions that are not there: parent, link, words."""
+    there = {kind: {one.get("id") for one in root.findall(kind)} for kind in ("road", "junction")}
+    for road in root.findall("road"):
+        for links in road.findall("link"):
+            for link in [*links.findall("predecessor"), *links.findall("successor")]:
+                kind, target = link.get("elementType", "road"), link.get("elementId")
+                if target not in there.get(kind, ()):
+                    yield links, link, f"road {road.get('id')}, {link.tag} {kind} {target}"
+    for junction in root.findall("junction"):
+        for link in junction.findall("connection"):
+            ends = {key: link.get(key) for key in ("incomingRoad", "connectingRoad")}
+            if lost := [f"{key} {target or '(none)'}" for key, target in ends.items() if target not in there["road"]]:
+                yield junction, link, f"junction {junction.get('id')}, connection {link.get('id')}, {', '.join(lost)}"

@@ -39,6 +39,7 @@ class Sumo(Procedural):
 
     Args:
         net: A road network: `.net.xml`, or `.xodr` (OpenDRIVE).
+        leave_out_links: Whether links of an `.xodr` to roads and junctions that are not there are left out.
         routes: Files of routes for it, which SUMO drives; relative to the document.
         fcd: Floating car data, which SUMO wrote before, instead of driving now.
         random: Streets and traffic that are drawn; with a net, its traffic only.
@@ -54,6 +55,7 @@ class Sumo(Procedural):
 
     type: Literal["sumo"] = "sumo"
     net: PathBeside | None = None
+    leave_out_links: bool = False
     routes: tuple[PathBeside, ...] = ()
     fcd: PathBeside | None = None
     random: DrawnStreets | None = None
@@ -135,7 +137,9 @@ class Sumo(Procedural):
         if self.net is None:
             assert self.random is not None  # checked in _check_sources
             return self.random.build(folder, generator)
-        return from_opendrive(self.net, folder) if self.net.suffix == ".xodr" else self.net
+        if self.net.suffix != ".xodr":
+            return self.net
+        return from_opendrive(self.net, folder, leave_out_links=self.leave_out_links)
 
     def _routes(
         self, folder: Path, network: Network, fleet: Fleet, duration_s: float, generator: np.random.Generator

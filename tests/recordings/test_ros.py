@@ -1,4 +1,4 @@
-"""Bags of ROS 2: clouds of all shapes, times of single points, trees of frames, and bags that do not hold together."""
+"""Bags of ROS: clouds of all shapes, times of single points, trees of frames, and bags that do not hold together."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from torchcover.data import RecordedFrames, open_recording
 from torchcover.files import BadFileError
 from torchcover.geometry import invert, rigid, rotation_from_euler, transform
 from torchcover.recordings.formats.bag import Bag
-from torchcover.recordings.formats.ros2 import Ros2
+from torchcover.recordings.formats.ros import RosBag
 from torchcover.recordings.in_vehicle import in_vehicle
 
 CORNERS_M = np.array([[5.0, 1.0, 0.5], [8.0, -2.0, 0.25], [-4.0, 0.5, 1.0], [6.0, 6.0, 2.0]])
@@ -58,7 +58,7 @@ def test_a_cloud_may_have_gaps_rows_and_big_ends(tmp_path, kind, order):
     def organised(time_ns):
         return cloud(columns, time_ns, "lidar", height=2, gap=3, end=5, order=order)
 
-    scan = Ros2(bag(tmp_path / "a", MOUNTED + clouds(organised))).scan("lidar", 0)
+    scan = RosBag(bag(tmp_path / "a", MOUNTED + clouds(organised))).scan("lidar", 0)
     stored_m = np.stack([columns[axis] for axis in "xyz"], axis=1)
     np.testing.assert_array_equal(scan.points_m, stored_m)
     assert scan.points_m.dtype == np.dtype(kind)
@@ -89,7 +89,7 @@ def test_points_with_times_are_moved_to_the_instant(tmp_path, field, stored):
         seen_m[7] = 0.0
         return cloud(points(seen_m, **{field: stored(offset_ns, time_ns)}), time_ns, "lidar")
 
-    recording = Ros2(bag(tmp_path / "a", MOUNTED + driven() + clouds(measured, 3)))
+    recording = RosBag(bag(tmp_path / "a", MOUNTED + driven() + clouds(measured, 3)))
     for index in range(3):
         scan = recording.scan("lidar", index)
         assert (scan.points_m[7] == 0).all()  # what never came back is still at the sensor
@@ -103,7 +103,7 @@ def test_clouds_of_other_times_are_moved_to_the_instant(tmp_path):
         return cloud(points(transform(invert(world_T_sensor), FAR_CORNERS_M)), time_ns + 40_000_000, "lidar")
 
     second = [("/b", time_ns + 40_000_000, message) for _, time_ns, message in clouds(late, 4)]
-    recording = Ros2(bag(tmp_path / "a", MOUNTED + driven() + clouds(count=3) + second))
+    recording = RosBag(bag(tmp_path / "a", MOUNTED + driven() + clouds(count=3) + second))
     assert recording.sensors == ("lidar", "b")
     frame = RecordedFrames(recording)[2]
     others_m = transform(invert(recording.world_T_vehicle(2)), FAR_CORNERS_M)
@@ -120,7 +120,7 @@ def test_odometry_may_be_that_of_another_frame(tmp_path):
         ("/odom", T0_NS + k * STEP_NS, odometry(pose_at(0.1 * k) @ vehicle_T_imu, T0_NS + k * STEP_NS, "imu"))
         for k in range(2)
     ]
-    recording = Ros2(bag(tmp_path / "a", mounted + measured + clouds()))
+    recording = RosBag(bag(tmp_path / "a", mounted + measured + clouds()))
     np.testing.assert_allclose(recording.world_T_vehicle(1), pose_at(0.1), atol=1e-9)
 
 
@@ -130,14 +130,14 @@ def test_a_tree_leads_to_the_frame_that_never_jumps(tmp_path):
     raised = rigid(np.eye(3), [0.0, 0.0, 0.3])
     mounted = [static(link("base_link", "lidar", mount), link("footprint", "base_link", raised))]
     moved = [("/tf", T0_NS + k * STEP_NS, tree(jump[k], here[k])) for k in range(2)]
-    recording = Ros2(bag(tmp_path / "a", mounted + moved + clouds()))
+    recording = RosBag(bag(tmp_path / "a", mounted + moved + clouds()))
     np.testing.assert_allclose(recording.world_T_vehicle(1), pose_at(0.1) @ raised, atol=1e-9)
 
 
 def test_scans_beyond_the_poses_are_left_out(tmp_path):
     late = [(topic, time_ns + 5 * STEP_NS, message) for topic, time_ns, message in driven(30)]
     late = [("/odom", time_ns, odometry(pose_at(0.0), time_ns)) for _, time_ns, _ in late]
-    recording = Ros2(bag(tmp_path / "a", MOUNTED + late + clouds(count=20)))
+    recording = RosBag(bag(tmp_path / "a", MOUNTED + late + clouds(count=20)))
     # 0.5 to 0.79 s, and what a vehicle does within 0.15 s more.
     assert recording.times_s.tolist() == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4, 0.5])
     assert recording.names[0] == str(T0_NS + 4 * STEP_NS)
@@ -156,9 +156,90 @@ def test_what_was_chosen_is_said(tmp_path):
         "left out, for no static transform links to base_link the frame of /b (nowhere)",
         "poses are taken from /odom (odometry of base_link), not from /goal (poses)",
     ]
-    with pytest.warns(UserWarning, match="lidar is taken for the vehicle's frame"):
-        recording = Ros2(bag(tmp_path / "b", MOUNTED + clouds()), vehicle_frame="lidar")
+    recording = RosBag(bag(tmp_path / "b", MOUNTED + clouds()), vehicle_frame="lidar")
     np.testing.assert_allclose(recording.scan("lidar", 0).vehicle_T_sensor, np.eye(4), atol=1e-12)
+
+
+raised = rigid(np.eye(3), [0.0, 0.0, 0.2])
+
+
+def test_the_frame_on_the_ground_is_the_vehicles(tmp_path):
+    mounted = [static(link("base_link", "lidar", mount), link("base_footprint", "base_link", raised))]
+    path = bag(tmp_path / "a", mounted + driven() + clouds())
+    with pytest.warns(UserWarning, match="base_footprint is taken for the vehicle's frame, not base_link"):
+        recording = RosBag(path)
+    np.testing.assert_allclose(recording.scan("lidar", 0).vehicle_T_sensor, raised @ mount, atol=1e-12)
+    np.testing.assert_allclose(recording.world_T_vehicle(1), pose_at(0.1) @ invert(raised), atol=1e-9)
+    asked = RosBag(path, vehicle_frame="base_link")
+    np.testing.assert_allclose(asked.scan("lidar", 0).vehicle_T_sensor, mount, atol=1e-12)
+
+
+def moved_tree(k, *links):
+    """What robot_state_publisher and odometry send 20 times a second."""
+    return (
+        "/tf",
+        T0_NS + k * STEP_NS // 2,
+        tree(*links, link("odom", "base_link", pose_at(0.05 * k), T0_NS + k * STEP_NS // 2)),
+    )
+
+
+@pytest.mark.parametrize("write", [bag, lambda path, messages: bags.bag1(path.with_suffix(".bag"), messages)])
+def test_mounts_may_come_with_what_moves(tmp_path, write):
+    # The head turns, and its camera with it.
+    turned = [rigid(rotation_from_euler(float(k), 0.0, 0.0), [0.0, 0.0, 1.0]) for k in range(8)]
+    moved = [
+        moved_tree(
+            k, link("base_link", "mast", raised), link("mast", "lidar", mount), link("base_link", "head", turned[k])
+        )
+        for k in range(8)
+    ]
+    head = [("/head", time_ns, cloud(points(CORNERS_M), time_ns, "head")) for _, time_ns, _ in clouds(count=3)]
+    path = write(tmp_path / "a", moved + clouds(count=3) + head)
+    with pytest.warns(UserWarning, match=r"left out, .* the frame of /head"):
+        recording = RosBag(path)
+    np.testing.assert_allclose(recording.scan("lidar", 0).vehicle_T_sensor, raised @ mount, atol=1e-9)
+    np.testing.assert_allclose(recording.world_T_vehicle(2), pose_at(0.2), atol=1e-6)
+
+
+def test_mounts_may_be_told(tmp_path):
+    # Odometry of the LiDAR itself, and what is mounted beside it.
+    of_lidar = [
+        ("/odom", time_ns, odometry(pose_at((time_ns - T0_NS) * 1e-9) @ mount, time_ns, "lidar"))
+        for _, time_ns, _ in driven()
+    ]
+    beside = rigid(np.eye(3), [0.0, 1.0, 0.0])
+    second = [("/b", time_ns, cloud(points(CORNERS_M), time_ns, "second")) for _, time_ns, _ in clouds(count=3)]
+    path = bag(
+        tmp_path / "a",
+        [static(link("rack", "lidar", raised), link("rack", "second", beside)), *of_lidar, *clouds(count=3), *second],
+    )
+    with pytest.raises(
+        BadFileError, match=r"base_link of the vehicle is needed; there are lidar, rack, second: name one"
+    ):
+        RosBag(path)
+    recording = open_recording(path, mounts={"lidar": mount})
+    assert recording.sensors == ("b", "lidar")
+    np.testing.assert_allclose(recording.scan("lidar", 0).vehicle_T_sensor, mount, atol=1e-12)
+    np.testing.assert_allclose(recording.scan("b", 0).vehicle_T_sensor, mount @ invert(raised) @ beside, atol=1e-12)
+    np.testing.assert_allclose(recording.world_T_vehicle(2), pose_at(0.2), atol=1e-9)
+    told = open_recording(path, mounts={"lidar": mount, "b": raised})
+    np.testing.assert_allclose(told.scan("b", 0).vehicle_T_sensor, raised, atol=1e-9)
+    alone = open_recording(bag(tmp_path / "b", clouds()), mounts={"lidar": mount})
+    np.testing.assert_allclose(alone.scan("lidar", 0).vehicle_T_sensor, mount, atol=1e-12)
+    with pytest.raises(BadFileError, match=r"mount of roof: there are clouds of b, lidar"):
+        open_recording(path, mounts={"roof": mount})
+
+
+def test_files_of_ros_1_are_parts_of_one_bag(tmp_path):
+    (tmp_path / "drive").mkdir()
+    bags.bag1(tmp_path / "drive" / "lidar.bag", MOUNTED + clouds(count=3))
+    bags.bag1(tmp_path / "drive" / "poses.bag", driven())
+    recording = open_recording(tmp_path / "drive")
+    np.testing.assert_allclose(recording.world_T_vehicle(2), pose_at(0.2), atol=1e-9)
+    whole = (tmp_path / "drive" / "lidar.bag").read_bytes()
+    (tmp_path / "drive" / "lidar.bag").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(BadFileError, match="not readable as a bag"):
+        open_recording(tmp_path / "drive")
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
@@ -173,11 +254,11 @@ def test_to_open_a_bag_reads_few_clouds(tmp_path, monkeypatch, storage):
         return found
 
     monkeypatch.setattr(Bag, "messages", counted)
-    recording = Ros2(path)
+    recording = RosBag(path)
     assert len(recording.names) == 27  # 2.49 s of poses
     # The first for its frame; those within 1 s of the first pose and of the last for their stamps.
     assert read.count("/lidar") <= 1 + 11 + 20
-    assert len(Ros2(next(path.glob("a.*"))).names) == 27  # the file alone
+    assert len(RosBag(next(path.glob("a.*"))).names) == 27  # the file alone
 
 
 def other(path, **changes):
@@ -222,7 +303,7 @@ XYZ = (("x", 0, 7), ("y", 4, 7))
     ],
 )
 def test_clouds_that_lie_about_themselves(tmp_path, changes, told):
-    recording = Ros2(other(tmp_path / "a", **changes))
+    recording = RosBag(other(tmp_path / "a", **changes))
     with pytest.raises(BadFileError, match=told):
         recording.scan("lidar", 0)
 
@@ -238,7 +319,7 @@ NOT_FINITE = rigid(np.eye(3), [0.0, np.nan, 0.0])
     ("messages", "told"),
     [
         (MOUNTED, "PointCloud2 with messages is needed; there are /tf_static .tf2_msgs/msg/TFMessage."),
-        (clouds(), "the frame base_link or base_footprint of the vehicle is needed; there are lidar"),
+        (clouds(), "the frame base_footprint or base_link of the vehicle is needed; there are lidar"),
         ([static(OTHER), *clouds()], r"of /lidar \(lidar\); static ones are of base_link, other"),
         ([static(*LOOP), *clouds()], "lidar -> a -> b -> a are mounted on each other in a loop"),
         ([static(link("base_link", "lidar", NOT_FINITE)), *clouds()], "lidar: three finite coordinates are needed"),
@@ -255,7 +336,7 @@ NOT_FINITE = rigid(np.eye(3), [0.0, np.nan, 0.0])
 def test_bags_that_do_not_hold_together(tmp_path, messages, told):
     path = bag(tmp_path / "a", messages)
     with pytest.raises(BadFileError, match=told) as error:
-        Ros2(path)
+        RosBag(path)
     assert str(error.value).startswith(f"{path}: ")
     assert str(error.value).count(str(path)) == 1
 
@@ -265,7 +346,7 @@ def test_a_gap_in_the_poses_is_not_bridged(tmp_path):
         *driven(2),
         *[("/odom", T0_NS + 15 * STEP_NS + k, odometry(mount, T0_NS + 15 * STEP_NS + k)) for k in range(2)],
     ]
-    recording = Ros2(bag(tmp_path / "a", MOUNTED + hole + clouds(count=15)))
+    recording = RosBag(bag(tmp_path / "a", MOUNTED + hole + clouds(count=15)))
     recording.scan("lidar", 1)
     with pytest.raises(BadFileError, match=r"the pose nearest to the time .* is 0.590 s off"):
         recording.scan("lidar", 6)
@@ -277,7 +358,7 @@ def test_a_sensor_that_pauses_is_missing_there(tmp_path):
         for _, time_ns, message in clouds(count=12)
         if not 3 <= (time_ns - T0_NS) // STEP_NS <= 4
     ]
-    recording = Ros2(bag(tmp_path / "a", MOUNTED + clouds(count=9) + paused))
+    recording = RosBag(bag(tmp_path / "a", MOUNTED + clouds(count=9) + paused))
     recording.scan("b", 2)
     with pytest.raises(BadFileError, match=r"the scan of b nearest to .* is 0.100 s off"):
         recording.scan("b", 3)
@@ -299,7 +380,7 @@ def test_metadata_that_cannot_be(tmp_path, change, told):
     assert change[0] in text
     (path / "metadata.yaml").write_text(text.replace(*change))
     with pytest.raises(BadFileError, match=told):
-        Ros2(path)
+        RosBag(path)
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
@@ -311,13 +392,13 @@ def test_a_bag_that_was_cut_off_or_is_gone(tmp_path, storage):
         open_recording(path)
     file.unlink()
     with pytest.raises(FileNotFoundError, match=f"{file.name}: no such file; .*metadata.yaml names it"):
-        Ros2(path)
+        RosBag(path)
 
 
 def test_an_index_that_lies_is_found_out(tmp_path):
-    path = next(bags.ros2(Drive(steps=2), tmp_path).glob("*.mcap"))
+    path = next(bags.ros(Drive(steps=2), tmp_path).glob("*.mcap"))
     data = path.read_bytes()
     count = data.rindex((2).to_bytes(8, "little"))
     path.write_bytes(data[:count] + (3).to_bytes(8, "little") + data[count + 8 :])
     with pytest.raises(BadFileError, match="no index of its messages, or only of some"):
-        Ros2(path)
+        RosBag(path)

@@ -1,8 +1,8 @@
-"""Bags of ROS 2: clouds of all LiDARs, where they are mounted, where the vehicle was."""
+"""Bags of ROS 1 and 2: clouds of all LiDARs, where they are mounted, where the vehicle was."""
 
 import os
 import warnings
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import ClassVar
 
@@ -12,14 +12,15 @@ from numpy.typing import NDArray
 from torchcover.files import naming
 from torchcover.geometry import invert
 from torchcover.geometry.rigid import Matrix
-from torchcover.recordings.formats.bag import METADATA, SUFFIXES, Bag
+from torchcover.recordings.formats.bag import METADATA, SUFFIXES, Bag, ros1_files
 from torchcover.recordings.formats.frame_tree import FrameTree, frame_name
 from torchcover.recordings.formats.point_cloud2 import CloudMessage, cloud_of
-from torchcover.recordings.formats.ros_poses import TF, WINDOW_NS, VehiclePoses, vehicle_poses
+from torchcover.recordings.formats.ros_poses import WINDOW_NS, VehiclePoses, mounted_transforms, vehicle_poses
 from torchcover.recordings.recording import NO_RETURN_M, Layout, Scan, SensorCalibrations, check_times
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
-VEHICLE_FRAMES = ("base_link", "base_footprint")
+# The first lies on the ground; robots have the second a wheel's radius above it.
+VEHICLE_FRAMES = ("base_footprint", "base_link")
 # Clouds that come so much more rarely than those of the fastest sensor are maps and the like.
 RAREST = 0.25
 # Scans of one instant: none is farther from the first sensor's than this share of the time from one to the next.
@@ -28,19 +29,21 @@ FARTHEST_SCAN = 0.75
 TICK_S = 1e-5
 
 
-class Ros2(Layout):
-    """A bag: a folder with `metadata.yaml` and `.db3` or `.mcap` files, or one such file. Needs `torchcover[ros]`.
+class RosBag(Layout):
+    """A bag: a folder with `metadata.yaml` and `.db3` or `.mcap` files, or with `.bag` files; or one such file.
 
-    The sensors are the topics of `PointCloud2`, named without the first slash, whose frame static transforms link to
-    the vehicle's; an instant is a scan of the one that has fewest, with the nearest of each other. Times are those of
-    recording, poses belong to the stamps of the clouds. Points with a time of their own (a field `t`, `time`,
-    `timestamp`, `time_stamp`, `offset_time` or `time_offset`) are taken as measured and moved to the stamp of
-    their instant; those without as one, too. Scans beyond the first and last pose are left out.
+    The sensors are the topics of `PointCloud2`, named without the first slash, whose frame is mounted on the vehicle's,
+    by tf_static or by transforms of tf that never change; an instant is a scan of the one that has fewest, with the
+    nearest of each other. Times are those of recording, poses belong to the stamps of the clouds. Points with a time of
+    their own (a field `t`, `time`, `timestamp`, `time_stamp`, `offset_time` or `time_offset`) are taken as measured and
+    moved to the stamp of their instant; those without as one, too. Scans beyond the first and last pose are left out.
+    Needs `torchcover[ros]`.
 
     Args:
         path: The folder or the file.
         vehicle_frame: The frame that is the vehicle's: x forward, y left, z up, on the ground. If not given it is
-            `base_link`, or else `base_footprint`.
+            `base_footprint`, or else `base_link`.
+        mounts: Name of a sensor -> (4, 4) `vehicle_T_sensor`, where the bag does not say it, or something else.
 
     Raises:
         FileNotFoundError: A file is missing.
@@ -51,27 +54,37 @@ class Ros2(Layout):
         UserWarning: What was chosen where there was a choice, and clouds that were left out.
     """
 
-    layout: ClassVar[str] = "metadata.yaml and *.db3 or *.mcap, or such a file, with topics of PointCloud2"
-    body = None
+    layout: ClassVar[str] = "metadata.yaml and *.db3 or *.mcap, *.bag, or such a file, with topics of PointCloud2"
 
-    def __init__(self, path: str | os.PathLike[str], vehicle_frame: str | None = None) -> None:
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        vehicle_frame: str | None = None,
+        mounts: Mapping[str, Matrix] | None = None,
+    ) -> None:
         self.path = Path(path)
+        self.told = {
+            "vehicle_frame": vehicle_frame,
+            "mounts": {name: np.asarray(of).tolist() for name, of in (mounts or {}).items()},
+        }
         self._bag = Bag(self.path)
-        with naming(self.path, "a ROS 2 bag"):
-            statics = [topic for topic in self._bag.topics(TF) if topic.endswith("tf_static")]
-            messages = [message for topic in statics for message in self._bag.messages(topic)]
-            tree = FrameTree(one for message in messages for one in message.transforms)
+        with naming(self.path, "a bag"):
             frames = self._frames_of_clouds()
-            self.vehicle_frame = vehicle_frame or _vehicle_frame({*tree.frames, *frames.values()})
-            self._mounts = self._mounted(frames, tree)
+            tree = FrameTree(mounted_transforms(self._bag))
+            self.vehicle_frame = vehicle_frame or _vehicle_frame({*tree.frames, *frames.values()}, mounts or {})
+            self._mounts = self._mounted(frames, tree, mounts or {})
             self.sensors = tuple(self._mounts)
-            self.rigs = {"ros2": self.sensors}
+            self.rigs = {"ros": self.sensors}
             found = vehicle_poses(self._bag, tree, self.vehicle_frame)
             self._poses = found[0] if found else None
             self._logged_ns = self._together()
             self._stamps_ns: dict[int, int] = {}
             self._leave_out_ends()
-            self._say_what_was_chosen([poses.source for poses in found])
+            if vehicle_frame is None and {*VEHICLE_FRAMES} <= tree.frames:
+                self._warn(f"{self.vehicle_frame} is taken for the vehicle's frame, not {VEHICLE_FRAMES[1]}")
+            if len(found) > 1:
+                others = ", ".join(poses.source for poses in found[1:])
+                self._warn(f"poses are taken from {found[0].source}, not from {others}")
             logged_ns = self._logged_ns[self.sensors[0]]
             self.names = tuple(map(str, logged_ns))
             self.times_s = check_times(
@@ -81,6 +94,8 @@ class Ros2(Layout):
     @classmethod
     def recognises(cls, path: Path) -> bool:
         """Whether it is such a folder or file."""
+        if ros1_files(path):
+            return True
         if path.is_dir():
             return (path / METADATA).exists() and any(any(path.glob(f"*{suffix}*")) for suffix in SUFFIXES.values())
         return path.suffix in SUFFIXES.values()
@@ -90,12 +105,12 @@ class Ros2(Layout):
         cloud, stamp_ns = self._cloud(sensor, index)
         source, mount = f"{self.path}: {sensor} at {self._logged_ns[sensor][index]}", self._mounts[sensor]
         if self._poses is None:
-            return Scan(cloud.points_m, mount, source)
+            return Scan(cloud.points_m, mount, source, rows=cloud.rows)
         vehicle_T_world = invert(self._world_T_vehicle(self._poses, index))
         logged_ns = int(self._logged_ns[sensor][index])
         if cloud.offsets_s is None:
             world_T_then = self._poses.at(np.array([stamp_ns]), logged_ns)[0]
-            return Scan(cloud.points_m, vehicle_T_world @ world_T_then @ mount, source)
+            return Scan(cloud.points_m, vehicle_T_world @ world_T_then @ mount, source, rows=cloud.rows)
         # Only what came back: zeros stay zeros, which say that nothing did.
         came = np.flatnonzero((np.abs(cloud.points_m) > NO_RETURN_M).any(axis=1))
         tick, of_point = np.unique(np.rint(cloud.offsets_s[came] / TICK_S).astype(np.int64), return_inverse=True)
@@ -103,7 +118,8 @@ class Ros2(Layout):
         sensor_T_then = (invert(mount) @ vehicle_T_world @ self._poses.at(times_ns, logged_ns) @ mount)[of_point]
         points_m = cloud.points_m.astype(np.float64)
         points_m[came] = np.einsum("nij,nj->ni", sensor_T_then[:, :3, :3], points_m[came]) + sensor_T_then[:, :3, 3]
-        return Scan(points_m, mount, source)
+        offsets_s = cloud.offsets_s + (stamp_ns - self._stamp_ns(index)) * 1e-9
+        return Scan(points_m, mount, source, rows=cloud.rows, offsets_s=offsets_s)
 
     def world_T_vehicle(self, index: int) -> Matrix | None:
         """Where the vehicle was at the stamp of the instant; None in a bag without poses."""
@@ -111,7 +127,7 @@ class Ros2(Layout):
 
     def calibrations(self) -> SensorCalibrations:
         """The mounts."""
-        return SensorCalibrations(f"static transforms to {self.vehicle_frame}", self._mounts)
+        return SensorCalibrations(f"transforms to {self.vehicle_frame}", self._mounts)
 
     def boxes(self, index: int) -> None:
         """None: there are no labels."""
@@ -132,13 +148,23 @@ class Ros2(Layout):
             for topic in often
         }
 
-    def _mounted(self, frames: Mapping[str, str], tree: FrameTree) -> dict[str, Matrix]:
+    def _mounted(self, frames: Mapping[str, str], tree: FrameTree, given: Mapping[str, Matrix]) -> dict[str, Matrix]:
         """Name of each sensor, the one of the fewest scans first -> `vehicle_T_sensor`."""
+        unknown = [name for name in given if self._topic(name) not in frames]
+        if unknown:
+            known = ", ".join(topic.removeprefix("/") for topic in frames)
+            raise ValueError(f"mount of {', '.join(unknown)}: there are clouds of {known}")
+        for name, mount in given.items():
+            tree.add(self.vehicle_frame, frames[self._topic(name)], mount)
         found = {topic: tree.between(self.vehicle_frame, frame) for topic, frame in frames.items()}
+        found |= {self._topic(name): mount for name, mount in given.items()}
         lost = [f"{topic} ({frames[topic]})" for topic, mount in found.items() if mount is None]
         told = f"no static transform links to {self.vehicle_frame} the frame of {', '.join(lost)}"
         if len(lost) == len(found):
-            raise ValueError(f"{told}; static ones are of {', '.join(sorted(tree.frames)) or 'no frames'}")
+            raise ValueError(
+                f"{told}; static ones are of {', '.join(sorted(tree.frames)) or 'no frames'}: name the vehicle's "
+                "(--vehicle-frame), or give mounts (--mount SENSOR=x,y,z,yaw,pitch,roll)"
+            )
         if lost:
             self._warn(f"left out, for {told}")
         return {topic.removeprefix("/"): mount for topic, mount in found.items() if mount is not None}
@@ -165,12 +191,6 @@ class Ros2(Layout):
             )
         self._logged_ns = {sensor: times_ns[inside] for sensor, times_ns in self._logged_ns.items()}
         self._stamps_ns = {}
-
-    def _say_what_was_chosen(self, sources: Sequence[str]) -> None:
-        if len(sources) > 1:
-            self._warn(f"poses are taken from {sources[0]}, not from {', '.join(sources[1:])}")
-        if self.vehicle_frame != VEHICLE_FRAMES[0]:
-            self._warn(f"{self.vehicle_frame} is taken for the vehicle's frame")
 
     def _warn(self, what: str) -> None:
         warnings.warn(f"{self.path}: {what}", stacklevel=5)
@@ -215,10 +235,13 @@ def nearest_of(times_ns: NDArray[np.int64], wanted_ns: NDArray[np.int64]) -> NDA
     return np.where(wanted_ns - times_ns[before] <= times_ns[after] - wanted_ns, before, after)
 
 
-def _vehicle_frame(frames: Collection[str]) -> str:
+def _vehicle_frame(frames: Collection[str], mounts: Collection[str]) -> str:
     for frame in VEHICLE_FRAMES:
         if frame in frames:
             return frame
+    if mounts:
+        return VEHICLE_FRAMES[1]
     raise ValueError(
-        f"the frame {' or '.join(VEHICLE_FRAMES)} of the vehicle is needed; there are {', '.join(sorted(frames))}"
+        f"the frame {' or '.join(VEHICLE_FRAMES)} of the vehicle is needed; there are {', '.join(sorted(frames))}: "
+        "name one (--vehicle-frame), or give mounts (--mount SENSOR=x,y,z,yaw,pitch,roll)"
     )
