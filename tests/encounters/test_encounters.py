@@ -27,7 +27,7 @@ SOLID = Solid(Scenario.model_validate({"name": "s", "ego": EGO, "bodies": [FLOOR
 
 
 def crossing(speed_kmh=36.0, other=None, **keys):
-    other = {"body": "child", "speed_kmh": 5.4, "from_m": 1.5} | (other or {})
+    other = {"body": "child_120cm", "speed_kmh": 5.4, "from_m": 1.5} | (other or {})
     return Encounter.model_validate({"name": "e", "ego": {"speed_kmh": speed_kmh}, "other": other, **keys})
 
 
@@ -114,7 +114,7 @@ def test_rows_of_obstacles_lie_where_the_ego_comes_from_or_beyond(speed_kmh):
 def test_a_bend_ends_at_the_meeting_and_is_as_long_as_its_angle():
     turning = Encounter.model_validate(
         {"name": "t", "ego": {"speed_kmh": 18, "radius_m": 8, "turn_deg": 90}, "seconds": 4,
-         "other": {"body": "child", "speed_kmh": 5, "from_m": 4}}
+         "other": {"body": "child_120cm", "speed_kmh": 5, "from_m": 4}}
     )  # fmt: skip
     staged = Staged(turning, SOLID)
     bend_s = 8 * math.pi / 2 / 5
@@ -178,7 +178,7 @@ def test_points_are_those_of_a_simulation_with_the_other_in_the_world():
         assert len(bodies) == 1 + len(shapes)
         x_m, y_m, _ = vehicle_T_other[:3, 3].tolist()
         yaw_deg = float(euler_from_rotation(vehicle_T_other[:3, :3])[0])
-        actor = {"name": "c", "category": "child", "shape": {"type": "vehicle", "vehicle": "child"},
+        actor = {"name": "c", "category": "child", "shape": {"type": "vehicle", "vehicle": "child_120cm"},
                  "pose": {"x_m": x_m, "y_m": y_m, "yaw_deg": yaw_deg}}  # fmt: skip
         world = Scenario.model_validate({"name": "s", "ego": EGO, "bodies": bodies, "actors": [actor]})
         scans = Simulator(world, {"r": small.rig}, PaperReference(rows=2, columns=2)).step(0).scans["r"]
@@ -241,7 +241,7 @@ def test_fog_hides_what_is_beyond_and_it_is_said_what_was_there_from_the_beginni
 
 
 FAMILY = {
-    "name": "f", "ego": {"speed_kmh": [20, 40]}, "other": {"body": "child", "speed_kmh": {"from": 3, "to": 7},
+    "name": "f", "ego": {"speed_kmh": [20, 40]}, "other": {"body": "child_120cm", "speed_kmh": {"from": 3, "to": 7},
     "at_width": {"from": 0.2, "to": 0.8}, "from_m": 1.5}, "obstacles": [{"body": ["hatchback", "van"]}],
 }  # fmt: skip
 
@@ -284,7 +284,7 @@ def test_rows_are_of_speeds_with_intervals_over_draws():
 def test_in_time_up_to_a_speed_is_in_time_at_all_that_are_slower():
     these = EncounterSet.model_validate(
         {"name": "s", "encounters": [FAMILY | {"ego": {"speed_kmh": [50, 10, 30]}, "obstacles": [], "other":
-         {"body": "child", "speed_kmh": 5, "from_m": 1.5}}]}
+         {"body": "child_120cm", "speed_kmh": 5, "from_m": 1.5}}]}
     )  # fmt: skip
     partly = encounter(rig(high("ahead")), these, phases=5)
     ttc_s = np.sort(partly.sightings[0].ttc_s)
@@ -298,20 +298,26 @@ def test_in_time_up_to_a_speed_is_in_time_at_all_that_are_slower():
 
 
 def test_a_film_shows_where_everybody_is_and_what_is_on_the_other():
-    other = {"body": "child", "speed_kmh": 5, "from_m": 1.5}
+    other = {"body": "child_120cm", "speed_kmh": 5, "from_m": 1.5}
     these = EncounterSet.model_validate({"name": "s", "encounters": [FAMILY | {"other": other}]})
     two = rig(high("ahead"), high("top", columns=40))
     picture = next(encounter_film(two, encounter([two], these, phases=2, vehicle="suv"), vehicle="suv"))
     words = " ".join(text.get_text() for text in picture.findobj(Text))
     assert "s to the collision; points on it: ahead 10, top 0" in words
-    for told in ("at 40 km/h: detected", "first ahead, without ahead", "in time up to", "child (1)", "hatchback (1)"):
+    for told in (
+        "at 40 km/h: detected",
+        "first ahead, without ahead",
+        "in time up to",
+        "child_120cm (1)",
+        "hatchback (1)",
+    ):
         assert told in words
 
 
 MISTAKES = [
-    ({"ego": {"speed_kmh": 0}, "other": {"body": "child", "speed_kmh": 0}}, "nobody moves"),
-    ({"other": {"body": "chidl", "speed_kmh": 5}}, "is 'child' meant"),
-    ({"other": {"body": "child", "speed_kmh": 5, "from_m": -1}}, "from_m"),
+    ({"ego": {"speed_kmh": 0}, "other": {"body": "child_120cm", "speed_kmh": 0}}, "nobody moves"),
+    ({"other": {"body": "child_12cm", "speed_kmh": 5}}, "is 'child_120cm' meant"),
+    ({"other": {"body": "child_120cm", "speed_kmh": 5, "from_m": -1}}, "from_m"),
     ({"ego": {"speed_kmh": []}}, "ego.speed_kmh: a list of values is empty"),
     ({"ego": {"speed_kmh": {"from": 5, "to": 5}}}, "from 5 must be below to 5"),
     ({"ego": {"speed_kmh": {"from": 5, "to": "x"}}}, "two numbers from and to"),
@@ -325,7 +331,7 @@ MISTAKES = [
 
 @pytest.mark.parametrize(("keys", "told"), MISTAKES)
 def test_a_family_that_makes_no_sense_is_told_once(keys, told, tmp_path):
-    family = {"name": "f", "ego": {"speed_kmh": 10}, "other": {"body": "child", "speed_kmh": 5}} | keys
+    family = {"name": "f", "ego": {"speed_kmh": 10}, "other": {"body": "child_120cm", "speed_kmh": 5}} | keys
     path = tmp_path / "set.yaml"
     path.write_text(yaml.safe_dump({"name": "s", "encounters": [family]}))
     with pytest.raises((ValueError, FileNotFoundError), match=told) as failure:

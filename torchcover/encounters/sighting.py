@@ -45,8 +45,8 @@ class Sighting(NamedTuple):
     """What a rig had of an encounter, for P phases of its looks and S sensors; 0 is not before the collision.
 
     `ttc_s` (P,) time to collision at detection, `in_time` (P,) whether that was in time; `sensor_ttc_s` (S, P) of each
-    sensor alone, `without_ttc_s` (S, P) of all others; `from_the_beginning` (P,) whether it was seen as soon as the
-    encounter began, and the other may have been there before.
+    sensor alone, `without_ttc_s` (S, P) of all others. From `open_s` on it was seen as soon as the encounter began, and
+    the other may have been there before: a time to collision is that, or more. It is inf if the other came then.
     """
 
     encounter: "Encounter | Approach"
@@ -55,8 +55,13 @@ class Sighting(NamedTuple):
     in_time: Bools
     sensor_ttc_s: Float64
     without_ttc_s: Float64
-    from_the_beginning: Bools
+    open_s: float
     world: str = ""
+
+    @property
+    def from_the_beginning(self) -> Bools:
+        """(P,) whether it was seen as soon as the encounter began."""
+        return self.ttc_s >= self.open_s
 
 
 class MountedRig:
@@ -142,9 +147,10 @@ def sight_encounter(
     )
     ttc_s, alone_s, without_s = (np.where(steps < NEVER, staged.contact_s - STEP_S * steps, 0.0) for steps in found)
     longest_s = max((criterion.looks / sensor.rate_hz for sensor in sensors), default=0.0)
-    from_the_beginning = (ttc_s > staged.contact_s - longest_s) & (encounter.before_s == encounter.seconds)
+    # Between two whole steps.
+    open_s = staged.contact_s - longest_s + STEP_S / 2 if encounter.before_s == encounter.seconds else math.inf
     in_time = ttc_s >= criterion.needed_s(encounter.closing_mps)
-    return Sighting(encounter, mounted_rig.rig.name, ttc_s, in_time, alone_s, without_s, from_the_beginning)
+    return Sighting(encounter, mounted_rig.rig.name, ttc_s, in_time, alone_s, without_s, open_s)
 
 
 def detections(

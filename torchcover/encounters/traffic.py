@@ -262,4 +262,4 @@ def sight_approach(rig: str, drive: Drive, approach: Approach, eyes: Eyes, crite
     seen = found[0] - begin
     until = int(min(seen[0], end)) + 1 if seen[0] else 0
     in_time = np.array([(approach.ttc_s >= approach.needed_s)[:until].all()])
-    return Sighting(approach, rig, ttc_s, in_time, alone_s, without_s, seen == 0, drive.name)
+    return Sighting(approach, rig, ttc_s, in_time, alone_s, without_s, criterion.within_s, drive.name)

@@ -65,7 +65,7 @@ def encounter(
         ValueError: A file that cannot be used, a number out of its bounds, an encounter that is none.
 
     Example:
-        >>> crossing = {"name": "a", "ego": {"speed_kmh": 30}, "other": {"body": "child", "speed_kmh": 5, "from_m": 2}}
+        >>> crossing = {"name": "a", "ego": {"speed_kmh": 30}, "other": {"body": "adult", "speed_kmh": 5, "from_m": 2}}
         >>> one = EncounterSet.model_validate({"name": "one", "encounters": [crossing]})
         >>> [(row.encounter, row.in_time) for row in encounter("front_roof_32", one, phases=2).rows]
         [('a', 1.0)]

@@ -158,8 +158,7 @@ class VehicleSpace(Readable):
                 continue
             own = (asked.regions or {}) if asked else {}
             region = {one.region: own[one.region]} if one.region in own else one.region
-            lost = (one.without,) if isinstance(one.without, str) else one.without
-            for key in (one.number, *(f"{one.number}_without_{name}" for name in lost)):
+            for key in (one.number, *(f"{one.number}_without_{name}" for name in one.without)):
                 each = Objective(number=key, region=region, band=one.height)
                 found |= {f"{REQUIRED}{each.words}, {bound.words}": (each, bound.value) for bound in one.bounds}
         return found

@@ -37,6 +37,15 @@ _QUOTE = Repr()
 _QUOTE.maxlevel, _QUOTE.maxstring, _QUOTE.maxlong, _QUOTE.maxother = 2, MAX_QUOTED, MAX_QUOTED, MAX_QUOTED
 
 
+# In place of what pydantic says.
+_WORDS = {
+    "model_type": "keys with values are needed",
+    "tuple_type": "a list is needed",
+    "too_short": "at least {min_length} are needed",
+    "too_long": "at most {max_length} are allowed",
+}
+
+
 class Document(BaseModel):
     """Base of everything that is written in YAML: unknown keys, NaN and infinity are errors; values do not change.
 
@@ -205,9 +214,12 @@ def _misspelt(details: Sequence[ErrorDetails]) -> dict[Place, Place]:
 def _told(detail: ErrorDetails, meant: Place | None = None) -> str:
     if meant:
         return f"{'.'.join(map(str, detail['loc']))}: unknown key; {meant[-1]} is meant, which is missing"
-    key = "".join(f"{str(part)[:MAX_QUOTED]}." for part in detail["loc"])  # none of what is about the whole document
+    # None of what is about the whole document; which of several forms was tried is in brackets.
+    key = "".join(f"{str(part)[:MAX_QUOTED]}." for part in detail["loc"] if str(part)[:1] != "(")
     arrived = "" if detail["type"] in ("missing", "value_error") else f" (got {_shorten(detail['input'])})"
-    return f"{key[:-1]}{': ' * bool(key)}{detail['msg'].removeprefix('Value error, ')}{arrived}"
+    said = detail["msg"].removeprefix("Value error, ")
+    words = _WORDS.get(detail["type"], "{}").format(said, **detail.get("ctx", {}))
+    return f"{key[:-1]}{': ' * bool(key)}{words}{arrived}"
 
 
 def _follows_from_another(detail: ErrorDetails) -> bool:
