@@ -36,7 +36,7 @@ def test_the_exit_code_is_the_verdict_on_all(torchcover, worlds, requirements, c
     unknown = "worst: -; margin: -; not kept: 0; not checked: 1; of: 1; no room: 0; the worst is: {}"
     where = "x = 0.00, y = 0.00 m, no room"
     assert (told.get(unknown.format(where)) == where) == ("not checked" in states)
-    assert record["worlds"] == {"bodies": str(worlds / "yard.yaml")}
+    assert record["worlds"] == {"target": str(worlds / "yard.yaml")}
     assert suite.get("failures") == str(states.count("not kept"))
     assert "no homologation" in " ".join(printed.split())
 

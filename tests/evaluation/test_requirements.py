@@ -345,6 +345,6 @@ def test_built_in_sets_say_where_they_are_from_and_that_they_are_no_homologation
     assert found.name == name
     assert "geometry, no homologation" in found.description
     assert "In doubt: " in found.description
-    bodies = found.of_kind(TargetRequirement)
+    bodies = [one for one in found.requirements if isinstance(one, TargetRequirement)]
     assert all((one.points is None) == (one.by == ("camera",)) != (one.pixels is None) for one in bodies)
     assert "memory" not in found.description

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 from xml.etree import ElementTree
@@ -70,8 +71,8 @@ class Checked:
     def tables(self) -> list[PageTable]:
         """One for each rig, with what the requirements say about themselves."""
         name, about = self.requirements.name, self.requirements.description
-        worlds = ", ".join(f"{what} in {world}" for what, world in self.settings.get("worlds", {}).items())
-        notes = [each for each in (about, f"Checked: {worlds}." * bool(worlds), NOTE) if each]
+        worlds = ", ".join(map(" ".join, self.settings["worlds"].items()))
+        notes = [*filter(None, [about]), f"Worlds: {worlds}.", NOTE]
         rows = {rig: [tuple(map(Words, _row(one))) for one in each] for rig, each in self.verdicts.items()}
         return [PageTable(f"{rig}: {name}", HEADINGS, each, notes=notes) for rig, each in rows.items()]
 
@@ -167,12 +168,11 @@ def check(
     called = [loaded(rig).model_copy(update={"name": n}) for rig, n in zip(given, distinct_names(given), strict=True)]
     if not called:
         raise ValueError("check: at least one rig is needed; got none")
-    targets = {one.target: Target.load(one.target) for one in asked.of_kind(TargetRequirement)}
-    for rig in called:  # before the work, not after it
-        for one in asked.requirements:
-            one.failing([sensor.name for sensor in rig.sensors])
-        for each in asked.of_kind(EncounterRequirement):
-            _check_lasts(each, with_ego(free_space(), {rig.name: rig}, vehicle))
+    targets = {one.target: Target.load(one.target) for one in asked.requirements if isinstance(one, TargetRequirement)}
+    for rig, one in product(called, asked.requirements):  # before the work, not after it
+        one.failing([sensor.name for sensor in rig.sensors])
+        if isinstance(one, EncounterRequirement):
+            _check_lasts(one, with_ego(free_space(), {rig.name: rig}, vehicle))
     own: dict[str, Any] = {"vehicle": vehicle, "sensor_model": sensor_model, "seed": seed}
     world, found = scenario or asked.scenario, dict[str, list[Verdict]]()
     for rig in called:
@@ -189,12 +189,9 @@ def check(
                 measured.append(_of_target(one, place, targets[one.target], rig, world, steps=steps, **own))
         found[rig.name] = verdicts(asked, measured)
     name, free = world.name if isinstance(world, Scenario) else str(world or ""), free_space().name
-    worlds = {
-        "regions": asked.of_kind(RegionRequirement) and (name or DEFAULT_SCENARIO),
-        "bodies": asked.of_kind(TargetRequirement) and (name or free),
-        "encounters": asked.of_kind(EncounterRequirement) and free,
-    }
-    told = {"worlds": {what: there for what, there in worlds.items() if there}, "steps": steps, **own}
+    worlds = {"region": name or DEFAULT_SCENARIO, "target": name or free, "encounters": free}
+    kinds = [kind for kind in worlds if any(hasattr(one, kind) for one in asked.requirements)]
+    told = {"worlds": {kind: worlds[kind] for kind in kinds}, "steps": steps, **own}
     return Checked(asked, found, {k: str(v) if isinstance(v, Path) else v for k, v in told.items()})
 
 
@@ -210,7 +207,7 @@ def _check_lasts(one: EncounterRequirement, world: Scenario) -> None:
 
 def _coverage(asked: Requirements, rig: Rig, scenario: AnyScenario | None, **more: Any) -> Coverage | None:  # noqa: ANN401
     """With all numbers of regions that are required; None if none is."""
-    of_regions = asked.of_kind(RegionRequirement)
+    of_regions = [one for one in asked.requirements if isinstance(one, RegionRequirement)]
     if not of_regions:
         return None
     keys = {one.number for one in of_regions}

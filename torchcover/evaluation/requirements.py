@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 import shapely
@@ -28,10 +28,10 @@ from torchcover.coverage.quantity import RADIUS, detection, over_known, seen_by_
 from torchcover.encounters import Criterion, EncounterSet
 from torchcover.geometry import BoundingBox
 from torchcover.simulation import RegionsOfInterest, Sensor, builtin_names
-from torchcover.simulation.documents import Bounds, BuiltIn, Coordinate, Document, NameOrFile, beside, is_file_name
+from torchcover.simulation.documents import SEVERAL, Bounds, BuiltIn, Coordinate, Document, NameOrFile, beside, by_name
 from torchcover.simulation.kinds import SENSORS
-from torchcover.targets import SIDES, TARGETS, Raster
-from torchcover.targets.raster import from_outline_m, side_of
+from torchcover.targets import SIDES, TARGETS
+from torchcover.targets.raster import side_of
 from torchcover.targets.survey import HITS, THRESHOLD_M
 
 Float64 = NDArray[np.float64]
@@ -199,21 +199,20 @@ class BodyPlaces(Document):
         middle_m = (low_m + high_m) / 2 if self.relative_to else np.zeros(2)
         origin_m = middle_m + (high_m - low_m) / 2 * towards
         places_m: Float64 = np.array(self.points_m or (), dtype=np.float64)
-        if self.within_m is not None:
-            self._between(0.0, 2 * self.within_m + float((high_m - low_m).max()))
-            around_m, sides = Raster.around(vehicle, self.within_m, self.step_m).positions_m, self.sides or SIDES
-            near = np.linalg.norm(from_outline_m(vehicle, around_m), axis=1) <= self.within_m
-            places_m = around_m[near & np.isin(side_of(vehicle, around_m), [-1, *map(SIDES.index, sides)])]
-        elif self.line_m is not None:
+        if self.line_m is not None:
             line = shapely.LineString(self.line_m)
             places_m = shapely.get_coordinates(line.interpolate(self._between(0.0, line.length)))
         elif self.points_m is None:
             own_m = np.stack([low_m, high_m], axis=1) - origin_m[:, None]
             (x0, x1), (y0, y1) = self.x_m or own_m[0], self.y_m or own_m[1]
             area = shapely.Polygon(self.polygon_m) if self.polygon_m else shapely.box(x0, y0, x1, y1)
+            area = area.buffer(self.within_m or 0.0)
             x0, y0, x1, y1 = area.bounds
             there_m = np.stack(np.meshgrid(self._between(x0, x1), self._between(y0, y1)), axis=-1).reshape(-1, 2)
-            places_m = there_m[shapely.intersects_xy(area, there_m)]
+            there = shapely.intersects_xy(area, there_m)
+            if self.within_m:
+                there &= np.isin(side_of(vehicle, there_m), [*map(SIDES.index, self.sides or SIDES)])
+            places_m = there_m[there]
         in_vehicle_m: Float64 = origin_m + places_m
         return in_vehicle_m
 
@@ -225,11 +224,7 @@ class BodyPlaces(Document):
         return np.linspace(low_m, high_m, steps + 1)
 
 
-def _several(given: Any) -> Any:  # noqa: ANN401  (whatever stood in the file)
-    return (given,) if isinstance(given, str) else given
-
-
-Names = Annotated[tuple[str, ...], BeforeValidator(_several)]
+Names = Annotated[tuple[str, ...], SEVERAL]
 
 
 class _Requirement(Document):
@@ -275,9 +270,6 @@ def _target(given: Any, info: ValidationInfo) -> Any:  # noqa: ANN401  (whatever
     if isinstance(given, str):
         check_called("target", [given], [*TARGETS, *builtin_names("vehicles")])
     return given
-
-
-R = TypeVar("R", bound=_Requirement)
 
 
 class TargetRequirement(_Requirement):
@@ -413,15 +405,6 @@ class InTime(Document):
     latency_s: NonNegativeFloat = 0.5
 
 
-def _encounters(given: Any, info: ValidationInfo) -> Any:  # noqa: ANN401
-    if isinstance(given, str) and is_file_name(given):
-        return EncounterSet.load(beside(Path(given), info))
-    if isinstance(given, str):
-        check_called("set of encounters", [given], builtin_names("encounters"))
-        return EncounterSet.load(given)
-    return given
-
-
 class EncounterRequirement(_Requirement):
     """When the other must be detected in each encounter of a set: in every phase of the looks, and every draw.
 
@@ -434,7 +417,7 @@ class EncounterRequirement(_Requirement):
         looks: In a row.
     """
 
-    encounters: Annotated[EncounterSet, BeforeValidator(_encounters)]
+    encounters: Annotated[EncounterSet, by_name(EncounterSet)]
     ttc_s: PositiveFloat | None = None
     in_time: InTime | None = None
     points: PositiveInt = Criterion.points
@@ -507,7 +490,3 @@ class Requirements(BuiltIn, RegionsOfInterest):
         if (twice := told.most_common(1)[0])[1] > 1:
             raise ValueError(f"several requirements read {twice[0]!r}; give each a name, or leave all but one out")
         return self
-
-    def of_kind(self, kind: type[R]) -> list[R]:
-        """Those of bodies, of regions, or of encounters."""
-        return [one for one in self.requirements if isinstance(one, kind)]

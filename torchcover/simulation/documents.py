@@ -1,6 +1,7 @@
 """YAML documents: typed, without unknown keys, found by path or by built-in name."""
 
 import hashlib
+import re
 from collections.abc import Sequence
 from difflib import get_close_matches
 from itertools import islice
@@ -35,15 +36,6 @@ Place = tuple[int | str, ...]
 # Looks at no more of a value than it writes: a list of lists of lists may be endless.
 _QUOTE = Repr()
 _QUOTE.maxlevel, _QUOTE.maxstring, _QUOTE.maxlong, _QUOTE.maxother = 2, MAX_QUOTED, MAX_QUOTED, MAX_QUOTED
-
-
-# In place of what pydantic says.
-_WORDS = {
-    "model_type": "keys with values are needed",
-    "tuple_type": "a list is needed",
-    "too_short": "at least {min_length} are needed",
-    "too_long": "at most {max_length} are allowed",
-}
 
 
 class Document(BaseModel):
@@ -217,8 +209,10 @@ def _told(detail: ErrorDetails, meant: Place | None = None) -> str:
     # None of what is about the whole document; which of several forms was tried is in brackets.
     key = "".join(f"{str(part)[:MAX_QUOTED]}." for part in detail["loc"] if str(part)[:1] != "(")
     arrived = "" if detail["type"] in ("missing", "value_error") else f" (got {_shorten(detail['input'])})"
-    said = detail["msg"].removeprefix("Value error, ")
-    words = _WORDS.get(detail["type"], "{}").format(said, **detail.get("ctx", {}))
+    words = detail["msg"].removeprefix("Value error, ")
+    if detail["type"] != "value_error":  # a list is a tuple to us, and keys with values are some class
+        words = re.sub(" after validation| or instance of .*", "", words)
+        words = words.replace("Tuple", "List").replace("tuple", "list")
     return f"{key[:-1]}{': ' * bool(key)}{words}{arrived}"
 
 
@@ -256,6 +250,22 @@ def _named(given: Any, info: ValidationInfo) -> Any:  # noqa: ANN401  (whatever 
 
 NameOrFile = Annotated[str, BeforeValidator(_named), _WRITTEN]
 """The name of a built-in document, or the path of a YAML file, which is meant from the folder of the document."""
+
+
+SEVERAL = BeforeValidator(lambda given: (given,) if isinstance(given, str) else given)
+"""Of a list of words: one stands for a list of one."""
+
+
+def by_name(of: type[BuiltIn]) -> BeforeValidator:
+    """Of a document within another: its name, if it is built in, or its file stand for it."""
+
+    def read(given: Any, info: ValidationInfo) -> Any:  # noqa: ANN401  (whatever stood in the file)
+        try:
+            return of.load(_named(given, info)) if isinstance(given, str) else given
+        except FileNotFoundError as error:
+            raise ValueError(str(error)) from error
+
+    return BeforeValidator(read)
 
 
 def is_file_name(path_or_name: str | Path) -> bool:
