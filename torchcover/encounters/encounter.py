@@ -37,19 +37,17 @@ def _body(content: Any) -> Any:  # noqa: ANN401  (whatever stood in the file)
     return {"type": "vehicle", "vehicle": content} if isinstance(content, str) else content
 
 
+# At the door, and once: a set has few bodies.
+_vehicle = lru_cache(maxsize=64)(Vehicle.load)
+
+
 def _known(shape: Shape) -> Shape:
-    """At the door, and once: a set has few bodies."""
-    if isinstance(shape, VehicleShape):
-        _check_vehicle(shape.vehicle)
-    return shape
-
-
-@lru_cache(maxsize=64)
-def _check_vehicle(name_or_path: str) -> None:
     try:
-        Vehicle.load(name_or_path)
+        if isinstance(shape, VehicleShape):
+            _vehicle(shape.vehicle)
     except FileNotFoundError as error:
         raise ValueError(str(error)) from error
+    return shape
 
 
 AnyBody = Annotated[Shape, BeforeValidator(_body), AfterValidator(_known)]

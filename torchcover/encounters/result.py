@@ -225,18 +225,15 @@ class Sightings:
 
     def bands(self) -> Iterator[tuple[str, dict[str, list[tuple[float, float, float]]], list[tuple[float, float]]]]:
         """For the picture: each encounter; of each rig speed (km/h), least and most time to collision; the needed."""
-        by_name = sorted(self.sightings, key=lambda one: one.encounter.name)
-        of_names = {name: list(group) for name, group in groupby(by_name, key=lambda one: one.encounter.name)}
-        for name in dict.fromkeys(one.encounter.name for one in self.sightings):
-            bands: dict[str, list[tuple[float, float, float]]] = {}
-            for rig in self.sensors:
-                times: dict[float, list[float]] = {}
-                for one in of_names[name]:
-                    if one.rig == rig:
-                        times.setdefault(abs(one.encounter.speed_kmh), []).extend(one.ttc_s.tolist())
-                bands[rig] = [(speed, min(each), max(each)) for speed, each in sorted(times.items())]
-            cases = {abs(one.encounter.speed_kmh): one.encounter.closing_mps for one in of_names[name]}
-            yield name, bands, [(speed, self.criterion.needed_s(mps)) for speed, mps in sorted(cases.items())]
+        found: dict[str, dict[str, dict[float, list[float]]]] = {}
+        needed_s: dict[str, dict[float, float]] = {}
+        for one in self.sightings:
+            name, kmh = one.encounter.name, abs(one.encounter.speed_kmh)
+            found.setdefault(name, {}).setdefault(one.rig, {}).setdefault(kmh, []).extend(one.ttc_s.tolist())
+            needed_s.setdefault(name, {})[kmh] = self.criterion.needed_s(one.encounter.closing_mps)
+        for name, rigs in found.items():
+            ends = {rig: [(kmh, min(t), max(t)) for kmh, t in sorted(each.items())] for rig, each in rigs.items()}
+            yield name, ends, sorted(needed_s[name].items())
 
 
 def _cells(row: EncounterRow) -> list[str]:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal
@@ -34,12 +35,10 @@ from torchcover.report import PageTable, Words, json_record
 from torchcover.simulation import Rig, Scenario, with_ego
 from torchcover.simulation.camera_sensor import CameraSensor
 from torchcover.simulation.moving import Solid
-from torchcover.targets import Spots, Target, survey_places
+from torchcover.targets import Target, survey_places
 from torchcover.targets.survey import THRESHOLD_M
 
 Float64 = NDArray[np.float64]
-# What is judged where a mean would hide a step in which nothing is seen.
-JUDGED = {"points": "least_points", "sensors": "least_sensors"}
 HEADINGS = ("requirement", "", "", "worst", "margin", "not kept", "not checked", "of", "no room", "the worst is")
 NOTE = (
     "A number with an error keeps a bound if all of its 95 % interval does, and does not if none of it does; else it "
@@ -80,8 +79,7 @@ class Checked:
     def record(self) -> dict[str, Any]:
         """All of it, for JSON."""
         rigs = {rig: [json_record(_record(one)) for one in each] for rig, each in self.verdicts.items()}
-        about = {"requirements": self.requirements.name, "description": self.requirements.description}
-        about |= {"torchcover": __version__, **self.settings}
+        about = {"requirements": self.requirements.name, "torchcover": __version__, **self.settings}
         return {**about, "exit_code": self.exit_code, "rigs": rigs}
 
     @property
@@ -171,6 +169,8 @@ def check(
     targets = {one.target: Target.load(one.target) for one in asked.requirements if isinstance(one, TargetRequirement)}
     for rig, one in product(called, asked.requirements):  # before the work, not after it
         one.failing([sensor.name for sensor in rig.sensors])
+        if isinstance(one, TargetRequirement):
+            one.groups(rig.sensors)
         if isinstance(one, EncounterRequirement):
             _check_lasts(one, with_ego(free_space(), {rig.name: rig}, vehicle))
     own: dict[str, Any] = {"vehicle": vehicle, "sensor_model": sensor_model, "seed": seed}
@@ -257,18 +257,15 @@ def _of_target(
 ) -> dict[str, Readings]:  # fmt: skip
     rig, world, usual_steps = in_world(given, scenario, vehicle, sensor_model)
     at_m, groups = place.positions_m(world.ego_box()), one.groups(rig.sensors)
-    every_s, own_steps = spread_s(world, None), (usual_steps > 1 and steps) or usual_steps
-
-    def survey(counting: Sequence[int]) -> Spots:
-        return survey_places(
-            rig, world, target, at_m, counting, steps=own_steps, every_s=every_s, seed=seed, hits=one.hits
-        )
-
+    own_steps = (usual_steps > 1 and steps) or usual_steps
+    of_survey: dict[str, Any] = {"steps": own_steps, "every_s": spread_s(world, None), "seed": seed, "hits": one.hits}
+    survey = partial(survey_places, rig, world, target, at_m, **of_survey)
     values: dict[str, list[Float64]] = {bound.key: [] for bound in one.bounds}
     where: list[str] = []
     for words, group in groups.items():
         seen = survey(group)
-        numbers = {name: getattr(seen, JUDGED.get(name, name)) for name in ("points", "sensors", "seen", "share")}
+        # A mean of the first two would hide a step in which nothing is seen.
+        numbers = {"points": seen.least_points, "sensors": seen.least_sensors, "share": seen.share}
         there = (seen.state == 0) | (place.points_m is not None)
         for (x, y), n in zip(at_m[there].tolist(), seen.steps[there].tolist(), strict=True):
             room = f", room in {n} of {own_steps} steps" * (n < own_steps) if n else ", no room"

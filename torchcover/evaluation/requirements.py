@@ -35,7 +35,6 @@ from torchcover.targets.raster import side_of
 from torchcover.targets.survey import HITS, THRESHOLD_M
 
 Float64 = NDArray[np.float64]
-Share = Annotated[float, Field(gt=0.0, le=1.0)]
 Side = Literal["front", "rear", "left", "right"]
 State = Literal["kept", "not kept", "not checked"]
 Corners = tuple[tuple[Coordinate, Coordinate], ...]
@@ -43,7 +42,8 @@ Corners = tuple[tuple[Coordinate, Coordinate], ...]
 KINDS, ANY = tuple(SENSORS), "any"
 # Of a mean over steps, what rounding makes of it.
 ROUNDING = 1e-9
-MOST_STEPS = 1000
+# Steps to a side of a place, and the worst places that are named.
+MOST_STEPS, TOLD = 1000, 5
 # What tables call numbers whose keys say too little.
 CALLED = {"ttc_s": "seconds to collision", "spare_s": "seconds to spare"}
 # Regions are called alike around any vehicle, and places are about as large.
@@ -99,13 +99,12 @@ class Verdict(NamedTuple):
     no_room: int = 0
 
 
-def verdicts(requirements: "Requirements", measured: Sequence[Mapping[str, Readings]], tell: int = 5) -> list[Verdict]:
+def verdicts(requirements: "Requirements", measured: Sequence[Mapping[str, Readings]]) -> list[Verdict]:
     """Judge every bound: kept if all of every interval keeps it, not kept if all of one does not, else not checked.
 
     Args:
         requirements: What is required.
         measured: Of each requirement in turn, the numbers of its bounds, by key; with none in it, nothing is checked.
-        tell: How many of the worst places to name.
 
     Example:
         >>> child = {"target": "child", "at": {"within_m": 2.0}, "points": 5}
@@ -115,15 +114,15 @@ def verdicts(requirements: "Requirements", measured: Sequence[Mapping[str, Readi
         ('not kept', -2.0, ('behind',))
     """
     pairs = zip(requirements.requirements, measured, strict=True)
-    return [_judged(one.words, bound, numbers[bound.key], tell) for one, numbers in pairs for bound in one.bounds]
+    return [_judged(one.words, bound, numbers[bound.key]) for one, numbers in pairs for bound in one.bounds]
 
 
-def _judged(words: str, bound: Bound, measured: Readings, tell: int) -> Verdict:
+def _judged(words: str, bound: Bound, measured: Readings) -> Verdict:
     sign = 1.0 if bound.is_least else -1.0
     beyond, *ends = (sign * (each - bound.value) for each in measured[:3])
     kept, failed = np.minimum(*ends) >= -ROUNDING, np.maximum(*ends) < -ROUNDING  # NaN is neither
     unknown, order = ~(kept | failed), np.argsort(beyond, kind="stable")  # NaN is last
-    told = order[(failed if failed.any() else unknown if unknown.any() else kept)[order]][:tell].tolist()
+    told = order[(failed if failed.any() else unknown if unknown.any() else kept)[order]][:TOLD].tolist()
     of_worst = (float(each[order[0]]) if len(order) else np.nan for each in (*measured[:3], beyond))
     state: State = "not kept" if failed.any() else "kept" if len(kept) and kept.all() else "not checked"
     (value, low, high, margin), where = of_worst, tuple(measured.where[k] for k in told)
@@ -196,8 +195,7 @@ class BodyPlaces(Document):
         """
         low_m, high_m = np.array(vehicle.lower_m[:2]), np.array(vehicle.upper_m[:2])
         towards = {None: (0, 0), "front": (1, 0), "rear": (-1, 0), "left": (0, 1), "right": (0, -1)}[self.relative_to]
-        middle_m = (low_m + high_m) / 2 if self.relative_to else np.zeros(2)
-        origin_m = middle_m + (high_m - low_m) / 2 * towards
+        origin_m = (low_m + high_m + (high_m - low_m) * towards) / 2 * bool(self.relative_to)
         places_m: Float64 = np.array(self.points_m or (), dtype=np.float64)
         if self.line_m is not None:
             line = shapely.LineString(self.line_m)
@@ -279,11 +277,10 @@ class TargetRequirement(_Requirement):
         target: "child", a built-in vehicle, the YAML file of one, or a mesh, as of `torchcover targets`.
         at: A place, or the name of one of the file's.
         by: Only these sensors count: a name or a kind ("lidar", "camera", "radar"), or several; all if not given.
-        hits: Points that are enough for `sensors`, `seen` and `visual_angle_deg`.
+        hits: Points that are enough for `sensors` and `visual_angle_deg`.
         points: Least number of points on it, in every step.
         pixels: Least number of pixels of the full image of one camera, in every step.
         sensors: Least number of sensors with enough points each, in every step.
-        seen: Least share of the steps with enough points.
         share: Least share of its visible surface within 0.4 m of a point on it, over all steps.
         visual_angle_deg: Least angle from its foot to its top, at a sensor that has enough points in every step.
     """
@@ -298,14 +295,13 @@ class TargetRequirement(_Requirement):
     points: PositiveFloat | None = None
     pixels: PositiveFloat | None = None
     sensors: PositiveInt | None = None
-    seen: Share | None = None
-    share: Share | None = None
+    share: Annotated[float, Field(gt=0.0, le=1.0)] | None = None
     visual_angle_deg: Annotated[float, Field(gt=0.0, lt=180.0)] | None = None
 
     @property
     def bounds(self) -> list[Bound]:
         """What is required."""
-        keys = ("points", "pixels", "sensors", "seen", "share", "visual_angle_deg")
+        keys = ("points", "pixels", "sensors", "share", "visual_angle_deg")
         return [Bound(key, getattr(self, key)) for key in keys if getattr(self, key)]
 
     @model_validator(mode="after")
@@ -325,13 +321,9 @@ class TargetRequirement(_Requirement):
         by = f", by {', '.join(self.by)}" * (self.by != KINDS) + f", hits {self.hits}" * (self.hits != HITS)
         return self.told(f"{Path(TARGETS.get(self.target, self.target)).stem}, {at}{by}")
 
-    def failing(self, sensors: Sequence[str]) -> list[str]:
-        """As of all."""
-        check_called("sensor", self.by, [*sensors, *KINDS])
-        return super().failing(sensors)
-
     def groups(self, sensors: Sequence[Sensor]) -> dict[str, list[int]]:
         """Numbers of the sensors that count, and of those without each that may fail; by what is then said of where."""
+        check_called("sensor", self.by, [*(one.name for one in sensors), *KINDS])
         of_kinds = tuple(of for kind, of in SENSORS.items() if kind in self.by)
         counts = [k for k, one in enumerate(sensors) if one.name in self.by or isinstance(one, of_kinds)]
         names = self.failing([one.name for one in sensors])
@@ -376,13 +368,12 @@ class RegionRequirement(_Requirement):
         known += [one for of in AGGREGATIONS for one in (of.of_keys({self.number}) or of.parse(of.example)).quantities]
         check_called("number of a region", [self.number], [one.key for one in known])
         quantity = next(one for one in known if one.key == self.number)
-        right, wrong = ("most", "least") if quantity.lower_is_better else ("least", "most")
+        better, right, wrong = ("less", "most", "least") if quantity.lower_is_better else ("more", "least", "most")
         if getattr(self, wrong) is not None:
-            better = "less" if quantity.lower_is_better else "more"
             raise ValueError(f"{wrong}: of {self.number} {better} is better; {right} is meant")
-        value, most = getattr(self, right), 1.0 if quantity.unit == "share" else np.inf
-        if value is not None and not 0.0 < value <= most:
-            raise ValueError(f"{right}: {self.number} is above 0{' and at most 1' * (most == 1)}; got {value:g}")
+        most = 1.0 if quantity.unit == "share" else np.inf
+        if any(not 0.0 < bound.value <= most for bound in self.bounds):
+            raise ValueError(f"{self.bounds[0].words}: it is above 0{' and at most 1' * (most == 1)}")
         if self.without and quantity not in both:
             raise ValueError(f"without: radius_m and detections are known without a sensor; got {self.number}")
         return self

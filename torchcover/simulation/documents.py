@@ -244,11 +244,12 @@ PathBeside = Annotated[Path, BeforeValidator(_beside), _WRITTEN]
 """A path in a document; a relative one is meant from the document's folder."""
 
 
-def _named(given: Any, info: ValidationInfo) -> Any:  # noqa: ANN401  (whatever stood in the file)
+def named(given: Any, info: ValidationInfo) -> Any:  # noqa: ANN401  (whatever stood in the file)
+    """The name of a built-in document, or the path of a YAML file, from the folder of the document that has it."""
     return str(beside(Path(given), info)) if isinstance(given, str) and is_file_name(given) else given
 
 
-NameOrFile = Annotated[str, BeforeValidator(_named), _WRITTEN]
+NameOrFile = Annotated[str, BeforeValidator(named), _WRITTEN]
 """The name of a built-in document, or the path of a YAML file, which is meant from the folder of the document."""
 
 
@@ -261,7 +262,7 @@ def by_name(of: type[BuiltIn]) -> BeforeValidator:
 
     def read(given: Any, info: ValidationInfo) -> Any:  # noqa: ANN401  (whatever stood in the file)
         try:
-            return of.load(_named(given, info)) if isinstance(given, str) else given
+            return of.load(named(given, info)) if isinstance(given, str) else given
         except FileNotFoundError as error:
             raise ValueError(str(error)) from error
 
