@@ -13,7 +13,7 @@ import typer
 from torchcover.simulation import builtin_documents
 
 # What one may look for, and why it is not there.
-ABSENT = "Not built in: the places of its cylinders were read in no public text."
+ABSENT = {"FMVSS 111": {"description": "Not built in: the places of its cylinders were read in no public text."}}
 
 
 def run(word: str | None) -> None:
@@ -38,8 +38,7 @@ def run(word: str | None) -> None:
         ("requirements", None),
     ):
         rows = []
-        absent = {"FMVSS 111": {"description": ABSENT}} if kind == "requirements" else {}
-        for name, document in (builtin_documents(kind) | absent).items():
+        for name, document in (builtin_documents(kind) | (ABSENT if kind == "requirements" else {})).items():
             cells = [name, what_of(document)] if what_of else [name]
             description = " ".join(document["description"].split())
             if word is None or word.lower() in " ".join((*cells, description)).lower():

@@ -58,11 +58,6 @@ class Sighting(NamedTuple):
     open_s: float
     world: str = ""
 
-    @property
-    def from_the_beginning(self) -> Bools:
-        """(P,) whether it was seen as soon as the encounter began."""
-        return self.ttc_s >= self.open_s
-
 
 class MountedRig:
     """A rig on its vehicle, for any number of encounters.

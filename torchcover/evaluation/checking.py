@@ -1,6 +1,5 @@
 """Measure all that requirements are about, and judge it: names in, verdicts and their files out."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -119,11 +118,10 @@ def _record(one: Verdict) -> dict[str, Any]:
 
 def _row(one: Verdict) -> tuple[str, ...]:
     ends = " or more" if one.high == np.inf else f" ({one.low:.4g} to {one.high:.4g})" if one.low < one.high else ""
-    value = "-" if math.isnan(one.value) else f"{one.value:.4g}{ends}"
-    margin = "-" if math.isnan(one.margin) else f"{one.margin:+.4g}"
+    numbers = ("-" if each.endswith("nan") else each for each in (f"{one.value:.4g}{ends}", f"{one.margin:+.4g}"))
     counts = map(str, (one.failed, one.unknown, one.count, one.no_room))
     where = one.where[0] if one.where else "nowhere"
-    return one.requirement, one.bound.words, one.state, value, margin, *counts, where
+    return one.requirement, one.bound.words, one.state, *numbers, *counts, where
 
 
 def check(
@@ -233,8 +231,7 @@ def _of_region(one: RegionRequirement, coverage: Coverage, rig: Rig) -> Readings
         agreed = np.isnan(number.error) and estimate.has_intervals[0]  # all blocks say the same
         ends.append((number.value,) * 3 if agreed else (number.value, number.low, number.high))
         where.append(f"{one.region} {one.height}{words.replace('_', ' ')}")
-    value, low, high = np.array(ends).T
-    return Readings(value, low, high, where)
+    return Readings(*np.array(ends).T, where)
 
 
 def _of_encounters(one: EncounterRequirement, rig: Rig, **given: Any) -> dict[str, Readings]:  # noqa: ANN401

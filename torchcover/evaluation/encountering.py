@@ -70,10 +70,9 @@ def encounter(
         >>> [(row.encounter, row.in_time) for row in encounter("front_roof_32", one, phases=2).rows]
         [('a', 1.0)]
     """
-    if phases < 1:
-        raise ValueError(f"phases: a number >= 1 is needed; got {phases}")
-    if seed < 0:
-        raise ValueError(f"seed: a number >= 0 is needed; got {seed}")
+    for name, value, least in (("phases", phases, 1), ("seed", seed, 0)):
+        if value < least:
+            raise ValueError(f"{name}: a number >= {least} is needed; got {value}")
     criterion = Criterion() if criterion is None else criterion
     sensing = _sensing(rigs, sensor_model)
     these = encounters if isinstance(encounters, EncounterSet) else EncounterSet.load(encounters)

@@ -12,7 +12,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 from pydantic import (
-    BeforeValidator,
+    AfterValidator,
     Discriminator,
     Field,
     NonNegativeFloat,
@@ -131,12 +131,8 @@ def _judged(words: str, bound: Bound, measured: Readings) -> Verdict:
     return Verdict(words, bound, state, value, low, high, margin, *counts, where, measured.no_room)
 
 
-def check_called(what: str, given: Iterable[str], known: Iterable[str]) -> None:
-    """Refuse names that nothing has.
-
-    Raises:
-        ValueError: Such a one; with the nearest.
-    """
+def _check_called(what: str, given: Iterable[str], known: Iterable[str]) -> None:
+    """Refuse names that nothing has, with the nearest."""
     names = list(known)
     for name in given:
         if name not in names:
@@ -258,15 +254,14 @@ class _Requirement(Document):
         Raises:
             ValueError: The rig has none of a name.
         """
-        check_called("sensor", self.without, [*sensors, ANY])
+        _check_called("sensor", self.without, [*sensors, ANY])
         return list(sensors if ANY in self.without else self.without)
 
 
-def _target(given: Any, info: ValidationInfo) -> Any:  # noqa: ANN401  (whatever stood in the file)
-    if isinstance(given, str) and Path(given).suffix:
+def _target(given: str, info: ValidationInfo) -> str:
+    if Path(given).suffix:
         return str(beside(Path(given), info))
-    if isinstance(given, str):
-        check_called("target", [given], [*TARGETS, *builtin_names("vehicles")])
+    _check_called("target", [given], [*TARGETS, *builtin_names("vehicles")])
     return given
 
 
@@ -285,7 +280,7 @@ class TargetRequirement(_Requirement):
         visual_angle_deg: Least angle from its foot to its top, at a sensor that has enough points in every step.
     """
 
-    target: Annotated[str, BeforeValidator(_target)]
+    target: Annotated[str, AfterValidator(_target)]
     at: Annotated[
         Annotated[str, Tag("(name)")] | Annotated[BodyPlaces, Tag("(place)")],
         Discriminator(lambda given: "(name)" if isinstance(given, str) else "(place)"),
@@ -323,7 +318,7 @@ class TargetRequirement(_Requirement):
 
     def groups(self, sensors: Sequence[Sensor]) -> dict[str, list[int]]:
         """Numbers of the sensors that count, and of those without each that may fail; by what is then said of where."""
-        check_called("sensor", self.by, [*(one.name for one in sensors), *KINDS])
+        _check_called("sensor", self.by, [*(one.name for one in sensors), *KINDS])
         of_kinds = tuple(of for kind, of in SENSORS.items() if kind in self.by)
         counts = [k for k, one in enumerate(sensors) if one.name in self.by or isinstance(one, of_kinds)]
         names = self.failing([one.name for one in sensors])
@@ -366,7 +361,7 @@ class RegionRequirement(_Requirement):
         both = RADIUS, detection(threshold_m)
         known = [*both, *map(over_known, both), sensors_seeing(threshold_m), seen_by_two(threshold_m)]
         known += [one for of in AGGREGATIONS for one in (of.of_keys({self.number}) or of.parse(of.example)).quantities]
-        check_called("number of a region", [self.number], [one.key for one in known])
+        _check_called("number of a region", [self.number], [one.key for one in known])
         quantity = next(one for one in known if one.key == self.number)
         better, right, wrong = ("less", "most", "least") if quantity.lower_is_better else ("more", "least", "most")
         if getattr(self, wrong) is not None:
@@ -473,10 +468,10 @@ class Requirements(BuiltIn, RegionsOfInterest):
             asked = self.around(SOME_VEHICLE.outline_m)
         for one in self.requirements:
             if isinstance(one, TargetRequirement) and isinstance(one.at, str):
-                check_called("place", [one.at], self.places)
+                _check_called("place", [one.at], self.places)
             if isinstance(one, RegionRequirement):
-                check_called("region", [one.region], [region.name for region in asked.regions])
-                check_called("height band", [one.height], asked.grid.heights)
+                _check_called("region", [one.region], [region.name for region in asked.regions])
+                _check_called("height band", [one.height], asked.grid.heights)
         told = Counter(f"{one.words}: {bound.words}" for one in self.requirements for bound in one.bounds)
         if (twice := told.most_common(1)[0])[1] > 1:
             raise ValueError(f"several requirements read {twice[0]!r}; give each a name, or leave all but one out")
