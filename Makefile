@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lowest lint types doctest docs smoke bench measured paper clean
+.PHONY: demo test lowest versions lint types doctest docs smoke bench measured paper clean
 
 demo: STEPS ?= 24
 demo: $(VENV)/.ready  ## evaluate a built-in rig in city traffic; writes to out/demo
@@ -27,6 +27,9 @@ lowest: $(VENV)/.ready  ## every test with the lowest versions that pyproject.to
 	OMP_NUM_THREADS=1 OMP_WAIT_POLICY=passive $(LOWEST)/bin/python -m pytest --numprocesses auto --dist worksteal \
 	  -W ignore::DeprecationWarning
 
+versions: $(VENV)/.ready  ## docs/measured/versions.md: every test on each version of Python, in systems made for it
+	$(BIN)/python -m benchmarks.measured versions
+
 lint: $(VENV)/.ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -48,7 +51,7 @@ smoke: $(VENV)/.ready  ## the built wheel, in an empty environment outside the r
 bench: $(VENV)/.ready  ## docs/measured/performance.md: speed and memory
 	$(BIN)/python -m benchmarks.measured performance
 
-measured: $(VENV)/.ready  ## the tables and pictures that README and the pages quote, with their pages, within 20 minutes
+measured: $(VENV)/.ready  ## the tables and pictures of docs/measured that are older than the code, cheapest first
 	$(BIN)/python -m benchmarks.measured
 
 paper: STEPS ?= 128

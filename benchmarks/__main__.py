@@ -47,7 +47,8 @@ def main(names):
         sys.exit(f"no benchmark {', '.join(sorted(unknown))}; there are {', '.join(BENCHMARKS)}")
     for name in names or PERFORMANCE:
         module = importlib.import_module(f"benchmarks.{name}")
-        print(f"## {name}: {module.__doc__.splitlines()[0]}\n", flush=True)
+        if len(names) != 1:
+            print(f"## {name}: {module.__doc__.splitlines()[0]}\n", flush=True)
         module.main()
         print(flush=True)
 

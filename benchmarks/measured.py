@@ -1,12 +1,14 @@
 """Make pages of `docs/measured` again: run the commands that stand there, and put what they print below them.
 
-`python -m benchmarks.measured [page ...]`, as in `heights`; without names, those of `QUOTED`: what README and the pages
-on definitions, accuracy and the paper quote and is made within 20 minutes of two cores. A command stands in a block of
-`console`; what it prints goes between `<!-- printed -->` and `<!-- /printed -->` behind the block, with the processor
-time that it took. A page that quotes the first table of another one has it between `<!-- first table of PAGE -->` and
-`<!-- /first table -->`.
+`python -m benchmarks.measured [page ...]`, as in `heights`; without names, all that are older than the code, the
+cheapest first, but for those whose commands need recordings (`SWEEPS`). What was made is not made again, so that it may
+be ended at any time and goes on. `--ages` says how old each is. A command stands in a block of `console`; what it
+prints goes between `<!-- printed -->` and `<!-- /printed -->` behind the block, with the processor time that it took
+and the last commit that changed what is measured. A page that quotes the first table of another one has it between
+`<!-- first table of PAGE -->` and `<!-- /first table -->`.
 """
 
+import argparse
 import os
 import re
 import resource
@@ -17,35 +19,85 @@ from pathlib import Path
 from PIL import Image
 
 ROOT = Path(__file__).parents[1]
-QUOTED = ("heights", "settings", "surface", "error_against_time", "paper", "README")
+# What is measured; whoever changes it makes pages old.
+CODE = ("torchcover", "datasets")
 COMMANDS = re.compile(
     r"(```console\n(?P<commands>[^`]+)```\n\n<!-- printed -->\n)(?:.*?)(<!-- /printed -->\n)", re.DOTALL
 )
+STAMP = re.compile(r"\*Printed in (?P<seconds>\d+) s of processor time(?:, by the code of (?P<commit>[0-9a-f]+))?\.\*")
+# Files that whoever runs the command has to give.
+NEEDED = re.compile(r"(?<![\w/.-])[A-Z]{3,}(?![\w=])")
+# Hours, as root.
+BY_HAND = ("versions",)
 PICTURES = re.compile(r"docs/images/\S+\.png")
 MOST_PIXELS, COLOURS = (1200, 1600), 256
 TABLE = re.compile(r"(<!-- first table of (?P<page>\S+) -->\n\n)(?:.*?)(\n<!-- /first table -->\n)", re.DOTALL)
 
 
-def main(names):
-    docs = ROOT / "docs"
-    pages = [docs / "measured" / f"{name}.md" for name in names or QUOTED]
+def main(words):
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("pages", nargs="*")
+    parser.add_argument("--ages", action="store_true", help="say how old each page is, and make none")
+    asked = parser.parse_args(words)
+    folder = ROOT / "docs" / "measured"
+    pages = [folder / f"{name}.md" for name in asked.pages]
     if missing := [page.stem for page in pages if not page.is_file()]:
         sys.exit(f"no page {', '.join(missing)} in docs/measured")
-    for page in pages:
-        seconds = make(page)
-        print(f"{page.relative_to(ROOT)}: {seconds:.0f} s of processor time", flush=True)
-    for page in docs.glob("*.md"):
-        quote(page)
+    if asked.ages:
+        for page in pages or sorted(folder.glob("*.md")):
+            print(f"{page.stem}: {age_words(page)}")
+        return
+    for page in pages or sorted(filter(is_due, folder.glob("*.md")), key=seconds_of):
+        print(f"{page.relative_to(ROOT)}: {make(page):.0f} s of processor time", flush=True)
+        for quoting in folder.parent.glob("*.md"):
+            quote(quoting)
+
+
+def is_due(page):
+    """Whether a page can be made here, and its tables are older than the code."""
+    blocks = [found["commands"] for found in COMMANDS.finditer(page.read_text(encoding="utf-8"))]
+    can_be = bool(blocks) and page.stem not in BY_HAND and not any(map(NEEDED.search, blocks))
+    return can_be and age(page) != 0
+
+
+def seconds_of(page):
+    """What its tables took, when they were printed; those that were never are last."""
+    stamps = [int(found["seconds"]) for found in STAMP.finditer(page.read_text(encoding="utf-8"))]
+    return sum(stamps) if stamps else float("inf")
+
+
+def age(page):
+    """How many changes of the code are younger than its tables; None if unknown."""
+    commits = [found["commit"] for found in STAMP.finditer(page.read_text(encoding="utf-8"))]
+    counts = [git("rev-list", "--count", f"{commit}..HEAD", "--", *CODE) if commit else "" for commit in commits]
+    return max(map(int, counts)) if counts and all(counts) else None
+
+
+def age_words(page):
+    changes = age(page)
+    if changes is None:
+        return "of unknown age"
+    return f"{changes} changes of the code are younger" if changes else "as new as the code"
+
+
+def git(*words):
+    """What git says; nothing where it does not know."""
+    try:
+        done = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=False)
+    except FileNotFoundError:
+        return ""
+    return "" if done.returncode else done.stdout.strip()
 
 
 def make(page, root=ROOT):
     """Run the commands of a page and write down what they print; the processor time that they took."""
-    times_s = []
+    times_s, commit = [], git("log", "-1", "--format=%h", "--", *CODE)
 
     def printed(found):
         text, seconds = run(found["commands"], root)
         times_s.append(seconds)
-        return f"{found[1]}\n{text}*Printed in {seconds:.0f} s of processor time.*\n\n{found[3]}"
+        of = f", by the code of {commit}" if commit else ""
+        return f"{found[1]}\n{text}*Printed in {seconds:.0f} s of processor time{of}.*\n\n{found[3]}"
 
     text = COMMANDS.sub(printed, page.read_text(encoding="utf-8"))
     for picture in PICTURES.findall(text):

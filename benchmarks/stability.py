@@ -70,7 +70,7 @@ def main():
     """Print a table for each room, and one of the large cases."""
     for title, room in ROOMS.items():
         searches = CPU_SEARCHES if title in SEARCHING else ()
-        print(f"### {title}\n")
+        print(f"## {title}\n")
         header = (
             "case",
             "expected",
@@ -82,7 +82,7 @@ def main():
         )
         table(header, [row(case, searches) for case in room.CASES if not case.benchmark_only])
         print(flush=True)
-    print("### Large\n")
+    print("## Large\n")
     table(("case", "backend", "unit", "bound", "error", "seconds", "MB"), list(large_rows()))
 
 

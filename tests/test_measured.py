@@ -1,12 +1,19 @@
 """Pages of measured tables are made by the commands that stand in them."""
 
+import importlib.util
 import re
+import shlex
+import subprocess
 from pathlib import Path
 
 import pytest
+import typer
 
+import benchmarks.__main__
 from benchmarks import measured
+from torchcover.cli.app import app
 
+COMMANDS = typer.main.get_command(app)
 DOCS = Path(__file__).parent.parent / "docs"
 
 
@@ -17,7 +24,10 @@ def test_what_a_command_prints_takes_the_place_of_what_it_printed_before(tmp_pat
     page.write_text(block.format("\nold\n"), encoding="utf-8")
     for _ in range(2):
         assert measured.make(page, tmp_path) < 5.0
-        assert page.read_text(encoding="utf-8") == block.format("\n| a |\n\n*Printed in 0 s of processor time.*\n\n")
+        text = page.read_text(encoding="utf-8")
+        commit = measured.STAMP.search(text)["commit"]
+        of = f", by the code of {commit}" if commit else ""
+        assert text == block.format(f"\n| a |\n\n*Printed in 0 s of processor time{of}.*\n\n")
 
 
 def test_a_command_that_fails_leaves_its_page_as_it_was(tmp_path):
@@ -30,11 +40,56 @@ def test_a_command_that_fails_leaves_its_page_as_it_was(tmp_path):
     assert "old" in page.read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("name", measured.QUOTED)
-def test_pages_that_are_quoted_say_how_they_were_made(name):
-    text = (DOCS / "measured" / f"{name}.md").read_text(encoding="utf-8")
-    assert measured.COMMANDS.search(text)
-    assert len(measured.COMMANDS.findall(text)) == text.count("<!-- printed -->") == text.count("processor time.*")
+def test_a_page_is_as_old_as_the_changes_of_the_code_since(tmp_path, monkeypatch):
+    def said(*words):
+        done = subprocess.run(["git", "-c", "user.name=a", "-c", "user.email=a@b", *words], cwd=tmp_path, check=True,
+                              capture_output=True, text=True)  # fmt: skip
+        return done.stdout.strip()
+
+    monkeypatch.setattr(measured, "ROOT", tmp_path)
+    page, code = tmp_path / "page.md", tmp_path / "torchcover" / "code.py"
+    code.parent.mkdir()
+    said("init", "--quiet")
+    ages = []
+    for number, (path, changed) in enumerate([(code, "a"), (page, "text"), (code, "b"), (code, "c")]):
+        path.write_text(f"{changed} {number}")
+        said("add", ".")
+        said("commit", "--quiet", "--message", "x")
+        if number == 0:
+            stamp = f"*Printed in 3 s of processor time, by the code of {said('rev-parse', '--short', 'HEAD')}.*"
+        page.write_text(f"```console\n$ echo 1\n```\n\n<!-- printed -->\n{stamp}\n\n<!-- /printed -->\n")
+        ages.append((measured.age(page), measured.is_due(page)))
+    assert ages == [(0, False), (0, False), (1, True), (2, True)]
+    assert measured.seconds_of(page) == 3
+    page.write_text(page.read_text().replace("echo 1", "read SWEEPS"))
+    assert not measured.is_due(page)
+    page.write_text("text")
+    assert measured.age(page) is None
+
+
+def commands_of(page):
+    """The lines of its consoles, each as words."""
+    blocks = re.findall(r"```console\n([^`]+)```", page.read_text(encoding="utf-8"))
+    lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines() if line.startswith("$ ")]
+    return [shlex.split(re.split(r"&&|[|>&]", line[2:])[0], comments=True) for line in lines]
+
+
+@pytest.mark.parametrize("page", sorted((DOCS / "measured").glob("*.md")), ids=lambda page: page.stem)
+def test_commands_of_pages_exist(page):
+    assert page.stem == "README" or commands_of(page)
+    for words in commands_of(page):
+        match words:
+            case ["python", "-m", "benchmarks", *names]:
+                assert set(names[:1]) <= set(benchmarks.__main__.BENCHMARKS)
+            case ["python", "-m", module, *_]:
+                assert importlib.util.find_spec(module), module
+            case ["python", script, *_]:
+                assert (DOCS.parent / script).is_file(), script
+            case ["torchcover", name, *options]:
+                known = {flag for one in COMMANDS.commands[name].params for flag in (*one.opts, *one.secondary_opts)}
+                assert {option for option in options if option.startswith("--")} <= known
+            case [name, *_]:
+                assert name in ("cp", "rm", "cat", "wait", "make"), name
 
 
 def test_quoted_tables_are_those_of_their_pages():

@@ -1,10 +1,12 @@
 """No run is lost: whatever ends it, it goes on from its checkpoint to the same bits."""
 
 import errno
+import json
 import os
 import random
 import signal
 import time
+import zipfile
 
 import numpy as np
 import pytest
@@ -285,5 +287,22 @@ def test_a_damaged_checkpoint_is_named(frame_of, path):
         with pytest.raises(BadFileError, match=r"checkpoint\.npz: "):
             measured(Drive(frame_of), path, steps=3)
     np.savez(path, header=np.array("{}"))
-    with pytest.raises(BadFileError, match="checkpoint format None; this torchcover reads format 1"):
+    with pytest.raises(BadFileError, match="checkpoint format None; this torchcover reads format 2"):
         measured(Drive(frame_of), path, steps=3)
+
+
+def test_an_edited_checkpoint_is_refused(frame_of, path):
+    measured(Drive(frame_of), path, steps=3)
+    with np.load(path) as file:
+        arrays = dict(file)
+    header = json.loads(str(arrays["header"]))
+    header["run"]["steps"] = 9
+    with zipfile.ZipFile(path) as archive:
+        seal = archive.comment
+    for edited in (arrays | {"header": np.array(json.dumps(header))}, dict(list(arrays.items())[1:])):
+        np.savez(path, **edited)
+        for comment in (b"", seal):
+            with zipfile.ZipFile(path, "a") as archive:
+                archive.comment = comment
+            with pytest.raises(BadFileError, match="it was edited, or is damaged; begin anew"):
+                measured(Drive(frame_of), path, steps=3)

@@ -15,6 +15,7 @@ from torchcover.cli import commands
 from torchcover.cli.evaluate import compare, evaluate
 from torchcover.evaluation.cores import set_threads
 from torchcover.evaluation.progress import terminable
+from torchcover.files.shown import shown
 
 app = typer.Typer(
     name="torchcover",
@@ -115,11 +116,11 @@ app.command("list")(commands.list_builtin)
 
 
 def _warn(message: Warning | str, *_: Any, **__: Any) -> None:  # noqa: ANN401  (where in our code: of no use to a user)
-    typer.echo(f"torchcover: warning: {' '.join(str(message).split())}", err=True)
+    typer.echo(f"torchcover: warning: {shown(' '.join(str(message).split()))}", err=True)
 
 
 def _fail(message: str, code: int = MISTAKE) -> None:
-    line = " ".join(message.split())
+    line = shown(" ".join(message.split()))
     if line:  # none where no command was given: the help has been printed
         typer.echo(f"torchcover: {line if len(line) <= MAX_LINE_CHARS else line[:MAX_LINE_CHARS] + ' ...'}", err=True)
     sys.exit(code)

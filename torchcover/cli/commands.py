@@ -211,18 +211,16 @@ def check(
     **settings: Any,  # noqa: ANN401
 ) -> None:
     """Is it enough? Exit code 0: all is checked and kept; 1: something is not kept; 3: something is not checked."""
-    from rich.console import Console
-
     from torchcover.cli.printing import print_files
     from torchcover.evaluation import check
     from torchcover.files import claimed
-    from torchcover.report import print_whole
+    from torchcover.report import Terminal, print_whole
 
     with claimed(out):
         found = check(rigs, requirements, scenario, progress=True, **settings)
         written = found.save(out)
     print_whole(found.tables())
-    print_files(written, out, Console())
+    print_files(written, out, Terminal())
     raise typer.Exit(found.exit_code)
 
 
@@ -251,13 +249,11 @@ def encounter(
     **settings: Any,  # noqa: ANN401
 ) -> None:
     """Would it see the child in time? Of crossings and other encounters: the time to collision at detection."""
-    from rich.console import Console
-
     from torchcover.cli.printing import print_files
     from torchcover.encounters import Criterion
     from torchcover.evaluation import encounter, encounter_film, met_in_recording, met_in_traffic, save_encounters
     from torchcover.files import claimed
-    from torchcover.report import check_film, print_whole, write_film
+    from torchcover.report import Terminal, check_film, print_whole, write_film
 
     criterion = Criterion(**{name: settings.pop(name) for name in Criterion.__annotations__})
     if frames is not None and (rigs or scenario is not None):
@@ -278,7 +274,7 @@ def encounter(
         told = {name: settings.get(name) for name in ("vehicle", "sensor_model")}
         write_film(film, encounter_film((rigs or [])[0], found, **told), per_s=10)
     print_whole(found.tables())
-    print_files(written, out, Console())
+    print_files(written, out, Terminal())
 
 
 @with_options(of_evaluate("sensor_model"))

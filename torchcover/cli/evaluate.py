@@ -182,12 +182,12 @@ def opened(
             if given is not None:
                 raise ValueError(f"--{option}: for a recording, which --frames gives")
         return None
-    from rich.console import Console
     from rich.markup import escape
 
     from torchcover.recordings import RecordedFrames, open_recording, reference_of_recording
+    from torchcover.report import Terminal
 
-    with Console(stderr=True).status(f"opening {escape(str(frames))}"):  # seconds, where there are 100,000 frames
+    with Terminal(stderr=True).status(f"opening {escape(str(frames))}"):  # seconds, where there are 100,000 frames
         recording = open_recording(frames, recording_format)
     return RecordedFrames(
         recording,

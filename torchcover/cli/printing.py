@@ -4,7 +4,6 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.console import Console
 from rich.markup import escape
 
 from torchcover.evaluation import AgreementStudy, MixedResult, Result, Study, relation, verdict
@@ -14,12 +13,12 @@ from torchcover.evaluation.result import sensor_model_words
 from torchcover.evaluation.result_page import left_out_table
 from torchcover.evaluation.study import WANTED
 from torchcover.published.comparison import page_tables
-from torchcover.report import PageTable, Words, print_table, print_whole
+from torchcover.report import PageTable, Terminal, Words, print_table, print_whole
 
 
 def print_result(result: Result, files: Sequence[Path], out: Path, *, explain: bool) -> None:
     """The tables, of several kinds of world one after the other, and where the files are."""
-    console = Console()
+    console = Terminal()
     if isinstance(result, MixedResult):
         for name, world in result.worlds.items():
             console.rule(escape(name))
@@ -31,7 +30,7 @@ def print_result(result: Result, files: Sequence[Path], out: Path, *, explain: b
     print_files(files, out, console)
 
 
-def _print_world(result: Result, console: Console, *, explain: bool) -> None:
+def _print_world(result: Result, console: Terminal, *, explain: bool) -> None:
     print_table(result.table, console)
     if result.metrics:
         print_whole(page_tables(result.metrics, parts=False))
@@ -48,7 +47,7 @@ def _print_world(result: Result, console: Console, *, explain: bool) -> None:
         console.print(line, markup=False, soft_wrap=True)
 
 
-def print_files(files: Sequence[Path], out: Path, console: Console) -> None:
+def print_files(files: Sequence[Path], out: Path, console: Terminal) -> None:
     """Which files were written: in folders, how many."""
     inside = Counter(path.parent.name for path in files if path.parent != out)
     words = [
@@ -60,7 +59,7 @@ def print_files(files: Sequence[Path], out: Path, console: Console) -> None:
 
 def print_study(study: Study, files: Sequence[Path], out: Path) -> None:
     """The tables, and the settings that are recommended."""
-    console = Console()
+    console = Terminal()
     print_whole(study.tables)
     for wanted in WANTED:
         console.print(study.advice(wanted), markup=False, soft_wrap=True)
@@ -72,7 +71,7 @@ DETECTORS_ONLY = "* an interval over detectors only: of worlds there are none, o
 
 def print_agreement(study: AgreementStudy, files: Sequence[Path], out: Path) -> None:
     """How metrics rank the placements, for each thing that detectors say of them, and the notes."""
-    console = Console()
+    console = Terminal()
     truths = list(dict.fromkeys(truth for truth, _ in study.found))
     readings = list(dict.fromkeys(reading for _, reading in study.found))
     tables = []

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import typer
-from rich.console import Console
 
 from torchcover.cli.printing import print_files
 from torchcover.evaluation.cores import usual_workers
@@ -23,7 +22,7 @@ from torchcover.placement import (
 from torchcover.placement.common_instants import WORLDS
 from torchcover.placement.plan import common_instants
 from torchcover.placement.running import CHECKPOINT
-from torchcover.report import print_whole
+from torchcover.report import Terminal, print_whole
 from torchcover.simulation.documents import read_mapping
 
 CHOICE_KEY = "candidates"
@@ -55,7 +54,7 @@ def run(
         if not resume:
             (out / CHECKPOINT).unlink(missing_ok=True)  # there is nothing left that would go on from it
     print_whole(report.tables[:2])
-    console = Console()
+    console = Terminal()
     print_files(written, out, console)
     console.print(report.sentence, markup=False, soft_wrap=True)
 

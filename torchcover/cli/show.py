@@ -6,14 +6,13 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
-from rich.console import Console
 from rich.progress import track
 
 from torchcover.evaluation import cameras_of, rig_pictures, scenario_pictures, vehicle_picture
 from torchcover.evaluation.settings import DEFAULT_SCENARIO
 from torchcover.evaluation.task import as_called
 from torchcover.files import BadFileError, write_durably
-from torchcover.report import check_film, write_film
+from torchcover.report import Terminal, check_film, write_film
 from torchcover.simulation import Scenario, builtin_names
 from torchcover.simulation.bodies import Vehicle
 from torchcover.simulation.documents import read_mapping
@@ -44,7 +43,7 @@ def run(
         ValueError: The name of none or of several, an option for another kind, or a document that is not valid.
         FileNotFoundError: No such file.
     """
-    console, kind = Console(), _kind(name)
+    console, kind = Terminal(), _kind(name)
     if kind == "vehicle":
         given = {"--scenario": scenario, "--rig": rig, "--vehicle": vehicle, "--step": step, "--seed": seed}
         _refuse("rigs and scenarios", given, f"{name!r} is a vehicle")
@@ -79,12 +78,12 @@ def run(
     console.print(f"Wrote {film}", markup=False, soft_wrap=True)
 
 
-def _say(console: Console, description: str) -> None:
+def _say(console: Terminal, description: str) -> None:
     if description:
         console.print(" ".join(description.split()), markup=False, highlight=False)
 
 
-def _write(console: Console, stem: Path, figures: Iterable[tuple[str, Figure]]) -> None:
+def _write(console: Terminal, stem: Path, figures: Iterable[tuple[str, Figure]]) -> None:
     for suffix, figure in figures:
         path = stem.with_name(f"{stem.name}{suffix}.png")
         write_durably(path, partial(figure.savefig, dpi=figure.dpi))

@@ -3,13 +3,11 @@
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
 from torchcover.cli.printing import print_files
 from torchcover.evaluation import save_targets, survey_target
 from torchcover.evaluation.target_survey import places_table, sides_table
 from torchcover.files import claimed
-from torchcover.report import print_whole
+from torchcover.report import Terminal, print_whole
 from torchcover.simulation import Rig
 from torchcover.targets import Heading, Raster, TargetMap
 
@@ -42,7 +40,7 @@ def run(
         )
         written = save_targets(seen, out, Rig.load(rig).sensors, files=files)
     _print(seen)
-    print_files(written, out, Console())
+    print_files(written, out, Terminal())
 
 
 def parsed_raster(text: str) -> Raster:
@@ -77,7 +75,7 @@ def parsed_heading(text: str) -> Heading:
 
 
 def _print(seen: TargetMap) -> None:
-    console = Console()
+    console = Terminal()
     length, width, height = seen.target_size_m
     size = f"{length:.2f} x {width:.2f} x {height:.2f} m"
     console.print(

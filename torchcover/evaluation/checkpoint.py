@@ -3,6 +3,7 @@
 The file is an `.npz` of the states of observers, and a header that says of which run they are.
 """
 
+import hashlib
 import io
 import json
 import math
@@ -27,7 +28,7 @@ from torchcover.files import NpyHeader, check_memory, read_npz, reads, write_dur
 EVERY_S = 60.0
 # Writing takes at most this share of the time, though it may take seconds.
 MOST_TIME = 0.05
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 HEADER = "header"
 # Of NumPy's types: numbers that are real, and truth.
 KINDS = "fiub"
@@ -190,6 +191,9 @@ def read_header(path: Path) -> dict[str, Any]:
     header: dict[str, Any] = json.loads(text)
     if header.get("format") != FORMAT_VERSION:
         raise ValueError(f"checkpoint format {header.get('format')}; this torchcover reads format {FORMAT_VERSION}")
+    with zipfile.ZipFile(path) as archive:
+        if archive.comment != _seal(archive):
+            raise ValueError("its checksum is that of another content: it was edited, or is damaged; begin anew")
     for name, keys in (("identity", ()), ("run", RUN_KEYS), ("states", ())):
         if not isinstance(header.get(name), dict) or not set(keys) <= header[name].keys():
             raise ValueError(f"not a whole checkpoint: {name} is missing, or parts of it")
@@ -214,6 +218,13 @@ def write_states(file: Path | IO[bytes], header: Mapping[str, Any], states: Mapp
         numbers = iter(range(10**9))
         packed = {name: _packed(state, archive, numbers) for name, state in states.items()}
         _add(archive, HEADER, np.array(json.dumps({"format": FORMAT_VERSION, **header, "states": packed})))
+        archive.comment = _seal(archive)
+
+
+def _seal(archive: zipfile.ZipFile) -> bytes:
+    """A checksum of all members, whose own checksums are looked at when they are read."""
+    members = [(one.filename, one.file_size, one.CRC) for one in archive.infolist()]
+    return hashlib.sha256(repr(members).encode()).hexdigest().encode()
 
 
 def _add(archive: zipfile.ZipFile, name: str, array: Array) -> None:

@@ -34,7 +34,8 @@ class Progress:
             return
         # rich takes 0.1 s to import, which nobody should wait for who wants no bar.
         from rich import progress
-        from rich.console import Console
+
+        from torchcover.report import Terminal
 
         self._rich = progress.Progress(
             progress.TextColumn("{task.description}", markup=False),
@@ -44,7 +45,7 @@ class Progress:
             progress.TextColumn("{task.fields[words]}", markup=False),
             progress.TimeRemainingColumn(),
             progress.TextColumn("left"),
-            console=Console(stderr=True),
+            console=Terminal(stderr=True),
         )
         self._task = self._rich.add_task(title, total=steps, completed=done, rate="", words="")
 

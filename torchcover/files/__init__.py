@@ -25,6 +25,7 @@ from torchcover.files.publishing import (
     write_durably,
     written_since,
 )
+from torchcover.files.shown import shown
 from torchcover.files.xml_text import feed_xml, parse_xml
 from torchcover.files.yaml_text import as_yaml, parse_yaml
 
@@ -57,6 +58,7 @@ __all__ = [
     "reads",
     "said_gb",
     "settled",
+    "shown",
     "write_durably",
     "write_npz",
     "written_since",

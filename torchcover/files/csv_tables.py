@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.files.bad_file import check_memory, decode, reads
+from torchcover.files.shown import as_cell, of_cell
 
 # Of a word of a row, once it is an object of Python, for each byte of the file.
 BYTES_PER_BYTE = 20
@@ -52,14 +53,15 @@ def read_csv(
     columns = dict(zip(names, zip(*table, strict=True) if table else [()] * len(names), strict=True))
     return CsvTable(
         {name: _finite(name, columns[name], lines) for name in (*numbers, *(optional or ())) if name in columns},
-        {name: [word.strip() for word in columns[name]] for name in words},
+        {name: [of_cell(word.strip()) for word in columns[name]] for name in words},
     )
 
 
 def csv_text(rows: Iterable[Iterable[object]]) -> str:
-    """Rows as CSV; an empty field for None and NaN, infinity is `inf`."""
+    """Rows as CSV; an empty field for None and NaN, infinity is `inf`, and text is safe to show in a spreadsheet."""
     text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(["" if value != value else value for value in row] for row in rows)
+    cells = (["" if value != value else as_cell(value) for value in row] for row in rows)
+    csv.writer(text, lineterminator="\n").writerows(cells)
     return text.getvalue()
 
 

@@ -44,6 +44,7 @@ from .renderers.layout import BOLD_MARKS as BOLD_MARKS
 from .renderers.layout import PageTable as PageTable
 from .renderers.layout import Words as Words
 from .renderers.layout import parts_of as parts_of
+from .renderers.text_file import Terminal as Terminal
 from .renderers.text_file import print_table as print_table
 from .renderers.text_file import print_whole as print_whole
 from .table import CoverageTable as CoverageTable

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterable, Iterator
 
+from torchcover.files import shown
 from torchcover.report.remarks import marks_on, notes_on
 from torchcover.report.renderers.layout import BOLD_MARKS, PageTable, Words, parts_of
 from torchcover.report.table import CoverageTable
@@ -32,7 +33,7 @@ def _cell(cell: Words) -> str:
 
 
 def _escaped(words: str) -> str:
-    return SPECIAL.sub(r"\\\g<0>", " ".join(words.split()))
+    return SPECIAL.sub(r"\\\g<0>", shown(" ".join(words.split())))
 
 
 def _line(cells: Iterable[str]) -> str:

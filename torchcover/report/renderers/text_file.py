@@ -1,16 +1,18 @@
 """A table as text for a terminal."""
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
 from rich.cells import cell_len
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.measure import Measurement
+from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
+from torchcover.files import shown
 from torchcover.report.remarks import marks_on, notes_on
 from torchcover.report.renderers.layout import PLACE_HEADINGS, PageTable, Words, parts_of
 from torchcover.report.table import CoverageTable
@@ -21,10 +23,19 @@ SIGNS = {"best": "*", "significant": "!"}
 MAX_LINE_CHARS = 10_000
 
 
+class Terminal(Console):
+    """Rich's console, on which control characters in names of others are shown and not obeyed."""
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
+        """What is to be printed: our own control codes, such as a cursor's, are segments of their own."""
+        for segment in super().render(renderable, options):
+            yield segment if segment.control else segment._replace(text=shown(segment.text))
+
+
 def render(table: CoverageTable) -> str:
     """The table as it is printed where lines may be as long as they like."""
     file = io.StringIO()
-    print_table(table, Console(file=file, width=1))
+    print_table(table, Terminal(file=file, width=1))
     return file.getvalue()
 
 
@@ -35,7 +46,7 @@ def print_table(table: CoverageTable, console: Console | None = None) -> None:
         table: The table.
         console: Where to; the terminal if not given.
     """
-    console = console or Console()
+    console = console or Terminal()
     tables = rich_tables(table)
     if console.is_terminal and narrowest_width(tables) > console.width:
         tables = rich_tables(table, two_lines=True)
@@ -73,7 +84,7 @@ def rich_tables(table: CoverageTable, *, two_lines: bool = False) -> list[Table]
 
 def print_whole(tables: Sequence[PageTable]) -> None:
     """Print tables as wide as they are: rather lines that are too long than numbers that are cut off."""
-    console, whole = Console(), [_in_words(table) for table in tables]
+    console, whole = Terminal(), [_in_words(table) for table in tables]
     console.width = max(console.width, narrowest_width(whole))
     for table in whole:
         console.print(table)

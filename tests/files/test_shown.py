@@ -1,0 +1,53 @@
+"""What others named is shown, and nothing more."""
+
+import csv
+import io
+
+import pytest
+
+from torchcover.files import csv_text, read_csv, shown
+from torchcover.report import Terminal
+
+NASTY = (
+    "=1+1",
+    "+cmd|' /C calc'!A0",
+    "-2+3",
+    "@SUM(A1)",
+    "\tx",
+    "\x1b]0;title\x07",
+    "a\x9bb",
+    "\u202egnp.exe",
+    "'=quoted",
+)
+
+
+@pytest.mark.parametrize("name", NASTY)
+def test_names_are_no_formulas_and_no_control_codes(name):
+    ((cell,),) = csv.reader(io.StringIO(csv_text([[name]])))
+    assert cell[0] not in "=+-@\t\r"
+    assert all(letter.isprintable() or letter == "\t" for letter in cell)
+
+
+def test_numbers_stay_numbers():
+    values = [-1.5, 3, "-0.25", "+1e-9", "-inf", None, float("nan"), "roof", "front left", "ü"]
+    ((*cells,),) = csv.reader(io.StringIO(csv_text([values])))
+    assert cells == ["-1.5", "3", "-0.25", "+1e-9", "-inf", "", "", "roof", "front left", "ü"]
+
+
+def test_a_name_that_begins_like_a_formula_comes_back(tmp_path):
+    names = ["=1+1", "-x", "'plain'", "'=quoted", "car"]
+    path = tmp_path / "names.csv"
+    path.write_text(csv_text([["name"], *([name] for name in names)]), encoding="utf-8")
+    assert read_csv(path, (), ["name"]).words["name"] == names
+
+
+def test_terminals_show_control_characters(capsys):
+    terminal = Terminal(width=60, force_terminal=True)
+    terminal.print("roof\x1b[2J\x1b]0;mine\x07", markup=False, highlight=False)
+    terminal.print("two\nlines\x9b", highlight=False)
+    assert "\\x1b[2J\\x1b]0;mine" in (printed := capsys.readouterr().out)
+    assert "two\nlines\\x9b" in printed
+    assert shown("two\nlines, ü, 車") == "two\nlines, ü, 車"
+    with terminal.status("opening"):  # whose own codes hide the cursor
+        pass
+    assert "\x1b[?25l" in capsys.readouterr().out
