@@ -58,7 +58,7 @@ class Checked:
 
     requirements: Requirements
     verdicts: Mapping[str, Sequence[Verdict]]
-    settings: Mapping[str, object]
+    settings: Mapping[str, Any]
 
     @property
     def exit_code(self) -> int:
@@ -68,11 +68,10 @@ class Checked:
 
     def tables(self) -> list[PageTable]:
         """One for each rig, with what the requirements say about themselves."""
-        name, about = self.requirements.name, self.requirements.description
-        worlds = ", ".join(map(" ".join, self.settings["worlds"].items()))
-        notes = [*filter(None, [about]), f"Worlds: {worlds}.", NOTE]
+        asked, worlds = self.requirements, ", ".join(map(" ".join, self.settings["worlds"].items()))
+        notes = [*filter(None, [asked.description]), f"Worlds: {worlds}.", NOTE]
         rows = {rig: [tuple(map(Words, _row(one))) for one in each] for rig, each in self.verdicts.items()}
-        return [PageTable(f"{rig}: {name}", HEADINGS, each, notes=notes) for rig, each in rows.items()]
+        return [PageTable(f"{rig}: {asked.name}", HEADINGS, each, notes=notes) for rig, each in rows.items()]
 
     @property
     def record(self) -> dict[str, Any]:
@@ -195,8 +194,8 @@ def check(
 
 def _check_lasts(one: EncounterRequirement, world: Scenario) -> None:
     ego = Solid(world.ego_mesh())
-    for case in one.encounters.encounters if one.ttc_s else ():
-        if one.ttc_s > (lasts_s := Staged(case, ego).contact_s):
+    for case in one.encounters.encounters:
+        if one.ttc_s and one.ttc_s > (lasts_s := Staged(case, ego).contact_s):
             raise ValueError(
                 f"ttc_s: {one.ttc_s:g} s are required, and {case.words} of {one.encounters.name!r} lasts "
                 f"{lasts_s:.2f} s; require less, or let it begin earlier (seconds, other.from_m)"
@@ -231,7 +230,8 @@ def _of_region(one: RegionRequirement, coverage: Coverage, rig: Rig) -> Readings
         agreed = np.isnan(number.error) and estimate.has_intervals[0]  # all blocks say the same
         ends.append((number.value,) * 3 if agreed else (number.value, number.low, number.high))
         where.append(f"{one.region} {one.height}{words.replace('_', ' ')}")
-    return Readings(*np.array(ends).T, where)
+    value, low, high = np.array(ends).T
+    return Readings(value, low, high, where)
 
 
 def _of_encounters(one: EncounterRequirement, rig: Rig, **given: Any) -> dict[str, Readings]:  # noqa: ANN401
@@ -260,7 +260,7 @@ def _of_target(
     values: dict[str, list[Float64]] = {bound.key: [] for bound in one.bounds}
     where: list[str] = []
     for words, group in groups.items():
-        seen = survey(group)
+        seen = survey(counting=group)
         # A mean of the first two would hide a step in which nothing is seen.
         numbers = {"points": seen.least_points, "sensors": seen.least_sensors, "share": seen.share}
         there = (seen.state == 0) | (place.points_m is not None)
@@ -270,7 +270,7 @@ def _of_target(
         for key in ("pixels", "visual_angle_deg"):
             numbers[key] = np.where(seen.state == 0, 0.0, np.nan)
         for k in group if one.pixels or one.visual_angle_deg else ():  # of each sensor alone
-            points, sensor = survey([k]).least_points, rig.sensors[k]
+            points, sensor = survey(counting=[k]).least_points, rig.sensors[k]
             x_m, y_m, z_m = sensor.mount.matrix()[:3, 3]
             away_m = np.hypot(*(at_m - (x_m, y_m)).T)
             angle = np.arctan2(target.solid.box.size_m[2] - z_m, away_m) + np.arctan2(z_m, away_m)

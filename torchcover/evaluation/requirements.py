@@ -425,7 +425,7 @@ class EncounterRequirement(_Requirement):
     @property
     def words(self) -> str:
         """In which encounters, and by what."""
-        given = {key: getattr(self, key) for key in ("points", "pixels", "looks") if key in self.model_fields_set}
+        given: dict[str, float] = self.model_dump(include=self.model_fields_set & {"points", "pixels", "looks"})
         given |= self.in_time.model_dump() if self.in_time else {}
         return self.told(", ".join((self.encounters.name, *(f"{key} {value:g}" for key, value in given.items()))))
 
