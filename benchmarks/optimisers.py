@@ -86,7 +86,7 @@ def main(arguments=()):
     options = parser.parse_args(arguments)
     rows = []
     for numbers in map(int, options.numbers.split(",")):
-        found = {}
+        found, asked = {}, {}
         for name in options.optimisers.split(","):
             if options.scenario:
                 runs = [
@@ -95,11 +95,12 @@ def main(arguments=()):
             else:
                 costs = options.budget_s, options.candidate_s
                 runs = [on_surface(name, numbers, seed, *costs) for seed in range(options.seeds)]
-            found[name], asked = np.array(runs).T
-            against = found[name] - found["random"] if "random" in found else found[name] * np.nan
+            found[name], asked[name] = np.array(runs).T
+        for name, each in found.items():
+            against = each - found.get("random", np.nan)
             error = against.std(ddof=1) / np.sqrt(len(against))
-            left = f"{np.median(found[name]):.2f}", f"{found[name].mean():.2f}"
-            rows.append((numbers, name, f"{asked.mean():.0f}", *left, f"{against.mean():+.2f} ± {error:.2f}"))
+            left = f"{np.median(each):.2f}", f"{each.mean():.2f}"
+            rows.append((numbers, name, f"{asked[name].mean():.0f}", *left, f"{against.mean():+.2f} ± {error:.2f}"))
     table(("numbers", "optimiser", "candidates", "left below (median)", "mean", "more than random's ± error"), rows)
 
 

@@ -298,6 +298,7 @@ def test_list_names_everything_built_in_and_what_it_is_made_of(torchcover):
     assert said["nuscenes_cameras"].startswith("6 cameras  The six cameras of the nuScenes cars (Renault Zoe)")
     assert said["velodyne_vlp16"].startswith("16 rows, 100 m   Velodyne VLP-16.")
     assert said["courtyard"].startswith("static")
+    assert said["FMVSS"].startswith("111 ")
 
 
 def test_list_with_a_word_prints_what_has_it_and_all_that_is_said_of_it(torchcover):

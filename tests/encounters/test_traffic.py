@@ -136,7 +136,7 @@ def test_the_answer_is_that_of_looking_all_the_time(driven):
             assert found.sensor_ttc_s[:, 0].tolist() == [ttc_s(step) for step in detected]
             assert found.ttc_s[0] == ttc_s(min(detected))  # of three rates or kinds: none counts with another
             assert found.without_ttc_s[1, 0] == ttc_s(min(detected[0], detected[2]))
-            assert found.from_the_beginning[0] == (min(detected) == one.step)
+            assert (found.ttc_s[0] >= found.open_s) == (min(detected) == one.step)
             until = min(min(detected) - one.step + 1, len(one.ttc_s)) if min(detected) > one.step else 0
             needed = one.ttc_s < one.needed_s
             assert (found.in_time[0] == (not needed[:until].any())) if needed.any() else np.isnan(found.in_time[0])
@@ -221,7 +221,7 @@ def test_the_nearest_time_until_detection_counts_though_it_grew_again(seen_from,
     on_it, about_it = [[9.0, 0.0, 1.0]], [[9.0, 0.0, 1.52], [9.0, 0.0, 0.0], [12.02, 0.0, 1.0], [9.0, -1.02, 1.0]]
     eyes = Eyes([1], [1], [1], [1], lambda step, _: [np.array(about_it + on_it * (step >= seen_from))])
     found = sight_approach("r", there, one, eyes, Criterion(points=1, looks=1))
-    assert (found.ttc_s[0], found.in_time[0], found.from_the_beginning[0]) == (ttc_s, in_time, seen_from == 0)
+    assert (found.ttc_s[0], found.in_time[0], (found.ttc_s[0] >= found.open_s)) == (ttc_s, in_time, seen_from == 0)
     assert found.without_ttc_s[0, 0] == 0
     # Whoever needs more than was asked about may have been too late before.
     early = one._replace(needed_s=np.full(4, 4.1))
@@ -257,7 +257,7 @@ def test_a_recording_of_a_world_says_the_same(scenario, tmp_path):
         assert one.encounter.ttc_s == pytest.approx(other.encounter.ttc_s, abs=1e-5)
         assert one.ttc_s == pytest.approx(other.ttc_s, abs=1e-5)
         assert np.array_equal(one.in_time, other.in_time, equal_nan=True)
-        assert one.from_the_beginning == other.from_the_beginning
+        assert (one.ttc_s[0] >= one.open_s) == (other.ttc_s[0] >= other.open_s)
     assert 0 < found.sightings[0].ttc_s[0] < 4
 
 

@@ -1,19 +1,23 @@
 """Requirements: what keeps a bound, where bodies are put, what is measured there, and what says nothing."""
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
-from tests.targets.worlds import lidar, rig, world
+from tests.targets.worlds import drive, lidar, rig, world
 from torchcover.encounters import Criterion
 from torchcover.evaluation import Readings, Requirements, check, encounter, evaluate, verdicts
-from torchcover.evaluation.requirements import BodyPlaces
+from torchcover.evaluation.requirements import BodyPlaces, TargetRequirement
 from torchcover.geometry import BoundingBox
 from torchcover.simulation import RegionsOfInterest, builtin_names
+from torchcover.simulation.documents import explain
 from torchcover.targets import SIDES, Raster, Target, survey
 
 CAR = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))
+NEAR = {"region": "20m", "height": "ground"}
 AHEAD = {"target": "child", "at": {"points_m": [[5.0, 0.0]]}, "points": 5}
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -51,6 +55,9 @@ LEAST, MOST = ("detection_0.4m", 0.9, None), ("radius_m", None, 0.5)
         (LEAST, [np.nan, 0.95], None, None, "not checked", 1, ("0",)),
         (LEAST, [np.nan, 0.1], None, None, "not kept", 1, ("1",)),
         (LEAST, [], None, None, "not checked", None, ()),
+        (LEAST, [0.95, 0.85], [0.95, 0.85], [np.inf, np.inf], "not checked", 1, ("1",)),
+        (LEAST, [0.95], [0.95], [np.inf], "kept", 0, ("0",)),
+        (LEAST, [0.95, 0.8, 0.85], [0.95, 0.8, 0.85], [np.inf, np.inf, 0.85], "not kept", 1, ("2",)),
         (MOST, [0.4], [0.3], [0.49], "kept", 0, ("0",)),
         (MOST, [0.4, 0.45], [0.3, 0.4], [0.49, 0.51], "not checked", 1, ("1",)),
         (MOST, [0.4, 0.7, np.inf], None, None, "not kept", 2, ("2", "1")),
@@ -63,7 +70,8 @@ def test_a_bound_is_kept_where_all_of_the_interval_is_known_to_keep_it(bound, va
         assert np.isnan([found.value, found.margin]).all()
     else:
         sign, limit = (1, bound[1]) if bound[1] else (-1, bound[2])
-        np.testing.assert_allclose([found.value, found.margin], [value[worst], sign * (value[worst] - limit)])
+        margin = np.nan if state == "not checked" else sign * (value[worst] - limit)
+        np.testing.assert_allclose([found.value, found.margin], [value[worst], margin])
 
 
 def test_bodies_are_put_where_a_place_says():
@@ -103,23 +111,27 @@ def test_bodies_are_put_where_a_place_says():
         ({**AHEAD, "at": {"polygon_m": [[0, 0], [1, 1], [1, 0], [0, 1]]}}, "its sides cross"),
         (
             {**AHEAD, "by": ["a", "b"], "sensors": 3},
-            "contradict each other: child, .*, by a, b: .* sensors >= 3",
+            "contradict each other: child_110cm, .*, by a, b: .* sensors >= 3",
         ),
+        ({**AHEAD, "by": ["a", "a"], "sensors": 2}, "contradict each other"),
+        ({**AHEAD, "by": ["a", "b"], "sensors": 2, "without": "any"}, "contradict each other"),
+        ({**AHEAD, "by": "a", "without": "a"}, "contradict each other"),
         ({**AHEAD, "by": "lidar", "pixels": 3}, "contradict each other"),
+        ({**AHEAD, "sensors": 1.5}, "sensors"),
+        ({**AHEAD, "visual_angle_deg": 400}, "visual_angle_deg"),
+        ({**AHEAD, "at": {"within_m": 1000}}, r"a place of 2004 m in steps of 0\.2 m; take a larger step_m"),
         ({"within_m": 1}, "give target, region or encounters"),
         ({"region": "front_3", "height": "ground", "number": "radius_m", "most": 1}, "is 'front_3m' meant"),
         ({"region": "20m", "height": "grund", "number": "radius_m", "most": 1}, "no height band .* is 'ground' meant"),
         ({"region": "20m", "height": "ground", "number": "radius", "most": 1}, "is 'radius_m' meant"),
-        ({"region": "20m", "height": "ground", "number": "radius_m"}, "nothing is required"),
-        (
-            {"region": "20m", "height": "ground", "number": "detection_0.4m", "least": 90},
-            "a share of at most 1; got 90",
-        ),
-        (
-            {"region": "20m", "height": "ground", "number": "radius_m", "most": 1, "least": 2},
-            "at least 2 and at most 1",
-        ),
-        ({"region": "20m", "height": "ground", "number": "radius_maximum_m", "most": 1, "without": "any"}, "without: "),
+        ({**NEAR, "number": "radius_m"}, "nothing is required"),
+        ({**NEAR, "number": "detection_0.4m", "least": 90}, r"detection_0\.4m >= 90: it is above 0 and at most 1"),
+        ({**NEAR, "number": "detection_0.40m", "least": 0.9}, r"is 'detection_0\.4m' meant"),
+        ({**NEAR, "number": "radius_q0.90_m", "most": 1}, r"is 'radius_q0\.9_m' meant"),
+        ({**NEAR, "number": "detection_0.4m", "most": 0.5}, "most: of detection_0.4m more is better; least is meant"),
+        ({**NEAR, "number": "radius_maximum_m", "least": 0.5}, "least: of radius_maximum_m less is better"),
+        ({**NEAR, "number": "radius_m", "most": -1}, "radius_m <= -1: it is above 0"),
+        ({**NEAR, "number": "radius_maximum_m", "most": 1, "without": "any"}, "without: "),
         ({"encounters": "crosing_like", "ttc_s": 1}, "is 'crossing_like' meant"),
         ({"encounters": "crossing_like"}, "nothing is required"),
     ],
@@ -129,11 +141,31 @@ def test_a_requirement_that_says_nothing_is_an_error(requirement, message):
         asked(requirement, places={"kerb": {"points_m": [[3, 0]]}})
 
 
-def test_requirements_that_contradict_each_other_are_an_error():
-    one = {"region": "20m", "height": "ground", "number": "radius_m"}
-    asked({**one, "least": 0.1}, {**one, "most": 0.2}, {**one, "height": "obstacle", "most": 0.05})
-    with pytest.raises(ValueError, match=r"20m ground radius_m is to be at least 0\.3 and at most 0\.2"):
-        asked({**one, "least": 0.1}, {**one, "most": 0.2}, {**one, "least": 0.3})
+def test_requirements_that_read_alike_are_told_apart_or_refused():
+    """What differs stands in their words: by them tables and JUnit call them."""
+    asked(AHEAD, {**AHEAD, "hits": 3}, {**AHEAD, "name": "again"}, {**AHEAD, "points": 6}, {**AHEAD, "by": "lidar"})
+    late = {"encounters": "crossing_like", "in_time": {"deceleration": 9}}
+    found = asked({**late, "looks": 1}, {**late, "points": 3}, {**late, "in_time": {"deceleration": 4}})
+    assert len({one.words for one in found.requirements}) == 3
+    with pytest.raises(ValueError, match=r"several requirements read 'child_110cm, .*: points >= 5'; give each a name"):
+        asked(AHEAD, {**AHEAD, "target": "child_110cm"})
+
+
+@pytest.mark.parametrize(
+    "one",
+    [
+        *({**AHEAD, key: 3} for key in ("by", "at", "without", "target", "shape")),
+        *({**AHEAD, "at": at} for at in ({"x": 1}, {"points_m": [[1, 2, 3]]}, {"polygon_m": [[1, 2]]})),
+        {"encounters": 3, "ttc_s": 1},
+        {"encounters": "crossing_like", "in_time": True},
+    ],
+)
+def test_messages_are_about_keys_of_the_file_and_not_of_the_program(one):
+    with pytest.raises(ValidationError) as told:
+        asked(one)
+    words = explain(told.value)
+    assert words.startswith("requirements.0.")
+    assert not re.search(r"\(place\)|tuple|literal|function|instance|validation|\.str", words.partition(" (got")[0])
 
 
 @pytest.mark.parametrize(
@@ -174,7 +206,9 @@ def test_what_is_judged_is_what_a_survey_sees():
         "hits": 1,
     }
     requirements = asked(
-        one, {**one, "by": ["lidar"], "pixels": None}, {**one, "by": "top", "pixels": None, "without": "any"}
+        one,
+        {**one, "by": ["lidar"], "pixels": None},
+        {**one, "by": ["top", "mast"], "pixels": None, "without": "mast"},
     )
     found = check(THREE, requirements, world()).verdicts["small"]
     all_of, lidars, top = found[:5], found[5:9], found[9:]
@@ -197,8 +231,18 @@ def test_where_a_body_cannot_stand_a_point_is_unknown_and_an_area_goes_without()
     nowhere = {**AHEAD, "at": {"x_m": [-1, 1], "y_m": [0, 0.1]}}
     found = check(rig(lidar(channels=61)), asked(inside, near, nowhere), world()).verdicts["small"]
     assert [(one.state, one.unknown) for one in found] == [("not checked", 1), ("kept", 0), ("not checked", 0)]
-    assert found[0].where == ("x = 0.00, y = 0.00 m",)
+    assert found[0].where == ("x = 0.00, y = 0.00 m, no room",)
     assert 0 < found[1].count < 2 * 26
+    assert [one.no_room for one in found] == [0, 52 - found[1].count, 22]
+
+
+def test_it_is_said_in_how_many_steps_a_body_had_room(tmp_path):
+    """A box drives over the place and is there in two of four steps."""
+    passing = {"name": "p", "category": "car", "shape": {"type": "box", "size_m": [2.0, 1.0, 1.0]},
+               "trajectory": drive(tmp_path, (0, 5, 0, 0), (2, 13, 0, 0))}  # fmt: skip
+    there = world(actors=[passing], duration_s=2.0, time_step_s=0.5)
+    (found,) = check(rig(lidar(channels=61)), asked(AHEAD), there, steps=4).verdicts["small"]
+    assert (found.state, found.where) == ("kept", ("x = 5.00, y = 0.00 m, room in 3 of 4 steps",))
 
 
 def test_a_kind_that_the_rig_has_not_sees_nothing_and_a_place_that_holds_nobody_is_not_checked():
@@ -228,10 +272,15 @@ def test_numbers_of_regions_are_those_of_evaluate():
     assert found[0].where[0] == "near ground without front"
 
 
-def test_times_to_collision_are_the_latest_of_all_phases(tmp_path):
-    box = tmp_path / "box.yaml"
-    box.write_text("name: box\nparts: [{name: b, shape: {type: box, size_m: [4, 2, 1]}}]\n")
-    walker = {"body": "child", "speed_kmh": 5, "from_m": 4}
+@pytest.fixture
+def box(tmp_path):
+    path = tmp_path / "box.yaml"
+    path.write_text("name: box\nparts: [{name: b, shape: {type: box, size_m: [4, 2, 1]}}]\n")
+    return path
+
+
+def test_times_to_collision_are_the_latest_of_all_phases(box):
+    walker = {"body": "child_120cm", "speed_kmh": 5, "from_m": 4}
     crossings = {"name": "two", "encounters": [{"name": "a", "ego": {"speed_kmh": [10, 30]}, "other": walker}]}
     looks = {"points": 1, "pixels": 20, "looks": 2}
     one = {
@@ -252,6 +301,25 @@ def test_times_to_collision_are_the_latest_of_all_phases(tmp_path):
     assert "at 30 km/h" in spare.where[0]
 
 
+def test_who_is_seen_from_the_beginning_may_have_been_before(box):
+    """So more than that is neither kept nor not, with a sensor lost, too; and nothing has more than the whole."""
+    way = {"name": "a", "ego": {"speed_kmh": 20}, "other": {"body": "adult", "speed_kmh": 5}, "seconds": 1.2}
+    one = {"encounters": {"name": "short", "encounters": [way]}, "points": 2, "looks": 2, "without": "any"}
+    two = rig(lidar(), lidar("mast", mount={"z_m": 1.2}))
+    brakes = {"deceleration": 9, "latency_s": 0.75}
+    found = check(two, asked({**one, "ttc_s": 0.9}, {**one, "ttc_s": 1.1, "in_time": brakes}), vehicle=box)
+    kept, ttc, spare = found.verdicts["small"]
+    assert [(each.state, each.unknown) for each in (kept, ttc, spare)] == [("kept", 0), *[("not checked", 3)] * 2]
+    assert 0.9 < ttc.value == ttc.low < 1.1 < ttc.high == np.inf
+    assert spare.value == pytest.approx(ttc.value - 20 / 3.6 / 18 - 0.75)
+    (table,) = found.tables()
+    assert [cell.text for cell in table.rows[1]][2:5] == ["not checked", f"{ttc.value:.4g} or more", "-"]
+    with pytest.raises(ValueError, match=r"1\.5 s are required, and encounter 'a' at 20 km/h .* lasts 1\.1\d s"):
+        check(two, asked({**one, "ttc_s": 1.5}), vehicle=box)
+    way["other"]["from_m"] = 1.65  # comes then
+    assert check(two, asked({**one, "ttc_s": 1.1}), vehicle=box).exit_code == 1
+
+
 @pytest.mark.parametrize(
     ("name", "rig_name", "keys"),
     [("robot", EXAMPLES / "robot" / "delivery_robot.yaml", {"vehicle": EXAMPLES / "robot" / "body.ply"}),
@@ -262,9 +330,21 @@ def test_the_examples_keep_what_they_require(name, rig_name, keys):
     assert found.exit_code == 0, found.tables()
 
 
+def test_a_camera_of_few_pixels_shows_nothing_even_if_they_were_points_enough(box):
+    (one,) = Requirements.load("reversing_r158_cameras").requirements
+    far = one.model_copy(update={"at": BodyPlaces(points_m=((-3.5, 0.0),), relative_to="rear")})
+    coarse = {**CAMERA, "mount": {"x_m": -2.1, "z_m": 1.0, "yaw_deg": 180}, "width": 48, "height": 36, "stride": 1}
+    points = far.model_copy(update={"pixels": None, "points": 5, "name": "as points"})
+    pixels, as_points = check(rig(coarse), asked(far, points), vehicle=box).verdicts["small"]
+    assert (pixels.state, as_points.state, pixels.value) == ("not kept", "kept", as_points.value)
+
+
 @pytest.mark.parametrize("name", builtin_names("requirements"))
 def test_built_in_sets_say_where_they_are_from_and_that_they_are_no_homologation(name):
     found = Requirements.load(name)
     assert found.name == name
     assert "geometry, no homologation" in found.description
+    assert "In doubt: " in found.description
+    bodies = [one for one in found.requirements if isinstance(one, TargetRequirement)]
+    assert all((one.points is None) == (one.by == ("camera",)) != (one.pixels is None) for one in bodies)
     assert "memory" not in found.description

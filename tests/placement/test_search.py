@@ -134,7 +134,7 @@ def test_what_bodies_require_is_looked_at_where_it_decides_and_ends_the_choice_o
         (bound,) = one.bounds
         counts = 1, int(margin < 0), 0, ()
         verdict = Verdict(one.words, bound, "kept" if margin >= 0 else "not kept", 0, 0, 0, margin, *counts)
-        return Checked(asked.name, {rig.name: [verdict]}, {})
+        return Checked(asked, {rig.name: [verdict]}, {})
 
     monkeypatch.setattr("torchcover.placement.search.check", looks)
     result = searched(of=space(requirements=required(points=5)), evaluations=30)
@@ -155,8 +155,8 @@ def test_a_child_is_looked_for_around_the_vehicle_of_the_space():
     assert 0.9 < search.evaluations[0].lacks < 1
 
 
-def test_requirements_that_contradict_each_other_are_refused_with_the_space():
-    with pytest.raises(ValueError, match=r"contradict each other: 20m ground .* least 0.9 and at most 0.5"):
+def test_a_bound_in_the_wrong_direction_is_refused_with_the_space():
+    with pytest.raises(ValueError, match=r"most: of detection_0\.4m more is better; least is meant"):
         space(requirements=required({"least": 0.9}, {"most": 0.5}))
 
 

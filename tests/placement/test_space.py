@@ -256,7 +256,7 @@ MISTAKES = [
     ({"vehicle": "spaceship"}, "vehicle: 'spaceship' is neither a .yaml file nor one of the built-in vehicles"),
     ({"vehicle": "body.ply"}, "vehicle: the name of a vehicle, or the path of its YAML file, is needed"),
     ({"start": "none"}, "start: 'none' is neither a .yaml file nor one of the built-in rigs"),
-    ({"start": 3}, "start: the name of a rig, or the path of its file, is needed; got int"),
+    ({"start": 3}, "start: Input should be a valid dictionary (got 3)"),
 ]
 
 

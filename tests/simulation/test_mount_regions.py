@@ -14,7 +14,7 @@ from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.shapes import Box, Mesh
 
 ROBOT = Path(__file__).parents[2] / "examples" / "robot" / "robot.yaml"
-SMALL = ("adult", "child", "child_110cm", "cyclist", "cylinder_80cm", "dog_57cm", "motorcycle", "pole_100cm")
+SMALL = ("adult", "child_110cm", "child_120cm", "cyclist", "cylinder_80cm", "dog_57cm", "motorcycle", "pole_100cm")
 VEHICLES = [*(name for name in builtin_names("vehicles") if name not in SMALL), str(ROBOT)]
 BOX = Skin(Box(type="box", size_m=(4.0, 2.0, 1.5)).mesh())
 

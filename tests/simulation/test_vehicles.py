@@ -10,8 +10,8 @@ from torchcover.simulation.bodies import Vehicle
 SIZES_M = {
     "adult": (0.305, 0.52, 1.75),
     "bus": (12.0, 2.55, 3.10),
-    "child": (0.209, 0.36, 1.20),
     "child_110cm": (0.1917, 0.33, 1.10),
+    "child_120cm": (0.209, 0.36, 1.20),
     "chrysler_pacifica": (5.176, 2.022, 1.777),
     "cyclist": (1.80, 0.60, 1.75),
     "cylinder_80cm": (0.30, 0.30, 0.80),
@@ -39,7 +39,9 @@ AXLES_M = {
     "volkswagen_passat_estate": (1.337, 2.709),
 }
 CARS = ("hatchback", "pickup", "sedan", "suv", "van", *AXLES_M)
-WITH_WHEELS = tuple(sorted(set(SIZES_M) - {"adult", "child", "child_110cm", "cylinder_80cm", "dog_57cm", "pole_100cm"}))
+WITH_WHEELS = tuple(
+    sorted(set(SIZES_M) - {"adult", "child_110cm", "child_120cm", "cylinder_80cm", "dog_57cm", "pole_100cm"})
+)
 
 
 def load(name):
@@ -159,7 +161,7 @@ def test_mirrors_end_within_the_width(name):
 
 
 def test_riders_and_walkers_have_a_head_on_top():
-    for name in ("adult", "child", "child_110cm", "cyclist", "motorcycle"):
+    for name in ("adult", "child_110cm", "child_120cm", "cyclist", "motorcycle"):
         mesh = load(name).mesh()
         top = mesh.vertices_m[mesh.vertices_m[:, 2] > SIZES_M[name][2] - 0.05]
         assert np.ptp(top[:, 1]) < 0.2

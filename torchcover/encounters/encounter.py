@@ -4,7 +4,6 @@ import math
 from collections.abc import Iterator
 from functools import lru_cache
 from itertools import product
-from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -20,7 +19,7 @@ from pydantic import (
 )
 
 from torchcover.simulation.bodies import Shape, Vehicle, VehicleShape
-from torchcover.simulation.documents import BuiltIn, Document, beside, explain, is_file_name
+from torchcover.simulation.documents import BuiltIn, Document, by_name, explain
 from torchcover.simulation.weather import CLEAR, Weather
 
 # Of a family: ten times what anybody would wait for.
@@ -38,28 +37,17 @@ def _body(content: Any) -> Any:  # noqa: ANN401  (whatever stood in the file)
     return {"type": "vehicle", "vehicle": content} if isinstance(content, str) else content
 
 
-def _weather(content: Any, info: ValidationInfo) -> Any:  # noqa: ANN401
-    if not isinstance(content, str):
-        return content
-    try:
-        return Weather.load(beside(Path(content), info) if is_file_name(content) else content)
-    except FileNotFoundError as error:
-        raise ValueError(str(error)) from error
+# At the door, and once: a set has few bodies.
+_vehicle = lru_cache(maxsize=64)(Vehicle.load)
 
 
 def _known(shape: Shape) -> Shape:
-    """At the door, and once: a set has few bodies."""
-    if isinstance(shape, VehicleShape):
-        _check_vehicle(shape.vehicle)
-    return shape
-
-
-@lru_cache(maxsize=64)
-def _check_vehicle(name_or_path: str) -> None:
     try:
-        Vehicle.load(name_or_path)
+        if isinstance(shape, VehicleShape):
+            _vehicle(shape.vehicle)
     except FileNotFoundError as error:
         raise ValueError(str(error)) from error
+    return shape
 
 
 AnyBody = Annotated[Shape, BeforeValidator(_body), AfterValidator(_known)]
@@ -143,7 +131,7 @@ class Encounter(Document):
     ego: Way
     other: Other
     obstacles: tuple[Obstacle, ...] = ()
-    weather: Annotated[Weather, BeforeValidator(_weather)] = CLEAR
+    weather: Annotated[Weather, by_name(Weather)] = CLEAR
     seconds: Annotated[float, Field(gt=0.0, le=60.0)] = 6.0
     speed_is_swept: bool = True
 

@@ -141,7 +141,7 @@ class Sightings:
         blocks = {name: k for k, name in enumerate(self.hours or map(str, range(len(draws))))}
         sums = torch.zeros(len(blocks), len(NUMBERS), dtype=torch.float64)
         for k, one in enumerate(draws):
-            of_one = [one.ttc_s.mean(), one.from_the_beginning.mean(), 1.0]
+            of_one = [one.ttc_s.mean(), (one.ttc_s >= one.open_s).mean(), 1.0]
             sums[blocks[one.world if self.hours else str(k)]] += torch.tensor(of_one, dtype=torch.float64)
         base = sums[:, [2, 2, 2]]
         base[:, 2] = torch.tensor(list(self.hours.values()) or [math.nan] * len(blocks))

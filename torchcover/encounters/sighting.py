@@ -46,8 +46,8 @@ class Sighting(NamedTuple):
 
     `needed_s` is what braking needs, in traffic the most of all the while; `ttc_s` (P,) time to collision at detection,
     `in_time` (P,) 1 if that was in time, 0 if not, NaN if nobody knows; `sensor_ttc_s` (S, P) of each sensor alone,
-    `without_ttc_s` (S, P) of all others; `from_the_beginning` (P,) whether it was seen as soon as the encounter began,
-    and the other may have been there before.
+    `without_ttc_s` (S, P) of all others. From `open_s` on it was seen as soon as the encounter began, and the other may
+    have been there before: a time to collision is that, or more. It is inf if the other came then.
     """
 
     encounter: "Encounter | Approach"
@@ -57,7 +57,7 @@ class Sighting(NamedTuple):
     in_time: Float64
     sensor_ttc_s: Float64
     without_ttc_s: Float64
-    from_the_beginning: Bools
+    open_s: float
     world: str = ""
 
 
@@ -143,10 +143,12 @@ def sight_encounter(
     )
     ttc_s, alone_s, without_s = (np.where(steps < NEVER, staged.contact_s - STEP_S * steps, 0.0) for steps in found)
     longest_s = max((criterion.looks / sensor.rate_hz for sensor in sensors), default=0.0)
-    from_the_beginning = (ttc_s > max(staged.contact_s - longest_s, 0.0)) & (encounter.before_s == encounter.seconds)
+    # Between two whole steps.
+    open_s = max(staged.contact_s - longest_s, 0.0) + STEP_S / 2
+    open_s = open_s if encounter.before_s == encounter.seconds else math.inf
     needed_s = criterion.needed_s(abs(encounter.ego.speed_mps), encounter.towards_mps)
     in_time = (ttc_s >= needed_s).astype(np.float64)
-    return Sighting(encounter, mounted_rig.rig.name, needed_s, ttc_s, in_time, alone_s, without_s, from_the_beginning)
+    return Sighting(encounter, mounted_rig.rig.name, needed_s, ttc_s, in_time, alone_s, without_s, open_s)
 
 
 def detections(

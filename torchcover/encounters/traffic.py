@@ -270,4 +270,4 @@ def sight_approach(rig: str, drive: Drive, approach: Approach, eyes: Eyes, crite
     unknown = not late.any() or (until == 0 and approach.needed_s[0] > criterion.within_s)
     in_time = np.array([np.nan if unknown else float(not late[:until].any())])
     needed_s = float(approach.needed_s.max())
-    return Sighting(approach, rig, needed_s, ttc_s, in_time, alone_s, without_s, seen == 0, drive.name)
+    return Sighting(approach, rig, needed_s, ttc_s, in_time, alone_s, without_s, criterion.within_s, drive.name)

@@ -66,15 +66,14 @@ def encounter(
         ValueError: A file that cannot be used, a number out of its bounds, an encounter that is none.
 
     Example:
-        >>> crossing = {"name": "a", "ego": {"speed_kmh": 30}, "other": {"body": "child", "speed_kmh": 5, "from_m": 2}}
+        >>> crossing = {"name": "a", "ego": {"speed_kmh": 30}, "other": {"body": "adult", "speed_kmh": 5, "from_m": 2}}
         >>> one = EncounterSet.model_validate({"name": "one", "encounters": [crossing]})
         >>> [(row.encounter, row.in_time) for row in encounter("front_roof_32", one, phases=2).rows]
         [('a', 1.0)]
     """
-    if phases < 1:
-        raise ValueError(f"phases: a number >= 1 is needed; got {phases}")
-    if seed < 0:
-        raise ValueError(f"seed: a number >= 0 is needed; got {seed}")
+    for name, value, least in (("phases", phases, 1), ("seed", seed, 0)):
+        if value < least:
+            raise ValueError(f"{name}: a number >= {least} is needed; got {value}")
     criterion = Criterion() if criterion is None else criterion
     sensing = _sensing(rigs, sensor_model)
     these = encounters if isinstance(encounters, EncounterSet) else EncounterSet.load(encounters)

@@ -2,6 +2,7 @@
 
 import re
 import warnings
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 from pydantic import (
-    BeforeValidator,
+    AfterValidator,
     Discriminator,
     Field,
     NonNegativeFloat,
@@ -23,29 +24,30 @@ from pydantic import (
 )
 
 from torchcover.coverage import AGGREGATIONS
+from torchcover.coverage.quantity import RADIUS, detection, over_known, seen_by_two, sensors_seeing
 from torchcover.encounters import Criterion, EncounterSet
 from torchcover.geometry import BoundingBox
 from torchcover.simulation import RegionsOfInterest, Sensor, builtin_names
-from torchcover.simulation.documents import Bounds, BuiltIn, Coordinate, Document, NameOrFile, beside, is_file_name
+from torchcover.simulation.documents import SEVERAL, Bounds, BuiltIn, Coordinate, Document, NameOrFile, beside, by_name
 from torchcover.simulation.kinds import SENSORS
-from torchcover.targets import SIDES, TARGETS, Raster
-from torchcover.targets.raster import from_outline_m, side_of
+from torchcover.targets import SIDES, TARGETS
+from torchcover.targets.raster import side_of
+from torchcover.targets.survey import HITS, THRESHOLD_M
 
 Float64 = NDArray[np.float64]
-Share = Annotated[float, Field(gt=0.0, le=1.0)]
 Side = Literal["front", "rear", "left", "right"]
 State = Literal["kept", "not kept", "not checked"]
 Corners = tuple[tuple[Coordinate, Coordinate], ...]
 
-KINDS = tuple(SENSORS)
+KINDS, ANY = tuple(SENSORS), "any"
 # Of a mean over steps, what rounding makes of it.
 ROUNDING = 1e-9
-MOST_STEPS = 1000
-# Numbers of a region that are no aggregation's, and what they may have been meant for.
-PLAIN = re.compile(r"(?:known_)?radius_m|(?:known_detection|detection|sensors|seen_by_two)_(\d+(?:\.\d+)?)m")
-LIKE = ("radius_m", "known_radius_m", "detection_0.4m", "known_detection_0.4m", "sensors_0.4m", "seen_by_two_0.4m")
-# Of some vehicle: regions are called alike around any.
-SOME_OUTLINE_M = np.array([[-2.0, -1.0], [2.0, 1.0]])
+# Steps to a side of a place, and the worst places that are named.
+MOST_STEPS, TOLD = 1000, 5
+# What tables call numbers whose keys say too little.
+CALLED = {"ttc_s": "seconds to collision", "spare_s": "seconds to spare"}
+# Regions are called alike around any vehicle, and places are about as large.
+SOME_VEHICLE = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))
 
 
 class Bound(NamedTuple):
@@ -58,27 +60,29 @@ class Bound(NamedTuple):
     @property
     def words(self) -> str:
         """As in `points >= 5`."""
-        return f"{self.key} {'>=' if self.is_least else '<='} {self.value:g}"
+        return f"{CALLED.get(self.key, self.key)} {'>=' if self.is_least else '<='} {self.value:g}"
 
 
 class Readings(NamedTuple):
     """(N,) values of a number, NaN where unknown, the ends of their 95 % intervals, and where each was measured.
 
-    Both ends are the value where it is exact, and NaN where there is no interval.
+    Both ends are the value where it is exact, and NaN where there is no interval; inf if it may be anything above. In
+    `no_room` other places there was no room for a body.
     """
 
     value: Float64
     low: Float64
     high: Float64
     where: Sequence[str]
+    no_room: int = 0
 
 
 class Verdict(NamedTuple):
     """Whether a bound is kept.
 
     `value`, `low` and `high` are of the worst that is known; `margin` is what it has beyond the bound, in its unit:
-    what it lacks if negative. Of `count` places, regions or encounters, `failed` do not keep it and `unknown` are not
-    checked; `where` names the worst of them, else of all.
+    what it lacks if negative, and NaN if that is not checked. Of `count` places, regions or encounters, `failed` do not
+    keep it and `unknown` are not checked; `where` names the worst of them, else of all. Others had `no_room`.
     """
 
     requirement: str
@@ -92,15 +96,15 @@ class Verdict(NamedTuple):
     failed: int
     unknown: int
     where: tuple[str, ...]
+    no_room: int = 0
 
 
-def verdicts(requirements: "Requirements", measured: Sequence[Mapping[str, Readings]], tell: int = 5) -> list[Verdict]:
+def verdicts(requirements: "Requirements", measured: Sequence[Mapping[str, Readings]]) -> list[Verdict]:
     """Judge every bound: kept if all of every interval keeps it, not kept if all of one does not, else not checked.
 
     Args:
         requirements: What is required.
         measured: Of each requirement in turn, the numbers of its bounds, by key; with none in it, nothing is checked.
-        tell: How many of the worst places to name.
 
     Example:
         >>> child = {"target": "child", "at": {"within_m": 2.0}, "points": 5}
@@ -110,27 +114,25 @@ def verdicts(requirements: "Requirements", measured: Sequence[Mapping[str, Readi
         ('not kept', -2.0, ('behind',))
     """
     pairs = zip(requirements.requirements, measured, strict=True)
-    return [_judged(one.words, bound, numbers[bound.key], tell) for one, numbers in pairs for bound in one.bounds]
+    return [_judged(one.words, bound, numbers[bound.key]) for one, numbers in pairs for bound in one.bounds]
 
 
-def _judged(words: str, bound: Bound, measured: Readings, tell: int) -> Verdict:
+def _judged(words: str, bound: Bound, measured: Readings) -> Verdict:
     sign = 1.0 if bound.is_least else -1.0
-    margin, *ends = (sign * (each - bound.value) for each in measured[:3])
+    beyond, *ends = (sign * (each - bound.value) for each in measured[:3])
     kept, failed = np.minimum(*ends) >= -ROUNDING, np.maximum(*ends) < -ROUNDING  # NaN is neither
-    unknown, order = ~(kept | failed), np.argsort(margin, kind="stable")  # NaN is last
-    told = order[(failed if failed.any() else unknown if unknown.any() else kept)[order]][:tell].tolist()
-    worst = [float(each[order[0]]) if len(order) else np.nan for each in (*measured[:3], margin)]
+    unknown, order = ~(kept | failed), np.argsort(beyond, kind="stable")  # NaN is last
+    told = order[(failed if failed.any() else unknown if unknown.any() else kept)[order]][:TOLD].tolist()
+    of_worst = (float(each[order[0]]) if len(order) else np.nan for each in (*measured[:3], beyond))
     state: State = "not kept" if failed.any() else "kept" if len(kept) and kept.all() else "not checked"
-    counts, where = (len(kept), int(failed.sum()), int(unknown.sum())), tuple(measured.where[k] for k in told)
-    return Verdict(words, bound, state, *worst, *counts, where)  # type: ignore[call-arg, arg-type]  # of these lengths
+    (value, low, high, margin), where = of_worst, tuple(measured.where[k] for k in told)
+    margin = np.nan if state == "not checked" else margin
+    counts = len(kept), int(failed.sum()), int(unknown.sum())
+    return Verdict(words, bound, state, value, low, high, margin, *counts, where, measured.no_room)
 
 
-def check_called(what: str, given: Iterable[str], known: Iterable[str]) -> None:
-    """Refuse names that nothing has.
-
-    Raises:
-        ValueError: Such a one; with the nearest.
-    """
+def _check_called(what: str, given: Iterable[str], known: Iterable[str]) -> None:
+    """Refuse names that nothing has, with the nearest."""
     names = list(known)
     for name in given:
         if name not in names:
@@ -178,6 +180,7 @@ class BodyPlaces(Document):
             raise ValueError("sides are of within_m, and relative_to is of the others")
         if self.polygon_m and not shapely.Polygon(self.polygon_m).is_valid:
             raise ValueError("polygon_m: its sides cross, or lie on each other")
+        self.positions_m(SOME_VEHICLE)  # not too many
         return self
 
     def positions_m(self, vehicle: BoundingBox) -> Float64:
@@ -188,23 +191,22 @@ class BodyPlaces(Document):
         """
         low_m, high_m = np.array(vehicle.lower_m[:2]), np.array(vehicle.upper_m[:2])
         towards = {None: (0, 0), "front": (1, 0), "rear": (-1, 0), "left": (0, 1), "right": (0, -1)}[self.relative_to]
-        middle_m = (low_m + high_m) / 2 if self.relative_to else np.zeros(2)
-        origin_m = middle_m + (high_m - low_m) / 2 * towards
+        origin_m = (low_m + high_m + (high_m - low_m) * towards) / 2 * bool(self.relative_to)
         places_m: Float64 = np.array(self.points_m or (), dtype=np.float64)
-        if self.within_m is not None:
-            around_m, sides = Raster.around(vehicle, self.within_m, self.step_m).positions_m, self.sides or SIDES
-            near = np.linalg.norm(from_outline_m(vehicle, around_m), axis=1) <= self.within_m
-            places_m = around_m[near & np.isin(side_of(vehicle, around_m), [-1, *map(SIDES.index, sides)])]
-        elif self.line_m is not None:
+        if self.line_m is not None:
             line = shapely.LineString(self.line_m)
             places_m = shapely.get_coordinates(line.interpolate(self._between(0.0, line.length)))
         elif self.points_m is None:
             own_m = np.stack([low_m, high_m], axis=1) - origin_m[:, None]
             (x0, x1), (y0, y1) = self.x_m or own_m[0], self.y_m or own_m[1]
             area = shapely.Polygon(self.polygon_m) if self.polygon_m else shapely.box(x0, y0, x1, y1)
+            area = area.buffer(self.within_m or 0.0)
             x0, y0, x1, y1 = area.bounds
             there_m = np.stack(np.meshgrid(self._between(x0, x1), self._between(y0, y1)), axis=-1).reshape(-1, 2)
-            places_m = there_m[shapely.intersects_xy(area, there_m)]
+            there = shapely.intersects_xy(area, there_m)
+            if self.within_m:
+                there &= np.isin(side_of(vehicle, there_m), [*map(SIDES.index, self.sides or SIDES)])
+            places_m = there_m[there]
         in_vehicle_m: Float64 = origin_m + places_m
         return in_vehicle_m
 
@@ -216,16 +218,19 @@ class BodyPlaces(Document):
         return np.linspace(low_m, high_m, steps + 1)
 
 
+Names = Annotated[tuple[str, ...], SEVERAL]
+
+
 class _Requirement(Document):
     """What each has.
 
     Args:
         name: What tables call it.
-        without: Sensors that may fail, one at a time: names, or "any".
+        without: Sensors that may fail, one at a time: a name or several, or "any".
     """
 
     name: str = ""
-    without: Literal["any"] | tuple[str, ...] = ()
+    without: Names = ()
 
     @property
     def bounds(self) -> list[Bound]:
@@ -240,8 +245,8 @@ class _Requirement(Document):
 
     def told(self, words: str) -> str:
         """What it says, after its own name."""
-        lost = self.without if isinstance(self.without, str) else " or ".join(self.without)
-        return f"{self.name}: " * bool(self.name) + words + f", also without {lost}" * bool(lost)
+        lost = f", also without {' or '.join(self.without)}" * bool(self.without)
+        return f"{self.name}: " * bool(self.name) + words + lost
 
     def failing(self, sensors: Sequence[str]) -> list[str]:
         """Those of a rig's sensors that may fail.
@@ -249,16 +254,14 @@ class _Requirement(Document):
         Raises:
             ValueError: The rig has none of a name.
         """
-        if self.without != "any":
-            check_called("sensor", self.without, sensors)
-        return list(sensors if self.without == "any" else self.without)
+        _check_called("sensor", self.without, [*sensors, ANY])
+        return list(sensors if ANY in self.without else self.without)
 
 
-def _target(given: Any, info: ValidationInfo) -> Any:  # noqa: ANN401  (whatever stood in the file)
-    if isinstance(given, str) and Path(given).suffix:
+def _target(given: str, info: ValidationInfo) -> str:
+    if Path(given).suffix:
         return str(beside(Path(given), info))
-    if isinstance(given, str):
-        check_called("target", [given], [*TARGETS, *builtin_names("vehicles")])
+    _check_called("target", [given], [*TARGETS, *builtin_names("vehicles")])
     return given
 
 
@@ -269,60 +272,55 @@ class TargetRequirement(_Requirement):
         target: "child", a built-in vehicle, the YAML file of one, or a mesh, as of `torchcover targets`.
         at: A place, or the name of one of the file's.
         by: Only these sensors count: a name or a kind ("lidar", "camera", "radar"), or several; all if not given.
-        hits: Points that are enough for `sensors`, `seen` and `visual_angle_deg`.
+        hits: Points that are enough for `sensors` and `visual_angle_deg`.
         points: Least number of points on it, in every step.
         pixels: Least number of pixels of the full image of one camera, in every step.
         sensors: Least number of sensors with enough points each, in every step.
-        seen: Least share of the steps with enough points.
         share: Least share of its visible surface within 0.4 m of a point on it, over all steps.
         visual_angle_deg: Least angle from its foot to its top, at a sensor that has enough points in every step.
     """
 
-    target: Annotated[str, BeforeValidator(_target)]
-    at: str | BodyPlaces
-    by: str | Annotated[tuple[str, ...], Field(min_length=1)] = KINDS
-    hits: PositiveInt = 5
+    target: Annotated[str, AfterValidator(_target)]
+    at: Annotated[
+        Annotated[str, Tag("(name)")] | Annotated[BodyPlaces, Tag("(place)")],
+        Discriminator(lambda given: "(name)" if isinstance(given, str) else "(place)"),
+    ]
+    by: Annotated[Names, Field(min_length=1)] = KINDS
+    hits: PositiveInt = HITS
     points: PositiveFloat | None = None
     pixels: PositiveFloat | None = None
-    sensors: PositiveFloat | None = None
-    seen: Share | None = None
-    share: Share | None = None
-    visual_angle_deg: PositiveFloat | None = None
+    sensors: PositiveInt | None = None
+    share: Annotated[float, Field(gt=0.0, le=1.0)] | None = None
+    visual_angle_deg: Annotated[float, Field(gt=0.0, lt=180.0)] | None = None
 
     @property
     def bounds(self) -> list[Bound]:
         """What is required."""
-        keys = ("points", "pixels", "sensors", "seen", "share", "visual_angle_deg")
+        keys = ("points", "pixels", "sensors", "share", "visual_angle_deg")
         return [Bound(key, getattr(self, key)) for key in keys if getattr(self, key)]
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        few = self.sensors and self.sensors > len(self._by) and not set(KINDS).intersection(self._by)
-        if few or (self.pixels and {"lidar", "radar"}.issuperset(self._by)):
+        left = len(set(self.by)) - any(one in (ANY, *self.by) for one in self.without)
+        few = (self.sensors or 1) > left and not set(KINDS).intersection(self.by)
+        if few or (self.pixels and {"lidar", "radar"}.issuperset(self.by)):
             both = ", ".join(bound.words for bound in self.bounds)
             raise ValueError(f"requirements contradict each other: {self.words}: {both}")
         return self
-
-    @property
-    def _by(self) -> tuple[str, ...]:
-        return (self.by,) if isinstance(self.by, str) else self.by
 
     @property
     def words(self) -> str:
         """Of what, where, by which sensors."""
         place = {} if isinstance(self.at, str) else self.at.model_dump(exclude_unset=True, mode="json")
         at = " ".join(f"{key} {value}" for key, value in place.items()) or self.at
-        return self.told(f"{self.target}, {at}" + f", by {', '.join(self._by)}" * (self.by != KINDS))
-
-    def failing(self, sensors: Sequence[str]) -> list[str]:
-        """As of all."""
-        check_called("sensor", self._by, [*sensors, *KINDS])
-        return super().failing(sensors)
+        by = f", by {', '.join(self.by)}" * (self.by != KINDS) + f", hits {self.hits}" * (self.hits != HITS)
+        return self.told(f"{Path(TARGETS.get(self.target, self.target)).stem}, {at}{by}")
 
     def groups(self, sensors: Sequence[Sensor]) -> dict[str, list[int]]:
         """Numbers of the sensors that count, and of those without each that may fail; by what is then said of where."""
-        of_kinds = tuple(of for kind, of in SENSORS.items() if kind in self._by)
-        counts = [k for k, one in enumerate(sensors) if one.name in self._by or isinstance(one, of_kinds)]
+        _check_called("sensor", self.by, [*(one.name for one in sensors), *KINDS])
+        of_kinds = tuple(of for kind, of in SENSORS.items() if kind in self.by)
+        counts = [k for k, one in enumerate(sensors) if one.name in self.by or isinstance(one, of_kinds)]
         names = self.failing([one.name for one in sensors])
         lost = [k for k in counts if sensors[k].name in names]  # the others change nothing
         return {"": counts} | {f", without {sensors[k].name}": [each for each in counts if each != k] for k in lost}
@@ -335,29 +333,43 @@ class RegionRequirement(_Requirement):
         region: As the file's `regions` call it; without these, as the usual table: "20m", "front_3m", ...
         height: Of the height band.
         number: By the name of its column in `summary.csv`: "detection_0.4m", "radius_m", "seen_by_two_0.4m", ...
-        least: What it must not be below.
-        most: What it must not be above.
+        least: What it must not be below, if more of it is better.
+        most: What it must not be above, if less of it is.
     """
 
     region: str
     height: str
     number: str
-    least: float = -np.inf
-    most: float = np.inf
+    least: float | None = None
+    most: float | None = None
 
     @property
     def bounds(self) -> list[Bound]:
         """What is required."""
-        both = Bound(self.number, self.least), Bound(self.number, self.most, is_least=False)
-        return [bound for bound in both if np.isfinite(bound.value)]
+        both = (self.least, True), (self.most, False)
+        return [Bound(self.number, value, is_least) for value, is_least in both if value is not None]
+
+    @property
+    def threshold_m(self) -> float | None:
+        """In the name of the number; None if there is none."""
+        found = re.search(r"_(\d+(?:\.\d+)?)m$", self.number)
+        return float(found[1]) if found else None
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if not PLAIN.fullmatch(self.number) and not any(kind.of_keys({self.number}) for kind in AGGREGATIONS):
-            check_called("number of a region", [self.number], LIKE)
-        if self.least > 1.0 and ("detection_" in self.number or "seen_by" in self.number):
-            raise ValueError(f"least: {self.number} is a share of at most 1; got {self.least:g}")
-        if self.without and self.number != "radius_m" and not self.number.startswith("detection_"):
+        threshold_m = self.threshold_m or THRESHOLD_M
+        both = RADIUS, detection(threshold_m)
+        known = [*both, *map(over_known, both), sensors_seeing(threshold_m), seen_by_two(threshold_m)]
+        known += [one for of in AGGREGATIONS for one in (of.of_keys({self.number}) or of.parse(of.example)).quantities]
+        _check_called("number of a region", [self.number], [one.key for one in known])
+        quantity = next(one for one in known if one.key == self.number)
+        better, right, wrong = ("less", "most", "least") if quantity.lower_is_better else ("more", "least", "most")
+        if getattr(self, wrong) is not None:
+            raise ValueError(f"{wrong}: of {self.number} {better} is better; {right} is meant")
+        most = 1.0 if quantity.unit == "share" else np.inf
+        if any(not 0.0 < bound.value <= most for bound in self.bounds):
+            raise ValueError(f"{self.bounds[0].words}: it is above 0{' and at most 1' * (most == 1)}")
+        if self.without and quantity not in both:
             raise ValueError(f"without: radius_m and detections are known without a sensor; got {self.number}")
         return self
 
@@ -379,15 +391,6 @@ class InTime(Document):
     latency_s: NonNegativeFloat = 0.5
 
 
-def _encounters(given: Any, info: ValidationInfo) -> Any:  # noqa: ANN401
-    if isinstance(given, str) and is_file_name(given):
-        return EncounterSet.load(beside(Path(given), info))
-    if isinstance(given, str):
-        check_called("set of encounters", [given], builtin_names("encounters"))
-        return EncounterSet.load(given)
-    return given
-
-
 class EncounterRequirement(_Requirement):
     """When the other must be detected in each encounter of a set: in every phase of the looks, and every draw.
 
@@ -400,7 +403,7 @@ class EncounterRequirement(_Requirement):
         looks: In a row.
     """
 
-    encounters: Annotated[EncounterSet, BeforeValidator(_encounters)]
+    encounters: Annotated[EncounterSet, by_name(EncounterSet)]
     ttc_s: PositiveFloat | None = None
     in_time: InTime | None = None
     points: PositiveInt = Criterion.points
@@ -421,19 +424,21 @@ class EncounterRequirement(_Requirement):
 
     @property
     def words(self) -> str:
-        """In which encounters."""
-        return self.told(self.encounters.name)
+        """In which encounters, and by what."""
+        given: dict[str, float] = self.model_dump(include=self.model_fields_set & {"points", "pixels", "looks"})
+        given |= self.in_time.model_dump() if self.in_time else {}
+        return self.told(", ".join((self.encounters.name, *(f"{key} {value:g}" for key, value in given.items()))))
 
 
 def _kind(content: Any) -> str | None:  # noqa: ANN401
     keys = content if isinstance(content, dict) else getattr(content, "model_fields_set", ())
-    return next((key for key in ("target", "region", "encounters") if key in keys), None)
+    return next((f"({key})" for key in ("target", "region", "encounters") if key in keys), None)
 
 
 AnyRequirement = Annotated[
-    Annotated[TargetRequirement, Tag("target")]
-    | Annotated[RegionRequirement, Tag("region")]
-    | Annotated[EncounterRequirement, Tag("encounters")],
+    Annotated[TargetRequirement, Tag("(target)")]
+    | Annotated[RegionRequirement, Tag("(region)")]
+    | Annotated[EncounterRequirement, Tag("(encounters)")],
     Discriminator(_kind, custom_error_type="kind", custom_error_message="give target, region or encounters"),
 ]
 
@@ -460,18 +465,14 @@ class Requirements(BuiltIn, RegionsOfInterest):
     @model_validator(mode="after")
     def _check_names(self) -> Self:
         with warnings.catch_warnings(action="ignore"):  # of what lies within a vehicle, which is not known yet
-            asked = self.around(SOME_OUTLINE_M)
-        ends: dict[tuple[str, ...], tuple[float, float]] = {}
+            asked = self.around(SOME_VEHICLE.outline_m)
         for one in self.requirements:
             if isinstance(one, TargetRequirement) and isinstance(one.at, str):
-                check_called("place", [one.at], self.places)
+                _check_called("place", [one.at], self.places)
             if isinstance(one, RegionRequirement):
-                check_called("region", [one.region], [region.name for region in asked.regions])
-                check_called("height band", [one.height], asked.grid.heights)
-                place = one.region, one.height, one.number
-                least, most = ends.get(place, (-np.inf, np.inf))
-                ends[place] = least, most = max(least, one.least), min(most, one.most)
-                if least > most:
-                    words = f"{' '.join(place)} is to be at least {least:g} and at most {most:g}"
-                    raise ValueError(f"requirements contradict each other: {words}")
+                _check_called("region", [one.region], [region.name for region in asked.regions])
+                _check_called("height band", [one.height], asked.grid.heights)
+        told = Counter(f"{one.words}: {bound.words}" for one in self.requirements for bound in one.bounds)
+        if (twice := told.most_common(1)[0])[1] > 1:
+            raise ValueError(f"several requirements read {twice[0]!r}; give each a name, or leave all but one out")
         return self

@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
-from pydantic import AfterValidator, BeforeValidator, Field, PlainValidator, ValidationInfo
+from pydantic import AfterValidator, Field
 
 from torchcover.evaluation.requirements import RegionRequirement, Requirements
 from torchcover.geometry import BoundingBox
@@ -13,7 +13,7 @@ from torchcover.geometry.arrays import Float64
 from torchcover.placement.objective import Name, Objective
 from torchcover.simulation import Rig, Scenario, with_ego
 from torchcover.simulation.bodies import mount_regions_of
-from torchcover.simulation.documents import NameOrFile, Readable, beside, is_file_name
+from torchcover.simulation.documents import SEVERAL, NameOrFile, Readable, by_name, is_file_name
 from torchcover.simulation.mount_regions import MountRegion, Skin
 
 # More of them make no front that anybody can look at.
@@ -22,42 +22,16 @@ MAX_OBJECTIVES = 3
 NOT_WORSE, REQUIRED = "not worse: ", "required: "
 
 
-def _rig(given: Any, info: ValidationInfo) -> Rig:  # noqa: ANN401  (whatever stood in the file)
-    """A rig, or one by its name or its file."""
-    if isinstance(given, Rig):
-        return given
-    if not isinstance(given, str):
-        raise ValueError(f"the name of a rig, or the path of its file, is needed; got {type(given).__name__}")
-    try:
-        return Rig.load(beside(Path(given), info) if is_file_name(given) else given)
-    except FileNotFoundError as error:
-        raise ValueError(str(error)) from error
-
-
 def _vehicle(given: str) -> str:
     if Path(given).suffix and not is_file_name(given):
         raise ValueError(f"the name of a vehicle, or the path of its YAML file, is needed; got {given!r}")
     return given
 
 
-def _requirements(given: Any, info: ValidationInfo) -> Requirements:  # noqa: ANN401
-    """Requirements, or a set of them by its name or its file."""
-    if isinstance(given, Requirements | dict):
-        return Requirements.model_validate(given, context=info.context)
-    try:
-        return Requirements.load(beside(Path(given), info) if is_file_name(given) else given)
-    except FileNotFoundError as error:
-        raise ValueError(str(error)) from error
-
-
-def _listed(given: Any) -> Any:  # noqa: ANN401  (whatever stood in the file)
-    return (given,) if isinstance(given, str) else given
-
-
 # A rig, or the name or the file of one.
-NamedRig = Annotated[Rig, PlainValidator(_rig)]
+NamedRig = Annotated[Rig, by_name(Rig)]
 # One name or file, or several.
-Names = Annotated[tuple[NameOrFile, ...], BeforeValidator(_listed), Field(min_length=1)]
+Names = Annotated[tuple[NameOrFile, ...], SEVERAL, Field(min_length=1)]
 # A vehicle's.
 NamedVehicle = Annotated[NameOrFile, AfterValidator(_vehicle)]
 
@@ -123,7 +97,7 @@ class VehicleSpace(Readable):
     vehicle: NamedVehicle | None = None
     objectives: dict[Name, Objective] = Field(min_length=1, max_length=MAX_OBJECTIVES)
     not_worse: tuple[Name | Objective, ...] = ()
-    requirements: Annotated[Requirements, PlainValidator(_requirements)] | None = None
+    requirements: Annotated[Requirements, by_name(Requirements)] | None = None
 
     @property
     def first_rig(self) -> Rig | None:
@@ -151,8 +125,7 @@ class VehicleSpace(Readable):
                 continue
             own = (asked.regions or {}) if asked else {}
             region = {one.region: own[one.region]} if one.region in own else one.region
-            lost = (one.without,) if isinstance(one.without, str) else one.without
-            for key in (one.number, *(f"{one.number}_without_{name}" for name in lost)):
+            for key in (one.number, *(f"{one.number}_without_{name}" for name in one.without)):
                 each = Objective(number=key, region=region, band=one.height)
                 found |= {f"{REQUIRED}{each.words}, {bound.words}": (each, bound.value) for bound in one.bounds}
         return found

@@ -1,6 +1,7 @@
 """YAML documents: typed, without unknown keys, found by path or by built-in name."""
 
 import hashlib
+import re
 from collections.abc import Sequence
 from difflib import get_close_matches
 from itertools import islice
@@ -205,9 +206,14 @@ def _misspelt(details: Sequence[ErrorDetails]) -> dict[Place, Place]:
 def _told(detail: ErrorDetails, meant: Place | None = None) -> str:
     if meant:
         return f"{'.'.join(map(str, detail['loc']))}: unknown key; {meant[-1]} is meant, which is missing"
-    key = "".join(f"{str(part)[:MAX_QUOTED]}." for part in detail["loc"])  # none of what is about the whole document
+    # None of what is about the whole document; which of several forms was tried is in brackets.
+    key = "".join(f"{str(part)[:MAX_QUOTED]}." for part in detail["loc"] if str(part)[:1] != "(")
     arrived = "" if detail["type"] in ("missing", "value_error") else f" (got {_shorten(detail['input'])})"
-    return f"{key[:-1]}{': ' * bool(key)}{detail['msg'].removeprefix('Value error, ')}{arrived}"
+    words = detail["msg"].removeprefix("Value error, ")
+    if detail["type"] != "value_error":  # a list is a tuple to us, and keys with values are some class
+        words = re.sub(" after validation| or instance of .*", "", words)
+        words = words.replace("Tuple", "List").replace("tuple", "list")
+    return f"{key[:-1]}{': ' * bool(key)}{words}{arrived}"
 
 
 def _follows_from_another(detail: ErrorDetails) -> bool:
@@ -238,12 +244,29 @@ PathBeside = Annotated[Path, BeforeValidator(_beside), _WRITTEN]
 """A path in a document; a relative one is meant from the document's folder."""
 
 
-def _named(given: Any, info: ValidationInfo) -> Any:  # noqa: ANN401  (whatever stood in the file)
+def named(given: Any, info: ValidationInfo) -> Any:  # noqa: ANN401  (whatever stood in the file)
+    """The name of a built-in document, or the path of a YAML file, from the folder of the document that has it."""
     return str(beside(Path(given), info)) if isinstance(given, str) and is_file_name(given) else given
 
 
-NameOrFile = Annotated[str, BeforeValidator(_named), _WRITTEN]
+NameOrFile = Annotated[str, BeforeValidator(named), _WRITTEN]
 """The name of a built-in document, or the path of a YAML file, which is meant from the folder of the document."""
+
+
+SEVERAL = BeforeValidator(lambda given: (given,) if isinstance(given, str) else given)
+"""Of a list of words: one stands for a list of one."""
+
+
+def by_name(of: type[BuiltIn]) -> BeforeValidator:
+    """Of a document within another: its name, if it is built in, or its file stand for it."""
+
+    def read(given: Any, info: ValidationInfo) -> Any:  # noqa: ANN401  (whatever stood in the file)
+        try:
+            return of.load(named(given, info)) if isinstance(given, str) else given
+        except FileNotFoundError as error:
+            raise ValueError(str(error)) from error
+
+    return BeforeValidator(read)
 
 
 def is_file_name(path_or_name: str | Path) -> bool:

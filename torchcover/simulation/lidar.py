@@ -1,6 +1,5 @@
 """LiDAR: a table of rows, turned through its columns, and the models on the market that it may start from."""
 
-from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -8,7 +7,7 @@ from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat, ValidationInfo, model_validator
 
 from torchcover.geometry.arrays import Float32, Float64
-from torchcover.simulation.documents import BuiltIn, Pose, beside, is_file_name
+from torchcover.simulation.documents import BuiltIn, Pose, named
 from torchcover.simulation.material import material_number, materials, tone
 from torchcover.simulation.rays import unit_directions
 from torchcover.simulation.returns import log_excess, return_probability
@@ -190,10 +189,7 @@ class Lidar(ScanPattern):
     def _complete_from_model(cls, content: Any, info: ValidationInfo) -> Any:  # noqa: ANN401  (what stood in the file)
         if not isinstance(content, dict) or not isinstance(content.get("model"), str):
             return content
-        name: str | Path = content["model"]
-        if is_file_name(name):
-            name = beside(Path(name), info)
         try:
-            return LidarModel.load(name).completing(content)
+            return LidarModel.load(named(content["model"], info)).completing(content)
         except FileNotFoundError as error:
             raise ValueError(f"model: {error}") from error

@@ -189,12 +189,9 @@ def _outline_m(scenario: Scenario) -> Float64:
 
 
 def _check(steps: int, seed: int, hits: int, threshold_m: float) -> None:
-    if steps < 1:
-        raise ValueError(f"steps: a number >= 1 is needed; got {steps}")
-    if seed < 0:
-        raise ValueError(f"seed: a number >= 0 is needed; got {seed}")
-    if hits < 1:
-        raise ValueError(f"hits: a number of points >= 1 is needed; got {hits}")
+    for name, value, least in (("steps", steps, 1), ("seed", seed, 0), ("hits", hits, 1)):
+        if value < least:
+            raise ValueError(f"{name}: a number >= {least} is needed; got {value}")
     if not 0 < threshold_m < math.inf:
         raise ValueError(f"threshold: metres above 0 are needed; got {threshold_m}")
 

@@ -66,7 +66,8 @@ def load_bodies() -> Mapping[str, Mesh]:
     """The built-in bodies, in all their sizes."""
     truck = Vehicle.load("truck")
     behind = [part.name.startswith("trailer") for part in truck.parts]
-    meshes = {kind: Vehicle.load(kind).mesh() for kind in BODIES if kind not in ("truck", "trailer")}
+    called = {kind: kind for kind in BODIES if kind not in ("truck", "trailer")} | {"child": "child_120cm"}
+    meshes = {kind: Vehicle.load(name).mesh() for kind, name in called.items()}
     for kind, is_rear in (("truck", False), ("trailer", True)):
         parts = tuple(part for part, at_rear in zip(truck.parts, behind, strict=True) if at_rear is is_rear)
         meshes[kind] = truck.model_copy(update={"parts": parts}).mesh()
