@@ -77,4 +77,4 @@ def test_the_page_of_a_target_draws_where_it_is_first_seen(tmp_path):
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     words = " ".join(Text(page).words)
     assert "front_roof_128: would it see dog_57cm?" in words
-    assert len(re.findall("first seen, with 5 points", page)) == 4
+    assert len(re.findall("border of what is seen, with 5 points", page)) == 4

@@ -55,18 +55,29 @@ def seen_where(points, *, raster=None, state=None, share=None, hits=5, least=Non
     )
 
 
-def test_the_first_seen_place_is_where_the_way_out_meets_enough_points():
-    """Seen from 3.5 m ahead of the middle on; to the left from 2 m on, less a gap that comes later; never behind."""
+def test_the_border_lies_between_each_place_that_is_seen_and_its_neighbours_that_are_not():
+    """Seen from 3.5 m ahead of the middle on; to the left from 2 m on, less a gap that comes later."""
     seen = seen_where(lambda x, y: np.where((x > 3.5) | ((y > 2) & ~((y > 3) & (y < 4))), 9, 0))
-    first = seen.first_seen_m()
-    assert first.shape == (360, 2)
-    assert first[0] == pytest.approx([3.5, 0.0], abs=0.13)
-    assert first[90] == pytest.approx([0.0, 2.0], abs=0.13)
-    assert np.isnan(first[180]).all()
-    assert np.isnan(first[270]).all()
-    everywhere = seen_where(lambda x, y: 9).first_seen_m()
-    assert everywhere[0] == pytest.approx([2.0, 0.0], abs=0.13)
-    np.testing.assert_allclose(np.arctan2(*everywhere.T[::-1]) % (2 * np.pi), np.deg2rad(np.arange(360)), atol=1e-9)
+    edges = seen.border_m().reshape(-1, 3, 2)
+    assert np.isnan(edges[:, 2]).all()
+    rows, columns = seen.raster.shape
+    expected = set()
+    for row, column in np.ndindex(rows, columns):
+        for other in ((row, column + 1), (row + 1, column)):
+            inside = other[0] < rows and other[1] < columns
+            if (
+                inside
+                and seen.free[row, column]
+                and seen.free[other]
+                and seen.enough[row, column] != seen.enough[other]
+            ):
+                x = (seen.x_m[column] + seen.x_m[other[1]]) / 2
+                y = (seen.y_m[row] + seen.y_m[other[0]]) / 2
+                expected.add((round(x, 6), round(y, 6)))
+    assert {tuple(middle) for middle in edges[:, :2].mean(axis=1).round(6) + 0.0} == expected
+    assert np.allclose(np.linalg.norm(edges[:, 0] - edges[:, 1], axis=1), seen.raster.step_m)
+    assert len(edges) == len(expected)
+    assert not len(seen_where(lambda x, y: 9).border_m())
 
 
 def test_sides_part_the_places_at_corners_of_45_degrees():
@@ -110,7 +121,7 @@ def test_the_files_hold_what_the_map_holds(tmp_path):
     assert names == ["targets.csv", "targets.npz", "report.html", "targets.png", "summary.json"]
     with np.load(tmp_path / "targets.npz") as arrays:
         np.testing.assert_array_equal(arrays["points"], seen.points)
-        np.testing.assert_array_equal(arrays["first_seen_m"], seen.first_seen_m())
+        np.testing.assert_array_equal(arrays["border_m"], seen.border_m())
         assert json.loads(str(arrays["settings"]))["raster"] == {"x": [-3, 3], "y": [-2, 2], "step_m": 1}
         assert arrays["x_m"].tolist() == [-2.5, -1.5, -0.5, 0.5, 1.5, 2.5]
     rows = list(csv.DictReader((tmp_path / "targets.csv").read_text().splitlines()))

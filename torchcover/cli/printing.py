@@ -41,8 +41,9 @@ def _print_world(result: Result, console: Terminal, *, explain: bool) -> None:
         )
     for line in result.run.skipped if result.run else ():
         console.print(f"skipped: {line}", style="yellow", markup=False)
-    for line in result.target_lines:
-        console.print(line, markup=False, soft_wrap=True)
+    for line in (*result.target_lines, " ".join(result.verdict)):
+        if line:
+            console.print(line, markup=False, soft_wrap=True)
 
 
 def print_files(files: Sequence[Path], out: Path, console: Terminal) -> None:

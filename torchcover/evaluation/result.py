@@ -40,6 +40,7 @@ from torchcover.report import (
     maps_of,
     page_html,
     table_dict,
+    verdict,
 )
 from torchcover.simulation import Sensor
 
@@ -115,6 +116,11 @@ class Result:
         return CoverageTable.of(self.coverages, self.regions, self.notes, self.source)
 
     @property
+    def verdict(self) -> tuple[str, ...]:
+        """The answer in sentences, the first of which says most; none tells what may be chance."""
+        return verdict(self.table)
+
+    @property
     def tables(self) -> list[PageTable]:
         """The tables of the page."""
         return [*page_tables(self.table), *(metric_tables(self.metrics) if self.metrics else [])]
@@ -143,6 +149,7 @@ class Result:
             **self._run_record,
             "target_error": self._outcome[0],
             "measure": self.table.measure,
+            "verdict": list(self.verdict),
             **table_dict(self.table),
             **({} if self.metrics is None else {"metrics": record(self.metrics)}),
         }
@@ -156,6 +163,7 @@ class Result:
         return Page(
             title=" against ".join(rigs) if len(rigs) == 2 else ", ".join(rigs),
             lead=f"Blind spots and coverage in {where}, measured by torchcover.",
+            verdict=self.verdict,
             tables=self.tables,
             maps=list(maps_of(self.coverages)) if self.coverages else [],
             rigs=[PageRig(name, sensor_views(of), rig_document(name, of)) for name, of in rigs.items()],

@@ -118,7 +118,7 @@ def free_space() -> Scenario:
 
 
 def target_picture(seen: TargetMap) -> Figure:
-    """The points on the target at every place, with the line at which it is first seen.
+    """The points on the target at every place, with the border of what is seen.
 
     Args:
         seen: From `survey_target`.
@@ -214,8 +214,7 @@ def _maps(seen: TargetMap) -> list[PageMap]:
         (100 * seen.share, ColourScale(near, "%", "viridis", 0.0, 100.0)),
         (seen.sensors, ColourScale(*of_sensors)),
     ]
-    first_seen = seen.first_seen_m()
-    line = Line(f"first seen, with {seen.hits} points, on the way out", np.vstack([first_seen, first_seen[:1]]))
+    line = Line(f"border of what is seen, with {seen.hits} points", seen.border_m())
     return [
         PageMap(
             quantity=scale.quantity,

@@ -49,6 +49,7 @@ from .renderers.text_file import print_table as print_table
 from .renderers.text_file import print_whole as print_whole
 from .table import CoverageTable as CoverageTable
 from .table import Row as Row
+from .verdict import verdict as verdict
 from .wording import difference_heading as difference_heading
 from .wording import difference_words as difference_words
 from .wording import error_words as error_words

@@ -40,4 +40,4 @@ def _number(value: float) -> str:
 def write_arrays(seen: TargetMap, path: Path) -> None:
     """All arrays, and the settings as JSON text in `settings`; `np.load` reads it."""
     arrays = {name: getattr(seen, name) for name in ARRAYS}
-    write_npz(path, {**arrays, "first_seen_m": seen.first_seen_m(), "settings": np.array(json.dumps(seen.settings()))})
+    write_npz(path, {**arrays, "border_m": seen.border_m(), "settings": np.array(json.dumps(seen.settings()))})

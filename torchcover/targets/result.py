@@ -17,7 +17,6 @@ Numbers = NDArray[np.int64]
 # What a cell is: there is room for the target in a step at least; the vehicle is there; there is none in any step.
 STATES = ("free", "occupied", "outside")
 FREE, OCCUPIED, OUTSIDE = range(3)
-DIRECTIONS = 360
 WITHIN_M = (1.0, 2.0, 3.0)
 
 
@@ -181,28 +180,21 @@ class TargetMap:
             share=float(self.share[row, column]),
         )
 
-    def first_seen_m(self) -> Float64:
-        """(360, 2) where it is first seen on the way out from the vehicle's middle, degree by degree from x towards y.
-
-        The way begins at the vehicle's box and ends at the first cell with enough points; NaN if no cell of it has.
-        """
-        middle_m = (np.array(self.vehicle.lower_m[:2]) + np.array(self.vehicle.upper_m[:2])) / 2
-        angles = np.deg2rad(np.arange(DIRECTIONS) * 360.0 / DIRECTIONS)
-        ways = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-        corner = np.array([[self.raster.x[0], self.raster.y[0]], [self.raster.x[1], self.raster.y[1]]])
-        reach_m = float(np.linalg.norm(np.abs(corner - middle_m).max(axis=0)))
-        lengths_m = np.arange(0.0, reach_m, self.raster.step_m / 4)
-        places_m = middle_m + lengths_m[None, :, None] * ways[:, None]
-        cell = np.floor((places_m - corner[0]) / self.raster.step_m).astype(np.int64)
-        rows, columns = self.raster.shape
-        inside = ((cell >= 0) & (cell < [columns, rows])).all(axis=2)
-        column, row = np.clip(cell, 0, [columns - 1, rows - 1]).transpose(2, 0, 1)
-        beyond = (from_outline_m(self.vehicle, places_m.reshape(-1, 2)) != 0).any(axis=1).reshape(inside.shape)
-        seen = inside & beyond & self.enough[row, column]
-        first = seen.argmax(axis=1)
-        found: Float64 = places_m[np.arange(DIRECTIONS), first]
-        found[~seen.any(axis=1)] = math.nan
-        return found
+    def border_m(self) -> Float64:
+        """(3 E, 2) the border between free cells where it is seen and where not: the ends of each edge, and NaN."""
+        seen, free, half_m = self.enough, self.free, self.raster.step_m / 2
+        x, y = np.meshgrid(self.x_m, self.y_m)
+        upright = (seen[:, 1:] != seen[:, :-1]) & free[:, 1:] & free[:, :-1]
+        level = (seen[1:] != seen[:-1]) & free[1:] & free[:-1]
+        parts = []
+        for at, (of_x, of_y), along in (
+            (upright, (x[:, :-1], y[:, :-1]), (0.0, 2.0)),
+            (level, (x[:-1], y[:-1]), (2.0, 0.0)),
+        ):
+            end = np.stack([of_x[at], of_y[at]], axis=1) + half_m  # ahead and to the left
+            parts.append(np.stack([end, end - half_m * np.array(along), np.full_like(end, math.nan)], axis=1))
+        border_m: Float64 = np.concatenate(parts).reshape(-1, 2)
+        return border_m
 
     @property
     def counts(self) -> dict[str, int]:

@@ -104,6 +104,7 @@ class Page:
     Args:
         title: Its name.
         lead: One line below.
+        verdict: The answer in sentences, the first of which says most.
         tables: The numbers.
         pictures: Above them.
         maps: In the order of the menus; differences are to the first rig.
@@ -116,6 +117,7 @@ class Page:
 
     title: str
     lead: str
+    verdict: Sequence[str] = ()
     tables: Sequence[PageTable] = ()
     pictures: Sequence[PagePicture] = ()
     maps: Sequence[PageMap] = ()

@@ -114,6 +114,7 @@ def page_html(page: Page) -> str:
     return Template(_file("page.html")).substitute(
         title=escape(page.title),
         lead=escape(page.lead),
+        verdict=f'<p class="verdict">{escape(" ".join(page.verdict))}</p>' if page.verdict else "",
         style=_file("page.css"),
         script_hash=script_hash(script),
         tables="\n".join(map(table_html, page.tables)),

@@ -7,6 +7,7 @@ from torchcover.files import shown
 from torchcover.report.remarks import marks_on, notes_on
 from torchcover.report.renderers.layout import BOLD_MARKS, PageTable, Words, parts_of
 from torchcover.report.table import CoverageTable
+from torchcover.report.verdict import verdict
 
 # What Markdown would take for something else: an underscore does so at the end of a word only.
 SPECIAL = re.compile(r"[\\`*|\[\]]|<(?=[A-Za-z/!?])|&(?=[\w#]+;)|(?<![^\W_])_|_(?![^\W_])")
@@ -16,7 +17,9 @@ def render(table: CoverageTable) -> str:
     """The table as Markdown text; what is marked is bold."""
     marks = [f"{BOLD_MARKS[mark]}: {meaning}" for mark, meaning in marks_on(table).items()]
     notes = [f"* {_escaped(note)}" for note in (*marks, *notes_on(table))]
-    return "\n".join([*(line for part in parts_of(table) for line in _lines(part)), *notes, ""])
+    told = _escaped(" ".join(verdict(table)))
+    first = [told, ""] if told else []
+    return "\n".join([*first, *(line for part in parts_of(table) for line in _lines(part)), *notes, ""])
 
 
 def _lines(part: PageTable) -> Iterator[str]:

@@ -1,0 +1,60 @@
+"""No sentence says what may be chance, and each number in it is one of the table."""
+
+import re
+from dataclasses import replace
+
+import pytest
+
+from torchcover.coverage import Region
+from torchcover.report import CoverageTable, verdict
+from torchcover.report.table import Row
+
+AHEAD = (Region("near", (0.0, 4.0), (-5.0, 5.0)), Region("far", (0.0, 12.0), (-5.0, 5.0)),
+         Region("behind", (-8.0, -6.0), (-5.0, 5.0)))  # fmt: skip
+
+
+def with_bodies(table, shares, best=None):
+    """The table with a child beside the vehicle: its rows of detection stand for the share of places."""
+    key = table.means[1].key
+    bodies = {}
+    for rig, share in shares.items():
+        row = table.rows[rig][0]
+        number = row.summary.numbers[key]._replace(value=share)
+        summary = replace(row.summary, region="front_3m", height="child_110cm", numbers={key: number})
+        bodies[rig] = (Row(rig, Region("front_3m", (2.0, 5.0), (-1.0, 1.0)), summary,
+                           frozenset({key} if rig == best else ()), {}),)  # fmt: skip
+    return replace(table, bodies=bodies)
+
+
+def test_of_one_rig_the_farthest_region_ahead_is_told_with_its_interval(trio):
+    (sentence,) = verdict(CoverageTable.of({"few": trio["few"]}, AHEAD))
+    assert sentence.startswith("Detected to 12 m ahead: of the ground ")
+    table = CoverageTable.of({"few": trio["few"]}, AHEAD)
+    rows = [row for row in table.rows["few"] if row.region is AHEAD[1]]
+    told = [int(number) for number in re.findall(r"(\d+) % \[(?:\d+), (?:\d+)\]", sentence)]
+    assert told == [round(100 * row.summary.numbers[table.means[1].key].value) for row in rows]
+
+
+def test_of_several_only_who_leads_by_more_than_chance_is_told(trio):
+    table = CoverageTable.of({name: trio[name] for name in ("few", "many")}, AHEAD)
+    (sentence,) = verdict(table)
+    assert re.search(r"of the ground many \d+ %, few \d+ %; of obstacles many \d+ %, few \d+ %", sentence)
+    (sentence,) = verdict(CoverageTable.of({name: trio[name] for name in ("few", "other")}, AHEAD))
+    assert sentence == "No rig detects more than the others to 12 m ahead beyond chance."
+
+
+def test_without_errors_nothing_is_told(pair, blind, trios, regions):
+    for coverages in (pair, blind, {"few": pair["few"]}, trios(4)):
+        assert verdict(CoverageTable.of(coverages, AHEAD)) == ()
+    assert verdict(CoverageTable.of(pair, regions[1:])) == ()
+
+
+@pytest.mark.parametrize(("shares", "best", "sentence"), [
+    ({"many": 0.997}, None, "Free places within 3 m where a child is seen: in front 99 % ["),
+    ({"few": 0.004, "many": 1.0}, "many", "where a child is seen: in front many 100 %, few 1 %."),
+    ({"few": 0.5, "many": 0.6}, None, "Of the places within 3 m where a child is seen, no rig has more than"),
+])  # fmt: skip
+def test_bodies_come_first(trio, shares, best, sentence):
+    table = with_bodies(CoverageTable.of({name: trio[name] for name in shares}, AHEAD), shares, best)
+    first, *_ = verdict(table)
+    assert sentence in first
