@@ -137,18 +137,32 @@ class AccumulatedReference:
         local_m = np.concatenate(
             [np.empty((0, 3)), *(scans[key].still_m[~loose[key]] for key in used), *(mover.points_m for mover in found)]
         )
-        local_m = local_m[first_of_each(sweeps.voxel(local_m))]
-        points_m = np.concatenate([transform(invert(local_T_vehicle), local_m), *parts])
+        # Noise, and errors of poses, make the ground a thick layer that would count for more and hide what is behind.
+        level_m = self._on_ground(recording, index, local_m)
+        first = first_of_each(sweeps.voxel(level_m))
+        vehicle_T_local = invert(local_T_vehicle)
+        points_m, level_m = (
+            np.concatenate([transform(vehicle_T_local, of[first]), *parts]) for of in (local_m, level_m)
+        )
         own = _beneath_or_in(points_m, recording.body)
         dropped["own_vehicle"] += len(own)
-        points_m = np.ascontiguousarray(np.delete(points_m, own, axis=0))
-        share = seen_share(points_m, recording.body or USUAL_BODY, self.voxel_m, index)
+        points_m, level_m = (np.ascontiguousarray(np.delete(of, own, axis=0)) for of in (points_m, level_m))
+        share = seen_share(level_m, recording.body or USUAL_BODY, self.voxel_m, index)
         dropped["hidden"] = int((share == 0).sum())
-        points_m, share = points_m[share > 0], share[share > 0]
+        points_m, level_m, share = points_m[share > 0], level_m[share > 0], share[share > 0]
         if not len(points_m):
             raise ValueError(f"no reference point is left of the scans within {self.window_s / 2:g} s of this instant")
-        weights = (square_metres(points_m) * share).astype(np.float32)
+        weights = (square_metres(level_m) * share).astype(np.float32)
         return InVehicle(points_m.astype(np.float32), dropped, weights)
+
+    def _on_ground(self, recording: Recording, index: int, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(N, 3) points, those near the ground put on it."""
+        ground = self._sweeps.ground(recording, index)
+        if ground is None:
+            return points_m
+        heights_m = ground.heights_m(points_m)
+        down_m = np.where(np.abs(heights_m) <= ON_GROUND_M, heights_m, 0.0)
+        return points_m - down_m[:, None] * [0.0, 0.0, 1.0]
 
     def _passing(self, recording: Recording, index: int, scans: Mapping[Key, Thinned]) -> dict[Key, NDArray[np.bool_]]:
         """Of the points of each scan, those above ground where nothing is seen for long."""

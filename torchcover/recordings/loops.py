@@ -6,7 +6,7 @@ import numpy as np
 
 from torchcover.neighbors.compiled import Array, compiled
 from torchcover.recordings.seen_past import COLUMNS, ROWS
-from torchcover.recordings.visible import BEHIND, BEHIND_M
+from torchcover.recordings.visible import BEHIND, BEHIND_M, OVER_M
 
 
 @compiled("void(f8[:, ::1], f4[:, ::1], i8, f8[:, ::1], f8, i2[::1], i8)")
@@ -44,12 +44,13 @@ def hide_by_loop(
 ) -> None:
     """Mark the points that a body or others hide from a place: `hide_by_arrays`."""
     count = points_m.shape[0]
-    up, across, range_m = np.empty(count), np.empty(count), np.empty(count)
+    up, over, across, range_m = np.empty(count), np.empty(count), np.empty(count), np.empty(count)
     for i in range(count):
         x, y, z = points_m[i, 0] - place_m[0], points_m[i, 1] - place_m[1], points_m[i, 2] - place_m[2]
         flat_m = math.sqrt(x * x + y * y)
         range_m[i] = math.sqrt(flat_m * flat_m + z * z)
         up[i], across[i] = math.atan2(z, flat_m) + math.pi / 2, math.atan2(y, x) + math.pi
+        over[i] = math.atan2(z + OVER_M, flat_m) + math.pi / 2
         enters, leaves = -math.inf, math.inf
         for axis in range(3):
             way_m = points_m[i, axis] - place_m[axis]
@@ -64,7 +65,7 @@ def hide_by_loop(
                 number = int(up[i] / bin_rad) * columns + int(across[i] / bin_rad)
                 nearest_m[number] = min(nearest_m[number], range_m[i])
         for i in range(count):
-            number = int(up[i] / bin_rad) * columns + int(across[i] / bin_rad)
+            number = int(over[i] / bin_rad) * columns + int(across[i] / bin_rad)
             hidden[i] |= nearest_m[number] * (1 + BEHIND) + BEHIND_M < range_m[i]
 
 

@@ -64,8 +64,9 @@ def movers(scans_m: Sequence[Float64], apart_s: Float64) -> list[Moved]:
     left = [np.ones(len(points_m), np.bool_) for points_m in scans_m]
     together = sorted(map(int, np.flatnonzero(np.abs(apart_s) <= TOGETHER_S)), key=lambda one: abs(apart_s[one]))
     for scan in together:
-        others = np.argsort(np.abs(apart_s - apart_s[scan]), kind="stable")
-        others = others[others != scan][:COMPARED]
+        times_s = np.unique(apart_s[apart_s != apart_s[scan]])
+        compared_s = times_s[np.argsort(np.abs(times_s - apart_s[scan]), kind="stable")[:COMPARED]]
+        others = np.flatnonzero(np.isin(apart_s, compared_s))
         since_s = np.ascontiguousarray(apart_s[others] - apart_s[scan])
         rows = np.flatnonzero(left[scan])
         for cluster in _clusters(cells[scan][rows], shape):

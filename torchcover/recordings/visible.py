@@ -17,6 +17,8 @@ ROBERTS = 1.2207440846057596 ** -np.arange(1.0, 4.0)
 BINS_RAD, FILLED = np.deg2rad([0.2, 0.4, 0.8, 1.6]), 1.2
 # So much farther, and by such a share, lies what is hidden.
 BEHIND_M, BEHIND = 0.4, 0.12
+# What is so far above a point has to be hidden, too: ground that is rough, or noise of it, hides none.
+OVER_M = 0.15
 # A point stands for the circle that holds so many others, but for no larger one.
 NEIGHBOURS, WIDEST_M = 8, 3.0
 
@@ -89,11 +91,13 @@ def hide_by_arrays(
     x, y, z = (points_m - place_m).T
     flat_m = np.sqrt(x * x + y * y)
     range_m = np.sqrt(flat_m * flat_m + z * z)
-    up, across = np.arctan2(z, flat_m) + np.pi / 2, np.arctan2(y, x) + np.pi
+    up, over = np.arctan2(z, flat_m) + np.pi / 2, np.arctan2(z + OVER_M, flat_m) + np.pi / 2
+    across = np.arctan2(y, x) + np.pi
     for bin_rad, near_m in zip(bins_rad, reach_m, strict=True):
         columns = int(2 * np.pi / bin_rad) + 1
-        number = (up / bin_rad).astype(np.int64) * columns + (across / bin_rad).astype(np.int64)
+        column = (across / bin_rad).astype(np.int64)
+        number, above = ((angle / bin_rad).astype(np.int64) * columns + column for angle in (up, over))
         nearest_m = np.full((int(np.pi / bin_rad) + 1) * columns, np.inf)
         near = range_m < near_m
         np.minimum.at(nearest_m, number[near], range_m[near])
-        hidden |= nearest_m[number] * (1 + BEHIND) + BEHIND_M < range_m
+        hidden |= nearest_m[above] * (1 + BEHIND) + BEHIND_M < range_m
