@@ -230,7 +230,11 @@ def cell_sizes(steps=24):
         numbers = []
         for row in coverage.summary(forward_regions((20.0, 80.0))):
             if row.height == "ground":
-                numbers += [f"{row.radius_m:.3f}", f"{row.detection[0.4]:.3f}", f"{row.known_share:.1%}"]
+                numbers += [
+                    f"{row.numbers['radius_m'].value:.3f}",
+                    f"{row.numbers['detection_0.4m'].value:.3f}",
+                    f"{row.known_share:.1%}",
+                ]
         rows.append((f"{cell:g}", *numbers, f"{seconds:.3f}", f"{megabytes:.1f}"))
     print(f"### Cell size: courtyard, front_roof_128, {steps} steps of 512 x 512 reference rays, ground\n")
     regions = [f"{region}: {what}" for region in ("20 m", "80 m") for what in ("radius (m)", "detection", "known")]
