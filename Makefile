@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 
 .PHONY: demo test lowest versions lint types doctest docs smoke bench measured paper clean
 
-demo: STEPS ?= 24
+demo: STEPS ?= 64
 demo: $(VENV)/.ready  ## evaluate a built-in rig in city traffic; writes to out/demo
 	$(BIN)/torchcover evaluate front_roof_128 --scenario urban --steps $(STEPS) --workers 2 --out out/demo
 

@@ -1,6 +1,5 @@
 """When rigs detected whom they met, by encounter and speed: numbers, tables, CSV."""
 
-import csv
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -15,6 +14,7 @@ from torchcover.encounters.criterion import Criterion
 from torchcover.encounters.sighting import Sighting
 from torchcover.encounters.traffic import WHO, Approach
 from torchcover.estimation import Estimate, Number, Quantity
+from torchcover.files import csv_text
 from torchcover.report import PageTable, Words, json_record, percent
 
 NUMBERS = (
@@ -221,10 +221,7 @@ class Sightings:
 
     def write_csv(self, path: Path) -> None:
         """Rows as of `rows`; empty where nothing is known."""
-        with path.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(EncounterRow._fields)
-            writer.writerows(map(_cells, self.rows))
+        path.write_text(csv_text([EncounterRow._fields, *map(_cells, self.rows)]), encoding="utf-8")
 
     def bands(self) -> Iterator[tuple[str, dict[str, list[tuple[float, float, float]]], list[tuple[float, float]]]]:
         """For the picture: each encounter; of each rig speed (km/h), least and most time to collision; the needed."""
