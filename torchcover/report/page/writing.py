@@ -114,7 +114,7 @@ def page_html(page: Page) -> str:
     return Template(_file("page.html")).substitute(
         title=escape(page.title),
         lead=escape(page.lead),
-        verdict=f'<p class="verdict">{escape(" ".join(page.verdict))}</p>' if page.verdict else "",
+        verdict=_verdict(page.verdict),
         style=_file("page.css"),
         script_hash=script_hash(script),
         tables="\n".join(map(table_html, page.tables)),
@@ -129,6 +129,11 @@ def page_html(page: Page) -> str:
         cells=cells.text(),
         script=script,
     )
+
+
+def _verdict(sentences: Sequence[str]) -> str:
+    words = escape(" ".join(sentences)).replace(" %", "&nbsp;%")
+    return f'<p class="verdict">{words}</p>' if sentences else ""
 
 
 def as_json(content: object) -> str:
