@@ -7,6 +7,7 @@ half an hour each on two cores. Systems stay in `out/versions`, for the next tim
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tarfile
@@ -87,9 +88,11 @@ def unpacked(folder):
     """The sdist, in a folder inside of a system."""
     run([sys.executable, "-m", "build", "--quiet", "--sdist", "--outdir", str(FOLDER), str(ROOT)])
     (packed,) = FOLDER.glob("*.tar.gz")
+    source = folder / packed.name.removesuffix(".tar.gz")
+    shutil.rmtree(source, ignore_errors=True)  # that of another commit
     with tarfile.open(packed) as archive:
         archive.extractall(folder, filter="data")
-    return folder / packed.name.removesuffix(".tar.gz")
+    return source
 
 
 def run(command, *, may_fail=False):
