@@ -61,7 +61,7 @@ def test_a_sensor_exactly_on_the_ground_is_warned_of(tmp_path, speed_mps):
 def test_a_sensor_on_the_skin_of_the_ego_is_where_it_may_be(tmp_path, speed_mps):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert len(simulator(tmp_path, {"z_m": 1.0}, speed_mps=speed_mps).step(0).clouds["mine"]) > 0
+        assert len(simulator(tmp_path, {"z_m": 1.0}, speed_mps=speed_mps, bodies=[BAR]).step(0).clouds["mine"]) > 0
 
 
 @pytest.mark.parametrize(("speed_mps", "times"), [(0.0, 1), (2.0, 3)])

@@ -176,9 +176,9 @@ def test_one_caster_answers_for_one_place_after_the_other():
     caster, outwards = RayCaster([box_at(9.0), box_at(0.0)]), np.array([[1.0], [0.0], [0.0]], dtype=np.float32)
     for _ in range(2):
         inside = caster.cast(HERE, outwards, endless(outwards))
-        assert (inside.body, inside.range_m) == ([1], [0.5])
+        assert (inside.body, inside.range_m) == ([1], [pytest.approx(0.5, rel=1e-6)])
         on_the_wall = caster.cast(np.array([0.5, 0.1, 0.1]), outwards, endless(outwards))
-        assert (on_the_wall.body, on_the_wall.range_m) == ([0], [8.0])
+        assert (on_the_wall.body, on_the_wall.range_m) == ([0], [pytest.approx(8.0, rel=1e-6)])
 
 
 def test_a_place_on_a_face_up_to_the_rounding_of_doubles_is_on_it():
@@ -191,7 +191,7 @@ def test_hits_name_their_body():
     directions = np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0]], dtype=np.float32).T
     hits = RayCaster([box_at(5.0), box_at(0.0, 7.0)]).cast(HERE, directions, endless(directions))
     assert hits.body.tolist() == [0, 1, -1]
-    np.testing.assert_allclose(hits.range_m, [4.5, 6.5, np.inf])
+    np.testing.assert_allclose(hits.range_m, [4.5, 6.5, np.inf], rtol=1e-6)
 
 
 @pytest.mark.parametrize(("limit", "body", "range_m"), [(4.4, -1, 4.4), (4.6, 0, 4.5), (np.inf, 0, 4.5)])

@@ -33,7 +33,8 @@ def seen_share(points_m: Float64, body: BoundingBox, voxel_m: float, seed: int) 
         seed: Of the places.
 
     Example:
-        >>> wall_m = np.stack([np.full(400, 5.0), *np.indices((20, 20)).reshape(2, -1) * 0.1], axis=1)
+        >>> y_m, z_m = np.indices((120, 80)).reshape(2, -1) * 0.05
+        >>> wall_m = np.stack([np.full(9600, 5.0), y_m - 3.0, z_m], axis=1)
         >>> behind_m = np.array([[9.0, 1.0, 1.0], [9.0, 9.0, 1.0]])
         >>> car = BoundingBox((-2.4, -0.9, 0.0), (2.4, 0.9, 1.6))
         >>> seen_share(np.concatenate([wall_m, behind_m]), car, 0.1, 0)[-2:].tolist()

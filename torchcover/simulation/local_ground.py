@@ -152,8 +152,8 @@ class LocalGround:
     Example:
         >>> from torchcover.simulation.shapes import Plane
         >>> ground = LocalGround([Plane(type="plane", size_m=(4, 4)).mesh()], np.zeros(3))
-        >>> ground.heights_m(np.array([[0.0, 0.0, 1.5], [9.0, 0.0, 1.5], [0.0, 0.0, -1.0]]))
-        array([1.5, nan, nan], dtype=float32)
+        >>> ground.heights_m(np.array([[0.0, 0.0, 1.5], [9.0, 0.0, 1.5], [0.0, 0.0, -1.0]])).round(3).tolist()
+        [1.5, nan, nan]
     """
 
     def __init__(self, meshes: Sequence[Mesh], origin_m: Float64) -> None:

@@ -71,7 +71,15 @@ def coincident_faces(meshes: Sequence[Mesh], within: Sequence[bool]) -> list[Boo
     """
     outward = np.concatenate([outward_faces(mesh) for mesh in meshes])
     number = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
-    caster, found = RayCaster(meshes), np.zeros(len(number), dtype=bool)
+    found, layer, in_itself = np.zeros(len(number), dtype=bool), _layers(meshes), np.array(within, dtype=bool)
+    layers = [
+        (
+            which,
+            RayCaster([meshes[k] for k in np.flatnonzero(layer == which).tolist()]),
+            np.flatnonzero(layer[number] == which),
+        )
+        for which in range(layer.max() + 1)
+    ]
     for part, corners_m in parts_of(meshes):
         has_area = normals_of(corners_m).any(axis=0)
         is_long = np.linalg.norm(corners_m - corners_m[[2, 0, 1]], axis=1).max(axis=0) > LONG_M
@@ -79,22 +87,46 @@ def coincident_faces(meshes: Sequence[Mesh], within: Sequence[bool]) -> list[Boo
             faces, corners = part.start + np.flatnonzero(some), corners_m[..., some]
             normals = normals_of(corners).T
             for shares in _inner_points(points) if len(faces) else ():
-                places_m = np.tensordot(shares, corners, 1).T
-                # From above, to what lies on it or is the same; from within, to what lies below.
-                for start_m in (COINCIDE_M, -APART_M):
-                    limit_m = COINCIDE_M + max(start_m, -COINCIDE_M / 2)
-                    met = caster.faces_met(places_m + start_m * normals, -normals, limit_m)
-                    other = (met >= 0) & (met != faces)
-                    other &= (number[met] != number[faces]) | np.array(within, dtype=bool)[number[faces]]
-                    one, two = faces[other], met[other]
-                    upon = normals[other], normals_of(corners_of(meshes, two)).T
-                    cosine = (upon[0] * upon[1]).sum(axis=1)
-                    # Back to back they are seen from different sides: by nobody, that of a body that stands on a sheet.
-                    apart = outward[one] & outward[two]
-                    apart |= (outward[one] & (upon[0][:, 2] < -ALIKE)) | (outward[two] & (upon[1][:, 2] < -ALIKE))
-                    same = (cosine > ALIKE) | ((cosine < -ALIKE) & ~apart)
-                    found[one[same]] = found[two[same]] = True
+                places_m, inner, rows = np.tensordot(shares, corners, 1).T, in_itself[number[faces]], []
+                for which, caster, of_layer in layers:
+                    own = layer[number[faces]] == which
+                    # Of others, to what lies on or below it; of its own body from above and from within, for a ray
+                    # that meets the face itself meets nothing else.
+                    for start_m, whose in ((COINCIDE_M, ~own | inner), (-APART_M, own & inner)):
+                        asked = np.flatnonzero(whose)
+                        starts_m, towards = places_m[asked] + start_m * normals[asked], -normals[asked]
+                        met = caster.faces_met(starts_m, towards, COINCIDE_M + max(start_m, -COINCIDE_M / 2))
+                        hit = met >= 0
+                        rows.append((asked[hit], of_layer[met[hit]]))
+                asked, two = np.concatenate(rows, axis=1)
+                others = two != faces[asked]
+                asked, one, two = asked[others], faces[asked[others]], two[others]
+                upon = normals[asked], normals_of(corners_of(meshes, two)).T
+                cosine = (upon[0] * upon[1]).sum(axis=1)
+                alike, opposite = cosine > ALIKE, cosine < -ALIKE
+                # Nobody sees a bottom that stands on a sheet, nor what coincides with it there.
+                down = outward[one] & (upon[0][:, 2] < -ALIKE), outward[two] & (upon[1][:, 2] < -ALIKE)
+                stands = np.isin(asked, asked[down[0] & ~outward[two] & (alike | opposite)])
+                # Back to back they are seen from different sides: by nobody, that of a body that stands on a sheet.
+                same = ~stands & (alike | (opposite & ~(outward[one] & outward[two]) & ~down[1]))
+                found[one[same]] = found[two[same]] = True
     return np.split(found, np.cumsum([len(mesh.faces) for mesh in meshes])[:-1])
+
+
+def _layers(meshes: Sequence[Mesh]) -> Int64:
+    """(meshes,) numbers of layers: bodies that may touch are in different ones.
+
+    Which of several faces at one place a ray meets first is up to how the processor rounds: so each is asked apart.
+    """
+    least_m, most_m = (
+        np.array([reach(mesh.vertices_m, axis=0) if len(mesh.faces) else np.full(3, np.nan) for mesh in meshes])
+        for reach in (np.min, np.max)
+    )
+    layers = np.full(len(meshes), -1)
+    for body in range(len(meshes)):
+        touch = (least_m[:body] <= most_m[body] + 2 * COINCIDE_M) & (most_m[:body] >= least_m[body] - 2 * COINCIDE_M)
+        layers[body] = next(free for free in range(body + 1) if free not in layers[:body][touch.all(axis=1)])
+    return layers
 
 
 def warn_of_coincidence(names: Sequence[str], coincident: Sequence[Bools]) -> None:

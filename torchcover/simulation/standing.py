@@ -4,9 +4,7 @@ import warnings
 
 import numpy as np
 
-from torchcover.geometry import transform
-from torchcover.geometry.arrays import Float64, Int64
-from torchcover.simulation.instant import Instant
+from torchcover.geometry.arrays import Int64
 from torchcover.simulation.scene import Scene
 
 # Nearer than this is near enough, above or below.
@@ -14,9 +12,6 @@ NEAR_M = 1.0
 # Instants that are looked at, and how far about the ego.
 LOOKS = 8
 WITHIN_M = 100.0
-# Faces of its own that lie above the ground under the middle of a resting ego, at most.
-OWN_FACES = 16
-LIFT_M = 1e-3
 
 
 def warn_of_floating(name: str, scene: Scene, steps: Int64) -> None:
@@ -42,19 +37,5 @@ def _grounded(scene: Scene, step: int) -> Int64:
     others = instant.moving.vehicle_T_part[instant.moving.body != instant.ego, :3, 3]
     places_m = np.concatenate([np.zeros((1, 3)), others])
     is_ego = np.arange(len(places_m)) == 0
-    return np.column_stack([is_ego, [_has_ground(instant, place_m, up) for place_m in places_m]]).astype(np.int64)
-
-
-def _has_ground(instant: Instant, place_m: Float64, up: Float64) -> bool:
-    """Whether a ray from above a place to below it meets what never moves, the ego itself aside."""
-    down = -(instant.static_T_vehicle[:3, :3] @ up).astype(np.float32)[:, None]
-    left_m = 2 * NEAR_M
-    for _ in range(OWN_FACES):
-        start_m = transform(instant.static_T_vehicle, (place_m + (left_m - NEAR_M) * up)[None])[0]
-        hits = instant.static.cast(start_m, down, np.array([left_m], dtype=np.float32))
-        if hits.body[0] != instant.ego:
-            return bool(hits.body[0] >= 0)
-        left_m -= float(hits.range_m[0]) + LIFT_M
-        if left_m <= 0:
-            return False
-    return False
+    heights_m = instant.heights_m((places_m + NEAR_M * up).astype(np.float32))
+    return np.column_stack([is_ego, heights_m <= 2 * NEAR_M]).astype(np.int64)
