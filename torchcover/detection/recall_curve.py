@@ -51,10 +51,8 @@ class Ratio:
 class Curve:
     """Recall and precision over bins, (S, B) for S score thresholds and B bins.
 
-    Args:
-        bins: What each bin holds, in words: "0.2-0.4", "hidden", "not sampled".
-        recall: Objects found, of the objects of the bin.
-        precision: Detections that found an object, of the detections of the bin.
+    `bins`: what each bin holds, in words: "0.2-0.4", "hidden", "not sampled"; `recall`: objects found, of the objects
+    of the bin; `precision`: detections that found an object, of the detections of the bin.
     """
 
     bins: tuple[str, ...]

@@ -71,10 +71,8 @@ def usual_workers(frames: int, worlds: int, *, whole: bool) -> int:
 
     None where a process can only be started anew: a program that is not made for that would start itself.
 
-    Args:
-        frames: How many.
-        worlds: How many they are of; a world is built by one process.
-        whole: Whether frames are handed over, rather than sums of them.
+    `frames`: how many; `worlds`: how many they are of; a world is built by one process; `whole`: whether frames are
+    handed over, rather than sums of them.
 
     Example:
         >>> usual_workers(frames=64, worlds=1, whole=False)

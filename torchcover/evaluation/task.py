@@ -72,11 +72,7 @@ class Task(NamedTuple, Generic[SourceT]):
         return tuple(self.given)
 
     def sensor_names(self) -> Mapping[str, Sequence[str]]:
-        """Name of each rig -> names of its sensors.
-
-        Raises:
-            ValueError: It is unknown which points are of which sensor.
-        """
+        """Name of each rig -> names of its sensors. ValueError: it is unknown which points are of which sensor."""
         known = self.frames.sensor_names
         if unknown := [rig for rig in self.rigs if rig not in known]:
             raise ValueError(f"redundancy: unknown which points of {', '.join(unknown)} are of which sensor")
@@ -262,21 +258,14 @@ def distinct(stems: Sequence[str]) -> list[str]:
 
 
 def loaded(rig: AnyRig) -> Rig:
-    """The rig itself.
-
-    Raises:
-        FileNotFoundError: No such file or built-in name.
-        ValueError: The file is not a rig.
-    """
+    """The rig itself. FileNotFoundError: no such file or built-in name. ValueError: the file is not a rig."""
     return rig if isinstance(rig, Rig) else Rig.load(rig)
 
 
 def as_called(rig: AnyRig) -> Rig:
     """The rig itself, under the name that tables and files of every command have for it.
 
-    Raises:
-        FileNotFoundError: As `loaded`.
-        ValueError: As `loaded`.
+    FileNotFoundError: as `loaded`. ValueError: as `loaded`.
     """
     return loaded(rig).model_copy(update={"name": _stem(rig)})
 

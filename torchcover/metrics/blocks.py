@@ -21,10 +21,8 @@ MIN_WAITING = 4096
 class Rows(NamedTuple):
     """What the rows of a `TouchedSums` are.
 
-    Args:
-        cells: How many cells there are; a row is of the cell `key % cells` in the block `key // cells`.
-        maxima: How many of the last columns are not added up, but keep the largest.
-        fine: Whether its blocks are the fine ones.
+    `cells`: how many cells there are; a row is of the cell `key % cells` in the block `key // cells`; `maxima`: how
+    many of the last columns are not added up, but keep the largest; `fine`: whether its blocks are the fine ones.
     """
 
     cells: int

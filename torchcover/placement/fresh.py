@@ -149,8 +149,7 @@ def fresh_test(
 
     A scenario without traffic is the same world for any seed, and is left out.
 
-    Raises:
-        ValueError: The seed of the search; no scenario with traffic; a rig that cannot be mounted in a fresh world.
+    ValueError: the seed of the search; no scenario with traffic; a rig that cannot be mounted in a fresh world.
     """
     first = next(iter(winners))
     others, parts = _others(searched.objectives, failures=max(len(start.sensors), len(winners[first].sensors)) > 1)

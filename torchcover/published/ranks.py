@@ -127,12 +127,8 @@ def kendall_tau_b(first: ArrayLike, second: ArrayLike) -> Float64:
 
     with C concordant, D discordant and P all pairs, T_i of them equal in the i-th (Kendall 1945, Biometrika 33, 239).
 
-    Args:
-        first: (..., n), NaN where unknown: what is unknown in one of the two is in no pair.
-        second: (..., n), likewise; the two broadcast.
-
-    Returns:
-        (...); NaN for fewer than three that are known, or if all of one are equal.
+    `first`: (..., n), NaN where unknown: what is unknown in one of the two is in no pair; `second`: (..., n), likewise;
+    the two broadcast. Returns (...); NaN for fewer than three that are known, or if all of one are equal.
 
     Example:
         >>> float(kendall_tau_b([1, 2, 3, 4], [1, 2, 4, 3]))

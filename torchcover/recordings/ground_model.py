@@ -79,12 +79,8 @@ class GroundModel(NamedTuple):
     def below(cls, surfaces: Sequence[Float64], place_m: Float64) -> "GroundModel | None":
         """The ground that sweeps have seen around a place.
 
-        Args:
-            surfaces: `low_surfaces` of each sweep.
-            place_m: (3,) where the vehicle is.
-
-        Returns:
-            It; None where none of it is near the vehicle.
+        `surfaces`: `low_surfaces` of each sweep; `place_m`: (3,) where the vehicle is. Returns it; None where none of
+        it is near the vehicle.
         """
         low, above_m = _columns(np.concatenate([np.empty((0, 4)), *surfaces]), place_m)
         if not len(low):

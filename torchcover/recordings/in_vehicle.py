@@ -36,12 +36,8 @@ class InVehicle(NamedTuple):
 def in_vehicle(scan: Scan, body: BoundingBox | None = None) -> InVehicle:
     """Move a scan into the vehicle frame; leave out what no surface of the world has returned.
 
-    Args:
-        scan: What was stored.
-        body: The vehicle itself: points in it are its own. None: its size is unknown.
-
-    Raises:
-        ValueError: A coordinate beyond 1e5 m, as in a world frame.
+    `scan`: what was stored; `body`: the vehicle itself: points in it are its own. None: its size is unknown.
+    ValueError: a coordinate beyond 1e5 m, as in a world frame.
 
     Example:
         >>> scan = Scan(np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0], [np.nan, 0.0, 0.0]]), None, "a.npy")

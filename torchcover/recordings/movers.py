@@ -31,9 +31,7 @@ WITHIN_M = 165.0
 class Moved(NamedTuple):
     """Something that moves.
 
-    Args:
-        points_m: (N, 3) where it is at the instant.
-        velocity_mps: (2,) along x and y of the frame of the points.
+    `points_m`: (N, 3) where it is at the instant; `velocity_mps`: (2,) along x and y of the frame of the points.
     """
 
     points_m: Float64
@@ -43,9 +41,8 @@ class Moved(NamedTuple):
 def movers(scans_m: Sequence[Float64], apart_s: Float64) -> list[Moved]:
     """What moves, or has stood for a moment only.
 
-    Args:
-        scans_m: (N, 3) points of each scan that belong to nothing that stands.
-        apart_s: (S,) when each scan was, from the instant on.
+    `scans_m`: (N, 3) points of each scan that belong to nothing that stands; `apart_s`: (S,) when each scan was, from
+    the instant on.
 
     Example:
         >>> side_m = np.stack([0.2 * np.arange(20), np.zeros(20), np.ones(20)], axis=1)

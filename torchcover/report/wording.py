@@ -51,10 +51,8 @@ def shown_unit(unit: Unit) -> ShownUnit:
 class Rounded(NamedTuple):
     """A number as a reader sees it.
 
-    Args:
-        value: In the unit that is shown: metres or percent.
-        decimals: How many are shown.
-        relation: "<" or ">" for a number that is beyond `value`, but would be rounded to an end of the scale.
+    `value`: in the unit that is shown: metres or percent; `decimals`: how many are shown; `relation`: "<" or ">" for a
+    number that is beyond `value`, but would be rounded to an end of the scale.
     """
 
     value: float
@@ -65,10 +63,7 @@ class Rounded(NamedTuple):
 def rounded(number: float, error: float, unit: Unit) -> Rounded:
     """Round a number: to the two digits of its error, or to the usual decimals if it has none.
 
-    Args:
-        number: In its unit; not NaN.
-        error: Its standard error; NaN for none.
-        unit: That of its quantity.
+    `number`: in its unit; not NaN; `error`: its standard error; NaN for none; `unit`: that of its quantity.
 
     Example:
         >>> rounded(0.34127, 0.0123, "m"), rounded(0.9999, float("nan"), "share")
@@ -88,9 +83,8 @@ def rounded(number: float, error: float, unit: Unit) -> Rounded:
 def rounded_error(error: float, max_decimals: int) -> Rounded:
     """Round an error > 0 to two digits.
 
-    Args:
-        error: In the unit that is shown.
-        max_decimals: No more decimals than these; what they would round to nothing is less than the least.
+    `error`: in the unit that is shown; `max_decimals`: no more decimals than these; what they would round to nothing is
+    less than the least.
     """
     least = 10.0**-max_decimals
     if error < least / 2:
@@ -172,13 +166,8 @@ def number_words(number: Number) -> str:
 def value_words(value: float, unit: Unit) -> str:
     """A number alone, without the unit.
 
-    Args:
-        value: In its unit.
-        unit: Its unit.
-
-    Returns:
-        A length with two decimals, a share in percent with one, what has another unit with four digits. A share is
-        never rounded to 0 or 100. "unknown" for NaN, "infinite" for infinity.
+    `value`: in its unit; `unit`: its unit. Returns a length with two decimals, a share in percent with one, what has
+    another unit with four digits. A share is never rounded to 0 or 100. "unknown" for NaN, "infinite" for infinity.
 
     Example:
         >>> [value_words(length, "m") for length in (0.126, 12.0, float("inf"), float("nan"))]

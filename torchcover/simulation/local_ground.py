@@ -77,8 +77,7 @@ def ground_under(meshes: Sequence[Mesh], places_m: Float64) -> list[Bools]:
     Two level surfaces are connected that share an edge, or of which one goes on where the other ends, at most 0.3 m
     higher or lower. If no place has any within a metre, a level face below counts, however far; else a sheet above.
 
-    Returns:
-        One (F,) mask for each mesh.
+    Returns one (F,) mask for each mesh.
     """
     outward = [outward_faces(mesh) for mesh in meshes]
     level = [level_faces(mesh, known) for mesh, known in zip(meshes, outward, strict=True)]

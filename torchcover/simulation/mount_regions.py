@@ -137,8 +137,7 @@ class MountRegion(Document):
     def on(self, skin: Skin, u: float, v: float) -> SkinPoint:
         """A place on the skin, `u` and `v` from 0 to 1 along the window's axes in the order x, y, z.
 
-        Raises:
-            ValueError: Nothing of the body is there.
+        ValueError: nothing of the body is there.
         """
         window = [bounds for bounds in (self.x_m, self.y_m, self.z_m) if bounds is not None]
         (x, y) = (low + share * (high - low) for share, (low, high) in zip((u, v), window, strict=True))

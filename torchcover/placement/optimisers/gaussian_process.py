@@ -34,9 +34,7 @@ class GaussianProcessSearch:
     Its noise is the squared error that it is told, and a little that it learns. A place where no rig can be counts as
     the lowest value so far, so that little is expected nearby. Where all are choices, each combination comes once.
 
-    Args:
-        cube: What is free.
-        seed: Of the first places and of where improvement is looked for.
+    `seed`: of the first places and of where improvement is looked for.
 
     Example:
         >>> search = GaussianProcessSearch(Cube(levels=(0,), start=np.array([0.0])), seed=0)

@@ -55,12 +55,8 @@ def square_sides(points: Tensor, cell_m: float) -> Tensor:
 def over_squares(values: Tensor, sides: Tensor) -> Tensor:
     """The sum over the square that each cell lies in.
 
-    Args:
-        values: (..., H, Y, X) what is added up.
-        sides: (H, Y, X) as from `square_sides`.
-
-    Returns:
-        (..., H, Y, X) float64.
+    `values`: (..., H, Y, X) what is added up; `sides`: (H, Y, X) as from `square_sides`. Returns (..., H, Y, X)
+    float64.
     """
     sums, side = values.double(), 2
     while side <= int(sides.max()):

@@ -34,9 +34,8 @@ class Window(NamedTuple):
 def asked_and_known(coverage: Coverage, ego_outline_m: Outline | None = None) -> Window:
     """What of a result is worth paper: where it knows cells within the regions' bounds, and the ego.
 
-    Args:
-        coverage: The result; the whole grid if it knows nothing.
-        ego_outline_m: (K, 2) corners x, y of the ego in metres.
+    `coverage`: the result; the whole grid if it knows nothing; `ego_outline_m`: (K, 2) corners x, y of the ego in
+    metres.
     """
     grid = coverage.grid
     known = coverage.known.spread(coverage.known.points > 0, False).any(dim=0)

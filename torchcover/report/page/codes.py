@@ -32,12 +32,7 @@ class CellBytes:
     def add(self, values: NDArray[Any], bits: int) -> int:
         """Keep an array.
 
-        Args:
-            values: (Y, X) numbers; NaN is unknown.
-            bits: Of each, 8 or 16.
-
-        Returns:
-            Its place in `arrays`.
+        `values`: (Y, X) numbers; NaN is unknown; `bits`: of each, 8 or 16. Returns its place in `arrays`.
         """
         if id(values) in self._known:  # which stays the same object, for it is held here
             return self._known[id(values)][1]
