@@ -23,11 +23,6 @@ class Ratio:
         low: Lower end of the 95 % Wilson interval (Wilson 1927).
         high: Its upper end.
         trials: int64 number of trials.
-
-    Example:
-        >>> import torch
-        >>> Ratio.of(torch.tensor([8, 0]), torch.tensor([10, 0])).value
-        tensor([0.8000,    nan], dtype=torch.float64)
     """
 
     value: Tensor

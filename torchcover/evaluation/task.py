@@ -214,13 +214,6 @@ def spread_s(scenario: Scenario, given_s: float | None) -> float:
 
     That is the golden share of its instants, round and round: any number of steps lies evenly over all of it, and no
     instant comes again before all have been seen.
-
-    Example:
-        >>> drive = {"name": "drive", "ego": {"shape": {"type": "box", "size_m": [4, 2, 2]}, "trajectory": "drive.csv"}}
-        >>> ground = {"bodies": [{"name": "ground", "shape": {"type": "plane", "size_m": [99, 99]}}], "duration_s": 30}
-        >>> every_s = spread_s(Scenario.model_validate({**drive, **ground}), None)
-        >>> [round(step * every_s % 30.1, 1) for step in range(6)]
-        [0.0, 18.6, 7.1, 25.7, 14.2, 2.7]
     """
     if given_s is not None:
         return given_s
@@ -232,12 +225,7 @@ def spread_s(scenario: Scenario, given_s: float | None) -> float:
 
 
 def distinct_names(rigs: Sequence[AnyRig]) -> list[str]:
-    """What the columns are called: the rig's name, or the stem of its file; numbered where two would be the same.
-
-    Example:
-        >>> distinct_names(["kitti", "old/my.yaml", "new/my.yaml"])
-        ['kitti', 'my', 'my_2']
-    """
+    """What the columns are called: the rig's name, or the stem of its file; numbered where two would be the same."""
     return distinct([_stem(rig) for rig in rigs])
 
 

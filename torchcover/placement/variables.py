@@ -9,12 +9,7 @@ DECIMALS = 6
 
 
 class FreeNumber(NamedTuple):
-    """A number between two others, under the name of its sensor and key, as "roof.pitch_deg".
-
-    Example:
-        >>> FreeNumber("roof.pitch_deg", -10.0, 15.0).at(0.5)
-        2.5
-    """
+    """A number between two others, under the name of its sensor and key, as "roof.pitch_deg"."""
 
     name: str
     low: float
@@ -40,13 +35,7 @@ class FreeNumber(NamedTuple):
 
 
 class FreeChoice(NamedTuple):
-    """One of several options, between which there is nothing: each has an equal part of the way from 0 to 1.
-
-    Example:
-        >>> model = FreeChoice("roof.model", ("a", "b"))
-        >>> model.at(0.49), model.at(0.5), model.unit("b")
-        ('a', 'b', 0.75)
-    """
+    """One of several options, between which there is nothing: each has an equal part of the way from 0 to 1."""
 
     name: str
     options: tuple[Value, ...]

@@ -38,11 +38,6 @@ def in_vehicle(scan: Scan, body: BoundingBox | None = None) -> InVehicle:
 
     `scan`: what was stored; `body`: the vehicle itself: points in it are its own. None: its size is unknown.
     ValueError: a coordinate beyond 1e5 m, as in a world frame.
-
-    Example:
-        >>> scan = Scan(np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0], [np.nan, 0.0, 0.0]]), None, "a.npy")
-        >>> in_vehicle(scan)
-        InVehicle(points_m=array([[5., 0., 0.]], dtype=float32), dropped=Counter({...}), weights=None, heights_m=None)
     """
     points_m, weights, heights_m = scan.points_m, scan.weights, scan.heights_m
     finite, returned = _finite(points_m), _returned(points_m)

@@ -43,13 +43,6 @@ def movers(scans_m: Sequence[Float64], apart_s: Float64) -> list[Moved]:
 
     `scans_m`: (N, 3) points of each scan that belong to nothing that stands; `apart_s`: (S,) when each scan was, from
     the instant on.
-
-    Example:
-        >>> side_m = np.stack([0.2 * np.arange(20), np.zeros(20), np.ones(20)], axis=1)
-        >>> times_s = np.array([-0.2, -0.1, 0.1, 0.2])
-        >>> car, = movers([side_m + [10.0 * time_s, 0.0, 0.0] for time_s in times_s], times_s)
-        >>> bool(np.abs(car.velocity_mps - [10.0, 0.0]).max() < 0.3), len(car.points_m)
-        (True, 80)
     """
     found: list[Moved] = []
     if sum(map(len, scans_m)) < FEWEST or len(scans_m) < 2:

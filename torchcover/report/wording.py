@@ -64,10 +64,6 @@ def rounded(number: float, error: float, unit: Unit) -> Rounded:
     """Round a number: to the two digits of its error, or to the usual decimals if it has none.
 
     `number`: in its unit; not NaN; `error`: its standard error; NaN for none; `unit`: that of its quantity.
-
-    Example:
-        >>> rounded(0.34127, 0.0123, "m"), rounded(0.9999, float("nan"), "share")
-        (Rounded(value=0.341, decimals=3, relation=''), Rounded(value=99.9, decimals=1, relation='>'))
     """
     shown = shown_unit(unit)
     value = shown.factor * number
@@ -168,14 +164,6 @@ def value_words(value: float, unit: Unit) -> str:
 
     `value`: in its unit; `unit`: its unit. Returns a length with two decimals, a share in percent with one, what has
     another unit with four digits. A share is never rounded to 0 or 100. "unknown" for NaN, "infinite" for infinity.
-
-    Example:
-        >>> [value_words(length, "m") for length in (0.126, 12.0, float("inf"), float("nan"))]
-        ['0.13', '12.00', 'infinite', 'unknown']
-        >>> value_words(0.49812, "share"), value_words(1.0, "share")
-        ('49.8', '100')
-        >>> value_words(-0.0123456, "nats"), value_words(12345.6, "points")
-        ('-0.01235', '12346')
     """
     if math.isnan(value):
         return UNKNOWN
@@ -193,12 +181,7 @@ def percent(share: float) -> str:
 
 
 def square_metres(m2: float) -> str:
-    """An area with one decimal that rounds nothing to none.
-
-    Example:
-        >>> [square_metres(m2) for m2 in (0.0, 0.01, 12.34, 1234.56, float("nan"))]
-        ['0', '<0.1', '12.3', '1,234.6', 'unknown']
-    """
+    """An area with one decimal that rounds nothing to none."""
     if math.isnan(m2):
         return UNKNOWN
     if m2 < 0.05:

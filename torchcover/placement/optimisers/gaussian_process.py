@@ -147,10 +147,6 @@ def log_expected_improvement(mean: Tensor, deviation: Tensor, best: float, scale
     """The logarithm of E[max(f - best, 0)] / scale for normally distributed f, without underflow (Ament et al. 2023).
 
     Means and deviations are (m,); deviations below a trillionth of the scale count as that.
-
-    Example:
-        >>> float(log_expected_improvement(torch.zeros(1), torch.ones(1), 0.0, 1.0).exp() * math.sqrt(2 * math.pi))
-        1.0
     """
     deviation = (deviation / scale).clamp_min(1e-12)
     z = (mean - best) / scale / deviation

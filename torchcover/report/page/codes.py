@@ -59,13 +59,7 @@ class CellBytes:
 
 
 def encoded(values: NDArray[np.float64], bits: int) -> tuple[NDArray[np.uint16], Mapping[str, Any]]:
-    """Codes of numbers that are not NaN, and what a reader needs to have them back (`cells.js`).
-
-    Example:
-        >>> codes, scale = encoded(np.array([0.0, 1.0, 3.0, np.inf]), 8)
-        >>> codes, scale
-        (array([  0,   1, 254, 255], dtype=uint16), {'log': False, 'low': 1.0, 'high': 3.0})
-    """
+    """Codes of numbers that are not NaN, and what a reader needs to have them back (`cells.js`)."""
     top = 2**bits - 1
     endless, nothing = np.isposinf(values), values == 0
     usual = values[np.isfinite(values) & ~nothing]
