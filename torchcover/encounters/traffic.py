@@ -82,8 +82,7 @@ class Drive(NamedTuple):
     def of_recording(cls, recording: Recording) -> Self:
         """That of a recording with poses, times and labelled objects.
 
-        Raises:
-            ValueError: One of these is missing, the size of the vehicle, or road users among the objects.
+        ValueError: one of these is missing, the size of the vehicle, or road users among the objects.
         """
         recorded = objects_of(recording)
         if recording.body is None:

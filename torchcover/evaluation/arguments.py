@@ -34,9 +34,7 @@ class Option:
 class Read(Generic[GivenT, ValueT]):
     """A field of a dataclass that takes more forms than one, and has one from then on.
 
-    Args:
-        read: Makes it of what was given.
-        default: As it may be given.
+    `read`: makes it of what was given; `default`: as it may be given.
     """
 
     def __init__(self, read: Callable[[GivenT], ValueT], default: GivenT) -> None:

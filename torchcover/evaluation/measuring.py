@@ -40,11 +40,7 @@ ENOUGH_FRAMES = 256
 
 
 def measured(task: Task[FrameSource], settings: Settings) -> Result:
-    """Measure it.
-
-    Raises:
-        ValueError: As `evaluate`.
-    """
+    """Measure it. ValueError: as `evaluate`."""
     ranks = settings.ranks
     frames = task.frames
     sensors = [sensor for of_rig in task.sensors.values() for sensor in of_rig]
@@ -231,11 +227,7 @@ def metric_of(
 
 
 def usable_device(name: str) -> torch.device:
-    """The device of this name.
-
-    Raises:
-        ValueError: It cannot be used here.
-    """
+    """The device of this name. ValueError: it cannot be used here."""
     try:
         device = torch.device(name)
         torch.zeros(1, device=device, dtype=torch.float64).item()  # the device `meta` has no values

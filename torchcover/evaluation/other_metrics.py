@@ -22,9 +22,7 @@ WHY: Mapping[Need, str] = {
 class OtherMetrics(NamedTuple):
     """The metrics of a run.
 
-    Args:
-        of_rigs: Name of a metric -> name of a rig -> the metric.
-        left_out: Name of a metric -> why there is none.
+    `of_rigs`: name of a metric -> name of a rig -> the metric; `left_out`: name of a metric -> why there is none.
     """
 
     of_rigs: Mapping[str, Mapping[str, FrameMetric]]
@@ -46,8 +44,7 @@ class OtherMetrics(NamedTuple):
 def metrics_of(task: Task[FrameSource], settings: Settings) -> OtherMetrics:
     """Make the metrics that were asked for; what cannot be made for all rigs is left out, if others can.
 
-    Raises:
-        ValueError: None of them can be made; the message says why.
+    ValueError: None of them can be made; the message says why.
     """
     sights, threshold_m = Sights(), settings.thresholds_m[0] if settings.thresholds_m else 0.4
     lacking, ego = _lacking(task), task.frames.ego_mesh()

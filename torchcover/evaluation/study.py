@@ -385,11 +385,7 @@ def _paired(first: Coverage, coverage: Coverage, region: Region, height: str) ->
 
 
 def command_s(plan: StudyPlan) -> float:
-    """How long `torchcover evaluate` takes for one step, from its start to its end.
-
-    Raises:
-        ValueError: It fails.
-    """
+    """How long `torchcover evaluate` takes for one step, from its start to its end. ValueError: it fails."""
     words = [*plan.command, "--steps=1"]
     start = time.perf_counter()
     with TemporaryDirectory() as folder:

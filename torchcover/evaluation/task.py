@@ -72,11 +72,7 @@ class Task(NamedTuple, Generic[SourceT]):
         return tuple(self.given)
 
     def sensor_names(self) -> Mapping[str, Sequence[str]]:
-        """Name of each rig -> names of its sensors.
-
-        Raises:
-            ValueError: It is unknown which points are of which sensor.
-        """
+        """Name of each rig -> names of its sensors. ValueError: it is unknown which points are of which sensor."""
         known = self.frames.sensor_names
         if unknown := [rig for rig in self.rigs if rig not in known]:
             raise ValueError(f"redundancy: unknown which points of {', '.join(unknown)} are of which sensor")
@@ -218,13 +214,6 @@ def spread_s(scenario: Scenario, given_s: float | None) -> float:
 
     That is the golden share of its instants, round and round: any number of steps lies evenly over all of it, and no
     instant comes again before all have been seen.
-
-    Example:
-        >>> drive = {"name": "drive", "ego": {"shape": {"type": "box", "size_m": [4, 2, 2]}, "trajectory": "drive.csv"}}
-        >>> ground = {"bodies": [{"name": "ground", "shape": {"type": "plane", "size_m": [99, 99]}}], "duration_s": 30}
-        >>> every_s = spread_s(Scenario.model_validate({**drive, **ground}), None)
-        >>> [round(step * every_s % 30.1, 1) for step in range(6)]
-        [0.0, 18.6, 7.1, 25.7, 14.2, 2.7]
     """
     if given_s is not None:
         return given_s
@@ -236,12 +225,7 @@ def spread_s(scenario: Scenario, given_s: float | None) -> float:
 
 
 def distinct_names(rigs: Sequence[AnyRig]) -> list[str]:
-    """What the columns are called: the rig's name, or the stem of its file; numbered where two would be the same.
-
-    Example:
-        >>> distinct_names(["kitti", "old/my.yaml", "new/my.yaml"])
-        ['kitti', 'my', 'my_2']
-    """
+    """What the columns are called: the rig's name, or the stem of its file; numbered where two would be the same."""
     return distinct([_stem(rig) for rig in rigs])
 
 
@@ -262,21 +246,14 @@ def distinct(stems: Sequence[str]) -> list[str]:
 
 
 def loaded(rig: AnyRig) -> Rig:
-    """The rig itself.
-
-    Raises:
-        FileNotFoundError: No such file or built-in name.
-        ValueError: The file is not a rig.
-    """
+    """The rig itself. FileNotFoundError: no such file or built-in name. ValueError: the file is not a rig."""
     return rig if isinstance(rig, Rig) else Rig.load(rig)
 
 
 def as_called(rig: AnyRig) -> Rig:
     """The rig itself, under the name that tables and files of every command have for it.
 
-    Raises:
-        FileNotFoundError: As `loaded`.
-        ValueError: As `loaded`.
+    FileNotFoundError: as `loaded`. ValueError: as `loaded`.
     """
     return loaded(rig).model_copy(update={"name": _stem(rig)})
 

@@ -36,11 +36,6 @@ class Trajectory:
 
     Raises:
         ValueError: No pose, shapes that do not fit, NaN or infinite numbers, times that do not ascend.
-
-    Example:
-        >>> drive = Trajectory.from_arrays([0.0, 2.0], positions_m=[[0, 0, 0], [20, 0, 0]], angles_deg=[[0, 0, 0]] * 2)
-        >>> drive.at(0.5)[:3, 3]
-        array([5., 0., 0.])
     """
 
     times_s: Matrix
@@ -137,12 +132,7 @@ class Trajectory:
 
 
 def poses_at(trajectories: Sequence[Trajectory], time_s: float) -> Matrix:
-    """(P, 4, 4) poses `world_T_body` of P bodies at one time; see `Trajectory.at`.
-
-    Example:
-        >>> poses_at([Trajectory.resting((x, 0.0, 0.0)) for x in (1.0, 2.0)], 0.5)[:, 0, 3]
-        array([1., 2.])
-    """
+    """(P, 4, 4) poses `world_T_body` of P bodies at one time; see `Trajectory.at`."""
     # Bodies of one world share their times, or have views of them: they are looked up once.
     moments, ends, shares = dict[int, tuple[int, int, float]](), [], []
     for each in trajectories:

@@ -54,8 +54,7 @@ class Questions(NamedTuple):
     def around(cls, ego_outline_m: Float64, objectives: Mapping[str, Objective]) -> Self:
         """What follows for a vehicle with (K, 2) corners x, y.
 
-        Raises:
-            ValueError: A region or a band that is none; two regions of one name; one that holds no cell centre.
+        ValueError: a region or a band that is none; two regions of one name; one that holds no cell centre.
         """
         usual = {region.name: region for region in RegionsOfInterest().around(ego_outline_m).regions}
         regions: dict[str, Region] = {}
@@ -125,8 +124,7 @@ class Questions(NamedTuple):
     def check(self, rig: Rig, ego: Mesh | None = None) -> None:
         """Refuse objectives that are numbers of no result of such a rig on its ego.
 
-        Raises:
-            ValueError: Such a one; the message has the nearest name.
+        ValueError: such a one; the message has the nearest name.
         """
         asked = self._replace(thresholds_m=self.thresholds_m or (THRESHOLD_M,))
         numbers = asked.numbers_of(rig, ego)

@@ -43,9 +43,8 @@ def by_name(seen: Iterable[Seen]) -> dict[str, list[Seen]]:
 class SeenObjects:
     """Objects at any time; between two of theirs they move evenly.
 
-    Args:
-        seen: When and where they were seen, in any order.
-        longest_gap_s: Where one was unseen for longer, it is unknown where it was.
+    `seen`: when and where they were seen, in any order; `longest_gap_s`: where one was unseen for longer, it is unknown
+    where it was.
     """
 
     def __init__(self, seen: Sequence[Seen], longest_gap_s: float = 1.0) -> None:

@@ -45,15 +45,7 @@ class RangeImage(NamedTuple):
 
     @classmethod
     def of(cls, points_m: NDArray[np.floating], sensor_T_local: Matrix) -> "RangeImage":
-        """Of the (N, 3) points that a scan has returned, in the frame of its sensor.
-
-        Example:
-            >>> wall_m = np.stack([np.full(900, 20.0), *np.indices((30, 30)).reshape(2, -1) * 0.05], axis=1)
-            >>> votes = np.zeros(2, np.int16)
-            >>> RangeImage.of(wall_m, np.eye(4)).vote(np.array([[10.0, 0.3, 0.3], [19.0, 0.6, 0.6]]), votes)
-            >>> votes.tolist()
-            [1, 0]
-        """
+        """Of the (N, 3) points that a scan has returned, in the frame of its sensor."""
         row, column, range_m = _bins(points_m.astype(np.float64), 1)
         if not len(row):
             return cls(np.zeros((0, COLUMNS), np.float32), 0, sensor_T_local, 0.0)

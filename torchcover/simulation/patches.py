@@ -30,13 +30,6 @@ def outward_faces(mesh: Mesh) -> Bools:
     Faces that share an edge belong to one surface. It is closed if every edge is run through as often one way as the
     other, and turned outwards if it encloses a volume that is not negative. A face of any other surface, such as a
     plane, an open mesh, or a ball that is turned inside out, may be seen from both sides.
-
-    Example:
-        >>> from torchcover.simulation.shapes import Box, Plane
-        >>> outward_faces(Box(type="box", size_m=(1, 1, 1)).mesh()).tolist() == [True] * 12
-        True
-        >>> outward_faces(Plane(type="plane", size_m=(1, 1)).mesh()).tolist()
-        [False, False]
     """
     if mesh.outward is not None:
         return mesh.outward

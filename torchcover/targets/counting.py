@@ -90,12 +90,8 @@ class Beams(NamedTuple):
     def filled(self, hits: RayHits, ends: Ends) -> tuple[RayHits, Numbers]:
         """All hits of each beam in which a target has some, at each position.
 
-        Args:
-            hits: N hits on the target, by ascending position and ray.
-            ends: Where the rays end without it.
-
-        Returns:
-            M hits, by position, beam and ray, and (M,) which of the N each is, -1 if it is on something else.
+        `hits`: N hits on the target, by ascending position and ray; `ends`: where the rays end without it. Returns M
+        hits, by position, beam and ray, and (M,) which of the N each is, -1 if it is on something else.
         """
         assert hits.place is not None  # the positions
         rays, beams = len(self.of_ray), len(self.first) - 1

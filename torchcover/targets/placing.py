@@ -36,12 +36,6 @@ def yaws(heading: Heading, target: BoundingBox, vehicle: BoundingBox, positions_
 
     Raises:
         ValueError: Another word, or degrees that are no number.
-
-    Example:
-        >>> wall = BoundingBox((-0.1, -1.0, 0.0), (0.1, 1.0, 1.0))
-        >>> car = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))
-        >>> np.rad2deg(yaws("wide", wall, car, np.array([[5.0, 0.0], [0.0, 5.0]]))).tolist()
-        [180.0, -90.0]
     """
     if heading in ("narrow", "wide"):
         towards_m = 0.0 - from_outline_m(vehicle, positions_m)  # no -0.0, which is another angle

@@ -93,9 +93,8 @@ class Steps:
     def __iter__(self) -> Iterator[Step]:
         """One after the other.
 
-        Raises:
-            FileNotFoundError: A mesh, vehicle or trajectory file is missing.
-            ValueError: A sensor or an actor that is where none can be.
+        FileNotFoundError: a mesh, vehicle or trajectory file is missing. ValueError: a sensor or an actor that is where
+        none can be.
         """
         resting: tuple[list[Ends], Float64, Bools] | None = None
         for index in range(self._steps):

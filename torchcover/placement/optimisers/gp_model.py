@@ -56,13 +56,6 @@ class GaussianProcess:
         Rasmussen and Williams 2006, Gaussian Processes for Machine Learning, algorithm 2.1 and section 5.4. `places`
         are (n, variables) float64, n of 1 or more, with duplicates or without; `values` (n,) and finite; `errors` (n,)
         the standard error of each, 0 for an exact one. Those of `like` are taken instead of learned, if it is given.
-
-        Example:
-            >>> x = torch.linspace(0, 1, 9, dtype=torch.float64)[:, None]
-            >>> model = GaussianProcess.fitted((0,), x, (6 * x[:, 0]).sin(), torch.zeros(9, dtype=torch.float64))
-            >>> mean, deviation = model.predict(torch.tensor([[0.3]], dtype=torch.float64))
-            >>> bool((mean - math.sin(1.8)).abs() < 0.01)
-            True
         """
         shift = float(values.mean())
         spread = float((values - shift).square().mean().sqrt())

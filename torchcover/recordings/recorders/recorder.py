@@ -56,11 +56,7 @@ class Recorder(Protocol):
     """Writes a recording step by step; another process may go on where one has ended."""
 
     def __init__(self, add: Add, setup: RecordingSetup, /) -> None:
-        """Begin one.
-
-        Raises:
-            ValueError: A rig that the layout cannot hold.
-        """
+        """Begin one. ValueError: a rig that the layout cannot hold."""
         ...
 
     def write(self, step: RecordedStep, /) -> Sequence[Any]:

@@ -148,9 +148,7 @@ def draw_cells(
 def cell_entries(array: NDArray[np.float64], unknown: str = NEVER_PROBED) -> list[Artist]:
     """The legend entries for cells without a colour of the scale.
 
-    Args:
-        array: Values of one map, or of several, NaN where unknown.
-        unknown: Why they are.
+    `array`: values of one map, or of several, NaN where unknown; `unknown`: why they are.
     """
     unknown_share = percent(float(np.isnan(array).mean()))
     entries: list[Artist] = [Patch(label=f"unknown: {unknown} ({unknown_share} % of the cells)", **UNKNOWN)]

@@ -61,12 +61,7 @@ class Sheet:
 def lay_out(grid: BevGrid, maps: int = 1) -> list[Sheet]:
     """Empty maps of the grid on one paper: long ones below each other, others beside each other.
 
-    Args:
-        grid: Bounds and cells.
-        maps: How many.
-
-    Returns:
-        The maps, row by row from the upper left.
+    `grid`: bounds and cells; `maps`: how many. Returns the maps, row by row from the upper left.
     """
     _, rows, columns = grid.shape
     across, inches_per_cell = _arrange(grid, maps)
@@ -115,12 +110,8 @@ def _label(axes: Axes, *, left: bool, lowest: bool) -> None:
 def stack_views(views: Sequence[tuple[Bounds, Bounds]], *, width_in: float) -> tuple[Figure, list[Axes]]:
     """Empty views in metres without cells, below each other, each in equal metres on both axes.
 
-    Args:
-        views: Bounds of the axis to the right, and of that upwards, in metres; from the top.
-        width_in: Width in inches.
-
-    Returns:
-        The paper, and the views from the top.
+    `views`: bounds of the axis to the right, and of that upwards, in metres; from the top; `width_in`: width in inches.
+    Returns the paper, and the views from the top.
     """
     heights_in = [width_in * (y[1] - y[0]) / (x[1] - x[0]) for x, y in views]
     paper_in = sum(heights_in) + LABELS_IN * (len(heights_in) - 1)

@@ -42,8 +42,7 @@ class Subject:
 def subjects_of(coverages: Mapping[str, Coverage]) -> Iterator[Subject]:
     """The quantities of the measure that the results have, then those of other aggregations.
 
-    Args:
-        coverages: By the name of the rig; one, or several that are paired.
+    `coverages`: by the name of the rig; one, or several that are paired.
     """
     first = next(iter(coverages.values()))
     if first.measure == "area":

@@ -34,11 +34,6 @@ def square_sides(points: Tensor, cell_m: float) -> Tensor:
     Returns:
         (H, Y, X) int64 how many cells wide the square is that each cell lies in: a power of 2, at most 2 m. Squares
         begin at the lower corner of the grid; those at the upper ends may be cut off.
-
-    Example:
-        >>> square_sides(torch.tensor([[[9, 9, 1, 0], [9, 0, 0, 0]]]), cell_m=1.0)
-        tensor([[[1, 1, 2, 2],
-                 [1, 1, 2, 2]]])
     """
     side = 2 ** max(0, math.floor(math.log2(LARGEST_M / cell_m)))
     sides = torch.full_like(points, side)
@@ -55,12 +50,8 @@ def square_sides(points: Tensor, cell_m: float) -> Tensor:
 def over_squares(values: Tensor, sides: Tensor) -> Tensor:
     """The sum over the square that each cell lies in.
 
-    Args:
-        values: (..., H, Y, X) what is added up.
-        sides: (H, Y, X) as from `square_sides`.
-
-    Returns:
-        (..., H, Y, X) float64.
+    `values`: (..., H, Y, X) what is added up; `sides`: (H, Y, X) as from `square_sides`. Returns (..., H, Y, X)
+    float64.
     """
     sums, side = values.double(), 2
     while side <= int(sides.max()):
