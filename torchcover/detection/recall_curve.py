@@ -18,11 +18,7 @@ NORMAL_QUANTILE = 1.959963984540054
 class Ratio:
     """A share of successes for each entry, in float64; NaN where nothing was counted.
 
-    Args:
-        value: Successes by trials.
-        low: Lower end of the 95 % Wilson interval (Wilson 1927).
-        high: Its upper end.
-        trials: int64 number of trials.
+    `low` and `high` are the ends of the 95 % Wilson interval (Wilson 1927), `trials` int64.
     """
 
     value: Tensor

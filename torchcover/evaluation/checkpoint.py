@@ -160,14 +160,8 @@ def _change(here: str, there: str) -> str:
 def write_checkpoint(path: Path, header: Mapping[str, Any], states: Mapping[str, State]) -> None:
     """Write it in the place of the one that is there; see `write_durably`.
 
-    Args:
-        path: The file.
-        header: What else is to be known, for JSON: `identity`, and `run` with `RUN_KEYS`.
-        states: By name; each of tensors, numbers, texts, None, and lists and dicts of them.
-
-    Raises:
-        TypeError: A state holds something else.
-        OSError: There is no room.
+    The header is for JSON: `identity`, and `run` with `RUN_KEYS`. States are of tensors, numbers, texts, None, and
+    lists and dicts of them. TypeError: a state holds something else. OSError: there is no room.
     """
     write_durably(path, partial(write_states, header=header, states=states))
 

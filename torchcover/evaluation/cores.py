@@ -79,14 +79,7 @@ def usual_workers(frames: int, worlds: int, *, whole: bool) -> int:
 
 
 def warn_of_spinning(threads: int) -> None:
-    """Tell, once a process, that several threads are about to spin.
-
-    Args:
-        threads: Of torch.
-
-    Warns:
-        UserWarning: There are several, and the environment does not say how they wait.
-    """
+    """Tell, once a process, that threads of torch are about to spin: the environment does not say how they wait."""
     if threads > 1 and not _is_said():
         _warn_once()
 

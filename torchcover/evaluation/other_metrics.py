@@ -81,14 +81,7 @@ def _lacking(task: Task[FrameSource]) -> frozenset[Need]:
 def compared(
     metrics: OtherMetrics, coverages: Mapping[str, Coverage], regions: Sequence[Region], seed: int
 ) -> MetricComparison:
-    """What the metrics say, and torchcover's numbers of some regions.
-
-    Args:
-        metrics: After the run.
-        coverages: By the name of the rig.
-        regions: Those whose numbers they are held against.
-        seed: Of the worlds that are drawn again.
-    """
+    """What the metrics say after the run, and torchcover's numbers of the regions that they are held against."""
     published = [
         one
         for name, of_rigs in metrics.of_rigs.items()

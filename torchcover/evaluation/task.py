@@ -48,15 +48,10 @@ MAX_TOLD = 40
 
 
 class Task(NamedTuple, Generic[SourceT]):
-    """Which rigs are measured in which frames.
+    """Which rigs are measured in which frames, under the names that they have in tables and files.
 
-    Args:
-        frames: Frames of these rigs, under the names that they have in tables and files.
-        given: Name of each rig -> what the user called it; None if it was not named.
-        sensors: Name of each rig -> its sensors, where they are known.
-        description: Where the frames come from, in words.
-        asked: What is asked about.
-        steps: Frames to use at most; None for all.
+    `given` is what the user called each rig, None if it was not named; `sensors` its sensors, where they are known;
+    `steps` how many frames to use at most.
     """
 
     frames: SourceT
@@ -283,17 +278,7 @@ def run_identity(
 ) -> dict[str, str]:
     """All that the result of a run depends on, by name: not the steps, of which there may be more later, nor who works.
 
-    Args:
-        task: What is measured.
-        settings: How.
-        others: The user's own observers.
-        ranks: How many processes share the run; each has its own part of it.
-
-    Returns:
-        Name -> what it is, or a hash of it.
-
-    Raises:
-        FileNotFoundError: A file that a document names is missing.
+    Ranks share the run, each with its own part of it. What is a document or a table is told by its hash.
     """
     kinds = {name: f"{type(one).__module__}.{type(one).__qualname__}" for name, one in others.items()}
     everything = {

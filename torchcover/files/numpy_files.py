@@ -46,18 +46,10 @@ def read_npz(
     check: Callable[[NpyHeader], None],
     choose: Callable[[Collection[str]], Collection[str]] = lambda names: names,
 ) -> dict[str, NDArray[Any]]:
-    """Read arrays of a `.npz`, whatever its compression.
+    """Read arrays of a `.npz` by name, whatever its compression; those that `choose` returns of all names, else all.
 
-    Args:
-        path: The file.
-        check: Called with each header, before memory is reserved; raises ValueError if it is not what is needed.
-        choose: Called with the names of all arrays, returns those that are wanted; else all are.
-
-    Returns:
-        Name -> array.
-
-    Raises:
-        ValueError: Not such an archive, a damaged one, or one that grows beyond what a file may take.
+    `check` gets each header before memory is reserved, and raises ValueError if it is not what is needed. ValueError:
+    not such an archive, a damaged one, or one that grows beyond what a file may take.
     """
     # zipfile raises, beside its own: RuntimeError (encrypted), NotImplementedError (a compression it lacks),
     # zlib.error, EOFError, OSError on offsets that lead out of the file.

@@ -34,14 +34,10 @@ FAILURE = re.compile(r"(.+)_without_(.+)")
 
 
 class Questions(NamedTuple):
-    """What objectives ask around one vehicle.
+    """What objectives ask around one vehicle, by name, and all regions that are asked about.
 
-    Args:
-        objectives: By name.
-        regions: By name, all that are asked about.
-        grid: Cells of 0.5 m around these, or as `evaluate` has them where a published metric is asked for.
-        max_radius_m: Where radii saturate: as in `evaluate`, or at the largest threshold if no radius is asked for.
-        thresholds_m: Of all detections.
+    The `grid` has cells of 0.5 m around these, or is that of `evaluate` where a published metric is asked for. Radii
+    saturate at `max_radius_m`: as in `evaluate`, or at the largest threshold if no radius is asked for.
     """
 
     objectives: Mapping[str, Objective]

@@ -15,15 +15,7 @@ SAME_TIME_S = 1e-3
 
 
 class Seen(NamedTuple):
-    """An object at an instant.
-
-    Args:
-        name: Its id.
-        time_s: When.
-        world_T_box: (4, 4) where: its centre, x along its length.
-        size_m: Length, width, height.
-        category: What it is.
-    """
+    """An object at an instant: `world_T_box` is its centre, x along its length; length, width, height are its size."""
 
     name: str
     time_s: float

@@ -29,13 +29,9 @@ BEYOND_M, BEYOND = 0.4, 0.12
 
 
 class RangeImage(NamedTuple):
-    """How far a scan has seen.
+    """How far a scan has seen: (rows, columns) float32 ranges up to which directions are free; 0 without return.
 
-    Args:
-        free_m: (rows, columns) float32 range up to which a direction is free; 0 where nothing came back.
-        first_row: How many rows there are below, which nothing hit.
-        sensor_T_local: (4, 4) from the frame in which places are given.
-        farthest_m: The largest of `free_m`.
+    Below are `first_row` rows that nothing hit; `sensor_T_local` is from the frame in which places are given.
     """
 
     free_m: NDArray[np.float32]

@@ -24,13 +24,9 @@ NEIGHBOURS, WIDEST_M = 8, 3.0
 
 
 def seen_share(points_m: Float64, body: BoundingBox, voxel_m: float, seed: int) -> Float64:
-    """(N,) share of places around the vehicle from which each of (N, 3) points is seen.
+    """(N,) share of places around the vehicle, which hides what is behind it, that see each of (N, 3) points.
 
-    Args:
-        points_m: In the vehicle frame.
-        body: The vehicle, which hides what is behind it.
-        voxel_m: How near to each other points are where they are near.
-        seed: Of the places.
+    Where the points are near each other, it is by `voxel_m`. They are in the vehicle frame; the seed is of the places.
     """
     seen, corners_m = np.zeros(len(points_m)), np.array([body.lower_m, body.upper_m])
     reach_m = np.append(np.inf, FILLED * voxel_m / (BINS_RAD[1:] / 2))

@@ -10,15 +10,9 @@ from torchcover.estimation import ROUND_OFF, Difference, Number, Quantity, Unit
 
 
 class ShownUnit(NamedTuple):
-    """How numbers of a unit are shown.
+    """How numbers of a unit, and differences of two, are shown: `factor` times what they are, up to the `highest`.
 
-    Args:
-        name: Behind a number.
-        difference_name: Behind a difference of two of them.
-        factor: From the unit of the quantity to what is shown.
-        decimals: Of a number without an error; None for four digits.
-        max_decimals: More than anybody can use, however small the error.
-        highest: The largest number there is, as it is shown.
+    Without an error a number has so many decimals, four digits for None, and never more than anybody can use.
     """
 
     name: str

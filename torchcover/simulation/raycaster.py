@@ -139,14 +139,10 @@ class Struck(NamedTuple):
 
 
 class RayCaster:
-    """A set of bodies that rays can be cast at, from several threads at once.
+    """A set of bodies that rays can be cast at, from several threads at once: a closed or open mesh each, in metres.
 
-    Args:
-        bodies: One closed or open mesh a body, in metres, in the frame that rays are given in. Coordinates should be
-            near the origin: they become float32.
-
-    Raises:
-        ValueError: There is no body, or one with a vertex that is not a number or farther than 1e9 m.
+    Coordinates should be near the origin of the rays' frame: they become float32. ValueError: there is no body, or one
+    with a vertex that is not a number or farther than 1e9 m.
     """
 
     def __init__(self, bodies: Sequence[Mesh]) -> None:

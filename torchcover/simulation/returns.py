@@ -29,15 +29,9 @@ def log_excess(
 ) -> Floats:
     """(N,) ln q of N hits, above 0 where what comes back is more than enough.
 
-    In the type of the ranges: logarithms of float32 are good to 1e-6.
-
-    Args:
-        range_m: (N,) how far they are.
-        cos_incidence: (N,) cosine between the rays and the normals of what they hit.
-        reflectivity: (N,) of that, from 0 to 1; infinite for a retroreflector.
-        incidence_exponent: (N,) k; 1 is Lambert's law.
-        range_at_10_percent_m: Range at which a reflectivity of 10 % met head-on is just enough.
-        extinction_per_m: alpha of the air, one way.
+    In the type of the ranges: logarithms of float32 are good to 1e-6. The reflectivity is from 0 to 1, infinite for a
+    retroreflector, the exponent k of the cosine of the incidence 1 for Lambert's law. At the range that is given, a
+    reflectivity of 10 % met head-on is just enough; the air's extinction is alpha, one way.
     """
     with np.errstate(divide="ignore"):  # of what reflects nothing: minus infinity
         excess: Floats = np.log(np.asarray(reflectivity) / 0.1)

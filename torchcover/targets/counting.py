@@ -120,19 +120,10 @@ def count(
     hits: int,
     threshold_m: float,
 ) -> Sums:
-    """Count what a rig gets from a target at P places.
+    """Count what a rig gets from a target at P places, whatever the number of threads.
 
-    Args:
-        target: The body.
-        surface: Its surface.
-        vehicle_T_target: (P, 4, 4) where it stands, but for the height of the ground there, which is that of the step.
-        mounted: The sensors.
-        steps: What `Steps` gives.
-        hits: How many points are enough.
-        threshold_m: How near a measured point must be to a point of the surface.
-
-    Returns:
-        `Sums`, which do not depend on the number of threads.
+    `vehicle_T_target` (P, 4, 4) is where it stands, but for the height of the ground there, which is that of the step;
+    `hits` are how many points are enough, `threshold_m` how near one must be to a point of the surface.
     """
     farthest_m = [np.max([step.sensors[k].ends.range_m for step in steps], axis=0) for k in range(len(mounted))]
     beams = [Beams.of(sensor) for sensor in mounted]

@@ -52,17 +52,9 @@ class Step(NamedTuple):
 
 
 class Steps:
-    """The steps of a run.
+    """The steps of a run, `every_steps` time steps of the scenario apart.
 
-    Args:
-        rig: The sensors.
-        scenario: The world.
-        target: What is placed.
-        surface: Its surface.
-        vehicle_T_target: (P, 4, 4) where, but for the height of the ground there.
-        steps: How many steps.
-        every_steps: Time steps of the scenario between one and the next.
-        seed: Of traffic, random places, noise and drop-out.
+    `vehicle_T_target` (P, 4, 4) is where the target stands, but for the height of the ground there.
     """
 
     def __init__(

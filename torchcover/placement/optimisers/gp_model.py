@@ -23,18 +23,12 @@ RESTARTS = ((0.0, 0.0), (-1.2, 4.0))
 
 @dataclass(frozen=True, eq=False)
 class GaussianProcess:
-    """What is known of a function after some values of it.
+    """What is known of a function after some values of it, which are shifted and scaled.
 
-    Args:
-        levels: As of `Cube`: the options of a choice are all as far from each other.
-        places: (n, variables) float64, where it was measured.
-        shift: Added to what is computed.
-        scale: What it is multiplied with first.
-        log_lengths: (variables,) of the kernel.
-        log_signal: Variance of the function.
-        log_noise: Variance that every value has beside its own.
-        cholesky: (n, n) factor of the kernel matrix with the noise.
-        weights: (n,) the matrix' inverse times the values.
+    `levels` are as of `Cube`, the options of a choice all as far from each other; `places` (n, variables) float64,
+    where it was measured. `log_lengths` (variables,) and `log_signal` are of the kernel, `log_noise` the variance that
+    every value has beside its own. `cholesky` (n, n) factors the kernel matrix with the noise, `weights` (n,) are its
+    inverse times the values.
     """
 
     levels: tuple[int, ...]

@@ -54,13 +54,9 @@ class PoseSeries(NamedTuple):
 
 
 class VehiclePoses:
-    """Poses of the vehicle's frame.
+    """Poses of the vehicle's frame, from a topic of the bag; `source` says for people what was taken.
 
-    Args:
-        bag: The bag.
-        topic: Where the poses are.
-        links: From the world to the vehicle: frames whose poses are read, and what is mounted, as (4, 4).
-        source: What was taken, for people.
+    `links` lead from the world to the vehicle: frames whose poses are read, and what is mounted, as (4, 4).
     """
 
     def __init__(self, bag: Bag, topic: str, links: Sequence[str | Matrix], source: str) -> None:

@@ -41,14 +41,9 @@ ABOVE: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset poin
 
 @dataclass(frozen=True)
 class Sheet:
-    """An empty map, alone on its paper or beside others.
+    """An empty map, x to the right and y upwards in equal metres, alone on its paper or beside others.
 
-    Args:
-        figure: The whole paper.
-        axes: The map: x to the right and y upwards, in equal metres.
-        bar: Place of the colour bar, which the maps on one paper share.
-        legend_columns: How many entries of a legend fit beside each other.
-        metres_per_inch: Scale of the map.
+    These share the place of the `bar`. So many columns of a legend fit beside each other.
     """
 
     figure: Figure
