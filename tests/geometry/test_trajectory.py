@@ -1,5 +1,7 @@
 """Where a body is at and between the times of its poses."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -63,3 +65,20 @@ def test_between_steep_poses_a_body_turns_about_one_axis(pitch_deg, others_deg):
         assert body.at(share)[:3, :3] == pytest.approx(between, abs=1e-9)
         assert poses_at([body, body], share)[1, :3, :3] == pytest.approx(between, abs=1e-9)
         assert body.at_each(np.array([0.1, share]))[1, :3, :3] == pytest.approx(between, abs=1e-9)
+
+
+def test_the_first_pose_out_of_order_is_named_and_any_later_time_will_do():
+    """Of steps of any length: what counts is that they are later."""
+    for step_s in (1e-9, 0.25, 1e6):
+        times_s = step_s * np.arange(4)
+        Trajectory.from_arrays(times_s, np.zeros((4, 3)), np.zeros((4, 3)))
+        for at in (1, 2, 3):
+            disordered = times_s.copy()
+            disordered[at] = disordered[at - 1]
+            with pytest.raises(ValueError, match=re.escape(f"pose {at} is at {disordered[at]:g} s, after")):
+                Trajectory.from_arrays(disordered, np.zeros((4, 3)), np.zeros((4, 3)))
+    for column in range(7):
+        numbers = np.arange(21.0).reshape(3, 7)
+        numbers[1:, column] = np.nan, -np.inf
+        with pytest.raises(ValueError, match="NaN or infinite numbers in 2 of 3 poses, first 1"):
+            Trajectory.from_arrays(numbers[:, 0], numbers[:, 1:4], numbers[:, 4:])
