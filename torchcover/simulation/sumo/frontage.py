@@ -18,9 +18,7 @@ def sides_of(
 ) -> tuple[list[Side], list[shapely.Geometry]]:
     """What can be seen of the sides of streets, and where nothing may stand."""
     street = shapely.union_all(shapely.buffer(vicinity.covered, GAP_M, join_style="mitre")).buffer(-GAP_M)
-    bridges = shapely.union_all(
-        [shapely.LineString(vicinity.lanes[number].line_m[:, :2]).buffer(BRIDGE_M) for number in sorted(vicinity.decks)]
-    )
+    bridges = vicinity.bridges(BRIDGE_M)
     shapely.prepare(bridges)
 
     def sees(places_m: Float64) -> Bools:

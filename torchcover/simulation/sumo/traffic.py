@@ -6,6 +6,7 @@ from tempfile import TemporaryDirectory
 from typing import Annotated, Literal, Self
 
 import numpy as np
+import shapely
 from pydantic import Field, model_validator
 
 from torchcover.geometry.arrays import Float64
@@ -32,6 +33,8 @@ WARM_UP_S = 30.0
 USUAL_BEGIN_S = 60.0
 # Of traffic that is drawn such a share may be where bodies cannot be: more, and it is thinner than was asked for.
 USUALLY_LEFT_OUT = 0.15
+# In plan, nothing is in anybody's way that is so near to the middle of a lane on a bridge: it may be below.
+BRIDGE_M = 3.0
 
 
 class Sumo(Procedural):
@@ -115,7 +118,7 @@ class Sumo(Procedural):
         raised = few(pavement.meshes(), decks(vicinity))
         static = (ground.mesh(), *raised, *few(*stood))
         parked = park(vicinity, ground, fleet, self.parked_share, generator)
-        obstacles = np.concatenate([pavement.parts, parked])
+        obstacles = shapely.difference(np.concatenate([pavement.parts, parked]), vicinity.bridges(BRIDGE_M))
         moved = motions([ego, *others], duration_s, origin_m, obstacles, pavement.walked)
         shown = possible(moved)
         fleet.left_out = len(moved) - len(shown)
