@@ -157,10 +157,8 @@ class Arm:
             value = value + self.evaluations[0].prefixes[-1].estimate.value.numpy()
         lost = np.where(self._lower, value - self._floors, self._floors - value) / np.abs(self._floors).clip(ROUNDING)
         lost[np.isnan(lost) & ~np.isnan(self._floors)] = 1.0  # what is unknown is all lost
-        names = [quantity.key for quantity in prefixes[-1].estimate.quantities]
-        return {name: share for name, share in zip(names, lost.tolist(), strict=True) if share > ROUNDING} | dict(
-            evaluation.lacks
-        )
+        lacks = dict(zip((one.key for one in prefixes[-1].estimate.quantities), lost.tolist(), strict=True))
+        return {name: share for name, share in lacks.items() if share > ROUNDING} | dict(evaluation.lacks)
 
     def _estimated(self, evaluation: Evaluation) -> tuple[Float64, Float64]:
         """Gain over the start at all instants, and the error that those have left which it was not scored at.

@@ -103,20 +103,12 @@ class PlacementSearch:
             self._note(Evaluation(number, arm.name, unit, values, infeasible=why))
         return None
 
-    def tell(
-        self,
-        candidate: Evaluation,
-        prefixes: tuple[Prefix, ...],
-        *,
-        lacks: Mapping[str, float] | None = None,
-        seconds: float = 0.0,
-    ) -> None:
+    def tell(self, candidate: Evaluation, prefixes: tuple[Prefix, ...], *, seconds: float = 0.0) -> None:
         """What a candidate scored; with too many rays on the vehicle, it cannot be.
 
         Args:
-            candidate: The last that was asked for.
+            candidate: The last that was asked for, with what it lacks.
             prefixes: From `instants.prefixes`, all or the first of them; of the start all.
-            lacks: As of `Evaluation`, which `evaluate` finds out.
             seconds: What it took.
 
         Raises:
@@ -126,7 +118,7 @@ class PlacementSearch:
         wrong = [] if candidate.number else list(self.space.violations(self.space.start))
         wrong += [why] if (why := self._too_many_self_hits(prefixes[-1])) else []
         why = "; ".join(wrong)
-        self._note(replace(candidate, rig=None, prefixes=prefixes, infeasible=why, lacks=lacks or {}, seconds=seconds))
+        self._note(replace(candidate, rig=None, prefixes=prefixes, infeasible=why, seconds=seconds))
 
     def refuse(self, candidate: Evaluation, why: str, *, seconds: float = 0.0) -> None:
         """Say that a candidate cannot be.
@@ -148,8 +140,8 @@ class PlacementSearch:
         except ValueError as error:
             self.refuse(candidate, str(error), seconds=time.perf_counter() - began)
         else:
-            lacks = self._lacks(candidate, prefixes)
-            self.tell(candidate, prefixes, lacks=lacks, seconds=time.perf_counter() - began)
+            candidate = replace(candidate, lacks=self._lacks(candidate, prefixes))
+            self.tell(candidate, prefixes, seconds=time.perf_counter() - began)
 
     def _scored(self, candidate: Evaluation) -> Iterator[Prefix]:
         assert candidate.rig is not None  # while it is asked for
