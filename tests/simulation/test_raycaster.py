@@ -1,11 +1,14 @@
 """The ray caster against closed forms and against a slow intersection test in float64."""
 
 import os
+from functools import partial
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
 
 from torchcover.geometry import rigid, rotation_from_euler
+from torchcover.simulation import raycaster
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.rays import unit_directions
 from torchcover.simulation.shapes import Box, Ellipsoid, Frustum, Mesh, Plane
@@ -13,6 +16,14 @@ from torchcover.simulation.shapes import Box, Ellipsoid, Frustum, Mesh, Plane
 HERE = np.zeros(3)
 NUMBERS = np.random.default_rng
 MOUNTAIN = Mesh(np.array([[1e6, 0, 0], [1e6, 100, 0], [1e6, 0, 100]]), np.array([[0, 1, 2]]))
+
+
+@pytest.fixture(params=["Embree", *["Warp"] * bool(find_spec("warp"))], autouse=True)
+def library(request, monkeypatch):
+    """Whoever casts, casts alike: every test here is about both."""
+    if request.param == "Warp":
+        monkeypatch.setitem(globals(), "RayCaster", partial(raycaster.RayCaster, device="cpu"))
+    return request.param
 
 
 def endless(directions):
@@ -209,6 +220,18 @@ def test_the_arguments_are_left_alone():
     assert np.isinf(limit).all()
     np.testing.assert_array_equal(directions, before)
     np.testing.assert_array_equal(origin, np.ones(3))
+
+
+def test_from_behind_are_met_closed_bodies_that_a_ray_starts_in():
+    """Not a sheet, which has no inside, nor what is met from outside; bodies without faces keep their numbers."""
+    nothing = Mesh(np.zeros((3, 3)), np.empty((0, 3), dtype=np.int64))
+    sheet = Plane(type="plane", size_m=(9, 9)).mesh().moved(rigid(np.eye(3), [0.0, 0.0, 0.2]))
+    caster = RayCaster([nothing, box_at(0.0, size=4.0), nothing, sheet, box_at(9.0)])
+    origins = np.array([[0.0, 0.0, 1.0], [1.0, 1.0, -1.0], [5.0, 0.0, 0.0], [20.0, 0.0, 0.0]])
+    directions = np.array([[1, 0.1, 0], [0, 0.1, 1], [1, 0.1, 0], [1, 0, 0]], dtype=np.float32)
+    assert caster.met_from_behind(origins, directions.T).tolist() == [1, -1, -1, -1]
+    bodies = np.searchsorted([0, 12, 14, 26], caster.faces_met(origins, directions, 5.5), side="right")
+    assert bodies.tolist() == [1, 2, 3, 0]
 
 
 def test_no_rays_are_an_empty_result():
