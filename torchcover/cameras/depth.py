@@ -156,8 +156,7 @@ def usable(depth: Tensor, max_depth: float) -> Tensor:
 def count_unusable(depth: Tensor, max_depth: float) -> dict[str, int]:
     """How many depths `usable` refuses, by reason.
 
-    Returns:
-        `depth_zero`, `depth_negative` (with minus infinity), `depth_nan`, `depth_infinite`, `depth_beyond_range`.
+    Returns `depth_zero`, `depth_negative` (with minus infinity), `depth_nan`, `depth_infinite`, `depth_beyond_range`.
 
     Example:
         >>> count_unusable(torch.tensor([0.0, 2.0, 90.0, torch.inf]), 50.0)["depth_beyond_range"]

@@ -86,10 +86,8 @@ class Tilt(Protocol):
 class Lens:
     """A lens model with its coefficients.
 
-    Args:
-        chart: Directions <-> plane.
-        distortion: Plane -> normalised image; None where they are the same, and then no solver ever runs.
-        tilt: Tilt of the sensor; None where there is none.
+    `chart`: directions <-> plane; `distortion`: plane -> normalised image; None where they are the same, and then no
+    solver ever runs; `tilt`: tilt of the sensor; None where there is none.
     """
 
     chart: Chart

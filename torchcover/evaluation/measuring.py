@@ -38,11 +38,7 @@ ENOUGH_FRAMES = 256
 
 
 def measured(task: Task[FrameSource], settings: Settings) -> Result:
-    """Measure it.
-
-    Raises:
-        ValueError: As `evaluate`.
-    """
+    """Measure it. ValueError: as `evaluate`."""
     ranks = settings.ranks
     frames = task.frames
     sensors = [sensor for of_rig in task.sensors.values() for sensor in of_rig]
@@ -193,18 +189,10 @@ def metric_of(
     square_metres: bool,
     blocks: int = BLOCKS,
 ) -> CoverageMetric:
-    """An empty metric of what `evaluate` is to measure.
+    """An empty metric of what `evaluate` is to measure, with the names of the sensors for redundancy.
 
-    Args:
-        settings: How.
-        asked: What is asked about.
-        sensors: Names of the sensors, for redundancy.
-        square_metres: Whether the frames have the square metres of reference points.
-        blocks: For standard errors; there are none with one.
-
-    Raises:
-        ValueError: An estimate by area is wanted, and there are no square metres; a device that cannot be used; a
-            threshold that makes no sense, or more cells than there is memory for maps of.
+    ValueError: an estimate by area is wanted, and there are no square metres; a device that cannot be used; a threshold
+    that makes no sense, or more cells than there is memory for maps of.
     """
     if settings.estimate == "area" and not square_metres:
         raise ValueError(

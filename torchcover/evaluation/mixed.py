@@ -158,12 +158,8 @@ def _agreed(each: Mapping[str, Any]) -> object:
 def measured_in_each(settings: Settings) -> MixedResult:
     """Measure in one kind of world after the other.
 
-    Args:
-        settings: Of `evaluate`, with several scenarios.
-
-    Raises:
-        ValueError: A recording among them, other regions in one than in another, processes that share the run, or
-            observers; as `evaluate`.
+    `settings`: of `evaluate`, with several scenarios. ValueError: a recording among them, other regions in one than in
+    another, processes that share the run, or observers; as `evaluate`.
     """
     assert settings.mixture is not None  # as its caller knows
     if settings.frames is not None:

@@ -41,11 +41,7 @@ FILES = ("numbers", "maps", "page")
 def wanted_files(given: str | Iterable[str]) -> frozenset[str]:
     """What is to be written of a result.
 
-    Args:
-        given: Of `FILES`: names, or a text as in `numbers,page`.
-
-    Raises:
-        ValueError: Another name, or none.
+    `given`: of `FILES`: names, or a text as in `numbers,page`. ValueError: another name, or none.
 
     Example:
         >>> sorted(wanted_files("page, numbers"))
@@ -66,8 +62,7 @@ def _rigs(given: "AnyRig | Sequence[AnyRig] | None") -> "tuple[AnyRig, ...]":
 def _mixture(given: object) -> "dict[str, tuple[AnyScenario, float]] | None":
     """Several scenarios and their shares.
 
-    Raises:
-        ValueError: One that is given twice, a recording, or weights that are no numbers, negative, or all 0.
+    ValueError: one that is given twice, a recording, or weights that are no numbers, negative, or all 0.
     """
     if isinstance(given, str) and any(sign in given for sign in ",=") and not Path(given).exists():
         parts = [part.strip().partition("=") for part in given.split(",")]

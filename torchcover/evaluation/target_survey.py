@@ -186,12 +186,7 @@ def target_record(seen: TargetMap) -> dict[str, Any]:
 
 
 def target_page(seen: TargetMap, sensors: Sequence[Sensor] = ()) -> Page:
-    """All that is known of a target, on one page.
-
-    Args:
-        seen: From `survey_target`.
-        sensors: Those of the rig.
-    """
+    """All that is known of a target, on one page. `seen`: from `survey_target`; `sensors`: those of the rig."""
     return Page(
         title=f"{seen.rig}: would it see {seen.target}?",
         lead=f"In {seen.scenario}, sensor model {seen.sensor_model}, measured by torchcover.",

@@ -279,8 +279,7 @@ def choose(
 def seen_by(rig: Rig, instants: CommonInstants) -> tuple[Bools, float]:
     """(T P,) which reference points have a point of a rig within each threshold; the share of rays on the vehicle.
 
-    Raises:
-        ValueError: The rig cannot be mounted.
+    ValueError: the rig cannot be mounted.
     """
     questions, rays, self_hits = instants.questions, 0, 0
     near: list[list[Bools]] = [[] for _ in questions.thresholds_m]
@@ -300,8 +299,7 @@ def worth_of(instants: CommonInstants) -> Float64:
     the square metres in its cell at its instant, which share the cell with its other instants, and that the mean with
     all known cells. For a threshold that is not that of the number it is worth nothing.
 
-    Raises:
-        ValueError: A region and band that no instant shows.
+    ValueError: a region and band that no instant shows.
     """
     questions, frames = instants.questions, list(instants.frames())
     keys = [detection(threshold).key for threshold in questions.thresholds_m]

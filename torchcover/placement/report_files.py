@@ -28,17 +28,9 @@ OF_THE_RUN = ("seconds", "torchcover", "space_sha256")
 class PlacementReport:
     """What was found, for its files, its page, and the terminal.
 
-    Args:
-        title: Of the page.
-        sentence: The last line of all.
-        record: What stands in `search.json`; what is unknown may be NaN.
-        settings: The names in it that the page shows.
-        rigs: Those that were found, by the name of their file.
-        shown: Rigs that the page shows, by what they are.
-        tables: On the page; the first is printed, too.
-        rows: Tables by the name of their CSV file, each with its headings.
-        pictures: Makes the stem of the file, what it shows and a figure of its own, one after the other.
-        ego_outline_m: (K, 2) corners x, y of the vehicle.
+    `record` stands in `search.json`, where what is unknown may be NaN; the page shows those `settings` of it, and the
+    rigs that are `shown`, by what they are. `rigs` and `rows`, tables with their headings, are by the names of their
+    files. The first table is printed, too. `pictures` makes the stem of a file, what it shows, and a figure of its own.
     """
 
     title: str

@@ -70,11 +70,7 @@ class Slopes(NamedTuple):
 
 
 def corners_of(lower_m: Float64, upper_m: Float64) -> tuple[int, int]:
-    """Rows and columns of the corners of a raster between two of them.
-
-    Raises:
-        ValueError: More than four million.
-    """
+    """Rows and columns of the corners of a raster between two of them. ValueError: more than four million."""
     columns, rows = (np.ceil((upper_m - lower_m) / CELL_M).astype(np.int64) + 1).tolist()
     if columns * rows > MAX_CORNERS:
         raise ValueError(

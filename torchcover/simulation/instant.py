@@ -68,9 +68,8 @@ class SensorScan(NamedTuple):
 class Instant:
     """A scene at one time. Its bodies are numbered: what never moves, then what moves and is near.
 
-    `out_of_range` says how many others that move are not near, or not there; `ground` what one drives or walks on,
-    `world_T_vehicle` where the vehicle is in its frame, and `motion` where everything is from a time before this one to
-    another.
+    `out_of_range` others that move are not near, or not there. `world_T_vehicle` is in the frame of the `ground`, and
+    `motion` where everything is from a time before this one to another.
     """
 
     static: RayCaster

@@ -42,15 +42,7 @@ SLACK_M = 1e-3
 
 
 def level_faces(mesh: Mesh, outward: Bools | None = None) -> Bools:
-    """(F,) whether one could stand on each face: it is not too steep, and of a closed body it is an upper side.
-
-    Example:
-        >>> from torchcover.simulation.shapes import Box, Plane
-        >>> int(level_faces(Box(type="box", size_m=(1, 1, 1)).mesh()).sum())
-        2
-        >>> level_faces(Plane(type="plane", size_m=(1, 1)).mesh()).tolist()
-        [True, True]
-    """
+    """(F,) whether one could stand on each face: it is not too steep, and of a closed body it is an upper side."""
     level, down = _looks(mesh, 1.0), looks_down(mesh)
     if down.any():
         level |= down & ~(outward_faces(mesh) if outward is None else outward)
@@ -77,8 +69,7 @@ def ground_under(meshes: Sequence[Mesh], places_m: Float64) -> list[Bools]:
     Two level surfaces are connected that share an edge, or of which one goes on where the other ends, at most 0.3 m
     higher or lower. If no place has any within a metre, a level face below counts, however far; else a sheet above.
 
-    Returns:
-        One (F,) mask for each mesh.
+    Returns one (F,) mask for each mesh.
     """
     outward = [outward_faces(mesh) for mesh in meshes]
     level = [level_faces(mesh, known) for mesh, known in zip(meshes, outward, strict=True)]
@@ -148,12 +139,6 @@ class LocalGround:
 
     Heights are measured along the world's vertical, not along the z axis of a vehicle that pitches. Meshes are of
     ground alone, in the world frame; `origin_m` (3,) is subtracted in float64: coordinates become float32.
-
-    Example:
-        >>> from torchcover.simulation.shapes import Plane
-        >>> ground = LocalGround([Plane(type="plane", size_m=(4, 4)).mesh()], np.zeros(3))
-        >>> ground.heights_m(np.array([[0.0, 0.0, 1.5], [9.0, 0.0, 1.5], [0.0, 0.0, -1.0]])).round(3).tolist()
-        [1.5, nan, nan]
     """
 
     def __init__(self, meshes: Sequence[Mesh], origin_m: Float64) -> None:

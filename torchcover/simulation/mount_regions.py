@@ -52,11 +52,6 @@ class Skin:
 
         Exactly on the mesh, in float64. The line comes from the side, at `across_m` on the two other axes in the order
         x, y, z.
-
-        Example:
-            >>> from torchcover.simulation.shapes import Box
-            >>> Skin(Box(type="box", size_m=(4.0, 2.0, 1.5)).mesh()).seen_from("above", (1.0, 0.5)).place_m
-            array([1. , 0.5, 1.5])
         """
         axis, sign = SEEN_FROM[side]
         others = [other for other in range(3) if other != axis]
@@ -137,8 +132,7 @@ class MountRegion(Document):
     def on(self, skin: Skin, u: float, v: float) -> SkinPoint:
         """A place on the skin, `u` and `v` from 0 to 1 along the window's axes in the order x, y, z.
 
-        Raises:
-            ValueError: Nothing of the body is there.
+        ValueError: nothing of the body is there.
         """
         window = [bounds for bounds in (self.x_m, self.y_m, self.z_m) if bounds is not None]
         (x, y) = (low + share * (high - low) for share, (low, high) in zip((u, v), window, strict=True))

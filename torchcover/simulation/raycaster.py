@@ -156,16 +156,11 @@ class Struck(NamedTuple):
 
 
 class RayCaster:
-    """A set of bodies that rays can be cast at, from several threads at once.
+    """A set of bodies that rays can be cast at, from several threads at once: a closed or open mesh each, in metres.
 
-    Args:
-        bodies: One closed or open mesh a body, in metres, in the frame that rays are given in. Coordinates should be
-            near the origin: they become float32.
-        device: Of Warp, such as `cuda:0`, which casts the rays then; Embree does if not given. They agree but for the
-            last bits.
-
-    Raises:
-        ValueError: There is no body, or one with a vertex that is not a number or farther than 1e9 m.
+    Coordinates should be near the origin of the rays' frame: they become float32. ValueError: there is no body, or one
+    with a vertex that is not a number or farther than 1e9 m. Warp casts on a `device` that is given, such as `cuda:0`,
+    else Embree; they agree but for the last bits.
     """
 
     def __init__(self, bodies: Sequence[Mesh], device: str | None = None) -> None:

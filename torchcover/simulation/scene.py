@@ -148,8 +148,7 @@ class Scene:
 
         Moving bodies whose origin is farther from the vehicle than `within_m` and their size are left out.
 
-        Raises:
-            ValueError: The bounding box of an actor overlaps that of the ego.
+        ValueError: the bounding box of an actor overlaps that of the ego.
         """
         if (step, within_m) not in self._instants:
             if len(self._instants) == INSTANTS_KEPT:

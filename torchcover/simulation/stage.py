@@ -170,11 +170,7 @@ class Stages:
 
 
 def mounted_on(scene: Scene, scenario: Scenario, name: str, rig: Rig) -> list[MountedSensor]:
-    """The sensors of a rig on the ego of a scene.
-
-    Raises:
-        ValueError: One is inside the ego's body.
-    """
+    """The sensors of a rig on the ego of a scene. ValueError: one is inside the ego's body."""
     for sensor in rig.sensors:
         place = sensor.mount.matrix()[:3, 3]
         if scene.encloses(place):

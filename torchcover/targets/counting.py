@@ -90,12 +90,8 @@ class Beams(NamedTuple):
     def filled(self, hits: RayHits, ends: Ends) -> tuple[RayHits, Numbers]:
         """All hits of each beam in which a target has some, at each position.
 
-        Args:
-            hits: N hits on the target, by ascending position and ray.
-            ends: Where the rays end without it.
-
-        Returns:
-            M hits, by position, beam and ray, and (M,) which of the N each is, -1 if it is on something else.
+        `hits`: N hits on the target, by ascending position and ray; `ends`: where the rays end without it. Returns M
+        hits, by position, beam and ray, and (M,) which of the N each is, -1 if it is on something else.
         """
         assert hits.place is not None  # the positions
         rays, beams = len(self.of_ray), len(self.first) - 1
@@ -124,19 +120,10 @@ def count(
     hits: int,
     threshold_m: float,
 ) -> Sums:
-    """Count what a rig gets from a target at P places.
+    """Count what a rig gets from a target at P places, whatever the number of threads.
 
-    Args:
-        target: The body.
-        surface: Its surface.
-        vehicle_T_target: (P, 4, 4) where it stands, but for the height of the ground there, which is that of the step.
-        mounted: The sensors.
-        steps: What `Steps` gives.
-        hits: How many points are enough.
-        threshold_m: How near a measured point must be to a point of the surface.
-
-    Returns:
-        `Sums`, which do not depend on the number of threads.
+    `vehicle_T_target` (P, 4, 4) is where it stands, but for the height of the ground there, which is that of the step;
+    `hits` are how many points are enough, `threshold_m` how near one must be to a point of the surface.
     """
     farthest_m = [np.max([step.sensors[k].ends.range_m for step in steps], axis=0) for k in range(len(mounted))]
     beams = [Beams.of(sensor) for sensor in mounted]

@@ -26,22 +26,9 @@ TOUCHING_SHARE = 0.05
 
 
 def yaws(heading: Heading, target: BoundingBox, vehicle: BoundingBox, positions_m: Float64) -> Float64:
-    """(P,) yaw of a target in radians at (P, 2) places.
+    """(P,) yaw of a target in radians at (P, 2) places, by the boxes of both.
 
-    Args:
-        heading: "narrow", "wide", or degrees about z, 0 as the vehicle.
-        target: The target's box.
-        vehicle: The vehicle's box, to whose nearest point the side is turned.
-        positions_m: Where the target stands.
-
-    Raises:
-        ValueError: Another word, or degrees that are no number.
-
-    Example:
-        >>> wall = BoundingBox((-0.1, -1.0, 0.0), (0.1, 1.0, 1.0))
-        >>> car = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))
-        >>> np.rad2deg(yaws("wide", wall, car, np.array([[5.0, 0.0], [0.0, 5.0]]))).tolist()
-        [180.0, -90.0]
+    The "narrow" or "wide" side is turned to the nearest point of the vehicle; degrees are about z, 0 as the vehicle.
     """
     if heading in ("narrow", "wide"):
         towards_m = 0.0 - from_outline_m(vehicle, positions_m)  # no -0.0, which is another angle
@@ -94,16 +81,10 @@ def holding(box: BoundingBox, vehicle_T_target: Float64, place_m: Float64) -> Bo
 
 
 def blocked(instant: Instant, box: BoundingBox, samples_m: Float64, vehicle_T_target: Float64) -> Bools:
-    """(P,) whether anything but the ego takes a target's room.
+    """(P,) whether anything but the ego takes a target's room, (P, 4, 4) poses of its box.
 
     What moves does so with its box. Of what rests, its faces are asked: whether one lies between the middle of the
-    target and a point of its surface, or the middle is behind one. Kerbs of up to 0.2 m do not count.
-
-    Args:
-        instant: The scene.
-        box: The target's box in its frame.
-        samples_m: (M, 3) points of its surface in its frame.
-        vehicle_T_target: (P, 4, 4) where it stands.
+    target and one of (M, 3) points of its surface, or the middle is behind one. Kerbs of up to 0.2 m do not count.
     """
     taken = np.zeros(len(vehicle_T_target), dtype=bool)
     moving, reach_m = instant.moving, float(np.linalg.norm(box.corners_m, axis=1).max())
