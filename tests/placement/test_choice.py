@@ -112,6 +112,8 @@ def test_the_choice_is_the_rig_with_the_best_score_and_its_files_say_so(folder):
     rows = list(csv.DictReader((folder / "out" / "candidates.csv").read_text().splitlines()))
     assert [row["name"] for row in rows if row["chosen"] == "True"] == sorted(found.names(found.best.chosen))
     assert "inside" in rows[-1]["why_not"]
+    assert found.to_dataframe()["name"].tolist() == [row["name"] for row in rows]
+    assert found.sentence in repr(found)
     assert json.loads((folder / "out" / "search.json").read_text())["found"][0]["proven"] is True
 
 

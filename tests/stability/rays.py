@@ -175,6 +175,29 @@ def coincident(caster):
     return most(caster(boxes, np.zeros(3), towards) - 4.5 / towards[0].astype(np.float64))
 
 
+def between_slabs(held):
+    """Places in the middle one of three slabs upon each other, turned about: those that are not found to be in it."""
+    generator, lost = np.random.default_rng(6), 0
+    slabs = box(20.0, 20.0, 1.0), box(20.0, 20.0, 2.0).moved(at(0, 0, 1.0)), box(24.0, 16.0, 1.0).moved(at(0, 0, 3.0))
+    for scale_m in np.repeat([1e-6, 1.0, 1e6], 200):
+        turn = rigid(rotation_from_euler(*generator.uniform(-180, 180, 3)), generator.uniform(-50, 50, 3))
+        moved = [mesh.moved(turn) for mesh in slabs]
+        caster = RayCaster([Mesh(mesh.vertices_m * scale_m, mesh.faces) for mesh in moved])
+        place_m = transform(turn, np.append(generator.uniform(-6, 6, 2), generator.uniform(1.1, 2.9))[None])[0]
+        lost += not held(caster, place_m * scale_m)
+    return lost
+
+
+def by_its_faces(caster, place_m):
+    return caster.inside(place_m).tolist() == [1]
+
+
+def by_a_ray(caster, place_m):
+    """Whether a ray first meets the middle one."""
+    towards = np.array([[0.6], [0.0], [0.8]], dtype=np.float32)
+    return caster.cast(place_m, towards, np.array([np.inf], dtype=np.float32)).body[0] == 1
+
+
 # Cones
 
 
@@ -338,6 +361,8 @@ CASES = [
          "Embree as it comes", partial(along_a_surface, bare_embree)),
     Case("coincident surfaces of two bodies", "closed form", "m", 2e-6, partial(coincident, ours),
          FORMULA, partial(coincident, formula), naive_fails=False),
+    Case("places between bodies that touch, of 1e-6 m to 1e6 m", "by construction", "of 600 wrong", 0,
+         partial(between_slabs, by_its_faces), "what a ray meets first", partial(between_slabs, by_a_ray)),
     Case("incidence on a slope 1e6 m away", "closed form", "cosine", 3e-7, partial(incidence, incidence_ours),
          "normals of float32 corners", partial(incidence, incidence_in_float32)),
     Case("a frame that turns 9 degrees in a sweep, 100 m away", "float64 at each time", "m", 0.01, partial(turning, 3),

@@ -27,7 +27,6 @@ from torchcover.report import (
     Page,
     PagePicture,
     StandingFaces,
-    draw_encounters,
     draw_scene,
     page_html,
 )
@@ -223,11 +222,6 @@ def encounter_film(
         )
 
 
-def encounter_picture(found: Sightings) -> Figure:
-    """Time to collision at detection against the speed, a band for each rig, and what is needed."""
-    return draw_encounters(list(found.bands()), title=f"{found.name}: time to collision at detection")
-
-
 def save_encounters(found: Sightings, folder: str | Path, *, files: str | Iterable[str] = FILES) -> list[Path]:
     """Write the files of the command line.
 
@@ -249,7 +243,7 @@ def save_encounters(found: Sightings, folder: str | Path, *, files: str | Iterab
         if "page" in wanted:
             written.add_text("report.html", page_html(_page(found)))
         if "maps" in wanted and not found.hours:
-            written.add_figure("encounters.png", encounter_picture(found))
+            written.add_figure("encounters.png", found.plot())
         written.publish(record)
     return written.paths
 
@@ -258,7 +252,7 @@ def _page(found: Sightings) -> Page:
     pictures = []
     if not found.hours:
         png = BytesIO()
-        encounter_picture(found).savefig(png, format="png")
+        found.plot().savefig(png, format="png")
         pictures = [PagePicture("Time to collision at detection against the speed", png.getvalue())]
     return Page(
         title=f"In time? {', '.join(found.sensors)}",

@@ -4,9 +4,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from torchcover.evaluation.result import sensor_model_words
 from torchcover.evaluation.settings import FILES
@@ -21,6 +22,9 @@ from torchcover.placement.variables import FreeNumber
 from torchcover.report import PageTable, Words, file_stems
 from torchcover.report.wording import UNKNOWN
 from torchcover.simulation import Rig
+
+if TYPE_CHECKING:
+    import pandas
 
 # Of a range: nearer to its end, a number is on it.
 BOUND = 0.005
@@ -53,7 +57,7 @@ class Pick:
         return f"{self.arm}: {self.role}" if self.role else self.arm
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class SearchResult:
     """What `run_search` returns.
 
@@ -191,6 +195,24 @@ class SearchResult:
             pictures=partial(search_pictures, search, None if self.best is None else self.best.evaluation),
             ego_outline_m=search.space.scenarios[0].ego_box().outline_m,
         )
+
+    def __repr__(self) -> str:
+        return f"SearchResult in {self.search.space.name}: {self.sentence}"
+
+    def _repr_html_(self) -> str:
+        return self.report._repr_html_()
+
+    def plot(self) -> Figure:
+        """The first of its pictures, how the search went: a figure of its own, outside pyplot."""
+        return self.report.plot()
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """The rows of `evaluations.csv`.
+
+        Raises:
+            ModuleNotFoundError: pandas is not there.
+        """
+        return self.report.to_dataframe()
 
     def save(self, folder: str | Path, *, files: str | Iterable[str] = FILES) -> list[Path]:
         """Write the files of the command line; see `PlacementReport.save`.

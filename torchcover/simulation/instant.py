@@ -20,15 +20,9 @@ from torchcover.simulation.rays import TILE_ROWS, Outlines, Tile, into_tiles, ou
 from torchcover.simulation.sweep import Motion, Poses, RayTimes, Sweep, no_motion
 
 Result = TypeVar("Result")
-# Directions all around, to find out whether a place lies inside a body.
+# Directions all around, to find out whether rays get out of a body.
 ALL_AROUND = unit_directions(np.linspace(-85.0, 85.0, 12)[:, None], np.arange(0.0, 360.0, 30.0)[None])
 ALL_AROUND_RAYS = ALL_AROUND.reshape(3, -1).astype(np.float32)
-# From outside of all closed bodies no ray meets the back of a face of one.
-BURIED_SHARE = 0.25
-# Seen from farther than this many radii, fewer of those directions than that share point at a ball.
-CLEAR_RADII = 2.0
-
-
 # Sweeps begin and end at whole ones of these.
 WHOLE_S = 0.005
 
@@ -206,20 +200,14 @@ class Instant:
         """Whether a place in the vehicle frame lies below the ground or inside a wall or another body than the ego."""
         if self.ground.is_above(position_m, self.world_T_vehicle):
             return True
-        if self._inside(self.static, transform(self.static_T_vehicle, position_m[None])[0], self.ego):
+        inside = self.static.inside(transform(self.static_T_vehicle, position_m[None])[0])
+        if (inside != self.ego).any():
             return True
-        moving, others = self.moving, self.moving.body != self.ego
-        near = np.linalg.norm(moving.centre_m - position_m, axis=1) <= CLEAR_RADII * moving.radius_m
-        if not (near & others).any():
-            return False
-        places_m = moving.from_there_m(position_m)
-        return any(self._inside(moving.casters[k], places_m[k]) for k in np.flatnonzero(near & others).tolist())
-
-    @staticmethod
-    def _inside(caster: RayCaster, place_m: Matrix, but: int = -1) -> bool:
-        """Whether a place lies inside another body of a caster than one."""
-        met = caster.met_from_behind(place_m, ALL_AROUND_RAYS)
-        return bool(((met >= 0) & (met != but)).mean() > BURIED_SHARE)
+        moving = self.moving
+        near = np.linalg.norm(moving.centre_m - position_m, axis=1) <= moving.radius_m
+        asked = np.flatnonzero(near & (moving.body != self.ego)).tolist()
+        places_m = moving.from_there_m(position_m) if asked else position_m[None]
+        return any(len(moving.casters[k].inside(places_m[k])) for k in asked)
 
     def on_a_face(self, position_m: Matrix) -> bool:
         """Whether a place in the vehicle frame lies exactly on the ground, or on a face of what else never moves."""

@@ -110,6 +110,9 @@ def _meets_static(instant: Instant, box: BoundingBox, samples_m: Float64, vehicl
     met: Bools = (hits.body >= 0) & (hits.body != instant.ego)
     up = np.zeros((3, len(starts_m)), dtype=np.float32)
     up[:] = (instant.static_T_vehicle[:3, 2])[:, None]
-    behind = instant.static.met_from_behind(starts_m, up)
-    inside = (behind >= 0) & (behind != instant.ego)
+    above = instant.static.cast_from_each(
+        starts_m.astype(np.float32), up, np.full(len(starts_m), np.inf, dtype=np.float32)
+    )
+    inside = above.body >= 0  # of something, perhaps
+    inside[inside] = [(instant.static.inside(place_m) != instant.ego).any() for place_m in starts_m[inside]]
     return np.asarray(met.reshape(len(starts_m), -1).any(axis=1) | inside)
