@@ -20,7 +20,6 @@ from torchcover.simulation.rig import Rig, with_ego
 from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.sensor import Draws
-from torchcover.simulation.sight import MountedSensor
 from torchcover.simulation.stage import Scenes, Stage, Stages
 from torchcover.simulation.standing import warn_of_floating
 from torchcover.simulation.world import Label, labels
@@ -193,7 +192,9 @@ class Simulator:
                 ego below the ground.
         """
         stage, instant = self.placed(index)
-        reference = self.reference_sensor.scan(self._surroundings(stage.scene, instant, index))
+        generator, name = np.random.default_rng([self.seed, index]), f"{self.scenario.name} step {index}"
+        around = Surroundings(stage.scene, instant, generator, name, threads=torch.get_num_threads())
+        reference = self.reference_sensor.scan(around)
         within = None if self.within_m is None else Balls.around(reference.points, self.within_m)
         scans = self._scans(stage, instant, index, within)
         of_all_rigs = [scan for of_rig in scans.values() for scan in of_rig]
@@ -319,21 +320,12 @@ class Simulator:
         return max([float(np.linalg.norm(farthest_m)) + self.reference_sensor.max_range_m, *reaches])
 
     def _scans(self, stage: Stage, instant: Instant, index: int, within: Balls | None) -> dict[str, list[SensorScan]]:
-        return {name: self._scan_rig(sensors, instant, index, within) for name, sensors in stage.mounted.items()}
-
-    def _scan_rig(
-        self, sensors: Sequence[MountedSensor], instant: Instant, index: int, within: Balls | None
-    ) -> list[SensorScan]:
-        scans = []
-        for k, mounted in enumerate(sensors, 1):
-            draws = Draws(np.random.default_rng([self.seed, index, k]), rays=len(mounted.pixel_of_ray))
-            scans.append(mounted.scan(instant, draws, threads=torch.get_num_threads(), within=within))
+        scans: dict[str, list[SensorScan]] = {name: [] for name in stage.mounted}
+        for name, sensors in stage.mounted.items():
+            for k, mounted in enumerate(sensors, 1):
+                draws = Draws(np.random.default_rng([self.seed, index, k]), rays=len(mounted.pixel_of_ray))
+                scans[name].append(mounted.scan(instant, draws, threads=torch.get_num_threads(), within=within))
         return scans
-
-    def _surroundings(self, scene: Scene, instant: Instant, index: int) -> Surroundings:
-        generator = np.random.default_rng([self.seed, index])
-        name = f"{self.scenario.name} step {index}"
-        return Surroundings(scene, instant, generator, name, threads=torch.get_num_threads())
 
 
 def _counts_of(scene: Scene, instant: Instant, scans: Sequence[SensorScan], reference: ReferenceScan) -> dict[str, int]:
