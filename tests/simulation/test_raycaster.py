@@ -222,16 +222,15 @@ def test_the_arguments_are_left_alone():
     np.testing.assert_array_equal(origin, np.ones(3))
 
 
-def test_from_behind_are_met_closed_bodies_that_a_ray_starts_in():
-    """Not a sheet, which has no inside, nor what is met from outside; bodies without faces keep their numbers."""
-    nothing = Mesh(np.zeros((3, 3)), np.empty((0, 3), dtype=np.int64))
-    sheet = Plane(type="plane", size_m=(9, 9)).mesh().moved(rigid(np.eye(3), [0.0, 0.0, 0.2]))
-    caster = RayCaster([nothing, box_at(0.0, size=4.0), nothing, sheet, box_at(9.0)])
-    origins = np.array([[0.0, 0.0, 1.0], [1.0, 1.0, -1.0], [5.0, 0.0, 0.0], [20.0, 0.0, 0.0]])
-    directions = np.array([[1, 0.1, 0], [0, 0.1, 1], [1, 0.1, 0], [1, 0, 0]], dtype=np.float32)
-    assert caster.met_from_behind(origins, directions.T).tolist() == [1, -1, -1, -1]
-    bodies = np.searchsorted([0, 12, 14, 26], caster.faces_met(origins, directions, 5.5), side="right")
-    assert bodies.tolist() == [1, 2, 3, 0]
+def test_bodies_without_faces_keep_their_numbers():
+    nothing, up = Mesh(np.zeros((3, 3)), np.empty((0, 3), dtype=np.int64)), np.array([[0.0, 0.1, 1.0]] * 3, np.float32)
+    caster = RayCaster([nothing, box_at(0.0, size=4.0), nothing, box_at(9.0), nothing])
+    starts = np.array([[0.0, 0.0, -5.0], [9.0, 0.0, -5.0], [30.0, 0.0, -5.0]])
+    hits = caster.cast_from_each(starts.astype(np.float32), up.T, np.full(3, 9.0, np.float32))
+    assert hits.body.tolist() == [1, 3, -1]
+    bodies = np.searchsorted([0, 12, 24], caster.faces_met(starts, up, 9.0), side="right")
+    assert bodies.tolist() == [1, 2, 0]
+    assert (RayCaster([nothing]).cast(HERE, up.T, endless(up.T)).body == -1).all()
 
 
 def test_no_rays_are_an_empty_result():

@@ -41,20 +41,19 @@ class WarpScene:
         # Of no faces there is no tree.
         self._tree = wp.Bvh(*(self._there(each, wp.vec3) for each in bounds)) if len(corners_m) else None
 
-    def run(self, origins_m: Float32, directions: Float32, dists: Float32 | None = None, *, output: bool = True) -> Any:  # noqa: ANN401
-        """Range, body, face and normal of what each of (N, 3) rays meets within (N,) limits, endless if not given."""
-        ends_m = np.full(len(origins_m), np.inf, np.float32) if dists is None else dists
-        face, normals = np.full(len(origins_m), -1, dtype=np.int32), np.zeros((len(origins_m), 3), np.float32)
+    def run(self, origins_m: Float32, directions: Float32, *, dists: Float32, output: bool) -> Any:  # noqa: ANN401
+        """Range, body and face of what each of (N, 3) rays meets within (N,) limits."""
+        ends_m, face = dists, np.full(len(origins_m), -1, dtype=np.int32)
         if self._tree is not None and len(face):
             with self._one_at_a_time:
                 rays = [self._there(origins_m, wp.vec3), self._there(directions, wp.vec3)]
-                told = [self._there(ends_m, wp.float32), self._there(face, wp.int32), self._there(normals, wp.vec3)]
+                told = [self._there(ends_m, wp.float32), self._there(face, wp.int32)]
                 given = [self._tree.id, self._corners_m, *rays, *told]
                 wp.launch(_meet, dim=len(face), inputs=given, device=self._device)
-                ends_m, face, normals = (each.numpy() for each in told)
+                ends_m, face = (each.numpy() for each in told)
         body = np.searchsorted(self._first_face, face, side="right").astype(np.int32) - 1
         triangle = np.where(face < 0, -1, face - self._first_face.take(body, mode="clip")).astype(np.int32)
-        return {"tfar": ends_m, "geomID": body, "primID": triangle, "Ng": normals}
+        return {"tfar": ends_m, "geomID": body, "primID": triangle}
 
     def _there(self, values: NDArray[Any], dtype: Any) -> Any:  # noqa: ANN401  (a type and an array of Warp)
         return wp.array(np.ascontiguousarray(values, values.dtype), dtype=dtype, device=self._device)
@@ -68,14 +67,12 @@ def _meet(
     directions: wp.array(dtype=wp.vec3),
     ends_m: wp.array(dtype=wp.float32),
     met: wp.array(dtype=wp.int32),
-    normals: wp.array(dtype=wp.vec3),
 ):
-    """Where each ray ends at its nearest face within its limit, which face that is, and its normal."""
+    """Where each ray ends at its nearest face within its limit, and which face that is."""
     i = wp.tid()
     origin, along = wp.vec3d(origins_m[i]), wp.vec3d(directions[i])
     end = wp.float64(ends_m[i])
     nearest = wp.int32(-1)
-    normal = wp.vec3d()
     face = wp.int32(0)
     query = wp.bvh_query_ray(tree, origins_m[i], directions[i])
     while wp.bvh_query_next(query, face, wp.float32(end) * (1.0 + 4.0 * 1.1920929e-07)):
@@ -92,8 +89,6 @@ def _meet(
             if way >= 0.0 and (way < end or (way == end and face < nearest)):
                 end = way
                 nearest = face
-                normal = wp.cross(b - a, c - a)
     if nearest >= 0:
         ends_m[i] = wp.float32(end)
         met[i] = nearest
-        normals[i] = wp.vec3(normal)
