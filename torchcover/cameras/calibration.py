@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from torchcover.cameras.entries import first, has_numbers, numbers, numbers_of, told, whole
-from torchcover.cameras.models import as_vector, check_image, check_model
+from torchcover.cameras.lens import as_vector
+from torchcover.cameras.models import check_image, check_model
 from torchcover.files import naming, parse_yaml, read_json_table, read_short_text, reads
 from torchcover.geometry import check_rigid, invert, rigid, rotation_from_euler, rotation_from_quaternion
 from torchcover.geometry.rigid import Matrix
@@ -59,13 +60,6 @@ def split_projection(numbers: Matrix, name: str) -> tuple[tuple[float, float, fl
     if 0.0 in intrinsics[:2]:
         raise ValueError(f"{name} has no focal length; got {P.tolist()}")
     return intrinsics, rigid(np.eye(3), np.linalg.solve(P[:, :3], P[:, 3]))
-
-
-def focal_from_fov(width: int, fov_deg: float) -> float:
-    """Focal length in pixels of a pinhole with this horizontal field of view: W / (2 tan(fov / 2))."""
-    if not 0.0 < fov_deg < 180.0:
-        raise ValueError(f"a pinhole's field of view lies between 0 and 180 degrees; got {fov_deg}")
-    return float(width / (2.0 * np.tan(np.deg2rad(fov_deg) / 2.0)))
 
 
 def carla_pose(

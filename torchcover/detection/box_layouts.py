@@ -14,8 +14,7 @@ def upright_rows(centre_m: ArrayLike, size_m: ArrayLike, heading: ArrayLike, veh
 
     `vehicle_T_source` is where the frame of the centres and headings is; None: it is the vehicle frame.
 
-    Raises:
-        ValueError: Numbers that are not finite, or shapes that do not fit.
+    ValueError: numbers that are not finite, or shapes that do not fit.
     """
     centre, size, ahead = _rows("centres", centre_m), _rows("sizes", size_m), _rows("headings", heading)
     if not len(centre) == len(size) == len(ahead):

@@ -12,11 +12,12 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from torchcover.detection.box_layouts import upright_rows
+from torchcover.files import brief
 from torchcover.geometry.arrays import Float64
 from torchcover.neighbors import check_tensor
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Boxes:
     """Boxes that stand upright in the vehicle frame (x forward, y left, z up), around the objects of one frame.
 
@@ -56,6 +57,8 @@ class Boxes:
     hits: Mapping[str, Tensor] = field(default_factory=dict)
     drawn_points: Tensor = None  # type: ignore[assignment]  # nor this
     bottom_heights_m: Tensor = None  # type: ignore[assignment]  # nor this
+
+    __repr__ = brief
 
     def __post_init__(self) -> None:
         for name in ("centre_m", "size_m", "yaw_rad"):

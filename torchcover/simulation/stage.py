@@ -80,13 +80,20 @@ class Scenes:
 
     In each process, that is: Embree's scenes cannot be pickled, so that a DataLoader worker builds its own. The bodies
     of each kind, which runs have in common, are made once. All that are kept may take `kept_bytes`; a small share of
-    the machine's memory if not given.
+    the machine's memory if not given. `device` is that of `RayCaster`, for what never moves.
     """
 
     def __init__(
-        self, scenario: Scenario, seed: int, kept_bytes: float | None = None, *, no_cache: bool = False
+        self,
+        scenario: Scenario,
+        seed: int,
+        kept_bytes: float | None = None,
+        *,
+        no_cache: bool = False,
+        device: str | None = None,
     ) -> None:
         self.scenario = scenario
+        self._device = device
         self._worlds = StoredWorlds(scenario, seed, no_cache=no_cache)
         self._kept_bytes = kept_bytes
         self._kept: dict[int, Scene] = {}
@@ -101,7 +108,7 @@ class Scenes:
             self._make_room()
             if self._ego is None and self.scenario.traffic is not None:
                 self._ego = self.scenario.ego_mesh()
-            scene = Scene(self._worlds.world(run, self._ego), self._solids)
+            scene = Scene(self._worlds.world(run, self._ego), self._solids, self._device)
         self._kept[run] = scene  # at the end: the first is the one that was asked for longest ago
         return scene
 
@@ -163,11 +170,7 @@ class Stages:
 
 
 def mounted_on(scene: Scene, scenario: Scenario, name: str, rig: Rig) -> list[MountedSensor]:
-    """The sensors of a rig on the ego of a scene.
-
-    Raises:
-        ValueError: One is inside the ego's body.
-    """
+    """The sensors of a rig on the ego of a scene. ValueError: one is inside the ego's body."""
     for sensor in rig.sensors:
         place = sensor.mount.matrix()[:3, 3]
         if scene.encloses(place):

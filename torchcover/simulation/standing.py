@@ -5,6 +5,7 @@ import warnings
 import numpy as np
 
 from torchcover.geometry.arrays import Int64
+from torchcover.simulation.local_ground import ROUNDING_M
 from torchcover.simulation.scene import Scene
 
 # Nearer than this is near enough, above or below.
@@ -38,4 +39,4 @@ def _grounded(scene: Scene, step: int) -> Int64:
     places_m = np.concatenate([np.zeros((1, 3)), others])
     is_ego = np.arange(len(places_m)) == 0
     heights_m = instant.heights_m((places_m + NEAR_M * up).astype(np.float32))
-    return np.column_stack([is_ego, heights_m <= 2 * NEAR_M]).astype(np.int64)
+    return np.column_stack([is_ego, heights_m <= 2 * NEAR_M + ROUNDING_M]).astype(np.int64)
