@@ -40,7 +40,7 @@ class Scene:
     at it. An ego that rests belongs to what never moves.
     """
 
-    def __init__(self, world: World, solids: Solids | None = None) -> None:
+    def __init__(self, world: World, solids: Solids | None = None, device: str | None = None) -> None:
         self.world = world
         self.ego_box = BoundingBox.around(world.ego.mesh.vertices_m)
         bodies = (world.ego, *world.objects)
@@ -65,7 +65,7 @@ class Scene:
         self._local_T_resting = [local_T_world @ actor.trajectory.at(0.0) for actor in self._resting]
         resting = [actor.mesh.moved(pose) for actor, pose in zip(self._resting, self._local_T_resting, strict=True)]
         scenery = self._scenery()
-        self._static = RayCaster(resting + scenery)
+        self._static = RayCaster(resting + scenery, device)
         self._faces = sum(len(mesh.faces) for mesh in resting + scenery)
         self._surfaces: dict[tuple[float, ...], SceneSurface] = {}
         self._instants: dict[tuple[int, float], Instant] = {}

@@ -73,6 +73,8 @@ class Simulator:
             this threshold do: rays that hit nothing there are not cast. Those points are the same to the bit.
         no_cache: Whether worlds that are drawn are built though they lie on disk from an earlier run, and are not kept
             there either; frames are the same to the bit.
+        device: Of Warp (`torchcover[warp]`), such as `cuda:0`, where rays are cast at what never moves, in one process;
+            by Embree, which agrees but for the last bits, if not given.
 
     Raises:
         ValueError: Rigs that name different vehicles, a negative seed, a time that is no multiple of the time step,
@@ -98,6 +100,7 @@ class Simulator:
         kept_bytes: float | None = None,
         within_m: float | None = None,
         no_cache: bool = False,
+        device: str | None = None,
     ) -> None:
         if seed < 0:
             raise ValueError(f"seed: a number >= 0 is needed; got {seed}")
@@ -107,7 +110,7 @@ class Simulator:
         self.seed = seed
         self.within_m = within_m
         self._every_steps = 1 if every_s is None else scenario.steps_in(every_s)
-        self._stages = Stages(Scenes(scenario, seed, kept_bytes, no_cache=no_cache), rigs)
+        self._stages = Stages(Scenes(scenario, seed, kept_bytes, no_cache=no_cache, device=device), rigs)
         self._check_size()
 
     @property

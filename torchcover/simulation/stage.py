@@ -86,13 +86,20 @@ class Scenes:
 
     In each process, that is: Embree's scenes cannot be pickled, so that a DataLoader worker builds its own. The bodies
     of each kind, which runs have in common, are made once. All that are kept may take `kept_bytes`; a small share of
-    the machine's memory if not given.
+    the machine's memory if not given. `device` is that of `RayCaster`, for what never moves.
     """
 
     def __init__(
-        self, scenario: Scenario, seed: int, kept_bytes: float | None = None, *, no_cache: bool = False
+        self,
+        scenario: Scenario,
+        seed: int,
+        kept_bytes: float | None = None,
+        *,
+        no_cache: bool = False,
+        device: str | None = None,
     ) -> None:
         self.scenario = scenario
+        self._device = device
         self._worlds = StoredWorlds(scenario, seed, no_cache=no_cache)
         self._kept_bytes = kept_bytes
         self._kept: dict[int, Scene] = {}
@@ -107,7 +114,7 @@ class Scenes:
             self._make_room()
             if self._ego is None and self.scenario.traffic is not None:
                 self._ego = self.scenario.ego_mesh()
-            scene = Scene(self._worlds.world(run, self._ego), self._solids)
+            scene = Scene(self._worlds.world(run, self._ego), self._solids, self._device)
         self._kept[run] = scene  # at the end: the first is the one that was asked for longest ago
         return scene
 
