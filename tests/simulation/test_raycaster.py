@@ -1,11 +1,14 @@
 """The ray caster against closed forms and against a slow intersection test in float64."""
 
 import os
+from functools import partial
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
 
 from torchcover.geometry import rigid, rotation_from_euler
+from torchcover.simulation import raycaster
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.rays import unit_directions
 from torchcover.simulation.shapes import Box, Ellipsoid, Frustum, Mesh, Plane
@@ -13,6 +16,14 @@ from torchcover.simulation.shapes import Box, Ellipsoid, Frustum, Mesh, Plane
 HERE = np.zeros(3)
 NUMBERS = np.random.default_rng
 MOUNTAIN = Mesh(np.array([[1e6, 0, 0], [1e6, 100, 0], [1e6, 0, 100]]), np.array([[0, 1, 2]]))
+
+
+@pytest.fixture(params=["Embree", *["Warp"] * bool(find_spec("warp"))], autouse=True)
+def library(request, monkeypatch):
+    """Whoever casts, casts alike: every test here is about both."""
+    if request.param == "Warp":
+        monkeypatch.setitem(globals(), "RayCaster", partial(raycaster.RayCaster, device="cpu"))
+    return request.param
 
 
 def endless(directions):
@@ -209,6 +220,17 @@ def test_the_arguments_are_left_alone():
     assert np.isinf(limit).all()
     np.testing.assert_array_equal(directions, before)
     np.testing.assert_array_equal(origin, np.ones(3))
+
+
+def test_bodies_without_faces_keep_their_numbers():
+    nothing, up = Mesh(np.zeros((3, 3)), np.empty((0, 3), dtype=np.int64)), np.array([[0.0, 0.1, 1.0]] * 3, np.float32)
+    caster = RayCaster([nothing, box_at(0.0, size=4.0), nothing, box_at(9.0), nothing])
+    starts = np.array([[0.0, 0.0, -5.0], [9.0, 0.0, -5.0], [30.0, 0.0, -5.0]])
+    hits = caster.cast_from_each(starts.astype(np.float32), up.T, np.full(3, 9.0, np.float32))
+    assert hits.body.tolist() == [1, 3, -1]
+    bodies = np.searchsorted([0, 12, 24], caster.faces_met(starts, up, 9.0), side="right")
+    assert bodies.tolist() == [1, 2, 0]
+    assert (RayCaster([nothing]).cast(HERE, up.T, endless(up.T)).body == -1).all()
 
 
 def test_no_rays_are_an_empty_result():

@@ -1,6 +1,7 @@
 """Ray casting at the extremes, against closed forms."""
 
 from functools import lru_cache, partial
+from importlib.util import find_spec
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
@@ -39,8 +40,9 @@ def directions(count, seed=0):
     return (rows / np.linalg.norm(rows, axis=0)).astype(np.float32)
 
 
-def cast(bodies, origin_m, towards):
-    return RayCaster(bodies).cast(np.asarray(origin_m), towards, np.full(towards.shape[1], np.inf, np.float32))
+def cast(bodies, origin_m, towards, device=None):
+    endless = np.full(towards.shape[1], np.inf, np.float32)
+    return RayCaster(bodies, device).cast(np.asarray(origin_m), towards, endless)
 
 
 def bare_embree(bodies, origin_m, towards, robust=True):
@@ -111,8 +113,8 @@ def scaled(scale, caster):
     return relative(caster(mesh), to_walls(directions(5000), -ROOM_M / 2, ROOM_M / 2) * scale)
 
 
-def ours_scaled(scale):
-    return scaled(scale, lambda mesh: cast([mesh], np.zeros(3), directions(5000)).range_m)
+def ours_scaled(scale, device=None):
+    return scaled(scale, lambda mesh: cast([mesh], np.zeros(3), directions(5000), device).range_m)
 
 
 def naive_scaled(scale):
@@ -334,8 +336,12 @@ def ours(bodies, origin_m, towards):
     return cast(bodies, origin_m, towards).range_m
 
 
-def alone(mesh, origin_m, towards):
-    return ours([mesh], origin_m, towards)
+def by_warp(bodies, origin_m, towards):
+    return cast(bodies, origin_m, towards, "cpu").range_m
+
+
+def alone(mesh, origin_m, towards, caster=ours):
+    return caster([mesh], origin_m, towards)
 
 
 def formula(bodies, origin_m, towards):
@@ -374,3 +380,18 @@ CASES = [
     Case("rays through balls of 1e-9 m to 100 km, around the sensor, beside and behind it, 100 km away", "longdouble",
          "of 536,832 spared", 0, partial(spared, Balls.met_by), "cosine in float32", partial(spared, met_by_cosine)),
 ]  # fmt: skip
+OF_WARP = [
+    Case("a room of 1e-9 m, by Warp", "closed form", "relative", 1e-6, partial(ours_scaled, 1e-10, "cpu"),
+         FORMULA + ", epsilon 1e-6", partial(naive_scaled, 1e-10)),
+    Case("a room of 1e9 m, by Warp", "closed form", "relative", 1e-6, partial(ours_scaled, 1e7, "cpu"),
+         FORMULA + ", epsilon 1e-6", partial(naive_scaled, 1e7), naive_fails=False),
+    Case("grazing rays, by Warp", "longdouble", "relative", 1e-6, partial(grazing, partial(alone, caster=by_warp)),
+         FORMULA + ", epsilon 1e-6", partial(grazing, moeller_trumbore), naive_fails=False),
+    Case("rays from a surface, by Warp", "closed form", "of 10,000 wrong", 0, partial(from_a_surface, by_warp),
+         "Embree as it comes", partial(from_a_surface, bare_embree)),
+    Case("rays along a surface they start on, by Warp", "closed form", "of 10,000 wrong", 0,
+         partial(along_a_surface, by_warp), "Embree as it comes", partial(along_a_surface, bare_embree)),
+    Case("coincident surfaces of two bodies, by Warp", "closed form", "m", 2e-6, partial(coincident, by_warp),
+         FORMULA, partial(coincident, formula), naive_fails=False),
+]  # fmt: skip
+CASES += OF_WARP if find_spec("warp") else []

@@ -2,10 +2,10 @@
 
 import math
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from torchcover.simulation.raycaster import Hits, RayCaster, Struck, cast_from
 from torchcover.simulation.rays import TILE_ROWS, Outlines, Tile, into_tiles, outlines, rotate, unit_directions
 from torchcover.simulation.sweep import Motion, Poses, RayTimes, Sweep, no_motion
 
+Result = TypeVar("Result")
 # Directions all around, to find out whether rays get out of a body.
 ALL_AROUND = unit_directions(np.linspace(-85.0, 85.0, 12)[:, None], np.arange(0.0, 360.0, 30.0)[None])
 ALL_AROUND_RAYS = ALL_AROUND.reshape(3, -1).astype(np.float32)
@@ -111,29 +112,26 @@ class Instant:
         sweep = self._sweep(times) if times else None
         bodies = self.outlines(origin_m) if sweep is None else sweep.outlines(origin_m)
 
-        def scan_tile(tile: Tile, own_m: Float32 | None, when: RayTimes | None) -> _TileScan:
+        def scan_tile(
+            tile: Tile, own_m: Float32 | None, when: RayTimes | None
+        ) -> tuple[Float32, Float32, Bools, Float32, Float32, Hits, int]:
             limit_m = _limit(tile, max_range_m)
             if sweep is None or when is None:
                 directions, hits, casts = self.cast(vehicle_T_sensor, tile, limit_m, bodies, own_m)
                 seen = self._seen(hits, ego_points)
                 points = _points(origin_m.astype(np.float32), directions, hits.range_m, seen)
-                return _TileScan(points, points, seen, hits.range_m[seen], directions, hits, casts)
+                return points, points, seen, hits.range_m[seen], directions, hits, casts
             swept = sweep.cast(vehicle_T_sensor, tile, when, limit_m, bodies, self.ego, own_m)
             hits, seen = swept.hits, self._seen(swept.hits, ego_points)
             points = landed = _points(swept.starts_m, swept.directions, hits.range_m, seen)
             if len(swept.on_body):
                 points = landed.copy()
                 points[np.cumsum(seen)[swept.on_body] - 1] = swept.points
-            return _TileScan(points, landed, seen, hits.range_m[seen], swept.directions, hits, swept.casts)
+            return points, landed, seen, hits.range_m[seen], swept.directions, hits, swept.casts
 
         own: Sequence[Float32 | None] = own_m or [None] * len(tiles)
         whens: Sequence[RayTimes | None] = times or [None] * len(tiles)
-        if threads <= 1 or len(tiles) <= 1:
-            scans = list(map(scan_tile, tiles, own, whens))
-        else:
-            # A pool for each scan: threads do not survive the fork that makes a DataLoader worker.
-            with ThreadPoolExecutor(threads) as pool:
-                scans = list(pool.map(scan_tile, tiles, own, whens))
+        scans = in_threads(threads, scan_tile, tiles, own, whens)
         points, landed, seen, range_m, directions, hits, casts = zip(*scans, strict=True)
 
         def towards(tile: int) -> Float32:
@@ -240,41 +238,28 @@ class Instant:
         hits = cast_from(self.static, self.static_T_vehicle, origin_m, directions, limit_m)
         if own_m is not None:
             hits.body[(hits.body < 0) & (own_m <= limit_m)] = self.ego
-        casts = self._cast_at_moving(origin_m, vehicle_R_sensor, tile, directions, hits, bodies, own_m is not None)
-        return directions, hits, casts
-
-    def _cast_at_moving(
-        self,
-        origin_m: Matrix,
-        vehicle_R_sensor: Matrix,
-        tile: Tile,
-        directions: Float32,
-        hits: Hits,
-        bodies: Outlines,
-        ego_is_known: bool,
-    ) -> int:
-        """Cast the rays of one tile at what moves, each at the bodies that it may meet before it ends; how many pairs.
-
-        The hits are brought up to date.
-        """
-        leaving_out = self.ego if ego_is_known else None
+        leaving_out = None if own_m is None else self.ego
         met, casts = self.moving.meetings(
             origin_m, vehicle_R_sensor, tile, directions, hits.range_m, bodies, leaving_out=leaving_out
         )
         self.moving.nearer(hits, met)
-        return casts
+        return directions, hits, casts
 
 
-class _TileScan(NamedTuple):
-    """What n rays of a tile saw: `points` and `landed` (K, 3) and `range_m` (K,) of those that did."""
+def in_threads(threads: int, function: Callable[..., Result], *columns: Iterable[Any]) -> list[Result]:
+    """What a function makes of each row of some columns, in their order, on so many threads."""
+    rows = list(zip(*columns, strict=True))
+    if threads <= 1 or len(rows) <= 1:
+        return [function(*row) for row in rows]
+    # A pool each time: threads do not survive the fork that makes a DataLoader worker.
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(function, *zip(*rows, strict=True)))
 
-    points: Float32
-    landed: Float32
-    seen: Bools
-    range_m: Float32
-    directions: Float32
-    hits: Hits
-    casts: int
+
+def encloses(caster: RayCaster, place_m: Matrix) -> bool:
+    """Whether a (3,) place lies inside of what can be cast at, so that no ray gets out."""
+    limit_m = np.full(ALL_AROUND_RAYS.shape[1], np.inf, dtype=np.float32)
+    return bool((caster.cast(place_m, ALL_AROUND_RAYS, limit_m).body >= 0).all())
 
 
 def _limit(tile: Tile, max_range_m: float) -> Float32:

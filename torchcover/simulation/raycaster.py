@@ -53,6 +53,23 @@ def _have_no_threads() -> None:
         os.sched_setaffinity(0, cores)
 
 
+def _embree(bodies: Sequence[Mesh]) -> EmbreeScene:
+    _have_no_threads()
+    # Robust: a ray through a shared edge hits one of the two faces instead of slipping between them.
+    scene = EmbreeScene(robust=True)
+    for body in bodies:
+        TriangleMesh(scene, body.vertices_m.astype(np.float32), body.faces.astype(np.int32))
+    # embreex commits the scene when it is first used; do it before several threads do.
+    scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
+    return scene
+
+
+def _warp(bodies: Sequence[Mesh], device: str) -> Any:  # noqa: ANN401  (answers as Embree's scene)
+    from torchcover.simulation.warp_scene import WarpScene
+
+    return WarpScene(bodies, device)
+
+
 class Faces:
     """The faces of all bodies, one after the other, and how far from each a place counts as on it.
 
@@ -151,10 +168,11 @@ class RayCaster:
     """A set of bodies that rays can be cast at, from several threads at once: a closed or open mesh each, in metres.
 
     Coordinates should be near the origin of the rays' frame: they become float32. ValueError: there is no body, or one
-    with a vertex that is not a number or farther than 1e9 m.
+    with a vertex that is not a number or farther than 1e9 m. Warp casts on a `device` that is given, such as `cuda:0`,
+    else Embree; they agree but for the last bits.
     """
 
-    def __init__(self, bodies: Sequence[Mesh]) -> None:
+    def __init__(self, bodies: Sequence[Mesh], device: str | None = None) -> None:
         if not bodies:
             raise ValueError("a scene needs at least one body")
         reach_m = float(np.max([np.abs(body.vertices_m).max(initial=0.0) for body in bodies]))  # NaN if one is
@@ -167,13 +185,7 @@ class RayCaster:
         self._bodies = bodies
         self._closed: dict[int, Bools] = {}  # asked of few: hardly any ray meets a face from behind
         self._last_asked: tuple[bytes, Int64] = b"", np.empty(0, dtype=np.int64)
-        _have_no_threads()
-        # Robust: a ray through a shared edge hits one of the two faces instead of slipping between them.
-        self._scene = EmbreeScene(robust=True)
-        for body in bodies:
-            TriangleMesh(self._scene, body.vertices_m.astype(np.float32), body.faces.astype(np.int32))
-        # embreex commits the scene when it is first used; do it before several threads do.
-        self._scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
+        self._scene = _embree(bodies) if device is None else _warp(bodies, device)
 
     @cached_property
     def _faces(self) -> Faces:
