@@ -126,14 +126,12 @@ class TargetMap(Spots):
     @property
     def points(self) -> Float64:
         """(Y, X) mean number of points on it, of all sensors."""
-        points: Float64 = self.sensor_points.sum(axis=0)
-        return points
+        return np.asarray(self.sensor_points.sum(axis=0))
 
     @property
     def free(self) -> NDArray[np.bool_]:
         """(Y, X) whether it can stand there."""
-        free: NDArray[np.bool_] = self.state == FREE
-        return free
+        return np.asarray(self.state == FREE)
 
     @property
     def enough(self) -> NDArray[np.bool_]:
@@ -209,8 +207,7 @@ class TargetMap(Spots):
         ):
             end = np.stack([of_x[at], of_y[at]], axis=1) + half_m  # ahead and to the left
             parts.append(np.stack([end, end - half_m * np.array(along), np.full_like(end, math.nan)], axis=1))
-        border_m: Float64 = np.concatenate(parts).reshape(-1, 2)
-        return border_m
+        return np.asarray(np.concatenate(parts).reshape(-1, 2))
 
     def __repr__(self) -> str:
         return f"TargetMap of {self.target} around {self.rig}: {self.raster.shape} places, {self.step_count} steps"
