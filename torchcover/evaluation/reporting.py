@@ -27,6 +27,7 @@ from torchcover.evaluation.target_survey import (
 )
 from torchcover.evaluation.task import AnyRig, AnyScenario, distinct_names, loaded, simulation
 from torchcover.files import Publication
+from torchcover.files.notebooks import small_html
 from torchcover.report import Page, escaped, file_stems, on_range, page_html, ranges_of
 from torchcover.simulation import Rig
 from torchcover.simulation.scenario import Mover
@@ -95,6 +96,9 @@ class Report:
             tables=tables,
             most_bytes=MAP_BYTES,
         )
+
+    def _repr_html_(self) -> str:
+        return small_html(self.verdict)
 
     @property
     def markdown(self) -> str:
