@@ -26,8 +26,7 @@ from torchcover.evaluation.target_survey import (
     target_verdict,
 )
 from torchcover.evaluation.task import AnyRig, AnyScenario, distinct_names, loaded, simulation
-from torchcover.files import Publication
-from torchcover.files.notebooks import small_html
+from torchcover.files import Publication, small_html
 from torchcover.report import Page, escaped, file_stems, on_range, page_html, ranges_of
 from torchcover.simulation import Rig
 from torchcover.simulation.scenario import Mover
