@@ -121,7 +121,7 @@ def test_average_precision_of_a_bin_is_over_the_recall_of_its_objects(example):
 
 def test_a_change_is_told_where_seeds_agree_and_only_there(example, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "160")
-    counts = SimpleNamespace(objects=torch.tensor([[1, 1], [1, 1], [0, 0]]))
+    counts = SimpleNamespace(objects=torch.tensor([[1, 1], [1, 1]]))
     # Of three seeds, in all, below and above a share of 0.5.
     values = np.array([[[0.5, 0.2, 0.8]] * 3, [[0.6, 0.1, 0.8], [0.61, 0.3, 0.9], [0.59, 0.2, 0.7]]])
     example.report_labels(values, ["all", "0-0.5", "0.5-1"], counts, example.Console())
