@@ -18,7 +18,7 @@ import torchcover
 from torchcover import Coverage, RegionsOfInterest, Rig, Scenario
 from torchcover.coverage import Maximum, Quantiles
 from torchcover.data import DEFAULT_REFERENCE, BadFrameError, Frame, FrameDataset
-from torchcover.evaluation import Settings, TargetError
+from torchcover.evaluation import Settings, TargetError, task
 from torchcover.evaluation.result_page import HEAVY
 from torchcover.evaluation.target_error import MIN_GROWTH, MIN_STEPS
 
@@ -274,6 +274,18 @@ def test_results_are_compared_as_if_they_had_been_measured_together():
         torchcover.compare(["front_roof_32", "front_roof_128"])
     with pytest.raises(TypeError, match="results of `evaluate` or coverage files are needed; got Coverage"):
         torchcover.compare([low.coverage, high.coverage])
+
+
+def test_a_gpu_casts_rays_if_warp_is_there_and_no_workers_are_asked_for(monkeypatch):
+    def device(given, **settings):
+        return task.casting_device(Settings("front_roof_32", device=given, **settings))
+
+    monkeypatch.setattr(task, "usable_device", torch.device)
+    monkeypatch.setattr(task, "find_spec", lambda name: name == "warp")
+    assert (device("cuda:1"), device("cuda", workers=0), device("cpu")) == ("cuda:1", "cuda", None)
+    assert device("cuda", workers=2) is None
+    monkeypatch.setattr(task, "find_spec", lambda _: None)
+    assert device("cuda") is None
 
 
 def test_every_argument_is_declared_once_and_stands_in_the_signature_and_in_the_docstring():

@@ -141,11 +141,11 @@ def _read_npy(path: Path) -> NDArray[Any]:
     return values
 
 
-def _read_exr(path: Path) -> NDArray[Any]:
-    return exr_image(path, _BYTES_PER_PIXEL)["pixels"]
-
-
-_READERS: dict[str, Callable[[Path], NDArray[Any]]] = {".png": _read_png, ".npy": _read_npy, ".exr": _read_exr}
+_READERS: dict[str, Callable[[Path], NDArray[Any]]] = {
+    ".png": _read_png,
+    ".npy": _read_npy,
+    ".exr": lambda path: exr_image(path, _BYTES_PER_PIXEL)["pixels"],
+}
 
 
 def usable(depth: Tensor, max_depth: float) -> Tensor:

@@ -6,7 +6,7 @@ from dataclasses import replace
 from difflib import get_close_matches
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, cast
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ from torch import Tensor
 from torchcover.coverage.aggregations import Layer, MeanOfMeans
 from torchcover.coverage.blocks import BlockSums, KnownCells, Maps
 from torchcover.coverage.bodies import BodySums
-from torchcover.coverage.coverage_file import CoverageParts, read_coverage, write_coverage
+from torchcover.coverage.coverage_file import read_coverage, write_coverage
 from torchcover.coverage.grid import BandFrame, BevGrid
 from torchcover.coverage.measures import Measure, errors_of_cells, estimate_area, estimate_known, estimate_redundancy
 from torchcover.coverage.quantity import RADIUS, by_area, over_known
@@ -189,7 +189,8 @@ class Coverage:
     @property
     def detection(self) -> Tensor:
         """(T, H, Y, X) float64 detection probability at each threshold."""
-        return self._stacked([self.listed[quantity.key].values for quantity in self.quantities[1:]])
+        each = [self.known.spread(self.listed[quantity.key].values) for quantity in self.quantities[1:]]
+        return torch.stack(each) if each else self.radius.new_empty((0, *self.grid.shape))
 
     @property
     def errors(self) -> Mapping[str, Tensor]:
@@ -206,10 +207,6 @@ class Coverage:
             each = errors_of_cells(self.quantities, self.known, self.area)
             errors |= {by_area(one).key: each[one.key] for one in self.quantities}
         return errors
-
-    def _stacked(self, each: Sequence[Tensor]) -> Tensor:
-        """(T, H, Y, X) one entry for each threshold."""
-        return torch.stack(list(map(self.known.spread, each))) if each else self.radius.new_empty((0, *self.grid.shape))
 
     def summary(self, regions: Sequence[Region] | None = None) -> list[RegionSummary]:
         """One row for each region and height band that tables show of it.
@@ -323,9 +320,7 @@ class Coverage:
 
         What `load` gives back has the same numbers, errors and differences to the last bit.
         """
-        given = {name: getattr(self, name) for name in CoverageParts.__annotations__ if name != "layers"}
-        parts = cast("CoverageParts", given | {"layers": list(self.listed.values())})
-        write_durably(Path(path), partial(write_coverage, parts, self.listed_errors))
+        write_durably(Path(path), partial(write_coverage, self))
 
     @classmethod
     def load(cls, path: str | Path) -> "Coverage":

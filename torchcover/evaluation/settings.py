@@ -338,7 +338,7 @@ class Settings:
     ] = Read(_metrics, ())
     device: Annotated[
         Read["str | torch.device", str],
-        Option("Where the search and the sums run: cpu, cuda, cuda:1, ...", str, in_study=True),
+        Option("Where the search and the sums run, with Warp rays too: cpu, cuda, cuda:1, ...", str, in_study=True),
     ] = Read(_device, "cpu")
     workers: Annotated[
         int | None,

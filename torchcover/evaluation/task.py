@@ -5,8 +5,11 @@ import json
 import math
 import warnings
 from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Generic, NamedTuple, TypeVar
+
+import torch
 
 from torchcover import __version__
 from torchcover.coverage.grid import BandFrame
@@ -149,11 +152,30 @@ def simulation(settings: Settings, *, boxes: bool = False) -> Task[SimulatedFram
         within_m=max(settings.thresholds_m) if settings.only_detection else None,
         kept_bytes=0.0,  # steps come in order: no world is needed again
         no_cache=settings.no_cache,
+        device=casting_device(settings),
     )
     frames.simulator.check_run(frames.steps)
     # A path says more than the name within the file.
     description = {**frames.description, "scenario": world.name if loaded_world is scenario else str(scenario)}
     return Task(frames, given, frames.sensors, description, asked, _most_steps(frames, settings))
+
+
+def casting_device(settings: Settings) -> str | None:
+    """The GPU that casts rays, if that of the run can: workers are forked, and cast by Embree."""
+    device = settings.ranks.device(settings.device) if settings.ranks else settings.device
+    on_a_gpu = device.startswith("cuda") and not settings.workers and find_spec("warp")
+    return str(usable_device(device)) if on_a_gpu else None
+
+
+def usable_device(name: str) -> torch.device:
+    """The device of this name. ValueError: it cannot be used here."""
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device, dtype=torch.float64).item()  # the device `meta` has no values
+    except (RuntimeError, AssertionError, TypeError, ImportError) as error:
+        said = str(error).splitlines()[0].partition(". ")[0]  # some go on for pages
+        raise ValueError(f"device {name}: cannot be used here ({said}); try cpu") from error
+    return device
 
 
 def _in_weather(

@@ -25,7 +25,7 @@ from torchcover.placement.choice_space import ChoiceSpace
 from torchcover.placement.common_instants import CommonInstants
 from torchcover.placement.fresh import FreshGain, FreshTest, fresh_test, told
 from torchcover.placement.report_files import PlacementReport
-from torchcover.placement.subsets import Candidates, Limits, Subset, best, best_of_several, random_subsets
+from torchcover.placement.subsets import SAME, Candidates, Limits, Subset, best, best_of_several, random_subsets
 from torchcover.report import ChoiceSize, PageTable, Words, draw_choice, file_stems
 from torchcover.simulation import Rig, Sensor
 from torchcover.simulation.regions_of_interest import DEFAULT_BAND_FRAME
@@ -115,7 +115,8 @@ class SensorChoice:
             "the best there is" if len(self.found) == 1 else f"between the best of {', '.join(self.space.objectives)}"
         )
         if self.best.short:
-            short = f"{100 * self.best.short:.2f} points in all"
+            lacks = zip(self.space.asked, (np.array(self.limits.least) - self.best.values).tolist(), strict=True)
+            short = "; ".join(f"{100 * lack:.2f} points of {name}" for name, lack in lacks if lack > SAME)
             kind = f"no choice keeps all that must be kept, and this one lacks the least: {short}"
         elif not self.best.proven:
             gap = f"at most {100 * self.best.gap:.2f} points below" if len(self.found) == 1 else "not proven to be"

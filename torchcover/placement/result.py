@@ -117,8 +117,8 @@ class SearchResult:
             yield f"Found in {self._spent(OPTIMISER)}, but not tested, so that no gain is shown: {self.untested}."
         else:
             yield f"{self._told(best, optimism=True)}."
-        if best is not None and (lacks := search.arms[OPTIMISER].lacks[search.arms[OPTIMISER].best]) > 0:
-            yield f"No candidate keeps all that must be kept; this one lacks the least, {lacks:.2%} in all."
+        if best is not None and (lacks := _lacks(search.arms[OPTIMISER], search.arms[OPTIMISER].best)):
+            yield f"No candidate keeps all that must be kept; this one lacks the least: {lacks}."
         if self.test is not None:
             yield f"{self.test.sentence}."
         if best is not None and (bounds := self._on_bounds(best.evaluation)):
@@ -285,7 +285,7 @@ class SearchResult:
             values = one.prefixes[-1].estimate.value.tolist()[: len(names)] if one.prefixes else unknown
             errors = unknown if pair is None else pair[1].tolist()
             each = [value for triple in zip(values, arm.gains[at].tolist(), errors, strict=True) for value in triple]
-            state, why = self._state(one, float(arm.lacks[at]))
+            state, why = self._state(one, _lacks(arm, at))
             hits = one.prefixes[-1].self_hit_share if one.prefixes else None
             own = [one.values.get(name) for name in variables]
             costs = self._cost(one), round(one.seconds, 3)
@@ -302,11 +302,11 @@ class SearchResult:
                 values = [one.values.get(variable) for variable in variables]
                 yield [name, one.number, *arm.gains[at].tolist(), self._cost(one), *values]
 
-    def _state(self, one: Evaluation, lacks: float) -> tuple[str, str]:
+    def _state(self, one: Evaluation, lacks: str) -> tuple[str, str]:
         if one.infeasible:
             return "infeasible", one.infeasible
-        if lacks > 0:
-            return "lacking", f"{lacks:.2%} in all of what must be kept"
+        if lacks:
+            return "lacking", lacks
         if one.instants < len(self.search.instants):
             return "dropped", "two standard errors below the best so far"
         return "complete", ""
@@ -327,6 +327,12 @@ def _arm_record(arm: Arm) -> dict[str, Any]:
         "instants": sum(one.instants for one in others),
         "seconds": round(sum(one.seconds for one in others), 3),
     }
+
+
+def _lacks(arm: Arm, at: int | None) -> str:
+    """What a candidate lacks of what must be kept, the most first; nothing if it keeps all."""
+    each = {} if at is None else arm.lacking(at)
+    return "; ".join(f"{each[name]:.2%} of {name}" for name in sorted(each, key=lambda name: -each[name]))
 
 
 def _value(value: object) -> str:

@@ -14,8 +14,8 @@ from torchcover.simulation.patches import connected, edges_of, outward_faces
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.shapes import Mesh, parts_of
 
-# Nothing steeper is driven or walked on.
-STEEPEST_DEG = 45.0
+# Nothing steeper is driven or walked on, but for what rounding makes of it.
+STEEPEST_DEG = 45.0 + 1e-6
 # Ground that is so little above a point counts as the ground below it: for rounding, and where wheels sink in.
 TOLERANCE_M = 0.05
 # A place so little below the ground lies on it.
@@ -123,6 +123,7 @@ def _probes_m(corners_m: Float64, border: Int64) -> Float64:
 
 def _met(caster: RayCaster, places_m: Float64, near_m: float) -> Int64:
     """(N,) number of the highest body no farther above or below each place than this, -1 for none."""
+    near_m += ROUNDING_M
     starts_m = (places_m + np.array([0.0, 0.0, near_m])).astype(np.float32)
     limit_m = np.full(len(starts_m), 2 * near_m, dtype=np.float32)
     return caster.cast_from_each(starts_m, _vertical(len(starts_m), -1.0), limit_m).body.astype(np.int64)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from pydantic import model_validator
 
 from torchcover.simulation.documents import Bounds, Document
-from torchcover.simulation.instant import ALL_AROUND_RAYS
+from torchcover.simulation.instant import encloses
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.shapes import Mesh
 
@@ -77,8 +77,7 @@ class Skin:
 
     def encloses(self, place_m: Vector) -> bool:
         """Whether a (3,) place lies inside the body, so that no ray gets out."""
-        limit_m = np.full(ALL_AROUND_RAYS.shape[1], np.inf, dtype=np.float32)
-        return bool((self._caster.cast(place_m, ALL_AROUND_RAYS, limit_m).body >= 0).all())
+        return encloses(self._caster, place_m)
 
     @cached_property
     def _caster(self) -> RayCaster:

@@ -48,8 +48,7 @@ def return_probability(
     `reflectivity_spread` (N,) is that of ln reflectivity between places of the material.
     """
     sigmas = np.asarray(log_excess / np.hypot(2.0 * np.asarray(spread), reflectivity_spread))
-    probability: Floats = SURE * torch.special.ndtr(torch.from_numpy(sigmas)).numpy()
-    return probability
+    return np.asarray(SURE * torch.special.ndtr(torch.from_numpy(sigmas)).numpy())
 
 
 def extinction_per_m(visibility_m: float | None, rain_mm_h: float = 0.0) -> float:

@@ -1,13 +1,13 @@
 """The points that a rig gets from a target: it is cast alone, and then the scene's depth says which rays arrive."""
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple, Self
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torchcover.simulation.instant import in_threads
 from torchcover.simulation.moving import Moving
 from torchcover.simulation.rays import outlines, rotate
 from torchcover.simulation.sensor import RayHits
@@ -144,12 +144,7 @@ def count(
             _count_step(sums, on_ground, mounted, beams, cut, hits, threshold_m)
         return sums
 
-    firsts, threads = range(0, max(len(vehicle_T_target), 1), CHUNK), torch.get_num_threads()
-    if threads <= 1 or len(firsts) <= 1:
-        parts = list(map(count_some, firsts))
-    else:
-        with ThreadPoolExecutor(threads) as pool:
-            parts = list(pool.map(count_some, firsts))
+    parts = in_threads(torch.get_num_threads(), count_some, range(0, max(len(vehicle_T_target), 1), CHUNK))
     return Sums._make(np.concatenate(column, axis=-1) for column in zip(*parts, strict=True))
 
 
@@ -246,8 +241,7 @@ def _in_target(mounted: MountedSensor, met: Met, vehicle_T_target: Float64) -> F
     range_m = met.range_m.astype(np.float64)
     from_origin_m = mounted.vehicle_T_sensor[:3, 3] + met.direction * range_m[:, None]
     from_origin_m -= vehicle_T_target[met.position, :3, 3]
-    hits_m: Float64 = np.einsum("nji,nj->ni", vehicle_T_target[met.position, :3, :3], from_origin_m)
-    return hits_m
+    return np.asarray(np.einsum("nji,nj->ni", vehicle_T_target[met.position, :3, :3], from_origin_m))
 
 
 def _any_of_each(position: Numbers, bits: NDArray[np.uint8], count: int) -> NDArray[np.uint8]:

@@ -35,8 +35,7 @@ def yaws(heading: Heading, target: BoundingBox, vehicle: BoundingBox, positions_
         length_m, width_m, _ = target.size_m
         # Whoever looks along the longer side sees the narrow one.
         along_x = (length_m >= width_m) == (heading == "narrow")
-        yaw: Float64 = np.arctan2(towards_m[:, 1], towards_m[:, 0]) - (0.0 if along_x else math.pi / 2)
-        return yaw
+        return np.asarray(np.arctan2(towards_m[:, 1], towards_m[:, 0]) - (0.0 if along_x else math.pi / 2))
     if isinstance(heading, str) or not math.isfinite(heading):
         raise ValueError(f"heading: narrow, wide or degrees are needed; got {heading!r}")
     return np.full(len(positions_m), math.radians(heading))
@@ -76,8 +75,7 @@ def standing(vehicle_T_target: Float64, z_m: Float64) -> Float64:
 def holding(box: BoundingBox, vehicle_T_target: Float64, place_m: Float64) -> Bools:
     """(P,) whether a target's box holds a (3,) place of the vehicle frame."""
     there_m = np.einsum("pji,pj->pi", vehicle_T_target[:, :3, :3], place_m - vehicle_T_target[:, :3, 3])
-    held: Bools = ((there_m > box.lower_m) & (there_m < box.upper_m)).all(axis=1)
-    return held
+    return np.asarray(((there_m > box.lower_m) & (there_m < box.upper_m)).all(axis=1))
 
 
 def blocked(instant: Instant, box: BoundingBox, samples_m: Float64, vehicle_T_target: Float64) -> Bools:
@@ -112,7 +110,9 @@ def _meets_static(instant: Instant, box: BoundingBox, samples_m: Float64, vehicl
     met: Bools = (hits.body >= 0) & (hits.body != instant.ego)
     up = np.zeros((3, len(starts_m)), dtype=np.float32)
     up[:] = (instant.static_T_vehicle[:3, 2])[:, None]
-    behind = instant.static.met_from_behind(starts_m, up)
-    inside = (behind >= 0) & (behind != instant.ego)
-    blocked: Bools = met.reshape(len(starts_m), -1).any(axis=1) | inside
-    return blocked
+    above = instant.static.cast_from_each(
+        starts_m.astype(np.float32), up, np.full(len(starts_m), np.inf, dtype=np.float32)
+    )
+    inside = above.body >= 0  # of something, perhaps
+    inside[inside] = [(instant.static.inside(place_m) != instant.ego).any() for place_m in starts_m[inside]]
+    return np.asarray(met.reshape(len(starts_m), -1).any(axis=1) | inside)

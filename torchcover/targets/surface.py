@@ -101,5 +101,4 @@ def _enclosed(target: Target, points_m: Float64) -> Bools:
         directions, far_m = np.tile(towards[:, None], len(left)), np.full(len(left), np.inf, dtype=np.float32)
         hits = target.solid.caster.cast_from_each(points_m[left].astype(np.float32), directions, far_m)
         left = left[hits.body >= 0]
-    enclosed: Bools = np.isin(np.arange(len(points_m)), left)
-    return enclosed
+    return np.asarray(np.isin(np.arange(len(points_m)), left))
