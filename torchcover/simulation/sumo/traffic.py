@@ -36,6 +36,8 @@ WARM_UP_S = 30.0
 USUAL_BEGIN_S = 60.0
 # Of traffic that is drawn such a share may be where bodies cannot be: more, and it is thinner than was asked for.
 USUALLY_LEFT_OUT = 0.15
+# In plan, nothing is in anybody's way that is so near to the middle of a lane on a bridge: it may be below.
+BELOW_M = 3.0
 
 
 def sides_of(
@@ -43,9 +45,7 @@ def sides_of(
 ) -> tuple[list[Side], list[shapely.Geometry]]:
     """What can be seen of the sides of streets, and where nothing may stand."""
     street = shapely.union_all(shapely.buffer(vicinity.covered, GAP_M, join_style="mitre")).buffer(-GAP_M)
-    bridges = shapely.union_all(
-        [shapely.LineString(vicinity.lanes[number].line_m[:, :2]).buffer(BRIDGE_M) for number in sorted(vicinity.decks)]
-    )
+    bridges = vicinity.bridges(BRIDGE_M)
     shapely.prepare(bridges)
 
     def sees(places_m: Float64) -> Bools:
@@ -136,7 +136,7 @@ class Sumo(Procedural):
         raised = few(pavement.meshes(), decks(vicinity))
         static = (ground.mesh(), *raised, *few(*stood))
         parked = park(vicinity, ground, fleet, self.parked_share, generator)
-        obstacles = np.concatenate([pavement.parts, parked])
+        obstacles = shapely.difference(np.concatenate([pavement.parts, parked]), vicinity.bridges(BELOW_M))
         moved = motions([ego, *others], duration_s, origin_m, obstacles, pavement.walked)
         shown = possible(moved)
         fleet.left_out = len(moved) - len(shown)
