@@ -160,6 +160,18 @@ class TargetMap(Spots):
                 rows.append(SideShare(name, limit_m, cells, float(self.seen[there].mean()) if cells else math.nan))
         return rows
 
+    def share_seen(self, within_m: float) -> float:
+        """Share of the free places within a distance where it is seen; NaN if none is free."""
+        near = self.free & (self.distance_m <= within_m)
+        return float(self.enough[near].mean()) if near.any() else math.nan
+
+    def losses_m2(self, within_m: float) -> dict[str, float]:
+        """For each sensor, how much more is not seen within a distance when it fails: fewer points than enough."""
+        near = self.enough & (self.distance_m <= within_m)
+        left = self.points - self.sensor_points
+        m2 = (near & (left < self.hits)).sum(axis=(1, 2)) * self.raster.step_m**2
+        return dict(zip(self.sensor_names, m2.tolist(), strict=True))
+
     def unseen_to_m(self) -> dict[str, float]:
         """For each side, how far the farthest free cell without enough points is; 0 if all have, NaN if none is."""
         farthest_m = {}
