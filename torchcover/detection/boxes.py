@@ -1,4 +1,4 @@
-"""Boxes around objects."""
+"""Boxes around objects, and how others write them down."""
 
 import math
 import warnings
@@ -11,9 +11,9 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from torchcover.detection.box_layouts import upright_rows
 from torchcover.files import brief
 from torchcover.geometry.arrays import Float64
+from torchcover.geometry.rigid import Matrix, transform
 from torchcover.neighbors import check_tensor
 
 
@@ -34,6 +34,8 @@ class Boxes:
             where none were, as in recordings.
         bottom_heights_m: (K,) height of the bottom of each box above the local ground, that is the highest ground below
             its centre; NaN where unknown.
+        visibility: (K,) share of what can be seen of it that a rig shows, as `box_visibility` measures it; NaN where
+            unknown.
 
     Raises:
         ValueError: Shapes that do not fit, NaN or infinite places, a length, width or height that is not positive.
@@ -57,6 +59,7 @@ class Boxes:
     hits: Mapping[str, Tensor] = field(default_factory=dict)
     drawn_points: Tensor = None  # type: ignore[assignment]  # nor this
     bottom_heights_m: Tensor = None  # type: ignore[assignment]  # nor this
+    visibility: Tensor = None  # type: ignore[assignment]  # nor this
 
     __repr__ = brief
 
@@ -70,6 +73,7 @@ class Boxes:
             "categories": ("",) * count,
             "drawn_points": torch.zeros(count, dtype=torch.int64, device=self.yaw_rad.device),
             "bottom_heights_m": self.centre_m.new_full((count,), math.nan),
+            "visibility": self.centre_m.new_full((count,), math.nan),
         }
         for name, unknown in fill.items():
             given = getattr(self, name)
@@ -90,7 +94,7 @@ class Boxes:
 
     def _check_shapes(self, count: int) -> None:
         expected = {"centre_m": (count, 3), "size_m": (count, 3), "yaw_rad": (count,), "velocity_mps": (count, 2)}
-        expected |= {"drawn_points": (count,), "bottom_heights_m": (count,)}
+        expected |= dict.fromkeys(("drawn_points", "bottom_heights_m", "visibility"), (count,))
         for name, shape in expected.items():
             if tuple(getattr(self, name).shape) != shape:
                 raise ValueError(
@@ -111,7 +115,7 @@ class Boxes:
 
         Args:
             rows: Metres and radians; further columns are not allowed.
-            others: `velocity_mps`, `ids`, `categories`, `hits`, `drawn_points`, `bottom_heights_m`.
+            others: `velocity_mps`, `ids`, `categories`, `hits`, `drawn_points`, `bottom_heights_m`, `visibility`.
 
         Raises:
             ValueError: Another shape, or as the constructor.
@@ -178,7 +182,7 @@ class Boxes:
 
     def _each(self, change: Callable[[Tensor], Tensor], **names: tuple[str, ...]) -> "Boxes":
         """With all tensors changed, and other names where their number changes."""
-        tensors = ("centre_m", "size_m", "yaw_rad", "velocity_mps", "drawn_points", "bottom_heights_m")
+        tensors = ("centre_m", "size_m", "yaw_rad", "velocity_mps", "drawn_points", "bottom_heights_m", "visibility")
         changed: dict[str, Any] = {name: change(getattr(self, name)) for name in tensors} | names
         return replace(self, **changed, hits={rig: change(count) for rig, count in self.hits.items()})
 
@@ -197,3 +201,31 @@ def _check_numbers(name: str, tensor: Tensor) -> None:
     if not tensor.isfinite().all():
         bad = int((~tensor.reshape(len(tensor), -1).isfinite()).any(dim=1).sum())
         raise ValueError(f"{name}: {bad} of {len(tensor)} boxes have NaN or infinite numbers; leave them out")
+
+
+def upright_rows(centre_m: ArrayLike, size_m: ArrayLike, heading: ArrayLike, vehicle_T_source: Matrix | None) -> Tensor:
+    """(K, 7) rows of boxes in the vehicle frame; what leans is put upright, its heading, (K, 3) vectors, kept.
+
+    `vehicle_T_source` is where the frame of the centres and headings is; None: it is the vehicle frame.
+
+    ValueError: numbers that are not finite, or shapes that do not fit.
+    """
+    centre, size, ahead = _rows("centres", centre_m), _rows("sizes", size_m), _rows("headings", heading)
+    if not len(centre) == len(size) == len(ahead):
+        counts = f"{len(centre)}, {len(size)} and {len(ahead)}"
+        raise ValueError(f"boxes: as many centres, sizes and headings are needed; got {counts}")
+    if vehicle_T_source is not None:
+        centre, ahead = transform(vehicle_T_source, centre), ahead @ vehicle_T_source[:3, :3].T
+    yaw = np.arctan2(ahead[:, 1], ahead[:, 0])
+    return torch.from_numpy(np.column_stack([centre, size, yaw])).float()
+
+
+def _rows(name: str, given: ArrayLike) -> Float64:
+    array = np.asarray(given, dtype=np.float64)
+    array = array.reshape(0, 3) if array.size == 0 else array
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise ValueError(f"{name} of boxes: shape (K, 3) is needed; got {array.shape}")
+    if not np.isfinite(array).all():
+        bad = int((~np.isfinite(array)).any(axis=1).sum())
+        raise ValueError(f"{name} of boxes: {bad} of {len(array)} are not finite")
+    return array

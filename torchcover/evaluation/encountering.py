@@ -76,14 +76,14 @@ def encounter(
     criterion = Criterion() if criterion is None else criterion
     sensing = _sensing(rigs, sensor_model)
     these = encounters if isinstance(encounters, EncounterSet) else EncounterSet.load(encounters)
+    mounted = [MountedRig(rig, with_ego(free_space(), {name: rig}, vehicle)) for name, rig in sensing.items()]
+    # Their mistakes are told before the first look.
+    staged = [(rig, Staged(one, rig.ego)) for rig in mounted for one in these.encounters]
     sightings = []
-    with Progress(len(sensing) * len(these.encounters), "encounters", shown=progress) as bar:
-        for name, rig in sensing.items():
-            mounted = MountedRig(rig, with_ego(free_space(), {name: rig}, vehicle))
-            # Their mistakes are told before the first look.
-            for one in [Staged(one, mounted.ego) for one in these.encounters]:
-                sightings.append(sight_encounter(mounted, one, criterion, phases=phases, seed=seed))
-                bar.advance(len(sensing) * len(these.encounters))
+    with Progress(len(staged), "encounters", shown=progress) as bar:
+        for rig, one in staged:
+            sightings.append(sight_encounter(rig, one, criterion, phases=phases, seed=seed))
+            bar.advance(len(staged))
     return Sightings(these.name, criterion, phases, seed, _sensors(sensing), sightings)
 
 
@@ -229,9 +229,6 @@ def save_encounters(found: Sightings, folder: str | Path, *, files: str | Iterab
         found: From `encounter`.
         folder: Where to write `encounters.csv`, `report.html`, `encounters.png` and `summary.json`; as `save_targets`.
         files: What to write beside `summary.json`, as in `Result.save`; "maps" is the picture.
-
-    Returns:
-        The files.
     """
     wanted = wanted_files(files)
     record = found.record()

@@ -223,6 +223,8 @@ class FrameBatch:
 
     frames: tuple[Frame, ...]
 
+    __repr__ = brief
+
     @property
     def sensor(self) -> list[Tensor]:
         """One (N, 3) cloud a frame, of the only rig, where its points truly are; N differs."""
@@ -353,9 +355,6 @@ def collate_frames(frames: Sequence[Frame]) -> FrameBatch:
 
     Args:
         frames: Frames whose clouds may differ in size.
-
-    Returns:
-        A `FrameBatch` of all of them.
 
     Example:
         >>> frame = Frame({"rig": torch.zeros(5, 3)}, torch.zeros(9, 3), index=0, name="a")

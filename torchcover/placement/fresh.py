@@ -22,8 +22,8 @@ from torchcover.targets import TARGETS, Raster, Target, survey
 
 # Changes that a sentence names.
 MOST_TOLD = 4
-# Of a target around the vehicle.
-WITHIN_M = 3.0
+# Of targets around the vehicle, and how far apart they are put: some hundred places tell two rigs apart.
+WITHIN_M, STEP_M = 3.0, 0.4
 # Usual regions have the same names around any vehicle.
 ANY_OUTLINE_M = np.array([[-2.0, -1.0], [2.0, -1.0], [2.0, 1.0], [-2.0, 1.0]])
 CHANGE_HEADINGS = ("what", "gain on\nfresh worlds", "unit", "p (Holm)", "share of\nthe gain")
@@ -224,7 +224,7 @@ def _of_targets(rig: Rig, start: Rig, searched: CommonInstants) -> dict[str, Dif
         ends = []
         for one in (rig, start):
             empty = with_ego(free_space().model_copy(update={"ego": searched.scenarios[0].ego}), {one.name: one})
-            raster = Raster.around(empty.ego_box(), WITHIN_M)
+            raster = Raster.around(empty.ego_box(), WITHIN_M, STEP_M)
             seen = survey(one.sensing("ideal"), empty, Target.load(target), raster)
             there = seen.free & (seen.distance_m <= WITHIN_M)
             # Every fourth cell along each axis is a block of its own: by them it is known what the raster leaves open.
