@@ -80,8 +80,8 @@ class RegionsOfInterest(Readable):
         heights: Name of each height band -> lower and upper bound of z in metres; they may overlap. Not given: the
             paper's, ground and obstacle.
         grid: Extent and cell. Not given: x from -40 to 160 m, y from -40 to 40 m, more if regions need it, and cells
-            of 0.25 m; where neither it nor regions are given, in a room or hall of at most 40 m around the ego, or with
-            sensors that reach no farther, that, with the regions 5m, 10m, 20m as far as they fit, and `room` or `range`.
+            of 0.25 m; where neither it nor regions are given, in a room of at most 40 m around the ego, or with sensors
+            that reach no farther, that, with the regions 5m, 10m, 20m as far as they fit, and `room` or `range`.
 
     Raises:
         ValueError: Bounds that are inverted, equal or not finite, a polygon that crosses itself.
