@@ -92,9 +92,6 @@ class Camera:
             height: Rows of the image.
             **rest: `model`, `coefficients`, `vehicle_T_camera`, `name`.
 
-        Returns:
-            The camera.
-
         Raises:
             ValueError: The matrix has another shape, a skew, or another last row.
         """

@@ -8,7 +8,7 @@ from torch import Tensor
 from torchcover.detection.boxes import Boxes, check_boxes
 from torchcover.detection.inside import points_in_boxes
 from torchcover.files import brief
-from torchcover.neighbors import blind_spot_radius, check_cloud, check_tensor
+from torchcover.neighbors import blind_spot_radius, check_cloud, check_weights
 
 # The sides of a box that face this height above the vehicle's origin can be seen; so many points across each.
 SEEN_FROM_M, SIDE_POINTS = 1.7, 12
@@ -183,13 +183,4 @@ def _check(sensor: Tensor, reference: Tensor, threshold: float, weights: Tensor 
     check_cloud(sensor, "sensor")
     if not threshold >= 0:
         raise ValueError(f"threshold: a distance >= 0 in metres is needed; got {threshold}")
-    if weights is None:
-        return
-    check_tensor(weights, "reference_weights")
-    if weights.shape != (len(reference),):
-        raise ValueError(
-            f"reference_weights: shape ({len(reference)},) is needed, one for each reference point; got "
-            f"{tuple(weights.shape)}"
-        )
-    if not (weights.isfinite() & (weights > 0)).all():
-        raise ValueError("reference_weights: finite weights > 0 are needed")
+    check_weights(weights, len(reference), "reference_weights")

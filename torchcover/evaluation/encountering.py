@@ -229,9 +229,6 @@ def save_encounters(found: Sightings, folder: str | Path, *, files: str | Iterab
         found: From `encounter`.
         folder: Where to write `encounters.csv`, `report.html`, `encounters.png` and `summary.json`; as `save_targets`.
         files: What to write beside `summary.json`, as in `Result.save`; "maps" is the picture.
-
-    Returns:
-        The files.
     """
     wanted = wanted_files(files)
     record = found.record()

@@ -119,9 +119,6 @@ class MixedResult(Result):
             folder: Where to write: `NAME/...`; `summary.csv`, with the rows of all worlds and of the mixture,
                 `report.html` and `summary.json`.
             files: As in `Result.save`.
-
-        Returns:
-            The files.
         """
         record, folders = self.record, file_stems(list(self.worlds))
         each = zip(folders, self.worlds.values(), strict=True)

@@ -143,9 +143,6 @@ def observe(
         journal: Goes on from a checkpoint, and keeps it; of these observers and this rule.
         ranks: The processes that share the frames, each of which calls this; the caller adds up what they have seen.
 
-    Returns:
-        How it went.
-
     Raises:
         BadFrameError: The frame that ended it.
         ValueError: Not a single frame could be used.

@@ -239,9 +239,6 @@ class Result:
                 `summary.json` lists.
             files: What to write beside `summary.json`: "numbers", "maps", "page", or a text as in "numbers,page".
 
-        Returns:
-            The files.
-
         Raises:
             ValueError: The folder is that of a file which is compared, or files that there are not.
         """

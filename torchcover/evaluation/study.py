@@ -266,11 +266,7 @@ class Study:
         return draw_work_precision(panels, title=" in ".join(map(str, self.plan.named)), legend_title="setting")
 
     def save(self, folder: str | Path) -> list[Path]:
-        """Write `work_precision.png` and `summary.json` into a folder, which is made if need be.
-
-        Returns:
-            The files.
-        """
+        """Write `work_precision.png` and `summary.json` into a folder, which is made if need be."""
         figure = self.draw()
         with Publication(Path(folder)) as files:
             files.add("work_precision.png", figure.savefig)

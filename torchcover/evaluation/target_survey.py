@@ -129,9 +129,6 @@ def save_targets(
             does not exist; files of an earlier run that its `summary.json` lists are deleted.
         sensors: Those of the rig, for the page.
         files: What to write beside `summary.json`, as in `Result.save`; "maps" is the picture.
-
-    Returns:
-        The files.
     """
     wanted = wanted_files(files)
     record = target_record(seen)

@@ -6,8 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchcover.detection.box_layouts import upright_rows
-from torchcover.detection.boxes import Boxes
+from torchcover.detection.boxes import Boxes, upright_rows
 from torchcover.geometry.rigid import Matrix, rigid, transform
 
 # A key frame of a label that is nearer than this is that of the instant.

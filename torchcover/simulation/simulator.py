@@ -20,8 +20,7 @@ from torchcover.simulation.rig import Rig, with_ego
 from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.sensor import Draws
-from torchcover.simulation.stage import Scenes, Stage, Stages
-from torchcover.simulation.standing import warn_of_floating
+from torchcover.simulation.stage import Scenes, Stage, Stages, warn_of_floating
 from torchcover.simulation.world import Label, labels
 
 # What a step takes at its largest: 73 to 246 were measured, for a LiDAR, a camera and the reference sensors.

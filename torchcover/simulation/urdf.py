@@ -47,9 +47,6 @@ class Robot(NamedTuple):
         Args:
             folder: Where to write; made if it does not exist.
 
-        Returns:
-            The files.
-
         Raises:
             ValueError: A sensor that no rig can have, such as one with a range of 0.
         """

@@ -51,8 +51,23 @@ class SideShare(NamedTuple):
     seen: float
 
 
+@dataclass(frozen=True, eq=False)
+class Spots:
+    """What some sensors get of a target at P places: the arrays of `TargetMap` that are called so, of one row."""
+
+    state: NDArray[np.uint8]
+    steps: Numbers
+    sensor_points: Float64
+    sensors: Float64
+    seen: Float64
+    least_points: Float64
+    least_sensors: Float64
+    share: Float64
+    visible_m2: Float64
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class TargetMap:
+class TargetMap(Spots):
     """What a rig sees of a target, for every cell of a raster. Rows are y, columns are x; NaN where it cannot stand.
 
     Args:
@@ -97,15 +112,6 @@ class TargetMap:
     threshold_m: float
     seed: int
     step_count: int
-    state: NDArray[np.uint8]
-    steps: Numbers
-    sensor_points: Float64
-    sensors: Float64
-    seen: Float64
-    least_points: Float64
-    least_sensors: Float64
-    share: Float64
-    visible_m2: Float64
 
     @property
     def x_m(self) -> Float64:

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from torchcover.cameras import Camera
-from torchcover.detection.box_layouts import upright_rows
-from torchcover.detection.boxes import Boxes
+from torchcover.detection.boxes import Boxes, upright_rows
 from torchcover.files import naming, parse_yaml, read_csv, read_short_text, reads
 from torchcover.geometry import BoundingBox, rigid, rotation_from_euler
 from torchcover.geometry.rigid import Matrix

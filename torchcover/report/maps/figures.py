@@ -98,9 +98,6 @@ def write_figures(figures: Iterable[Named], folder: str | Path) -> list[Path]:
     Args:
         figures: Their names without suffix, and they: what `map_figures` gives.
         folder: Where to write; made if it does not exist.
-
-    Returns:
-        The files.
     """
     paths = []
     for name, figure in figures:
