@@ -50,6 +50,15 @@ class BoxVisibility:
         """
         return ~self.known & (self.drawn_points > 0)
 
+    @property
+    def level(self) -> Tensor:
+        """(K,) int64 levels of visibility as nuScenes names them: 1 to 40 %, 2 to 60 %, 3 to 80 %, 4; 0 if unknown.
+
+        There it is the share of an object's pixels in all cameras, here that of its surface with this rig.
+        """
+        borders = self.share.new_tensor([0.4, 0.6, 0.8])
+        return (torch.bucketize(self.share, borders, right=True) + 1).where(self.known, 0)
+
     def __len__(self) -> int:
         return len(self.share)
 
