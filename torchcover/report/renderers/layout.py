@@ -56,9 +56,6 @@ class PageTable:
 def parts_of(table: CoverageTable) -> list[PageTable]:
     """The parts of a table.
 
-    Args:
-        table: The table.
-
     Returns:
         For one rig one part, a column for each quantity. For several the paper's layout: a part for each quantity, a
         column for each rig; and, if there are errors, as many parts with the differences to the first rig. Then the
