@@ -9,9 +9,11 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Generic, NamedTuple, TypeVar
 
+import numpy as np
 import torch
 
 from torchcover import __version__
+from torchcover.coverage import Region
 from torchcover.coverage.grid import BandFrame
 from torchcover.evaluation.observers import AnyObserver
 from torchcover.evaluation.settings import DEFAULT_STEPS, OPTIONS, Settings
@@ -31,6 +33,7 @@ from torchcover.simulation import (
 )
 from torchcover.simulation.recorded_rig import recorded_body
 from torchcover.simulation.regions_of_interest import DEFAULT_BAND_FRAME
+from torchcover.simulation.scenario import ROOM_M
 from torchcover.simulation.simulated_frames import DEFAULT_REFERENCE
 
 AnyRig = Rig | str | Path
@@ -139,7 +142,7 @@ def simulation(settings: Settings, *, boxes: bool = False) -> Task[SimulatedFram
     loaded_world = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
     world = with_ego(loaded_world, carried, settings.vehicle)
     asked = (settings.ask or RegionsOfInterest()).around(
-        world.ego_box().outline_m, settings.cell_m, _band_frame(settings)
+        world.ego_box().outline_m, settings.cell_m, _band_frame(settings), _within(world, carried)
     )
     frames = SimulatedFrames(
         world,
@@ -226,6 +229,21 @@ def _recording(frames: FrameSource, settings: Settings) -> Task[FrameSource]:
     return Task(chosen, given, sensors, frames.description, asked, settings.steps)
 
 
+def _within(world: Scenario, rigs: Mapping[str, Rig]) -> Region | None:
+    """The room that the ego is in, or what its sensors reach; None if both are large."""
+    reach_m = max(
+        world.reach_m(sensor, rig.weather) + float(np.linalg.norm(sensor.mount.matrix()[:2, 3]))
+        for rig in rigs.values()
+        for sensor in rig.sensors
+    )
+    room = world.room_m()
+    if reach_m > ROOM_M:
+        return Region("room", *room) if room else None
+    (x0, x1), (y0, y1) = room or ((-reach_m, reach_m), (-reach_m, reach_m))
+    within = (max(x0, -reach_m), min(x1, reach_m)), (max(y0, -reach_m), min(y1, reach_m))
+    return Region("room" if within == room else "range", *within)
+
+
 def spread_s(scenario: Scenario, given_s: float | None) -> float:
     """Time between two steps: what was given, else 10 s in traffic, else what spreads the steps over the scenario.
 
@@ -242,8 +260,8 @@ def spread_s(scenario: Scenario, given_s: float | None) -> float:
 
 
 def distinct_names(rigs: Sequence[AnyRig]) -> list[str]:
-    """What the columns are called: the rig's name, or the stem of its file; numbered where two would be the same."""
-    return distinct([_stem(rig) for rig in rigs])
+    """What the columns are called: the rigs' names; numbered where two would be the same."""
+    return distinct([_name(rig) for rig in rigs])
 
 
 def distinct(stems: Sequence[str]) -> list[str]:
@@ -272,7 +290,7 @@ def as_called(rig: AnyRig) -> Rig:
 
     FileNotFoundError: as `loaded`. ValueError: as `loaded`.
     """
-    return loaded(rig).model_copy(update={"name": _stem(rig)})
+    return loaded(rig).model_copy(update={"name": _name(rig)})
 
 
 def is_document(rig: AnyRig) -> bool:
@@ -285,10 +303,8 @@ def given_as(rig: AnyRig) -> str:
     return rig.name if isinstance(rig, Rig) else str(rig)
 
 
-def _stem(rig: AnyRig) -> str:
-    if isinstance(rig, Rig):
-        return rig.name
-    return Path(rig).stem if _is_file(rig) else str(rig)
+def _name(rig: AnyRig) -> str:
+    return loaded(rig).name if isinstance(rig, Rig) or _is_file(rig) else str(rig)
 
 
 def _is_file(rig: str | Path) -> bool:
