@@ -73,7 +73,7 @@ def main():
             apart = 100 * (own - of)[:, 1]
             to_recorder = 100 * ((own - of) - (found[name]["recorder"][1] - true["recorder"]))[:, 1]
             between = "" if rig == "recorder" else f"{rms(to_recorder):.1f}"
-            radii = 100 * (own / of - 1)[:, 0]
+            radii = 100 * (own[:, 0] / of[:, 0] - 1)
             rows.append((rig, f"made, {name}", f"{rms(apart):.1f} / {rms(radii):.0f}", f"{worst(apart):+.1f}", between,
                          *words_of(own)))  # fmt: skip
     table(("rig", "world", "rms", "worst", "rms of the difference to the recorder", *places), rows)

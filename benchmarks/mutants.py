@@ -1,13 +1,15 @@
 """Do tests notice? The code is changed in one place at a time, and the tests of its room should fail.
 
 `python -m benchmarks.mutants [room ...] [--seed N] [--count N]`: places are drawn by the seed, from the modules of each
-room. A mutant *survives* if all tests of its room pass. Some are equal to what they were made of, which no test can
-tell: `EQUAL` has those that were looked at, with the reason. Kernels of numba run as the Python that they are.
+room, which pass without a change. A mutant *survives* if all of them pass. Some are equal to what they were made of,
+which no test can tell: `EQUAL` has those that were looked at, with the reason. Kernels of numba are compiled again.
 """
 
 import argparse
 import ast
 import copy
+import json
+import multiprocessing
 import os
 import random
 import re
@@ -16,9 +18,11 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from itertools import accumulate
+from itertools import accumulate, count
 from pathlib import Path
 from typing import NamedTuple
+
+import pytest
 
 from benchmarks.timing import table
 
@@ -33,7 +37,10 @@ ROOMS = {
     "simulation": (
         ("simulation/surface.py", "simulation/surface_points.py", "simulation/local_ground.py",
          "simulation/recorded_returns.py", "simulation/sweep.py", "simulation/raycaster.py"),
-        ("simulation",),
+        tuple(f"simulation/test_{name}.py" for name in (
+            "surface_reference", "local_ground", "recorded_returns", "sweep", "raycaster", "sound", "returns",
+            "visible_area", "spared_rays", "simulator", "mounts",
+        )),
     ),
     "evaluation": (
         ("evaluation/checkpoint.py", "evaluation/ranks.py"),
@@ -47,12 +54,19 @@ SWAPPED = {
 }  # fmt: skip
 RENAMED = {"min": "max", "max": "min", "all": "any", "any": "all", "minimum": "maximum", "maximum": "minimum",
            "floor": "ceil", "ceil": "floor", "cos": "sin", "sin": "cos"}  # fmt: skip
-# Looked at, and the same as what they were made of: file, line as it is written, what it became.
-EQUAL: dict[tuple[str, str], str] = {}
+# Looked at, and the same as what they were made of: file, what stood there, what it became; and why.
+EQUAL: dict[tuple[str, str, str], str] = {}
 # Of unions of types, which fail where they are made.
 OF_TYPES = re.compile(r"\|.*\b(None|str|int|float|bool|[A-Z]\w*)\b|\b(None|str|int|float|bool|[A-Z]\w*)\b.*\|")
-# A test that hangs has noticed.
-MOST_S = 300.0
+# A test that hangs has noticed: it takes this many times what all tests take without a change.
+MOST_TIMES = 5.0
+# Slower ones come last.
+SLOW_S = 1.0
+TIMES_S = count(1_000_000_000)
+# What all tests load, once.
+SERVER = multiprocessing.get_context("forkserver")
+LOADED = ["kornia", "lightning", "matplotlib.pyplot", "numba", "pydantic", "pytest", "scipy", "torch",
+          "torchmetrics", "trimesh", "typer"]  # fmt: skip
 
 
 class Mutant(NamedTuple):
@@ -72,6 +86,8 @@ def main(words):
     parser.add_argument("--count", type=int, default=25, help="mutants of each room")
     asked = parser.parse_args(words)
     rows, survivors = [], []
+    os.environ |= {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
+    SERVER.set_forkserver_preload(LOADED)
     with tempfile.TemporaryDirectory() as folder:
         tree = Path(folder)
         listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True).stdout
@@ -79,8 +95,14 @@ def main(words):
         subprocess.run(["tar", "-xf", f"{folder}/all.tar"], cwd=tree, check=True)
         for room in asked.rooms or ROOMS:
             found = list(drawn(room, asked.count, asked.seed))
-            survived = [mutant for mutant in found if passes(room, mutant, tree)]
-            equal = [mutant for mutant in survived if (mutant.before, mutant.after) in EQUAL]
+            kept = tree / "durations.json"
+            kept.unlink(missing_ok=True)
+            start_s = time.monotonic()
+            if told := failures(room, None, tree):
+                sys.exit(f"tests of {room} fail without a change:\n{told}")
+            most_s = MOST_TIMES * (time.monotonic() - start_s)
+            survived = [mutant for mutant in found if survives(room, mutant, tree, most_s)]
+            equal = [one for one in survived if (one.path.name, one.before, one.after) in EQUAL]
             killed, valid = len(found) - len(survived), len(found) - len(equal)
             rows.append((room, len(found), len(equal), killed, f"{100 * killed / max(valid, 1):.0f} %"))
             survivors += [mutant for mutant in survived if mutant not in equal]
@@ -91,28 +113,74 @@ def main(words):
         table(("survived", "was", "became"), named)
 
 
-def passes(room: str, mutant: Mutant, tree: Path) -> bool:
+def survives(room: str, mutant: Mutant, tree: Path, most_s: float) -> bool:
     """Whether all tests of a room pass with a change; it is undone after them."""
-    target = tree / mutant.path
+    target, start_s = tree / mutant.path, time.monotonic()
     whole = target.read_text(encoding="utf-8")
-    target.write_text(mutant.text, encoding="utf-8")
-    first = sorted((tree / "tests").glob(f"**/test_{target.stem}*.py"))
-    tests = [str(path) for path in first] + [f"tests/{name}" for name in ROOMS[room][1]]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive", "PYTHONPATH": str(tree),
-                   "PYTHONDONTWRITEBYTECODE": "1", "NUMBA_DISABLE_JIT": "1"}  # fmt: skip
-    start_s = time.monotonic()
+    write(target, mutant.text)
+    if target.stem == "compiled":  # what others were compiled with
+        for kept in tree.rglob("*.nbi"):
+            kept.unlink()
     try:
-        command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *tests]
-        done = subprocess.run(command, cwd=tree, env=environment, capture_output=True, timeout=MOST_S, check=False)
-        passed = done.returncode == 0
-    except subprocess.TimeoutExpired:
-        passed = False
+        survived = not failures(room, target, tree, most_s)
     finally:
-        target.write_text(whole, encoding="utf-8")
+        write(target, whole)
     words = f"{mutant.path}:{mutant.line} {mutant.before} -> {mutant.after}"
-    ending = f"{'SURVIVED' if passed else 'killed'} in {time.monotonic() - start_s:.0f} s"
+    ending = f"{'SURVIVED' if survived else 'killed'} in {time.monotonic() - start_s:.0f} s"
     print(f"{ending}: {words}", file=sys.stderr, flush=True)
-    return passed
+    return survived
+
+
+def write(target: Path, text: str) -> None:
+    """Write a module at a time at which none was written before, as what was compiled is known by."""
+    target.write_text(text, encoding="utf-8")
+    os.utime(target, (at_s := next(TIMES_S), at_s))
+
+
+def failures(room: str, target: Path | None, tree: Path, most_s: float | None = None) -> str:
+    """What the tests of a room print if they do not pass, those named like a module first; else nothing."""
+    first = sorted((tree / "tests").glob(f"**/test_{target.stem}*.py")) if target else []
+    printed = tree / "printed.txt"
+    tests = [*map(str, first), *(f"tests/{name}" for name in ROOMS[room][1])]
+    run = SERVER.Process(target=tested, args=(str(tree), str(printed), tests))
+    run.start()
+    run.join(most_s)
+    if run.is_alive():
+        run.kill()
+        run.join()
+        return "too slow"
+    return printed.read_text(encoding="utf-8", errors="replace") if run.exitcode else ""
+
+
+def tested(tree: str, printed: str, tests: list[str]) -> None:
+    """Run tests until the first fails, in a process that has loaded the packages of others but nothing of ours."""
+    output = os.open(printed, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    os.dup2(output, 1)
+    os.dup2(output, 2)
+    os.chdir(tree)
+    sys.path.insert(0, tree)
+    for name in [name for name in sys.modules if name.split(".")[0] in ("benchmarks", "tests", "torchcover")]:
+        del sys.modules[name]
+    order = Quickest(Path(tree, "durations.json"))
+    os._exit(pytest.main(["-x", "-q", "-p", "no:cacheprovider", *tests], plugins=[order]))
+
+
+class Quickest:
+    """Run the slow tests last: a plugin of pytest."""
+
+    def __init__(self, kept: Path) -> None:
+        self._kept, self._is_new = kept, not kept.exists()
+        self._seconds = {} if self._is_new else json.loads(kept.read_text(encoding="utf-8"))
+
+    def pytest_collection_modifyitems(self, items):
+        items.sort(key=lambda item: self._seconds.get(item.nodeid, 0.0) > SLOW_S)
+
+    def pytest_runtest_logreport(self, report):
+        self._seconds[report.nodeid] = self._seconds.get(report.nodeid, 0.0) + report.duration
+
+    def pytest_sessionfinish(self):
+        if self._is_new:
+            self._kept.write_text(json.dumps(self._seconds), encoding="utf-8")
 
 
 def drawn(room: str, count: int, seed: int) -> Iterator[Mutant]:

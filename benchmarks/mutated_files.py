@@ -12,12 +12,13 @@ import time
 import warnings
 import zlib
 from collections import Counter
+from itertools import product
 from pathlib import Path
 
 from benchmarks.damage import damaged
 from benchmarks.good_files import Kind, archive, kinds, ply
 from benchmarks.timing import table
-from torchcover.files import BadFileError
+from torchcover.files import BadFileError, own_process
 
 MAX_SECONDS, MAX_MB = 5.0, 500
 # A reader that never ends.
@@ -31,16 +32,17 @@ class Endless(BaseException):
 def main():
     """Print a table of readers, and one of bombs."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--files", type=int, default=20_000)
+    parser.add_argument("--files", type=int, default=20_000, help="of each seed")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--show", action="store_true", help="print a message of every sort")
     arguments, _ = parser.parse_known_args()
     with tempfile.TemporaryDirectory() as folder, _silent_libraries():
         every = kinds(folder)
         found = {kind.name: Counter() for kind in every}
         messages = {}
-        for number in range(arguments.files):
+        for number, seed in product(range(arguments.files), arguments.seeds):
             kind = every[number % len(every)]
-            data = mutated(every, number)
+            data = mutated(every, number, seed)
             outcome = attempt(kind, data, Path(folder), messages)
             _add(found[kind.name], outcome)
         bombs = [(name, *attempt(kind, kind.data, Path(folder), messages)) for name, kind in _bombs()]
@@ -54,7 +56,13 @@ def main():
                 for key in columns
             }
         )
-    print(f"{arguments.files} mutated files; slow: above {MAX_SECONDS:g} s, large: above {MAX_MB} MB\n")
+    for reading in own_process._processes.values():
+        reading.end()
+    children_mb = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
+    print(
+        f"{arguments.files:,} files of each of {len(arguments.seeds)} seeds. The largest size of this process was "
+        f"{_largest_mb():.0f} MB, of one that reads for it {children_mb:.0f} MB.\n"
+    )
     table(
         ("file", *columns),
         [(name, *(counts[key] for key in columns)) for name, counts in {**found, "all": total}.items()],
@@ -69,10 +77,10 @@ def main():
         print("\n".join(sorted(messages.values())))
 
 
-def mutated(every, number):
-    """The bytes of the mutated file of this number: always the same."""
-    kind = every[number % len(every)]
-    return damaged(kind.data, [other.data for other in every], random.Random(f"mutated file {number}"))
+def mutated(every, number, seed=0):
+    """The bytes of the mutated file of this number and seed: always the same."""
+    kind, draw = every[number % len(every)], random.Random(f"mutated file {number}" + f" of {seed}" * (seed > 0))
+    return damaged(kind.data, [other.data for other in every], draw)
 
 
 def attempt(kind, data, folder, messages=None):

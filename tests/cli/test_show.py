@@ -4,6 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import trimesh
 from matplotlib.image import imread
 from PIL import Image
 
@@ -58,6 +59,50 @@ def test_a_scenario_is_drawn_in_the_frame_of_the_ego(torchcover, worlds, drawn):
     assert (np.abs(on_actor[:, 0] - 20.0) < 2.1).all()
     assert (np.abs(on_actor[:, 1] - 5.0) < 1.1).all()
     assert len(drawn["reference"]) > 1000
+
+
+@pytest.mark.filterwarnings("default")
+@pytest.mark.parametrize(
+    ("size", "told", "doubt"),
+    [
+        ("4.5 1.8 1.5", "4.50 m long (x, forward), 1.80 m wide (y), 1.50 m high (z, up)", ""),
+        ("1.8 4.5 1.5", "1.80 m long", "wider than long; a vehicle's x axis points forward"),
+        ("83.7 30 25", "83.70 m long", "far too large for a vehicle on a road; a file in millimetres"),
+    ],
+)
+def test_a_mesh_and_the_vehicle_of_it_say_their_size_and_what_is_doubtful(torchcover, tmp_path, size, told, doubt):
+    trimesh.creation.box([float(number) for number in size.split()]).export(tmp_path / "car.obj")
+    (tmp_path / "car.yaml").write_text("name: car\nparts: [{name: body, shape: {type: mesh, path: car.obj}}]\n")
+    for name in ("car.obj", "car.yaml"):
+        code, printed, warned = torchcover("show", tmp_path / name, "--out", tmp_path)
+        assert code == 0
+        assert told in printed
+        assert (tmp_path / "car.png").is_file()
+        assert doubt in warned
+        assert bool(warned) == bool(doubt)
+    code, _, error = torchcover("show", tmp_path / "none.obj")
+    assert code == 2
+    assert "none.obj" in error
+
+
+def test_a_robot_of_urdf_becomes_a_vehicle_and_a_rig_that_can_be_shown(torchcover, tmp_path):
+    box = "<visual><geometry><box size='0.8 0.6 0.4'/></geometry></visual>"
+    camera = (
+        "<camera><horizontal_fov>1.5</horizontal_fov><image><width>64</width><height>48</height></image>"
+        "<clip><near>0.1</near><far>9</far></clip></camera>"
+    )
+    sensor = f"<sensor name='d' type='depth'><pose>0.5 0 0 0 0 0</pose>{camera}</sensor>"
+    urdf = tmp_path / "bot.urdf"
+    urdf.write_text(f"<robot name='bot'><link name='b'>{box}</link><gazebo reference='b'>{sensor}</gazebo></robot>")
+    code, printed, _ = torchcover("robot", urdf, "--out", tmp_path / "bot")
+    assert code == 0
+    assert "rig.yaml with 1 sensors; look at it: torchcover show" in " ".join(printed.split())
+    assert torchcover("show", tmp_path / "bot" / "rig.yaml", "--out", tmp_path)[0] == 0
+    urdf.write_text(f"<robot name='bot'><link name='b'>{box}</link></robot>")
+    code, printed, _ = torchcover("robot", urdf, "--out", tmp_path / "none")
+    assert code == 0
+    assert "no rig, for it has no sensor in a tag of Gazebo" in printed
+    assert torchcover("robot", urdf, "--package", "bot")[0] == 2
 
 
 def test_a_vehicle_is_drawn_with_its_mount_regions_on_its_skin(torchcover, tmp_path, drawn):

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from torchcover.detection import Boxes
-from torchcover.detection.box_layouts import upright_rows
+from torchcover.detection.boxes import upright_rows
 from torchcover.geometry import rigid, rotation_from_euler
 
 RANDOM = np.random.default_rng(11)

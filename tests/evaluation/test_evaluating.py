@@ -18,7 +18,7 @@ import torchcover
 from torchcover import Coverage, RegionsOfInterest, Rig, Scenario
 from torchcover.coverage import Maximum, Quantiles
 from torchcover.data import DEFAULT_REFERENCE, BadFrameError, Frame, FrameDataset
-from torchcover.evaluation import Settings, TargetError
+from torchcover.evaluation import Settings, TargetError, task
 from torchcover.evaluation.result_page import HEAVY
 from torchcover.evaluation.target_error import MIN_GROWTH, MIN_STEPS
 
@@ -71,7 +71,7 @@ def test_one_rig(tmp_path):
     assert places[6:8] == [("left_3m", "ground"), ("right_3m", "ground")]
     assert places[8:] == [(f"{side}_3m", "pole_100cm") for side in ("front", "rear", "left", "right")]
     assert "front_roof_32: 2 steps" in repr(result)
-    assert "mean blind spot" in repr(result)
+    assert "mean blind spot" in str(result)
     stem, figure = next(iter(result.maps()))
     assert (stem, isinstance(figure, Figure)) == ("radius_area_m_ground", True)
     files = result.save(tmp_path / "new" / "out")
@@ -177,11 +177,11 @@ def test_a_result_that_was_cut_short_says_so_wherever_its_numbers_stand(error, r
     assert [warning.filename for warning in told] == [__file__]
     # Of the frame that ended it, coverage has the step: it was fed before the other observer.
     assert f"The run was cut short after 3 steps: {reason}." in result.table.notes
-    assert reason in " ".join(repr(result).split())
+    assert reason in " ".join(str(result).split())
 
 
 def test_a_run_that_came_to_its_end_says_nothing_of_one():
-    assert "cut short" not in repr(torchcover.evaluate(frames=Single(), cell_m=4.0, steps=2))
+    assert "cut short" not in str(torchcover.evaluate(frames=Single(), cell_m=4.0, steps=2))
 
 
 def test_the_only_rig_of_a_source_goes_by_the_name_of_the_sensors_it_is():
@@ -274,6 +274,18 @@ def test_results_are_compared_as_if_they_had_been_measured_together():
         torchcover.compare(["front_roof_32", "front_roof_128"])
     with pytest.raises(TypeError, match="results of `evaluate` or coverage files are needed; got Coverage"):
         torchcover.compare([low.coverage, high.coverage])
+
+
+def test_a_gpu_casts_rays_if_warp_is_there_and_no_workers_are_asked_for(monkeypatch):
+    def device(given, **settings):
+        return task.casting_device(Settings("front_roof_32", device=given, **settings))
+
+    monkeypatch.setattr(task, "usable_device", torch.device)
+    monkeypatch.setattr(task, "find_spec", lambda name: name == "warp")
+    assert (device("cuda:1"), device("cuda", workers=0), device("cpu")) == ("cuda:1", "cuda", None)
+    assert device("cuda", workers=2) is None
+    monkeypatch.setattr(task, "find_spec", lambda _: None)
+    assert device("cuda") is None
 
 
 def test_every_argument_is_declared_once_and_stands_in_the_signature_and_in_the_docstring():

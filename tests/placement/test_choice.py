@@ -112,6 +112,8 @@ def test_the_choice_is_the_rig_with_the_best_score_and_its_files_say_so(folder):
     rows = list(csv.DictReader((folder / "out" / "candidates.csv").read_text().splitlines()))
     assert [row["name"] for row in rows if row["chosen"] == "True"] == sorted(found.names(found.best.chosen))
     assert "inside" in rows[-1]["why_not"]
+    assert found.to_dataframe()["name"].tolist() == [row["name"] for row in rows]
+    assert found.sentence in repr(found)
     assert json.loads((folder / "out" / "search.json").read_text())["found"][0]["proven"] is True
 
 
@@ -144,10 +146,10 @@ def test_where_no_choice_keeps_what_is_there_the_least_bad_says_by_how_much(fold
     assert found.best.short == pytest.approx(min(short.values()))
     assert found.best.short > 0.01
     assert short[found.best.chosen[0]] == min(short.values())
-    assert (
-        f"no choice keeps all that must be kept, and this one lacks the least: {100 * found.best.short:.2f}"
-        in found.sentence
-    )
+    lost = kept - each[found.best.chosen[0]]
+    names = [name for name in space.asked if name not in space.objectives]
+    told = [f"{100 * lack:.2f} points of {name}" for lack, name in zip(lost, names, strict=True) if lack > 1e-6]
+    assert f"keeps all that must be kept, and this one lacks the least: {'; '.join(told)}" in found.sentence
 
 
 def test_a_candidate_with_too_many_rays_on_the_vehicle_is_refused(folder):

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 
 import numpy as np
 import pytest
@@ -63,6 +64,14 @@ def test_there_is_a_row_for_every_evaluation_and_its_gain_is_the_difference_of_m
     best = max((row for row in table if row["state"] == "complete" and row["arm"] != "random"),
                key=lambda row: float(row["near_gain"]))  # fmt: skip
     assert int(best["number"]) == result.best.evaluation.number
+
+
+def test_a_notebook_is_told_the_sentence_and_has_a_row_for_every_evaluation(one):
+    result, _, _ = one
+    assert result.sentence in repr(result)
+    assert re.search(r"<strong>.*</strong>.*data:image/png;base64,", result._repr_html_())
+    table = result.to_dataframe()
+    assert table["number"].tolist() == [each.number for each in result.search.evaluations]
 
 
 def test_the_record_has_seeds_gains_and_what_was_saved(one):

@@ -117,6 +117,9 @@ def test_heights_are_those_along_the_vertical_of_the_world_in_any_frame():
 def test_steep_faces_and_what_is_far_above_are_nobodys_ground():
     assert level_faces(wedge((0, 1), (0, 1), (0, 0.9))).sum() == 2
     assert level_faces(wedge((0, 1), (0, 1), (0, 1.1))).sum() == 0
+    for seed in range(50):  # 45 degrees, whatever rounding makes of that
+        turn, side = rigid(rotation_from_euler(seed, 0, 0), [seed, 7.3, -0.1]), 1 / (1 + seed)
+        assert level_faces(wedge((0, side), (0, 1), (0, side)).moved(turn)).sum() == 2
     walls = [solid((0.2, 40, 5), 5), solid((0.2, 40, 5), -5)]
     assert np.isnan(heights(ground_of(walls), [0, 0, 1])).all()
     roof = solid((9, 9, 0.2), 0, 0, 3)

@@ -1,11 +1,14 @@
 """The ray caster against closed forms and against a slow intersection test in float64."""
 
 import os
+from functools import partial
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
 
 from torchcover.geometry import rigid, rotation_from_euler
+from torchcover.simulation import raycaster
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.rays import unit_directions
 from torchcover.simulation.shapes import Box, Ellipsoid, Frustum, Mesh, Plane
@@ -13,6 +16,14 @@ from torchcover.simulation.shapes import Box, Ellipsoid, Frustum, Mesh, Plane
 HERE = np.zeros(3)
 NUMBERS = np.random.default_rng
 MOUNTAIN = Mesh(np.array([[1e6, 0, 0], [1e6, 100, 0], [1e6, 0, 100]]), np.array([[0, 1, 2]]))
+
+
+@pytest.fixture(params=["Embree", *["Warp"] * bool(find_spec("warp"))], autouse=True)
+def library(request, monkeypatch):
+    """Whoever casts, casts alike: every test here is about both."""
+    if request.param == "Warp":
+        monkeypatch.setitem(globals(), "RayCaster", partial(raycaster.RayCaster, device="cpu"))
+    return request.param
 
 
 def endless(directions):
@@ -211,6 +222,17 @@ def test_the_arguments_are_left_alone():
     np.testing.assert_array_equal(origin, np.ones(3))
 
 
+def test_bodies_without_faces_keep_their_numbers():
+    nothing, up = Mesh(np.zeros((3, 3)), np.empty((0, 3), dtype=np.int64)), np.array([[0.0, 0.1, 1.0]] * 3, np.float32)
+    caster = RayCaster([nothing, box_at(0.0, size=4.0), nothing, box_at(9.0), nothing])
+    starts = np.array([[0.0, 0.0, -5.0], [9.0, 0.0, -5.0], [30.0, 0.0, -5.0]])
+    hits = caster.cast_from_each(starts.astype(np.float32), up.T, np.full(3, 9.0, np.float32))
+    assert hits.body.tolist() == [1, 3, -1]
+    bodies = np.searchsorted([0, 12, 24], caster.faces_met(starts, up, 9.0), side="right")
+    assert bodies.tolist() == [1, 2, 0]
+    assert (RayCaster([nothing]).cast(HERE, up.T, endless(up.T)).body == -1).all()
+
+
 def test_no_rays_are_an_empty_result():
     none = np.empty((3, 0), np.float32)
     assert RayCaster([random_mesh(5)]).cast(HERE, none, endless(none)).range_m.shape == (0,)
@@ -228,3 +250,60 @@ def test_scenes_are_built_without_threads_that_a_forked_process_would_miss():
     RayCaster([random_mesh(20_000)])
     assert len(os.listdir("/proc/self/task")) == threads
     assert os.sched_getaffinity(0) == cores
+
+
+def stacked(sizes):
+    """Slabs upon each other, and the places of their middles."""
+    tops = np.cumsum([size[2] for size in sizes])
+    boxes = [Box(type="box", size_m=size).mesh() for size in sizes]
+    starts = [np.array([0.0, 0.0, top - size[2]]) for top, size in zip(tops, sizes, strict=True)]
+    return [Mesh(mesh.vertices_m + start, mesh.faces) for mesh, start in zip(boxes, starts, strict=True)]
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_place_between_bodies_that_touch_is_inside_one_however_they_are_turned(seed):
+    """The faces in which they touch are there twice: which of the two a ray met would be up to rounding."""
+    numbers = NUMBERS(seed)
+    turn = rigid(rotation_from_euler(*numbers.uniform(-np.pi, np.pi, 3) * (seed % 3 > 0)), numbers.uniform(-50, 50, 3))
+    slabs = stacked([(20, 20, 1), (20, 20, 2), (24, 16, 1)])
+    order = numbers.permutation(3)
+    caster = RayCaster([slabs[k].moved(turn) for k in order])
+    for height_m, expected in ((0.5, [0]), (2.0, [1]), (3.5, [2]), (4.5, []), (-0.5, [])):
+        for beside_m in ((0.0, 0.0), (0.3, -4.2), (7.0, 7.0)):
+            place_m = turn[:3, :3] @ [*beside_m, height_m] + turn[:3, 3]
+            assert order[caster.inside(place_m)].tolist() == expected
+
+
+def test_a_place_is_inside_of_what_encloses_it_and_of_no_sheet():
+    """Convex bodies against their half spaces; bodies within bodies, and one of two parts that touch."""
+    ball, cube = Ellipsoid(type="ellipsoid", size_m=(4, 3, 2)).mesh(), box_at(0.0, size=2.0)
+    caster = RayCaster([ball, Plane(type="plane", size_m=(9, 9)).mesh(), cube])
+    places = NUMBERS(0).uniform(-2.2, 2.2, (2000, 3))
+    places[:100, :2] = 0.0  # above and below vertices, edges and the middles of faces
+    for place in places:
+        within = [number for number, body in ((0, ball), (2, cube)) if behind_all(body, place)]
+        assert caster.inside(place).tolist() == within
+    ahead = cube.moved(rigid(np.eye(3), [2, 0, 0]))
+    vertices_m, faces = (
+        np.concatenate([cube.vertices_m, ahead.vertices_m]),
+        np.concatenate([cube.faces, cube.faces + 8]),
+    )
+    both = RayCaster([Mesh(vertices_m, faces)])
+    found = [len(both.inside(np.array([x, 0.2, 0.1]))) for x in (-1.5, 0.0, 1.0, 2.0, 3.5)]
+    assert found == [0, 1, 1, 1, 0]
+
+
+def behind_all(mesh, place):
+    """Whether a place lies behind every face of a convex body."""
+    a, b, c = mesh.vertices_m[mesh.faces].transpose(1, 0, 2)
+    return bool((((place - a) * np.cross(b - a, c - a)).sum(axis=1) < 0).all())
+
+
+def test_who_stands_on_top_of_a_body_is_not_inside_and_who_lies_below_its_bottom_is_not_either():
+    for seed in range(50):
+        shift = NUMBERS(seed).uniform(-500, 500, 3)
+        slab = stacked([(4, 4, 0.3)])[0]
+        caster = RayCaster([Mesh(slab.vertices_m + shift, slab.faces)])
+        heights = {-1e-3: [], 1e-3: [0], 0.3 - 1e-3: [0], 0.3: [], 0.3 + 1e-3: []}
+        for height, expected in heights.items():
+            assert caster.inside(shift + np.array([0.1, 0.7, height])).tolist() == expected

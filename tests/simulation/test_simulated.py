@@ -1,12 +1,13 @@
 """A simulated frame is a pure function of scenario, rig, seed and index."""
 
 import pickle
+from importlib.util import find_spec
 
 import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from torchcover import Rig, Scenario
+from torchcover import Rig, Scenario, nearest
 from torchcover.data import SimulatedFrames, collate_frames
 from torchcover.simulation import PaperReference
 
@@ -47,6 +48,18 @@ def test_a_frame_does_not_depend_on_workers():
     there = [frame for batch in loader for frame in batch.frames]
     assert all(same(a, b) for a, b in zip(here, there, strict=True))
     assert [frame.index for frame in there] == list(range(6))
+
+
+@pytest.mark.skipif(not find_spec("warp"), reason="Warp is not installed")
+@pytest.mark.parametrize("scenario", ["courtyard", "urban"])
+def test_rays_of_warp_end_where_those_of_embree_do(scenario):
+    """But for rounding, and for rays that pass an edge on the other side."""
+    by_embree, by_warp = (
+        SimulatedFrames(scenario, "kitti", steps=2, every_s=1.0, device=device)[1] for device in (None, "cpu")
+    )
+    for one, other in ((by_embree.sensor, by_warp.sensor), (by_embree.reference, by_warp.reference)):
+        for queries, points in ((one, other), (other, one)):
+            assert (nearest(queries, points).distance > 1e-3).float().mean() < 1e-4
 
 
 def test_a_frame_survives_pickling_of_the_dataset_after_use():

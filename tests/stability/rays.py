@@ -1,6 +1,7 @@
 """Ray casting at the extremes, against closed forms."""
 
 from functools import lru_cache, partial
+from importlib.util import find_spec
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
@@ -39,8 +40,9 @@ def directions(count, seed=0):
     return (rows / np.linalg.norm(rows, axis=0)).astype(np.float32)
 
 
-def cast(bodies, origin_m, towards):
-    return RayCaster(bodies).cast(np.asarray(origin_m), towards, np.full(towards.shape[1], np.inf, np.float32))
+def cast(bodies, origin_m, towards, device=None):
+    endless = np.full(towards.shape[1], np.inf, np.float32)
+    return RayCaster(bodies, device).cast(np.asarray(origin_m), towards, endless)
 
 
 def bare_embree(bodies, origin_m, towards, robust=True):
@@ -111,8 +113,8 @@ def scaled(scale, caster):
     return relative(caster(mesh), to_walls(directions(5000), -ROOM_M / 2, ROOM_M / 2) * scale)
 
 
-def ours_scaled(scale):
-    return scaled(scale, lambda mesh: cast([mesh], np.zeros(3), directions(5000)).range_m)
+def ours_scaled(scale, device=None):
+    return scaled(scale, lambda mesh: cast([mesh], np.zeros(3), directions(5000), device).range_m)
 
 
 def naive_scaled(scale):
@@ -173,6 +175,29 @@ def coincident(caster):
     ends = np.stack([np.full(5000, 4.5), y, z])
     towards = (ends / np.linalg.norm(ends, axis=0)).astype(np.float32)
     return most(caster(boxes, np.zeros(3), towards) - 4.5 / towards[0].astype(np.float64))
+
+
+def between_slabs(held):
+    """Places in the middle one of three slabs upon each other, turned about: those that are not found to be in it."""
+    generator, lost = np.random.default_rng(6), 0
+    slabs = box(20.0, 20.0, 1.0), box(20.0, 20.0, 2.0).moved(at(0, 0, 1.0)), box(24.0, 16.0, 1.0).moved(at(0, 0, 3.0))
+    for scale_m in np.repeat([1e-6, 1.0, 1e6], 200):
+        turn = rigid(rotation_from_euler(*generator.uniform(-180, 180, 3)), generator.uniform(-50, 50, 3))
+        moved = [mesh.moved(turn) for mesh in slabs]
+        caster = RayCaster([Mesh(mesh.vertices_m * scale_m, mesh.faces) for mesh in moved])
+        place_m = transform(turn, np.append(generator.uniform(-6, 6, 2), generator.uniform(1.1, 2.9))[None])[0]
+        lost += not held(caster, place_m * scale_m)
+    return lost
+
+
+def by_its_faces(caster, place_m):
+    return caster.inside(place_m).tolist() == [1]
+
+
+def by_a_ray(caster, place_m):
+    """Whether a ray first meets the middle one."""
+    towards = np.array([[0.6], [0.0], [0.8]], dtype=np.float32)
+    return caster.cast(place_m, towards, np.array([np.inf], dtype=np.float32)).body[0] == 1
 
 
 # Cones
@@ -311,8 +336,12 @@ def ours(bodies, origin_m, towards):
     return cast(bodies, origin_m, towards).range_m
 
 
-def alone(mesh, origin_m, towards):
-    return ours([mesh], origin_m, towards)
+def by_warp(bodies, origin_m, towards):
+    return cast(bodies, origin_m, towards, "cpu").range_m
+
+
+def alone(mesh, origin_m, towards, caster=ours):
+    return caster([mesh], origin_m, towards)
 
 
 def formula(bodies, origin_m, towards):
@@ -338,6 +367,8 @@ CASES = [
          "Embree as it comes", partial(along_a_surface, bare_embree)),
     Case("coincident surfaces of two bodies", "closed form", "m", 2e-6, partial(coincident, ours),
          FORMULA, partial(coincident, formula), naive_fails=False),
+    Case("places between bodies that touch, of 1e-6 m to 1e6 m", "by construction", "of 600 wrong", 0,
+         partial(between_slabs, by_its_faces), "what a ray meets first", partial(between_slabs, by_a_ray)),
     Case("incidence on a slope 1e6 m away", "closed form", "cosine", 3e-7, partial(incidence, incidence_ours),
          "normals of float32 corners", partial(incidence, incidence_in_float32)),
     Case("a frame that turns 9 degrees in a sweep, 100 m away", "float64 at each time", "m", 0.01, partial(turning, 3),
@@ -349,3 +380,18 @@ CASES = [
     Case("rays through balls of 1e-9 m to 100 km, around the sensor, beside and behind it, 100 km away", "longdouble",
          "of 536,832 spared", 0, partial(spared, Balls.met_by), "cosine in float32", partial(spared, met_by_cosine)),
 ]  # fmt: skip
+OF_WARP = [
+    Case("a room of 1e-9 m, by Warp", "closed form", "relative", 1e-6, partial(ours_scaled, 1e-10, "cpu"),
+         FORMULA + ", epsilon 1e-6", partial(naive_scaled, 1e-10)),
+    Case("a room of 1e9 m, by Warp", "closed form", "relative", 1e-6, partial(ours_scaled, 1e7, "cpu"),
+         FORMULA + ", epsilon 1e-6", partial(naive_scaled, 1e7), naive_fails=False),
+    Case("grazing rays, by Warp", "longdouble", "relative", 1e-6, partial(grazing, partial(alone, caster=by_warp)),
+         FORMULA + ", epsilon 1e-6", partial(grazing, moeller_trumbore), naive_fails=False),
+    Case("rays from a surface, by Warp", "closed form", "of 10,000 wrong", 0, partial(from_a_surface, by_warp),
+         "Embree as it comes", partial(from_a_surface, bare_embree)),
+    Case("rays along a surface they start on, by Warp", "closed form", "of 10,000 wrong", 0,
+         partial(along_a_surface, by_warp), "Embree as it comes", partial(along_a_surface, bare_embree)),
+    Case("coincident surfaces of two bodies, by Warp", "closed form", "m", 2e-6, partial(coincident, by_warp),
+         FORMULA, partial(coincident, formula), naive_fails=False),
+]  # fmt: skip
+CASES += OF_WARP if find_spec("warp") else []

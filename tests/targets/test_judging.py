@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from torchcover.evaluation import free_space, save_targets, survey_target, target_picture, target_record
+from torchcover.evaluation import free_space, save_targets, survey_target, target_record
 from torchcover.geometry import BoundingBox
 from torchcover.report.drawings.targets import UNSEEN
 from torchcover.simulation import with_ego
@@ -135,7 +135,7 @@ def test_the_files_hold_what_the_map_holds(tmp_path):
 
 def test_the_picture_shows_cells_where_they_are():
     seen = seen_where(lambda x, y: np.where(y > 0, 0, 100))
-    figure = target_picture(seen)
+    figure = seen.plot()
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     pixels = np.asarray(canvas.buffer_rgba())[..., :3]

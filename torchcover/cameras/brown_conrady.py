@@ -12,13 +12,26 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchcover.cameras.lens import Linear, Scalar, number, positive_roots
+from torchcover.cameras.lens import Linear, Scalar, as_vector, number, positive_roots
 from torchcover.geometry.arrays import Float64
 
 
-def as_vector(values: Sequence[Scalar], like: Tensor) -> Tensor:
-    """Floats or 0-d tensors as one tensor beside `like`, with their gradients."""
-    return torch.stack([torch.as_tensor(value, dtype=like.dtype, device=like.device) for value in values])
+@dataclass(frozen=True)
+class PlaneChart:
+    """The plane z = 1 of pinhole and Brown-Conrady lenses: a = x / z, b = y / z, for z > 0, before 90 degrees."""
+
+    limit: float = torch.inf
+
+    def draw(self, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Points in front of the camera, drawn where their ray meets z = 1."""
+        front = z > 0
+        depth = torch.where(front, z, 1.0)  # a division by 0 behind the camera would put NaN into the gradients
+        return x / depth, y / depth, front
+
+    def lift(self, a: Tensor, b: Tensor) -> Tensor:
+        """(a, b, 1), normalised."""
+        norm = torch.sqrt(a * a + b * b + 1.0)
+        return torch.stack((a / norm, b / norm, 1.0 / norm), dim=-1)
 
 
 @dataclass(frozen=True)
@@ -27,8 +40,7 @@ class BrownConrady:
 
     g = (1 + k1 s + k2 s^2 + k3 s^3) / (1 + k4 s + k5 s^2 + k6 s^3).
 
-    Args:
-        coefficients: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]: 4, 5, 8 or 12 numbers.
+    `coefficients`: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]: 4, 5, 8 or 12 numbers.
     """
 
     coefficients: Sequence[Scalar]

@@ -1,19 +1,21 @@
 """Reading calibrations: each reader turns one kind of source into a `Calibration`, from which a `Camera` is made."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from torchcover.cameras.entries import first, has_numbers, numbers, numbers_of, told, whole
-from torchcover.cameras.models import as_vector, check_image, check_model
+from torchcover.cameras.lens import as_vector
+from torchcover.cameras.models import check_image, check_model
 from torchcover.files import naming, parse_yaml, read_json_table, read_short_text, reads
 from torchcover.geometry import check_rigid, invert, rigid, rotation_from_euler, rotation_from_quaternion
 from torchcover.geometry.rigid import Matrix
 
+# Beyond, squares of float64 overflow.
+MAX_NUMBER = 1e150
 # Camera axes (x right, y down, z forward) of a camera that looks along the vehicle's x (forward; y left, z up).
 LOOKING_FORWARD = rigid([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], [0.0, 0.0, 0.0])
 
@@ -24,6 +26,70 @@ _MODEL_NAMES = {
     "equidistant": "kannala_brandt",
     "fisheye": "kannala_brandt",
 }
+
+
+def told(value: object) -> str:
+    """What arrived, for a message. YAML may hold lists of lists whose text has no end."""
+    return repr(value)[:80] if isinstance(value, str | int | float | None) else f"a {type(value).__name__}"
+
+
+def first(content: Mapping[str, Any], *names: str) -> tuple[str, Any]:
+    """The first entry of these names that there is."""
+    for name in names:
+        if name in content:
+            return name, content[name]
+    raise ValueError(f"{' or '.join(names)} is missing")
+
+
+def whole(content: Mapping[str, Any], *names: str) -> int:
+    """The first of these entries, a whole number."""
+    name, value = first(content, *names)
+    if type(value) is not int:
+        raise ValueError(f"{name}: a whole number is needed; got {told(value)}")
+    return value
+
+
+def numbers(content: Mapping[str, Any], *names: str) -> Matrix:
+    """A matrix that is written as {rows, cols, data}, or a list of numbers."""
+    name, value = first(content, *names)
+    data = value.get("data") if isinstance(value, dict) else value
+    if not has_numbers(data):
+        raise ValueError(f"{name}: a list of finite numbers is needed; got {told(data)}")
+    values = np.array([float(number) for number in data])
+    if not isinstance(value, dict):
+        return values
+    rows, columns = whole(value, "rows"), whole(value, "cols")
+    if min(rows, columns) < 0 or rows * columns != values.size:
+        raise ValueError(f"{name}: {rows} rows and {columns} columns are not {values.size} numbers")
+    return values.reshape(rows, columns)
+
+
+def numbers_of(table: Mapping[str, Sequence[str]], key: str, length: int) -> Matrix:
+    """The numbers behind a key of a KITTI file."""
+    words = table.get(key, [])
+    if not has_numbers(words, length):
+        arrived = " ".join(words)[:120] or "nothing"
+        raise ValueError(f"{key} with {length} numbers is needed; got {arrived}; the file holds {', '.join(table)}")
+    return np.array(words, dtype=np.float64)
+
+
+def has_numbers(values: object, length: int | None = None) -> TypeGuard[list[Any]]:
+    """Whether it is a list of finite numbers, without a look into whatever else may be in it.
+
+    YAML takes 1e-1, without a point, for text.
+    """
+    return (
+        isinstance(values, list)
+        and length in (None, len(values))
+        and all(isinstance(value, int | float | str) and _is_finite(value) for value in values)
+    )
+
+
+def _is_finite(value: float | str) -> bool:
+    try:
+        return not isinstance(value, bool) and abs(float(value)) < MAX_NUMBER
+    except (ValueError, OverflowError):
+        return False
 
 
 @dataclass(frozen=True)
@@ -59,13 +125,6 @@ def split_projection(numbers: Matrix, name: str) -> tuple[tuple[float, float, fl
     if 0.0 in intrinsics[:2]:
         raise ValueError(f"{name} has no focal length; got {P.tolist()}")
     return intrinsics, rigid(np.eye(3), np.linalg.solve(P[:, :3], P[:, 3]))
-
-
-def focal_from_fov(width: int, fov_deg: float) -> float:
-    """Focal length in pixels of a pinhole with this horizontal field of view: W / (2 tan(fov / 2))."""
-    if not 0.0 < fov_deg < 180.0:
-        raise ValueError(f"a pinhole's field of view lies between 0 and 180 degrees; got {fov_deg}")
-    return float(width / (2.0 * np.tan(np.deg2rad(fov_deg) / 2.0)))
 
 
 def carla_pose(

@@ -13,8 +13,8 @@ from torchcover.cameras import calibration
 from torchcover.cameras.calibration import Calibration
 from torchcover.cameras.depth import count_unusable, usable
 from torchcover.cameras.inverse import ANSWERED
-from torchcover.cameras.lens import Scalar
-from torchcover.cameras.models import as_vector, check_image, check_model
+from torchcover.cameras.lens import Scalar, as_vector
+from torchcover.cameras.models import check_image, check_model
 from torchcover.cameras.optics import Optics
 from torchcover.cameras.ray_table import RayTable
 from torchcover.cameras.unprojection import DepthKind, Selection, check_depth, scale_rays, select
@@ -92,9 +92,6 @@ class Camera:
             height: Rows of the image.
             **rest: `model`, `coefficients`, `vehicle_T_camera`, `name`.
 
-        Returns:
-            The camera.
-
         Raises:
             ValueError: The matrix has another shape, a skew, or another last row.
         """
@@ -122,7 +119,9 @@ class Camera:
             >>> Camera.from_fov(500, 420, 90.0)
             Camera('camera', 500x420, pinhole, fx=250, fy=250, cx=249.5, cy=209.5)
         """
-        focal = calibration.focal_from_fov(width, fov_deg)
+        if not 0.0 < fov_deg < 180.0:
+            raise ValueError(f"a pinhole's field of view lies between 0 and 180 degrees; got {fov_deg}")
+        focal = float(width / (2.0 * np.tan(np.deg2rad(fov_deg) / 2.0)))
         return cls(width, height, focal, focal, (width - 1) / 2.0, (height - 1) / 2.0, **rest)
 
     @classmethod

@@ -141,11 +141,11 @@ def _read_npy(path: Path) -> NDArray[Any]:
     return values
 
 
-def _read_exr(path: Path) -> NDArray[Any]:
-    return exr_image(path, _BYTES_PER_PIXEL)["pixels"]
-
-
-_READERS: dict[str, Callable[[Path], NDArray[Any]]] = {".png": _read_png, ".npy": _read_npy, ".exr": _read_exr}
+_READERS: dict[str, Callable[[Path], NDArray[Any]]] = {
+    ".png": _read_png,
+    ".npy": _read_npy,
+    ".exr": lambda path: exr_image(path, _BYTES_PER_PIXEL)["pixels"],
+}
 
 
 def usable(depth: Tensor, max_depth: float) -> Tensor:
@@ -156,8 +156,7 @@ def usable(depth: Tensor, max_depth: float) -> Tensor:
 def count_unusable(depth: Tensor, max_depth: float) -> dict[str, int]:
     """How many depths `usable` refuses, by reason.
 
-    Returns:
-        `depth_zero`, `depth_negative` (with minus infinity), `depth_nan`, `depth_infinite`, `depth_beyond_range`.
+    Returns `depth_zero`, `depth_negative` (with minus infinity), `depth_nan`, `depth_infinite`, `depth_beyond_range`.
 
     Example:
         >>> count_unusable(torch.tensor([0.0, 2.0, 90.0, torch.inf]), 50.0)["depth_beyond_range"]

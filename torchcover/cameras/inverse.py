@@ -113,9 +113,8 @@ def solve(
     `u` and `v` are (N,) float64 normalised image coordinates, `focal` is pixels per unit of both, for the residual is
     measured in pixels; the coefficients of `distortion` are floats.
 
-    Returns:
-        `a`, `b` (N,) float64, 0 where there is no answer, and (N,) uint8: `ANSWERED`, `OUTSIDE` (no point of the valid
-            region has this image) or `UNCONVERGED`.
+    Returns `a`, `b` (N,) float64, 0 where there is no answer, and (N,) uint8: `ANSWERED`, `OUTSIDE` (no point of the
+    valid region has this image) or `UNCONVERGED`.
     """
 
     def quick(u: Float64, v: Float64) -> tuple[Float64, ...]:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from torchcover.geometry.arrays import Float64
@@ -86,15 +87,20 @@ class Tilt(Protocol):
 class Lens:
     """A lens model with its coefficients.
 
-    Args:
-        chart: Directions <-> plane.
-        distortion: Plane -> normalised image; None where they are the same, and then no solver ever runs.
-        tilt: Tilt of the sensor; None where there is none.
+    `chart`: directions <-> plane; `distortion`: plane -> normalised image; None where they are the same, and then no
+    solver ever runs; `tilt`: tilt of the sensor; None where there is none.
     """
 
     chart: Chart
     distortion: Distortion | None = None
     tilt: Tilt | None = None
+
+
+def as_vector(values: Sequence[Scalar], like: Tensor | None = None) -> Tensor:
+    """Numbers, or tensors with their gradients, as a vector, float64 or beside another tensor."""
+    empty = torch.empty(0, dtype=torch.float64) if like is None else like.new_empty(0)
+    parts = [torch.as_tensor(value, dtype=empty.dtype, device=empty.device) for value in values]
+    return torch.stack(parts) if parts else empty
 
 
 def number(value: Scalar) -> float:

@@ -5,10 +5,9 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from torchcover.cameras.brown_conrady import BrownConrady, SensorTilt
+from torchcover.cameras.brown_conrady import BrownConrady, PlaneChart, SensorTilt
 from torchcover.cameras.kannala_brandt import AngleChart, KannalaBrandt, ThetaPolynomial
 from torchcover.cameras.lens import Distortion, Lens, Scalar
-from torchcover.cameras.pinhole import PlaneChart
 from torchcover.cameras.unified import DoubleSphereChart, ExtendedChart, SphereChart
 
 # Model -> (allowed numbers of coefficients, their order).
@@ -97,9 +96,3 @@ def check_image(name: str, width: int, height: int, intrinsics: Tensor) -> None:
         raise ValueError(f"{name}: fx, fy, cx, cy must be finite; got {intrinsics.tolist()}")
     if not (intrinsics[:2] > 0).all():
         raise ValueError(f"{name}: fx and fy must be positive; got {intrinsics[:2].tolist()}")
-
-
-def as_vector(values: Sequence[Scalar]) -> Tensor:
-    """Numbers, or tensors with their gradients, as a float64 vector."""
-    parts = [torch.as_tensor(value, dtype=torch.float64) for value in values]
-    return torch.stack(parts) if parts else torch.empty(0, dtype=torch.float64)

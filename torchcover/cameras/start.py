@@ -17,9 +17,7 @@ _FARTHEST_SEED = 500.0
 class StartTable:
     """Undistorted radius over distorted radius.
 
-    Args:
-        step: Distorted radius from one entry to the next.
-        radii: (K,) undistorted radii.
+    `step`: distorted radius from one entry to the next; `radii`: (K,) undistorted radii.
     """
 
     step: float

@@ -37,8 +37,7 @@ def _over(x: Tensor, y: Tensor, below: Tensor, shown: Tensor) -> tuple[Tensor, T
 class SphereChart:
     """(x, y) / (z + xi |p|): the unit sphere seen from xi behind its centre (Mei and Rives 2007).
 
-    Args:
-        xi: Distance of the eye from the centre, at least 0; 0 is the pinhole.
+    `xi`: distance of the eye from the centre, at least 0; 0 is the pinhole.
     """
 
     xi: Scalar
@@ -66,9 +65,7 @@ class SphereChart:
 class ExtendedChart:
     """(x, y) / (alpha d + (1 - alpha) z), d = sqrt(beta (x^2 + y^2) + z^2) (Khomutenko et al. 2016).
 
-    Args:
-        alpha: From 0, the pinhole, to 1.
-        beta: Above 0; 1 is the sphere.
+    `alpha`: from 0, the pinhole, to 1; `beta`: above 0; 1 is the sphere.
     """
 
     alpha: Scalar
@@ -98,9 +95,7 @@ class ExtendedChart:
 class DoubleSphereChart:
     """(x, y) / (alpha |(x, y, xi d + z)| + (1 - alpha) (xi d + z)), d = |p| (Usenko et al. 2018).
 
-    Args:
-        xi: Distance between the two centres, from -1 to 1.
-        alpha: From 0 to 1.
+    `xi`: distance between the two centres, from -1 to 1; `alpha`: from 0 to 1.
     """
 
     xi: Scalar

@@ -11,13 +11,10 @@ _KINDS = ("z", "distance")
 
 
 class Selection(NamedTuple):
-    """The pixels of every stride-th row and column.
+    """The pixels of every stride-th row and column: (h, w, 3) points at depth 1, which (h, w) have a ray.
 
-    Args:
-        rays: (h, w, 3) points at depth 1.
-        has_ray: (h, w) bool.
-        allowed: (h, w) or (B, h, w) bool: has a ray and is not masked.
-        depth: (h, w) or (B, h, w).
+    `allowed` and `depth`, (h, w) or (B, h, w), are of one image or a batch; what has a ray and is not masked is
+    allowed.
     """
 
     rays: Tensor

@@ -128,6 +128,26 @@ def world(
     typer.echo(f"{told}. Wrote {out}; try rigs in it: torchcover evaluate RIG --scenario {out / 'scenario.yaml'}")
 
 
+def robot(
+    urdf: Annotated[Path, typer.Argument(help="URDF file; of xacro what `xacro FILE` prints.")],
+    package: Annotated[
+        list[str] | None,
+        typer.Option(help="NAME=FOLDER: a ROS package that meshes are in, if it does not lie around the file."),
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", help="Folder for the vehicle and the rig.")] = Path("robot"),
+) -> None:
+    """Make a vehicle and a rig of a robot's URDF: its body, and the sensors of its Gazebo tags."""
+    from torchcover.simulation import read_robot
+
+    found = read_robot(urdf, dict(_pair(text) for text in package or ()))
+    found.save(out)
+    for note in found.notes:
+        typer.echo(note)
+    rig = f"{out / 'rig.yaml'} with {len(found.sensors)} sensors; look at it: torchcover show {out / 'rig.yaml'}"
+    none = f"no rig, for it has no sensor in a tag of Gazebo; look at it: torchcover show {out / 'vehicle.yaml'}"
+    typer.echo(f"Wrote {out / 'vehicle.yaml'} and {rig if found.sensors else none}")
+
+
 def calibrate(
     recording: Annotated[Path, typer.Argument(help="A drive on a straight road, of any layout in docs/recordings.md.")],
     rig: Annotated[
@@ -157,7 +177,9 @@ def _pair(text: str) -> tuple[str, str]:
 
 @with_options(of_evaluate("vehicle"))
 def show(
-    name: Annotated[str, typer.Argument(help="Rig, scenario or vehicle: a built-in name (see `list`) or a YAML file.")],
+    name: Annotated[
+        str, typer.Argument(help="Rig, scenario or vehicle: a built-in name (see `list`), a YAML file or a mesh.")
+    ],
     scenario: Annotated[
         str | None, typer.Option(help="For a rig: the scenario whose ego carries it and that it sees (courtyard).")
     ] = None,

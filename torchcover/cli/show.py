@@ -5,6 +5,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 from rich.progress import track
 
@@ -14,8 +15,9 @@ from torchcover.evaluation.task import as_called
 from torchcover.files import BadFileError, write_durably
 from torchcover.report import Terminal, check_film, write_film
 from torchcover.simulation import Scenario, builtin_names
-from torchcover.simulation.bodies import Vehicle
+from torchcover.simulation.bodies import Body, Vehicle, VehicleShape, body_called, mover_mesh
 from torchcover.simulation.documents import read_mapping
+from torchcover.simulation.shapes import MeshFile
 
 DEFAULT_RIG = "front_roof_128"
 # Kinds of documents, and the key that only such a one has.
@@ -48,8 +50,11 @@ def run(
         given = {"--scenario": scenario, "--rig": rig, "--vehicle": vehicle, "--step": step, "--seed": seed}
         _refuse("rigs and scenarios", given, f"{name!r} is a vehicle")
         _refuse("a scenario", {"--film": film}, f"{name!r} is a vehicle")
-        body = Vehicle.load(name)
+        shape = body_called(name)
+        body = Vehicle.load(name) if isinstance(shape, VehicleShape) else _of_mesh(shape)
         _say(console, body.description)
+        length_m, width_m, height_m = np.ptp(mover_mesh(name, shape).vertices_m, axis=0)  # with what is doubtful of it
+        _say(console, f"{length_m:.2f} m long (x, forward), {width_m:.2f} m wide (y), {height_m:.2f} m high (z, up)")
         _write(console, out / Path(name).stem, [("", vehicle_picture(body))])
         return
     if kind == "rig":
@@ -78,6 +83,10 @@ def run(
     console.print(f"Wrote {film}", markup=False, soft_wrap=True)
 
 
+def _of_mesh(shape: MeshFile) -> Vehicle:
+    return Vehicle(name=shape.path.name, parts=(Body(name="body", shape=shape),))
+
+
 def _say(console: Terminal, description: str) -> None:
     if description:
         console.print(" ".join(description.split()), markup=False, highlight=False)
@@ -98,6 +107,8 @@ def _steps_of_film(world: Scenario, first: int) -> range:
 def _kind(name: str) -> str:
     if Path(name).suffix in (".yaml", ".yml"):
         return _kind_of_file(Path(name))
+    if Path(name).suffix:
+        return "vehicle"  # a mesh
     of = {kind: builtin_names(f"{kind}s") for kind in KINDS}
     kinds = [kind for kind, names in of.items() if name in names]
     if len(kinds) != 1:

@@ -28,13 +28,7 @@ class CellMeans(NamedTuple):
 
 
 def mean_per_cell(cell: Tensor, values: Tensor, weights: Tensor | None = None) -> CellMeans:
-    """Mean of each of (V, N) values over the points of each cell, summed in float64; all weigh alike if not told.
-
-    Example:
-        >>> means = mean_per_cell(torch.tensor([4, 4, 7]), torch.tensor([[1.0, 3.0, 5.0]]))
-        >>> means.cell, means.points, means.mean
-        (tensor([4, 7]), tensor([2, 1]), tensor([[2., 5.]], dtype=torch.float64))
-    """
+    """Mean of each of (V, N) values over the points of each cell, summed in float64; all weigh alike if not told."""
     touched, of_point, points = torch.unique(cell, return_inverse=True, return_counts=True)
     if weights is None:
         weight, weighted = points.double(), values.double()

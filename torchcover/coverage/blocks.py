@@ -16,13 +16,10 @@ MapT = TypeVar("MapT")
 
 @dataclass(frozen=True)
 class KnownCells:
-    """The cells that a reference point has probed, as lists: of small cells they are few.
+    """The K cells that a reference point has probed, as lists: of small cells they are few.
 
-    Args:
-        shape: (H, Y, X) all cells.
-        at: (K,) int64 which of them, as an index into all, ascending.
-        probed_steps: (K,) int64 steps that had a reference point in each.
-        points: (K,) int64 reference points in each.
+    `at` (K,) int64 is which of all cells, (H, Y, X), each is, ascending; `probed_steps` and `points` (K,) int64 how
+    many steps had a reference point in it, and how many points there were.
     """
 
     shape: tuple[int, ...]
@@ -68,12 +65,8 @@ class BlockSums:
     They are of the radius in metres, then of the share of points within each threshold: the means of each step in the
     cell, which are divided by the steps; or these times the square metres of each point, divided by square metres.
 
-    Args:
-        steps: (B,) int64 steps in each block; 0 in the blocks that are not in use.
-        shape: (B, H, Y, X) blocks and cells.
-        at: (N,) int64 which cell of which block, as an index into all of them, ascending.
-        base: (N,) what is divided by: steps, or square metres; above 0.
-        listed: (Q, N) float64 sums of each quantity.
+    `steps` (B,) int64 are those of each block, 0 in blocks that are not in use; `shape` (B, H, Y, X). Ascending `at`
+    (N,) int64 is which cell of which block, `base` (N,) what is divided by, above 0, `listed` (Q, N) float64 the sums.
     """
 
     steps: Tensor

@@ -13,10 +13,8 @@ from torchcover.coverage.binning import mean_per_cell
 class CellSums(NamedTuple):
     """The columns by what they are.
 
-    Args:
-        probed_steps: (...) float64 steps that had a reference point in the cell.
-        points: (...) float64 reference points in the cell.
-        of: Name of each aggregation -> its sums by name, each (*its own shape but for the cells, ...).
+    `probed_steps`: (...) float64 steps that had a reference point in the cell; `points`: (...) float64 reference points
+    in the cell; `of`: name of each aggregation -> its sums by name, each (*its own shape but for the cells, ...).
     """
 
     probed_steps: Tensor

@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -27,6 +27,9 @@ from torchcover.estimation import Quantity
 from torchcover.files import NpyHeader, TooLargeError, check_memory, read_npz, reads, write_npz
 from torchcover.metrics.blocks import FINER
 
+if TYPE_CHECKING:
+    from torchcover.coverage.result import Coverage
+
 FORMAT_VERSION = 10
 Arrays = dict[str, NDArray[Any]]
 # Steps, cells, what is divided by, sums.
@@ -38,51 +41,22 @@ BODIES = ("body_steps", "body_sums", "body_cells")
 AGGREGATED = ("region_numbers", "region_numbers_left_out")
 
 
-class CoverageParts(TypedDict):
-    """What a `Coverage` is made of: the arguments of its constructor."""
-
-    grid: BevGrid
-    thresholds: Sequence[float]
-    max_radius: float
-    known: KnownCells
-    layers: Sequence[Layer]
-    counts: Mapping[str, int]
-    blocks: BlockSums | None
-    area: BlockSums | None
-    regions: Sequence[Region]
-    places: PlaceSums | None
-    aggregated: PlaceNumbers | None
-    redundancy: Redundancy | None
-    bodies: BodySums | None
-
-
-def write_coverage(parts: CoverageParts, errors: Mapping[str, Tensor], path: Path) -> None:
+def write_coverage(coverage: "Coverage", path: Path) -> None:
     """Write a coverage to one compressed file, with standard errors by key, for NumPy users."""
-    grid, known, blocks, area, redundancy = (
-        parts["grid"],
-        parts["known"],
-        parts["blocks"],
-        parts["area"],
-        parts["redundancy"],
-    )
-    places, aggregated, bodies = parts["places"], parts["aggregated"], parts["bodies"]
+    grid, known, blocks, area = coverage.grid, coverage.known, coverage.blocks, coverage.area
+    places, aggregated = coverage.places, coverage.aggregated
+    redundancy, bodies, layers = coverage.redundancy, coverage.bodies, coverage.listed.values()
     header = {
         "format": FORMAT_VERSION,
-        "grid": {
-            "x": grid.x,
-            "y": grid.y,
-            "cell": grid.cell,
-            "heights": dict(grid.heights),
-            "band_frame": grid.band_frame,
-        },
+        "grid": asdict(grid),
         "shape": grid.shape,
-        "thresholds": parts["thresholds"],
-        "max_radius": parts["max_radius"],
-        "layers": [layer.quantity._asdict() for layer in parts["layers"]],
-        "counts": parts["counts"],
+        "thresholds": coverage.thresholds,
+        "max_radius": coverage.max_radius,
+        "layers": [layer.quantity._asdict() for layer in layers],
+        "counts": coverage.counts,
         "blocks": 1 if blocks is None else len(blocks.steps),
         "square_metres": area is not None,
-        "regions": [asdict(region) for region in parts["regions"]],
+        "regions": [asdict(region) for region in coverage.regions],
         "by_area": places is not None,
         "aggregated": [] if aggregated is None else [quantity._asdict() for quantity in aggregated.quantities],
         "sensors": None if redundancy is None else redundancy.sensors,
@@ -90,8 +64,8 @@ def write_coverage(parts: CoverageParts, errors: Mapping[str, Tensor], path: Pat
         "redundancy": [] if redundancy is None else [layer.quantity._asdict() for layer in redundancy.listed.values()],
     }
     tensors = {"cell": known.at, "probed_steps": known.probed_steps, "points": known.points}
-    tensors |= {layer.quantity.key: layer.values for layer in parts["layers"]}
-    tensors |= {f"{key}_error": error for key, error in errors.items()}
+    tensors |= {layer.quantity.key: layer.values for layer in layers}
+    tensors |= {f"{key}_error": error for key, error in coverage.listed_errors.items()}
     if aggregated is not None:
         tensors |= dict(zip(AGGREGATED, aggregated[1:], strict=True))
     if redundancy is not None:
@@ -108,8 +82,8 @@ def write_coverage(parts: CoverageParts, errors: Mapping[str, Tensor], path: Pat
 
 
 @reads("a saved coverage")
-def read_coverage(path: Path) -> CoverageParts:
-    """Read what `write_coverage` wrote."""
+def read_coverage(path: Path) -> dict[str, Any]:
+    """Read what `write_coverage` wrote: the arguments of `Coverage`."""
     try:
         arrays = read_npz(path, _check_kind)
         header: dict[str, Any] = json.loads(str(arrays.pop("header")))
@@ -133,16 +107,8 @@ def _check_kind(header: NpyHeader) -> None:
         raise ValueError(f"an array of {header.dtype}")
 
 
-def _parts(header: dict[str, Any], arrays: Arrays) -> CoverageParts:
-    stored = header["grid"]
-    heights = {name: (band[0], band[1]) for name, band in stored["heights"].items()}
-    grid = BevGrid(
-        x=tuple(stored["x"]),
-        y=tuple(stored["y"]),
-        cell=stored["cell"],
-        heights=heights,
-        band_frame=stored["band_frame"],
-    )
+def _parts(header: dict[str, Any], arrays: Arrays) -> dict[str, Any]:
+    grid = BevGrid(**header["grid"])
     known = _known(grid, arrays)
     layers = _layers(header["layers"], arrays)
     blocks = max((len(arrays[names[0]]) for names in (IN_BLOCKS, OVER_AREA) if names[0] in arrays), default=0)

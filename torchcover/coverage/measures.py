@@ -45,19 +45,11 @@ def area_in_blocks(coverage: "Coverage", region: Region, height: str) -> tuple[T
     """The sums over the visible surface of one region in one band, in blocks.
 
     R = E[ sum of r dA ] / E[ sum of dA ]: a ratio of additive sums, so that the number of points, the size of cells and
-    the share of known ones do not move it.
+    the share of known ones do not move it. Points were summed up by their own place, or the region's bounds are edges
+    of cells, which have the same points.
 
-    Args:
-        coverage: Whose sums.
-        region: One of its regions, over which points were summed up by their own place; or one whose bounds are edges
-            of cells, which have the same points.
-        height: Name of the band.
-
-    Returns:
-        (B,) int64 steps of each block; (B, 1 + Q) float64 its square metres, then those times each of the quantities.
-
-    Raises:
-        ValueError: There are no square metres; another region.
+    Returns (B,) int64 steps of each block; (B, 1 + Q) float64 its square metres, then those times each of the
+    quantities.
     """
     if coverage.area is None:
         raise ValueError(

@@ -83,9 +83,6 @@ class CoverageNumber(CoverageMetric):
         Args:
             val: What `compute` or `forward` returned, once or several times; the number so far if not given.
             ax: Where to; a new figure of pyplot's if not given.
-
-        Returns:
-            The figure and the axes.
         """
         fig, ax = figure_of(ax)
         self._plot(val, ax)

@@ -17,14 +17,9 @@ ROBUST_PERCENTILE = 98
 def draw_coverage(coverage: object, ax: "Axes", layer: str | None, height: str | None) -> None:
     """Draw one layer in one height band, seen from above: x forward to the right, y left upwards, the vehicle at 0, 0.
 
-    Dark is blind, grey is unknown; what is beyond the colours, such as an infinite radius, has the last one.
-
-    Args:
-        coverage: What `CoverageMetric.compute` returned.
-        ax: Where to.
-        layer: A key of `Coverage.layers`; the detection at the first threshold if not given, or the radius if there is
-            none: by area where the points have square metres.
-        height: Name of the band; the first if not given.
+    Dark is blind, grey is unknown; what is beyond the colours, such as an infinite radius, has the last one. If not
+    given, the layer is the detection at the first threshold, or the radius if there is none, by area where the points
+    have square metres; the band is the first.
     """
     if not isinstance(coverage, Coverage):
         raise TypeError(f"val: one Coverage, as compute() returns it, is needed; got {type(coverage).__name__}")

@@ -6,7 +6,7 @@ from dataclasses import replace
 from difflib import get_close_matches
 from functools import cached_property, partial
 from pathlib import Path
-from typing import ClassVar, cast
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ from torch import Tensor
 from torchcover.coverage.aggregations import Layer, MeanOfMeans
 from torchcover.coverage.blocks import BlockSums, KnownCells, Maps
 from torchcover.coverage.bodies import BodySums
-from torchcover.coverage.coverage_file import CoverageParts, read_coverage, write_coverage
+from torchcover.coverage.coverage_file import read_coverage, write_coverage
 from torchcover.coverage.grid import BandFrame, BevGrid
 from torchcover.coverage.measures import Measure, errors_of_cells, estimate_area, estimate_known, estimate_redundancy
 from torchcover.coverage.quantity import RADIUS, by_area, over_known
@@ -23,7 +23,12 @@ from torchcover.coverage.region_sums import PlaceNumbers, PlaceSums
 from torchcover.coverage.regions import Places, Region, check_regions, regions_within, shown_places
 from torchcover.coverage.summary import RegionSummary, summarise
 from torchcover.estimation import Estimate, Quantity
-from torchcover.files import write_durably
+from torchcover.files import data_frame, data_set, small_html, write_durably
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
+    from matplotlib.figure import Figure
 
 
 class Coverage:
@@ -99,6 +104,58 @@ class Coverage:
         known = f"{len(self.known.at) / self.grid.cells:.1%} of the cells known"
         return f"Coverage({self.grid.shape} cells, {self.counts['steps']} steps, {known})"
 
+    def _repr_html_(self) -> str:
+        return small_html([repr(self)], self.plot())
+
+    def plot(self, layer: str | None = None, height: str | None = None) -> "Figure":
+        """One layer in one height band, seen from above.
+
+        Args:
+            layer: A key of `layers`; the detection at the first threshold if not given.
+            height: Name of the band; the first if not given.
+
+        Returns:
+            A figure of its own, outside pyplot.
+
+        Raises:
+            ValueError: There is no such layer or band.
+        """
+        from matplotlib.figure import Figure
+
+        from torchcover.coverage.plotting import draw_coverage
+
+        figure = Figure(figsize=(9.0, 4.5), layout="constrained")
+        draw_coverage(self, figure.subplots(), layer, height)
+        return figure
+
+    def to_dataframe(self, regions: Sequence[Region] | None = None) -> "pandas.DataFrame":
+        """The numbers of `scalars`, a row for each region and height band, or body beside the vehicle.
+
+        Args:
+            regions: As in `summary`.
+
+        Raises:
+            ModuleNotFoundError: pandas is not there.
+        """
+        rows, errors = self._rows(regions), self.blocks is not None
+        return data_frame({"region": row.region, "height": row.height, **row.flat(errors=errors)} for row in rows)
+
+    def to_xarray(self) -> "xarray.Dataset":
+        """The maps: each layer, its standard error as `KEY_error`, `points` and `probed_steps`.
+
+        Returns:
+            Over `height`, names of bands, and `y_m` and `x_m`, the middles of the cells; NaN where nothing is known.
+
+        Raises:
+            ModuleNotFoundError: xarray is not there.
+        """
+        maps = {key: layer.values for key, layer in self.layers.items()}
+        maps |= {f"{key}_error": values for key, values in self.errors.items()}
+        maps |= {"points": self.points, "probed_steps": self.probed_steps}
+        of_cells = {"y_m": self.grid.y_centres_m.numpy(), "x_m": self.grid.x_centres_m.numpy()}
+        arrays = {key: values.cpu().numpy() for key, values in maps.items()}
+        return data_set(arrays, {"height": list(self.grid.heights), **of_cells})
+
     @property
     def layers(self) -> Mapping[str, Layer]:
         """(H, Y, X) each, by the key of their quantity: `coverage.layers["radius_m"].values`."""
@@ -132,7 +189,8 @@ class Coverage:
     @property
     def detection(self) -> Tensor:
         """(T, H, Y, X) float64 detection probability at each threshold."""
-        return self._stacked([self.listed[quantity.key].values for quantity in self.quantities[1:]])
+        each = [self.known.spread(self.listed[quantity.key].values) for quantity in self.quantities[1:]]
+        return torch.stack(each) if each else self.radius.new_empty((0, *self.grid.shape))
 
     @property
     def errors(self) -> Mapping[str, Tensor]:
@@ -149,10 +207,6 @@ class Coverage:
             each = errors_of_cells(self.quantities, self.known, self.area)
             errors |= {by_area(one).key: each[one.key] for one in self.quantities}
         return errors
-
-    def _stacked(self, each: Sequence[Tensor]) -> Tensor:
-        """(T, H, Y, X) one entry for each threshold."""
-        return torch.stack(list(map(self.known.spread, each))) if each else self.radius.new_empty((0, *self.grid.shape))
 
     def summary(self, regions: Sequence[Region] | None = None) -> list[RegionSummary]:
         """One row for each region and height band that tables show of it.
@@ -255,17 +309,18 @@ class Coverage:
             `"radius_m/20m/ground"`, `"detection_0.4m/20m/ground"`, `"known_share/20m/ground"` and so on, and
             `"visible_m2/20m/ground"` if the reference points had square metres.
         """
-        rows = [*self.summary(regions), *(self.bodies.summary() if self.bodies else ())]
+        rows = self._rows(regions)
         return {key: value for row in rows for key, value in row.scalars(errors=self.blocks is not None).items()}
+
+    def _rows(self, regions: Sequence[Region] | None) -> list[RegionSummary]:
+        return [*self.summary(regions), *(self.bodies.summary() if self.bodies else ())]
 
     def save(self, path: str | Path) -> None:
         """Write everything to one `.npz` file, which NumPy reads too: lists over the known cells, and the blocks.
 
         What `load` gives back has the same numbers, errors and differences to the last bit.
         """
-        given = {name: getattr(self, name) for name in CoverageParts.__annotations__ if name != "layers"}
-        parts = cast("CoverageParts", given | {"layers": list(self.listed.values())})
-        write_durably(Path(path), partial(write_coverage, parts, self.listed_errors))
+        write_durably(Path(path), partial(write_coverage, self))
 
     @classmethod
     def load(cls, path: str | Path) -> "Coverage":

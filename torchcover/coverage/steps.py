@@ -62,11 +62,8 @@ class CheckedStep(NamedTuple):
 class StepSums(NamedTuple):
     """What one step adds to the sums of a `CoverageMetric`; it is small, and travels between processes.
 
-    Args:
-        place_in_time: Which decides about its block.
-        counts: Name of a count -> how much it grows.
-        cells: (1 + C, K) float64 cells of the grid that it touches, and what it adds to their columns.
-        places: (1 + C, K) the same of regions in bands; nothing is touched where none are asked about.
+    `cells` (1 + C, K) float64 are those of the grid that it touches, and what it adds to their columns; `places` the
+    same of regions in bands. `place_in_time` decides about its block, `counts` says how much each count grows.
     """
 
     place_in_time: int
@@ -117,14 +114,7 @@ def checked_steps(
     names: Sequence[str] = (),
     first: int,
 ) -> list[CheckedStep]:
-    """The steps of an update, in order; the arguments are those of `CoverageMetric` and its `update`.
-
-    Raises:
-        ValueError: Lists of different length, a shape other than (N, 3), NaN or infinite coordinates, weights that are
-            not positive and finite, heights that are infinite or do not go with the grid, errors that are NaN, a place
-            in time that is negative or above 10^15.
-        TypeError: A cloud is not a floating-point tensor, a place in time not a whole number.
-    """
+    """The steps of an update, in order; the arguments and errors are those of `CoverageMetric` and its `update`."""
     if square_metres and weights is None:
         raise ValueError(
             "weights: the square metres of each reference point are needed, as a SurfaceReference gives them; got "

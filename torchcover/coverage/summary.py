@@ -73,6 +73,10 @@ class RegionSummary:
 
     def scalars(self, *, errors: bool) -> dict[str, float]:
         """As `Coverage.scalars` has them, with or without errors."""
+        return {f"{key}/{self.region}/{self.height}": value for key, value in self.flat(errors=errors).items()}
+
+    def flat(self, *, errors: bool) -> dict[str, float]:
+        """The same without the names of the region and the band."""
         flat = {}
         for key, number in self.numbers.items():
             flat[key] = number.value
@@ -81,7 +85,7 @@ class RegionSummary:
         flat["known_share"] = self.known_share
         if self.measure == "area":
             flat["visible_m2"] = self.visible_m2
-        return {f"{key}/{self.region}/{self.height}": value for key, value in flat.items()}
+        return flat
 
 
 def summarise(coverage: "Coverage", region: Region, height: str) -> RegionSummary:

@@ -37,9 +37,6 @@ def points_in_boxes(points: Tensor, boxes: Boxes, *, skin_m: float = SKIN_M) -> 
         boxes: K boxes in the same frame, on the same device.
         skin_m: How much thicker.
 
-    Returns:
-        `Inside(box, point)`.
-
     Raises:
         TypeError: The points are no tensor.
 

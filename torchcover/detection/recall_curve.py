@@ -18,16 +18,7 @@ NORMAL_QUANTILE = 1.959963984540054
 class Ratio:
     """A share of successes for each entry, in float64; NaN where nothing was counted.
 
-    Args:
-        value: Successes by trials.
-        low: Lower end of the 95 % Wilson interval (Wilson 1927).
-        high: Its upper end.
-        trials: int64 number of trials.
-
-    Example:
-        >>> import torch
-        >>> Ratio.of(torch.tensor([8, 0]), torch.tensor([10, 0])).value
-        tensor([0.8000,    nan], dtype=torch.float64)
+    `low` and `high` are the ends of the 95 % Wilson interval (Wilson 1927), `trials` int64.
     """
 
     value: Tensor
@@ -51,10 +42,8 @@ class Ratio:
 class Curve:
     """Recall and precision over bins, (S, B) for S score thresholds and B bins.
 
-    Args:
-        bins: What each bin holds, in words: "0.2-0.4", "hidden", "not sampled".
-        recall: Objects found, of the objects of the bin.
-        precision: Detections that found an object, of the detections of the bin.
+    `bins`: what each bin holds, in words: "0.2-0.4", "hidden", "not sampled"; `recall`: objects found, of the objects
+    of the bin; `precision`: detections that found an object, of the detections of the bin.
     """
 
     bins: tuple[str, ...]

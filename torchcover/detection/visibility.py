@@ -7,13 +7,14 @@ from torch import Tensor
 
 from torchcover.detection.boxes import Boxes, check_boxes
 from torchcover.detection.inside import points_in_boxes
+from torchcover.files import brief
 from torchcover.neighbors import blind_spot_radius, check_cloud, check_tensor
 
 # The sides of a box that face this height above the vehicle's origin can be seen; so many points across each.
 SEEN_FROM_M, SIDE_POINTS = 1.7, 12
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class BoxVisibility:
     """What the rig saw of each of K boxes, in float64. A box without a point of reference or rig is unknown: NaN.
 
@@ -33,6 +34,8 @@ class BoxVisibility:
     drawn_points: Tensor
     sensor_points: Tensor
     threshold_m: float
+
+    __repr__ = brief
 
     @property
     def known(self) -> Tensor:

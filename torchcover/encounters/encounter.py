@@ -231,8 +231,7 @@ class EncounterSet(BuiltIn):
 def expanded(family: dict[str, Any], draws: int, generator: np.random.Generator) -> Iterator[dict[str, Any]]:
     """The encounters of a family, each with one value where the family has a list or a range.
 
-    Raises:
-        ValueError: A list of none, a range that is none, or too many.
+    ValueError: a list of none, a range that is none, or too many.
     """
     swept, drawn = dict[Place, Any](), dict[Place, Any]()
     for place, value in _leaves(family, ()):

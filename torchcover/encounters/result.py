@@ -5,17 +5,21 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import groupby
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
+from matplotlib.figure import Figure
 
 from torchcover.encounters.criterion import Criterion
 from torchcover.encounters.sighting import Sighting
 from torchcover.encounters.traffic import WHO, Approach
 from torchcover.estimation import Estimate, Number, Quantity
-from torchcover.files import csv_text
-from torchcover.report import PageTable, Words, json_record, percent
+from torchcover.files import csv_text, data_frame, small_html
+from torchcover.report import PageTable, Words, draw_encounters, json_record, percent
+
+if TYPE_CHECKING:
+    import pandas
 
 NUMBERS = (
     Quantity("ttc_s", "time to collision at detection", "s", lower_is_better=False),
@@ -63,7 +67,7 @@ class EncounterRow(NamedTuple):
     without_worst_s: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Sightings:
     """What some rigs had of a set of encounters, or of those that happened in traffic.
 
@@ -218,6 +222,36 @@ class Sightings:
             *([] if self.sightings else ["Nobody was met: drive longer (--worlds), or elsewhere."]),
         ]
         return PageTable("Met, and detected before", ("who", "met", "an hour", *rigs), cells, notes=notes)
+
+    def __repr__(self) -> str:
+        return f"Sightings of {', '.join(self.sensors)} in {self.name}: {len(self.sightings)} encounters"
+
+    def _repr_html_(self) -> str:
+        of_rows = {(row.encounter, row.rig): f"{percent(row.in_time)} %" for row in self.rows}
+        up_to = {key: "at no speed" if kmh != kmh else f"up to {kmh:g} km/h" for key, kmh in self.up_to_kmh().items()}
+        told = (f"{rig} in time, {name}: {words}." for (name, rig), words in (of_rows | up_to).items())
+        return small_html([repr(self), *told], None if self.hours else self.plot())
+
+    def plot(self) -> Figure:
+        """Time to collision at detection against the speed, a band for each rig, and what is needed.
+
+        Returns:
+            A figure of its own, outside pyplot.
+
+        Raises:
+            ValueError: Of traffic, where speeds are whatever they were.
+        """
+        if self.hours:
+            raise ValueError("no picture of what was met in traffic: its numbers are in `rows` and `to_dataframe()`")
+        return draw_encounters(list(self.bands()), title=f"{self.name}: time to collision at detection")
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """`rows`, a column for each field of `EncounterRow`.
+
+        Raises:
+            ModuleNotFoundError: pandas is not there.
+        """
+        return data_frame(self.rows)
 
     def write_csv(self, path: Path) -> None:
         """Rows as of `rows`; empty where nothing is known."""

@@ -64,9 +64,8 @@ class Sighting(NamedTuple):
 class MountedRig:
     """A rig on its vehicle, for any number of encounters.
 
-    Args:
-        rig: The sensors; what takes time to scan is looked at as if it took none.
-        scenario: Whose ego carries it; see `with_ego`.
+    `rig`: the sensors; what takes time to scan is looked at as if it took none; `scenario`: whose ego carries it; see
+    `with_ego`.
     """
 
     def __init__(self, rig: Rig, scenario: Scenario) -> None:
@@ -76,11 +75,7 @@ class MountedRig:
         self._told = set[str]()
 
     def mounted(self, encounter: Encounter, scene: Scene) -> Sequence[MountedSensor]:
-        """The sensors, in the weather of an encounter.
-
-        Raises:
-            ValueError: A sensor inside the ego's body.
-        """
+        """The sensors, in the weather of an encounter. ValueError: a sensor inside the ego's body."""
         weather = self.rig.weather or encounter.weather
         key = weather.model_dump_json()
         if key not in self._mounted:
@@ -214,10 +209,8 @@ def first_run(is_enough: IsEnough, steps: Numbers, looks: int) -> Numbers:
     A look that is not enough rules out all runs that it is in, so the last look of a run is asked first: before
     anything is seen, one look in `looks`.
 
-    Args:
-        is_enough: Tells it of (N,) steps.
-        steps: (P, J) of the looks of each phase, `NEVER` at the end.
-        looks: How many.
+    `is_enough`: tells it of (N,) steps; `steps`: (P, J) of the looks of each phase, `NEVER` at the end; `looks`: how
+    many.
     """
     phases, most = steps.shape
     known = np.zeros(steps.shape, dtype=np.int8)  # 1 enough, -1 not
@@ -246,10 +239,7 @@ def first_run(is_enough: IsEnough, steps: Numbers, looks: int) -> Numbers:
 class Looks:
     """How many points each sensor has on the other, at any millisecond; each is found once.
 
-    Args:
-        mounted_rig: The rig.
-        staged: Who is where.
-        seed: Of noise and drop-out.
+    `staged`: who is where; `seed`: of noise and drop-out.
     """
 
     def __init__(self, mounted_rig: MountedRig, staged: Staged, seed: int) -> None:

@@ -51,15 +51,7 @@ def who(track: Track) -> str:
 
 
 class Drive(NamedTuple):
-    """Who is where over time, in a world or a recording.
-
-    Args:
-        name: Of the world.
-        times_s: (T,) the instants.
-        world_T_ego: (T, 4, 4) the vehicle frame at each.
-        ego: The box of the vehicle in it.
-        tracks: The other road users.
-    """
+    """Who is where at (T,) times, in a world or a recording: (T, 4, 4) vehicle frames, its box, other road users."""
 
     name: str
     times_s: Float64
@@ -82,8 +74,7 @@ class Drive(NamedTuple):
     def of_recording(cls, recording: Recording) -> Self:
         """That of a recording with poses, times and labelled objects.
 
-        Raises:
-            ValueError: One of these is missing, the size of the vehicle, or road users among the objects.
+        ValueError: one of these is missing, the size of the vehicle, or road users among the objects.
         """
         recorded = objects_of(recording)
         if recording.body is None:
@@ -164,14 +155,10 @@ def _velocities_mps(times_s: Float64, places_m: Float64) -> Float64:
 
 
 class Eyes(NamedTuple):
-    """The S sensors of a rig in one drive.
+    """The S sensors of a rig in one drive: the `periods` of their looks in steps, as `channels` has them.
 
-    Args:
-        periods: As `channels` has them, in steps.
-        enough: How many points are.
-        counts_as: How many points each of their points is.
-        every: They look at every so-manieth step.
-        clouds: Of a step, the points (N, 3) of each in the vehicle frame that lie in some balls, and maybe others.
+    So many points of each are `enough`, and what each of their points counts for. `clouds` has of a step the (N, 3)
+    points of each in the vehicle frame that lie in some balls, and maybe others.
     """
 
     periods: Sequence[float | None]

@@ -115,12 +115,7 @@ def student_p(t: float, degrees_of_freedom: int) -> float:
 
 
 def is_significant(difference: float, error: float, degrees_of_freedom: int) -> bool | None:
-    """Whether a difference is more than chance, by Student's t at 95 %; None if its standard error is NaN.
-
-    Example:
-        >>> is_significant(0.3, 0.1, 15), is_significant(0.2, 0.1, 15), is_significant(0.2, float("nan"), 3)
-        (True, False, None)
-    """
+    """Whether a difference is more than chance, by Student's t at 95 %; None if its standard error is NaN."""
     if math.isnan(error):
         return None
     return abs(difference) > max(student_t95(degrees_of_freedom) * error, ROUND_OFF)

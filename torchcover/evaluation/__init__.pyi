@@ -3,7 +3,6 @@ from .checking import check as check
 from .checkpoint import Checkpoint as Checkpoint
 from .encountering import encounter as encounter
 from .encountering import encounter_film as encounter_film
-from .encountering import encounter_picture as encounter_picture
 from .encountering import met_in_recording as met_in_recording
 from .encountering import met_in_traffic as met_in_traffic
 from .encountering import save_encounters as save_encounters
@@ -47,5 +46,4 @@ from .target_error import standings as standings
 from .target_survey import free_space as free_space
 from .target_survey import save_targets as save_targets
 from .target_survey import survey_target as survey_target
-from .target_survey import target_picture as target_picture
 from .target_survey import target_record as target_record

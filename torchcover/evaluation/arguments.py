@@ -16,13 +16,9 @@ Arguments = ParamSpec("Arguments")
 
 @dataclass(frozen=True)
 class Option:
-    """An argument that the command line has as an option of the same name.
+    """An argument that the command line has as an option of the same name, `torchcover study` too with `in_study`.
 
-    Args:
-        words: What it is, for the help and the documentation.
-        typed: Its type on the command line; that of Python if not given.
-        minimum: The least value.
-        in_study: Whether `torchcover study` has it, too.
+    `typed` is its type there, if not that of Python.
     """
 
     words: str
@@ -34,9 +30,7 @@ class Option:
 class Read(Generic[GivenT, ValueT]):
     """A field of a dataclass that takes more forms than one, and has one from then on.
 
-    Args:
-        read: Makes it of what was given.
-        default: As it may be given.
+    `read`: makes it of what was given; `default`: as it may be given.
     """
 
     def __init__(self, read: Callable[[GivenT], ValueT], default: GivenT) -> None:

@@ -99,11 +99,7 @@ class Checked:
         return "".join(letter if letter.isprintable() or letter == "\n" else " " for letter in text)
 
     def save(self, folder: str | Path) -> list[Path]:
-        """Write `junit.xml` and `summary.json` into a folder, which is made if it does not exist.
-
-        Returns:
-            The files.
-        """
+        """Write `junit.xml` and `summary.json` into a folder, which is made if it does not exist."""
         with Publication(Path(folder)) as written:
             written.add_text("junit.xml", self.junit)
             written.publish(self.record)

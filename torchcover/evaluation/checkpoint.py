@@ -75,13 +75,8 @@ class Checkpoint:
 class Journal:
     """Keeps the checkpoint of one run.
 
-    Args:
-        checkpoint: Where.
-        identity: What defines the run; see `run_identity`.
-        states: All that learns from frames, by name.
-
-    Raises:
-        TypeError: Something whose state cannot be kept.
+    `checkpoint`: where; `identity`: what defines the run; see `run_identity`; `states`: all that learns from frames, by
+    name. TypeError: something whose state cannot be kept.
     """
 
     def __init__(self, checkpoint: Checkpoint, identity: Mapping[str, str], states: Mapping[str, object]) -> None:
@@ -96,9 +91,7 @@ class Journal:
     def restore(self, run: Progressing) -> None:
         """Go on from the file, if there is one and that is wanted.
 
-        Raises:
-            ValueError: It is the checkpoint of another run; the message says in what. Or, as `BadFileError`, it is
-                damaged.
+        ValueError: it is the checkpoint of another run; the message says in what. Or, as `BadFileError`, it is damaged.
         """
         if not self.resume or not self.path.exists():
             return
@@ -167,14 +160,8 @@ def _change(here: str, there: str) -> str:
 def write_checkpoint(path: Path, header: Mapping[str, Any], states: Mapping[str, State]) -> None:
     """Write it in the place of the one that is there; see `write_durably`.
 
-    Args:
-        path: The file.
-        header: What else is to be known, for JSON: `identity`, and `run` with `RUN_KEYS`.
-        states: By name; each of tensors, numbers, texts, None, and lists and dicts of them.
-
-    Raises:
-        TypeError: A state holds something else.
-        OSError: There is no room.
+    The header is for JSON: `identity`, and `run` with `RUN_KEYS`. States are of tensors, numbers, texts, None, and
+    lists and dicts of them. TypeError: a state holds something else. OSError: there is no room.
     """
     write_durably(path, partial(write_states, header=header, states=states))
 
@@ -183,9 +170,7 @@ def write_checkpoint(path: Path, header: Mapping[str, Any], states: Mapping[str,
 def read_header(path: Path) -> dict[str, Any]:
     """The header.
 
-    Raises:
-        FileNotFoundError: No such file.
-        BadFileError: Not a checkpoint, a damaged one, or one of another version.
+    FileNotFoundError: no such file. BadFileError: not a checkpoint, a damaged one, or one of another version.
     """
     text = str(_read(path, HEADER))
     header: dict[str, Any] = json.loads(text)
@@ -204,8 +189,7 @@ def read_header(path: Path) -> dict[str, Any]:
 def read_state(path: Path, header: Mapping[str, Any], name: str) -> dict[str, Any]:
     """One of the states, bit for bit.
 
-    Raises:
-        BadFileError: It is damaged, or takes more memory than `TORCHCOVER_MAX_FILE_GB` allows.
+    BadFileError: it is damaged, or takes more memory than `TORCHCOVER_MAX_FILE_GB` allows.
     """
     state: dict[str, Any] = _unpacked(header["states"][name], path)
     return state

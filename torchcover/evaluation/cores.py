@@ -28,12 +28,7 @@ SHARED_BYTES = 256e6
 
 
 def cores() -> int:
-    """Cores that this process may use: those that it is bound to, at most as many as its container is given.
-
-    Example:
-        >>> 1 <= cores() <= os.cpu_count()
-        True
-    """
+    """Cores that this process may use: those that it is bound to, at most as many as its container is given."""
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     for files in CPU_QUOTAS:
         try:
@@ -71,14 +66,8 @@ def usual_workers(frames: int, worlds: int, *, whole: bool) -> int:
 
     None where a process can only be started anew: a program that is not made for that would start itself.
 
-    Args:
-        frames: How many.
-        worlds: How many they are of; a world is built by one process.
-        whole: Whether frames are handed over, rather than sums of them.
-
-    Example:
-        >>> usual_workers(frames=64, worlds=1, whole=False)
-        0
+    `frames`: how many; `worlds`: how many they are of; a world is built by one process; `whole`: whether frames are
+    handed over, rather than sums of them.
     """
     if start_method() != "fork" or multiprocessing.current_process().daemon:  # which may start none
         return 0
@@ -90,14 +79,7 @@ def usual_workers(frames: int, worlds: int, *, whole: bool) -> int:
 
 
 def warn_of_spinning(threads: int) -> None:
-    """Tell, once a process, that several threads are about to spin.
-
-    Args:
-        threads: Of torch.
-
-    Warns:
-        UserWarning: There are several, and the environment does not say how they wait.
-    """
+    """Tell, once a process, that threads of torch are about to spin: the environment does not say how they wait."""
     if threads > 1 and not _is_said():
         _warn_once()
 

@@ -27,7 +27,6 @@ from torchcover.report import (
     Page,
     PagePicture,
     StandingFaces,
-    draw_encounters,
     draw_scene,
     page_html,
 )
@@ -77,14 +76,14 @@ def encounter(
     criterion = Criterion() if criterion is None else criterion
     sensing = _sensing(rigs, sensor_model)
     these = encounters if isinstance(encounters, EncounterSet) else EncounterSet.load(encounters)
+    mounted = [MountedRig(rig, with_ego(free_space(), {name: rig}, vehicle)) for name, rig in sensing.items()]
+    # Their mistakes are told before the first look.
+    staged = [(rig, Staged(one, rig.ego)) for rig in mounted for one in these.encounters]
     sightings = []
-    with Progress(len(sensing) * len(these.encounters), "encounters", shown=progress) as bar:
-        for name, rig in sensing.items():
-            mounted = MountedRig(rig, with_ego(free_space(), {name: rig}, vehicle))
-            # Their mistakes are told before the first look.
-            for one in [Staged(one, mounted.ego) for one in these.encounters]:
-                sightings.append(sight_encounter(mounted, one, criterion, phases=phases, seed=seed))
-                bar.advance(len(sensing) * len(these.encounters))
+    with Progress(len(staged), "encounters", shown=progress) as bar:
+        for rig, one in staged:
+            sightings.append(sight_encounter(rig, one, criterion, phases=phases, seed=seed))
+            bar.advance(len(staged))
     return Sightings(these.name, criterion, phases, seed, _sensors(sensing), sightings)
 
 
@@ -223,11 +222,6 @@ def encounter_film(
         )
 
 
-def encounter_picture(found: Sightings) -> Figure:
-    """Time to collision at detection against the speed, a band for each rig, and what is needed."""
-    return draw_encounters(list(found.bands()), title=f"{found.name}: time to collision at detection")
-
-
 def save_encounters(found: Sightings, folder: str | Path, *, files: str | Iterable[str] = FILES) -> list[Path]:
     """Write the files of the command line.
 
@@ -235,9 +229,6 @@ def save_encounters(found: Sightings, folder: str | Path, *, files: str | Iterab
         found: From `encounter`.
         folder: Where to write `encounters.csv`, `report.html`, `encounters.png` and `summary.json`; as `save_targets`.
         files: What to write beside `summary.json`, as in `Result.save`; "maps" is the picture.
-
-    Returns:
-        The files.
     """
     wanted = wanted_files(files)
     record = found.record()
@@ -249,7 +240,7 @@ def save_encounters(found: Sightings, folder: str | Path, *, files: str | Iterab
         if "page" in wanted:
             written.add_text("report.html", page_html(_page(found)))
         if "maps" in wanted and not found.hours:
-            written.add_figure("encounters.png", encounter_picture(found))
+            written.add_figure("encounters.png", found.plot())
         written.publish(record)
     return written.paths
 
@@ -258,7 +249,7 @@ def _page(found: Sightings) -> Page:
     pictures = []
     if not found.hours:
         png = BytesIO()
-        encounter_picture(found).savefig(png, format="png")
+        found.plot().savefig(png, format="png")
         pictures = [PagePicture("Time to collision at detection against the speed", png.getvalue())]
     return Page(
         title=f"In time? {', '.join(found.sensors)}",

@@ -7,8 +7,6 @@ from contextlib import ExitStack, nullcontext
 from dataclasses import replace
 from pathlib import Path
 
-import torch
-
 from torchcover.coverage import CoverageMetric
 from torchcover.evaluation.checkpoint import Checkpoint, Journal
 from torchcover.evaluation.cores import usual_workers
@@ -20,7 +18,7 @@ from torchcover.evaluation.result import Result
 from torchcover.evaluation.result_page import check_drawable, left_out
 from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.target_error import TargetWatch
-from torchcover.evaluation.task import CALLER, Task, run_identity
+from torchcover.evaluation.task import CALLER, Task, casting_device, run_identity, usable_device
 from torchcover.files import claimed
 from torchcover.frames import BadFrameError, FrameSource
 from torchcover.simulation import Asked, SimulatedFrames
@@ -40,11 +38,7 @@ ENOUGH_FRAMES = 256
 
 
 def measured(task: Task[FrameSource], settings: Settings) -> Result:
-    """Measure it.
-
-    Raises:
-        ValueError: As `evaluate`.
-    """
+    """Measure it. ValueError: as `evaluate`."""
     ranks = settings.ranks
     frames = task.frames
     sensors = [sensor for of_rig in task.sensors.values() for sensor in of_rig]
@@ -92,7 +86,7 @@ def _workers(task: Task[FrameSource], settings: Settings) -> int:
     if settings.workers is not None:
         return settings.workers
     frames = task.frames
-    if settings.ranks or not isinstance(frames, SimulatedFrames):
+    if settings.ranks or not isinstance(frames, SimulatedFrames) or casting_device(settings):
         return 0
     most = min(len(frames), task.steps or len(frames), ENOUGH_FRAMES)
     whole = bool(settings.observers or settings.metrics) or not settings.device.startswith("cpu")
@@ -195,18 +189,10 @@ def metric_of(
     square_metres: bool,
     blocks: int = BLOCKS,
 ) -> CoverageMetric:
-    """An empty metric of what `evaluate` is to measure.
+    """An empty metric of what `evaluate` is to measure, with the names of the sensors for redundancy.
 
-    Args:
-        settings: How.
-        asked: What is asked about.
-        sensors: Names of the sensors, for redundancy.
-        square_metres: Whether the frames have the square metres of reference points.
-        blocks: For standard errors; there are none with one.
-
-    Raises:
-        ValueError: An estimate by area is wanted, and there are no square metres; a device that cannot be used; a
-            threshold that makes no sense, or more cells than there is memory for maps of.
+    ValueError: an estimate by area is wanted, and there are no square metres; a device that cannot be used; a threshold
+    that makes no sense, or more cells than there is memory for maps of.
     """
     if settings.estimate == "area" and not square_metres:
         raise ValueError(
@@ -228,18 +214,3 @@ def metric_of(
     )
     check_fits(f"maps of {grid.cells:,} cells", BYTES_A_CELL * grid.cells, "use larger cells, or a smaller grid")
     return metric.to(device)
-
-
-def usable_device(name: str) -> torch.device:
-    """The device of this name.
-
-    Raises:
-        ValueError: It cannot be used here.
-    """
-    try:
-        device = torch.device(name)
-        torch.zeros(1, device=device, dtype=torch.float64).item()  # the device `meta` has no values
-    except (RuntimeError, AssertionError, TypeError, ImportError) as error:
-        said = str(error).splitlines()[0].partition(". ")[0]  # some go on for pages
-        raise ValueError(f"device {name}: cannot be used here ({said}); try cpu") from error
-    return device

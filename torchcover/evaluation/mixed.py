@@ -107,10 +107,10 @@ class MixedResult(Result):
         each = {MIXTURE: page_tables(self.table), **{name: world.tables for name, world in self.worlds.items()}}
         return [replace(one, title=f"{name}: {one.title}".rstrip(": ")) for name, of in each.items() for one in of]
 
-    def maps(self) -> Iterator[tuple[str, Figure]]:
+    def maps(self, layer: str | None = None) -> Iterator[tuple[str, Figure]]:
         """Those of each kind of world; its name is the first part of the stems."""
         for name, world in self.worlds.items():
-            yield from ((f"{name}/{stem}", figure) for stem, figure in world.maps())
+            yield from ((f"{name}/{stem}", figure) for stem, figure in world.maps(layer))
 
     def save(self, folder: str | Path, *, files: str | Iterable[str] = FILES) -> list[Path]:
         """Write the files of each kind of world to a folder of its own, as `Result.save`, and those of the mixture.
@@ -119,9 +119,6 @@ class MixedResult(Result):
             folder: Where to write: `NAME/...`; `summary.csv`, with the rows of all worlds and of the mixture,
                 `report.html` and `summary.json`.
             files: As in `Result.save`.
-
-        Returns:
-            The files.
         """
         record, folders = self.record, file_stems(list(self.worlds))
         each = zip(folders, self.worlds.values(), strict=True)
@@ -140,7 +137,11 @@ class MixedResult(Result):
         columns = list(dict.fromkeys(chain.from_iterable(rows)))
         return csv_text([columns, *([row.get(column, "") for column in columns] for row in rows)])
 
-    def __repr__(self) -> str:
+    @property
+    def _about(self) -> str:
+        return f"Mixture of {', '.join(self.worlds)}: {', '.join(self.rigs)}"
+
+    def __str__(self) -> str:
         tables = {**{name: world.table for name, world in self.worlds.items()}, MIXTURE: self.table}
         return "\n".join(f"{name}\n{RENDERERS['text'](table)}" for name, table in tables.items())
 
@@ -158,12 +159,8 @@ def _agreed(each: Mapping[str, Any]) -> object:
 def measured_in_each(settings: Settings) -> MixedResult:
     """Measure in one kind of world after the other.
 
-    Args:
-        settings: Of `evaluate`, with several scenarios.
-
-    Raises:
-        ValueError: A recording among them, other regions in one than in another, processes that share the run, or
-            observers; as `evaluate`.
+    `settings`: of `evaluate`, with several scenarios. ValueError: a recording among them, other regions in one than in
+    another, processes that share the run, or observers; as `evaluate`.
     """
     assert settings.mixture is not None  # as its caller knows
     if settings.frames is not None:

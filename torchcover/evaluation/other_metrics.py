@@ -22,9 +22,7 @@ WHY: Mapping[Need, str] = {
 class OtherMetrics(NamedTuple):
     """The metrics of a run.
 
-    Args:
-        of_rigs: Name of a metric -> name of a rig -> the metric.
-        left_out: Name of a metric -> why there is none.
+    `of_rigs`: name of a metric -> name of a rig -> the metric; `left_out`: name of a metric -> why there is none.
     """
 
     of_rigs: Mapping[str, Mapping[str, FrameMetric]]
@@ -46,8 +44,7 @@ class OtherMetrics(NamedTuple):
 def metrics_of(task: Task[FrameSource], settings: Settings) -> OtherMetrics:
     """Make the metrics that were asked for; what cannot be made for all rigs is left out, if others can.
 
-    Raises:
-        ValueError: None of them can be made; the message says why.
+    ValueError: None of them can be made; the message says why.
     """
     sights, threshold_m = Sights(), settings.thresholds_m[0] if settings.thresholds_m else 0.4
     lacking, ego = _lacking(task), task.frames.ego_mesh()
@@ -84,14 +81,7 @@ def _lacking(task: Task[FrameSource]) -> frozenset[Need]:
 def compared(
     metrics: OtherMetrics, coverages: Mapping[str, Coverage], regions: Sequence[Region], seed: int
 ) -> MetricComparison:
-    """What the metrics say, and torchcover's numbers of some regions.
-
-    Args:
-        metrics: After the run.
-        coverages: By the name of the rig.
-        regions: Those whose numbers they are held against.
-        seed: Of the worlds that are drawn again.
-    """
+    """What the metrics say after the run, and torchcover's numbers of the regions that they are held against."""
     published = [
         one
         for name, of_rigs in metrics.of_rigs.items()

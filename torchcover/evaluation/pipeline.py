@@ -61,13 +61,9 @@ class Run:
 
 
 class MeasuredFrame(NamedTuple):
-    """What is left of a frame where it was measured.
+    """What is left of a frame where it was measured: what each observer is to add, and how long that took there.
 
-    Args:
-        frame: The frame, if an observer needs it; what travels between processes is small without it.
-        counts: `Frame.counts`.
-        sums: Which observer -> what it is to add.
-        measuring_s: How long that took, in this process.
+    The frame itself is there if an observer needs it; what travels between processes is small without it.
     """
 
     frame: Frame | None
@@ -146,9 +142,6 @@ def observe(
             `Run.complete`.
         journal: Goes on from a checkpoint, and keeps it; of these observers and this rule.
         ranks: The processes that share the frames, each of which calls this; the caller adds up what they have seen.
-
-    Returns:
-        How it went.
 
     Raises:
         BadFrameError: The frame that ended it.

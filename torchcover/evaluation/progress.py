@@ -78,11 +78,7 @@ def terminable(told: Callable[[Sequence[int]], object]) -> Iterator[list[int]]:
 
     For a program: a library leaves them alone. What is ignored stays so, as under `nohup`.
 
-    Args:
-        told: Called whenever one comes, at once, with all that have come.
-
-    Returns:
-        A list of those that have come.
+    `told`: called whenever one comes, at once, with all that have come. Returns a list of those that have come.
     """
     program = _Program(told)
     before = {number: signal.getsignal(number) for number in ENDS}
@@ -100,8 +96,7 @@ def terminable(told: Callable[[Sequence[int]], object]) -> Iterator[list[int]]:
 def held_back() -> Iterator[list[int]]:
     """Hold them back until the block is done: no frame may count for some observers, or some sums, only.
 
-    Returns:
-        A list of those that have come; who clears it has them forgotten.
+    Returns a list of those that have come; who clears it has them forgotten.
     """
     arrived: list[int] = []
     if threading.current_thread() is not threading.main_thread():  # where they never arrive

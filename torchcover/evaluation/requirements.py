@@ -184,11 +184,7 @@ class BodyPlaces(Document):
         return self
 
     def positions_m(self, vehicle: BoundingBox) -> Float64:
-        """(P, 2) in the frame of a vehicle.
-
-        Raises:
-            ValueError: More than 1000 to a side.
-        """
+        """(P, 2) in the frame of a vehicle. ValueError: more than 1000 to a side."""
         low_m, high_m = np.array(vehicle.lower_m[:2]), np.array(vehicle.upper_m[:2])
         towards = {None: (0, 0), "front": (1, 0), "rear": (-1, 0), "left": (0, 1), "right": (0, -1)}[self.relative_to]
         origin_m = (low_m + high_m + (high_m - low_m) * towards) / 2 * bool(self.relative_to)
@@ -249,11 +245,7 @@ class _Requirement(Document):
         return f"{self.name}: " * bool(self.name) + words + lost
 
     def failing(self, sensors: Sequence[str]) -> list[str]:
-        """Those of a rig's sensors that may fail.
-
-        Raises:
-            ValueError: The rig has none of a name.
-        """
+        """Those of a rig's sensors that may fail. ValueError: the rig has none of a name."""
         _check_called("sensor", self.without, [*sensors, ANY])
         return list(sensors if ANY in self.without else self.without)
 

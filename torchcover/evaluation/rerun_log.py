@@ -32,12 +32,7 @@ RIM_POINTS = 33
 class RerunLog:
     """Writes frames as they pass: an observer, for `evaluate(..., observers={"rerun": log})`; then `finish`.
 
-    Args:
-        path: The file, `.rrd`.
-
-    Raises:
-        ImportError: rerun-sdk is not installed.
-        ValueError: Another suffix.
+    `path`: the file, `.rrd`. ImportError: rerun-sdk is not installed. ValueError: another suffix.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -71,11 +66,7 @@ class RerunLog:
         """Nothing: what it knows is in the file."""
 
     def merge_state(self, _: "RerunLog") -> None:
-        """Refuse.
-
-        Raises:
-            ValueError: Always: several processes cannot write one file.
-        """
+        """Refuse. ValueError: always: several processes cannot write one file."""
         raise ValueError("rerun: several processes cannot write one file; run it without torchrun")
 
     def state_dict(self) -> dict[str, Any]:

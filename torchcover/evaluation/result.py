@@ -4,13 +4,14 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from torchcover import __version__
 from torchcover.coverage import Coverage, Region
+from torchcover.coverage.quantity import by_area
 from torchcover.estimation import MIN_BLOCKS
 from torchcover.evaluation.pipeline import Run
 from torchcover.evaluation.progress import held_back
@@ -26,7 +27,7 @@ from torchcover.evaluation.result_page import (
 )
 from torchcover.evaluation.settings import FILES, wanted_files
 from torchcover.evaluation.target_error import TargetError, outcome
-from torchcover.files import Publication
+from torchcover.files import Publication, data_frame, small_html
 from torchcover.published.comparison import MetricComparison, numbers_csv, record, tau_csv
 from torchcover.published.comparison import page_tables as metric_tables
 from torchcover.report import (
@@ -42,7 +43,12 @@ from torchcover.report import (
     table_dict,
     verdict,
 )
+from torchcover.report.failures import decisive
+from torchcover.report.renderers.records import records_of
 from torchcover.simulation import Sensor
+
+if TYPE_CHECKING:
+    import pandas
 
 # Where more places of the reference sensor are refused, something is wrong with the scene.
 REFUSED_SHARE = 0.2
@@ -173,8 +179,41 @@ class Result:
             more_tables=[left_out_table(self.left_out)] if self.left_out else [],
         )
 
-    def maps(self) -> Iterator[tuple[str, Figure]]:
+    def _repr_html_(self) -> str:
+        return small_html([self._about, *self.verdict], self.plot() if self.coverages else None)
+
+    def plot(self, layer: str | None = None) -> Figure:
+        """Draw one map, several rigs side by side, in the first height band.
+
+        Args:
+            layer: A key of `Coverage.layers`; what sensors are judged by, the detection at the first threshold, if not
+                given.
+
+        Returns:
+            A figure of its own, outside pyplot.
+
+        Raises:
+            ValueError: No map shows that.
+        """
+        first = decisive(self.table)
+        key = layer or (by_area(first) if self.table.measure == "area" else first).key
+        for _, figure in self.maps(key):
+            return figure
+        raise ValueError(f"layer: no map shows {key!r}")
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """The rows of `summary.csv`; NaN where nothing is known.
+
+        Raises:
+            ModuleNotFoundError: pandas is not there.
+        """
+        return data_frame(records_of(self.table))
+
+    def maps(self, layer: str | None = None) -> Iterator[tuple[str, Figure]]:
         """Draw the maps, one by one; several rigs side by side, and their differences to the first.
+
+        Args:
+            layer: Key of the only quantity to draw; all if not given.
 
         Returns:
             The stem of the file name, and a figure of its own, outside pyplot.
@@ -185,6 +224,7 @@ class Result:
             ego_outline_m=self.ego_outline_m,
             sensors=views,
             vehicle=self.vehicle,
+            layer=layer,
         )
 
     def save(self, folder: str | Path, *, files: str | Iterable[str] = FILES) -> list[Path]:
@@ -198,9 +238,6 @@ class Result:
                 does not exist. Files of an earlier run that this one does not write are deleted: those that its
                 `summary.json` lists.
             files: What to write beside `summary.json`: "numbers", "maps", "page", or a text as in "numbers,page".
-
-        Returns:
-            The files.
 
         Raises:
             ValueError: The folder is that of a file which is compared, or files that there are not.
@@ -325,10 +362,16 @@ class Result:
         blocks = self._first.blocks
         return blocks is not None and int((blocks.steps > 0).sum()) >= MIN_BLOCKS
 
-    def __repr__(self) -> str:
+    @property
+    def _about(self) -> str:
         cut_short = ", cut short" if self.run is not None and not self.run.complete else ""
-        about = f"Result of {', '.join(self.coverages)}: {self._first.counts['steps']} steps{cut_short}"
-        return f"{about}\n{RENDERERS['text'](self.table)}"
+        return f"Result of {', '.join(self.coverages)}: {self._first.counts['steps']} steps{cut_short}"
+
+    def __repr__(self) -> str:
+        return "\n".join([self._about, *self.verdict])
+
+    def __str__(self) -> str:
+        return f"{self._about}\n{RENDERERS['text'](self.table)}"
 
 
 def sensor_model_words(of_rigs: object) -> list[str]:

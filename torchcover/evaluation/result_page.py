@@ -109,8 +109,7 @@ def sensor_views(sensors: Sequence[Sensor]) -> list[SensorView]:
 def check_drawable(sensors: Sequence[Sensor]) -> None:
     """Find out before a run, not after it, whether its maps can show the sensors.
 
-    Raises:
-        ValueError: A sensor none of whose rays in the middle row is one, so that it is unknown how wide it sees.
+    ValueError: a sensor none of whose rays in the middle row is one, so that it is unknown how wide it sees.
     """
     for sensor in sensors:
         if not 0 < sensor.horizontal_fov_deg <= 360:
@@ -143,10 +142,8 @@ def _corners(region: Region) -> np.ndarray[Any, np.dtype[np.float64]]:
 def facts_of(record: Mapping[str, Any], rigs: Mapping[str, str | None], steps: int) -> dict[str, dict[str, str]]:
     """Under which settings, and how the run went.
 
-    Args:
-        record: What stands in `summary.json`.
-        rigs: What the user called each rig, by its name.
-        steps: Steps that were measured.
+    `record`: what stands in `summary.json`; `rigs`: what the user called each rig, by its name; `steps`: steps that
+    were measured.
     """
     settings = {name: value for name, value in record.items() if name not in (*OF_THE_RUN, *ELSEWHERE)}
     run = {name: record[name] for name in OF_THE_RUN} | {"python": platform.python_version()} | _versions()

@@ -41,11 +41,7 @@ FILES = ("numbers", "maps", "page")
 def wanted_files(given: str | Iterable[str]) -> frozenset[str]:
     """What is to be written of a result.
 
-    Args:
-        given: Of `FILES`: names, or a text as in `numbers,page`.
-
-    Raises:
-        ValueError: Another name, or none.
+    `given`: of `FILES`: names, or a text as in `numbers,page`. ValueError: another name, or none.
 
     Example:
         >>> sorted(wanted_files("page, numbers"))
@@ -66,8 +62,7 @@ def _rigs(given: "AnyRig | Sequence[AnyRig] | None") -> "tuple[AnyRig, ...]":
 def _mixture(given: object) -> "dict[str, tuple[AnyScenario, float]] | None":
     """Several scenarios and their shares.
 
-    Raises:
-        ValueError: One that is given twice, a recording, or weights that are no numbers, negative, or all 0.
+    ValueError: one that is given twice, a recording, or weights that are no numbers, negative, or all 0.
     """
     if isinstance(given, str) and any(sign in given for sign in ",=") and not Path(given).exists():
         parts = [part.strip().partition("=") for part in given.split(",")]
@@ -343,7 +338,7 @@ class Settings:
     ] = Read(_metrics, ())
     device: Annotated[
         Read["str | torch.device", str],
-        Option("Where the search and the sums run: cpu, cuda, cuda:1, ...", str, in_study=True),
+        Option("Where the search and the sums run, with Warp rays too: cpu, cuda, cuda:1, ...", str, in_study=True),
     ] = Read(_device, "cpu")
     workers: Annotated[
         int | None,

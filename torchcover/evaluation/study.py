@@ -110,17 +110,9 @@ def _options(settings: Mapping[str, Any]) -> Iterator[str]:
 
 
 class Studied(NamedTuple):
-    """A number as one setting has it.
+    """A number as one setting has it: value, what its error becomes, and difference to the first on the same instants.
 
-    Args:
-        region: Name of the region.
-        height: Name of the band.
-        awaited: Whether `--target-error` waits for it.
-        quantity: What it is.
-        value: In its unit.
-        error: What its error becomes.
-        difference: To the first setting on the same instants; None of the first itself.
-        is_biased: Whether that is beyond chance.
+    `awaited` says whether `--target-error` waits for it, `is_biased` whether the difference is beyond chance.
     """
 
     region: str
@@ -274,11 +266,7 @@ class Study:
         return draw_work_precision(panels, title=" in ".join(map(str, self.plan.named)), legend_title="setting")
 
     def save(self, folder: str | Path) -> list[Path]:
-        """Write `work_precision.png` and `summary.json` into a folder, which is made if need be.
-
-        Returns:
-            The files.
-        """
+        """Write `work_precision.png` and `summary.json` into a folder, which is made if need be."""
         figure = self.draw()
         with Publication(Path(folder)) as files:
             files.add("work_precision.png", figure.savefig)
@@ -385,11 +373,7 @@ def _paired(first: Coverage, coverage: Coverage, region: Region, height: str) ->
 
 
 def command_s(plan: StudyPlan) -> float:
-    """How long `torchcover evaluate` takes for one step, from its start to its end.
-
-    Raises:
-        ValueError: It fails.
-    """
+    """How long `torchcover evaluate` takes for one step, from its start to its end. ValueError: it fails."""
     words = [*plan.command, "--steps=1"]
     start = time.perf_counter()
     with TemporaryDirectory() as folder:

@@ -5,10 +5,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from torchcover import __version__
-from torchcover.coverage import BevGrid
 from torchcover.evaluation.progress import held_back
 from torchcover.evaluation.result_page import rig_document, sensor_views, words_of
 from torchcover.evaluation.settings import FILES, wanted_files
@@ -22,7 +20,6 @@ from torchcover.report import (
     PageRig,
     PageTable,
     Words,
-    draw_targets,
     json_record,
     page_html,
     percent,
@@ -117,28 +114,6 @@ def free_space() -> Scenario:
     return Scenario(name="free space", ego=Mover(), bodies=(ground,))
 
 
-def target_picture(seen: TargetMap) -> Figure:
-    """The points on the target at every place, with the border of what is seen.
-
-    Args:
-        seen: From `survey_target`.
-    """
-    length, width, height = seen.target_size_m
-    heading = f"{seen.heading} side to the vehicle" if isinstance(seen.heading, str) else f"yaw {seen.heading:g}°"
-    steps = f"{seen.step_count} step{'s' if seen.step_count > 1 else ''}"
-    return draw_targets(
-        seen.points,
-        seen.enough,
-        BevGrid(x=seen.raster.x, y=seen.raster.y, cell=seen.raster.step_m),
-        vehicle_outline_m=seen.vehicle_outline_m,
-        vehicle_box_m=seen.vehicle.outline_m,
-        sensors_m=seen.sensors_m,
-        hits=seen.hits,
-        title=f"{seen.rig}: points on {seen.target}",
-        subtitle=f"{length:.2f} x {width:.2f} x {height:.2f} m, {heading}; {seen.scenario}, {steps}",
-    )
-
-
 def save_targets(
     seen: TargetMap,
     folder: str | Path,
@@ -154,9 +129,6 @@ def save_targets(
             does not exist; files of an earlier run that its `summary.json` lists are deleted.
         sensors: Those of the rig, for the page.
         files: What to write beside `summary.json`, as in `Result.save`; "maps" is the picture.
-
-    Returns:
-        The files.
     """
     wanted = wanted_files(files)
     record = target_record(seen)
@@ -169,7 +141,7 @@ def save_targets(
         if "page" in wanted:
             written.add_text("report.html", page_html(target_page(seen, sensors)))
         if "maps" in wanted:
-            written.add_figure("targets.png", target_picture(seen))
+            written.add_figure("targets.png", seen.plot())
         written.publish(record)
     return written.paths
 
@@ -186,12 +158,7 @@ def target_record(seen: TargetMap) -> dict[str, Any]:
 
 
 def target_page(seen: TargetMap, sensors: Sequence[Sensor] = ()) -> Page:
-    """All that is known of a target, on one page.
-
-    Args:
-        seen: From `survey_target`.
-        sensors: Those of the rig.
-    """
+    """All that is known of a target, on one page. `seen`: from `survey_target`; `sensors`: those of the rig."""
     return Page(
         title=f"{seen.rig}: would it see {seen.target}?",
         lead=f"In {seen.scenario}, sensor model {seen.sensor_model}, measured by torchcover.",

@@ -5,8 +5,11 @@ import json
 import math
 import warnings
 from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Generic, NamedTuple, TypeVar
+
+import torch
 
 from torchcover import __version__
 from torchcover.coverage.grid import BandFrame
@@ -48,15 +51,10 @@ MAX_TOLD = 40
 
 
 class Task(NamedTuple, Generic[SourceT]):
-    """Which rigs are measured in which frames.
+    """Which rigs are measured in which frames, under the names that they have in tables and files.
 
-    Args:
-        frames: Frames of these rigs, under the names that they have in tables and files.
-        given: Name of each rig -> what the user called it; None if it was not named.
-        sensors: Name of each rig -> its sensors, where they are known.
-        description: Where the frames come from, in words.
-        asked: What is asked about.
-        steps: Frames to use at most; None for all.
+    `given` is what the user called each rig, None if it was not named; `sensors` its sensors, where they are known;
+    `steps` how many frames to use at most.
     """
 
     frames: SourceT
@@ -72,11 +70,7 @@ class Task(NamedTuple, Generic[SourceT]):
         return tuple(self.given)
 
     def sensor_names(self) -> Mapping[str, Sequence[str]]:
-        """Name of each rig -> names of its sensors.
-
-        Raises:
-            ValueError: It is unknown which points are of which sensor.
-        """
+        """Name of each rig -> names of its sensors. ValueError: it is unknown which points are of which sensor."""
         known = self.frames.sensor_names
         if unknown := [rig for rig in self.rigs if rig not in known]:
             raise ValueError(f"redundancy: unknown which points of {', '.join(unknown)} are of which sensor")
@@ -158,11 +152,30 @@ def simulation(settings: Settings, *, boxes: bool = False) -> Task[SimulatedFram
         within_m=max(settings.thresholds_m) if settings.only_detection else None,
         kept_bytes=0.0,  # steps come in order: no world is needed again
         no_cache=settings.no_cache,
+        device=casting_device(settings),
     )
     frames.simulator.check_run(frames.steps)
     # A path says more than the name within the file.
     description = {**frames.description, "scenario": world.name if loaded_world is scenario else str(scenario)}
     return Task(frames, given, frames.sensors, description, asked, _most_steps(frames, settings))
+
+
+def casting_device(settings: Settings) -> str | None:
+    """The GPU that casts rays, if that of the run can: workers are forked, and cast by Embree."""
+    device = settings.ranks.device(settings.device) if settings.ranks else settings.device
+    on_a_gpu = device.startswith("cuda") and not settings.workers and find_spec("warp")
+    return str(usable_device(device)) if on_a_gpu else None
+
+
+def usable_device(name: str) -> torch.device:
+    """The device of this name. ValueError: it cannot be used here."""
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device, dtype=torch.float64).item()  # the device `meta` has no values
+    except (RuntimeError, AssertionError, TypeError, ImportError) as error:
+        said = str(error).splitlines()[0].partition(". ")[0]  # some go on for pages
+        raise ValueError(f"device {name}: cannot be used here ({said}); try cpu") from error
+    return device
 
 
 def _in_weather(
@@ -218,13 +231,6 @@ def spread_s(scenario: Scenario, given_s: float | None) -> float:
 
     That is the golden share of its instants, round and round: any number of steps lies evenly over all of it, and no
     instant comes again before all have been seen.
-
-    Example:
-        >>> drive = {"name": "drive", "ego": {"shape": {"type": "box", "size_m": [4, 2, 2]}, "trajectory": "drive.csv"}}
-        >>> ground = {"bodies": [{"name": "ground", "shape": {"type": "plane", "size_m": [99, 99]}}], "duration_s": 30}
-        >>> every_s = spread_s(Scenario.model_validate({**drive, **ground}), None)
-        >>> [round(step * every_s % 30.1, 1) for step in range(6)]
-        [0.0, 18.6, 7.1, 25.7, 14.2, 2.7]
     """
     if given_s is not None:
         return given_s
@@ -236,12 +242,7 @@ def spread_s(scenario: Scenario, given_s: float | None) -> float:
 
 
 def distinct_names(rigs: Sequence[AnyRig]) -> list[str]:
-    """What the columns are called: the rig's name, or the stem of its file; numbered where two would be the same.
-
-    Example:
-        >>> distinct_names(["kitti", "old/my.yaml", "new/my.yaml"])
-        ['kitti', 'my', 'my_2']
-    """
+    """What the columns are called: the rig's name, or the stem of its file; numbered where two would be the same."""
     return distinct([_stem(rig) for rig in rigs])
 
 
@@ -262,21 +263,14 @@ def distinct(stems: Sequence[str]) -> list[str]:
 
 
 def loaded(rig: AnyRig) -> Rig:
-    """The rig itself.
-
-    Raises:
-        FileNotFoundError: No such file or built-in name.
-        ValueError: The file is not a rig.
-    """
+    """The rig itself. FileNotFoundError: no such file or built-in name. ValueError: the file is not a rig."""
     return rig if isinstance(rig, Rig) else Rig.load(rig)
 
 
 def as_called(rig: AnyRig) -> Rig:
     """The rig itself, under the name that tables and files of every command have for it.
 
-    Raises:
-        FileNotFoundError: As `loaded`.
-        ValueError: As `loaded`.
+    FileNotFoundError: as `loaded`. ValueError: as `loaded`.
     """
     return loaded(rig).model_copy(update={"name": _stem(rig)})
 
@@ -306,17 +300,7 @@ def run_identity(
 ) -> dict[str, str]:
     """All that the result of a run depends on, by name: not the steps, of which there may be more later, nor who works.
 
-    Args:
-        task: What is measured.
-        settings: How.
-        others: The user's own observers.
-        ranks: How many processes share the run; each has its own part of it.
-
-    Returns:
-        Name -> what it is, or a hash of it.
-
-    Raises:
-        FileNotFoundError: A file that a document names is missing.
+    Ranks share the run, each with its own part of it. What is a document or a table is told by its hash.
     """
     kinds = {name: f"{type(one).__module__}.{type(one).__qualname__}" for name, one in others.items()}
     everything = {

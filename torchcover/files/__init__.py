@@ -16,6 +16,10 @@ from torchcover.files.json_tables import read_json_table as read_json_table
 from torchcover.files.native import exr_image as exr_image
 from torchcover.files.native import laz_points as laz_points
 from torchcover.files.native import read_feather as read_feather
+from torchcover.files.notebooks import brief as brief
+from torchcover.files.notebooks import data_frame as data_frame
+from torchcover.files.notebooks import data_set as data_set
+from torchcover.files.notebooks import small_html as small_html
 from torchcover.files.numpy_files import DEFLATE_MAX_RATIO as DEFLATE_MAX_RATIO
 from torchcover.files.numpy_files import NpyHeader as NpyHeader
 from torchcover.files.numpy_files import npz_headers as npz_headers

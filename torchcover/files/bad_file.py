@@ -93,9 +93,7 @@ def reads(
 def naming(path: Path, content: str) -> Iterator[None]:
     """Turn whatever goes wrong into a `BadFileError` that names the file; a missing one, a folder and a package aside.
 
-    Args:
-        path: The file, or the folder of several.
-        content: What it is meant to be.
+    `path`: the file, or the folder of several; `content`: what it is meant to be.
     """
     try:
         yield
@@ -134,11 +132,8 @@ class TooLargeError(ValueError):
 def check_memory(needed_bytes: int) -> None:
     """Refuse to read a file that needs more memory than one may take, before any of it is reserved.
 
-    Args:
-        needed_bytes: What reading it takes at its largest, the file's own bytes included where they are held.
-
-    Raises:
-        TooLargeError: More than 2 GB, or than the environment variable TORCHCOVER_MAX_FILE_GB says.
+    `needed_bytes`: what reading it takes at its largest, the file's own bytes included where they are held.
+    TooLargeError: more than 2 GB, or than the environment variable TORCHCOVER_MAX_FILE_GB says.
 
     Example:
         >>> check_memory(16 * 100_000)  # a scan
@@ -160,8 +155,7 @@ def most_gb() -> float:
 def said_gb(variable: str, usual_gb: float) -> float:
     """Gigabytes that an environment variable says, or what is usual without it.
 
-    Raises:
-        ValueError: It is no number of at least 0.
+    ValueError: it is no number of at least 0.
     """
     given = os.environ.get(variable)
     try:
@@ -174,11 +168,7 @@ def said_gb(variable: str, usual_gb: float) -> float:
 
 
 def decode(data: bytes) -> str:
-    """Decode UTF-8, with or without a byte order mark.
-
-    Raises:
-        ValueError: Not UTF-8.
-    """
+    """Decode UTF-8, with or without a byte order mark. ValueError: not UTF-8."""
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -186,11 +176,7 @@ def decode(data: bytes) -> str:
 
 
 def read_short_text(path: Path) -> str:
-    """Text of a file that people write, or could have written.
-
-    Raises:
-        ValueError: More than a megabyte, or not UTF-8.
-    """
+    """Text of a file that people write, or could have written. ValueError: more than a megabyte, or not UTF-8."""
     size_bytes = path.stat().st_size
     if size_bytes > MAX_SHORT_BYTES:
         raise ValueError(f"{size_bytes} bytes; at most {MAX_SHORT_BYTES} are read of such a file")

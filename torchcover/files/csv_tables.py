@@ -27,17 +27,10 @@ class CsvTable(NamedTuple):
 def read_csv(
     path: Path, numbers: Sequence[str], words: Sequence[str] = (), optional: Sequence[str] | None = ()
 ) -> CsvTable:
-    """Read a table whose first line names its columns, in any order.
+    """Read a table whose first line names its columns, of numbers or of any words, in any order.
 
-    Args:
-        path: The file.
-        numbers: Columns of numbers.
-        words: Columns of anything.
-        optional: Columns of numbers that may be missing; None: any others may be there, and are not read.
-
-    Raises:
-        BadFileError: Columns that are missing, doubled or unknown, a row of another width, or what is no finite number;
-            the message names line and column.
+    Optional columns of numbers may be missing; None: any others may be there, and are not read. BadFileError: columns
+    that are missing, doubled or unknown, a row of another width, or what is no finite number; it names line and column.
     """
     check_memory(BYTES_PER_BYTE * path.stat().st_size)
     rows = _rows(decode(path.read_bytes()))

@@ -11,13 +11,7 @@ OBJECTS_PER_BYTE = 8
 
 
 class JsonTable(NamedTuple):
-    """A table.
-
-    Args:
-        path: Its file.
-        rows: As they were written.
-        by_token: The same by their `token`.
-    """
+    """A table. `rows`: as they were written; `by_token`: the same by their `token`."""
 
     path: Path
     rows: list[dict[str, Any]]
@@ -32,11 +26,7 @@ class JsonTable(NamedTuple):
 
 @reads("a table of rows")
 def read_json_table(path: Path) -> JsonTable:
-    """Read a JSON list of objects.
-
-    Raises:
-        BadFileError: Another content.
-    """
+    """Read a JSON list of objects. BadFileError: another content."""
     check_memory(OBJECTS_PER_BYTE * path.stat().st_size)
     rows = json.loads(decode(path.read_bytes()))
     if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):

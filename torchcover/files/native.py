@@ -16,16 +16,8 @@ from torchcover.files.own_process import apart
 def read_feather(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
     """Read columns of a feather table.
 
-    Args:
-        path: The file.
-        names: The columns.
-
-    Returns:
-        Name -> numbers, or text.
-
-    Raises:
-        BadFileError: No such table, a column that is missing or has holes, or no rows.
-        ImportError: pyarrow is not installed.
+    Returns name -> numbers, or text. BadFileError: no such table, a column that is missing or has holes, or no rows.
+    ImportError: pyarrow is not installed.
     """
     try:
         from pyarrow import feather

@@ -26,12 +26,7 @@ _HEADER_READERS = {
 
 
 class NpyHeader(NamedTuple):
-    """What a `.npy` says about its array.
-
-    Args:
-        shape: Of the array.
-        dtype: Of its elements, never Python objects.
-    """
+    """What a `.npy` says about its array. `dtype`: of its elements, never Python objects."""
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
@@ -40,15 +35,8 @@ class NpyHeader(NamedTuple):
 def read_npy(path: Path, check: Callable[[NpyHeader], None]) -> NDArray[Any]:
     """Read a `.npy`.
 
-    Args:
-        path: The file.
-        check: Called with the header, before memory is reserved; raises ValueError if it is not what is needed.
-
-    Returns:
-        The array.
-
-    Raises:
-        ValueError: Not such a file, Python objects, an array of another size than the file, or too large a one.
+    `check`: called with the header, before memory is reserved; raises ValueError if it is not what is needed. Returns
+    the array. ValueError: not such a file, Python objects, an array of another size than the file, or too large a one.
     """
     return _load(lambda: path.open("rb"), path.stat().st_size, check)
 
@@ -58,18 +46,10 @@ def read_npz(
     check: Callable[[NpyHeader], None],
     choose: Callable[[Collection[str]], Collection[str]] = lambda names: names,
 ) -> dict[str, NDArray[Any]]:
-    """Read arrays of a `.npz`, whatever its compression.
+    """Read arrays of a `.npz` by name, whatever its compression; those that `choose` returns of all names, else all.
 
-    Args:
-        path: The file.
-        check: Called with each header, before memory is reserved; raises ValueError if it is not what is needed.
-        choose: Called with the names of all arrays, returns those that are wanted; else all are.
-
-    Returns:
-        Name -> array.
-
-    Raises:
-        ValueError: Not such an archive, a damaged one, or one that grows beyond what a file may take.
+    `check` gets each header before memory is reserved, and raises ValueError if it is not what is needed. ValueError:
+    not such an archive, a damaged one, or one that grows beyond what a file may take.
     """
     # zipfile raises, beside its own: RuntimeError (encrypted), NotImplementedError (a compression it lacks),
     # zlib.error, EOFError, OSError on offsets that lead out of the file.
@@ -95,8 +75,7 @@ def read_npz(
 def npz_headers(path: Path) -> dict[str, NpyHeader]:
     """What the arrays of a `.npz` are, unread; members that are no arrays are left out.
 
-    Raises:
-        ValueError: Not such an archive, or a damaged one.
+    ValueError: not such an archive, or a damaged one.
     """
     found = {}
     with zipfile.ZipFile(path) as archive:
@@ -109,12 +88,7 @@ def npz_headers(path: Path) -> dict[str, NpyHeader]:
 def write_npz(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Write arrays to a compressed `.npz`, as NumPy reads it.
 
-    Args:
-        path: The file.
-        arrays: By their names; no Python objects.
-
-    Raises:
-        ValueError: An array of Python objects.
+    `arrays`: by their names; no Python objects. ValueError: an array of Python objects.
     """
     # `numpy.savez_compressed` knows the slow default only, which takes twice as long for an eighth less.
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:

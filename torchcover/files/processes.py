@@ -24,12 +24,8 @@ _prctl = ctypes.CDLL(None).prctl if sys.platform == "linux" else None
 def end_with_parent(memory_gb: float = math.inf) -> Callable[..., None] | None:
     """What a process that this one starts has to call first, to be killed when this one ends, however that ends.
 
-    Args:
-        memory_gb: What it may take in all.
-
-    Returns:
-        For the `preexec_fn` of `subprocess` and the `worker_init_fn` of a `DataLoader`; None where the system, any but
-        Linux, cannot do so.
+    `memory_gb`: what it may take in all. Returns for the `preexec_fn` of `subprocess` and the `worker_init_fn` of a
+    `DataLoader`; None where the system, any but Linux, cannot do so.
 
     Example:
         >>> import subprocess

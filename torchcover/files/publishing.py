@@ -76,12 +76,8 @@ def claimed(folder: Path) -> Iterator[None]:
 
     What an earlier process had completed, and could not put in its place, is put there first.
 
-    Args:
-        folder: Made if it does not exist, and taken away again if nothing is written to it.
-
-    Raises:
-        ValueError: Another process has claimed it.
-        OSError: It cannot be written to.
+    `folder`: made if it does not exist, and taken away again if nothing is written to it. ValueError: another process
+    has claimed it. OSError: it cannot be written to.
     """
     from filelock import FileLock, Timeout  # takes longer to import than all else that readers need
 
@@ -116,8 +112,7 @@ def claimed(folder: Path) -> Iterator[None]:
 def written_since(start_s: float) -> list[Path]:
     """Files in the folders that this process has claimed, written since a time; none that lies aside.
 
-    Args:
-        start_s: As `time.time` gives it.
+    `start_s`: as `time.time` gives it.
     """
     return [
         folder / path.name
@@ -180,12 +175,8 @@ class Publication:
     def add(self, name: str, write: Callable[[Path], object]) -> None:
         """Write a file aside.
 
-        Args:
-            name: Its path within the folder.
-            write: Writes it to the path that it is given.
-
-        Raises:
-            OSError: It cannot be written, for want of room for example.
+        `name`: its path within the folder; `write`: writes it to the path that it is given. OSError: it cannot be
+        written, for want of room for example.
         """
         with _naming(self.folder / name):
             _write_synced(self._aside / name, write)
@@ -245,14 +236,8 @@ def noted(folder: Path) -> list[dict[str, Any]]:
 def settled(path: Path) -> Path:
     """Where to read a file that may be one of a `Publication`: in its place, once all of them are in theirs.
 
-    Args:
-        path: The file.
-
-    Returns:
-        The same, but of a folder that cannot be written to, or that another process is writing to, where it lies now.
-
-    Raises:
-        FileNotFoundError: It was one of the publication before.
+    Returns the same, but of a folder that cannot be written to, or that another process is writing to, where it lies
+    now. FileNotFoundError: it was one of the publication before.
     """
     for folder in path.absolute().parents[:2]:
         if (listed := _waiting(folder)) is None:

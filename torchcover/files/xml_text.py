@@ -15,8 +15,7 @@ TREE_PER_BYTE = 20
 def parse_xml(path: Path) -> ElementTree.Element:
     """The tree of an XML file.
 
-    Raises:
-        ValueError: Not XML in UTF-8, it declares entities, or its tree would not fit into memory.
+    ValueError: not XML in UTF-8, it declares entities, or its tree would not fit into memory.
     """
     check_memory(TREE_PER_BYTE * path.stat().st_size)
     text = decode(path.read_bytes())
@@ -28,13 +27,8 @@ def parse_xml(path: Path) -> ElementTree.Element:
 def feed_xml(pieces: Iterable[bytes], start: Callable[[str, list[str]], None]) -> None:
     """Read XML that may be of any length, one start tag after the other; nothing of it is kept.
 
-    Args:
-        pieces: Its bytes.
-        start: Called with the name of each element, and with the names and values of its attributes in turn; what it
-            raises ends the reading.
-
-    Raises:
-        ValueError: Not XML, or it declares entities.
+    `start`: called with the name of each element, and with the names and values of its attributes in turn; what it
+    raises ends the reading. ValueError: not XML, or it declares entities.
 
     Example:
         >>> feed_xml([b"<a x='1'", b"><b/></a>"], lambda name, attributes: print(name, attributes))

@@ -34,12 +34,8 @@ def parse_yaml(text: str) -> Any:  # noqa: ANN401  (YAML knows no types)
     Scalars are those of YAML 1.2; what looks like a number to YAML 1.1 alone is a string. Anchors, aliases and `<<` are
     read, and so are OpenCV's tag for matrices and its first line, `%YAML:1.0`.
 
-    Args:
-        text: The whole text.
-
-    Raises:
-        ValueError: Not YAML, a key that is there twice, another tag, or a text that is too long, too deep or grows too
-            large by its aliases; the message has the line.
+    ValueError: not YAML, a key that is there twice, another tag, or a text that is too long, too deep or grows too
+    large by its aliases; the message has the line.
 
     Example:
         >>> parse_yaml("mount: {x_m: 1, z_m: 1e-1}\nname: on")

@@ -90,11 +90,7 @@ class Augmentation:
             raise ValueError(f"seed: a number >= 0 is needed; got {self.seed}")
 
     def __call__(self, frame: Frame, epoch: int = 0) -> Frame:
-        """The frame as it is in one epoch.
-
-        Raises:
-            ValueError: A frame without an index (-1), or a negative epoch.
-        """
+        """The frame as it is in one epoch. ValueError: a frame without an index (-1), or a negative epoch."""
         if frame.index < 0 or epoch < 0:
             raise ValueError(
                 f"frame {frame.name!r}, index {frame.index}, epoch {epoch}: numbers >= 0 are needed, for the draw "

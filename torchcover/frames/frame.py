@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchcover.coverage.grid import BandFrame
 from torchcover.detection.boxes import Boxes
+from torchcover.files import brief
 
 
 class Measured(NamedTuple):
@@ -24,7 +25,7 @@ class Measured(NamedTuple):
     error_m: Tensor
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Frame:
     """The clouds of one time step, in the vehicle frame (x forward, y left, z up, metres).
 
@@ -61,6 +62,8 @@ class Frame:
     sensor_points: Mapping[str, Mapping[str, int]] | None = None
     reference_heights_m: Tensor | None = None
     measured: Mapping[str, Measured] = field(default_factory=dict)
+
+    __repr__ = brief
 
     def __post_init__(self) -> None:
         if self.place_in_time is None:
@@ -207,7 +210,7 @@ class Frame:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class FrameBatch:
     """Frames side by side, as `CoverageMetric.update` takes them.
 
@@ -350,9 +353,6 @@ def collate_frames(frames: Sequence[Frame]) -> FrameBatch:
 
     Args:
         frames: Frames whose clouds may differ in size.
-
-    Returns:
-        A `FrameBatch` of all of them.
 
     Example:
         >>> frame = Frame({"rig": torch.zeros(5, 3)}, torch.zeros(9, 3), index=0, name="a")

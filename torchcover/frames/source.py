@@ -109,11 +109,7 @@ class FrameSource(Protocol):
         """Number of frames."""
 
     def __getitem__(self, index: int, /) -> Frame:
-        """One frame.
-
-        Raises:
-            BadFrameError: It cannot be used; the others can.
-        """
+        """One frame. BadFrameError: it cannot be used; the others can."""
 
 
 def worlds_of(frames: object) -> Callable[[int], int]:

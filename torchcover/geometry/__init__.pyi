@@ -1,7 +1,7 @@
 from .bounding_box import BoundingBox as BoundingBox
+from .bounding_box import contact_s as contact_s
+from .bounding_box import outlines_at as outlines_at
 from .bounding_box import overlapping as overlapping
-from .contact import contact_s as contact_s
-from .contact import outlines_at as outlines_at
 from .height_field import HeightField as HeightField
 from .height_field import fitted as fitted
 from .height_field import spread as spread

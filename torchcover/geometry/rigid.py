@@ -142,8 +142,7 @@ def quaternion_from_rotation(rotation: Matrix) -> Matrix:
         ]
     )
     wxyz = np.linalg.eigh(matrix)[1][:, -1]
-    found: Matrix = np.copysign(1.0, wxyz[0]) * wxyz + 0.0  # no -0
-    return found
+    return np.asarray(np.copysign(1.0, wxyz[0]) * wxyz + 0.0)  # no -0
 
 
 def slerp(first_wxyz: Matrix, second_wxyz: Matrix, share: Matrix) -> Matrix:
@@ -155,8 +154,7 @@ def slerp(first_wxyz: Matrix, second_wxyz: Matrix, share: Matrix) -> Matrix:
     sine = np.where(straight, 1.0, np.sin(angle))
     of_first = np.where(straight, 1 - share, np.sin((1 - share) * angle) / sine)
     of_second = np.where(straight, share, np.sin(share * angle) / sine)
-    between: Matrix = of_first * first_wxyz + of_second * second_wxyz
-    return between
+    return np.asarray(of_first * first_wxyz + of_second * second_wxyz)
 
 
 def check_rigid(matrix: ArrayLike, name: str) -> Matrix:

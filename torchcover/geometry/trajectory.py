@@ -22,25 +22,11 @@ STEEP_DEG = 60.0
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Poses at times.
+    """Poses at times: (K,) ascending times, (K, 3) places and (K, 3) yaw, pitch and roll as of `rotation_from_euler`.
 
     In between it moves on a straight line, and yaw, pitch and roll each turn the shorter way; beyond a pitch of 60
-    degrees, where angles say little, it turns about one axis.
-
-    Args:
-        times_s: (K,) ascending times in seconds.
-        positions_m: (K, 3) positions in the world frame in metres, float64: they may be of UTM size.
-        angles_deg: (K, 3) yaw, pitch and roll; see `torchcover.geometry.rotation_from_euler`.
-        transient: Whether the body is there only between the first and the last time, as in a recording that it enters
-            and leaves; else it rests before and after.
-
-    Raises:
-        ValueError: No pose, shapes that do not fit, NaN or infinite numbers, times that do not ascend.
-
-    Example:
-        >>> drive = Trajectory.from_arrays([0.0, 2.0], positions_m=[[0, 0, 0], [20, 0, 0]], angles_deg=[[0, 0, 0]] * 2)
-        >>> drive.at(0.5)[:3, 3]
-        array([5., 0., 0.])
+    degrees, where angles say little, it turns about one axis. Places are float64: they may be of UTM size. Before and
+    after it rests; who is `transient`, as in a recording that it enters and leaves, is not there then.
     """
 
     times_s: Matrix
@@ -137,12 +123,7 @@ class Trajectory:
 
 
 def poses_at(trajectories: Sequence[Trajectory], time_s: float) -> Matrix:
-    """(P, 4, 4) poses `world_T_body` of P bodies at one time; see `Trajectory.at`.
-
-    Example:
-        >>> poses_at([Trajectory.resting((x, 0.0, 0.0)) for x in (1.0, 2.0)], 0.5)[:, 0, 3]
-        array([1., 2.])
-    """
+    """(P, 4, 4) poses `world_T_body` of P bodies at one time; see `Trajectory.at`."""
     # Bodies of one world share their times, or have views of them: they are looked up once.
     moments, ends, shares = dict[int, tuple[int, int, float]](), [], []
     for each in trajectories:

@@ -21,10 +21,8 @@ MIN_WAITING = 4096
 class Rows(NamedTuple):
     """What the rows of a `TouchedSums` are.
 
-    Args:
-        cells: How many cells there are; a row is of the cell `key % cells` in the block `key // cells`.
-        maxima: How many of the last columns are not added up, but keep the largest.
-        fine: Whether its blocks are the fine ones.
+    `cells`: how many cells there are; a row is of the cell `key % cells` in the block `key // cells`; `maxima`: how
+    many of the last columns are not added up, but keep the largest; `fine`: whether its blocks are the fine ones.
     """
 
     cells: int
@@ -80,13 +78,7 @@ def added_up(rows: Tensor, maxima: int = 0) -> Tensor:
 
 
 def merged(one: Tensor, other: Tensor, maxima: int = 0) -> Tensor:
-    """What `added_up` makes of the rows of two tables that it has made, sooner: their keys are in order.
-
-    Example:
-        >>> one, other = torch.tensor([[2.0, 5.0], [7.0, 3.0]]), torch.tensor([[1.0, 9.0], [7.0, 4.0]])
-        >>> merged(one, other).tolist()
-        [[1.0, 9.0], [2.0, 5.0], [7.0, 7.0]]
-    """
+    """What `added_up` makes of the rows of two tables that it has made, sooner: their keys are in order."""
     if not len(one) or not len(other):
         return one if len(one) else other
     before = torch.searchsorted(one[:, 0].contiguous(), other[:, 0].contiguous())

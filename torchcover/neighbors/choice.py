@@ -39,9 +39,8 @@ log = logging.getLogger("torchcover")
 def choose_search(query: Tensor, points: Tensor, backend: str) -> Search:
     """The search of a backend: a name in `BACKENDS`, or "auto".
 
-    Raises:
-        ValueError: An unknown backend, or one for other devices than that of the clouds.
-        ImportError: A backend was named whose library is missing, or does not work.
+    ValueError: an unknown backend, or one for other devices than that of the clouds. ImportError: a backend was named
+    whose library is missing, or does not work.
     """
     on_cpu = query.device.type == "cpu"
     if backend == "auto":

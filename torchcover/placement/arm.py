@@ -1,6 +1,6 @@
 """An arm of a search: an optimiser, what it was told, and the candidates that others have to beat."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -61,8 +61,12 @@ class Arm:
 
     @property
     def lacks(self) -> Float64:
-        """(evaluations,) what numbers lack of what they must be, in all, each as a share of that."""
-        return np.array(self._lacks)
+        """(evaluations,) what they lack of what must be kept, in all, each as a share of that."""
+        return np.array([sum(each.values()) for each in self._lacks], dtype=np.float64)
+
+    def lacking(self, at: int) -> Mapping[str, float]:
+        """What it is that a candidate lacks, by name."""
+        return self._lacks[at]
 
     @property
     def complete(self) -> list[int]:
@@ -76,8 +80,8 @@ class Arm:
 
         Only of those that lack nothing; if there is none, of those that lack the least.
         """
-        least = self.lacks[self.complete].min(initial=np.inf)
-        complete = [at for at in self.complete if self._lacks[at] <= least]
+        lacks = self.lacks[self.complete]
+        complete = [at for at, lack in zip(self.complete, lacks, strict=True) if lack <= lacks.min()]
         return [at for at, on in zip(complete, non_dominated(self.gains[complete]).tolist(), strict=True) if on]
 
     @property
@@ -142,18 +146,19 @@ class Arm:
         """(evaluations, objectives) what optimisers are told of: gains, less what the lacks cost."""
         return np.asarray(self.gains - PENALTY * self._scale[: self._objectives] * self.lacks[:, None])
 
-    def _lacking(self, evaluation: Evaluation) -> float:
+    def _lacking(self, evaluation: Evaluation) -> Mapping[str, float]:
         prefixes = evaluation.prefixes
         if not prefixes:
-            return 0.0
+            return {}
         value = prefixes[-1].estimate.value.numpy()
         if evaluation.number and evaluation.instants < self.evaluations[0].instants:
             # As good as its difference to the start promises.
             value = value - self.evaluations[0].prefixes[len(prefixes) - 1].estimate.value.numpy()
             value = value + self.evaluations[0].prefixes[-1].estimate.value.numpy()
         lost = np.where(self._lower, value - self._floors, self._floors - value) / np.abs(self._floors).clip(ROUNDING)
-        lost = np.nan_to_num(lost[~np.isnan(self._floors)], nan=1.0)  # what is unknown is all lost
-        return float(lost[lost > ROUNDING].sum()) + evaluation.lacks
+        lost[np.isnan(lost) & ~np.isnan(self._floors)] = 1.0  # what is unknown is all lost
+        lacks = dict(zip((one.key for one in prefixes[-1].estimate.quantities), lost.tolist(), strict=True))
+        return {name: share for name, share in lacks.items() if share > ROUNDING} | dict(evaluation.lacks)
 
     def _estimated(self, evaluation: Evaluation) -> tuple[Float64, Float64]:
         """Gain over the start at all instants, and the error that those have left which it was not scored at.

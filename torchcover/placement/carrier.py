@@ -52,9 +52,7 @@ class Carrier(NamedTuple):
     def of(cls, scenarios: Sequence[Scenario]) -> "Carrier":
         """The ego of all scenarios.
 
-        Raises:
-            ValueError: They have different ones.
-            FileNotFoundError: A mesh or vehicle file is missing.
+        ValueError: they have different ones. FileNotFoundError: a mesh or vehicle file is missing.
         """
         first, *others = scenarios
         shape = first.ego.shape if first.ego else None
@@ -64,11 +62,7 @@ class Carrier(NamedTuple):
         return cls(first.ego_name, Skin(first.ego_mesh()), mount_regions_of(shape))
 
     def region(self, name: str) -> MountRegion:
-        """A mount region by its name.
-
-        Raises:
-            ValueError: There is none; the message lists those that there are.
-        """
+        """A mount region by its name. ValueError: there is none; the message lists those that there are."""
         if name not in self.regions:
             told = ", ".join(self.regions) or "none at all: add mount_regions to its document"
             raise ValueError(f"region: {self.name} has no {name!r}; it has {told}")

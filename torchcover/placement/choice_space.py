@@ -56,8 +56,7 @@ class MountGrid(Document):
     def poses(self, carrier: Carrier) -> Iterator[tuple[str, Pose]]:
         """Names and poses; where a window of a region has nothing of the body, there is none.
 
-        Raises:
-            ValueError: The vehicle has no such region.
+        ValueError: the vehicle has no such region.
         """
         for name in self.region:
             region = carrier.region(name)
@@ -109,8 +108,7 @@ class CandidateGroup(Document):
     def sensors(self, group: str, carrier: Carrier) -> Iterator[Sensor]:
         """A sensor at each place on a vehicle, called after the group and the place.
 
-        Raises:
-            ValueError: The vehicle has no such region.
+        ValueError: the vehicle has no such region.
         """
         places = list(self.places.items())
         if self.grid is not None:

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -25,10 +25,13 @@ from torchcover.placement.choice_space import ChoiceSpace
 from torchcover.placement.common_instants import CommonInstants
 from torchcover.placement.fresh import FreshGain, FreshTest, fresh_test, told
 from torchcover.placement.report_files import PlacementReport
-from torchcover.placement.subsets import Candidates, Limits, Subset, best, best_of_several, random_subsets
+from torchcover.placement.subsets import SAME, Candidates, Limits, Subset, best, best_of_several, random_subsets
 from torchcover.report import ChoiceSize, PageTable, Words, draw_choice, file_stems
 from torchcover.simulation import Rig, Sensor
 from torchcover.simulation.regions_of_interest import DEFAULT_BAND_FRAME
+
+if TYPE_CHECKING:
+    import pandas
 
 # Random choices that keep to the limits, as a control.
 DRAWN = 1000
@@ -37,7 +40,7 @@ HEADINGS = ("sensor", "alone (%)", "lost without it\n(points)", "cost (EUR)")
 MOST_SIZES = 12
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class SensorChoice:
     """What was chosen, and how good that is.
 
@@ -112,7 +115,8 @@ class SensorChoice:
             "the best there is" if len(self.found) == 1 else f"between the best of {', '.join(self.space.objectives)}"
         )
         if self.best.short:
-            short = f"{100 * self.best.short:.2f} points in all"
+            lacks = zip(self.space.asked, (np.array(self.limits.least) - self.best.values).tolist(), strict=True)
+            short = "; ".join(f"{100 * lack:.2f} points of {name}" for name, lack in lacks if lack > SAME)
             kind = f"no choice keeps all that must be kept, and this one lacks the least: {short}"
         elif not self.best.proven:
             gap = f"at most {100 * self.best.gap:.2f} points below" if len(self.found) == 1 else "not proven to be"
@@ -144,6 +148,24 @@ class SensorChoice:
             pictures=self._pictures,
             ego_outline_m=self.space.scenarios[0].ego_box().outline_m,
         )
+
+    def __repr__(self) -> str:
+        return f"SensorChoice in {self.space.name}: {self.sentence}"
+
+    def _repr_html_(self) -> str:
+        return self.report._repr_html_()
+
+    def plot(self) -> Figure:
+        """The first of its pictures, what more sensors are worth: a figure of its own, outside pyplot."""
+        return self.report.plot()
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """The rows of `candidates.csv`.
+
+        Raises:
+            ModuleNotFoundError: pandas is not there.
+        """
+        return self.report.to_dataframe()
 
     def save(self, folder: str | Path, *, files: str | Iterable[str] = FILES) -> list[Path]:
         """Write the files of the command line; see `PlacementReport.save`.
@@ -279,8 +301,7 @@ def choose(
 def seen_by(rig: Rig, instants: CommonInstants) -> tuple[Bools, float]:
     """(T P,) which reference points have a point of a rig within each threshold; the share of rays on the vehicle.
 
-    Raises:
-        ValueError: The rig cannot be mounted.
+    ValueError: the rig cannot be mounted.
     """
     questions, rays, self_hits = instants.questions, 0, 0
     near: list[list[Bools]] = [[] for _ in questions.thresholds_m]
@@ -300,8 +321,7 @@ def worth_of(instants: CommonInstants) -> Float64:
     the square metres in its cell at its instant, which share the cell with its other instants, and that the mean with
     all known cells. For a threshold that is not that of the number it is worth nothing.
 
-    Raises:
-        ValueError: A region and band that no instant shows.
+    ValueError: a region and band that no instant shows.
     """
     questions, frames = instants.questions, list(instants.frames())
     keys = [detection(threshold).key for threshold in questions.thresholds_m]

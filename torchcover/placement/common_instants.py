@@ -355,11 +355,7 @@ class CommonInstants:
 
 
 def _instants_of(simulators: Sequence[Simulator], worlds: int, per_world: int) -> list[HeldInstant]:
-    """The instants of all scenarios, world by world.
-
-    Raises:
-        ValueError: A run through a scenario has fewer instants.
-    """
+    """The instants of all scenarios, world by world. ValueError: a run through a scenario has fewer instants."""
     of_worlds = [
         (scenario, steps)
         for scenario, simulator in enumerate(simulators)

@@ -78,10 +78,7 @@ def misplaced(sensor: Sensor, skin: Skin) -> str | None:
 
 
 def price_eur(cost: Mapping[str, float], sensor: str, model: str | None) -> float:
-    """What a sensor costs, with its mount, by its model or by its name.
-
-    Raises:
-        ValueError: It has no price.
+    """What a sensor costs, with its mount, by its model or by its name. ValueError: it has no price.
 
     Example:
         >>> price_eur({"velodyne_vlp16": 3000.0, "mount": 100.0}, "roof", "velodyne_vlp16")
@@ -101,8 +98,7 @@ def check_prices(
 ) -> None:
     """Whether all that may be chosen has a price, and the cheapest of it is not dearer than a limit, if there is one.
 
-    Raises:
-        ValueError: A price is missing, is one of nothing, or the limit is below the cheapest rig.
+    ValueError: a price is missing, is one of nothing, or the limit is below the cheapest rig.
     """
     if not cost:
         if max_cost_eur is not None:

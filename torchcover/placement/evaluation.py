@@ -1,7 +1,7 @@
 """A candidate of a search, and what became of it."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Self
 
 import numpy as np
@@ -28,7 +28,8 @@ class Evaluation:
         rig: It, while it is asked for.
         prefixes: What it scored after more and more instants; empty if it was not scored.
         infeasible: Why it cannot be; empty if it can.
-        lacks: Of what is required of bodies and in encounters, as shares of it, in all; 0 too where others are better.
+        lacks: What is required of bodies and in encounters -> what it lacks of that, as a share; nothing is known where
+            others are better.
         seconds: What it took.
     """
 
@@ -39,7 +40,7 @@ class Evaluation:
     rig: Rig | None = None
     prefixes: tuple[Prefix, ...] = ()
     infeasible: str = ""
-    lacks: float = 0.0
+    lacks: Mapping[str, float] = field(default_factory=dict)
     seconds: float = 0.0
 
     @property

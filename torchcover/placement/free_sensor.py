@@ -130,8 +130,7 @@ class FreeSensor(Document):
     def made(self, start: Sensor, values: Mapping[str, Value], carrier: Carrier) -> Sensor | None:
         """The sensor that values make of that of the start, by the names of `variables`; None where they leave it out.
 
-        Raises:
-            ValueError: Nothing of the body is at its place.
+        ValueError: nothing of the body is at its place.
         """
         own = {key: values.get(f"{start.name}.{key}", given) for key, given in self._given().items()}
         if own.get("present") is False:
@@ -209,11 +208,7 @@ def pose_of(x_m: float, y_m: float, z_m: float, yaw_deg: float, pitch_deg: float
 
 
 def top_m(carrier: Carrier, mount: Pose) -> float:
-    """How high the vehicle's body is where a sensor is mounted.
-
-    Raises:
-        ValueError: The body is not below it.
-    """
+    """How high the vehicle's body is where a sensor is mounted. ValueError: the body is not below it."""
     below = carrier.skin.seen_from("above", (mount.x_m, mount.y_m))
     if below is None:
         raise ValueError(

@@ -22,8 +22,8 @@ from torchcover.targets import TARGETS, Raster, Target, survey
 
 # Changes that a sentence names.
 MOST_TOLD = 4
-# Of a target around the vehicle.
-WITHIN_M = 3.0
+# Of targets around the vehicle, and how far apart they are put: some hundred places tell two rigs apart.
+WITHIN_M, STEP_M = 3.0, 0.4
 # Usual regions have the same names around any vehicle.
 ANY_OUTLINE_M = np.array([[-2.0, -1.0], [2.0, -1.0], [2.0, 1.0], [-2.0, 1.0]])
 CHANGE_HEADINGS = ("what", "gain on\nfresh worlds", "unit", "p (Holm)", "share of\nthe gain")
@@ -149,8 +149,7 @@ def fresh_test(
 
     A scenario without traffic is the same world for any seed, and is left out.
 
-    Raises:
-        ValueError: The seed of the search; no scenario with traffic; a rig that cannot be mounted in a fresh world.
+    ValueError: the seed of the search; no scenario with traffic; a rig that cannot be mounted in a fresh world.
     """
     first = next(iter(winners))
     others, parts = _others(searched.objectives, failures=max(len(start.sensors), len(winners[first].sensors)) > 1)
@@ -225,7 +224,7 @@ def _of_targets(rig: Rig, start: Rig, searched: CommonInstants) -> dict[str, Dif
         ends = []
         for one in (rig, start):
             empty = with_ego(free_space().model_copy(update={"ego": searched.scenarios[0].ego}), {one.name: one})
-            raster = Raster.around(empty.ego_box(), WITHIN_M)
+            raster = Raster.around(empty.ego_box(), WITHIN_M, STEP_M)
             seen = survey(one.sensing("ideal"), empty, Target.load(target), raster)
             there = seen.free & (seen.distance_m <= WITHIN_M)
             # Every fourth cell along each axis is a block of its own: by them it is known what the raster leaves open.
@@ -262,17 +261,7 @@ def unit_words(unit: str) -> str:
 
 
 def told(gain: FreshGain, *, optimism: bool = False) -> str:
-    """A gain in words, which call it one only where it is told from chance: by Student's t at 95 %.
-
-    Example:
-        >>> from torchcover.coverage.quantity import detection
-        >>> test = Difference(detection(0.4), 0.0132, 0.0024, 0.0081, 0.0183, significant=True, blocks=16, better=16)
-        >>> told(FreshGain("near", "area", test, 0.0148), optimism=True)
-        'gained +1.32  [+0.81, +1.83] points on 16 fresh worlds (t 5.5, better in 16), optimism +0.16'
-        >>> small = test._replace(value=0.002, low=-0.0031, high=0.0071, significant=False)
-        >>> told(FreshGain("near", "area", small, 0.0148))
-        'no gain is shown: +0.20  [-0.31, +0.71] points on 16 fresh worlds (t 0.8, better in 16)'
-    """
+    """A gain in words, which call it one only where it is told from chance: by Student's t at 95 %."""
     test, unit = gain.test, gain.test.quantity.unit
     if math.isnan(test.value):
         return "unknown in the fresh worlds"

@@ -12,10 +12,6 @@ def non_dominated(values: Float64) -> Bools:
     """Which of (candidates, objectives) no other is as good as everywhere and better than somewhere; equal ones stay.
 
     A row with NaN is not among them.
-
-    Example:
-        >>> non_dominated(np.array([[1.0, 0.0], [0.0, 1.0], [0.5, 0.5], [0.4, 0.5]]))
-        array([ True,  True,  True, False])
     """
     known = np.logical_not(np.isnan(values).any(axis=1))
     as_good = np.all(values[:, None] >= values[None], axis=2)
@@ -29,10 +25,6 @@ def hypervolume(values: Float64, reference: Float64) -> float:
 
     What is not above that in all of them adds nothing. By slices along the last objective, whose number is that of the
     candidates: exact, and quick for two or three.
-
-    Example:
-        >>> hypervolume(np.array([[2.0, 1.0], [1.0, 2.0]]), np.zeros(2))
-        3.0
     """
     above = values[(values > reference).all(axis=1)]
     if not len(above):
@@ -56,10 +48,6 @@ def chebyshev(values: Float64, weights: Float64) -> Float64:
 
     `values` (candidates, objectives) are in units that can be compared; weights are positive and add up to 1. Higher is
     better; whatever has the highest is dominated by none.
-
-    Example:
-        >>> chebyshev(np.array([[1.0, 0.0], [0.4, 0.4]]), np.array([0.5, 0.5]))
-        array([0.025, 0.22 ])
     """
     weighted = values * weights
     return np.asarray(weighted.min(axis=1) + AUGMENTATION * weighted.sum(axis=1))

@@ -34,14 +34,10 @@ FAILURE = re.compile(r"(.+)_without_(.+)")
 
 
 class Questions(NamedTuple):
-    """What objectives ask around one vehicle.
+    """What objectives ask around one vehicle, by name, and all regions that are asked about.
 
-    Args:
-        objectives: By name.
-        regions: By name, all that are asked about.
-        grid: Cells of 0.5 m around these, or as `evaluate` has them where a published metric is asked for.
-        max_radius_m: Where radii saturate: as in `evaluate`, or at the largest threshold if no radius is asked for.
-        thresholds_m: Of all detections.
+    The `grid` has cells of 0.5 m around these, or is that of `evaluate` where a published metric is asked for. Radii
+    saturate at `max_radius_m`: as in `evaluate`, or at the largest threshold if no radius is asked for.
     """
 
     objectives: Mapping[str, Objective]
@@ -54,8 +50,7 @@ class Questions(NamedTuple):
     def around(cls, ego_outline_m: Float64, objectives: Mapping[str, Objective]) -> Self:
         """What follows for a vehicle with (K, 2) corners x, y.
 
-        Raises:
-            ValueError: A region or a band that is none; two regions of one name; one that holds no cell centre.
+        ValueError: a region or a band that is none; two regions of one name; one that holds no cell centre.
         """
         usual = {region.name: region for region in RegionsOfInterest().around(ego_outline_m).regions}
         regions: dict[str, Region] = {}
@@ -125,8 +120,7 @@ class Questions(NamedTuple):
     def check(self, rig: Rig, ego: Mesh | None = None) -> None:
         """Refuse objectives that are numbers of no result of such a rig on its ego.
 
-        Raises:
-            ValueError: Such a one; the message has the nearest name.
+        ValueError: such a one; the message has the nearest name.
         """
         asked = self._replace(thresholds_m=self.thresholds_m or (THRESHOLD_M,))
         numbers = asked.numbers_of(rig, ego)

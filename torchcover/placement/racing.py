@@ -36,14 +36,7 @@ def gains(estimate: Estimate, other: Estimate) -> tuple[Float64, Float64]:
 
 
 def racing_order(world_of: Sequence[int] | Int64, seed: int) -> Int64:
-    """(n,) all instants in an order drawn at random, round by round of one instant of each world.
-
-    Example:
-        >>> worlds = np.array([0, 0, 1, 1, 2, 2])
-        >>> order = racing_order(worlds, seed=0)
-        >>> sorted(order.tolist()), sorted(worlds[order[:3]].tolist())
-        ([0, 1, 2, 3, 4, 5], [0, 1, 2])
-    """
+    """(n,) all instants in an order drawn at random, round by round of one instant of each world."""
     generator = np.random.default_rng(seed)
     shuffled = generator.permutation(len(world_of))
     worlds = np.asarray(world_of)[shuffled]

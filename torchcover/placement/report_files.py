@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from matplotlib.figure import Figure
 
@@ -15,11 +15,14 @@ from torchcover.evaluation import sensor_views
 from torchcover.evaluation.progress import held_back
 from torchcover.evaluation.result_page import rig_document, words_of
 from torchcover.evaluation.settings import FILES, wanted_files
-from torchcover.files import Publication, csv_text
+from torchcover.files import Publication, csv_text, data_frame, small_html
 from torchcover.geometry.arrays import Float64
 from torchcover.placement.fresh import finite
 from torchcover.report import Page, PagePicture, PageRig, PageTable, page_html
 from torchcover.simulation import Rig
+
+if TYPE_CHECKING:
+    import pandas
 
 OF_THE_RUN = ("seconds", "torchcover", "space_sha256")
 
@@ -28,17 +31,9 @@ OF_THE_RUN = ("seconds", "torchcover", "space_sha256")
 class PlacementReport:
     """What was found, for its files, its page, and the terminal.
 
-    Args:
-        title: Of the page.
-        sentence: The last line of all.
-        record: What stands in `search.json`; what is unknown may be NaN.
-        settings: The names in it that the page shows.
-        rigs: Those that were found, by the name of their file.
-        shown: Rigs that the page shows, by what they are.
-        tables: On the page; the first is printed, too.
-        rows: Tables by the name of their CSV file, each with its headings.
-        pictures: Makes the stem of the file, what it shows and a figure of its own, one after the other.
-        ego_outline_m: (K, 2) corners x, y of the vehicle.
+    `record` stands in `search.json`, where what is unknown may be NaN; the page shows those `settings` of it, and the
+    rigs that are `shown`, by what they are. `rigs` and `rows`, tables with their headings, are by the names of their
+    files. The first table is printed, too. `pictures` makes the stem of a file, what it shows, and a figure of its own.
     """
 
     title: str
@@ -51,6 +46,18 @@ class PlacementReport:
     rows: Mapping[str, Iterable[Iterable[object]]]
     pictures: Callable[[], Iterator[tuple[str, str, Figure]]]
     ego_outline_m: Float64
+
+    def _repr_html_(self) -> str:
+        return small_html([self.title, self.sentence], self.plot())
+
+    def plot(self) -> Figure:
+        """The first of the pictures."""
+        return next(self.pictures())[2]
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """The first of the tables that are written as CSV."""
+        headings, *rows = next(iter(self.rows.values()))
+        return data_frame(dict(zip(map(str, headings), row, strict=True)) for row in rows)
 
     def save(self, folder: str | Path, *, files: str | Iterable[str] = FILES) -> list[Path]:
         """Write the files of the command line: first what was found, then the pictures and the page.

@@ -4,9 +4,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from torchcover.evaluation.result import sensor_model_words
 from torchcover.evaluation.settings import FILES
@@ -21,6 +22,9 @@ from torchcover.placement.variables import FreeNumber
 from torchcover.report import PageTable, Words, file_stems
 from torchcover.report.wording import UNKNOWN
 from torchcover.simulation import Rig
+
+if TYPE_CHECKING:
+    import pandas
 
 # Of a range: nearer to its end, a number is on it.
 BOUND = 0.005
@@ -53,7 +57,7 @@ class Pick:
         return f"{self.arm}: {self.role}" if self.role else self.arm
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class SearchResult:
     """What `run_search` returns.
 
@@ -113,8 +117,8 @@ class SearchResult:
             yield f"Found in {self._spent(OPTIMISER)}, but not tested, so that no gain is shown: {self.untested}."
         else:
             yield f"{self._told(best, optimism=True)}."
-        if best is not None and (lacks := search.arms[OPTIMISER].lacks[search.arms[OPTIMISER].best]) > 0:
-            yield f"No candidate keeps all that must be kept; this one lacks the least, {lacks:.2%} in all."
+        if best is not None and (lacks := _lacks(search.arms[OPTIMISER], search.arms[OPTIMISER].best)):
+            yield f"No candidate keeps all that must be kept; this one lacks the least: {lacks}."
         if self.test is not None:
             yield f"{self.test.sentence}."
         if best is not None and (bounds := self._on_bounds(best.evaluation)):
@@ -192,6 +196,24 @@ class SearchResult:
             ego_outline_m=search.space.scenarios[0].ego_box().outline_m,
         )
 
+    def __repr__(self) -> str:
+        return f"SearchResult in {self.search.space.name}: {self.sentence}"
+
+    def _repr_html_(self) -> str:
+        return self.report._repr_html_()
+
+    def plot(self) -> Figure:
+        """The first of its pictures, how the search went: a figure of its own, outside pyplot."""
+        return self.report.plot()
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """The rows of `evaluations.csv`.
+
+        Raises:
+            ModuleNotFoundError: pandas is not there.
+        """
+        return self.report.to_dataframe()
+
     def save(self, folder: str | Path, *, files: str | Iterable[str] = FILES) -> list[Path]:
         """Write the files of the command line; see `PlacementReport.save`.
 
@@ -263,7 +285,7 @@ class SearchResult:
             values = one.prefixes[-1].estimate.value.tolist()[: len(names)] if one.prefixes else unknown
             errors = unknown if pair is None else pair[1].tolist()
             each = [value for triple in zip(values, arm.gains[at].tolist(), errors, strict=True) for value in triple]
-            state, why = self._state(one, float(arm.lacks[at]))
+            state, why = self._state(one, _lacks(arm, at))
             hits = one.prefixes[-1].self_hit_share if one.prefixes else None
             own = [one.values.get(name) for name in variables]
             costs = self._cost(one), round(one.seconds, 3)
@@ -280,11 +302,11 @@ class SearchResult:
                 values = [one.values.get(variable) for variable in variables]
                 yield [name, one.number, *arm.gains[at].tolist(), self._cost(one), *values]
 
-    def _state(self, one: Evaluation, lacks: float) -> tuple[str, str]:
+    def _state(self, one: Evaluation, lacks: str) -> tuple[str, str]:
         if one.infeasible:
             return "infeasible", one.infeasible
-        if lacks > 0:
-            return "lacking", f"{lacks:.2%} in all of what must be kept"
+        if lacks:
+            return "lacking", lacks
         if one.instants < len(self.search.instants):
             return "dropped", "two standard errors below the best so far"
         return "complete", ""
@@ -305,6 +327,12 @@ def _arm_record(arm: Arm) -> dict[str, Any]:
         "instants": sum(one.instants for one in others),
         "seconds": round(sum(one.seconds for one in others), 3),
     }
+
+
+def _lacks(arm: Arm, at: int | None) -> str:
+    """What a candidate lacks of what must be kept, the most first; nothing if it keeps all."""
+    each = {} if at is None else arm.lacking(at)
+    return "; ".join(f"{each[name]:.2%} of {name}" for name in sorted(each, key=lambda name: -each[name]))
 
 
 def _value(value: object) -> str:

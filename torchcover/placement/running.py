@@ -91,9 +91,7 @@ class _Journal:
     def restore(self) -> None:
         """Go on from what is there.
 
-        Raises:
-            ValueError: It is of another search.
-            BadFileError: The start scores something else than it did.
+        ValueError: it is of another search. BadFileError: the start scores something else than it did.
         """
         self._journal.restore(Run())
         if not self._search.evaluations:
@@ -142,8 +140,7 @@ class _Budget:
     def check(self) -> None:
         """Find out whether there is time for a candidate of each arm, if there was none before.
 
-        Raises:
-            ValueError: There is not.
+        ValueError: there is not.
         """
         if len(self._search.evaluations) > 1 or self._clock() + 2 * self.one_s <= self.until:
             return

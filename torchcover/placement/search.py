@@ -103,15 +103,12 @@ class PlacementSearch:
             self._note(Evaluation(number, arm.name, unit, values, infeasible=why))
         return None
 
-    def tell(
-        self, candidate: Evaluation, prefixes: tuple[Prefix, ...], *, lacks: float = 0.0, seconds: float = 0.0
-    ) -> None:
+    def tell(self, candidate: Evaluation, prefixes: tuple[Prefix, ...], *, seconds: float = 0.0) -> None:
         """What a candidate scored; with too many rays on the vehicle, it cannot be.
 
         Args:
-            candidate: The last that was asked for.
+            candidate: The last that was asked for, with what it lacks.
             prefixes: From `instants.prefixes`, all or the first of them; of the start all.
-            lacks: Of what is required of bodies and in encounters, which `evaluate` finds out.
             seconds: What it took.
 
         Raises:
@@ -121,7 +118,7 @@ class PlacementSearch:
         wrong = [] if candidate.number else list(self.space.violations(self.space.start))
         wrong += [why] if (why := self._too_many_self_hits(prefixes[-1])) else []
         why = "; ".join(wrong)
-        self._note(replace(candidate, rig=None, prefixes=prefixes, infeasible=why, lacks=lacks, seconds=seconds))
+        self._note(replace(candidate, rig=None, prefixes=prefixes, infeasible=why, seconds=seconds))
 
     def refuse(self, candidate: Evaluation, why: str, *, seconds: float = 0.0) -> None:
         """Say that a candidate cannot be.
@@ -143,8 +140,8 @@ class PlacementSearch:
         except ValueError as error:
             self.refuse(candidate, str(error), seconds=time.perf_counter() - began)
         else:
-            lacks = self._lacks(candidate, prefixes)
-            self.tell(candidate, prefixes, lacks=lacks, seconds=time.perf_counter() - began)
+            candidate = replace(candidate, lacks=self._lacks(candidate, prefixes))
+            self.tell(candidate, prefixes, seconds=time.perf_counter() - began)
 
     def _scored(self, candidate: Evaluation) -> Iterator[Prefix]:
         assert candidate.rig is not None  # while it is asked for
@@ -157,22 +154,25 @@ class PlacementSearch:
             if candidate.number and self.arms[candidate.arm].is_worse(known, ERRORS_BELOW):
                 return
 
-    def _lacks(self, candidate: Evaluation, prefixes: Sequence[Prefix]) -> float:
+    def _lacks(self, candidate: Evaluation, prefixes: Sequence[Prefix]) -> dict[str, float]:
         """Of what bodies and encounters require; looked at where it decides, as it takes as long as the rest.
 
         Of each bound that is not kept, the mean of the share of places that do not keep it and of what the worst lacks.
         """
         required = self.space.to_check
         if required is None or (candidate.number and not self.arms[candidate.arm].may_lead(prefixes)):
-            return 0.0
+            return {}
         assert candidate.rig is not None  # while it is asked for
         ego = self.space.scenarios[0].ego
         world = required.scenario or free_space().model_copy(update={"ego": ego})
         (found,) = check(candidate.rig, required, world, sensor_model=self.plan.sensor_model).verdicts.values()
-        broken = [one for one in found if one.state != "kept"]
-        worst = (-one.margin / (abs(one.bound.value) or 1.0) for one in broken)
-        at_worst = sum(1.0 if math.isnan(one) else max(one, 0.0) for one in worst)
-        return float(at_worst + sum((one.failed + one.unknown) / max(one.count, 1) for one in broken)) / 2
+        lacks = {}
+        for one in found:
+            worst = 1.0 if math.isnan(one.margin) else max(-one.margin / (abs(one.bound.value) or 1.0), 0.0)
+            if one.state != "kept":
+                share = (one.failed + one.unknown) / max(one.count, 1)
+                lacks[f"{one.requirement}, {one.bound.words}"] = (worst + share) / 2
+        return lacks
 
     def state_dict(self) -> dict[str, Any]:
         """All that a checkpoint keeps: the evaluations."""

@@ -91,14 +91,7 @@ class Candidates:
 
     @classmethod
     def grouped(cls, worth: ArrayLike, seen: Sequence[Bools], always: Bools) -> Self:
-        """Group P points by what each is worth, (Q, P), which candidates see it, and whether it is seen anyway.
-
-        Example:
-            >>> seen = [np.array(each, dtype=bool) for each in ([1, 1, 0, 0], [1, 1, 1, 0])]
-            >>> two = Candidates.grouped([[0.1, 0.2, 0.3, 0.4]], seen, np.zeros(4, dtype=bool))
-            >>> two.sees.astype(int).tolist(), two.worth.round(3).tolist(), two.values([0, 1]).round(3).tolist()
-            ([[0, 1], [1, 1]], [[0.3, 0.3]], [0.6])
-        """
+        """Group P points by what each is worth, (Q, P), which candidates see it, and whether it is seen anyway."""
         worth = np.asarray(worth, dtype=np.float64)
         rows = np.packbits(np.stack(seen), axis=0)  # eight candidates a byte
         counts = ~always & rows.any(axis=0) & worth.any(axis=0)
@@ -121,12 +114,6 @@ def best(candidates: Candidates, limits: Limits, weights: Sequence[float] | Floa
     """The best subset, and of equal ones the cheapest. Where none is worth `least`, what lacks the least in all.
 
     `weights` are of the first numbers of `Candidates.worth`, whose sum is made as large as it gets.
-
-    Example:
-        >>> seen = [np.array(each, dtype=bool) for each in ([1, 1, 0, 0], [0, 1, 1, 1], [1, 0, 0, 0])]
-        >>> three = Candidates.grouped([[0.1, 0.2, 0.3, 0.4]], seen, np.zeros(4, dtype=bool))
-        >>> best(three, Limits(2, [500.0, 900.0, 100.0])).chosen
-        (1, 2)
     """
     goal = _Goal.of(candidates, limits, weights)
     chosen, gap = _searched(goal)

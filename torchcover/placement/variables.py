@@ -9,12 +9,7 @@ DECIMALS = 6
 
 
 class FreeNumber(NamedTuple):
-    """A number between two others, under the name of its sensor and key, as "roof.pitch_deg".
-
-    Example:
-        >>> FreeNumber("roof.pitch_deg", -10.0, 15.0).at(0.5)
-        2.5
-    """
+    """A number between two others, under the name of its sensor and key, as "roof.pitch_deg"."""
 
     name: str
     low: float
@@ -23,18 +18,13 @@ class FreeNumber(NamedTuple):
     def at(self, u: float) -> float:
         """The value at a share from 0 to 1 of the way from the lowest to the highest.
 
-        Raises:
-            ValueError: The share is not from 0 to 1.
+        ValueError: the share is not from 0 to 1.
         """
         _check_share(self.name, u)
         return min(max(round(self.low + u * (self.high - self.low), DECIMALS), self.low), self.high)
 
     def unit(self, value: Value) -> float:
-        """The share of the way at which a value lies.
-
-        Raises:
-            ValueError: It lies outside.
-        """
+        """The share of the way at which a value lies. ValueError: it lies outside."""
         if not self.holds(value):
             raise ValueError(f"{self.name}: a number from {self.low:g} to {self.high:g} is needed; got {value!r}")
         return (float(value) - self.low) / (self.high - self.low)
@@ -45,32 +35,18 @@ class FreeNumber(NamedTuple):
 
 
 class FreeChoice(NamedTuple):
-    """One of several options, between which there is nothing: each has an equal part of the way from 0 to 1.
-
-    Example:
-        >>> model = FreeChoice("roof.model", ("a", "b"))
-        >>> model.at(0.49), model.at(0.5), model.unit("b")
-        ('a', 'b', 0.75)
-    """
+    """One of several options, between which there is nothing: each has an equal part of the way from 0 to 1."""
 
     name: str
     options: tuple[Value, ...]
 
     def at(self, u: float) -> Value:
-        """The option in whose part a share from 0 to 1 lies.
-
-        Raises:
-            ValueError: The share is not from 0 to 1.
-        """
+        """The option in whose part a share from 0 to 1 lies. ValueError: the share is not from 0 to 1."""
         _check_share(self.name, u)
         return self.options[min(int(u * len(self.options)), len(self.options) - 1)]
 
     def unit(self, value: Value) -> float:
-        """The middle of the part of an option.
-
-        Raises:
-            ValueError: It is none of them.
-        """
+        """The middle of the part of an option. ValueError: it is none of them."""
         if not self.holds(value):
             raise ValueError(f"{self.name}: one of {', '.join(map(str, self.options))} is needed; got {value!r}")
         return (self.options.index(value) + 0.5) / len(self.options)

@@ -41,13 +41,9 @@ class Tau(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MetricComparison:
-    """What metrics of others say of the rigs of a run, compared with torchcover's own numbers.
+    """What metrics of others say of the rigs of a run, compared with torchcover's own numbers of regions.
 
-    Args:
-        rigs: Their names.
-        rankings: The metrics' numbers.
-        own: torchcover's numbers of regions that they are held against.
-        left_out: Name of a metric that could not be made -> why.
+    `left_out` says of a metric that could not be made why.
     """
 
     rigs: tuple[str, ...]

@@ -92,9 +92,6 @@ class FrameMetric(MergeableMetric):
             val: What `compute` or `forward` returned; the numbers so far if not given.
             ax: Where to; a new figure of pyplot's if not given.
 
-        Returns:
-            The figure and the axes.
-
         Raises:
             TypeError: `val` holds anything else.
         """

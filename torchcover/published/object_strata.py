@@ -17,12 +17,8 @@ class ObjectStrata:
 
     An object's range is the distance of its centre from the vehicle's origin, over ground.
 
-    Args:
-        categories: Names; objects of others are among all of them only.
-        range_borders_m: Ascending, positive; what is farther than the last does not count.
-
-    Raises:
-        ValueError: A category that is named twice, borders out of order or none.
+    `categories`: names; objects of others are among all of them only; `range_borders_m`: ascending, positive; what is
+    farther than the last does not count. ValueError: a category that is named twice, borders out of order or none.
 
     Example:
         >>> ObjectStrata(("car",), (20.0, 40.0)).names

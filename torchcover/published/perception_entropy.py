@@ -25,10 +25,6 @@ def standard_deviation(measurements: Tensor, kind: str) -> Tensor:
 
     AP is kept within [0.001, 0.999], as GO4ROBO does; with the constants of LiDARs it is 0.999 from 10 points on. No
     measurement is as bad as can be.
-
-    Example:
-        >>> standard_deviation(torch.tensor([0, 1, 100]), "lidar")
-        tensor([9.9900e+02, 5.1745e-01, 1.0010e-03], dtype=torch.float64)
     """
     a, b = CONSTANTS[kind]
     precision = (a * measurements.double().log() + b).clamp(*PRECISIONS)
@@ -41,14 +37,7 @@ def late_fusion(sigmas: Sequence[Tensor]) -> Tensor:
 
 
 def entropy(sigma: Tensor, *, bounded: bool = False) -> Tensor:
-    """Nats of a Gaussian in the plane: 2 ln sigma + 1 + ln 2 pi; bounded: 2 ln(sigma + 1) + ln 2 pi.
-
-    Example:
-        >>> of_lidar = standard_deviation(torch.tensor(5), "lidar")
-        >>> of_camera = standard_deviation(torch.tensor(1000), "camera")
-        >>> round(float(entropy(late_fusion([of_lidar, of_camera]))), 6)
-        -1.653611
-    """
+    """Nats of a Gaussian in the plane: 2 ln sigma + 1 + ln 2 pi; bounded: 2 ln(sigma + 1) + ln 2 pi."""
     if bounded:
         return 2 * (sigma + 1).log() + math.log(2 * math.pi)
     return 2 * sigma.log() + 1 + math.log(2 * math.pi)

@@ -108,12 +108,7 @@ def drawn_again(estimate: Estimate, seed: int) -> Float64 | None:
 
 
 def midranks(values: ArrayLike) -> Float64:
-    """(..., n) ranks from 1, the smallest, on; equal values share the mean of theirs, and what is NaN stays so.
-
-    Example:
-        >>> midranks([3.0, float("nan"), 1.0, 3.0]).tolist()
-        [2.5, nan, 1.0, 2.5]
-    """
+    """(..., n) ranks from 1, the smallest, on; equal values share the mean of theirs, and what is NaN stays so."""
     own = np.asarray(values, dtype=np.float64)
     smaller = (own[..., None, :] < own[..., :, None]).sum(axis=-1)
     equal = (own[..., None, :] == own[..., :, None]).sum(axis=-1)
@@ -127,16 +122,8 @@ def kendall_tau_b(first: ArrayLike, second: ArrayLike) -> Float64:
 
     with C concordant, D discordant and P all pairs, T_i of them equal in the i-th (Kendall 1945, Biometrika 33, 239).
 
-    Args:
-        first: (..., n), NaN where unknown: what is unknown in one of the two is in no pair.
-        second: (..., n), likewise; the two broadcast.
-
-    Returns:
-        (...); NaN for fewer than three that are known, or if all of one are equal.
-
-    Example:
-        >>> float(kendall_tau_b([1, 2, 3, 4], [1, 2, 4, 3]))
-        0.666...
+    `first`: (..., n), NaN where unknown: what is unknown in one of the two is in no pair; `second`: (..., n), likewise;
+    the two broadcast. Returns (...); NaN for fewer than three that are known, or if all of one are equal.
     """
     one, other = _known_in_both(first, second)
     signs = [_signs(each[..., :, None], each[..., None, :]) for each in (one, other)]
@@ -146,12 +133,7 @@ def kendall_tau_b(first: ArrayLike, second: ArrayLike) -> Float64:
 
 
 def spearman(first: ArrayLike, second: ArrayLike) -> Float64:
-    """Spearman's rank correlation: Pearson's of the midranks, so that ties are right; else as `kendall_tau_b`.
-
-    Example:
-        >>> float(spearman([1, 2, 3, 4], [10, 20, 40, 30]))
-        0.8
-    """
+    """Spearman's rank correlation: Pearson's of the midranks, so that ties are right; else as `kendall_tau_b`."""
     one, other = (midranks(values) for values in _known_in_both(first, second))
     count = np.maximum((~np.isnan(one)).sum(axis=-1, keepdims=True), 1)
     one, other = (np.nan_to_num(ranks - np.nansum(ranks, axis=-1, keepdims=True) / count) for ranks in (one, other))
@@ -176,10 +158,6 @@ def permutation_p(first: ArrayLike, second: ArrayLike) -> float:
 
     It is the share of orders of the second with as strong a one, NaN if none is known. With several first series, (k,
     n), it is that of the best of them: of k metrics that were looked at, one is always good.
-
-    Example:
-        >>> permutation_p([1, 2, 3, 4], [1, 2, 3, 4])           # 2 of 24 orders
-        0.0833...
     """
     series, target = np.atleast_2d(np.asarray(first, dtype=np.float64)), np.asarray(second, dtype=np.float64)
     found = np.abs([spearman(one, target) for one in series])
@@ -195,10 +173,6 @@ def strongest_by_chance(first: ArrayLike, second: ArrayLike) -> Float64:
     """(P,) the strongest rank correlation of (k, n) series, of either sign, to each of many orders of the second.
 
     From 0 to 1: what the best of k metrics that mean nothing reaches.
-
-    Example:
-        >>> float(strongest_by_chance([1, 2, 3], [1, 2, 3]).mean())             # of six orders two have 1, four 0.5
-        0.666...
     """
     target, numbers = np.asarray(second, dtype=np.float64), orders(np.size(second))
     best = np.zeros(len(numbers))

@@ -17,8 +17,7 @@ REGION: BoundingBox = BoundingBox((-30.0, -20.0, -0.5), (30.0, 20.0, 3.5))
 def checked_grid(region: BoundingBox, voxel_m: float, bytes_a_voxel: int) -> VoxelGrid:
     """The voxels of a region, if this machine has the memory for what is kept of each.
 
-    Raises:
-        ValueError: It has not; or as `VoxelGrid`.
+    ValueError: it has not; or as `VoxelGrid`.
     """
     grid = VoxelGrid(region, float(voxel_m))
     what = f"{grid.voxels:,} voxels of {voxel_m:g} m in {' x '.join(f'{size:g}' for size in region.size_m)} m"
@@ -29,8 +28,7 @@ def checked_grid(region: BoundingBox, voxel_m: float, bytes_a_voxel: int) -> Vox
 def check_sensors(sensors: Sequence[Sensor]) -> None:
     """Refuse a rig without sensors: it would have no rays, which some metrics reward.
 
-    Raises:
-        ValueError: There is no sensor.
+    ValueError: there is no sensor.
     """
     if not sensors:
         raise ValueError("sensors: the sensors of the rig, with their mounts and rays, are needed; got none")
@@ -60,8 +58,7 @@ def crossed_on_the_way(sensors: Sequence[Sensor], frame: Frame, rig: str | None,
     A ray that gave no point is not known to a frame, and crosses nothing: what it passed through the open sky, or with
     its drop-out, is left out.
 
-    Raises:
-        ValueError: Which points are of which sensor is unknown, or a sensor is none of these.
+    ValueError: which points are of which sensor is unknown, or a sensor is none of these.
     """
     mounts = {sensor.name: sensor.mount.matrix()[:3, 3] for sensor in sensors}
     crossed = np.zeros(grid.shape, dtype=bool)

@@ -122,11 +122,7 @@ class Sights:
 
 
 def rig_of(frame: Frame, rig: str | None) -> str:
-    """The name of the rig; of the only one if none is given.
-
-    Raises:
-        ValueError: There is no such rig, or there are several.
-    """
+    """The name of the rig; of the only one if none is given. ValueError: there is no such rig, or there are several."""
     frame.cloud_of(rig)
     return next(iter(frame.clouds)) if rig is None else rig
 

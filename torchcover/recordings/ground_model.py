@@ -62,13 +62,6 @@ class GroundModel(NamedTuple):
         lower_m: (2,) where it may begin, in the frame of the points that it was made of.
         field: The heights, from there.
         known: (SIDE^2,) squares, row after row along y, in which there is a height; they begin `REACH` before that.
-
-    Example:
-        >>> x, y = np.meshgrid(np.arange(-20, 20, 0.3), np.arange(-20, 20, 0.3))
-        >>> road_m = np.stack([x.ravel(), y.ravel(), 0.05 * x.ravel() - 1.7], axis=1)
-        >>> ground = GroundModel.below([low_surfaces(road_m, np.zeros(3))], np.zeros(3))
-        >>> ground.heights_m(np.array([[10.0, 0.0, 0.3], [50.0, 0.0, 1.0]])).round(2)
-        array([1.5, nan])
     """
 
     lower_m: Float64
@@ -79,12 +72,8 @@ class GroundModel(NamedTuple):
     def below(cls, surfaces: Sequence[Float64], place_m: Float64) -> "GroundModel | None":
         """The ground that sweeps have seen around a place.
 
-        Args:
-            surfaces: `low_surfaces` of each sweep.
-            place_m: (3,) where the vehicle is.
-
-        Returns:
-            It; None where none of it is near the vehicle.
+        `surfaces`: `low_surfaces` of each sweep; `place_m`: (3,) where the vehicle is. Returns it; None where none of
+        it is near the vehicle.
         """
         low, above_m = _columns(np.concatenate([np.empty((0, 4)), *surfaces]), place_m)
         if not len(low):

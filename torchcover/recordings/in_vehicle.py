@@ -36,17 +36,8 @@ class InVehicle(NamedTuple):
 def in_vehicle(scan: Scan, body: BoundingBox | None = None) -> InVehicle:
     """Move a scan into the vehicle frame; leave out what no surface of the world has returned.
 
-    Args:
-        scan: What was stored.
-        body: The vehicle itself: points in it are its own. None: its size is unknown.
-
-    Raises:
-        ValueError: A coordinate beyond 1e5 m, as in a world frame.
-
-    Example:
-        >>> scan = Scan(np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0], [np.nan, 0.0, 0.0]]), None, "a.npy")
-        >>> in_vehicle(scan)
-        InVehicle(points_m=array([[5., 0., 0.]], dtype=float32), dropped=Counter({...}), weights=None, heights_m=None)
+    `scan`: what was stored; `body`: the vehicle itself: points in it are its own. None: its size is unknown.
+    ValueError: a coordinate beyond 1e5 m, as in a world frame.
     """
     points_m, weights, heights_m = scan.points_m, scan.weights, scan.heights_m
     finite, returned = _finite(points_m), _returned(points_m)

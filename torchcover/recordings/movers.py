@@ -31,9 +31,7 @@ WITHIN_M = 165.0
 class Moved(NamedTuple):
     """Something that moves.
 
-    Args:
-        points_m: (N, 3) where it is at the instant.
-        velocity_mps: (2,) along x and y of the frame of the points.
+    `points_m`: (N, 3) where it is at the instant; `velocity_mps`: (2,) along x and y of the frame of the points.
     """
 
     points_m: Float64
@@ -43,16 +41,8 @@ class Moved(NamedTuple):
 def movers(scans_m: Sequence[Float64], apart_s: Float64) -> list[Moved]:
     """What moves, or has stood for a moment only.
 
-    Args:
-        scans_m: (N, 3) points of each scan that belong to nothing that stands.
-        apart_s: (S,) when each scan was, from the instant on.
-
-    Example:
-        >>> side_m = np.stack([0.2 * np.arange(20), np.zeros(20), np.ones(20)], axis=1)
-        >>> times_s = np.array([-0.2, -0.1, 0.1, 0.2])
-        >>> car, = movers([side_m + [10.0 * time_s, 0.0, 0.0] for time_s in times_s], times_s)
-        >>> bool(np.abs(car.velocity_mps - [10.0, 0.0]).max() < 0.3), len(car.points_m)
-        (True, 80)
+    `scans_m`: (N, 3) points of each scan that belong to nothing that stands; `apart_s`: (S,) when each scan was, from
+    the instant on.
     """
     found: list[Moved] = []
     if sum(map(len, scans_m)) < FEWEST or len(scans_m) < 2:

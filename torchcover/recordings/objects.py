@@ -84,9 +84,7 @@ class Ego(NamedTuple):
 class RecordedObjects(NamedTuple):
     """Who was recorded, at times of one clock.
 
-    Args:
-        tracks: Everybody but its egos.
-        egos: Its own; the first is meant if none is named.
+    `tracks`: everybody but its egos; `egos`: its own; the first is meant if none is named.
     """
 
     tracks: tuple[Track, ...]

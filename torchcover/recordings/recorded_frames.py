@@ -194,12 +194,7 @@ class RecordedFrames(FrameDataset):
         return len(self.recording.frames)
 
     def __getitem__(self, index: int) -> Frame:
-        """Read one frame.
-
-        Raises:
-            IndexError: There are fewer frames.
-            BadFrameError: One of its files cannot be used.
-        """
+        """Read one frame. IndexError: there are fewer frames. BadFrameError: one of its files cannot be used."""
         position = operator.index(index)
         if not -len(self) <= position < len(self):
             raise IndexError(f"frame {position} of {len(self)} in {self.recording.path}")

@@ -51,8 +51,7 @@ class Scan:
 def check_times(times_s: NDArray[np.float64], count: int, source: str) -> NDArray[np.float64]:
     """Return the times of instants in seconds, if they can be those.
 
-    Raises:
-        ValueError: Another number of them, or two that do not follow each other.
+    ValueError: another number of them, or two that do not follow each other.
     """
     if len(times_s) != count:
         raise ValueError(f"{source}: {len(times_s):,} times for {count:,} scans; one each is needed")
@@ -159,10 +158,8 @@ class Layout:
 class SensorCalibrations(NamedTuple):
     """Mounts of LiDARs, and cameras.
 
-    Args:
-        source: Where it is from, for people.
-        mounts: Name of a LiDAR -> (4, 4) `vehicle_T_lidar`, where its scans do not say it.
-        cameras: With their places in the vehicle frame.
+    `source`: where it is from, for people; `mounts`: name of a LiDAR -> (4, 4) `vehicle_T_lidar`, where its scans do
+    not say it; `cameras`: with their places in the vehicle frame.
     """
 
     source: str
@@ -175,24 +172,15 @@ class CalibratedRecording(Protocol):
     """A recording that knows more of its sensors."""
 
     def calibrations(self) -> SensorCalibrations:
-        """Read them.
-
-        Raises:
-            OSError: They are not there.
-            ValueError: They are not what they are meant to be.
-        """
+        """Read them. OSError: they are not there. ValueError: they are not what they are meant to be."""
         ...
 
 
 def whole_recording(folder: Path) -> dict[str, Any] | None:
     """What `recording.json` says of a recording that torchcover has written: `frames`, by name, and `content`.
 
-    Returns:
-        It; None where another tool has written the recording, or there is none.
-
-    Raises:
-        ValueError: Its files are not in their places, and may not be put there.
-        BadFileError: A `recording.json` that cannot be read.
+    Returns it; None where another tool has written the recording, or there is none. ValueError: its files are not in
+    their places, and may not be put there. BadFileError: a `recording.json` that cannot be read.
     """
     marker = folder / RECORDING
     if settled(marker) != marker:

@@ -6,8 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchcover.detection.box_layouts import upright_rows
-from torchcover.detection.boxes import Boxes
+from torchcover.detection.boxes import Boxes, upright_rows
 from torchcover.geometry.rigid import Matrix, rigid, transform
 
 # A key frame of a label that is nearer than this is that of the instant.
@@ -15,15 +14,7 @@ SAME_TIME_S = 1e-3
 
 
 class Seen(NamedTuple):
-    """An object at an instant.
-
-    Args:
-        name: Its id.
-        time_s: When.
-        world_T_box: (4, 4) where: its centre, x along its length.
-        size_m: Length, width, height.
-        category: What it is.
-    """
+    """An object at an instant: `world_T_box` is its centre, x along its length; length, width, height are its size."""
 
     name: str
     time_s: float
@@ -43,9 +34,8 @@ def by_name(seen: Iterable[Seen]) -> dict[str, list[Seen]]:
 class SeenObjects:
     """Objects at any time; between two of theirs they move evenly.
 
-    Args:
-        seen: When and where they were seen, in any order.
-        longest_gap_s: Where one was unseen for longer, it is unknown where it was.
+    `seen`: when and where they were seen, in any order; `longest_gap_s`: where one was unseen for longer, it is unknown
+    where it was.
     """
 
     def __init__(self, seen: Sequence[Seen], longest_gap_s: float = 1.0) -> None:

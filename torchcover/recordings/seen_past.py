@@ -29,13 +29,9 @@ BEYOND_M, BEYOND = 0.4, 0.12
 
 
 class RangeImage(NamedTuple):
-    """How far a scan has seen.
+    """How far a scan has seen: (rows, columns) float32 ranges up to which directions are free; 0 without return.
 
-    Args:
-        free_m: (rows, columns) float32 range up to which a direction is free; 0 where nothing came back.
-        first_row: How many rows there are below, which nothing hit.
-        sensor_T_local: (4, 4) from the frame in which places are given.
-        farthest_m: The largest of `free_m`.
+    Below are `first_row` rows that nothing hit; `sensor_T_local` is from the frame in which places are given.
     """
 
     free_m: NDArray[np.float32]
@@ -45,15 +41,7 @@ class RangeImage(NamedTuple):
 
     @classmethod
     def of(cls, points_m: NDArray[np.floating], sensor_T_local: Matrix) -> "RangeImage":
-        """Of the (N, 3) points that a scan has returned, in the frame of its sensor.
-
-        Example:
-            >>> wall_m = np.stack([np.full(900, 20.0), *np.indices((30, 30)).reshape(2, -1) * 0.05], axis=1)
-            >>> votes = np.zeros(2, np.int16)
-            >>> RangeImage.of(wall_m, np.eye(4)).vote(np.array([[10.0, 0.3, 0.3], [19.0, 0.6, 0.6]]), votes)
-            >>> votes.tolist()
-            [1, 0]
-        """
+        """Of the (N, 3) points that a scan has returned, in the frame of its sensor."""
         row, column, range_m = _bins(points_m.astype(np.float64), 1)
         if not len(row):
             return cls(np.zeros((0, COLUMNS), np.float32), 0, sensor_T_local, 0.0)

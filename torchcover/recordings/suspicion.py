@@ -141,13 +141,7 @@ def ground_is_elsewhere(clouds: Mapping[str, Sequence[NDArray[np.float32]]]) -> 
 
 
 def ground_height_m(points_m: NDArray[np.floating]) -> float | None:
-    """The height of the ground beneath the vehicle; None where none is seen near it.
-
-    Example:
-        >>> x, y = np.meshgrid(np.arange(-20, 20, 0.5), np.arange(-20, 20, 0.5))
-        >>> round(ground_height_m(np.stack([x.ravel(), y.ravel(), 0.05 * x.ravel() - 1.7], axis=1)), 1)
-        -1.7
-    """
+    """The height of the ground beneath the vehicle; None where none is seen near it."""
     near_m = points_m[(np.abs(points_m) < GROUND_WITHIN_M).all(axis=1)].astype(np.float64)
     origin_m = np.zeros((1, 3))
     ground = GroundModel.below([low_surfaces(near_m, origin_m[0])], origin_m[0])

@@ -100,10 +100,7 @@ class Sweeps:
     def instants(self, recording: Recording, index: int, margin_s: float = 0.0) -> list[int]:
         """The instants of the window, the nearest in time first: the one alone where times or poses are unknown.
 
-        Args:
-            recording: The recording.
-            index: The instant.
-            margin_s: So much before and after the window, too.
+        `recording`: the recording; `index`: the instant; `margin_s`: so much before and after the window, too.
         """
         if not self.window_s or recording.times_s is None or recording.world_T_vehicle(index) is None:
             return [index]

@@ -24,21 +24,9 @@ NEIGHBOURS, WIDEST_M = 8, 3.0
 
 
 def seen_share(points_m: Float64, body: BoundingBox, voxel_m: float, seed: int) -> Float64:
-    """(N,) share of places around the vehicle from which each of (N, 3) points is seen.
+    """(N,) share of places around the vehicle, which hides what is behind it, that see each of (N, 3) points.
 
-    Args:
-        points_m: In the vehicle frame.
-        body: The vehicle, which hides what is behind it.
-        voxel_m: How near to each other points are where they are near.
-        seed: Of the places.
-
-    Example:
-        >>> y_m, z_m = np.indices((120, 80)).reshape(2, -1) * 0.05
-        >>> wall_m = np.stack([np.full(9600, 5.0), y_m - 3.0, z_m], axis=1)
-        >>> behind_m = np.array([[9.0, 1.0, 1.0], [9.0, 9.0, 1.0]])
-        >>> car = BoundingBox((-2.4, -0.9, 0.0), (2.4, 0.9, 1.6))
-        >>> seen_share(np.concatenate([wall_m, behind_m]), car, 0.1, 0)[-2:].tolist()
-        [0.0, 1.0]
+    Where the points are near each other, it is by `voxel_m`. They are in the vehicle frame; the seed is of the places.
     """
     seen, corners_m = np.zeros(len(points_m)), np.array([body.lower_m, body.upper_m])
     reach_m = np.append(np.inf, FILLED * voxel_m / (BINS_RAD[1:] / 2))

@@ -41,14 +41,10 @@ class Row:
 
 
 class Conditions(NamedTuple):
-    """What the numbers of one rig hold under.
+    """What the numbers of one rig hold under: what happened, as in `Coverage.counts`, and how many points there were.
 
-    Args:
-        counts: What happened in the run, as in `Coverage.counts`.
-        blocks: How many blocks of contiguous steps the errors come from; None without errors.
-        steps_per_block: Steps of a full one.
-        points: Reference points within the grid.
-        fewest: Of a mixture with too few blocks, the kind of world that has the fewest.
+    Errors come from so many blocks of contiguous steps, None without errors; of a mixture with too few, `fewest` is the
+    kind of world that has the fewest.
     """
 
     counts: Mapping[str, int]

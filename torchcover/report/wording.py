@@ -10,15 +10,9 @@ from torchcover.estimation import ROUND_OFF, Difference, Number, Quantity, Unit
 
 
 class ShownUnit(NamedTuple):
-    """How numbers of a unit are shown.
+    """How numbers of a unit, and differences of two, are shown: `factor` times what they are, up to the `highest`.
 
-    Args:
-        name: Behind a number.
-        difference_name: Behind a difference of two of them.
-        factor: From the unit of the quantity to what is shown.
-        decimals: Of a number without an error; None for four digits.
-        max_decimals: More than anybody can use, however small the error.
-        highest: The largest number there is, as it is shown.
+    Without an error a number has so many decimals, four digits for None, and never more than anybody can use.
     """
 
     name: str
@@ -51,10 +45,8 @@ def shown_unit(unit: Unit) -> ShownUnit:
 class Rounded(NamedTuple):
     """A number as a reader sees it.
 
-    Args:
-        value: In the unit that is shown: metres or percent.
-        decimals: How many are shown.
-        relation: "<" or ">" for a number that is beyond `value`, but would be rounded to an end of the scale.
+    `value`: in the unit that is shown: metres or percent; `decimals`: how many are shown; `relation`: "<" or ">" for a
+    number that is beyond `value`, but would be rounded to an end of the scale.
     """
 
     value: float
@@ -65,14 +57,7 @@ class Rounded(NamedTuple):
 def rounded(number: float, error: float, unit: Unit) -> Rounded:
     """Round a number: to the two digits of its error, or to the usual decimals if it has none.
 
-    Args:
-        number: In its unit; not NaN.
-        error: Its standard error; NaN for none.
-        unit: That of its quantity.
-
-    Example:
-        >>> rounded(0.34127, 0.0123, "m"), rounded(0.9999, float("nan"), "share")
-        (Rounded(value=0.341, decimals=3, relation=''), Rounded(value=99.9, decimals=1, relation='>'))
+    `number`: in its unit; not NaN; `error`: its standard error; NaN for none; `unit`: that of its quantity.
     """
     shown = shown_unit(unit)
     value = shown.factor * number
@@ -88,9 +73,8 @@ def rounded(number: float, error: float, unit: Unit) -> Rounded:
 def rounded_error(error: float, max_decimals: int) -> Rounded:
     """Round an error > 0 to two digits.
 
-    Args:
-        error: In the unit that is shown.
-        max_decimals: No more decimals than these; what they would round to nothing is less than the least.
+    `error`: in the unit that is shown; `max_decimals`: no more decimals than these; what they would round to nothing is
+    less than the least.
     """
     least = 10.0**-max_decimals
     if error < least / 2:
@@ -172,21 +156,8 @@ def number_words(number: Number) -> str:
 def value_words(value: float, unit: Unit) -> str:
     """A number alone, without the unit.
 
-    Args:
-        value: In its unit.
-        unit: Its unit.
-
-    Returns:
-        A length with two decimals, a share in percent with one, what has another unit with four digits. A share is
-        never rounded to 0 or 100. "unknown" for NaN, "infinite" for infinity.
-
-    Example:
-        >>> [value_words(length, "m") for length in (0.126, 12.0, float("inf"), float("nan"))]
-        ['0.13', '12.00', 'infinite', 'unknown']
-        >>> value_words(0.49812, "share"), value_words(1.0, "share")
-        ('49.8', '100')
-        >>> value_words(-0.0123456, "nats"), value_words(12345.6, "points")
-        ('-0.01235', '12346')
+    `value`: in its unit; `unit`: its unit. Returns a length with two decimals, a share in percent with one, what has
+    another unit with four digits. A share is never rounded to 0 or 100. "unknown" for NaN, "infinite" for infinity.
     """
     if math.isnan(value):
         return UNKNOWN
@@ -204,12 +175,7 @@ def percent(share: float) -> str:
 
 
 def square_metres(m2: float) -> str:
-    """An area with one decimal that rounds nothing to none.
-
-    Example:
-        >>> [square_metres(m2) for m2 in (0.0, 0.01, 12.34, 1234.56, float("nan"))]
-        ['0', '<0.1', '12.3', '1,234.6', 'unknown']
-    """
+    """An area with one decimal that rounds nothing to none."""
     if math.isnan(m2):
         return UNKNOWN
     if m2 < 0.05:

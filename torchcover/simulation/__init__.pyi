@@ -42,6 +42,8 @@ from .simulated_frames import reference_of_objects as reference_of_objects
 from .simulator import Observation as Observation
 from .simulator import Simulator as Simulator
 from .surface_reference import SurfaceReference as SurfaceReference
+from .urdf import Robot as Robot
+from .urdf import read_robot as read_robot
 from .weather import Weather as Weather
 from .world import Label as Label
 from .writing import write_recording as write_recording

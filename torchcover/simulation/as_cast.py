@@ -60,8 +60,7 @@ class _Scan(NamedTuple):
         tick, of_point = np.unique(np.rint(offsets_s * (1e9 / TICK_NS)).astype(np.int64), return_inverse=True)
         world_T_then = self.way.at(tick * TICK_NS, "the LiDAR")
         then_T_now = (np.linalg.inv(world_T_then) @ self.way.at(np.zeros(1, np.int64), "the LiDAR"))[of_point]
-        moved: Matrix = np.einsum("nij,nj->ni", then_T_now[:, :3, :3], points_m) + then_T_now[:, :3, 3]
-        return moved
+        return np.asarray(np.einsum("nij,nj->ni", then_T_now[:, :3, :3], points_m) + then_T_now[:, :3, 3])
 
     def undone(self, turn: Turn, points_m: Matrix) -> Matrix:
         """The same, by what the turn says of their directions then."""

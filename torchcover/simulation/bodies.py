@@ -184,12 +184,7 @@ class Vehicle(BuiltIn):
 
 
 def mount_regions_of(shape: Shape | None) -> dict[str, MountRegion]:
-    """Where sensors can be mounted on a body: on a vehicle that says it.
-
-    Example:
-        >>> "roof" in mount_regions_of(VehicleShape(type="vehicle", vehicle="suv"))
-        True
-    """
+    """Where sensors can be mounted on a body: on a vehicle that says it."""
     if not isinstance(shape, VehicleShape):
         return {}
     return Vehicle.load(shape.vehicle).mount_regions

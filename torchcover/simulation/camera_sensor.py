@@ -1,6 +1,6 @@
 """A camera that measures depth: the pixels of a lens as rays."""
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 import torch
@@ -132,27 +132,11 @@ class CameraSensor(Ranging):
         Raises:
             ValueError: The lens model is unknown or takes another number of coefficients.
         """
-        vehicle_T_camera = self.mount.matrix() @ MOUNT_T_CAMERA
+        own: dict[str, Any] = {"vehicle_T_camera": self.mount.matrix() @ MOUNT_T_CAMERA, "name": self.name}
         if self.fov_deg is not None:
-            return Camera.from_fov(
-                self.width, self.height, self.fov_deg, vehicle_T_camera=vehicle_T_camera, name=self.name
-            )
-        assert self.fx is not None  # checked in _check_lens, like the next three
-        assert self.fy is not None
-        assert self.cx is not None
-        assert self.cy is not None
-        return Camera(
-            self.width,
-            self.height,
-            self.fx,
-            self.fy,
-            self.cx,
-            self.cy,
-            self.lens,
-            self.coefficients,
-            vehicle_T_camera=vehicle_T_camera,
-            name=self.name,
-        )
+            return Camera.from_fov(self.width, self.height, self.fov_deg, **own)
+        own |= {key: getattr(self, key) for key in ("fx", "fy", "cx", "cy", "coefficients")}
+        return Camera(self.width, self.height, model=self.lens, **own)
 
     def directions(self) -> Float64:
         """(3, rows, columns) unit directions in the frame of the mount; NaN where a pixel has no ray."""

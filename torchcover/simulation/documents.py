@@ -142,9 +142,8 @@ class Readable(Document):
     def load(cls, path: str | Path) -> Self:
         """Read it from a YAML file.
 
-        Raises:
-            FileNotFoundError: No such file.
-            BadFileError: Not YAML, or a wrong key or value; the message names the file and the key.
+        FileNotFoundError: no such file. BadFileError: not YAML, or a wrong key or value; the message names the file and
+        the key.
         """
         return read_document(cls, Path(path))
 
@@ -277,8 +276,7 @@ def is_file_name(path_or_name: str | Path) -> bool:
 def found(kind: str, path_or_name: str | Path) -> Path:
     """Where a document is: a path that ends in .yaml or .yml, or a built-in one of a kind by its name.
 
-    Raises:
-        FileNotFoundError: No built-in one of this name; the message lists the names.
+    FileNotFoundError: no built-in one of this name; the message lists the names.
     """
     path = Path(path_or_name)
     if is_file_name(path):

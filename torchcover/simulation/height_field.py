@@ -1,6 +1,6 @@
 """Ground that has a height everywhere: plain, or a raster, which the heights of places become."""
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,16 +13,6 @@ CELL_M = 5.0
 # Beyond what may be seen, so that nobody looks past its end.
 MARGIN_M = 40.0
 MAX_CORNERS = 4_000_000
-
-
-class Ground(Protocol):
-    """Has a height everywhere."""
-
-    def heights_m(self, places_m: Float64) -> Float64:
-        """(N,) at (N, 2) places."""
-
-    def mesh(self) -> Mesh:
-        """What rays hit of it."""
 
 
 class Plain(NamedTuple):
@@ -70,12 +60,12 @@ class Slopes(NamedTuple):
         return Mesh(np.column_stack([places_m, self.corners_m.reshape(-1)[used]]), faces.reshape(-1, 3)).made_of("road")
 
 
-def corners_of(lower_m: Float64, upper_m: Float64) -> tuple[int, int]:
-    """Rows and columns of the corners of a raster between two of them.
+# What has a height everywhere.
+Ground = Plain | Slopes
 
-    Raises:
-        ValueError: More than four million.
-    """
+
+def corners_of(lower_m: Float64, upper_m: Float64) -> tuple[int, int]:
+    """Rows and columns of the corners of a raster between two of them. ValueError: more than four million."""
     columns, rows = (np.ceil((upper_m - lower_m) / CELL_M).astype(np.int64) + 1).tolist()
     if columns * rows > MAX_CORNERS:
         raise ValueError(

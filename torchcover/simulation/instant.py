@@ -2,10 +2,10 @@
 
 import math
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,15 +19,10 @@ from torchcover.simulation.raycaster import Hits, RayCaster, Struck, cast_from
 from torchcover.simulation.rays import TILE_ROWS, Outlines, Tile, into_tiles, outlines, rotate, unit_directions
 from torchcover.simulation.sweep import Motion, Poses, RayTimes, Sweep, no_motion
 
-# Directions all around, to find out whether a place lies inside a body.
+Result = TypeVar("Result")
+# Directions all around, to find out whether rays get out of a body.
 ALL_AROUND = unit_directions(np.linspace(-85.0, 85.0, 12)[:, None], np.arange(0.0, 360.0, 30.0)[None])
 ALL_AROUND_RAYS = ALL_AROUND.reshape(3, -1).astype(np.float32)
-# From outside of all closed bodies no ray meets the back of a face of one.
-BURIED_SHARE = 0.25
-# Seen from farther than this many radii, fewer of those directions than that share point at a ball.
-CLEAR_RADII = 2.0
-
-
 # Sweeps begin and end at whole ones of these.
 WHOLE_S = 0.005
 
@@ -68,9 +63,8 @@ class SensorScan(NamedTuple):
 class Instant:
     """A scene at one time. Its bodies are numbered: what never moves, then what moves and is near.
 
-    `out_of_range` says how many others that move are not near, or not there; `ground` what one drives or walks on,
-    `world_T_vehicle` where the vehicle is in its frame, and `motion` where everything is from a time before this one to
-    another.
+    `out_of_range` others that move are not near, or not there. `world_T_vehicle` is in the frame of the `ground`, and
+    `motion` where everything is from a time before this one to another.
     """
 
     static: RayCaster
@@ -118,29 +112,26 @@ class Instant:
         sweep = self._sweep(times) if times else None
         bodies = self.outlines(origin_m) if sweep is None else sweep.outlines(origin_m)
 
-        def scan_tile(tile: Tile, own_m: Float32 | None, when: RayTimes | None) -> _TileScan:
+        def scan_tile(
+            tile: Tile, own_m: Float32 | None, when: RayTimes | None
+        ) -> tuple[Float32, Float32, Bools, Float32, Float32, Hits, int]:
             limit_m = _limit(tile, max_range_m)
             if sweep is None or when is None:
                 directions, hits, casts = self.cast(vehicle_T_sensor, tile, limit_m, bodies, own_m)
                 seen = self._seen(hits, ego_points)
                 points = _points(origin_m.astype(np.float32), directions, hits.range_m, seen)
-                return _TileScan(points, points, seen, hits.range_m[seen], directions, hits, casts)
+                return points, points, seen, hits.range_m[seen], directions, hits, casts
             swept = sweep.cast(vehicle_T_sensor, tile, when, limit_m, bodies, self.ego, own_m)
             hits, seen = swept.hits, self._seen(swept.hits, ego_points)
             points = landed = _points(swept.starts_m, swept.directions, hits.range_m, seen)
             if len(swept.on_body):
                 points = landed.copy()
                 points[np.cumsum(seen)[swept.on_body] - 1] = swept.points
-            return _TileScan(points, landed, seen, hits.range_m[seen], swept.directions, hits, swept.casts)
+            return points, landed, seen, hits.range_m[seen], swept.directions, hits, swept.casts
 
         own: Sequence[Float32 | None] = own_m or [None] * len(tiles)
         whens: Sequence[RayTimes | None] = times or [None] * len(tiles)
-        if threads <= 1 or len(tiles) <= 1:
-            scans = list(map(scan_tile, tiles, own, whens))
-        else:
-            # A pool for each scan: threads do not survive the fork that makes a DataLoader worker.
-            with ThreadPoolExecutor(threads) as pool:
-                scans = list(pool.map(scan_tile, tiles, own, whens))
+        scans = in_threads(threads, scan_tile, tiles, own, whens)
         points, landed, seen, range_m, directions, hits, casts = zip(*scans, strict=True)
 
         def towards(tile: int) -> Float32:
@@ -209,20 +200,14 @@ class Instant:
         """Whether a place in the vehicle frame lies below the ground or inside a wall or another body than the ego."""
         if self.ground.is_above(position_m, self.world_T_vehicle):
             return True
-        if self._inside(self.static, transform(self.static_T_vehicle, position_m[None])[0], self.ego):
+        inside = self.static.inside(transform(self.static_T_vehicle, position_m[None])[0])
+        if (inside != self.ego).any():
             return True
-        moving, others = self.moving, self.moving.body != self.ego
-        near = np.linalg.norm(moving.centre_m - position_m, axis=1) <= CLEAR_RADII * moving.radius_m
-        if not (near & others).any():
-            return False
-        places_m = moving.from_there_m(position_m)
-        return any(self._inside(moving.casters[k], places_m[k]) for k in np.flatnonzero(near & others).tolist())
-
-    @staticmethod
-    def _inside(caster: RayCaster, place_m: Matrix, but: int = -1) -> bool:
-        """Whether a place lies inside another body of a caster than one."""
-        met = caster.met_from_behind(place_m, ALL_AROUND_RAYS)
-        return bool(((met >= 0) & (met != but)).mean() > BURIED_SHARE)
+        moving = self.moving
+        near = np.linalg.norm(moving.centre_m - position_m, axis=1) <= moving.radius_m
+        asked = np.flatnonzero(near & (moving.body != self.ego)).tolist()
+        places_m = moving.from_there_m(position_m) if asked else position_m[None]
+        return any(len(moving.casters[k].inside(places_m[k])) for k in asked)
 
     def on_a_face(self, position_m: Matrix) -> bool:
         """Whether a place in the vehicle frame lies exactly on the ground, or on a face of what else never moves."""
@@ -253,41 +238,28 @@ class Instant:
         hits = cast_from(self.static, self.static_T_vehicle, origin_m, directions, limit_m)
         if own_m is not None:
             hits.body[(hits.body < 0) & (own_m <= limit_m)] = self.ego
-        casts = self._cast_at_moving(origin_m, vehicle_R_sensor, tile, directions, hits, bodies, own_m is not None)
-        return directions, hits, casts
-
-    def _cast_at_moving(
-        self,
-        origin_m: Matrix,
-        vehicle_R_sensor: Matrix,
-        tile: Tile,
-        directions: Float32,
-        hits: Hits,
-        bodies: Outlines,
-        ego_is_known: bool,
-    ) -> int:
-        """Cast the rays of one tile at what moves, each at the bodies that it may meet before it ends; how many pairs.
-
-        The hits are brought up to date.
-        """
-        leaving_out = self.ego if ego_is_known else None
+        leaving_out = None if own_m is None else self.ego
         met, casts = self.moving.meetings(
             origin_m, vehicle_R_sensor, tile, directions, hits.range_m, bodies, leaving_out=leaving_out
         )
         self.moving.nearer(hits, met)
-        return casts
+        return directions, hits, casts
 
 
-class _TileScan(NamedTuple):
-    """What n rays of a tile saw: `points` and `landed` (K, 3) and `range_m` (K,) of those that did."""
+def in_threads(threads: int, function: Callable[..., Result], *columns: Iterable[Any]) -> list[Result]:
+    """What a function makes of each row of some columns, in their order, on so many threads."""
+    rows = list(zip(*columns, strict=True))
+    if threads <= 1 or len(rows) <= 1:
+        return [function(*row) for row in rows]
+    # A pool each time: threads do not survive the fork that makes a DataLoader worker.
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(function, *zip(*rows, strict=True)))
 
-    points: Float32
-    landed: Float32
-    seen: Bools
-    range_m: Float32
-    directions: Float32
-    hits: Hits
-    casts: int
+
+def encloses(caster: RayCaster, place_m: Matrix) -> bool:
+    """Whether a (3,) place lies inside of what can be cast at, so that no ray gets out."""
+    limit_m = np.full(ALL_AROUND_RAYS.shape[1], np.inf, dtype=np.float32)
+    return bool((caster.cast(place_m, ALL_AROUND_RAYS, limit_m).body >= 0).all())
 
 
 def _limit(tile: Tile, max_range_m: float) -> Float32:

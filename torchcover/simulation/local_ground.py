@@ -14,8 +14,8 @@ from torchcover.simulation.patches import connected, edges_of, outward_faces
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.shapes import Mesh, parts_of
 
-# Nothing steeper is driven or walked on.
-STEEPEST_DEG = 45.0
+# Nothing steeper is driven or walked on, but for what rounding makes of it.
+STEEPEST_DEG = 45.0 + 1e-6
 # Ground that is so little above a point counts as the ground below it: for rounding, and where wheels sink in.
 TOLERANCE_M = 0.05
 # A place so little below the ground lies on it.
@@ -42,15 +42,7 @@ SLACK_M = 1e-3
 
 
 def level_faces(mesh: Mesh, outward: Bools | None = None) -> Bools:
-    """(F,) whether one could stand on each face: it is not too steep, and of a closed body it is an upper side.
-
-    Example:
-        >>> from torchcover.simulation.shapes import Box, Plane
-        >>> int(level_faces(Box(type="box", size_m=(1, 1, 1)).mesh()).sum())
-        2
-        >>> level_faces(Plane(type="plane", size_m=(1, 1)).mesh()).tolist()
-        [True, True]
-    """
+    """(F,) whether one could stand on each face: it is not too steep, and of a closed body it is an upper side."""
     level, down = _looks(mesh, 1.0), looks_down(mesh)
     if down.any():
         level |= down & ~(outward_faces(mesh) if outward is None else outward)
@@ -77,8 +69,7 @@ def ground_under(meshes: Sequence[Mesh], places_m: Float64) -> list[Bools]:
     Two level surfaces are connected that share an edge, or of which one goes on where the other ends, at most 0.3 m
     higher or lower. If no place has any within a metre, a level face below counts, however far; else a sheet above.
 
-    Returns:
-        One (F,) mask for each mesh.
+    Returns one (F,) mask for each mesh.
     """
     outward = [outward_faces(mesh) for mesh in meshes]
     level = [level_faces(mesh, known) for mesh, known in zip(meshes, outward, strict=True)]
@@ -132,6 +123,7 @@ def _probes_m(corners_m: Float64, border: Int64) -> Float64:
 
 def _met(caster: RayCaster, places_m: Float64, near_m: float) -> Int64:
     """(N,) number of the highest body no farther above or below each place than this, -1 for none."""
+    near_m += ROUNDING_M
     starts_m = (places_m + np.array([0.0, 0.0, near_m])).astype(np.float32)
     limit_m = np.full(len(starts_m), 2 * near_m, dtype=np.float32)
     return caster.cast_from_each(starts_m, _vertical(len(starts_m), -1.0), limit_m).body.astype(np.int64)
@@ -148,12 +140,6 @@ class LocalGround:
 
     Heights are measured along the world's vertical, not along the z axis of a vehicle that pitches. Meshes are of
     ground alone, in the world frame; `origin_m` (3,) is subtracted in float64: coordinates become float32.
-
-    Example:
-        >>> from torchcover.simulation.shapes import Plane
-        >>> ground = LocalGround([Plane(type="plane", size_m=(4, 4)).mesh()], np.zeros(3))
-        >>> ground.heights_m(np.array([[0.0, 0.0, 1.5], [9.0, 0.0, 1.5], [0.0, 0.0, -1.0]])).round(3).tolist()
-        [1.5, nan, nan]
     """
 
     def __init__(self, meshes: Sequence[Mesh], origin_m: Float64) -> None:

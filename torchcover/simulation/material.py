@@ -73,9 +73,8 @@ class Materials(NamedTuple):
 def material_number(name: str) -> int:
     """The number of a material by name or YAML file, which meshes have in this process; 0 is where none was said.
 
-    Raises:
-        FileNotFoundError: There is none; the message lists those that there are.
-        ValueError: A file that is not valid, or more materials than there are numbers.
+    FileNotFoundError: there is none; the message lists those that there are. ValueError: a file that is not valid, or
+    more materials than there are numbers.
     """
     known = _builtin_numbers()
     if name in known:

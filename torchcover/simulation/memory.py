@@ -27,15 +27,7 @@ def machine_bytes() -> float:
 
 
 def check_fits(what: str, needed_bytes: float, advice: str) -> None:
-    """Refuse what this machine has no memory for, before any of it is reserved.
-
-    Example:
-        >>> check_fits("1,000 rays", 1e6, "take fewer")
-        >>> check_fits("a million million rays", 1e14, "take fewer")  # doctest: +ELLIPSIS
-        Traceback (most recent call last):
-        ...
-        ValueError: a million million rays: 1e+05 GB of memory are needed, and this machine has ... GB; take fewer
-    """
+    """Refuse what this machine has no memory for, before any of it is reserved."""
     if needed_bytes > machine_bytes():
         raise ValueError(
             f"{what}: {needed_bytes / 1e9:.3g} GB of memory are needed, and this machine has "

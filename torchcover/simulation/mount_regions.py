@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from pydantic import model_validator
 
 from torchcover.simulation.documents import Bounds, Document
-from torchcover.simulation.instant import ALL_AROUND_RAYS
+from torchcover.simulation.instant import encloses
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.shapes import Mesh
 
@@ -52,11 +52,6 @@ class Skin:
 
         Exactly on the mesh, in float64. The line comes from the side, at `across_m` on the two other axes in the order
         x, y, z.
-
-        Example:
-            >>> from torchcover.simulation.shapes import Box
-            >>> Skin(Box(type="box", size_m=(4.0, 2.0, 1.5)).mesh()).seen_from("above", (1.0, 0.5)).place_m
-            array([1. , 0.5, 1.5])
         """
         axis, sign = SEEN_FROM[side]
         others = [other for other in range(3) if other != axis]
@@ -82,8 +77,7 @@ class Skin:
 
     def encloses(self, place_m: Vector) -> bool:
         """Whether a (3,) place lies inside the body, so that no ray gets out."""
-        limit_m = np.full(ALL_AROUND_RAYS.shape[1], np.inf, dtype=np.float32)
-        return bool((self._caster.cast(place_m, ALL_AROUND_RAYS, limit_m).body >= 0).all())
+        return encloses(self._caster, place_m)
 
     @cached_property
     def _caster(self) -> RayCaster:
@@ -137,8 +131,7 @@ class MountRegion(Document):
     def on(self, skin: Skin, u: float, v: float) -> SkinPoint:
         """A place on the skin, `u` and `v` from 0 to 1 along the window's axes in the order x, y, z.
 
-        Raises:
-            ValueError: Nothing of the body is there.
+        ValueError: nothing of the body is there.
         """
         window = [bounds for bounds in (self.x_m, self.y_m, self.z_m) if bounds is not None]
         (x, y) = (low + share * (high - low) for share, (low, high) in zip((u, v), window, strict=True))

@@ -30,13 +30,6 @@ def outward_faces(mesh: Mesh) -> Bools:
     Faces that share an edge belong to one surface. It is closed if every edge is run through as often one way as the
     other, and turned outwards if it encloses a volume that is not negative. A face of any other surface, such as a
     plane, an open mesh, or a ball that is turned inside out, may be seen from both sides.
-
-    Example:
-        >>> from torchcover.simulation.shapes import Box, Plane
-        >>> outward_faces(Box(type="box", size_m=(1, 1, 1)).mesh()).tolist() == [True] * 12
-        True
-        >>> outward_faces(Plane(type="plane", size_m=(1, 1)).mesh()).tolist()
-        [False, False]
     """
     if mesh.outward is not None:
         return mesh.outward
@@ -157,15 +150,11 @@ class Patches(NamedTuple):
         coincident: Int32 | None = None,
         outward: Bools | None = None,
     ) -> Self:
-        """Cut a mesh, or what is wanted of it.
+        """Cut a mesh of no object, or what is wanted of it: what lies in some boxes, and has an area.
 
-        Args:
-            mesh: Any, of no object; faces without an area are left out.
-            bounds: What lies outside of these boxes is left out; all is wanted if not given.
-            heights: Of (3, 3, N) corners, coordinates, triangles and (N,) the faces that they are parts of: their
-                `heights_m`, and (N,) whether any of that is wanted.
-            coincident: (F,) what patches of each face have as `face`, if any coincides.
-            outward: (F,) what `outward_faces` says of it, if that is known.
+        `heights` gives of (3, 3, N) corners, coordinates, triangles and (N,) the faces that they are parts of their
+        `heights_m`, and (N,) whether any of that is wanted. `coincident` (F,) is what patches of each face have as
+        `face`, `outward` (F,) what `outward_faces` says of it, if that is known.
         """
         extent_m = 0.0 if bounds is not None else float(np.ptp(mesh.vertices_m, axis=0).max())
         longest_m = max(LONGEST_M, LONGEST_SHARE * extent_m)

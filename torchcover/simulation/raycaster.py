@@ -34,6 +34,8 @@ CONTACTS_BEYOND = 2.0 ** np.arange(1, 13)
 CONTACT_ROUNDINGS = 4
 # Origins are rounded too, before they come here: in float64, as a share of the largest coordinate.
 MIN_CONTACT = 1e-12
+# So far beside a place the line upwards starts if it would run through an edge.
+BESIDE_M = ((0.0, 0.0), (1.1e-7, 2.3e-7), (-3.7e-7, 1.9e-7))
 
 
 @cache
@@ -49,6 +51,23 @@ def _have_no_threads() -> None:
         scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
     finally:
         os.sched_setaffinity(0, cores)
+
+
+def _embree(bodies: Sequence[Mesh]) -> EmbreeScene:
+    _have_no_threads()
+    # Robust: a ray through a shared edge hits one of the two faces instead of slipping between them.
+    scene = EmbreeScene(robust=True)
+    for body in bodies:
+        TriangleMesh(scene, body.vertices_m.astype(np.float32), body.faces.astype(np.int32))
+    # embreex commits the scene when it is first used; do it before several threads do.
+    scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
+    return scene
+
+
+def _warp(bodies: Sequence[Mesh], device: str) -> Any:  # noqa: ANN401  (answers as Embree's scene)
+    from torchcover.simulation.warp_scene import WarpScene
+
+    return WarpScene(bodies, device)
 
 
 class Faces:
@@ -96,6 +115,13 @@ class Faces:
             return near
         return np.asarray(near[self.from_plane_m(place_m, near) <= 2 * self.contact_m[near]])
 
+    def above(self, place_m: NDArray[np.floating]) -> Int64:
+        """Numbers of those that a line upwards from a (3,) place may meet."""
+        x, y, z = place_m
+        near = np.flatnonzero((self._lower_m[0] <= x) & (x <= self._upper_m[0]))
+        near = near[(self._lower_m[1, near] <= y) & (y <= self._upper_m[1, near])]
+        return np.asarray(near[z <= self._upper_m[2, near]])
+
     def from_plane_m(self, place_m: NDArray[np.floating], faces: Int64) -> Float64:
         """Distance of a (3,) place from the planes of some of them."""
         corners_m = corners_of(self._bodies, faces)
@@ -139,17 +165,14 @@ class Struck(NamedTuple):
 
 
 class RayCaster:
-    """A set of bodies that rays can be cast at, from several threads at once.
+    """A set of bodies that rays can be cast at, from several threads at once: a closed or open mesh each, in metres.
 
-    Args:
-        bodies: One closed or open mesh a body, in metres, in the frame that rays are given in. Coordinates should be
-            near the origin: they become float32.
-
-    Raises:
-        ValueError: There is no body, or one with a vertex that is not a number or farther than 1e9 m.
+    Coordinates should be near the origin of the rays' frame: they become float32. ValueError: there is no body, or one
+    with a vertex that is not a number or farther than 1e9 m. Warp casts on a `device` that is given, such as `cuda:0`,
+    else Embree; they agree but for the last bits.
     """
 
-    def __init__(self, bodies: Sequence[Mesh]) -> None:
+    def __init__(self, bodies: Sequence[Mesh], device: str | None = None) -> None:
         if not bodies:
             raise ValueError("a scene needs at least one body")
         reach_m = float(np.max([np.abs(body.vertices_m).max(initial=0.0) for body in bodies]))  # NaN if one is
@@ -162,13 +185,7 @@ class RayCaster:
         self._bodies = bodies
         self._closed: dict[int, Bools] = {}  # asked of few: hardly any ray meets a face from behind
         self._last_asked: tuple[bytes, Int64] = b"", np.empty(0, dtype=np.int64)
-        _have_no_threads()
-        # Robust: a ray through a shared edge hits one of the two faces instead of slipping between them.
-        self._scene = EmbreeScene(robust=True)
-        for body in bodies:
-            TriangleMesh(self._scene, body.vertices_m.astype(np.float32), body.faces.astype(np.int32))
-        # embreex commits the scene when it is first used; do it before several threads do.
-        self._scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
+        self._scene = _embree(bodies) if device is None else _warp(bodies, device)
 
     @cached_property
     def _faces(self) -> Faces:
@@ -264,23 +281,32 @@ class RayCaster:
             again = hit & starts_on_plane(faces)
             rays, travelled_m, range_m, faces = rays[again], travelled_m[again], range_m[again], faces[again]
 
-    def met_from_behind(self, origin_m: NDArray[np.floating], directions: Float32) -> Int32:
-        """(N,) which closed bodies rays first meet from behind, as those do that start inside; else -1.
+    def inside(self, place_m: NDArray[np.floating]) -> Int64:
+        """Numbers of the bodies that a (3,) place lies inside of; a sheet has no inside.
 
-        A sheet has no inside: the face is one of a closed surface that is turned outwards. Rays have (3, N) unit
-        directions and one (3,) origin, or (N, 3).
+        It is inside a closed surface that is turned outwards if a line upwards leaves that more often than it enters.
+        No ray is cast: which of two faces it met first where bodies touch would be up to how the processor rounds.
         """
-        origins = np.ascontiguousarray(np.broadcast_to(origin_m.astype(np.float32), (directions.shape[1], 3)))
-        answer = self._scene.run(origins, directions.T, output=True)
-        # Embree's Ng points to where the corners of the face turn counter-clockwise.
-        behind = (answer["Ng"] * directions.T).sum(axis=1) > 0
-        bodies: Int32 = np.where(behind, answer["geomID"], -1)
-        for number in np.unique(bodies[behind]).tolist():
+        faces = self._faces.above(place_m)
+        body = np.searchsorted(self._first_face, faces, side="right") - 1
+        bodies, of = np.unique(body, return_inverse=True)
+        is_closed = np.zeros(len(faces), dtype=bool)
+        for number in bodies.tolist():
             if number not in self._closed:
                 self._closed[number] = outward_faces(self._bodies[number])
-            of_body = np.flatnonzero(bodies == number)
-            bodies[of_body[~self._closed[number][answer["primID"][of_body]]]] = -1
-        return bodies
+            is_closed[body == number] = self._closed[number][faces[body == number] - self._first_face[number]]
+        corners_m = corners_of(self._bodies, faces) - place_m[:, None]
+        for beside_m in BESIDE_M:
+            x_m, y_m = corners_m[:, 0] - beside_m[0], corners_m[:, 1] - beside_m[1]
+            # Twice the signed areas between the line and each edge: of an edge of two faces the same, to the bit.
+            areas = np.roll(x_m, -1, 0) * np.roll(y_m, -2, 0) - np.roll(y_m, -1, 0) * np.roll(x_m, -2, 0)
+            whole = areas.sum(axis=0)
+            if not ((areas == 0).any(axis=0) & (whole != 0)).any():
+                break
+        with np.errstate(divide="ignore", invalid="ignore"):
+            is_above = (areas * corners_m[:, 2]).sum(axis=0) / whole > self._faces.contact_m[faces]
+        way = (areas > 0).all(axis=0).astype(np.int64) - (areas < 0).all(axis=0)
+        return bodies[np.bincount(of, way * (is_above & is_closed), len(bodies)) > 0]
 
 
 def cast_from(

@@ -83,13 +83,7 @@ class Balls(NamedTuple):
 
     @classmethod
     def around(cls, points_m: NDArray[np.floating], radius_m: float) -> Self:
-        """One around each of (N, 3) points; of more than a few, larger ones that hold those of neighbours.
-
-        Example:
-            >>> points_m = np.random.default_rng(0).normal(0, (30.0, 30.0, 1.0), (5000, 3))
-            >>> len(Balls.around(points_m[:800], 0.4).centres_m), len(Balls.around(points_m, 0.4).centres_m) < 1000
-            (800, True)
-        """
+        """One around each of (N, 3) points; of more than a few, larger ones that hold those of neighbours."""
         if len(points_m) <= FEW:
             return cls(points_m, radius_m)
         points = points_m.astype(np.float64)

@@ -78,14 +78,8 @@ def rig_document(
 def recorded_body(recording: Recording, vehicle: str | Path) -> BoundingBox:
     """The body of the vehicle that recorded something, and what is mounted on it.
 
-    Args:
-        recording: The recording.
-        vehicle: A built-in vehicle, the YAML file of one or a mesh file; or `x0,x1,y0,y1,z0,z1`, the sides of the body
-            in metres of the vehicle frame.
-
-    Raises:
-        ValueError: Other numbers, or what is no vehicle.
-        FileNotFoundError: No such vehicle.
+    `vehicle` is a built-in one, the YAML file of one or a mesh file; or `x0,x1,y0,y1,z0,z1`, the sides of the body in
+    metres of the vehicle frame.
     """
     sides = str(vehicle).split(",")
     if len(sides) > 1:

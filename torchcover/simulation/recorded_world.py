@@ -18,7 +18,7 @@ from torchcover.geometry import (
     rotation_from_euler,
     transform,
 )
-from torchcover.geometry.arrays import Float64, Int64
+from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.geometry.rigid import Matrix
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings.accumulated_reference import (
@@ -53,6 +53,8 @@ CELL_M, HOLE_M, FOOT_M = 0.2, 1.0, 0.6
 AGAIN_M, LEAST_TIMES, LEAST_WAY_M = 2.0, 3, 2.0
 # What it is called by its length and width.
 CALLED = (((1.3, 1.3), "pedestrian"), ((2.6, 1.3), "bicycle"), ((6.5, np.inf), "car"), ((np.inf, np.inf), "truck"))
+# Of what moves, such a share is seen past; of a wall that comes into sight, and so seems to, none is.
+PAST = 0.3
 # So near to a mover, what seems to stand is its own; as is what seems to move so near to the vehicle, as its mirrors.
 BESIDE_M = 0.4
 # As large as nine in ten times; and no larger or smaller than that.
@@ -79,13 +81,13 @@ class Surveyed(NamedTuple):
     Args:
         ground: Where it is known.
         standing_m: (N, 3) a place in each cell in which something stands or lies.
-        loose: Of each scan when it was, and (N, 3) what does not stand.
+        loose: Of each scan when it was, (N, 3) what does not stand, and whether each is seen past.
         images: How far some of them saw.
     """
 
     ground: Slopes
     standing_m: Float64
-    loose: list[tuple[float, Float64]]
+    loose: list[tuple[float, Float64, Bools]]
     images: list[RangeImage]
 
 
@@ -178,14 +180,13 @@ def _seen(
                 f"{skipped} instants are lost, and a world does not; mend them, or make one of fewer frames (--steps)"
             )
         parts = [standing_m]
-        for (sensor, instant), apart_m in sorted(reference.told_apart(recording, index).items()):
+        for (sensor, instant), (points_m, told) in sorted(reference.told_apart(recording, index).items()):
             if not done < instant < len(times_s):
                 continue
-            still_m, loose_m = (
-                np.delete(of_m, within(transform(invert(poses[instant]), of_m), own), axis=0) for of_m in apart_m
-            )
-            parts.append(still_m)
-            loose.append((float(times_s[instant]), loose_m))
+            free = np.ones(len(points_m), np.bool_)
+            free[within(transform(invert(poses[instant]), points_m), own)] = False
+            parts.append(points_m[free & (told == 0)])
+            loose.append((float(times_s[instant]), points_m[free & (told > 0)], told[free & (told > 0)] == 2))
             image = sweeps.thinned(recording, sensor, instant).image
             if image is not None and times_s[instant] - looked_s[sensor] > look_every_s - 1e-6:
                 images.append(image)
@@ -323,7 +324,7 @@ def _first_place_m(recording: Recording) -> Float64:
 
 def _found(seen: Surveyed, drive: Trajectory) -> Iterator[Row]:
     """Rows of `movers.csv` of what rays tell to move, from one instant to the next."""
-    scan_s = np.array([time_s for time_s, _ in seen.loose])
+    scan_s = np.array([time_s for time_s, *_ in seen.loose])
     tracks: list[list[tuple[float, Float64, Moved]]] = []
     before_s = -np.inf
     for time_s in np.unique(scan_s):
@@ -341,12 +342,26 @@ def _found(seen: Surveyed, drive: Trajectory) -> Iterator[Row]:
             continue
         if max(len(moved.points_m) for *_, moved in track) < KNOWN_POINTS:
             continue
-        number += 1
         boxes = _boxes(track, drive, seen.ground)
+        if _seen_past(seen, scan_s, [time_s for time_s, *_ in track], boxes) < PAST:
+            continue
+        number += 1
         fits = (boxes[0, 3:5] <= sizes_m for sizes_m, _ in CALLED)
         called = next(name for fit, (_, name) in zip(fits, CALLED, strict=True) if fit.all())
         for (time_s, *_), box in zip(track, boxes, strict=True):
             yield (time_s, f"found_{number}", called, *box.tolist())
+
+
+def _seen_past(seen: Surveyed, scan_s: Float64, times_s: Sequence[float], boxes: Float64) -> float:
+    """The share that is seen past of what lies in the boxes of a track; what only comes into sight never is."""
+    inside = past = 0
+    for time_s, box in zip(times_s, boxes, strict=True):
+        pose, room = _around(("", "", "", *box.tolist()))
+        for scan in np.flatnonzero(scan_s == time_s):
+            _, points_m, is_past = seen.loose[scan]
+            rows = within(transform(invert(pose), points_m), room)
+            inside, past = inside + len(rows), past + int(is_past[rows].sum())
+    return past / max(inside, 1)
 
 
 def _go_on(tracks: list[list[tuple[float, Float64, Moved]]], time_s: float, found: Sequence[Moved]) -> None:

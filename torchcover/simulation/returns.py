@@ -29,21 +29,9 @@ def log_excess(
 ) -> Floats:
     """(N,) ln q of N hits, above 0 where what comes back is more than enough.
 
-    In the type of the ranges: logarithms of float32 are good to 1e-6.
-
-    Args:
-        range_m: (N,) how far they are.
-        cos_incidence: (N,) cosine between the rays and the normals of what they hit.
-        reflectivity: (N,) of that, from 0 to 1; infinite for a retroreflector.
-        incidence_exponent: (N,) k; 1 is Lambert's law.
-        range_at_10_percent_m: Range at which a reflectivity of 10 % met head-on is just enough.
-        extinction_per_m: alpha of the air, one way.
-
-    Example:
-        >>> float(log_excess(100.0, 1.0, 0.1, 1.0, 100.0))                       # as the data sheet says
-        0.0
-        >>> round(float(np.exp(log_excess(100.0, 0.5, 0.4, 1.0, 100.0))), 12)    # four times as bright, aslant
-        2.0
+    In the type of the ranges: logarithms of float32 are good to 1e-6. The reflectivity is from 0 to 1, infinite for a
+    retroreflector, the exponent k of the cosine of the incidence 1 for Lambert's law. At the range that is given, a
+    reflectivity of 10 % met head-on is just enough; the air's extinction is alpha, one way.
     """
     with np.errstate(divide="ignore"):  # of what reflects nothing: minus infinity
         excess: Floats = np.log(np.asarray(reflectivity) / 0.1)
@@ -58,24 +46,15 @@ def return_probability(
     """(N,) P(return) of hits with (N,) ln q, `spread` the standard deviation of ln range of the sensor.
 
     `reflectivity_spread` (N,) is that of ln reflectivity between places of the material.
-
-    Example:
-        >>> float(return_probability(0.0, 0.3)) == SURE / 2
-        True
     """
     sigmas = np.asarray(log_excess / np.hypot(2.0 * np.asarray(spread), reflectivity_spread))
-    probability: Floats = SURE * torch.special.ndtr(torch.from_numpy(sigmas)).numpy()
-    return probability
+    return np.asarray(SURE * torch.special.ndtr(torch.from_numpy(sigmas)).numpy())
 
 
 def extinction_per_m(visibility_m: float | None, rain_mm_h: float = 0.0) -> float:
     """Extinction of light of 905 nm in air, one way: of fog by Koschmieder's law, if there is any, and of rain.
 
     Rain: 1.076 R^0.67 dB/km, R in mm/h (Carbonneau & Wisely 1998, Proc. SPIE 3232).
-
-    Example:
-        >>> round(extinction_per_m(50.0), 4), round(1e3 * extinction_per_m(None, 10.0), 2)
-        (0.0599, 1.16)
     """
     decibels_per_km = 1.076 * rain_mm_h**0.67
     of_rain = decibels_per_km * np.log(10.0) / 10.0 / 1e3

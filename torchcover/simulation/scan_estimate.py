@@ -54,13 +54,6 @@ def estimate_scan(scans: Sequence[Float64], lasers: Lasers = None) -> ScanEstima
 
     The LiDAR turns about z. A row whose rays all miss everything is not found. `lasers` says which laser each point is
     of; they are found by elevation if unknown.
-
-    Example:
-        >>> azimuth, elevation = np.meshgrid(np.deg2rad(np.arange(0.0, 360.0)), np.deg2rad([-20.0, -10.0, -7.0]))
-        >>> around = np.stack([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)], axis=2).reshape(-1, 3)
-        >>> found = estimate_scan([8.0 * around])
-        >>> found.elevations_deg.round(2), found.columns
-        (array([ -7., -10., -20.]), 360)
     """
     points_m = np.concatenate([np.empty((0, 3)), *scans])
     if len(points_m) < 2:

@@ -10,7 +10,7 @@ from torchcover.geometry import BoundingBox, invert, overlapping
 from torchcover.geometry.arrays import Bools, Float32, Int32, Int64
 from torchcover.geometry.rigid import Matrix
 from torchcover.geometry.trajectory import poses_at
-from torchcover.simulation.instant import ALL_AROUND_RAYS, Instant
+from torchcover.simulation.instant import Instant, encloses
 from torchcover.simulation.local_ground import LocalGround, ground_under, level_faces, looks_down
 from torchcover.simulation.memory import check_fits
 from torchcover.simulation.moving import Moving, Solids
@@ -40,7 +40,7 @@ class Scene:
     at it. An ego that rests belongs to what never moves.
     """
 
-    def __init__(self, world: World, solids: Solids | None = None) -> None:
+    def __init__(self, world: World, solids: Solids | None = None, device: str | None = None) -> None:
         self.world = world
         self.ego_box = BoundingBox.around(world.ego.mesh.vertices_m)
         bodies = (world.ego, *world.objects)
@@ -65,7 +65,7 @@ class Scene:
         self._local_T_resting = [local_T_world @ actor.trajectory.at(0.0) for actor in self._resting]
         resting = [actor.mesh.moved(pose) for actor, pose in zip(self._resting, self._local_T_resting, strict=True)]
         scenery = self._scenery()
-        self._static = RayCaster(resting + scenery)
+        self._static = RayCaster(resting + scenery, device)
         self._faces = sum(len(mesh.faces) for mesh in resting + scenery)
         self._surfaces: dict[tuple[float, ...], SceneSurface] = {}
         self._instants: dict[tuple[int, float], Instant] = {}
@@ -148,8 +148,7 @@ class Scene:
 
         Moving bodies whose origin is farther from the vehicle than `within_m` and their size are left out.
 
-        Raises:
-            ValueError: The bounding box of an actor overlaps that of the ego.
+        ValueError: the bounding box of an actor overlaps that of the ego.
         """
         if (step, within_m) not in self._instants:
             if len(self._instants) == INSTANTS_KEPT:
@@ -230,9 +229,7 @@ class Scene:
 
     def encloses(self, position_m: Matrix) -> bool:
         """Whether a place in the vehicle frame lies inside the ego's body, so that no ray gets out."""
-        ego = self._solids.of(self.world.ego.mesh).caster
-        hits = ego.cast(position_m, ALL_AROUND_RAYS, np.full(ALL_AROUND_RAYS.shape[1], np.inf, dtype=np.float32))
-        return bool((hits.body >= 0).all())
+        return encloses(self._solids.of(self.world.ego.mesh).caster, position_m)
 
     def _check_overlap(self, time_s: float, vehicle_T_world: Matrix, distance_m: Matrix) -> None:
         bodies = self._resting + self._moving

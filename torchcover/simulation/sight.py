@@ -1,14 +1,13 @@
 """What is seen from a place on the ego: by the rays of a sensor, or of given points."""
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
 
 from torchcover.geometry import rigid
 from torchcover.geometry.arrays import Bools, Float32, Float64, Int32, Int64
-from torchcover.simulation.instant import Instant, SensorScan
+from torchcover.simulation.instant import Instant, SensorScan, in_threads
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.rays import BLOCK, Balls, Tile, into_tiles, pixels_in_tiles, rotate
 from torchcover.simulation.scene import Scene, ends_at
@@ -197,12 +196,7 @@ def sight(instant: Instant, place_m: Float64, targets_m: Float32, *, threads: in
         return rays, hits.body, casts
 
     hidden_by, tiles = np.full(len(targets_m), -1, dtype=np.int32), range(0, len(order), TILE_RAYS)
-    if threads <= 1 or len(tiles) <= 1:
-        answers = list(map(cast, tiles))
-    else:
-        # A pool for each place: threads do not survive the fork that makes a DataLoader worker.
-        with ThreadPoolExecutor(threads) as pool:
-            answers = list(pool.map(cast, tiles))
+    answers = in_threads(threads, cast, tiles)
     for rays, body, _ in answers:
         hidden_by[rays] = body
     self_hits = int(np.count_nonzero(hidden_by == instant.ego))

@@ -65,6 +65,7 @@ class SimulatedFrames(FrameDataset):
         kept_bytes: As in `Simulator`.
         within_m: As in `Simulator`: the clouds have the points near the reference, and hardly any others.
         no_cache: As in `Simulator`.
+        device: As in `Simulator`.
 
     Raises:
         FileNotFoundError: An unknown name or file.
@@ -93,6 +94,7 @@ class SimulatedFrames(FrameDataset):
         kept_bytes: float | None = None,
         within_m: float | None = None,
         no_cache: bool = False,
+        device: str | None = None,
     ) -> None:
         if not 1 <= steps <= MAX_STEPS:
             raise ValueError(f"steps: a number from 1 to {MAX_STEPS:,} is needed; got {steps}")
@@ -110,6 +112,7 @@ class SimulatedFrames(FrameDataset):
             kept_bytes=kept_bytes,
             within_m=within_m,
             no_cache=no_cache,
+            device=device,
         )
         self.steps = steps
         self.boxes = boxes

@@ -20,9 +20,7 @@ from torchcover.simulation.rig import Rig, with_ego
 from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.sensor import Draws
-from torchcover.simulation.sight import MountedSensor
-from torchcover.simulation.stage import Scenes, Stage, Stages
-from torchcover.simulation.standing import warn_of_floating
+from torchcover.simulation.stage import Scenes, Stage, Stages, warn_of_floating
 from torchcover.simulation.world import Label, labels
 
 # What a step takes at its largest: 73 to 246 were measured, for a LiDAR, a camera and the reference sensors.
@@ -75,6 +73,8 @@ class Simulator:
             this threshold do: rays that hit nothing there are not cast. Those points are the same to the bit.
         no_cache: Whether worlds that are drawn are built though they lie on disk from an earlier run, and are not kept
             there either; frames are the same to the bit.
+        device: Of Warp (`torchcover[warp]`), such as `cuda:0`, where rays are cast at what never moves, in one process;
+            by Embree, which agrees but for the last bits, if not given.
 
     Raises:
         ValueError: Rigs that name different vehicles, a negative seed, a time that is no multiple of the time step,
@@ -100,6 +100,7 @@ class Simulator:
         kept_bytes: float | None = None,
         within_m: float | None = None,
         no_cache: bool = False,
+        device: str | None = None,
     ) -> None:
         if seed < 0:
             raise ValueError(f"seed: a number >= 0 is needed; got {seed}")
@@ -109,7 +110,7 @@ class Simulator:
         self.seed = seed
         self.within_m = within_m
         self._every_steps = 1 if every_s is None else scenario.steps_in(every_s)
-        self._stages = Stages(Scenes(scenario, seed, kept_bytes, no_cache=no_cache), rigs)
+        self._stages = Stages(Scenes(scenario, seed, kept_bytes, no_cache=no_cache, device=device), rigs)
         self._check_size()
 
     @property
@@ -190,7 +191,9 @@ class Simulator:
                 ego below the ground.
         """
         stage, instant = self.placed(index)
-        reference = self.reference_sensor.scan(self._surroundings(stage.scene, instant, index))
+        generator, name = np.random.default_rng([self.seed, index]), f"{self.scenario.name} step {index}"
+        around = Surroundings(stage.scene, instant, generator, name, threads=torch.get_num_threads())
+        reference = self.reference_sensor.scan(around)
         within = None if self.within_m is None else Balls.around(reference.points, self.within_m)
         scans = self._scans(stage, instant, index, within)
         of_all_rigs = [scan for of_rig in scans.values() for scan in of_rig]
@@ -316,21 +319,12 @@ class Simulator:
         return max([float(np.linalg.norm(farthest_m)) + self.reference_sensor.max_range_m, *reaches])
 
     def _scans(self, stage: Stage, instant: Instant, index: int, within: Balls | None) -> dict[str, list[SensorScan]]:
-        return {name: self._scan_rig(sensors, instant, index, within) for name, sensors in stage.mounted.items()}
-
-    def _scan_rig(
-        self, sensors: Sequence[MountedSensor], instant: Instant, index: int, within: Balls | None
-    ) -> list[SensorScan]:
-        scans = []
-        for k, mounted in enumerate(sensors, 1):
-            draws = Draws(np.random.default_rng([self.seed, index, k]), rays=len(mounted.pixel_of_ray))
-            scans.append(mounted.scan(instant, draws, threads=torch.get_num_threads(), within=within))
+        scans: dict[str, list[SensorScan]] = {name: [] for name in stage.mounted}
+        for name, sensors in stage.mounted.items():
+            for k, mounted in enumerate(sensors, 1):
+                draws = Draws(np.random.default_rng([self.seed, index, k]), rays=len(mounted.pixel_of_ray))
+                scans[name].append(mounted.scan(instant, draws, threads=torch.get_num_threads(), within=within))
         return scans
-
-    def _surroundings(self, scene: Scene, instant: Instant, index: int) -> Surroundings:
-        generator = np.random.default_rng([self.seed, index])
-        name = f"{self.scenario.name} step {index}"
-        return Surroundings(scene, instant, generator, name, threads=torch.get_num_threads())
 
 
 def _counts_of(scene: Scene, instant: Instant, scans: Sequence[SensorScan], reference: ReferenceScan) -> dict[str, int]:

@@ -14,6 +14,8 @@ from torchcover.simulation.shapes import Mesh, corners_of, normals_of, parts_of
 # Surfaces that are nearer to each other are one; nearer than the other, float32 cannot tell that they are two.
 COINCIDE_M = 1e-3
 APART_M = 1e-4
+# From so far above, and as far below, is asked what coincides: where one may be exactly, no ray begins or ends.
+UPON_M = COINCIDE_M + APART_M
 # The cosine of the angle between two that coincide, at least.
 ALIKE = 0.9
 # Of a face so many points are asked along each side, of one that is longer than the other many.
@@ -92,10 +94,10 @@ def coincident_faces(meshes: Sequence[Mesh], within: Sequence[bool]) -> list[Boo
                     own = layer[number[faces]] == which
                     # Of others, to what lies on or below it; of its own body from above and from within, for a ray
                     # that meets the face itself meets nothing else.
-                    for start_m, whose in ((COINCIDE_M, ~own | inner), (-APART_M, own & inner)):
+                    for start_m, whose in ((UPON_M, ~own | inner), (-APART_M, own & inner)):
                         asked = np.flatnonzero(whose)
                         starts_m, towards = places_m[asked] + start_m * normals[asked], -normals[asked]
-                        met = caster.faces_met(starts_m, towards, COINCIDE_M + max(start_m, -COINCIDE_M / 2))
+                        met = caster.faces_met(starts_m, towards, UPON_M + max(start_m, -COINCIDE_M / 2))
                         hit = met >= 0
                         rows.append((asked[hit], of_layer[met[hit]]))
                 asked, two = np.concatenate(rows, axis=1)

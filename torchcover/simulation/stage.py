@@ -10,8 +10,9 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from torch.utils.data import get_worker_info
 
-from torchcover.geometry.arrays import Float64
+from torchcover.geometry.arrays import Float64, Int64
 from torchcover.simulation.instant import Instant
+from torchcover.simulation.local_ground import ROUNDING_M
 from torchcover.simulation.memory import machine_bytes
 from torchcover.simulation.moving import Solids
 from torchcover.simulation.rig import Rig
@@ -21,6 +22,11 @@ from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.sight import MountedSensor
 from torchcover.simulation.stored_worlds import StoredWorlds
 
+# Nearer than this is near enough, above or below.
+NEAR_M = 1.0
+# Instants that are looked at, and how far about the ego.
+LOOKS = 8
+WITHIN_M = 100.0
 # A sensor on the ground is asked about a place this far above it: whether it is inside of something else.
 LIFT_M = np.array([0.0, 0.0, 0.01])
 # What all scenes that are kept may take: in a process, four cities of a minute or more of anything smaller; and of the
@@ -80,13 +86,20 @@ class Scenes:
 
     In each process, that is: Embree's scenes cannot be pickled, so that a DataLoader worker builds its own. The bodies
     of each kind, which runs have in common, are made once. All that are kept may take `kept_bytes`; a small share of
-    the machine's memory if not given.
+    the machine's memory if not given. `device` is that of `RayCaster`, for what never moves.
     """
 
     def __init__(
-        self, scenario: Scenario, seed: int, kept_bytes: float | None = None, *, no_cache: bool = False
+        self,
+        scenario: Scenario,
+        seed: int,
+        kept_bytes: float | None = None,
+        *,
+        no_cache: bool = False,
+        device: str | None = None,
     ) -> None:
         self.scenario = scenario
+        self._device = device
         self._worlds = StoredWorlds(scenario, seed, no_cache=no_cache)
         self._kept_bytes = kept_bytes
         self._kept: dict[int, Scene] = {}
@@ -101,7 +114,7 @@ class Scenes:
             self._make_room()
             if self._ego is None and self.scenario.traffic is not None:
                 self._ego = self.scenario.ego_mesh()
-            scene = Scene(self._worlds.world(run, self._ego), self._solids)
+            scene = Scene(self._worlds.world(run, self._ego), self._solids, self._device)
         self._kept[run] = scene  # at the end: the first is the one that was asked for longest ago
         return scene
 
@@ -163,11 +176,7 @@ class Stages:
 
 
 def mounted_on(scene: Scene, scenario: Scenario, name: str, rig: Rig) -> list[MountedSensor]:
-    """The sensors of a rig on the ego of a scene.
-
-    Raises:
-        ValueError: One is inside the ego's body.
-    """
+    """The sensors of a rig on the ego of a scene. ValueError: one is inside the ego's body."""
     for sensor in rig.sensors:
         place = sensor.mount.matrix()[:3, 3]
         if scene.encloses(place):
@@ -186,3 +195,30 @@ def mounted_on(scene: Scene, scenario: Scenario, name: str, rig: Rig) -> list[Mo
         )
         for one in rig.sensors
     ]
+
+
+def warn_of_floating(name: str, scene: Scene, steps: Int64) -> None:
+    """Warn if the ego, or more than half of the others that move, have no ground near the bottoms of their bodies."""
+    found = np.concatenate([_grounded(scene, step) for step in steps[:: -(-len(steps) // LOOKS)].tolist()])
+    of_ego, of_others = found[found[:, 0] > 0, 1], found[found[:, 0] == 0, 1]
+    for who, grounded, share in (("the ego", of_ego, 0.0), ("others that move", of_others, 0.5)):
+        missing = int((grounded == 0).sum())
+        if missing > share * len(grounded):
+            warnings.warn(
+                f"{name}: {missing} of {len(grounded)} times that were looked at, {who} had no ground within "
+                f"{NEAR_M:g} m below or above the wheels, so that little of it will be known; is the ground a mesh in "
+                "the same frame, and z that of the bottom? Traffic of type 'tracks' without `ground` makes ground that "
+                "follows the tracks",
+                stacklevel=4,
+            )
+
+
+def _grounded(scene: Scene, step: int) -> Int64:
+    """(bodies, 2) whether each that is there at a step is the ego, and whether it has ground."""
+    instant = scene.at(step, within_m=WITHIN_M)
+    up = scene.world.ego.trajectory.at(step * scene.world.time_step_s)[2, :3]
+    others = instant.moving.vehicle_T_part[instant.moving.body != instant.ego, :3, 3]
+    places_m = np.concatenate([np.zeros((1, 3)), others])
+    is_ego = np.arange(len(places_m)) == 0
+    heights_m = instant.heights_m((places_m + NEAR_M * up).astype(np.float32))
+    return np.column_stack([is_ego, heights_m <= 2 * NEAR_M + ROUNDING_M]).astype(np.int64)

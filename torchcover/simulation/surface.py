@@ -97,16 +97,11 @@ class AboveGround(NamedTuple):
 class SceneSurface:
     """The surface of what never moves, in the order of places on the ground, and of each object that moves.
 
-    Args:
-        scenery: What never moves and is no object, in the frame of the ray caster of what never moves.
-        objects: Of the objects, by number, the patches of all of their surface, in their own frames.
-        resting: By number, `static_T_object` of those that never move.
-        moving: Of the others the number of the object, by that of the body in an instant.
-        bounds: Boxes in the frame of what never moves, outside of which no scenery is ever asked for.
-        outward: For each mesh of the scenery (F,) what `outward_faces` says of it.
-        above: What is asked by height above the local ground; None if nothing is.
-        coincident: For each mesh that never moves (F,) numbers of its faces that coincide with others, -1 for the rest;
-            empty if none does.
+    `scenery` is what never moves and is no object, in the frame of the ray caster of that, `objects` the patches of
+    each object's surface in its own frame. `resting` has `static_T_object` by the number of those that never move,
+    `moving` the others' numbers by that of the body in an instant. Outside of `bounds` no scenery is ever asked for.
+    For each mesh of the scenery (F,) are what `outward_faces` says, and numbers of its faces that coincide with others,
+    -1 for the rest.
     """
 
     def __init__(

@@ -14,11 +14,12 @@ from torchcover.simulation.patches import Bounds
 from torchcover.simulation.reference_sensor import ReferenceScan, Surroundings, check_reach, position_in_shell
 from torchcover.simulation.regions_of_interest import DEFAULT_BAND_FRAME, Areas, Asked, Bands
 from torchcover.simulation.sight import Sight, sight
-from torchcover.simulation.sound import COINCIDE_M
+from torchcover.simulation.sound import UPON_M
 from torchcover.simulation.surface_points import SurfacePoints, SurfaceStrata
 
 DEFAULT_RAYS = 16_384
-# How far above the surface a ray to it ends, in metres, and as a share of the coordinates that casting rounds.
+# How far above the surface a ray to it ends, in metres, and as a share of the coordinates that casting rounds. What
+# lies there coincides with it.
 ABOVE_M = 1e-3
 ABOVE_SHARE = 5e-7
 
@@ -185,7 +186,7 @@ def _uncovered(found: SurfacePoints, surroundings: Surroundings) -> SurfacePoint
     if len(asked) == 0:
         return found
     uncovered = np.ones(len(found.points_m), dtype=bool)
-    first = surroundings.instant.first_faces(found.points_m[asked], found.normals[asked], COINCIDE_M)
+    first = surroundings.instant.first_faces(found.points_m[asked], found.normals[asked], UPON_M)
     # Between two faces of one surface rounding decides; these are not covered by another.
     coincident = np.concatenate(surroundings.scene.coincident)
     uncovered[asked] = (first == found.face[0, asked]) | (first < 0) | ~np.isin(first, coincident[coincident >= 0])

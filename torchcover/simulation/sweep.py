@@ -167,12 +167,7 @@ class Sweep:
 
 
 def parabola_weights(samples_s: Float64, times_s: Float64) -> Float64:
-    """(T, 3) how much poses at three times weigh at (T,) others near them: Lagrange's parabola through them.
-
-    Example:
-        >>> parabola_weights(np.array([0.0, 1.0, 2.0]), np.array([0.5])).tolist()
-        [[0.375, 0.75, -0.125]]
-    """
+    """(T, 3) how much poses at three times weigh at (T,) others near them: Lagrange's parabola through them."""
     a, b, c = samples_s
     if a == c:
         return np.tile([1.0, 0.0, 0.0], (len(times_s), 1))

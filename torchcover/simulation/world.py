@@ -17,14 +17,10 @@ MAX_STEPS = 1_000_000
 
 @dataclass(frozen=True, eq=False)
 class Actor:
-    """A body with a place for every time.
+    """A body with a place for every time, and a name of its own.
 
-    Args:
-        name: Different for each actor of a world.
-        category: What it is: "car", "truck", "bus", "cyclist", "pedestrian", ...
-        mesh: Its form in its own frame: origin on the ground under the centre of the bounding box, x forward, z up.
-            Actors of one kind share one mesh object.
-        trajectory: `world_T_actor` over time.
+    Its mesh is in its own frame: origin on the ground under the centre of the bounding box, x forward, z up; actors of
+    one kind share it. The trajectory is `world_T_actor`.
     """
 
     name: str

@@ -1,13 +1,13 @@
 """The points that a rig gets from a target: it is cast alone, and then the scene's depth says which rays arrive."""
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple, Self
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torchcover.simulation.instant import in_threads
 from torchcover.simulation.moving import Moving
 from torchcover.simulation.rays import outlines, rotate
 from torchcover.simulation.sensor import RayHits
@@ -90,12 +90,8 @@ class Beams(NamedTuple):
     def filled(self, hits: RayHits, ends: Ends) -> tuple[RayHits, Numbers]:
         """All hits of each beam in which a target has some, at each position.
 
-        Args:
-            hits: N hits on the target, by ascending position and ray.
-            ends: Where the rays end without it.
-
-        Returns:
-            M hits, by position, beam and ray, and (M,) which of the N each is, -1 if it is on something else.
+        `hits`: N hits on the target, by ascending position and ray; `ends`: where the rays end without it. Returns M
+        hits, by position, beam and ray, and (M,) which of the N each is, -1 if it is on something else.
         """
         assert hits.place is not None  # the positions
         rays, beams = len(self.of_ray), len(self.first) - 1
@@ -124,19 +120,10 @@ def count(
     hits: int,
     threshold_m: float,
 ) -> Sums:
-    """Count what a rig gets from a target at P places.
+    """Count what a rig gets from a target at P places, whatever the number of threads.
 
-    Args:
-        target: The body.
-        surface: Its surface.
-        vehicle_T_target: (P, 4, 4) where it stands, but for the height of the ground there, which is that of the step.
-        mounted: The sensors.
-        steps: What `Steps` gives.
-        hits: How many points are enough.
-        threshold_m: How near a measured point must be to a point of the surface.
-
-    Returns:
-        `Sums`, which do not depend on the number of threads.
+    `vehicle_T_target` (P, 4, 4) is where it stands, but for the height of the ground there, which is that of the step;
+    `hits` are how many points are enough, `threshold_m` how near one must be to a point of the surface.
     """
     farthest_m = [np.max([step.sensors[k].ends.range_m for step in steps], axis=0) for k in range(len(mounted))]
     beams = [Beams.of(sensor) for sensor in mounted]
@@ -157,12 +144,7 @@ def count(
             _count_step(sums, on_ground, mounted, beams, cut, hits, threshold_m)
         return sums
 
-    firsts, threads = range(0, max(len(vehicle_T_target), 1), CHUNK), torch.get_num_threads()
-    if threads <= 1 or len(firsts) <= 1:
-        parts = list(map(count_some, firsts))
-    else:
-        with ThreadPoolExecutor(threads) as pool:
-            parts = list(pool.map(count_some, firsts))
+    parts = in_threads(torch.get_num_threads(), count_some, range(0, max(len(vehicle_T_target), 1), CHUNK))
     return Sums._make(np.concatenate(column, axis=-1) for column in zip(*parts, strict=True))
 
 
@@ -259,8 +241,7 @@ def _in_target(mounted: MountedSensor, met: Met, vehicle_T_target: Float64) -> F
     range_m = met.range_m.astype(np.float64)
     from_origin_m = mounted.vehicle_T_sensor[:3, 3] + met.direction * range_m[:, None]
     from_origin_m -= vehicle_T_target[met.position, :3, 3]
-    hits_m: Float64 = np.einsum("nji,nj->ni", vehicle_T_target[met.position, :3, :3], from_origin_m)
-    return hits_m
+    return np.asarray(np.einsum("nji,nj->ni", vehicle_T_target[met.position, :3, :3], from_origin_m))
 
 
 def _any_of_each(position: Numbers, bits: NDArray[np.uint8], count: int) -> NDArray[np.uint8]:

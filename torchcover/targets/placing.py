@@ -26,30 +26,16 @@ TOUCHING_SHARE = 0.05
 
 
 def yaws(heading: Heading, target: BoundingBox, vehicle: BoundingBox, positions_m: Float64) -> Float64:
-    """(P,) yaw of a target in radians at (P, 2) places.
+    """(P,) yaw of a target in radians at (P, 2) places, by the boxes of both.
 
-    Args:
-        heading: "narrow", "wide", or degrees about z, 0 as the vehicle.
-        target: The target's box.
-        vehicle: The vehicle's box, to whose nearest point the side is turned.
-        positions_m: Where the target stands.
-
-    Raises:
-        ValueError: Another word, or degrees that are no number.
-
-    Example:
-        >>> wall = BoundingBox((-0.1, -1.0, 0.0), (0.1, 1.0, 1.0))
-        >>> car = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))
-        >>> np.rad2deg(yaws("wide", wall, car, np.array([[5.0, 0.0], [0.0, 5.0]]))).tolist()
-        [180.0, -90.0]
+    The "narrow" or "wide" side is turned to the nearest point of the vehicle; degrees are about z, 0 as the vehicle.
     """
     if heading in ("narrow", "wide"):
         towards_m = 0.0 - from_outline_m(vehicle, positions_m)  # no -0.0, which is another angle
         length_m, width_m, _ = target.size_m
         # Whoever looks along the longer side sees the narrow one.
         along_x = (length_m >= width_m) == (heading == "narrow")
-        yaw: Float64 = np.arctan2(towards_m[:, 1], towards_m[:, 0]) - (0.0 if along_x else math.pi / 2)
-        return yaw
+        return np.asarray(np.arctan2(towards_m[:, 1], towards_m[:, 0]) - (0.0 if along_x else math.pi / 2))
     if isinstance(heading, str) or not math.isfinite(heading):
         raise ValueError(f"heading: narrow, wide or degrees are needed; got {heading!r}")
     return np.full(len(positions_m), math.radians(heading))
@@ -89,21 +75,14 @@ def standing(vehicle_T_target: Float64, z_m: Float64) -> Float64:
 def holding(box: BoundingBox, vehicle_T_target: Float64, place_m: Float64) -> Bools:
     """(P,) whether a target's box holds a (3,) place of the vehicle frame."""
     there_m = np.einsum("pji,pj->pi", vehicle_T_target[:, :3, :3], place_m - vehicle_T_target[:, :3, 3])
-    held: Bools = ((there_m > box.lower_m) & (there_m < box.upper_m)).all(axis=1)
-    return held
+    return np.asarray(((there_m > box.lower_m) & (there_m < box.upper_m)).all(axis=1))
 
 
 def blocked(instant: Instant, box: BoundingBox, samples_m: Float64, vehicle_T_target: Float64) -> Bools:
-    """(P,) whether anything but the ego takes a target's room.
+    """(P,) whether anything but the ego takes a target's room, (P, 4, 4) poses of its box.
 
     What moves does so with its box. Of what rests, its faces are asked: whether one lies between the middle of the
-    target and a point of its surface, or the middle is behind one. Kerbs of up to 0.2 m do not count.
-
-    Args:
-        instant: The scene.
-        box: The target's box in its frame.
-        samples_m: (M, 3) points of its surface in its frame.
-        vehicle_T_target: (P, 4, 4) where it stands.
+    target and one of (M, 3) points of its surface, or the middle is behind one. Kerbs of up to 0.2 m do not count.
     """
     taken = np.zeros(len(vehicle_T_target), dtype=bool)
     moving, reach_m = instant.moving, float(np.linalg.norm(box.corners_m, axis=1).max())
@@ -131,7 +110,9 @@ def _meets_static(instant: Instant, box: BoundingBox, samples_m: Float64, vehicl
     met: Bools = (hits.body >= 0) & (hits.body != instant.ego)
     up = np.zeros((3, len(starts_m)), dtype=np.float32)
     up[:] = (instant.static_T_vehicle[:3, 2])[:, None]
-    behind = instant.static.met_from_behind(starts_m, up)
-    inside = (behind >= 0) & (behind != instant.ego)
-    blocked: Bools = met.reshape(len(starts_m), -1).any(axis=1) | inside
-    return blocked
+    above = instant.static.cast_from_each(
+        starts_m.astype(np.float32), up, np.full(len(starts_m), np.inf, dtype=np.float32)
+    )
+    inside = above.body >= 0  # of something, perhaps
+    inside[inside] = [(instant.static.inside(place_m) != instant.ego).any() for place_m in starts_m[inside]]
+    return np.asarray(met.reshape(len(starts_m), -1).any(axis=1) | inside)

@@ -127,5 +127,4 @@ def from_outline_m(box: BoundingBox, positions_m: NDArray[np.float64]) -> NDArra
         [[1.0, 0.0], [-0.5, -0.25]]
     """
     nearest_m = np.clip(positions_m, box.lower_m[:2], box.upper_m[:2])
-    away_m: NDArray[np.float64] = positions_m - nearest_m
-    return away_m
+    return np.asarray(positions_m - nearest_m)

@@ -2,14 +2,22 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.coverage import BevGrid
+from torchcover.files import data_set, small_html
 from torchcover.geometry import BoundingBox
+from torchcover.report import draw_targets, percent
 from torchcover.targets.placing import Heading
 from torchcover.targets.raster import SIDES, Raster, from_outline_m, side_of
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
+    from matplotlib.figure import Figure
 
 Float64 = NDArray[np.float64]
 Numbers = NDArray[np.int64]
@@ -18,6 +26,8 @@ Numbers = NDArray[np.int64]
 STATES = ("free", "occupied", "outside")
 FREE, OCCUPIED, OUTSIDE = range(3)
 WITHIN_M = (1.0, 2.0, 3.0)
+MAPS = ("distance_m", "side", "state", "steps", "points", "sensors", "seen", "least_points", "least_sensors", "share",
+        "visible_m2")  # fmt: skip
 
 
 class Place(NamedTuple):
@@ -41,7 +51,7 @@ class SideShare(NamedTuple):
     seen: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class TargetMap:
     """What a rig sees of a target, for every cell of a raster. Rows are y, columns are x; NaN where it cannot stand.
 
@@ -195,6 +205,52 @@ class TargetMap:
             parts.append(np.stack([end, end - half_m * np.array(along), np.full_like(end, math.nan)], axis=1))
         border_m: Float64 = np.concatenate(parts).reshape(-1, 2)
         return border_m
+
+    def __repr__(self) -> str:
+        return f"TargetMap of {self.target} around {self.rig}: {self.raster.shape} places, {self.step_count} steps"
+
+    def _repr_html_(self) -> str:
+        near = (f"{side.side} {percent(side.seen)} %" for side in self.sides(WITHIN_M[-1:]) if side.cells)
+        where = f"Free places within {WITHIN_M[-1]:g} m where it gets {self.hits} points or more: {', '.join(near)}."
+        return small_html([f"Would {self.rig} see {self.target}?", where], self.plot())
+
+    def plot(self) -> "Figure":
+        """The points on the target at every place, with the border of what is seen: a figure of its own."""
+        length, width, height = self.target_size_m
+        heading = f"{self.heading} side to the vehicle" if isinstance(self.heading, str) else f"yaw {self.heading:g}°"
+        steps = f"{self.step_count} step{'s' if self.step_count > 1 else ''}"
+        return draw_targets(
+            self.points,
+            self.enough,
+            BevGrid(x=self.raster.x, y=self.raster.y, cell=self.raster.step_m),
+            vehicle_outline_m=self.vehicle_outline_m,
+            vehicle_box_m=self.vehicle.outline_m,
+            sensors_m=self.sensors_m,
+            hits=self.hits,
+            title=f"{self.rig}: points on {self.target}",
+            subtitle=f"{length:.2f} x {width:.2f} x {height:.2f} m, {heading}; {self.scenario}, {steps}",
+        )
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """A row for each cell, with its middle, `distance_m`, `side`, `state` and all maps.
+
+        Raises:
+            ModuleNotFoundError: pandas is not there.
+        """
+        maps = self.to_xarray().to_dataframe().reset_index()
+        maps["side"] = [SIDES[side] if side >= 0 else "" for side in self.side.ravel()]
+        maps["state"] = [STATES[state] for state in self.state.ravel()]
+        return maps
+
+    def to_xarray(self) -> "xarray.Dataset":
+        """The maps, and `points_SENSOR` of each sensor, over `y_m` and `x_m`, the middles of the cells.
+
+        Raises:
+            ModuleNotFoundError: xarray is not there.
+        """
+        maps: dict[str, NDArray[Any]] = {name: getattr(self, name) for name in MAPS}
+        maps |= {f"points_{name}": of for name, of in zip(self.sensor_names, self.sensor_points, strict=True)}
+        return data_set(maps, {"y_m": self.y_m, "x_m": self.x_m})
 
     @property
     def counts(self) -> dict[str, int]:

@@ -52,17 +52,9 @@ class Step(NamedTuple):
 
 
 class Steps:
-    """The steps of a run.
+    """The steps of a run, `every_steps` time steps of the scenario apart.
 
-    Args:
-        rig: The sensors.
-        scenario: The world.
-        target: What is placed.
-        surface: Its surface.
-        vehicle_T_target: (P, 4, 4) where, but for the height of the ground there.
-        steps: How many steps.
-        every_steps: Time steps of the scenario between one and the next.
-        seed: Of traffic, random places, noise and drop-out.
+    `vehicle_T_target` (P, 4, 4) is where the target stands, but for the height of the ground there.
     """
 
     def __init__(
@@ -93,9 +85,8 @@ class Steps:
     def __iter__(self) -> Iterator[Step]:
         """One after the other.
 
-        Raises:
-            FileNotFoundError: A mesh, vehicle or trajectory file is missing.
-            ValueError: A sensor or an actor that is where none can be.
+        FileNotFoundError: a mesh, vehicle or trajectory file is missing. ValueError: a sensor or an actor that is where
+        none can be.
         """
         resting: tuple[list[Ends], Float64, Bools] | None = None
         for index in range(self._steps):

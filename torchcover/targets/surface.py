@@ -57,17 +57,9 @@ class Surface(NamedTuple):
     def seen_from(
         self, place_m: Float64, target: Target, vehicle_T_target: Float64, instant: Instant, *, threads: int = 1
     ) -> Bits:
-        """Which of the points a place sees, the target itself and everything else in the way.
+        """(P, M / 8) bits: which of the points a (3,) place sees, the target itself and everything else in the way.
 
-        Args:
-            place_m: (3,) in the vehicle frame.
-            target: Whose surface it is.
-            vehicle_T_target: (P, 4, 4) where it stands.
-            instant: The scene without it.
-            threads: Number of threads; the result does not depend on it.
-
-        Returns:
-            (P, M / 8) bits.
+        The target stands at (P, 4, 4) poses in the instant, which is without it. Threads do not change the result.
         """
         target_R_vehicle = vehicle_T_target[:, :3, :3].swapaxes(1, 2)
         there_m = (target_R_vehicle @ (place_m - vehicle_T_target[:, :3, 3])[..., None])[..., 0]
@@ -109,5 +101,4 @@ def _enclosed(target: Target, points_m: Float64) -> Bools:
         directions, far_m = np.tile(towards[:, None], len(left)), np.full(len(left), np.inf, dtype=np.float32)
         hits = target.solid.caster.cast_from_each(points_m[left].astype(np.float32), directions, far_m)
         left = left[hits.body >= 0]
-    enclosed: Bools = np.isin(np.arange(len(points_m)), left)
-    return enclosed
+    return np.asarray(np.isin(np.arange(len(points_m)), left))

@@ -23,13 +23,10 @@ def frames_in(batch: object) -> tuple[Frame, ...]:
 
 
 def frame_of(sensor: Tensor, reference: Tensor, name: object, vehicle_T_lidar: Tensor | None) -> Frame:
-    """A frame out of the points of another framework.
+    """A frame out of another framework's (N, 3 + ...) points of the rig and (M, 3 + ...) of the reference sensor.
 
-    Args:
-        sensor: (N, 3 + ...) points of the rig in metres.
-        reference: (M, 3 + ...) points of the reference sensor.
-        name: What the framework calls the sample; its index too if that is a number. None: neither is known.
-        vehicle_T_lidar: (4, 4) pose of the points' frame; None if they are in the vehicle frame already.
+    `name` is what that calls the sample, and its index if it is a number; None: neither is known. Without
+    `vehicle_T_lidar` the points are in the vehicle frame already.
     """
     name = "" if name is None else str(name)
     return Frame(

@@ -14,11 +14,8 @@ from torchcover.training.batches import UNKNOWN_INDEX
 class Shard(NamedTuple):
     """How samples are dealt out: number k of a process is number `k * processes + process` of all.
 
-    Args:
-        process: Rank of this process.
-        processes: Number of processes.
-        samples: Number of different samples; what is dealt out beyond it repeats the first ones. None as long as it is
-            not known.
+    `process`: rank of this process; `processes`: number of processes; `samples`: number of different samples; what is
+    dealt out beyond it repeats the first ones. None as long as it is not known.
     """
 
     process: int

@@ -106,6 +106,12 @@ def test_who_is_where_another_one_is_goes_and_of_two_the_one_that_meets_more():
     assert possible([bodies[0], later]) == [bodies[0], later]
 
 
+def test_who_is_on_a_bridge_meets_nobody_below_it():
+    below, above = user(straight()), user(np.column_stack([np.full(51, 50.0), straight(x_m=-50.0)[:, 0]]), yaw_deg=90.0)
+    lifted = above._replace(track=above.track._replace(places_m=above.track.places_m + np.array([0.0, 0.0, 6.0])))
+    assert [len(possible(motions([below, other], 10.0, ORIGIN))) for other in (above, lifted)] == [1, 2]
+
+
 @pytest.fixture(scope="module")
 def corner(tmp_path_factory):
     """Two streets 7 m wide, and the pavement inside and outside of the turn from the one to the other."""
@@ -158,6 +164,14 @@ def test_a_trailer_follows_its_kingpin_and_both_parts_count(corner):
     assert possible([alone, rests]) == [alone, rests]
     wide = motions([semi_trailer(turn(5.0, 3.0, (3.5, 4.5)))], 22.0, ORIGIN, corner)[0]
     assert not wide.can_be
+
+
+def test_who_keeps_to_a_lane_beside_a_kerb_is_looked_at_too(corner):
+    off, on = (motions([user(straight(x_m=-80.0, y_m=y))], 8.0, ORIGIN, corner)[0] for y in (3.5, 0.4))
+    assert off.over_kerb_m == 0.0
+    assert off.poses[:, 1] == pytest.approx(3.5)
+    assert on.over_kerb_m == 0.0
+    assert on.poses[5:, 1].min() > 1.0
 
 
 def test_who_cannot_get_round_is_not_there(corner):

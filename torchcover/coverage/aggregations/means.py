@@ -60,8 +60,7 @@ class VisibleArea(Aggregation):
     Sums over cells and steps are as good: the mean over a region is the ratio of its sums. A `CoverageMetric` with
     `square_metres=True` has it.
 
-    Args:
-        thresholds: Detection thresholds in metres.
+    `thresholds`: detection thresholds in metres.
     """
 
     name: ClassVar[str] = "area"

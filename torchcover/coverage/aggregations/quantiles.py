@@ -21,12 +21,7 @@ RADIUS_EDGES_M = torch.cat([torch.tensor([0.0]), torch.logspace(-2, 2, 81), torc
 
 
 def bin_of(values: Tensor, edges: Tensor) -> Tensor:
-    """(N,) int64 which half-open bin [edges[i], edges[i + 1]) each value is in, -1 outside; of equal edges none is.
-
-    Example:
-        >>> bin_of(torch.tensor([-0.1, 0.0, 0.9, 2.0]).double(), torch.tensor([0.0, 1.0, 2.0]).double())
-        tensor([-1,  0,  0, -1])
-    """
+    """(N,) int64 which half-open bin [edges[i], edges[i + 1]) each value is in, -1 outside; of equal edges none is."""
     index = torch.bucketize(values, edges.to(values.device), right=True) - 1
     return index.where(index < len(edges) - 1, -1)
 

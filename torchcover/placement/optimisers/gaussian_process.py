@@ -34,9 +34,7 @@ class GaussianProcessSearch:
     Its noise is the squared error that it is told, and a little that it learns. A place where no rig can be counts as
     the lowest value so far, so that little is expected nearby. Where all are choices, each combination comes once.
 
-    Args:
-        cube: What is free.
-        seed: Of the first places and of where improvement is looked for.
+    `seed`: of the first places and of where improvement is looked for.
 
     Example:
         >>> search = GaussianProcessSearch(Cube(levels=(0,), start=np.array([0.0])), seed=0)
@@ -149,10 +147,6 @@ def log_expected_improvement(mean: Tensor, deviation: Tensor, best: float, scale
     """The logarithm of E[max(f - best, 0)] / scale for normally distributed f, without underflow (Ament et al. 2023).
 
     Means and deviations are (m,); deviations below a trillionth of the scale count as that.
-
-    Example:
-        >>> float(log_expected_improvement(torch.zeros(1), torch.ones(1), 0.0, 1.0).exp() * math.sqrt(2 * math.pi))
-        1.0
     """
     deviation = (deviation / scale).clamp_min(1e-12)
     z = (mean - best) / scale / deviation

@@ -23,18 +23,12 @@ RESTARTS = ((0.0, 0.0), (-1.2, 4.0))
 
 @dataclass(frozen=True, eq=False)
 class GaussianProcess:
-    """What is known of a function after some values of it.
+    """What is known of a function after some values of it, which are shifted and scaled.
 
-    Args:
-        levels: As of `Cube`: the options of a choice are all as far from each other.
-        places: (n, variables) float64, where it was measured.
-        shift: Added to what is computed.
-        scale: What it is multiplied with first.
-        log_lengths: (variables,) of the kernel.
-        log_signal: Variance of the function.
-        log_noise: Variance that every value has beside its own.
-        cholesky: (n, n) factor of the kernel matrix with the noise.
-        weights: (n,) the matrix' inverse times the values.
+    `levels` are as of `Cube`, the options of a choice all as far from each other; `places` (n, variables) float64,
+    where it was measured. `log_lengths` (variables,) and `log_signal` are of the kernel, `log_noise` the variance that
+    every value has beside its own. `cholesky` (n, n) factors the kernel matrix with the noise, `weights` (n,) are its
+    inverse times the values.
     """
 
     levels: tuple[int, ...]
@@ -56,13 +50,6 @@ class GaussianProcess:
         Rasmussen and Williams 2006, Gaussian Processes for Machine Learning, algorithm 2.1 and section 5.4. `places`
         are (n, variables) float64, n of 1 or more, with duplicates or without; `values` (n,) and finite; `errors` (n,)
         the standard error of each, 0 for an exact one. Those of `like` are taken instead of learned, if it is given.
-
-        Example:
-            >>> x = torch.linspace(0, 1, 9, dtype=torch.float64)[:, None]
-            >>> model = GaussianProcess.fitted((0,), x, (6 * x[:, 0]).sin(), torch.zeros(9, dtype=torch.float64))
-            >>> mean, deviation = model.predict(torch.tensor([[0.3]], dtype=torch.float64))
-            >>> bool((mean - math.sin(1.8)).abs() < 0.01)
-            True
         """
         shift = float(values.mean())
         spread = float((values - shift).square().mean().sqrt())

@@ -6,11 +6,7 @@ from torchcover.placement.optimisers.optimiser import Cube, Unit
 
 
 class RandomSearch:
-    """Evenly distributed places, whatever it is told.
-
-    Args:
-        cube: What is free.
-        seed: Of its draws.
+    """Evenly distributed places, whatever it is told. `seed`: of its draws.
 
     Example:
         >>> RandomSearch(Cube(levels=(0, 3)), seed=0).ask().shape

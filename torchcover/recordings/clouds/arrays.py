@@ -47,12 +47,8 @@ def read_archive(path: Path) -> Points:
 def read_weighted_cloud(path: Path) -> tuple[Points, NDArray[np.float64]]:
     """Read a cloud and what each of its points counts for: the arrays `points` and `weights` of a `.npz`.
 
-    Returns:
-        (N, 3) points, and (N,) float64 weights.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        BadFileError: Not such a file; a weight that is not positive and finite, or another number of them.
+    Returns (N, 3) points, and (N,) float64 weights. FileNotFoundError: there is no such file. BadFileError: not such a
+    file; a weight that is not positive and finite, or another number of them.
     """
     if path.suffix.lower() != ".npz":
         raise ValueError("weights are read from a .npz with the arrays points and weights only")
@@ -70,11 +66,8 @@ def read_weighted_cloud(path: Path) -> tuple[Points, NDArray[np.float64]]:
 def read_heights(path: Path, count: int) -> NDArray[np.float32] | None:
     """Read how high above the local ground the points of a cloud are: the array `heights_m` of a `.npz`.
 
-    Returns:
-        (N,) metres, NaN where there is no ground at or below; None if the file does not say.
-
-    Raises:
-        BadFileError: Another number of them, or infinite ones.
+    Returns (N,) metres, NaN where there is no ground at or below; None if the file does not say. BadFileError: another
+    number of them, or infinite ones.
     """
     if path.suffix.lower() != ".npz" or "heights_m" not in npz_headers(path):
         return None

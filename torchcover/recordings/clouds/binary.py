@@ -39,8 +39,7 @@ SUFFIXES = {4: ".bin (x y z intensity)", 5: ".pcd.bin (x y z intensity ring)"}
 def check_records(data: bytes, columns: int) -> NDArray[np.float32]:
     """(N, columns) little-endian float32, x y z first, if the bytes may be such.
 
-    Raises:
-        ValueError: Bytes are left over, or the numbers are no coordinates.
+    ValueError: bytes are left over, or the numbers are no coordinates.
     """
     known = next((name for start, name in SIGNATURES.items() if data.startswith(start)), None)
     if known is None and all(byte in PRINTABLE for byte in data[:1024]):

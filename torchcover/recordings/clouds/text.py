@@ -50,19 +50,9 @@ def read_text(path: Path) -> NDArray[np.float64]:
 def parse_rows(
     rows: Iterable[str], columns: Sequence[int], width: int, delimiter: str | None = None
 ) -> NDArray[np.float64]:
-    """Parse some columns of every row.
+    """(N, 3) numbers of rows, of which none is blank; float64 keeps all digits of UTM-sized coordinates.
 
-    Args:
-        rows: At least one, without blank ones.
-        columns: Where x, y and z are.
-        width: How many columns every row has.
-        delimiter: None for white space.
-
-    Returns:
-        (N, 3) float64, which keeps all digits of UTM-sized coordinates.
-
-    Raises:
-        ValueError: A row of another width, or one without three numbers.
+    ValueError: a row of another width, or one without three numbers.
     """
     checked = _of_width(rows, width, delimiter)
     try:

@@ -62,10 +62,8 @@ class Argoverse2(Layout):
 
     The clouds are in the frame of the ego and corrected for its motion within a turn. Needs `torchcover[av2]`.
 
-    Raises:
-        FileNotFoundError: No sweeps, or no poses.
-        ValueError: A table with other columns, a sweep without a pose within 10 ms.
-        ImportError: pyarrow is not installed.
+    FileNotFoundError: no sweeps, or no poses. ValueError: a table with other columns, a sweep without a pose within 10
+    ms. ImportError: pyarrow is not installed.
     """
 
     layout: ClassVar[str] = "sensors/lidar/TIME.feather, city_SE3_egovehicle.feather"

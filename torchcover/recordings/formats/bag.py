@@ -32,10 +32,8 @@ class Bag:
     Needs `torchcover[ros]`. Opening reads the index only. Messages are read as what the standard definitions say of
     their types; those that are in the bag, of which code would be made, are left aside.
 
-    Raises:
-        FileNotFoundError: A file is missing.
-        BadFileError: What is no bag, or a part of one; files that are compressed as a whole or have no index.
-        ImportError: rosbags is not installed.
+    FileNotFoundError: a file is missing. BadFileError: what is no bag, or a part of one; files that are compressed as a
+    whole or have no index. ImportError: rosbags is not installed.
     """
 
     def __init__(self, path: Path) -> None:
@@ -124,9 +122,8 @@ def check_suffix(path: Path) -> None:
 def check_metadata(path: Path) -> None:
     """Whether the files that `metadata.yaml` names can be read one message at a time.
 
-    Raises:
-        FileNotFoundError: One is missing.
-        BadFileError: Other content, files elsewhere, files that are compressed as a whole.
+    FileNotFoundError: one is missing. BadFileError: other content, files elsewhere, files that are compressed as a
+    whole.
     """
     content = parse_yaml(read_short_text(path))
     told = content.get("rosbag2_bagfile_information") if isinstance(content, dict) else None

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from torchcover.cameras import Camera
-from torchcover.detection.box_layouts import upright_rows
-from torchcover.detection.boxes import Boxes
+from torchcover.detection.boxes import Boxes, upright_rows
 from torchcover.files import naming, parse_yaml, read_csv, read_short_text, reads
 from torchcover.geometry import BoundingBox, rigid, rotation_from_euler
 from torchcover.geometry.rigid import Matrix
@@ -126,10 +125,8 @@ def read_carla_vehicle(path: Path) -> CarlaVehicle:
 def read_carla_boxes(path: Path, vehicle_T_world: Matrix) -> Boxes:
     """Read the objects of a frame.
 
-    Args:
-        path: A table with the columns `id, category, x, y, z, roll, pitch, yaw, extent_x, extent_y, extent_z`: the
-            centre and half the size of each bounding box in the world; `velocity_x, velocity_y` may be there too.
-        vehicle_T_world: (4, 4) the inverse of the vehicle's pose.
+    The table has the columns `id, category, x, y, z, roll, pitch, yaw, extent_x, extent_y, extent_z`: the centre and
+    half the size of each bounding box in the world; `velocity_x, velocity_y` may be there too.
     """
     table = read_csv(path, (*POSE, *EXTENT), ("id", "category"), VELOCITY)
     numbers, count = table.numbers, len(table.words["id"])

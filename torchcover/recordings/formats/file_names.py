@@ -15,17 +15,10 @@ CLOUDS = f"a cloud; allowed are files ending in {', '.join(READERS)}"
 def frame_files(
     folder: Path, like: Sequence[str] | None = None, beside: Collection[str] = (), *, images: bool = False
 ) -> dict[str, Path]:
-    """The clouds, or depth images, in a folder by the names of their frames, in natural order (frame2 before frame10).
+    """The clouds, or depth images in PNG, by the names of their frames in natural order (frame2 before frame10).
 
-    Args:
-        folder: Where they are.
-        like: Names that there have to be, and no others.
-        beside: Names of files that may be there and are no clouds.
-        images: Whether depth images in PNG are wanted, and no clouds.
-
-    Raises:
-        FileNotFoundError: No such folder.
-        ValueError: A file that is no cloud, two files of one name, no files, or other names than `like`.
+    There have to be those of `like`, and no others; files `beside` them are no clouds. ValueError: a file that is no
+    cloud, two files of one name, no files, or other names than `like`.
     """
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder; clouds are needed in it, one a frame")

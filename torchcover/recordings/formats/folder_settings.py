@@ -54,12 +54,9 @@ class PlaceSettings(NamedTuple):
 
 
 class FolderSettings(NamedTuple):
-    """What the file says.
+    """What the file says, by `sensor`, `sensors/NAME`, `rigs/NAME` or `reference`, where it does.
 
-    Args:
-        places: `sensor`, `sensors/NAME`, `rigs/NAME` or `reference` -> how its clouds are to be read, where it says so.
-        square_metres: Whether the reference's files have weights, the square metres of their points.
-        body: The vehicle itself; None if unknown.
+    With `square_metres` the reference's files have weights; `body` is the vehicle itself, None if unknown.
     """
 
     places: dict[str, PlaceSettings]

@@ -21,14 +21,10 @@ NAMES = ("id", "category")
 
 
 class PoseTable:
-    """A pose for every frame, and where the table says so, its time.
+    """A pose for every frame, in their order, and where the table says so, its time.
 
-    Args:
-        path: A table with the columns `frame, x_m, y_m, z_m, qw, qx, qy, qz`, and `time_s` if it is `timed`; `instant`
-            may be there too, a whole number that frames share which are no news to each other
-            (`Frame.place_in_time`).
-        names: The frames, in order.
-        timed: Whether there are times.
+    Its columns are `frame, x_m, y_m, z_m, qw, qx, qy, qz`, and `time_s` if it is `timed`; `instant` may be there too, a
+    whole number that frames share which are no news to each other (`Frame.place_in_time`).
     """
 
     def __init__(self, path: Path, names: Sequence[str], *, timed: bool) -> None:
@@ -60,10 +56,9 @@ class PoseTable:
 def read_boxes(path: Path) -> Boxes:
     """Read the objects of a frame.
 
-    Args:
-        path: A table with the columns `x_m, y_m, z_m, length_m, width_m, height_m, yaw_rad, id, category`: the centre,
-            half-way up, in the vehicle frame; `id` and `category` may be empty. `vx_mps, vy_mps` may be there too, the
-            velocity over ground along the vehicle's x and y, and `drawn_points` and `bottom_height_m`, see `Boxes`.
+    The columns are `x_m, y_m, z_m, length_m, width_m, height_m, yaw_rad, id, category`: the centre, half-way up, in the
+    vehicle frame; `id` and `category` may be empty. `vx_mps, vy_mps` may be there too, the velocity over ground along
+    the vehicle's x and y, and `drawn_points` and `bottom_height_m`, see `Boxes`.
     """
     table = read_csv(path, BOX, NAMES, (*VELOCITY, DRAWN, BOTTOM))
     numbers, ids = table.numbers, table.words["id"]

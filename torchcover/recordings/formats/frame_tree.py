@@ -12,8 +12,7 @@ from torchcover.geometry.rigid import Matrix
 class FrameTree:
     """Transforms of frames from their parents.
 
-    Args:
-        transforms: Messages `geometry_msgs/msg/TransformStamped`; of two for the same frame the later counts.
+    `transforms`: messages `geometry_msgs/msg/TransformStamped`; of two for the same frame the later counts.
     """
 
     def __init__(self, transforms: Iterable[Any]) -> None:

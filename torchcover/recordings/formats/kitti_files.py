@@ -125,9 +125,7 @@ def read_oxts(path: Path) -> NDArray[np.float64]:
 def world_T_imu(oxts: NDArray[np.float64], latitude_deg: float) -> Matrix:
     """(4, 4) the pose of the IMU in a Mercator projection, scaled at a latitude as in the development kit.
 
-    Args:
-        oxts: (6,) as `read_oxts` gives it.
-        latitude_deg: That of the drive's first record.
+    `oxts`: (6,) as `read_oxts` gives it; `latitude_deg`: that of the drive's first record.
 
     Example:
         >>> world_T_imu(np.array([49.0, 8.0, 110.0, 0.0, 0.0, np.pi / 2]), 49.0)[:3, 1].round(6)

@@ -29,8 +29,7 @@ class KittiObject(Layout):
     The data set has no reference, and neighbours in the list are not neighbours in time: a reference has to be in a
     folder `reference/FRAME.*` beside them, in the frame of the LiDAR.
 
-    Args:
-        path: `training`, `testing`, or the folder that holds `training`.
+    `path`: `training`, `testing`, or the folder that holds `training`.
     """
 
     layout: ClassVar[str] = "velodyne/FRAME.bin, calib/FRAME.txt, label_2/FRAME.txt"

@@ -33,9 +33,8 @@ class KittiRaw(Layout):
 
     Boxes are those of `tracklet_labels.xml`, if it is there.
 
-    Raises:
-        FileNotFoundError: A part is missing.
-        ValueError: No frames, another number of times than of scans, times out of order, a bad calibration.
+    FileNotFoundError: a part is missing. ValueError: no frames, another number of times than of scans, times out of
+    order, a bad calibration.
     """
 
     layout: ClassVar[str] = "DATE/DRIVE/velodyne_points/data/FRAME.bin, oxts/data/FRAME.txt"

@@ -19,13 +19,10 @@ LONGEST_TURN_S = 1.0
 
 
 class CloudMessage(NamedTuple):
-    """A cloud.
+    """A cloud: (N, 3) points in the frame of the sensor, also those that are not finite, and (N,) the laser of each.
 
-    Args:
-        points_m: (N, 3) in the frame of the sensor, those that are not finite included.
-        stamp_ns: The time of the message, 0 if its sender gave none.
-        offsets_s: (N,) when each point was measured, since then; None if unknown.
-        rows: (N,) number of the laser of each; None if unknown.
+    `stamp_ns` is the time of the message, 0 if its sender gave none, `offsets_s` (N,) when each was measured since
+    then.
     """
 
     points_m: Points

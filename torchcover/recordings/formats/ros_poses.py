@@ -26,13 +26,7 @@ SAME = 1e-6
 
 
 class PoseSeries(NamedTuple):
-    """Poses at ascending times.
-
-    Args:
-        times_ns: (K,).
-        places_m: (K, 3).
-        wxyz: (K, 4) unit quaternions.
-    """
+    """Poses at ascending times. `times_ns`: (K,); `places_m`: (K, 3); `wxyz`: (K, 4) unit quaternions."""
 
     times_ns: NDArray[np.int64]
     places_m: Matrix
@@ -60,13 +54,9 @@ class PoseSeries(NamedTuple):
 
 
 class VehiclePoses:
-    """Poses of the vehicle's frame.
+    """Poses of the vehicle's frame, from a topic of the bag; `source` says for people what was taken.
 
-    Args:
-        bag: The bag.
-        topic: Where the poses are.
-        links: From the world to the vehicle: frames whose poses are read, and what is mounted, as (4, 4).
-        source: What was taken, for people.
+    `links` lead from the world to the vehicle: frames whose poses are read, and what is mounted, as (4, 4).
     """
 
     def __init__(self, bag: Bag, topic: str, links: Sequence[str | Matrix], source: str) -> None:
@@ -87,12 +77,7 @@ class VehiclePoses:
         return self._span_ns[0] - edge_ns <= time_ns <= self._span_ns[1] + edge_ns
 
     def at(self, times_ns: NDArray[np.int64], logged_ns: int) -> Matrix:
-        """(N, 4, 4) `world_T_vehicle`.
-
-        Args:
-            times_ns: (N,) when.
-            logged_ns: About when such messages were recorded.
-        """
+        """(N, 4, 4) `world_T_vehicle`. `times_ns`: (N,) when; `logged_ns`: about when such messages were recorded."""
         with naming(self._bag.path, "a bag"):
             series = self._around(logged_ns)
             world_T_here = np.broadcast_to(np.eye(4), (len(times_ns), 4, 4))

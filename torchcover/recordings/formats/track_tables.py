@@ -21,15 +21,9 @@ MAX_STEP = 5.0
 def read_trajectory(path: Path) -> Trajectory:
     """Read a trajectory.
 
-    Args:
-        path: `.csv` with the columns t, x, y, z, roll, pitch, yaw (seconds, metres, degrees); or `.npz` with `times_s`
-            (K,) and `world_T_body` (K, 4, 4).
-
-    Raises:
-        FileNotFoundError: No such file.
-        IsADirectoryError: A folder.
-        BadFileError: Another suffix, missing columns, what is no number, NaN, times that do not ascend, a gap in time,
-            a pose that is not a rigid transform, or damage; the message names the file.
+    A `.csv` has the columns t, x, y, z, roll, pitch, yaw (seconds, metres, degrees), a `.npz` `times_s` (K,) and
+    `world_T_body` (K, 4, 4). BadFileError: another suffix, missing columns, what is no number, NaN, times that do not
+    ascend, a gap in time, a pose that is not a rigid transform, or damage.
     """
     readers = {".csv": _read_csv, ".npz": _read_npz}
     if path.suffix not in readers:
@@ -43,15 +37,9 @@ def read_trajectory(path: Path) -> Trajectory:
 def read_box_tracks(path: Path) -> tuple[Track, ...]:
     """Read recorded boxes, one track for each id: of its first size, there between its first and last time.
 
-    Args:
-        path: `.csv` with the columns t, id, category, x, y, z, length, width, height, yaw (seconds, metres, degrees; x,
-            y, z of the centre of the bottom).
-
-    Raises:
-        FileNotFoundError: No such file.
-        IsADirectoryError: A folder.
-        BadFileError: Missing columns, what is no number, NaN, times that do not ascend, a box without volume; the
-            message names the file and the id.
+    The `.csv` has the columns t, id, category, x, y, z, length, width, height, yaw (seconds, metres, degrees; x, y, z
+    of the centre of the bottom). BadFileError: missing columns, what is no number, NaN, times that do not ascend, a box
+    without volume; the message names the file and the id.
     """
     return tuple(_tracks(path))
 

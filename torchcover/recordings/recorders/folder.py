@@ -23,8 +23,7 @@ class FolderRecorder:
 
     Clouds are float64, so that moved back into the vehicle frame they are the same.
 
-    Raises:
-        ValueError: A sensor whose name is none of a folder.
+    ValueError: a sensor whose name is none of a folder.
     """
 
     def __init__(self, add: Add, setup: RecordingSetup) -> None:

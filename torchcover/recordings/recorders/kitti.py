@@ -26,8 +26,7 @@ class KittiRecorder:
     The layout has no mount: the frame of its clouds is that of KITTI's LiDAR, 1.73 m above the ground and 0.58 m behind
     the vehicle's middle, wherever the rig has its own. Clouds are float32, intensities 0.
 
-    Raises:
-        ValueError: Another rig than of one LiDAR.
+    ValueError: another rig than of one LiDAR.
     """
 
     def __init__(self, add: Add, setup: RecordingSetup) -> None:

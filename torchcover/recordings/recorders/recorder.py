@@ -11,15 +11,9 @@ from torchcover.recordings.clouds.arrays import Points
 
 
 class RecordingSetup(NamedTuple):
-    """What is recorded, the same at every step.
+    """What is the same at every step: the mounts of the rig's sensors, which of these are LiDARs, the vehicle.
 
-    Args:
-        rig: The name of the rig.
-        mounts: Name of each sensor -> (4, 4) `vehicle_T_sensor`.
-        lidars: The sensors that are LiDARs.
-        body: The vehicle itself, in its own frame.
-        square_metres: Whether frames have the square metres of their reference points.
-        boxes: Whether the frames have boxes.
+    `square_metres` and `boxes` say whether the frames have those.
     """
 
     rig: str
@@ -31,14 +25,10 @@ class RecordingSetup(NamedTuple):
 
 
 class RecordedStep(NamedTuple):
-    """A step of a recording.
+    """A step of a recording, by the name of its files.
 
-    Args:
-        name: What its files are called.
-        time_s: When it was.
-        world_T_vehicle: (4, 4) where the vehicle was.
-        clouds: Name of each sensor -> (N, 3) float32 points in the vehicle frame, as they landed.
-        frame: Everything together.
+    `clouds` are (N, 3) float32 points of each sensor in the vehicle frame, as they landed; the frame is everything
+    together.
     """
 
     name: str
@@ -56,11 +46,7 @@ class Recorder(Protocol):
     """Writes a recording step by step; another process may go on where one has ended."""
 
     def __init__(self, add: Add, setup: RecordingSetup, /) -> None:
-        """Begin one.
-
-        Raises:
-            ValueError: A rig that the layout cannot hold.
-        """
+        """Begin one. ValueError: a rig that the layout cannot hold."""
         ...
 
     def write(self, step: RecordedStep, /) -> Sequence[Any]:

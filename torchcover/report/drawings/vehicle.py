@@ -39,14 +39,7 @@ VIEWS = {
 
 
 def draw_body(axes: Axes, vertices_m: Points, faces: NDArray[np.int64], view: View) -> None:
-    """Draw a body, shaded: what is nearer to the eye is drawn later.
-
-    Args:
-        axes: What to draw in.
-        vertices_m: (V, 3) corners.
-        faces: (F, 3) triangles.
-        view: Where one looks from.
-    """
+    """Draw (F, 3) triangles between (V, 3) corners, shaded: what is nearer to the eye is drawn later."""
     corners = vertices_m[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)

@@ -123,17 +123,10 @@ def draw_cells(
     opacity: NDArray[np.float64] | None = None,
     infinite: str = INFINITE,
 ) -> AxesImage:
-    """Colour each cell; unknown ones are hatched grey, infinite ones have a colour of their own.
+    """Colour (Y, X) cells; unknown ones, NaN, are hatched grey, infinite ones have a colour of their own.
 
-    Args:
-        axes: Axes of a map, with limits set to the grid's bounds.
-        array: (Y, X) values, NaN where unknown.
-        scale: What the colours mean.
-        opacity: (Y, X) in [0, 1] of each cell; all are opaque if not given.
-        infinite: Colour of infinite cells.
-
-    Returns:
-        The image, for the colour bar.
+    The axes have the grid's bounds as limits. Cells are opaque but for an `opacity` from 0 to 1 of each. Returns the
+    image, for the colour bar.
     """
     # Unknown cells are holes through which the ground of the axes shows.
     axes.patch.set(**UNKNOWN, linewidth=0)
@@ -148,9 +141,7 @@ def draw_cells(
 def cell_entries(array: NDArray[np.float64], unknown: str = NEVER_PROBED) -> list[Artist]:
     """The legend entries for cells without a colour of the scale.
 
-    Args:
-        array: Values of one map, or of several, NaN where unknown.
-        unknown: Why they are.
+    `array`: values of one map, or of several, NaN where unknown; `unknown`: why they are.
     """
     unknown_share = percent(float(np.isnan(array).mean()))
     entries: list[Artist] = [Patch(label=f"unknown: {unknown} ({unknown_share} % of the cells)", **UNKNOWN)]
@@ -169,11 +160,7 @@ def paler_entry() -> Artist:
 def draw_colour_bar(sheet: Sheet, image: AxesImage, array: NDArray[np.float64], scale: ColourScale) -> None:
     """Draw the colour bar with quantity and unit; if values lie beyond an end, an arrow and how many there are.
 
-    Args:
-        sheet: The sheet of the map, or of one of several that share the colour bar.
-        image: What `draw_cells` returned.
-        array: Values of all the maps, NaN where unknown.
-        scale: What the colours mean.
+    Maps that share it are beside each other on the sheet; `array` has the values of all.
     """
     known = array[np.isfinite(array)]
     rounding = 1e-6 * (scale.high - scale.low)

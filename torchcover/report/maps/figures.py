@@ -32,6 +32,7 @@ def map_figures(
     ego_outline_m: NDArray[np.floating] | None = None,
     sensors: Mapping[str, Sequence[SensorView]] | None = None,
     vehicle: str | None = None,
+    layer: str | None = None,
 ) -> Iterator[Named]:
     """Draw what was measured in every height band, for one rig or for several.
 
@@ -46,6 +47,7 @@ def map_figures(
         ego_outline_m: (K, 2) corners x, y of the ego in the vehicle frame in metres.
         sensors: What to mark, by the name of the rig.
         vehicle: What the ego is called, for the titles.
+        layer: Key of the only quantity to draw; all if not given.
 
     Returns:
         Pairs, drawn one by one, of a name that is fit for a file and a figure: `radius_m_ground`,
@@ -65,7 +67,7 @@ def map_figures(
     if len(coverages) > 1:
         check_paired(coverages)
     coverages = {name: as_drawn(coverage) for name, coverage in coverages.items()}
-    return _figures(coverages, _Setting(ego_outline_m, sensors or {}, vehicle))
+    return _figures(coverages, _Setting(ego_outline_m, sensors or {}, vehicle), layer)
 
 
 def band_figures(coverage: Coverage) -> Iterator[Named]:
@@ -96,9 +98,6 @@ def write_figures(figures: Iterable[Named], folder: str | Path) -> list[Path]:
     Args:
         figures: Their names without suffix, and they: what `map_figures` gives.
         folder: Where to write; made if it does not exist.
-
-    Returns:
-        The files.
     """
     paths = []
     for name, figure in figures:
@@ -152,11 +151,13 @@ class _Band:
         return None if subject.opacity is None else subject.opacity[self.number]
 
 
-def _figures(coverages: Mapping[str, Coverage], setting: _Setting) -> Iterator[Named]:
+def _figures(coverages: Mapping[str, Coverage], setting: _Setting, layer: str | None) -> Iterator[Named]:
     first, ego = next(iter(coverages.values())), setting.ego_outline_m
     bands, shown = _bands(first.grid), asked_and_known(first, ego)
     near = None if ego is None else near_field(first.grid, ego)
     for whole in map(setting.told, subjects_of(coverages)):
+        if layer not in (None, whole.quantity.key):
+            continue
         subject = _within(whole, shown)
         yield from _draw_rigs(subject, shown.grid, bands, setting)
         yield from _draw_differences(subject, shown.grid, bands, setting)

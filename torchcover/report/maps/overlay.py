@@ -112,15 +112,8 @@ def sensor_colour(at: int) -> str:
 def draw_ego(axes: Axes, outline_m: NDArray[np.floating]) -> list[Artist]:
     """Fill the ego's outline.
 
-    Args:
-        axes: Axes of a map.
-        outline_m: (K, 2) corners x, y in the vehicle frame in metres, K >= 3.
-
-    Returns:
-        Legend entries.
-
-    Raises:
-        ValueError: Another shape.
+    `axes`: axes of a map; `outline_m`: (K, 2) corners x, y in the vehicle frame in metres, K >= 3. Returns legend
+    entries. ValueError: another shape.
     """
     outline = np.asarray(outline_m)
     if outline.ndim != 2 or outline.shape[1] != 2 or len(outline) < 3:
@@ -133,13 +126,8 @@ def draw_ego(axes: Axes, outline_m: NDArray[np.floating]) -> list[Artist]:
 def draw_sensors(sheet: Sheet, sensors: Sequence[SensorView], *, named: bool = True) -> list[Artist]:
     """Draw each sensor as a dot with an arrow in its direction, numbered if there are several, and its field of view.
 
-    Args:
-        sheet: The sheet of the map.
-        sensors: What to draw.
-        named: Whether the legend names each; else there are no numbers either.
-
-    Returns:
-        Legend entries.
+    `sheet`: the sheet of the map; `sensors`: what to draw; `named`: whether the legend names each; else there are no
+    numbers either. Returns legend entries.
     """
     if not sensors:
         return []

@@ -41,14 +41,9 @@ ABOVE: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset poin
 
 @dataclass(frozen=True)
 class Sheet:
-    """An empty map, alone on its paper or beside others.
+    """An empty map, x to the right and y upwards in equal metres, alone on its paper or beside others.
 
-    Args:
-        figure: The whole paper.
-        axes: The map: x to the right and y upwards, in equal metres.
-        bar: Place of the colour bar, which the maps on one paper share.
-        legend_columns: How many entries of a legend fit beside each other.
-        metres_per_inch: Scale of the map.
+    These share the place of the `bar`. So many columns of a legend fit beside each other.
     """
 
     figure: Figure
@@ -61,12 +56,7 @@ class Sheet:
 def lay_out(grid: BevGrid, maps: int = 1) -> list[Sheet]:
     """Empty maps of the grid on one paper: long ones below each other, others beside each other.
 
-    Args:
-        grid: Bounds and cells.
-        maps: How many.
-
-    Returns:
-        The maps, row by row from the upper left.
+    `grid`: bounds and cells; `maps`: how many. Returns the maps, row by row from the upper left.
     """
     _, rows, columns = grid.shape
     across, inches_per_cell = _arrange(grid, maps)
@@ -115,12 +105,8 @@ def _label(axes: Axes, *, left: bool, lowest: bool) -> None:
 def stack_views(views: Sequence[tuple[Bounds, Bounds]], *, width_in: float) -> tuple[Figure, list[Axes]]:
     """Empty views in metres without cells, below each other, each in equal metres on both axes.
 
-    Args:
-        views: Bounds of the axis to the right, and of that upwards, in metres; from the top.
-        width_in: Width in inches.
-
-    Returns:
-        The paper, and the views from the top.
+    `views`: bounds of the axis to the right, and of that upwards, in metres; from the top; `width_in`: width in inches.
+    Returns the paper, and the views from the top.
     """
     heights_in = [width_in * (y[1] - y[0]) / (x[1] - x[0]) for x, y in views]
     paper_in = sum(heights_in) + LABELS_IN * (len(heights_in) - 1)

@@ -20,15 +20,10 @@ NOTHING_FOUND = "no visible surface found"
 
 @dataclass(frozen=True)
 class Subject:
-    """What some maps show: one quantity of every rig in every band.
+    """What some maps show: one quantity of every rig, (H, Y, X) in the unit that is shown, by one scale in every band.
 
-    Args:
-        quantity: What the values are.
-        values: Name of the rig -> (H, Y, X) in the unit that is shown.
-        scale: What the colours mean: the same for all bands and rigs.
-        unknown: Why a cell has no number, for the legend.
-        conditions: How much was measured, and how finely.
-        opacity: (H, Y, X) in [0, 1] how opaque each cell is drawn; None if all are alike.
+    For the legend: why a cell has no number, and how much was measured, and how finely. `opacity` (H, Y, X) is None if
+    all cells are alike.
     """
 
     quantity: Quantity
@@ -42,8 +37,7 @@ class Subject:
 def subjects_of(coverages: Mapping[str, Coverage]) -> Iterator[Subject]:
     """The quantities of the measure that the results have, then those of other aggregations.
 
-    Args:
-        coverages: By the name of the rig; one, or several that are paired.
+    `coverages`: by the name of the rig; one, or several that are paired.
     """
     first = next(iter(coverages.values()))
     if first.measure == "area":

@@ -27,18 +27,8 @@ FAINTEST = 0.3
 def square_sides(points: Tensor, cell_m: float) -> Tensor:
     """Cut a grid into squares of cells: a square is cut in four if each quarter has 8 points at least, or none at all.
 
-    Args:
-        points: (H, Y, X) reference points in each cell.
-        cell_m: Side of a cell in metres.
-
-    Returns:
-        (H, Y, X) int64 how many cells wide the square is that each cell lies in: a power of 2, at most 2 m. Squares
-        begin at the lower corner of the grid; those at the upper ends may be cut off.
-
-    Example:
-        >>> square_sides(torch.tensor([[[9, 9, 1, 0], [9, 0, 0, 0]]]), cell_m=1.0)
-        tensor([[[1, 1, 2, 2],
-                 [1, 1, 2, 2]]])
+    Of (H, Y, X) points in each cell, gives (H, Y, X) int64 how many cells wide the square is that it lies in: a power
+    of 2, at most 2 m. Squares begin at the lower corner of the grid; those at the upper ends may be cut off.
     """
     side = 2 ** max(0, math.floor(math.log2(LARGEST_M / cell_m)))
     sides = torch.full_like(points, side)
@@ -55,12 +45,8 @@ def square_sides(points: Tensor, cell_m: float) -> Tensor:
 def over_squares(values: Tensor, sides: Tensor) -> Tensor:
     """The sum over the square that each cell lies in.
 
-    Args:
-        values: (..., H, Y, X) what is added up.
-        sides: (H, Y, X) as from `square_sides`.
-
-    Returns:
-        (..., H, Y, X) float64.
+    `values`: (..., H, Y, X) what is added up; `sides`: (H, Y, X) as from `square_sides`. Returns (..., H, Y, X)
+    float64.
     """
     sums, side = values.double(), 2
     while side <= int(sides.max()):
@@ -125,15 +111,8 @@ def as_drawn(coverage: Coverage) -> Coverage:
 def opacity_of(area: BlockSums, steps: int, sides: Tensor, cell_m: float) -> Tensor:
     """How opaque a place is drawn, by how much surface is seen there in a step.
 
-    Args:
-        area: The sums.
-        steps: How many steps.
-        sides: (H, Y, X) as from `square_sides`.
-        cell_m: Side of a cell in metres.
-
-    Returns:
-        (H, Y, X) in [0, 1]: 0 where nothing was seen, 1 where as much as open ground has, which is the footprint of the
-        square, or more; between them the root of the share, from 0.3 on.
+    Returns (H, Y, X): 0 where nothing was seen, 1 where as much as open ground has, which is the footprint of the
+    square, or more; between them the root of the share, from 0.3 on.
     """
     m2 = over_squares(area.totals()[0], sides)
     footprint_m2 = over_squares(torch.full_like(m2, cell_m**2), sides)

@@ -34,9 +34,8 @@ class Window(NamedTuple):
 def asked_and_known(coverage: Coverage, ego_outline_m: Outline | None = None) -> Window:
     """What of a result is worth paper: where it knows cells within the regions' bounds, and the ego.
 
-    Args:
-        coverage: The result; the whole grid if it knows nothing.
-        ego_outline_m: (K, 2) corners x, y of the ego in metres.
+    `coverage`: the result; the whole grid if it knows nothing; `ego_outline_m`: (K, 2) corners x, y of the ego in
+    metres.
     """
     grid = coverage.grid
     known = coverage.known.spread(coverage.known.points > 0, False).any(dim=0)
@@ -51,13 +50,7 @@ def asked_and_known(coverage: Coverage, ego_outline_m: Outline | None = None) ->
 
 
 def near_field(grid: BevGrid, ego_outline_m: Outline) -> Window | None:
-    """The ego and two of its lengths around it, as far as the grid goes; None where that is nothing.
-
-    Example:
-        >>> ego = np.array([[-2.0, -1.0], [2.0, -1.0], [2.0, 1.0], [-2.0, 1.0]])
-        >>> near_field(BevGrid(x=(0.0, 40.0), y=(-20.0, 20.0)), ego).grid.x
-        (0.0, 10.0)
-    """
+    """The ego and two of its lengths around it, as far as the grid goes; None where that is nothing."""
     low, high = ego_outline_m.min(axis=0), ego_outline_m.max(axis=0)
     reach_m = NEAR_LENGTHS * float(high[0] - low[0])
     x, y = ((float(low[axis]) - reach_m, float(high[axis]) + reach_m) for axis in (0, 1))

@@ -32,12 +32,7 @@ class CellBytes:
     def add(self, values: NDArray[Any], bits: int) -> int:
         """Keep an array.
 
-        Args:
-            values: (Y, X) numbers; NaN is unknown.
-            bits: Of each, 8 or 16.
-
-        Returns:
-            Its place in `arrays`.
+        `values`: (Y, X) numbers; NaN is unknown; `bits`: of each, 8 or 16. Returns its place in `arrays`.
         """
         if id(values) in self._known:  # which stays the same object, for it is held here
             return self._known[id(values)][1]
@@ -64,13 +59,7 @@ class CellBytes:
 
 
 def encoded(values: NDArray[np.float64], bits: int) -> tuple[NDArray[np.uint16], Mapping[str, Any]]:
-    """Codes of numbers that are not NaN, and what a reader needs to have them back (`cells.js`).
-
-    Example:
-        >>> codes, scale = encoded(np.array([0.0, 1.0, 3.0, np.inf]), 8)
-        >>> codes, scale
-        (array([  0,   1, 254, 255], dtype=uint16), {'log': False, 'low': 1.0, 'high': 3.0})
-    """
+    """Codes of numbers that are not NaN, and what a reader needs to have them back (`cells.js`)."""
     top = 2**bits - 1
     endless, nothing = np.isposinf(values), values == 0
     usual = values[np.isfinite(values) & ~nothing]

@@ -20,10 +20,8 @@ TITLE = "The rig from above, forward to the right. Fields of view fade out; how 
 def rig_drawing(sensors: Sequence[SensorView], ego_outline_m: Array | None, number: int) -> str:
     """An SVG element with x forward to the right; fields of view fade out, for they are longer than the paper.
 
-    Args:
-        sensors: What to draw.
-        ego_outline_m: (K, 2) corners x, y of the ego in metres, if it is known.
-        number: Of the rig on its page: no two drawings share a name.
+    `sensors`: what to draw; `ego_outline_m`: (K, 2) corners x, y of the ego in metres, if it is known; `number`: of the
+    rig on its page: no two drawings share a name.
     """
     places = np.array([[view.x_m, view.y_m] for view in sensors])
     every = places if ego_outline_m is None else np.vstack([places, ego_outline_m])

@@ -17,15 +17,9 @@ Columns = dict[str, Callable[[Row], object]]
 
 
 class Column(NamedTuple):
-    """What stands in a row besides its numbers and their errors.
+    """What stands in a row besides its numbers and their errors, of tables of one measure or of all.
 
-    Args:
-        key: Its name in CSV and JSON.
-        meaning: What it is, for the documentation.
-        of: The value.
-        heading: Above it where a table is in words; empty if it is not shown there.
-        words: Makes text of the value there.
-        measure: Of which tables it is shown; None for all.
+    `meaning` is for the documentation. In words it stands under its heading, if it has one, as `words` makes it text.
     """
 
     key: str

@@ -64,12 +64,8 @@ def rich_tables(table: CoverageTable, *, two_lines: bool = False) -> list[Table]
 
     The best number of each row is bold and marked `*`; a difference that is more than chance is bold and marked `!`.
 
-    Args:
-        table: The table.
-        two_lines: Whether intervals stand below their numbers.
-
-    Returns:
-        A table for each part; what they hold under, and what went wrong, is the caption of the last.
+    `two_lines`: whether intervals stand below their numbers. Returns a table for each part; what they hold under, and
+    what went wrong, is the caption of the last.
     """
     parts = parts_of(table)
     if two_lines:
@@ -106,9 +102,8 @@ def _in_words(table: PageTable) -> Table:
 def narrowest_width(tables: Sequence[Table], folded: Sequence[str] = ()) -> int:
     """Characters in a line that tables need at least.
 
-    Args:
-        tables: Tables for rich, whose numbers stay whole.
-        folded: Headings, each of one column, that may be folded to the width of the numbers below.
+    `tables`: tables for rich, whose numbers stay whole; `folded`: headings, each of one column, that may be folded to
+    the width of the numbers below.
     """
     console = Console(width=MAX_LINE_CHARS)
     natural = max(Measurement.get(console, console.options, table).maximum for table in tables)

@@ -88,8 +88,7 @@ def crowd(
     The ego is the one of a name; else it is drawn in proportion to the ways that vehicles drive, of one type or of all
     cars.
 
-    Raises:
-        ValueError: Nobody who may be the ego is there for the whole run.
+    ValueError: nobody who may be the ego is there for the whole run.
     """
     lengths_m = {kind: fleet.length_m(kind) for kind in CATEGORIES}
     users: list[RoadUser] = []

@@ -38,8 +38,7 @@ def write_routes(
 ) -> None:
     """Write vehicles and people, all of whom set off at 0.
 
-    Raises:
-        ValueError: No street that cars may use leads anywhere, or there would be more than 20,000.
+    ValueError: no street that cars may use leads anywhere, or there would be more than 20,000.
     """
     rows = [
         f'<vType id="{kind}" vClass="pedestrian"/>'

@@ -145,8 +145,7 @@ class Recorded(NamedTuple):
 def record(pieces: Iterable[bytes], window: TimeWindow) -> Recorded:
     """Read floating car data from pieces of XML, no more of which are asked for than the window needs.
 
-    Raises:
-        ValueError: Not such data, or without angles.
+    ValueError: not such data, or without angles.
     """
     collector = _Collector(window)
     with suppress(_Enough):

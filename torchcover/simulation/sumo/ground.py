@@ -16,8 +16,8 @@ from torchcover.simulation.traffic.scenery import plateau
 SMOOTHINGS = 4
 DECK_M = 0.8
 GAP_M, CROSSING_GAP_M = 0.3, 1.3
-# Slivers that are left where outlines nearly meet.
-SMALLEST_M2 = 0.05
+# Half the width of what is left where outlines nearly meet, and of points of needles: no kerb is as narrow.
+SLIVER_M = 0.1
 
 
 def ground_of(vicinity: Vicinity) -> Plain | Slopes:
@@ -73,8 +73,9 @@ class Pavement:
         self._ground = ground
         walked = shapely.union_all([*vicinity.surfaces("sidewalk", "corner"), *vicinity.medians])
         driven = shapely.union_all(vicinity.surfaces("road", "turn", "bay", "shoulder", "crossing"))
-        parts = shapely.get_parts(shapely.difference(walked, driven))
-        self.parts = parts[(shapely.get_type_id(parts) == 3) & (shapely.area(parts) > SMALLEST_M2)]
+        narrowed = shapely.buffer(shapely.difference(walked, driven), -SLIVER_M, join_style="mitre")
+        self.parts = shapely.get_parts(shapely.buffer(narrowed, SLIVER_M, join_style="mitre"))
+        self.parts = self.parts[~shapely.is_empty(self.parts)]
         self._tree = shapely.STRtree(self.parts)
         # With crossings, and without the gaps that the drawing of a network leaves, most of all before these.
         gaps = ((vicinity.surfaces("sidewalk", "corner"), GAP_M), (vicinity.surfaces("crossing"), CROSSING_GAP_M))

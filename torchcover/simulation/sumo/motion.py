@@ -21,13 +21,13 @@ AXLE_SHARE, HEELS_M = 0.3, 0.4
 FASTEST_ON_FOOT_MPS, CATCH_UP_MPS, HURRIES_MPS = 4.0, 0.8, 3.5
 # People go so far within the edges of pavements and crossings, to which those come back who were no farther from them.
 OFF_EDGE_M, BESIDE_M = 0.25, 2.0
-# Whose rear axle follows its own way so closely is off the kerbs, as its lane is; poses are looked at this often.
-# Riders go anywhere in a lane, and a little beyond.
-ASTRAY_M, LOOKS_EVERY, NARROW_M = 0.25, 2, 1.0
+# Whether bodies are over kerbs is looked at this often along their ways.
+LOOK_M = 1.0
 # How often a way is moved aside, over which length before and after, and the room that is left; to rub is to be off.
 SWINGS, SWING_M, SWING_LENGTHS, ROOM_M, RUBS_M = 4, 8.0, 1.0, 0.1, 0.05
-# Outlines of bodies are that far apart. Who meets whom is looked for in pieces of ways of so many poses.
-APART_M, PIECE_STEPS = 0.05, 20
+# Outlines of bodies are that far apart, unless one is so much above the other. Who meets whom is looked for in pieces
+# of ways of so many poses.
+APART_M, ABOVE_M, PIECE_STEPS = 0.05, 3.0, 20
 BODIES_AT_ONCE = 256
 
 
@@ -155,14 +155,12 @@ def _keep_off(
     rears = _rears(users, poses)
     # When bodies are looked at, and what they draw along.
     look: dict[tuple[int, bool], Int64] = {}
-    for number, (user, way_m, own) in enumerate(zip(users, ways_m, poses, strict=True)):
+    for number, (user, way_m) in enumerate(zip(users, ways_m, strict=True)):
         if not user.track.on_foot:
-            astray_m = _lengths(2 * own[:, :2] - way_m - _behind(way_m, user.drawn_m, own[0, 2]))
-            anywhere = user.sizes_m[0][1] < NARROW_M
-            look[number, False] = np.flatnonzero(anywhere | (astray_m > ASTRAY_M))[::LOOKS_EVERY]
-        if number in rears:
-            astray_m = DRAWS[user.kind].rod_m / 2 * np.abs(rears[number][:, 2] - own[:, 2])
-            look[number, True] = np.flatnonzero(astray_m > ASTRAY_M)[::LOOKS_EVERY]
+            steps = np.diff((_along_m(way_m) / LOOK_M).astype(np.int64), prepend=-1)
+            look[number, False] = np.flatnonzero(steps)
+            if number in rears:
+                look[number, True] = look[number, False]
     for swing in range(SWINGS + 1):
         counts = [len(at) for at in look.values()]
         of = np.repeat(np.array([number for number, _ in look], dtype=np.int64), counts)
@@ -178,7 +176,7 @@ def _keep_off(
         met = np.unique(of[push_m != 0.0]).tolist()
         if not met or swing == SWINGS:
             break
-        turned, look = look, {}
+        look = {key: at for key, at in look.items() if key[0] in met}
         for number in met:
             pushed = (of == number) & (push_m != 0.0)
             wanted_m = push_m[pushed] + np.copysign(ROOM_M, push_m[pushed])
@@ -188,10 +186,6 @@ def _keep_off(
             bumps_m = wanted_m * np.where(away < 1, (1 + np.cos(np.pi * away)) / 2, 0.0)
             aside_m[number] += bumps_m.max(axis=1).clip(min=0.0) + bumps_m.min(axis=1).clip(max=0.0)
             moved_m[number] = ways_m[number] + aside_m[number][:, None] * left[number]
-            look[number, False] = np.flatnonzero(aside_m[number])[::LOOKS_EVERY]
-            if number in rears:
-                moved = np.interp(along_m - lag_m, along_m, aside_m[number]) != 0.0
-                look[number, True] = np.union1d(turned[number, True], np.flatnonzero(moved)[::LOOKS_EVERY])
         again = _poses([users[number] for number in met], [moved_m[number] for number in met])
         for number, own in zip(met, again, strict=True):
             poses[number] = own
@@ -207,13 +201,19 @@ def possible(bodies: Sequence[Motion]) -> list[Motion]:
     bodies = [bodies[0], *(body for body in bodies[1:] if body.can_be)]
     meets = np.zeros((len(bodies), len(bodies)), dtype=bool)
     step_s = float(bodies[0].times_s[1])
-    parts = [(number, *part) for number, body in enumerate(bodies) for part in body.parts]
+    # With the height at which it is told to be: who is on a bridge meets nobody below.
+    heights_m = [np.interp(body.times_s, body.user.track.times_s, body.user.track.places_m[:, 2]) for body in bodies]
+    parts = [
+        (number, np.column_stack([poses, heights_m[number]]), size_m)
+        for number, body in enumerate(bodies)
+        for poses, size_m in body.parts
+    ]
     of = np.array([number for number, _, _ in parts])
     first = [round(float(bodies[number].times_s[0]) / step_s) for number in of.tolist()]
     size_m = np.array([size_m for _, _, size_m in parts]) + APART_M
     reach_m = np.linalg.norm(size_m, axis=1)[:, None] / 2
     for begin in range(0, len(bodies[0].times_s), PIECE_STEPS):
-        poses = np.full((PIECE_STEPS, len(parts), 3), np.nan)
+        poses = np.full((PIECE_STEPS, len(parts), 4), np.nan)
         for number, (_, own, _) in enumerate(parts):
             start = begin - first[number]
             piece = own[max(start, 0) : max(start + PIECE_STEPS, 0)]
@@ -225,7 +225,8 @@ def possible(bodies: Sequence[Motion]) -> list[Motion]:
         boxes = shapely.box(*low_m.T, *high_m.T)
         one, other = there[shapely.STRtree(boxes).query(boxes)]
         one, other = (pair[of[one] < of[other]] for pair in (one, other))
-        met = _overlap(poses[:, one], size_m[one], poses[:, other], size_m[other]).any(axis=0)
+        meet = _overlap(poses[:, one], size_m[one], poses[:, other], size_m[other])
+        met = (meet & (np.abs(poses[:, one, 3] - poses[:, other, 3]) < ABOVE_M)).any(axis=0)
         one, other = of[one[met]], of[other[met]]
         meets[one, other] = meets[other, one] = True
     number_met = meets.sum(axis=1)
@@ -238,7 +239,7 @@ def possible(bodies: Sequence[Motion]) -> list[Motion]:
 
 
 def _overlap(one: Float64, size_m: Float64, other: Float64, other_size_m: Float64) -> Bools:
-    """(T, K) whether K pairs of rectangles with poses (T, K, 3) do, as no axis of either separates them."""
+    """(T, K) whether K pairs of rectangles with poses (T, K, 3 or more) do, as no axis of either separates them."""
     between_m, turn = other[..., :2] - one[..., :2], other[..., 2] - one[..., 2]
     cos, sin = np.abs(np.cos(turn)), np.abs(np.sin(turn))
     meet = np.isfinite(turn)

@@ -51,13 +51,9 @@ class NetworkLane(NamedTuple):
 
 
 class Network(NamedTuple):
-    """A road network.
+    """A road network: lanes, those of an edge from the outer side of the road inwards; (K, 3) outlines of junctions.
 
-    Args:
-        lanes: All lanes; those of one edge follow each other from the outer side of the road inwards.
-        junctions: (K, 3) outlines.
-        connections: Pairs of numbers of lanes, of which the one leads on to the other across a junction.
-        left_hand: Whether people drive on the left.
+    `connections` are pairs of numbers of lanes, of which the one leads on to the other across a junction.
     """
 
     lanes: tuple[NetworkLane, ...]

@@ -29,12 +29,7 @@ ALWAYS = ("--xml-validation", "never")
 
 
 def run(program: str, *options: str | Path) -> None:
-    """Run a program to its end.
-
-    Raises:
-        ImportError: SUMO is not installed.
-        ValueError: It fails; with its own message.
-    """
+    """Run a program to its end. ImportError: SUMO is not installed. ValueError: it fails; with its own message."""
     for _ in output_of(program, *options):
         pass
 

@@ -143,13 +143,7 @@ class DrawnStreets(Document):
 
 
 def turning_mps(line_m: Float64) -> float:
-    """How fast a turn, (K, 2) places of its lane, may be driven: where it is tightest, not on its average.
-
-    Example:
-        >>> quarter = np.linspace(0.0, np.pi / 2, 30)
-        >>> round(turning_mps(8.0 * np.stack([np.cos(quarter), np.sin(quarter)], axis=1)), 1)
-        4.0
-    """
+    """How fast a turn, (K, 2) places of its lane, may be driven: where it is tightest, not on its average."""
     steps_m = np.diff(line_m, axis=0)
     lengths_m = np.hypot(*steps_m.T)
     turned = np.unwrap(np.arctan2(steps_m[:, 1], steps_m[:, 0]))

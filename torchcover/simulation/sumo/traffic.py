@@ -6,14 +6,14 @@ from tempfile import TemporaryDirectory
 from typing import Annotated, Literal, Self
 
 import numpy as np
+import shapely
 from pydantic import Field, model_validator
 
-from torchcover.geometry.arrays import Float64
+from torchcover.geometry.arrays import Bools, Float64
 from torchcover.simulation.documents import PathBeside
 from torchcover.simulation.sumo.crowd import crowd, types_of
 from torchcover.simulation.sumo.demand import EGO_TYPE, write_routes
 from torchcover.simulation.sumo.floating import Recorded, TimeWindow, read_floating, record
-from torchcover.simulation.sumo.frontage import sides_of
 from torchcover.simulation.sumo.ground import Pavement, decks, ground_of
 from torchcover.simulation.sumo.motion import motions, possible
 from torchcover.simulation.sumo.network import SAME_PLACE_M, Network, read_network
@@ -22,16 +22,37 @@ from torchcover.simulation.sumo.simulating import from_opendrive, home, simulate
 from torchcover.simulation.sumo.streets import DrawnStreets
 from torchcover.simulation.sumo.vicinity import OFF_STREET_M, Vicinity
 from torchcover.simulation.traffic.fleet import EGO, Fleet
-from torchcover.simulation.traffic.frontage import Times, stand
+from torchcover.simulation.traffic.frontage import Side, Times, sides_around, stand
 from torchcover.simulation.traffic.procedural import Procedural
 from torchcover.simulation.traffic.scenery import Scenery, few
 from torchcover.simulation.world import Actor
 
+# Nothing stands nearer to a lane than this; furniture and houses keep off by more, so that no crown hangs over it.
+CLEAR_M, KERB_M, BEHIND_M = 0.4, 1.0, 2.2
+# Gaps that the drawing of a network left are street, too; and beside bridges nothing stands.
+GAP_M, BRIDGE_M = 1.0, 12.0
 # Traffic that is drawn sets off everywhere at once, and needs some time to get into motion and to queue at lights.
 WARM_UP_S = 30.0
 USUAL_BEGIN_S = 60.0
 # Of traffic that is drawn such a share may be where bodies cannot be: more, and it is thinner than was asked for.
 USUALLY_LEFT_OUT = 0.15
+# In plan, nothing is in anybody's way that is so near to the middle of a lane on a bridge: it may be below.
+BELOW_M = 3.0
+
+
+def sides_of(
+    vicinity: Vicinity, built_share: float, generator: np.random.Generator
+) -> tuple[list[Side], list[shapely.Geometry]]:
+    """What can be seen of the sides of streets, and where nothing may stand."""
+    street = shapely.union_all(shapely.buffer(vicinity.covered, GAP_M, join_style="mitre")).buffer(-GAP_M)
+    bridges = vicinity.bridges(BRIDGE_M)
+    shapely.prepare(bridges)
+
+    def sees(places_m: Float64) -> Bools:
+        return np.asarray(vicinity.sees(places_m) & ~shapely.contains_xy(bridges, *places_m.T))
+
+    taken = shapely.buffer(vicinity.covered, CLEAR_M).tolist()
+    return sides_around(street, (KERB_M, BEHIND_M), sees, built_share, generator), taken
 
 
 class Sumo(Procedural):
@@ -115,7 +136,7 @@ class Sumo(Procedural):
         raised = few(pavement.meshes(), decks(vicinity))
         static = (ground.mesh(), *raised, *few(*stood))
         parked = park(vicinity, ground, fleet, self.parked_share, generator)
-        obstacles = np.concatenate([pavement.parts, parked])
+        obstacles = shapely.difference(np.concatenate([pavement.parts, parked]), vicinity.bridges(BELOW_M))
         moved = motions([ego, *others], duration_s, origin_m, obstacles, pavement.walked)
         shown = possible(moved)
         fleet.left_out = len(moved) - len(shown)

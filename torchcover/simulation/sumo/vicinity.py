@@ -82,6 +82,11 @@ class Vicinity:
         """Numbers of the lanes that lie on bridges, at least in part."""
         return frozenset(self.of_lane[self.on_deck].tolist())
 
+    def bridges(self, beside_m: float) -> shapely.Geometry:
+        """What is no farther in plan from the middle of a lane on a bridge."""
+        lines = _lines([self.lanes[number].line_m[:, :2] for number in sorted(self.decks)])
+        return shapely.union_all(shapely.buffer(lines, beside_m))
+
     @cached_property
     def covered(self) -> NDArray[np.object_]:
         """The polygons in plan of all that is street, be it on a bridge or not."""

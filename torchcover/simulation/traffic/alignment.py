@@ -24,15 +24,8 @@ class Alignment:
 
     A station is the way along the line, on the level. A place beside it is a station and how far to the left it lies.
 
-    Args:
-        stations_m: (K,) ascending.
-        curvatures_per_m: (K,) at the stations, positive to the left; 0 at both ends.
-        start: x and y in metres and heading in radians at the first station.
-
-    Example:
-        >>> quarter = Alignment([0.0, 10.0, 30.0, 40.0], [0.0, np.pi / 60, np.pi / 60, 0.0])
-        >>> quarter.poses(50.0, 0.0).round(3)
-        array([24.305, 34.305, 90.   ])
+    `stations_m`: (K,) ascending; `curvatures_per_m`: (K,) at the stations, positive to the left; 0 at both ends;
+    `start`: x and y in metres and heading in radians at the first station.
     """
 
     def __init__(

@@ -78,11 +78,7 @@ def load_bodies() -> Mapping[str, Mesh]:
 
 
 class Fleet:
-    """The bodies of a world, and the drivers drawn for them.
-
-    Raises:
-        ValueError: A kind has no body.
-    """
+    """The bodies of a world, and the drivers drawn for them. ValueError: a kind has no body."""
 
     def __init__(self, bodies: Mapping[str, Mesh], ego: Mesh | None, generator: np.random.Generator) -> None:
         missing = sorted(CATEGORIES.keys() - bodies.keys())

@@ -288,8 +288,9 @@ def _free(
 
 def _meeting(outlines_m: Float64, group: Int64) -> Int64:
     """(2, P) pairs of (N, 4, 2) convex outlines of two groups that no side of the one or the other separates."""
-    boxes = shapely.box(*outlines_m.min(axis=1).T, *outlines_m.max(axis=1).T)
-    pairs = shapely.STRtree(boxes).query(boxes)
+    # Their diagonals have the same bounds as boxes, and are made in less time.
+    diagonals = shapely.linestrings(np.stack([outlines_m.min(axis=1), outlines_m.max(axis=1)], axis=1))
+    pairs = shapely.STRtree(diagonals).query(diagonals)
     pairs = pairs[:, (pairs[0] > pairs[1]) & (group[pairs[0]] != group[pairs[1]])]
     for way in (1, -1):
         one, other = pairs[::way]

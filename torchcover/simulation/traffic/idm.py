@@ -27,15 +27,8 @@ LADEN_W_PER_KG, ROLLING, DRAG_PER_M, GRAVITY_MPS2 = 1000.0 / 120.0, 0.006, 9e-5,
 class Driver:
     """How somebody drives; one number for one driver, or arrays (N,) for N of them.
 
-    Args:
-        desired_speed_mps: Speed on an empty road.
-        headway_s: Time to the vehicle ahead that is kept beyond the standstill gap.
-        standstill_gap_m: Gap to the vehicle ahead in a queue, bumper to bumper.
-        acceleration_mps2: When starting on an empty road.
-        deceleration_mps2: Comfortable braking.
-
-    Raises:
-        ValueError: A desired speed that is not above 0.
+    Speed and acceleration are those on an empty road, the gap is that in a queue, bumper to bumper, beyond which the
+    headway is kept; the deceleration is comfortable.
     """
 
     desired_speed_mps: Quantity

@@ -15,10 +15,6 @@ class Polyline:
 
     Curves need corners close to each other. The seam of a loop, whose last corner equals the first, lies on a straight
     part.
-
-    Example:
-        >>> Polyline(np.array([[0.0, 5.0], [0.0, 105.0]])).poses(20.0)
-        array([ 0., 25., 90.])
     """
 
     points_m: Float64

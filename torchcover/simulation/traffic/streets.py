@@ -74,15 +74,9 @@ class Section:
 
 @dataclass(frozen=True, eq=False)
 class Streets:
-    """Where the streets are.
+    """Where the streets are: the course of the main street, and (J,) stations at which others of 1 or 2 lanes cross it.
 
-    Args:
-        section: Of the main street.
-        junctions_m: (J,) stations of the main street at which others cross it.
-        cross_lanes_each_way: (J,) 1 or 2.
-        signals: Their lights.
-        reach_m: How far from the origin lanes begin and end: beyond what is driven in the run.
-        course: Of the main street.
+    Lanes begin and end `reach_m` from the origin: beyond what is driven in the run.
     """
 
     section: Section

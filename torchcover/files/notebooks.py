@@ -1,0 +1,109 @@
+"""What an interactive session shows of objects: short words, a small picture, their rows as a frame of data."""
+
+from base64 import b64encode
+from collections.abc import Iterable, Mapping
+from dataclasses import fields
+from html import escape
+from importlib import import_module
+from io import BytesIO
+from reprlib import Repr
+from typing import TYPE_CHECKING, Any
+
+from torchcover.files.shown import shown
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
+    from matplotlib.figure import Figure
+    from numpy.typing import NDArray
+
+WIDTH_PX = 760
+
+
+class _Brief(Repr):
+    """Shapes of arrays, and the beginning of what is long."""
+
+    def repr_Tensor(self, array: Any, level: int) -> str:  # noqa: ANN401  (a tensor, or an array of NumPy's)
+        return f"{tuple(array.shape)} {str(array.dtype).removeprefix('torch.')}"
+
+    repr_ndarray = repr_Tensor
+
+
+def brief(one: Any) -> str:  # noqa: ANN401  (any dataclass)
+    """What a dataclass is made of in a few words; what is empty or None is left out. Meant as a `__repr__`.
+
+    Example:
+        >>> import numpy as np
+        >>> from dataclasses import dataclass
+        >>> @dataclass(repr=False)
+        ... class Cloud:
+        ...     points: np.ndarray
+        ...     name: str = ""
+        ...     __repr__ = brief
+        >>> Cloud(np.zeros((5000, 3)))
+        Cloud(points=(5000, 3) float64)
+    """
+    words = _Brief()
+    named = ((field.name, getattr(one, field.name)) for field in fields(one))
+    told = [f"{name}={words.repr(value)}" for name, value in named if value is not None and _is_some(value)]
+    return f"{type(one).__name__}({', '.join(told)})"
+
+
+def _is_some(value: object) -> bool:
+    return not isinstance(value, str | tuple | list | Mapping) or len(value) > 0
+
+
+def small_html(sentences: Iterable[str], figure: "Figure | None" = None) -> str:
+    """What a notebook shows of a result: sentences, and a picture below them.
+
+    Args:
+        sentences: Words, the first of which is a heading; names in them may hold anything.
+        figure: A figure of its own, outside pyplot.
+
+    Returns:
+        HTML that asks for no other file.
+
+    Example:
+        >>> small_html(["<b>", "seen"])
+        '<p><strong>&lt;b&gt;</strong></p><p>seen</p>'
+    """
+    first, *others = (escape(shown(sentence)) for sentence in sentences)
+    parts = [f"<strong>{first}</strong>", *others]
+    if figure is not None:
+        png = BytesIO()
+        figure.savefig(png, format="png", dpi=WIDTH_PX / figure.get_size_inches()[0])
+        source = f"data:image/png;base64,{b64encode(png.getvalue()).decode()}"
+        parts.append(f'<img src="{source}" alt="{first}" style="max-width: 100%">')
+    return "".join(f"<p>{part}</p>" for part in parts)
+
+
+def data_set(maps: Mapping[str, "NDArray[Any]"], axes: Mapping[str, "NDArray[Any] | list[str]"]) -> "xarray.Dataset":
+    """Maps over the same axes as a labelled data set.
+
+    Args:
+        maps: By name, arrays over all axes.
+        axes: Name of each axis, the outermost first -> where its entries are.
+
+    Raises:
+        ModuleNotFoundError: xarray is not there.
+    """
+    return _extra("xarray").Dataset({name: (list(axes), values) for name, values in maps.items()}, coords=dict(axes))
+
+
+def data_frame(rows: Iterable[Mapping[str, object] | Any]) -> "pandas.DataFrame":
+    """Rows as a frame of data.
+
+    Args:
+        rows: Mappings, all with the same keys, or named tuples.
+
+    Raises:
+        ModuleNotFoundError: pandas is not there.
+    """
+    return _extra("pandas").DataFrame([row if isinstance(row, Mapping) else row._asdict() for row in rows])
+
+
+def _extra(name: str) -> Any:  # noqa: ANN401  (a module)
+    try:
+        return import_module(name)
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(f"{name} is needed for this: pip install 'torchcover[frames]'") from error
