@@ -11,8 +11,10 @@ from shutil import rmtree
 
 import numpy as np
 
+from benchmarks.accumulated_reference import words
+from benchmarks.recorded_measure import distance
 from benchmarks.timing import table
-from torchcover import evaluate
+from torchcover import evaluate, forward_regions
 from torchcover.recordings import open_recording
 from torchcover.simulation import Rig, SimulatedFrames, write_recording, write_world
 
@@ -61,26 +63,22 @@ def main():
             worlds[name] = Path(folder) / name / "scenario.yaml"
             rmtree(drive / "boxes", ignore_errors=True)
         found = {name: numbers(rigs, world, options) for name, world in worlds.items()}
-    for name, words in told.items():
-        print(f"{name}: {words}")
+    for name, made in told.items():
+        print(f"{name}: {made}")
     print()
-    places, true = next(iter(found["true"].values()))[0], {rig: of for rig, (_, of) in found["true"].items()}
-    rows = []
-    for rig, of in true.items():
-        rows.append((rig, "the true one", "", "", "", *words_of(of)))
+    places, rows = [f"{region.name} {height}" for region in forward_regions() for height in ("ground", "obstacle")], []
+    for rig in rigs:
+        own = {name: of[rig] for name, of in found.items()}
+        rows.append((rig, "the true one", "", "", "", *words(own["true"])))
         for name in told:
-            own = found[name][rig][1]
-            apart = 100 * (own - of)[:, 1]
-            to_recorder = 100 * ((own - of) - (found[name]["recorder"][1] - true["recorder"]))[:, 1]
-            between = "" if rig == "recorder" else f"{rms(to_recorder):.1f}"
-            radii = 100 * (own[:, 0] / of[:, 0] - 1)
-            rows.append((rig, f"made, {name}", f"{rms(apart):.1f} / {rms(radii):.0f}", f"{worst(apart):+.1f}", between,
-                         *words_of(own)))  # fmt: skip
+            apart = [100 * (found[name][of] - found["true"][of])[:, 1] for of in (rig, "recorder")]
+            between = "" if rig == "recorder" else f"{np.sqrt(np.nanmean((apart[0] - apart[1]) ** 2)):.1f}"
+            rows.append((rig, f"made, {name}", *distance(own[name], own["true"]), between, *words(own[name])))
     table(("rig", "world", "rms", "worst", "rms of the difference to the recorder", *places), rows)
 
 
 def numbers(rigs, world, options):
-    """Names of regions and bands, and (them, 2) radius and detection by area, of each rig."""
+    """Radius and detection by area of each rig, over the forward regions and bands."""
     result = evaluate(
         list(rigs.values()),
         str(world),
@@ -91,26 +89,17 @@ def numbers(rigs, world, options):
         vehicle=VEHICLE,
         cell_m=0.5,
     )
-    found = {}
-    for rig, rows in result.table.rows.items():
-        places = [f"{row.region.name} {row.summary.height}" for row in rows]
-        found[rig] = (
-            places,
-            np.array([[row.summary.numbers[key].value for key in ("radius_m", "detection_0.4m")] for row in rows]),
+    asked = [region.name for region in forward_regions()]
+    return {
+        rig: np.array(
+            [
+                [row.summary.numbers[key].value for key in ("radius_m", "detection_0.4m")]
+                for row in rows
+                if row.region.name in asked
+            ]
         )
-    return found
-
-
-def rms(numbers):
-    return float(np.sqrt(np.nanmean(np.square(numbers))))
-
-
-def worst(numbers):
-    return float(numbers[np.nanargmax(np.abs(numbers))])
-
-
-def words_of(rows):
-    return [f"{100 * detection:.0f} % / {radius_m:.2f} m" for radius_m, detection in rows]
+        for rig, rows in result.table.rows.items()
+    }
 
 
 if __name__ == "__main__":
