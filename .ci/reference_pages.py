@@ -50,8 +50,8 @@ def on_config(config):
 
 def on_files(files, config):
     """Add the pages that no file is written for."""
-    made = {"index": first_page(), "reference/commands": commands(), "reference/documents": documents(),
-            "reference/columns": columns(), "reference/api": api()}  # fmt: skip
+    made = {"index": first_page(), "notebook": notebook(), "reference/commands": commands(),
+            "reference/documents": documents(), "reference/columns": columns(), "reference/api": api()}  # fmt: skip
     for name, text in made.items():
         files.append(File.generated(config, f"{name}.md", content=text))
     return files
@@ -61,9 +61,28 @@ def first_page():
     """The README, with its links seen from `docs`."""
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     text = re.sub(r"\]\(docs/([^)]*)\)", lambda link: f"]({link[1]})", text)
-    text = text.replace("](measured)", "](measured/README.md)")
+    text = text.replace("](measured)", "](measured/README.md)").replace("](notebook.ipynb)", "](notebook.md)")
     # What is not part of the site is named, not linked.
     return re.sub(r"\[([^\]]*)\]\((CONTRIBUTING|CHANGELOG)\.md\)", r"\1 (\2.md)", text)
+
+
+def notebook():
+    """The notebook with what its cells show."""
+    parts = []
+    for cell in json.loads((ROOT / "docs" / "notebook.ipynb").read_text(encoding="utf-8"))["cells"]:
+        source = "".join(cell["source"])
+        parts.append(source if cell["cell_type"] == "markdown" else f"```python\n{source}\n```")
+        for output in cell.get("outputs", ()):
+            shown = output.get("data", {"text/plain": output.get("text", "")})
+            if "text/html" in shown:
+                parts.append(f"<div>{''.join(shown['text/html'])}</div>".replace("\n\n", "\n"))
+            elif "image/png" in shown:
+                parts.append(
+                    f'<img alt="What the cell draws" src="data:image/png;base64,{"".join(shown["image/png"]).strip()}">'
+                )
+            else:
+                parts.append(f"```text\n{''.join(shown['text/plain'])}\n```")
+    return "\n\n".join(parts)
 
 
 def commands():

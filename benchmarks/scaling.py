@@ -9,10 +9,12 @@ each of which is measured, and the whole beside a run that none of them was meas
 
 import argparse
 import os
+import pickle
 import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,9 +30,10 @@ from torchcover.simulation import Scenario
 
 RIG, SCENARIO, EVERY_S, STEPS_A_WORLD = "front_roof_128", "urban", 10.0, 6
 RAYS = (4096, 16_384, 65_536, 262_144)
-CELLS_M = (1.0, 0.5, 0.25)
+CELLS_M = (1.0, 0.25, 0.1, 0.05)
 TRAFFIC = (5.0, 20.0, 80.0)  # vehicles to a kilometre of lane
 RIGS = (1, 2, 4, 8)
+RANKS = (4, 16, 64)
 # The run that is extrapolated to: as in the documentation.
 MANY_RIGS, MANY_SCENARIOS, STEPS = 1000, 100, 64
 RIGS_TOGETHER = 8
@@ -54,6 +57,8 @@ def main():
     print()
     table(("cell (m)", "cells", "a step (s)", "sums (MB)", "checkpoint (s)", "checkpoint (MB)", "to another rank (MB)"),
           list(by_cells(steps)))  # fmt: skip
+    print()
+    table(("ranks", "from one to another (MB)", "until all are merged (s)"), list(by_ranks(steps)))
     print()
     table(("steps", "a step (s)"), [(n, step_s(n, rays=4096)) for n in (steps, 2 * steps, 4 * steps)])
     cost = fitted(steps, of_rays, of_rigs)
@@ -124,6 +129,28 @@ def by_cells(steps):
             size_mb = path.stat().st_size / 1e6
         grid = observer.metric.grid
         yield cell_m, grid.cells, steps_s / steps, sums_mb, taken_s, size_mb, len(packed(observer)) / 1e6
+
+
+def by_ranks(steps):
+    """What merging in pairs takes the slowest pair of each round, of ranks that have seen a city each."""
+    frames = frames_of(steps)
+    seen = [frames[index] for index in range(steps)]
+    for size in RANKS:
+        ranks, took_s, apart = [], 0.0, 1
+        for city in range(size):
+            (observer,) = observers_of(frames)
+            for number in range(STEPS_A_WORLD):
+                observer.update(replace(seen[(city + number) % steps], place_in_time=city))
+            ranks.append(observer)
+        sent_mb = len(packed(ranks[-1])) / 1e6
+        while apart < size:
+            pairs_s = []
+            for rank in range(0, size, 2 * apart):
+                begin_s = time.process_time()
+                ranks[rank].merge_state(pickle.loads(packed(ranks[rank + apart]).numpy().data))
+                pairs_s.append(time.process_time() - begin_s)
+            took_s, apart = took_s + max(pairs_s), 2 * apart
+        yield size, sent_mb, took_s
 
 
 def fitted(steps, of_rays, of_rigs):

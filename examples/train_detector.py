@@ -3,7 +3,10 @@
 A PointPillars-like encoder (Lang et al. 2019) with a CenterPoint-like head (Yin et al. 2021) learns to find cars in
 simulated city traffic, once with each rig, from the same instants. Every epoch logs average precision, coverage by
 region and recall by visibility, side by side. At the end: a table, a figure, and how strongly visibility and recall
-agree. Needs `pip install 'torchcover[lightning,tensorboard]'`; uses a GPU if there is one.
+agree. With `--labels 3` it learns from three seeds each with all cars, and with those only that the rig can show, and
+says what that changes in average precision by visibility.
+
+Needs `pip install 'torchcover[lightning,tensorboard]'`; uses a GPU if there is one.
 """
 
 import argparse
@@ -28,7 +31,7 @@ from torch.nn import functional
 from torch.utils.data import DataLoader
 
 from torchcover import BevGrid, CoverageMetric, Region
-from torchcover.data import Augmentation, SimulatedFrames, collate_frames
+from torchcover.data import Augmentation, SimulatedFrames, VisibleTargets, collate_frames
 from torchcover.detection import RecallByVisibility, box_visibility, match
 from torchcover.report import number_words
 from torchcover.simulation import PaperReference, SurfaceReference
@@ -47,6 +50,10 @@ SCORES = tuple(np.linspace(0.05, 0.95, 46).round(3).tolist())
 # The one of SCORES at which recall is shown.
 OPERATING_SCORE = 0.31
 MATCH_M = 2.0
+# Of the labels that are compared: a car of which the rig shows less is left out of the ground truth.
+LEAST_VISIBLE = 0.2
+# Two-sided 95 % of Student's t, by the number of seeds.
+STUDENT_T = {2: 12.71, 3: 4.30, 4: 3.18, 5: 2.78, 6: 2.57, 7: 2.45, 8: 2.36}
 
 
 # Data.
@@ -178,13 +185,17 @@ def decode(heat, boxes, most=100):
     return torch.stack([x, y, z, *(s.clamp(-2, 3).exp() for s in size), torch.atan2(sine, cosine)], dim=1), score
 
 
-def average_precision(counts):
-    """Mean over 101 recalls of the precision there, as in nuScenes but without its cut-offs; NaN without objects."""
-    curve = counts.overall()
-    columns = (curve.recall.value, curve.precision.value, curve.precision.trials)
-    recall, precision, detections = (column[:, 0].cpu().numpy() for column in columns)
+def average_precision(counts, at=None):
+    """Mean over 101 recalls of the precision there, as in nuScenes but without its cut-offs; NaN without objects.
+
+    Of a bin of visibility, by its number: over the recalls of its objects, with the precision of all detections.
+    """
+    curve, of_bin = counts.overall(), counts.over("visibility").recall
+    recalls = curve.recall.value[:, 0] if at is None else of_bin.value[:, at]
+    columns = (recalls, curve.precision.value[:, 0], curve.precision.trials[:, 0])
+    recall, precision, detections = (column.cpu().numpy() for column in columns)
     used = detections > 0
-    if not counts.objects.any():
+    if not counts.objects.any() or np.isnan(recall).all():
         return math.nan
     if not used.any():
         return 0.0
@@ -196,13 +207,14 @@ def average_precision(counts):
 class Training(lightning.LightningModule):
     """One rig's detector, its losses and its logs."""
 
-    def __init__(self, rig, visibility, steps, seed):
+    def __init__(self, rig, visibility, steps, seed, least_hits=MIN_HITS):
         super().__init__()
         self.rig = rig
         self.detector = Detector()
         self.recall = RecallByVisibility(threshold=MATCH_M, score_thresholds=SCORES)
         self.visibility = visibility
         self.steps = steps
+        self.least_hits = least_hits
         self.augment = Augmentation(max_yaw_rad=math.radians(15.0), seed=seed)
         self.objects = []
 
@@ -210,7 +222,7 @@ class Training(lightning.LightningModule):
         """The loss of augmented frames."""
         frames = [self.augment(frame, self.current_epoch) for frame in batch.frames]
         heat, boxes = self.detector([frame.clouds[f"network {self.rig}"] for frame in frames])
-        truth = [frame.boxes.select(frame.boxes.hits[self.rig] >= MIN_HITS).rows for frame in frames]
+        truth = [frame.boxes.select(frame.boxes.hits[self.rig] >= self.least_hits).rows for frame in frames]
         loss = loss_of(heat, boxes, truth)
         self.log("loss", loss, batch_size=len(batch), prog_bar=True)
         return loss
@@ -259,25 +271,25 @@ def coverage_metric(*, square_metres):
     return CoverageMetric(grid, max_radius=grid.diagonal_m, blocks=16, square_metres=square_metres)
 
 
-def train(rig, training_frames, validation_frames, metric, options, console):
-    """Train one rig's detector, with the coverage beside it; its module, and the coverage."""
+def train(rig, training_frames, validation_frames, metric, options, console, **of_training):
+    """Train one rig's detector, with the coverage beside it if there is a metric; its module, and the coverage."""
     lightning.seed_everything(options.seed, verbose=False)
     loaders = [
         DataLoader(training_frames, batch_size=8, shuffle=True, drop_last=True, collate_fn=collate_frames),
         DataLoader(validation_frames, batch_size=8, collate_fn=collate_frames),
     ]
-    coverage = CoverageCallback(metric, regions=REGIONS, rig=rig, fixed_frames=True)
+    coverage = metric and CoverageCallback(metric, regions=REGIONS, rig=rig, fixed_frames=True)
     visibility = {
         f.index: box_visibility(f.clouds[rig], f.reference, f.boxes, reference_weights=f.reference_weights)
         for f in validation_frames
     }
-    module = Training(rig, visibility, steps=options.epochs * len(loaders[0]), seed=options.seed)
+    module = Training(rig, visibility, steps=options.epochs * len(loaders[0]), seed=options.seed, **of_training)
     profiler = SimpleProfiler(dirpath=options.out, filename=f"profile-{rig}")
     trainer = lightning.Trainer(
         devices=1,
         max_epochs=options.epochs,
         logger=TensorBoardLogger(options.out, name=rig, version=""),
-        callbacks=[coverage],
+        callbacks=[coverage] if coverage else [],
         profiler=profiler,
         num_sanity_val_steps=0,
         log_every_n_steps=1,
@@ -285,6 +297,8 @@ def train(rig, training_frames, validation_frames, metric, options, console):
         enable_model_summary=False,
     )
     trainer.fit(module, *loaders)
+    if not coverage:
+        return module, None
     seconds = {action: sum(durations) for action, durations in profiler.recorded_durations.items()}
     measuring = sum(time for action, time in seconds.items() if "CoverageCallback" in action)
     epochs = seconds["run_training_epoch"]
@@ -292,7 +306,45 @@ def train(rig, training_frames, validation_frames, metric, options, console):
     return module, coverage.coverage
 
 
+def compare_labels(options, console):
+    """Train on all cars, and on those only that the rig can show, from several seeds; AP by visibility of both."""
+    rig, surface = RIGS[-1], SurfaceReference(((X_M, Y_M),), max_range_m=65.0, object_points=64)
+    frames = {
+        name: simulate(steps, seed, surface, f"{name} frames", keep_clouds=True)
+        for name, steps, seed in (("training", options.train, 0), ("validation", options.validate, 1))
+    }
+    visible = list(VisibleTargets(frames["training"], LEAST_VISIBLE, rig=rig))
+    cars = sum(len(frame.boxes) for frame in visible)
+    left_out = sum(frame.counts["targets_left_out"] for frame in visible)
+    console.print(f"{cars} cars are visible, {left_out} are left out: below {LEAST_VISIBLE:.0%}, or unknown")
+    found = {"all cars": [], "visible cars": []}
+    for seed in range(options.labels):
+        seeded = argparse.Namespace(**{**vars(options), "seed": seed})
+        for name, labelled in zip(found, (frames["training"], visible), strict=True):
+            module, _ = train(rig, labelled, frames["validation"], None, seeded, console, least_hits=0)
+            bins = module.counts.over("visibility").bins
+            of_bins = [average_precision(module.counts, at) for at in range(len(bins))]
+            found[name].append([average_precision(module.counts), *of_bins])
+    report_labels(np.array(list(found.values())), ["all", *bins], module.counts, console)
+
+
 # What came of it.
+
+
+def report_labels(values, names, counts, console):
+    """Print AP with all labels and with the visible ones, (2, seeds, bins), and what of the change is beyond chance."""
+    seeds = values.shape[1]
+    table = Table("visibility", "cars", "AP, all cars", "AP, visible cars", "change, 95 % over seeds", "")
+    cars = [counts.objects.sum(), *counts.objects.sum(dim=1)]
+    for at, (name, number) in enumerate(zip(names, map(int, cars), strict=True)):
+        if not number:
+            continue
+        mean, change = values[:, :, at].mean(axis=1), values[1, :, at] - values[0, :, at]
+        half = STUDENT_T[seeds] * change.std(ddof=1) / math.sqrt(seeds)
+        told = "more than chance" if abs(change.mean()) > half else "nothing can be said"
+        numbers = (f"{mean[0]:.3f}", f"{mean[1]:.3f}", f"{change.mean():+.3f} ± {half:.3f}")
+        table.add_row(name, str(number), *numbers, told)
+    console.print(table)
 
 
 def ranks(values):
@@ -396,11 +448,15 @@ def main():
     parser.add_argument("--validate", type=int, default=64, help="frames to validate on, 4 from a drive")
     parser.add_argument("--epochs", type=int, default=10)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--labels", type=int, choices=STUDENT_T, help="compare labels instead, from so many seeds")
     parser.add_argument("--out", type=Path, default=Path("out/train_detector"))
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
 
     console = Console()
+    if options.labels:
+        compare_labels(options, console)
+        return
     unused = PaperReference(rows=1, columns=1)
     surface = SurfaceReference(((X_M, Y_M),), max_range_m=65.0, object_points=64)
     training_frames = simulate(options.train, options.seed, unused, "training frames", keep_clouds=False)

@@ -400,10 +400,10 @@ def test_a_quantile_counts_weights_not_points():
 @pytest.mark.parametrize(
     ("weights", "message"),
     [
-        ([1.0, 0.0], "positive, finite"),
-        ([1.0, -1.0], "positive, finite"),
-        ([1.0, math.nan], "positive, finite"),
-        ([1.0, math.inf], "positive, finite"),
+        ([1.0, 0.0], "finite weights > 0"),
+        ([1.0, -1.0], "finite weights > 0"),
+        ([1.0, math.nan], "finite weights > 0"),
+        ([1.0, math.inf], "finite weights > 0"),
         ([1.0], r"shape \(2,\), one for each reference point"),
         ([[1.0, 1.0]], r"shape \(2,\)"),
     ],

@@ -5,10 +5,39 @@ import pytest
 import torch
 from scipy import stats
 
-from torchcover.coverage import BevGrid, CoverageMetric, Region, differences
+from torchcover.coverage import BevGrid, CoverageMetric, Region, check_paired, differences
 
 SQUARE = BevGrid(x=(0.0, 10.0), y=(-5.0, 5.0), cell=1.0)
 NEAR = Region("near", (0.0, 5.0), (-5.0, 5.0))
+
+
+def measured(*, weighed=False, steps=(0, 1), radius=1.0, more=0, blocks=8):
+    metric = CoverageMetric(SQUARE, blocks=blocks, square_metres=weighed)
+    for at in steps:
+        reference = torch.tensor([[0.5, 0.5, 0.0], [3.5, 0.5, 0.0], [3.6, 0.5, 0.0]])[: 2 + more]
+        weights = {"weights": torch.ones(len(reference))} if weighed else {}
+        metric.update(reference - torch.tensor([0.0, 0.0, radius]), reference, **weights, place_in_time=at)
+    return metric.compute()
+
+
+@pytest.mark.parametrize(
+    ("other", "message"),
+    [
+        ({"weighed": True}, "they have different layers"),
+        ({"more": 1}, "different reference points"),
+        ({"more": -1}, "different reference points"),
+        ({"steps": (0, 0)}, "different reference points"),
+        ({"steps": (0, 1, 1)}, "different reference points"),
+        ({"blocks": 1}, "different reference points"),
+    ],
+)
+def test_only_what_was_measured_at_the_same_points_by_the_same_measure_is_compared(other, message):
+    check_paired({"a": measured(), "b": measured(radius=2.0), "c": measured(radius=0.5)})
+    for pair in ((measured(), measured(**other)), (measured(**other), measured())):
+        with pytest.raises(ValueError, match=rf"'a' and 'b' cannot be compared: .*{message}"):
+            check_paired(dict(zip("ab", pair, strict=True)))
+    with pytest.raises(ValueError, match=r"a comparison needs at least two rigs; got a$"):
+        check_paired({"a": measured()})
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.05, 0.1, 0.3])

@@ -54,3 +54,12 @@ def test_a_label_of_kitti_is_a_box_that_stands_on_its_bottom():
     (row,) = Boxes.from_kitti_label([turned], rigid(axes, np.zeros(3))).rows
     assert row[6].item() == pytest.approx(0.0, abs=1e-6)
     assert torch.equal(Boxes.from_rows(row[None]).rows[0], row)
+
+
+def test_labels_at_once_are_those_one_by_one():
+    labels = np.random.default_rng(0).normal(size=(5, 14))
+    labels[:, 7:10] = np.abs(labels[:, 7:10])
+    camera = rigid(rotation_from_euler(-87.0, 2.0, -91.0), np.array([0.3, -0.2, 1.7]))
+    together = Boxes.from_kitti_label(labels, camera).rows
+    assert together.shape == (5, 7)
+    torch.testing.assert_close(together, torch.cat([Boxes.from_kitti_label([one], camera).rows for one in labels]))

@@ -340,6 +340,19 @@ def test_impossible_parameters_are_refused(options, message):
         RecallByVisibility(**options)
 
 
+@pytest.mark.parametrize("column", range(7))
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, -1e-9])
+def test_one_bad_number_of_a_detection_is_enough(column, bad):
+    detections = torch.tensor([row(0, 0)] * 3).double()
+    detections[1, column] = bad
+    boxes, share = Boxes.from_rows(torch.tensor([row(0, 0)])), torch.tensor([0.5])
+    if bad == -1e-9 and column not in (3, 4, 5):
+        RecallByVisibility().update(detections, boxes, share)
+        return
+    with pytest.raises(ValueError, match=r"1 of 3 have NaN .*the first is 1; drop them"):
+        RecallByVisibility().update(detections, boxes, share)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

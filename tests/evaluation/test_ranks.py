@@ -4,6 +4,7 @@ import math
 import os
 import pickle
 import signal
+import socket
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -229,3 +230,20 @@ def test_without_torchrun_there_are_no_ranks(monkeypatch):
             monkeypatch.setenv("WORLD_SIZE", size)
         with joined_ranks() as ranks:
             assert ranks is None
+
+
+def test_torchrun_tells_two_processes_which_they_are(frame_of, tmp_path):
+    """Processes of one machine that have its environment alone share a run."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+
+    def work(ranks):
+        os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": f"{port}", "WORLD_SIZE": "2", "RANK": f"{ranks.rank}"}
+        with joined_ranks() as joined:
+            return (joined.rank, joined.size), measured(Drive(frame_of), joined)
+
+    single = measured(Drive(frame_of))
+    for rank, ((who, found), _) in enumerate(in_ranks(tmp_path, work)):
+        assert who == (rank, 2)
+        check_equal(found, single)

@@ -111,6 +111,12 @@ def test_many_quaternions_are_turned_at_once_as_each_alone():
     np.testing.assert_allclose(rotation_from_quaternion(many), each, rtol=0.0, atol=1e-15)
 
 
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.int8])
+def test_a_quaternion_of_fewer_digits_is_turned_with_all_of_a_double(dtype):
+    few = np.array([[3, 1, -2, 5], [0, 1, 1, 1]], dtype=dtype)
+    np.testing.assert_array_equal(rotation_from_quaternion(few), rotation_from_quaternion(few.astype(np.float64)))
+
+
 def test_a_quaternion_of_norm_zero_is_refused():
     with pytest.raises(ValueError, match="norm 0 is no rotation"):
         rotation_from_quaternion([0.0, 0.0, 0.0, 0.0])

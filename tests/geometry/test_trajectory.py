@@ -1,5 +1,7 @@
 """Where a body is at and between the times of its poses."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -63,3 +65,64 @@ def test_between_steep_poses_a_body_turns_about_one_axis(pitch_deg, others_deg):
         assert body.at(share)[:3, :3] == pytest.approx(between, abs=1e-9)
         assert poses_at([body, body], share)[1, :3, :3] == pytest.approx(between, abs=1e-9)
         assert body.at_each(np.array([0.1, share]))[1, :3, :3] == pytest.approx(between, abs=1e-9)
+
+
+def test_the_first_pose_out_of_order_is_named_and_any_later_time_will_do():
+    """Of steps of any length: what counts is that they are later."""
+    for step_s in (1e-9, 0.25, 1e6):
+        times_s = step_s * np.arange(4)
+        Trajectory.from_arrays(times_s, np.zeros((4, 3)), np.zeros((4, 3)))
+        for at in (1, 2, 3):
+            disordered = times_s.copy()
+            disordered[at] = disordered[at - 1]
+            with pytest.raises(ValueError, match=re.escape(f"pose {at} is at {disordered[at]:g} s, after")):
+                Trajectory.from_arrays(disordered, np.zeros((4, 3)), np.zeros((4, 3)))
+    for column in range(7):
+        numbers = np.arange(21.0).reshape(3, 7)
+        numbers[1:, column] = np.nan, -np.inf
+        with pytest.raises(ValueError, match="NaN or infinite numbers in 2 of 3 poses, first 1"):
+            Trajectory.from_arrays(numbers[:, 0], numbers[:, 1:4], numbers[:, 4:])
+
+
+def test_velocity_is_that_of_the_stretch_and_at_a_pose_the_mean_of_both():
+    track = Trajectory.from_arrays(
+        [1.0, 1.5, 3.5, 4.0], [[0, 0, 0], [1, 0, 0], [1, 6, -2], [1, 6, -2]], np.zeros((4, 3))
+    )
+    expected = {0.9: [0, 0, 0], 1.0: [2, 0, 0], 1.2: [2, 0, 0], 1.5: [1, 1.5, -0.5], 2.0: [0, 3, -1],
+                3.5: [0, 1.5, -0.5], 3.9: [0, 0, 0], 4.0: [0, 0, 0], 4.1: [0, 0, 0]}  # fmt: skip
+    for time_s, velocity_mps in expected.items():
+        np.testing.assert_allclose(track.velocity_at(time_s), velocity_mps, atol=1e-12)
+    for inner_s in (1.2, 2.0, 3.7):  # the difference of places, where nothing changes
+        near = track.positions_at(np.array([inner_s - 1e-6, inner_s + 1e-6]))
+        np.testing.assert_allclose(track.velocity_at(inner_s), (near[1] - near[0]) / 2e-6, atol=1e-6)
+    assert Trajectory.resting((1, 2, 3)).velocity_at(0.0).tolist() == [0, 0, 0]
+    moving_last = Trajectory.from_arrays([0.0, 2.0], [[0, 0, 0], [0, -3, 0]], np.zeros((2, 3)))
+    assert [moving_last.velocity_at(time_s)[1] for time_s in (-0.1, 0.0, 1.0, 2.0, 2.1)] == [0, -1.5, -1.5, -1.5, 0]
+
+
+def test_what_ever_changes_its_pose_moves():
+    def moves(places, angles=None, **how):
+        angles = np.zeros((len(places), 3)) if angles is None else angles
+        return Trajectory(np.arange(len(places)) * 1.0, np.array(places, float), np.array(angles, float), **how).moves
+
+    here, aside = [0, 0, 0], np.eye(3)
+    rest = [moves([here]), moves([here] * 3), moves([[5, 6, 7]] * 2, [[1, 2, 3]] * 2)]
+    assert rest == [False] * 3
+    away = [moves([here, [0, 0, 1e-9]]), moves([here, [0, 1, 0], here])]
+    turning = [moves([here] * 3, [here, aside[axis], here]) for axis in range(3)]
+    turning += [moves([here] * 2, [here, aside[axis]]) for axis in range(3)]
+    coming = [moves([here], transient=True), moves([here] * 2, transient=True)]
+    assert [*away, *turning, *coming] == [True] * 10
+
+
+def test_places_at_its_own_times_are_its_places_and_elsewhere_between():
+    times_s, places = np.array([0.0, 1.0, 3.0]), np.array([[0.0, 0, 0], [2, 0, 0], [2, 8, 0]])
+    for transient in (False, True):
+        track = Trajectory(times_s, places, np.zeros((3, 3)), transient)
+        assert track.bytes == 2 * 3 * 3 * 8
+        for asked in (times_s, times_s[:2], times_s[1:], np.array([0.0, 2.0]), np.empty(0)):
+            expected = [track.at(time_s)[:3, 3] for time_s in asked.tolist()]
+            np.testing.assert_allclose(track.positions_at(asked), np.reshape(expected, (-1, 3)), atol=1e-12)
+    for transient, before in ((False, [1, 2, 3]), (True, [np.nan] * 3)):
+        alone = Trajectory(np.array([5.0]), np.array([[1.0, 2, 3]]), np.zeros((1, 3)), transient)
+        np.testing.assert_array_equal(alone.positions_at(np.array([4.0, 5.0])), [before, [1, 2, 3]])

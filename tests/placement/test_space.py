@@ -230,7 +230,7 @@ MISTAKES = [
     ({"free": {"roof": {"region": "roof", "height_m": [-0.1, 0.5]}}}, "free.roof.height_m: from 0.001 to 10"),
     ({"free": {"roof": {"model": ["velodyne_vlp16"]}}}, "free.roof.model: "),
     ({"free": {"roof": {"model": ["velodyne_vlp16", "velodyne_vlp16"]}}}, "model: at least two different options"),
-    ({"free": {"roof": {"model": ["velodyne_vlp16", "velodine"]}}}, "built-in lidars: hesai_at128"),
+    ({"free": {"roof": {"model": ["velodyne_vlp16", "velodine"]}}}, "built-in lidars; is "),
     ({"free": {"roof": {"present": [True, True]}}}, "free.roof: present: [true, false] is the choice"),
     (
         {"free": {"roof": {"mirror_of": "left"}}},

@@ -86,7 +86,7 @@ def test_a_vehicles_file_lies_beside_the_document_that_names_it(tmp_path, monkey
 
 
 def test_an_unknown_vehicle_is_told_with_whose_it_is_and_the_known_ones():
-    with pytest.raises(FileNotFoundError, match=r"rig 'top': vehicle: 'tank' is neither .* built-in vehicles: adult"):
+    with pytest.raises(FileNotFoundError, match=r"rig 'top': vehicle: 'tank' is neither .* built-in vehicles; is "):
         with_ego(given(), {"top": rig("tank")})
 
 

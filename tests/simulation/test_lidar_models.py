@@ -140,7 +140,7 @@ def test_a_model_can_be_a_file_beside_the_rig(tmp_path):
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        ("model: vlp16", r"sensors\.0: model: 'vlp16' is neither .* built-in lidars: .*velodyne_vlp16"),
+        ("model: vlp16", r"sensors\.0: model: 'vlp16' is neither .* built-in lidars; is .*velodyne_vlp16"),
         ("model: none.yaml", r"sensors\.0: model: .*none\.yaml: no such file"),
         ("model: 16", r"sensors\.0\.model: .*string \(got 16\)"),
         ("model: hesai_pandar64, channels: 8", r"sensors\.0: the rows are missing"),

@@ -15,6 +15,7 @@ from torchcover.simulation import Rig, Scenario
 from torchcover.simulation.moving import Solid
 from torchcover.simulation.shapes import Box
 from torchcover.simulation.traffic.articulated import tractrix
+from torchcover.simulation.traffic.idm import Driver, acceleration_in, advance, tightness
 
 from .case import Case, most
 
@@ -263,6 +264,27 @@ def middles_come_near(a_m, b_m, velocity_mps):
     return nearest_m < reach_m
 
 
+def run_into(step):
+    """200 drivers at 0 to 70 m/s behind one who stops, closer than any of them likes, by steps of 0.05 to 3 s."""
+    generator, hit = np.random.default_rng(9), 0
+    for step_s in (0.05, 0.5, 3.0):
+        driver = Driver(generator.uniform(1e-3, 70.0, 200), standstill_gap_m=generator.uniform(0.0, 2.0, 200))
+        place_m, speed_mps = -np.cumsum(10.0 ** generator.uniform(-3, 2, 200)), generator.uniform(0.0, 70.0, 200)
+        for _ in range(200):
+            ahead_m, ahead_mps = np.append(0.0, place_m[:-1]), np.append(0.0, speed_mps[:-1])
+            gap_m = ahead_m - place_m
+            tight = tightness(driver, speed_mps, gap_m, speed_mps - ahead_mps)
+            wanted_mps2 = acceleration_in(driver, speed_mps, tight, driver.desired_speed_mps)
+            way_m, speed_mps = step(speed_mps, wanted_mps2, gap_m, step_s)
+            place_m = place_m + way_m
+        hit += int((np.append(0.0, place_m[:-1]) < place_m - 1e-9).sum())
+    return hit
+
+
+def without_room(speed_mps, wanted_mps2, _, step_s):
+    return speed_mps * step_s, np.maximum(speed_mps + wanted_mps2 * step_s, 0.0)
+
+
 CASES = [
     *(
         Case(f"{where} by steps of {step_s:g} s", "40 digits (mpmath)", "rad", bound, partial(law, drawn_along, step_s),
@@ -288,4 +310,6 @@ CASES = [
          partial(touching, will_share), "circles", partial(touching, middles_come_near)),
     Case("a walker of 2 cm past the corner of a wall, at 300 km/h", "closed form", "s", 5e-3, sight_error,
          "looks at 10 Hz", sight_at_10_hz),
+    Case("drivers much too close and fast, by steps of 0.05 to 3 s", "nobody runs into another", "of 600", 0,
+         partial(run_into, advance), "speed times step", partial(run_into, without_room)),
 ]  # fmt: skip

@@ -1,6 +1,7 @@
 """Poses and points where angles, lengths and types run out."""
 
 from functools import lru_cache, partial
+from itertools import product
 
 import numpy as np
 import torch
@@ -14,6 +15,7 @@ from torchcover.geometry import (
     rotation_from_quaternion,
     transform,
 )
+from torchcover.geometry.trajectory import Trajectory
 
 from .case import Case, most
 
@@ -58,6 +60,29 @@ def straight_down():
 def straight_down_in_float32():
     pitch = np.deg2rad(np.float32(90.0))
     return most([np.cos(pitch), np.sin(pitch) - 1])
+
+
+PITCHES = ((85.0, 95.0), (60.5, 120.0), (-90.0, -70.0), (89.999, 90.001), (90.0, 90.0))
+
+
+def between_steep(between):
+    """A body that pitches through the vertical, on the way from one pose to another."""
+    worst = 0.0
+    for (first, last), (yaw, roll) in product(PITCHES, ((0.0, 0.0), (170.0, -30.0), (-90.0, 179.0))):
+        ends = [rotation_from_euler(yaw, pitch, roll) for pitch in (first, last)]
+        for share in (0.0, 0.1, 0.5, 0.9):
+            expected = rotation_from_euler(yaw, first + share * (last - first), roll)
+            worst = max(worst, as_angle(between(ends, share), expected))
+    return worst
+
+
+def on_a_trajectory(ends, share):
+    return Trajectory.from_poses([0.0, 1.0], np.stack([rigid(end, np.zeros(3)) for end in ends])).at(share)[:3, :3]
+
+
+def angle_by_angle(ends, share):
+    first, last = (euler_from_rotation(end) for end in ends)
+    return rotation_from_euler(*(first + share * ((last - first + 180.0) % 360.0 - 180.0)))
 
 
 def quaternions(of):
@@ -116,6 +141,8 @@ CASES = [
          partial(steep, euler_from_rotation), "each angle on its own", partial(steep, euler_by_the_book)),
     Case("axis of a sensor pitched by +-90 degrees", "-z, +z", "rad", 1e-15, straight_down,
          "float32", straight_down_in_float32),
+    Case("between poses pitched by 60 to 120 degrees", "closed form", "rad", 1e-9,
+         partial(between_steep, on_a_trajectory), "each angle on its own", partial(between_steep, angle_by_angle)),
     Case("quaternions of length 1e-300 to 1e300", "the same rotation", "rad", 1e-15,
          partial(quaternions, rotation_from_quaternion), "divided by its norm",
          partial(quaternions, quaternion_by_norm)),

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from torchcover.estimation import Estimate, Quantity
+from torchcover.estimation.jackknife import jackknife_error
 from torchcover.metrics.blocks import SumsInBlocks, added_up
 from torchcover.neighbors import packets
 
@@ -206,6 +207,24 @@ def float32_keys(cloud):
     return cells_on_the_curve(cloud).astype(np.float32)
 
 
+def jackknife(error_of):
+    """Of 512 blocks of 1 to 1000 steps that differ by a millionth of what they say."""
+    generator = np.random.default_rng(8)
+    steps, says = generator.integers(1, 1000, 512), 1.0 + 1e-6 * generator.standard_normal(512)
+    whole = (steps * says).sum() / steps.sum()
+    left_out = (whole * steps.sum() - steps * says) / (steps.sum() - steps)
+    exact, n = (each.astype(np.longdouble) for each in (left_out, steps))
+    ratio, mean = n.sum() / n, np.longdouble(whole)
+    pseudo = ratio * mean - (ratio - 1) * exact
+    centre = 512 * mean - ((1 - 1 / ratio) * exact).sum()
+    expected = np.sqrt(((pseudo - centre) ** 2 / (ratio - 1)).mean())
+    return relative(float(error_of(*map(torch.from_numpy, (left_out, np.array(whole), steps)))), float(expected))
+
+
+def jackknife_in_float32(left_out, whole, steps):
+    return jackknife_error(left_out.float(), whole.float(), steps.float())
+
+
 CASES = [
     Case("1,000,000 rows of one cell, of 1e-8 to 1e8", "math.fsum", "relative", 1e-11, one_cell,
          "float32 running sum", one_cell_in_float32),
@@ -214,6 +233,8 @@ CASES = [
          "float32 keys", lambda: unlike_dense(keys_in_float32())),
     Case("blocks added up in pairs, keys up to 2^53", "whole numbers", "of 60 wrong", 0, pairs,
          "float32 keys", pairs_in_float32),
+    Case("error of 512 blocks that differ by 1e-6", "longdouble", "relative", 1e-7, partial(jackknife, jackknife_error),
+         "float32", partial(jackknife, jackknife_in_float32)),
     Case("error of a mixture with weights of 1e-12 and 1", "longdouble", "relative", 1e-12,
          partial(error_of_a_mixture, TINY), "weights not squared", partial(error_without_squares, TINY)),
     Case("degrees of freedom of the same", "longdouble", "freedom", 0, partial(freedom, TINY),

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import torch
 from mmengine.evaluator import BaseMetric, Evaluator
-from mmengine.registry import METRICS
+from mmengine.registry import METRICS, TRANSFORMS
+from mmengine.structures import BaseDataElement
 
 from torchcover import BevGrid, CoverageMetric, Region
 from torchcover.data import Frame
@@ -114,6 +115,35 @@ def test_a_data_batch_of_mmdetection3d():
         frames_of_data_batch(inputs, [samples[0], {"sample_idx": 1}])
     with pytest.raises(ValueError, match=r"vehicle_T_lidar: shape \(4, 4\)"):
         frames_of_data_batch(inputs, samples, vehicle_T_lidar=torch.eye(3))
+
+
+@TRANSFORMS.register_module()
+class PackAsMMDetection3D:
+    """Of `Pack3DDetInputs` what matters here: the points as inputs, of all else only some keys, beside the sample."""
+
+    def __init__(self, keys, meta_keys=("box_type_3d", "sample_idx")):
+        self.keys, self.meta_keys = keys, meta_keys
+
+    def __call__(self, results):
+        if isinstance(results, list):
+            return [self(one) for one in results]
+        sample = BaseDataElement(metainfo={key: results[key] for key in self.meta_keys if key in results})
+        return {"inputs": {key: results.pop(key) for key in self.keys}, "data_samples": sample}
+
+
+@pytest.mark.parametrize("augmented", [False, True])
+def test_packed_with_the_reference_a_sample_keeps_the_default_meta_keys(augmented):
+    config = {"type": "PackWithReference", "pack": {"type": "PackAsMMDetection3D", "keys": ["points"]}}
+    pack = TRANSFORMS.build(config)
+    results = {"points": cloud(20, 0), "reference_points": cloud(40, 100), "sample_idx": 0, "box_type_3d": "lidar"}
+    packed = pack([results] if augmented else results)
+    packed = packed[0] if augmented else packed
+    sample = packed["data_samples"].to_dict() | dict(packed["data_samples"].metainfo_items())
+    assert (sample["box_type_3d"], sample["sample_idx"]) == ("lidar", 0)
+    batch = frames_of_data_batch({"inputs": {"points": [packed["inputs"]["points"]]}}, [sample])
+    torch.testing.assert_close(batch.frames[0].reference, cloud(40, 100)[:, :3])
+    with pytest.raises(ValueError, match="the results have no 'reference_points'"):
+        pack({"points": cloud(20, 0)})
 
 
 def test_by_area_too_a_process_that_was_dealt_nothing_evaluates():

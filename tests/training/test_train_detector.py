@@ -4,6 +4,7 @@ import importlib.util
 import math
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -105,6 +106,32 @@ def test_average_precision_in_closed_form(example):
     assert math.isnan(average_precision(example, [([9.0], [0.9], [])]))
 
 
+def test_average_precision_of_a_bin_is_over_the_recall_of_its_objects(example):
+    metric = RecallByVisibility(visibility_borders=(0.5,), score_thresholds=example.SCORES)
+    there = torch.tensor([[x, 0.0, 1.0, 4.0, 2.0, 1.5, 0.0] for x in (9.0, 19.0, 29.0)])
+    # Both well visible ones are found, of two detections; the other is not.
+    found = there[:2]
+    metric.update(found, Boxes.from_rows(there), torch.tensor([0.9, 0.8, 0.1]), torch.tensor([0.9, 0.8]))
+    counts = metric.compute()
+    assert counts.over("visibility").bins[:2] == ("0-0.5", "0.5-1")
+    assert (example.average_precision(counts, 1), example.average_precision(counts, 0)) == (1.0, pytest.approx(1 / 101))
+    assert math.isnan(example.average_precision(counts, 2))
+    assert example.average_precision(counts) == pytest.approx(67 / 101)
+
+
+def test_a_change_is_told_where_seeds_agree_and_only_there(example, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "160")
+    counts = SimpleNamespace(objects=torch.tensor([[1, 1], [1, 1]]))
+    # Of three seeds, in all, below and above a share of 0.5.
+    values = np.array([[[0.5, 0.2, 0.8]] * 3, [[0.6, 0.1, 0.8], [0.61, 0.3, 0.9], [0.59, 0.2, 0.7]]])
+    example.report_labels(values, ["all", "0-0.5", "0.5-1"], counts, example.Console())
+    lines = [line for line in capsys.readouterr().out.splitlines() if "±" in line]
+    assert [("more than chance" in line, "nothing can be said" in line) for line in lines] == [
+        (True, False), (False, True), (False, True),
+    ]  # fmt: skip
+    assert "+0.100 ± 0.025" in lines[0]  # 4.30 times 0.01 / sqrt(3)
+
+
 @pytest.mark.parametrize("levels", [3, 10, 1000])
 def test_rank_correlation_is_that_of_scipy(example, levels):
     generator = np.random.default_rng(levels)
@@ -164,6 +191,17 @@ def random_frames(steps, seed, reference, name, keep_clouds):
         drawn = {"reference_weights": weights, "reference_heights_m": reference[:, 2]}
         frames.append(Frame(clouds, reference, index, "f", **drawn, boxes=boxes))
     return frames
+
+
+def test_labels_are_compared_from_several_seeds(example, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(example, "simulate", random_frames)
+    options = {"--train": 8, "--validate": 8, "--epochs": 1, "--labels": 2, "--out": tmp_path}
+    monkeypatch.setattr(sys, "argv", ["train_detector.py", *(str(word) for pair in options.items() for word in pair)])
+    monkeypatch.setenv("COLUMNS", "160")
+    example.main()
+    said = capsys.readouterr().out
+    assert "cars are visible" in said
+    assert "AP, visible cars" in said
 
 
 def test_a_small_run_trains_both_rigs_logs_every_epoch_and_ends_with_table_and_figure(

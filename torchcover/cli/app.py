@@ -108,8 +108,8 @@ def version(show: Annotated[bool, typer.Option("--version", help="Print the vers
         raise typer.Exit
 
 
-for command in (evaluate, compare, commands.study, commands.record, commands.rig, commands.robot, commands.calibrate,
-                commands.world, commands.show, commands.targets, commands.check, commands.encounter,
+for command in (commands.report, evaluate, compare, commands.study, commands.record, commands.rig, commands.robot,
+                commands.calibrate, commands.world, commands.show, commands.targets, commands.check, commands.encounter,
                 commands.search):  # fmt: skip
     app.command()(command)
 app.command("list")(commands.list_builtin)

@@ -246,6 +246,55 @@ def targets(
     )
 
 
+@with_options(of_evaluate("vehicle", "sensor_model", "seed", "workers"))
+def report(
+    rigs: Annotated[list[str], typer.Argument(help="Rigs: built-in names (see `list`) or YAML files; at most 8.")],
+    scenario: Annotated[str, typer.Option(help="Traffic: a built-in name or a YAML file.")] = "urban",
+    target: Annotated[
+        str, typer.Option(help="What is put beside the vehicle in free space, as of `targets`.")
+    ] = "child",
+    encounters: Annotated[
+        str | None, typer.Option(help="Set of encounters, as of `encounter`. Not given: none.")
+    ] = None,
+    requirements: Annotated[
+        str | None, typer.Option(help="What they must see, as of `check`. Not given: nothing.")
+    ] = None,
+    steps: Annotated[int, typer.Option(min=1, help="Steps of the traffic.")] = 64,
+    budget: Annotated[
+        str | None, typer.Option(help="Time after which the traffic ends, as in 90s or 5min. Not given: all steps.")
+    ] = None,
+    out: options.Out = Path("out/report"),
+    files: options.Files = "numbers,page",
+    **settings: Any,  # noqa: ANN401
+) -> None:
+    """One page for a meeting: would it see a child, what fails with a sensor, how far does it see, and how soon."""
+    from torchcover.cli.printing import print_files
+    from torchcover.evaluation import report
+    from torchcover.files import claimed
+    from torchcover.report import Terminal
+
+    if budget is not None:
+        settings["budget_s"] = parsed_budget(budget)
+    with claimed(out):
+        found = report(
+            rigs,
+            scenario,
+            target,
+            encounters=encounters,
+            requirements=requirements,
+            steps=steps,
+            progress=True,
+            **settings,
+        )
+        written = found.save(out, files=files)
+    console = Terminal()
+    print_files(written, out, console)
+    for words in found.verdict:
+        console.print(words, markup=False, soft_wrap=True)
+    if found.result.run is not None:
+        found.result.run.raise_failure()
+
+
 @with_options(of_evaluate("vehicle", "sensor_model", "steps", "seed", "workers"))
 def check(
     rigs: Annotated[list[str], typer.Argument(help="Rigs: built-in names (see `list`) or YAML files.")],

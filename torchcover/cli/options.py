@@ -20,6 +20,20 @@ if TYPE_CHECKING:
 Command = Callable[..., None]
 
 
+# The groups of `--help`, by the names of options; what is in none stands under "Options".
+PANELS = {
+    "What": "scenario frames vehicle sensor_model weather target heading encounters requirements aggregations "
+    "redundancy metrics thresholds_m threshold_m hits reference estimate phases worlds",
+    "Where": "ask region height grid cell_m band_frame probe raster",
+    "How exact": "steps rays every_s seed target_error only_detection budget evaluations optimiser fresh_worlds "
+    "per_world",
+    "Output": "out files rerun explain film",
+    "How it runs": "device workers no_cache resume skip_bad_frames",
+    "Of a recording": " ".join(["recording_format vehicle_frame mount sensors window_s", *Corrections.__annotations__]),
+}
+PANEL_OF = {name: panel for panel, names in PANELS.items() for name in names.split()}
+
+
 def with_options(parameters: Sequence[inspect.Parameter]) -> Callable[[Command], Command]:
     """A decorator: the command has these options, too, and gets those that were given as keywords.
 
@@ -34,6 +48,9 @@ def with_options(parameters: Sequence[inspect.Parameter]) -> Callable[[Command],
 
         own = [each for each in parameters_of(command) if each.kind is not inspect.Parameter.VAR_KEYWORD]
         update_wrapper(called, command)
+        for each in (*own, *parameters):
+            for said in get_args(each.annotation)[1:]:
+                said.rich_help_panel = PANEL_OF.get(each.name, said.rich_help_panel)
         # What typer reads.
         called.__signature__ = inspect.Signature([*own, *parameters])  # type: ignore[attr-defined]
         called.__annotations__ = {each.name: each.annotation for each in (*own, *parameters)}

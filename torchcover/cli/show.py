@@ -16,7 +16,7 @@ from torchcover.files import BadFileError, write_durably
 from torchcover.report import Terminal, check_film, write_film
 from torchcover.simulation import Scenario, builtin_names
 from torchcover.simulation.bodies import Body, Vehicle, VehicleShape, body_called, mover_mesh
-from torchcover.simulation.documents import read_mapping
+from torchcover.simulation.documents import nearest, read_mapping
 from torchcover.simulation.shapes import MeshFile
 
 DEFAULT_RIG = "front_roof_128"
@@ -113,8 +113,8 @@ def _kind(name: str) -> str:
     kinds = [kind for kind, names in of.items() if name in names]
     if len(kinds) != 1:
         both = f"both a {' and a '.join(kinds)}: give the YAML file"
-        known = "; ".join(f"{kind}s: {', '.join(names)}" for kind, names in of.items())
-        raise ValueError(f"{name!r} is {both if kinds else 'neither a .yaml file nor built in'}; {known}")
+        meant = nearest(name, sorted(set().union(*of.values())))
+        raise ValueError(f"{name!r} is {both if kinds else f'neither a .yaml file nor built in; {meant}'}")
     return kinds[0]
 
 

@@ -1,5 +1,7 @@
 """What `torchcover targets` does and prints."""
 
+import math
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +46,7 @@ def run(
 
 
 def parsed_raster(text: str) -> Raster:
-    """The raster of `x0,x1,y0,y1,step`, in metres.
+    """The raster of `x0,x1,y0,y1,step`, in metres; up to a step larger, with a warning, if the step does not divide it.
 
     Raises:
         ValueError: Other than five numbers, or what `Raster` refuses.
@@ -57,6 +59,12 @@ def parsed_raster(text: str) -> Raster:
         x0, x1, y0, y1, step_m = map(float, text.split(","))
     except ValueError as error:
         raise ValueError(f"--raster: x0,x1,y0,y1,step in metres, as in -8,8,-5,5,0.2; got {text!r}") from error
+    if 0 < step_m < math.inf and math.isfinite(x0 + x1 + y0 + y1):
+        most_x, most_y = (low + step_m * math.ceil((high - low) / step_m - 1e-6) for low, high in ((x0, x1), (y0, y1)))
+        if max(abs(most_x - x1), abs(most_y - y1)) > 1e-6:
+            told = f"--raster {text}: no whole number of steps; it ends at x {most_x:g} and y {most_y:g} m instead"
+            warnings.warn(told, stacklevel=2)
+            x1, y1 = most_x, most_y
     return Raster((x0, x1), (y0, y1), step_m)
 
 

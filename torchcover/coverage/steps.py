@@ -13,7 +13,7 @@ from torchcover.coverage.aggregations import Aggregation, MeanOfMeans, VisibleAr
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.quantity import MEASURED_WITHIN_M, detection
 from torchcover.coverage.redundancy import SensorFailures
-from torchcover.neighbors import check_cloud, check_tensor
+from torchcover.neighbors import check_cloud, check_tensor, check_weights
 
 # The aggregations that a metric has by itself.
 BUILT_IN = frozenset({MeanOfMeans.name, VisibleArea.name, SensorFailures.name})
@@ -145,7 +145,7 @@ def checked_steps(
         steps.append(step)
         check_cloud(step.reference, f"reference[{at}]")
         _check_resolution(step.reference, grid, f"reference[{at}]")
-        _check_weights(step.weights, len(step.reference), f"weights[{at}]")
+        check_weights(step.weights, len(step.reference), f"weights[{at}]")
         _check_height(step.height, step.reference, grid, f"height[{at}]")
         if not 0 <= step.number <= MAX_NUMBER:
             raise ValueError(f"place_in_time[{at}]: a number from 0 to {MAX_NUMBER:,} is needed; got {step.number}")
@@ -208,18 +208,6 @@ def _numbers(place_in_time: Any) -> list[int]:  # noqa: ANN401  (whatever the ca
         raise TypeError(
             f"place_in_time: a whole number, or a list with one for each step, is needed; got {place_in_time!r}"
         ) from error
-
-
-def _check_weights(weights: Tensor | None, points: int, name: str) -> None:
-    if weights is None:
-        return
-    check_tensor(weights, name)
-    if weights.shape != (points,):
-        raise ValueError(
-            f"{name}: shape ({points},), one for each reference point, is needed; got {tuple(weights.shape)}"
-        )
-    if not bool(((weights > 0) & weights.isfinite()).all()):
-        raise ValueError(f"{name}: positive, finite numbers are needed")
 
 
 def _check_height(height: Tensor | None, points: Tensor, grid: BevGrid, name: str) -> None:

@@ -6,6 +6,7 @@ from torchcover.frames import FrameBatch as FrameBatch
 from torchcover.frames import FrameDataset as FrameDataset
 from torchcover.frames import FrameSource as FrameSource
 from torchcover.frames import Measured as Measured
+from torchcover.frames import VisibleTargets as VisibleTargets
 from torchcover.frames import collate_frames as collate_frames
 from torchcover.frames import flip as flip
 from torchcover.frames import rotate as rotate

@@ -34,6 +34,8 @@ class Boxes:
             where none were, as in recordings.
         bottom_heights_m: (K,) height of the bottom of each box above the local ground, that is the highest ground below
             its centre; NaN where unknown.
+        visibility: (K,) share of what can be seen of it that a rig shows, as `box_visibility` measures it; NaN where
+            unknown.
 
     Raises:
         ValueError: Shapes that do not fit, NaN or infinite places, a length, width or height that is not positive.
@@ -57,6 +59,7 @@ class Boxes:
     hits: Mapping[str, Tensor] = field(default_factory=dict)
     drawn_points: Tensor = None  # type: ignore[assignment]  # nor this
     bottom_heights_m: Tensor = None  # type: ignore[assignment]  # nor this
+    visibility: Tensor = None  # type: ignore[assignment]  # nor this
 
     __repr__ = brief
 
@@ -70,6 +73,7 @@ class Boxes:
             "categories": ("",) * count,
             "drawn_points": torch.zeros(count, dtype=torch.int64, device=self.yaw_rad.device),
             "bottom_heights_m": self.centre_m.new_full((count,), math.nan),
+            "visibility": self.centre_m.new_full((count,), math.nan),
         }
         for name, unknown in fill.items():
             given = getattr(self, name)
@@ -90,7 +94,7 @@ class Boxes:
 
     def _check_shapes(self, count: int) -> None:
         expected = {"centre_m": (count, 3), "size_m": (count, 3), "yaw_rad": (count,), "velocity_mps": (count, 2)}
-        expected |= {"drawn_points": (count,), "bottom_heights_m": (count,)}
+        expected |= dict.fromkeys(("drawn_points", "bottom_heights_m", "visibility"), (count,))
         for name, shape in expected.items():
             if tuple(getattr(self, name).shape) != shape:
                 raise ValueError(
@@ -111,7 +115,7 @@ class Boxes:
 
         Args:
             rows: Metres and radians; further columns are not allowed.
-            others: `velocity_mps`, `ids`, `categories`, `hits`, `drawn_points`, `bottom_heights_m`.
+            others: `velocity_mps`, `ids`, `categories`, `hits`, `drawn_points`, `bottom_heights_m`, `visibility`.
 
         Raises:
             ValueError: Another shape, or as the constructor.
@@ -178,7 +182,7 @@ class Boxes:
 
     def _each(self, change: Callable[[Tensor], Tensor], **names: tuple[str, ...]) -> "Boxes":
         """With all tensors changed, and other names where their number changes."""
-        tensors = ("centre_m", "size_m", "yaw_rad", "velocity_mps", "drawn_points", "bottom_heights_m")
+        tensors = ("centre_m", "size_m", "yaw_rad", "velocity_mps", "drawn_points", "bottom_heights_m", "visibility")
         changed: dict[str, Any] = {name: change(getattr(self, name)) for name in tensors} | names
         return replace(self, **changed, hits={rig: change(count) for rig, count in self.hits.items()})
 

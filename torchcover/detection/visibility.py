@@ -8,7 +8,7 @@ from torch import Tensor
 from torchcover.detection.boxes import Boxes, check_boxes
 from torchcover.detection.inside import points_in_boxes
 from torchcover.files import brief
-from torchcover.neighbors import blind_spot_radius, check_cloud, check_tensor
+from torchcover.neighbors import blind_spot_radius, check_cloud, check_weights
 
 # The sides of a box that face this height above the vehicle's origin can be seen; so many points across each.
 SEEN_FROM_M, SIDE_POINTS = 1.7, 12
@@ -49,6 +49,15 @@ class BoxVisibility:
         What is neither known nor hidden was not sampled: nobody asked whether it can be seen.
         """
         return ~self.known & (self.drawn_points > 0)
+
+    @property
+    def level(self) -> Tensor:
+        """(K,) int64 levels of visibility as nuScenes names them: 1 to 40 %, 2 to 60 %, 3 to 80 %, 4; 0 if unknown.
+
+        There it is the share of an object's pixels in all cameras, here that of its surface with this rig.
+        """
+        borders = self.share.new_tensor([0.4, 0.6, 0.8])
+        return (torch.bucketize(self.share, borders, right=True) + 1).where(self.known, 0)
 
     def __len__(self) -> int:
         return len(self.share)
@@ -183,13 +192,4 @@ def _check(sensor: Tensor, reference: Tensor, threshold: float, weights: Tensor 
     check_cloud(sensor, "sensor")
     if not threshold >= 0:
         raise ValueError(f"threshold: a distance >= 0 in metres is needed; got {threshold}")
-    if weights is None:
-        return
-    check_tensor(weights, "reference_weights")
-    if weights.shape != (len(reference),):
-        raise ValueError(
-            f"reference_weights: shape ({len(reference)},) is needed, one for each reference point; got "
-            f"{tuple(weights.shape)}"
-        )
-    if not (weights.isfinite() & (weights > 0)).all():
-        raise ValueError("reference_weights: finite weights > 0 are needed")
+    check_weights(weights, len(reference), "reference_weights")

@@ -250,8 +250,7 @@ class Looks:
 
     def points(self, sensors: Sequence[int], steps: Numbers) -> Numbers:
         """(N,) points, or pixels, of some sensors together at (N,) steps."""
-        points: Numbers = np.sum([self._of_sensor(k, steps) for k in sensors], axis=0, dtype=np.int64)
-        return points
+        return np.asarray(np.sum([self._of_sensor(k, steps) for k in sensors], axis=0, dtype=np.int64))
 
     def _of_sensor(self, number: int, steps: Numbers) -> Numbers:
         known = self._points[number]

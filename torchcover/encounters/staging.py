@@ -72,8 +72,7 @@ class Staged:
 
     def vehicle_T_other(self, times_s: Float64) -> Float64:
         """(T, 4, 4) where the other is, as the ego has it."""
-        pose: Float64 = invert(self.world_T_ego(times_s)) @ self.world_T_other(times_s)
-        return pose
+        return np.asarray(invert(self.world_T_ego(times_s)) @ self.world_T_other(times_s))
 
     def scene(self, solids: Solids, *, whole: bool = False) -> Scene:
         """All but the other, or the `whole`, with a time step of a millisecond."""

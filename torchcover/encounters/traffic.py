@@ -150,8 +150,7 @@ def _velocities_mps(times_s: Float64, places_m: Float64) -> Float64:
     pace_mps, unknown = np.diff(places_m, axis=0) / np.diff(times_s)[:, None], np.full((1, 2), np.nan)
     before, after = np.concatenate([unknown, pace_mps]), np.concatenate([pace_mps, unknown])
     before, after = np.where(np.isnan(before), after, before), np.where(np.isnan(after), before, after)
-    velocities: Float64 = (before + after) / 2
-    return velocities
+    return np.asarray((before + after) / 2)
 
 
 class Eyes(NamedTuple):

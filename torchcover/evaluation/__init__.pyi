@@ -21,6 +21,8 @@ from .progress import Progress as Progress
 from .ranks import Ranks as Ranks
 from .ranks import joined_ranks as joined_ranks
 from .ranks import rank_count as rank_count
+from .reporting import Report as Report
+from .reporting import report as report
 from .requirements import Readings as Readings
 from .requirements import Requirements as Requirements
 from .requirements import Verdict as Verdict

@@ -66,6 +66,16 @@ class Checked:
         states = {one.state for each in self.verdicts.values() for one in each}
         return 1 if "not kept" in states else 3 if "not checked" in states else 0
 
+    @property
+    def verdict(self) -> tuple[str, ...]:
+        """How many of the requirements each rig keeps, in a sentence."""
+        told = []
+        for rig, each in self.verdicts.items():
+            states = [one.state for one in each]
+            others = [f"{states.count(s)} {s}" for s in ("not kept", "not checked") if s in states]
+            told.append(", ".join([f"{rig} keeps {states.count('kept')}", *others]))
+        return (f"Of the {len(each)} bounds of {self.requirements.name}: {'; '.join(told)}.",)
+
     def tables(self) -> list[PageTable]:
         """One for each rig, with what the requirements say about themselves."""
         asked, worlds = self.requirements, ", ".join(map(" ".join, self.settings["worlds"].items()))

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from torchcover import __version__
 from torchcover.encounters import Criterion, Encounter, EncounterSet, Sightings, Staged, sight_encounter
+from torchcover.encounters.result import ALL
 from torchcover.encounters.sighting import Looks, MountedRig
 from torchcover.encounters.staging import STEP_S, solid_of
 from torchcover.encounters.traffic import Drive, Eyes, approaches, sight_approach
@@ -238,14 +239,31 @@ def save_encounters(found: Sightings, folder: str | Path, *, files: str | Iterab
                 written.add("encounters.csv", found.write_csv)
             written.publish(record)
         if "page" in wanted:
-            written.add_text("report.html", page_html(_page(found)))
+            written.add_text("report.html", page_html(encounters_page(found)))
         if "maps" in wanted and not found.hours:
             written.add_figure("encounters.png", found.plot())
         written.publish(record)
     return written.paths
 
 
-def _page(found: Sightings) -> Page:
+def encounters_verdict(found: Sightings) -> tuple[str, ...]:
+    """In how many of the encounters each rig is in time, in a sentence; of traffic, who was met when too late."""
+    rows = [row for row in found.rows if row.encounter != ALL and row.to_brake]
+    of_rigs = {rig: [row for row in rows if row.rig == rig] for rig in found.sensors}
+    if not rows:
+        return ("Nobody was met for whom the vehicle had to brake.",)
+    if found.hours:
+        late = {rig: round(sum((1 - row.in_time) * row.to_brake for row in of)) for rig, of in of_rigs.items()}
+        most = max(sum(row.to_brake for row in of) for of in of_rigs.values())
+        told = "; ".join(f"{rig} {count}" for rig, count in late.items())
+        return (f"Of {most} for whom the vehicle had to brake, detected too late: {told}.",)
+    told = "; ".join(f"{rig} {sum(row.in_time == 1 for row in of)}" for rig, of in of_rigs.items())
+    count = max(map(len, of_rigs.values()))
+    return (f"Of {count} encounters of {found.name}, each speed counted, always in time: {told}.",)
+
+
+def encounters_page(found: Sightings) -> Page:
+    """All of it on one page."""
     pictures = []
     if not found.hours:
         png = BytesIO()
@@ -255,6 +273,7 @@ def _page(found: Sightings) -> Page:
         title=f"In time? {', '.join(found.sensors)}",
         lead=f"The encounters of {found.name}, measured by torchcover. In time is geometry: what was seen when, with "
         "the brakes and the latency that were assumed.",
+        verdict=encounters_verdict(found),
         tables=found.tables(),
         pictures=pictures,
         facts={"Settings": words_of(found.settings()), "Run": {"torchcover": __version__}},

@@ -12,7 +12,7 @@ from torchcover.evaluation.checkpoint import Checkpoint, Journal
 from torchcover.evaluation.cores import usual_workers
 from torchcover.evaluation.observers import AnyObserver, CoverageObserver
 from torchcover.evaluation.other_metrics import compared, metrics_of
-from torchcover.evaluation.pipeline import Run, observe
+from torchcover.evaluation.pipeline import Run, StoppingRule, observe
 from torchcover.evaluation.ranks import Ranks
 from torchcover.evaluation.result import Result
 from torchcover.evaluation.result_page import check_drawable, left_out
@@ -37,8 +37,8 @@ BODIES = "bodies beside the vehicle"
 ENOUGH_FRAMES = 256
 
 
-def measured(task: Task[FrameSource], settings: Settings) -> Result:
-    """Measure it. ValueError: as `evaluate`."""
+def measured(task: Task[FrameSource], settings: Settings, until: StoppingRule | None = None) -> Result:
+    """Measure it, or less if a rule says so. ValueError: as `evaluate`."""
     ranks = settings.ranks
     frames = task.frames
     sensors = [sensor for of_rig in task.sensors.values() for sensor in of_rig]
@@ -47,7 +47,7 @@ def measured(task: Task[FrameSource], settings: Settings) -> Result:
     metrics = metrics_of(task, settings) if settings.metrics else None
     others = {**settings.observers, **(metrics.observers if metrics else {}), **_probes(task, settings)}
     with ranks.aborting() if ranks else nullcontext():
-        coverage, seen, run = _observed(task, settings, others)
+        coverage, seen, run = _observed(task, settings, others, until)
     coverages = {name: observer.compute() for name, observer in coverage.items()}
     if isinstance(probes := seen.get(BODIES), Probes):
         for name, one in coverages.items():
@@ -105,7 +105,9 @@ def _probes(task: Task[FrameSource], settings: Settings) -> dict[str, Probes]:
     return {BODIES: Probes(task.frames.simulator, bodies, BLOCKS)}
 
 
-def _observed(task: Task[FrameSource], settings: Settings, others: Observers) -> tuple[Observers, Observers, Run]:
+def _observed(
+    task: Task[FrameSource], settings: Settings, others: Observers, until: StoppingRule | None
+) -> tuple[Observers, Observers, Run]:
     ranks, checkpoint = settings.ranks, settings.checkpoint
     if ranks:
         settings = replace(settings, device=ranks.device(settings.device))
@@ -138,7 +140,7 @@ def _observed(task: Task[FrameSource], settings: Settings, others: Observers) ->
             workers=settings.workers or 0,
             device=settings.device,
             skip_bad_frames=settings.skip_bad_frames,
-            until=watch,
+            until=watch or until,
             progress=settings.progress and (ranks is None or ranks.rank == 0),
             keep_partial=True,
             journal=journal,

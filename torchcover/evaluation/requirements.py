@@ -203,8 +203,7 @@ class BodyPlaces(Document):
             if self.within_m:
                 there &= np.isin(side_of(vehicle, there_m), [*map(SIDES.index, self.sides or SIDES)])
             places_m = there_m[there]
-        in_vehicle_m: Float64 = origin_m + places_m
-        return in_vehicle_m
+        return np.asarray(origin_m + places_m)
 
     def _between(self, low_m: float, high_m: float) -> Float64:
         """Both ends, and as many steps in between as it takes."""

@@ -135,8 +135,7 @@ def _cells(values: NDArray[Any], grid: BevGrid, scale: ColourScale) -> Any:  # n
 def coloured(values: NDArray[Any], scale: ColourScale) -> NDArray[np.uint8]:
     """(N, 3) colours of values."""
     share = np.clip((np.minimum(values, scale.high) - scale.low) / (scale.high - scale.low), 0.0, 1.0)
-    colours: NDArray[np.uint8] = colormaps[scale.colormap](share, bytes=True)[:, :3]
-    return colours
+    return np.asarray(colormaps[scale.colormap](share, bytes=True)[:, :3])
 
 
 def _boxes(boxes: Boxes) -> Any:  # noqa: ANN401

@@ -249,7 +249,7 @@ class Result:
         with Publication(Path(folder)) as written:
             with held_back():  # the numbers are safe before anything ends this, and before the maps are drawn
                 if "numbers" in wanted:
-                    self._add_numbers(written)
+                    self.add_numbers(written)
                 summary = self.record
                 written.publish(summary)
             if "page" in wanted:
@@ -259,7 +259,7 @@ class Result:
             written.publish(summary)
         return written.paths
 
-    def _add_numbers(self, files: Publication) -> None:
+    def add_numbers(self, files: Publication) -> None:
         """Write the files of numbers; a rig may be called what no file can be."""
         stems = file_stems(list(self.coverages)) if self.is_comparison else ["coverage"]
         for stem, coverage in zip(stems, self.coverages.values(), strict=True):

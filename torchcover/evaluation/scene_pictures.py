@@ -156,16 +156,14 @@ def _ground_m(terrain_m: Matrix, places_m: Matrix) -> Matrix:
 
 def _normals(corners_m: Matrix) -> Matrix:
     """(F, 3) of (F, 3, 3) faces, as long as these are large."""
-    normals: Matrix = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
-    return normals
+    return np.asarray(np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0]))
 
 
 def _heights_m(corners_m: Matrix) -> Matrix:
     """(F,) the highest point of each of (F, 3, 3) faces; of flat ones the middle, for a pavement may be on a slope."""
     normals = _normals(corners_m)
     flat = np.abs(normals[:, 2]) > FLAT * np.linalg.norm(normals, axis=1)
-    heights_m: Matrix = np.where(flat, corners_m[..., 2].mean(axis=1), corners_m[..., 2].max(axis=1))
-    return heights_m
+    return np.asarray(np.where(flat, corners_m[..., 2].mean(axis=1), corners_m[..., 2].max(axis=1)))
 
 
 def _actor_marks(world: World, time_s: float) -> list[ActorMark]:

@@ -1,6 +1,8 @@
 """What a rig sees of a target: names and defaults in, a map and its files out."""
 
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,12 +19,17 @@ from torchcover.report import (
     Line,
     Page,
     PageMap,
+    PagePlan,
     PageRig,
     PageTable,
     Words,
+    body_words,
+    capitalised,
     json_record,
     page_html,
     percent,
+    square_metres,
+    whole_percent,
 )
 from torchcover.simulation import Rig, Scenario, Sensor, with_ego
 from torchcover.simulation.bodies import Body
@@ -36,6 +43,10 @@ GROUND_M = 2000.0
 # On the page.
 NO_ROOM = "no room for it"
 ROBUST_PERCENTILE = 98
+# What sentences and plans count.
+NEAR_M = 2.0
+# Areas that differ by less are those of other cells, too.
+ALIKE = 0.9
 
 
 def survey_target(
@@ -162,12 +173,66 @@ def target_page(seen: TargetMap, sensors: Sequence[Sensor] = ()) -> Page:
     return Page(
         title=f"{seen.rig}: would it see {seen.target}?",
         lead=f"In {seen.scenario}, sensor model {seen.sensor_model}, measured by torchcover.",
+        verdict=target_verdict({seen.rig: seen}),
+        plans=[plan_of(seen)],
         tables=[sides_table(seen), places_table(seen.worst(), "The worst places")],
         maps=_maps(seen),
         rigs=[PageRig(seen.rig, sensor_views(sensors), rig_document(seen.rig, sensors))],
         ego_outline_m=seen.vehicle_outline_m,
         facts={"Settings": words_of(seen.settings()), "Run": {"torchcover": __version__}},
     )
+
+
+def plan_of(seen: TargetMap) -> PagePlan:
+    """Where it is seen, and what is lost with each sensor, as a page shows it."""
+    by = np.where(seen.enough, np.maximum(np.nan_to_num(seen.least_sensors), 1), 0).astype(np.int64)
+    near = seen.free & (seen.distance_m <= NEAR_M)
+    count, unseen = int(near.sum()), int((near & ~seen.enough).sum())
+    m2 = square_metres(unseen * seen.raster.step_m**2)
+    return PagePlan(
+        rig=seen.rig,
+        words=f"Not seen at {unseen:,} of {count:,} places within {NEAR_M:g} m, {m2} m².",
+        x=seen.raster.x,
+        y=seen.raster.y,
+        cell_m=seen.raster.step_m,
+        seen_by=np.where(seen.free, by, -1),
+        vehicle_box_m=seen.vehicle.outline_m,
+        vehicle_outline_m=seen.vehicle_outline_m,
+        within_m=NEAR_M,
+        losses_m2=seen.losses_m2(NEAR_M) if len(seen.sensor_names) > 1 else {},
+    )
+
+
+def target_verdict(seen: Mapping[str, TargetMap]) -> tuple[str, ...]:
+    """Where rigs see a body, and which sensor most hangs on, in sentences; no words where nothing is free.
+
+    Args:
+        seen: By the name of the rig: the same body on the same places.
+    """
+    shares = {rig: one.share_seen(NEAR_M) for rig, one in seen.items()}
+    known = sorted((rig for rig in shares if not math.isnan(shares[rig])), key=lambda rig: -shares[rig])
+    if not known:
+        return (f"No place within {NEAR_M:g} m is free: what is seen there is unknown.",)
+    alike = [(share, ", ".join(rigs)) for share, rigs in groupby(known, lambda rig: whole_percent(shares[rig]))]
+    (most, best), *others = alike
+    first = seen[known[0]]
+    body = f"{body_words(first.target)} of {first.target_size_m[2]:.2f} m"
+    told = [f"{capitalised(body)} is seen at {most} % of the places within {NEAR_M:g} m by {best}"]
+    told += [f"at {share} % by {rigs}" for share, rigs in others]
+    return (f"{', '.join(told)}.", *(_on_loss(rig, seen[rig]) for rig in known))
+
+
+def _on_loss(rig: str, seen: TargetMap) -> str:
+    """Of one rig, the sensor with which most places are lost; several where the cells are too coarse to tell."""
+    losses = seen.losses_m2(NEAR_M)
+    most_m2 = max(losses.values())
+    if len(losses) == 1:
+        return f"{rig} has one sensor: without it, it sees nothing."
+    if not most_m2:
+        return f"{rig} loses no place within {NEAR_M:g} m, whichever sensor fails."
+    worst = [sensor for sensor, m2 in losses.items() if m2 >= ALIKE * most_m2]
+    lost = f"{'up to ' * (len(worst) > 1)}{square_metres(most_m2)} m² more are not seen within {NEAR_M:g} m"
+    return f"{rig} most needs its {' and '.join(worst)}: without {'one' if len(worst) > 1 else 'it'}, {lost}."
 
 
 def _maps(seen: TargetMap) -> list[PageMap]:

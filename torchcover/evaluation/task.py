@@ -242,8 +242,8 @@ def spread_s(scenario: Scenario, given_s: float | None) -> float:
 
 
 def distinct_names(rigs: Sequence[AnyRig]) -> list[str]:
-    """What the columns are called: the rig's name, or the stem of its file; numbered where two would be the same."""
-    return distinct([_stem(rig) for rig in rigs])
+    """What the columns are called: the rigs' names; numbered where two would be the same."""
+    return distinct([_name(rig) for rig in rigs])
 
 
 def distinct(stems: Sequence[str]) -> list[str]:
@@ -272,7 +272,7 @@ def as_called(rig: AnyRig) -> Rig:
 
     FileNotFoundError: as `loaded`. ValueError: as `loaded`.
     """
-    return loaded(rig).model_copy(update={"name": _stem(rig)})
+    return loaded(rig).model_copy(update={"name": _name(rig)})
 
 
 def is_document(rig: AnyRig) -> bool:
@@ -285,10 +285,8 @@ def given_as(rig: AnyRig) -> str:
     return rig.name if isinstance(rig, Rig) else str(rig)
 
 
-def _stem(rig: AnyRig) -> str:
-    if isinstance(rig, Rig):
-        return rig.name
-    return Path(rig).stem if _is_file(rig) else str(rig)
+def _name(rig: AnyRig) -> str:
+    return loaded(rig).name if isinstance(rig, Rig) or _is_file(rig) else str(rig)
 
 
 def _is_file(rig: str | Path) -> bool:

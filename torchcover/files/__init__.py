@@ -40,4 +40,6 @@ from torchcover.files.shown import shown as shown
 from torchcover.files.xml_text import feed_xml as feed_xml
 from torchcover.files.xml_text import parse_xml as parse_xml
 from torchcover.files.yaml_text import as_yaml as as_yaml
+from torchcover.files.yaml_text import builtin_folder as builtin_folder
 from torchcover.files.yaml_text import parse_yaml as parse_yaml
+from torchcover.files.yaml_text import road_user_classes as road_user_classes

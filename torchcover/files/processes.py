@@ -21,7 +21,7 @@ MOST_FILES = 256
 _prctl = ctypes.CDLL(None).prctl if sys.platform == "linux" else None
 
 
-def end_with_parent(memory_gb: float = math.inf) -> Callable[..., None] | None:
+def end_with_parent(memory_gb: float = math.inf, cpu_s: float = math.inf) -> Callable[..., None] | None:
     """What a process that this one starts has to call first, to be killed when this one ends, however that ends.
 
     `memory_gb`: what it may take in all. Returns for the `preexec_fn` of `subprocess` and the `worker_init_fn` of a
@@ -32,7 +32,7 @@ def end_with_parent(memory_gb: float = math.inf) -> Callable[..., None] | None:
         >>> subprocess.run([sys.executable, "-c", ""], preexec_fn=end_with_parent()).returncode
         0
     """
-    return partial(_end_with, os.getpid(), memory_gb) if _prctl else None
+    return partial(_end_with, os.getpid(), memory_gb, cpu_s) if _prctl else None
 
 
 def limit(memory_gb: float) -> None:
@@ -50,8 +50,10 @@ def _lower(what: int, most: int) -> None:
     resource.setrlimit(what, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))
 
 
-def _end_with(parent: int, memory_gb: float, *_: object) -> None:
+def _end_with(parent: int, memory_gb: float, cpu_s: float, *_: object) -> None:
     assert _prctl is not None  # or nobody would have been given this
+    if cpu_s < math.inf:
+        _lower(resource.RLIMIT_CPU, math.ceil(cpu_s))
     if memory_gb < math.inf:
         _lower(resource.RLIMIT_AS, int(memory_gb * 1e9))
     _prctl(PR_SET_PDEATHSIG, signal.SIGKILL)

@@ -2,6 +2,8 @@
 
 import re
 from collections.abc import Hashable, Mapping
+from functools import cache
+from pathlib import Path
 from typing import Any, ClassVar
 
 import yaml
@@ -50,6 +52,25 @@ def parse_yaml(text: str) -> Any:  # noqa: ANN401  (YAML knows no types)
     except (yaml.YAMLError, ValueError) as error:
         reason = " ".join(str(error).replace('in "<unicode string>", ', "").split())
         raise ValueError(f"not a YAML file: {reason}") from error
+
+
+def builtin_folder(kind: str) -> Path:
+    """Where the built-in documents of a kind lie.
+
+    Args:
+        kind: As `builtin_documents` takes it, or "road_users" and "published", which have tables.
+    """
+    package = Path(__file__).parents[1]
+    # In a wheel the folder lies inside the package; in a checkout beside it.
+    installed = package / "_datasets"
+    return (installed if installed.is_dir() else package.parent / "datasets") / kind
+
+
+@cache
+def road_user_classes() -> Mapping[str, Mapping[str, Any]]:
+    """What is said of road users by words of recordings, and by classes."""
+    found: dict[str, dict[str, Any]] = parse_yaml((builtin_folder("road_users") / "classes.yaml").read_text("utf-8"))
+    return found
 
 
 def as_yaml(content: Mapping[str, Any]) -> str:

@@ -11,3 +11,4 @@ from .source import ChosenRigs as ChosenRigs
 from .source import FrameDataset as FrameDataset
 from .source import FrameSource as FrameSource
 from .source import worlds_of as worlds_of
+from .visible_targets import VisibleTargets as VisibleTargets

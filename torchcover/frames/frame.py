@@ -223,6 +223,8 @@ class FrameBatch:
 
     frames: tuple[Frame, ...]
 
+    __repr__ = brief
+
     @property
     def sensor(self) -> list[Tensor]:
         """One (N, 3) cloud a frame, of the only rig, where its points truly are; N differs."""

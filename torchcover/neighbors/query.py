@@ -245,6 +245,19 @@ def check_tensor(given: object, name: str, *, floating: bool = False) -> None:
     raise TypeError(f"{name}: {wanted} is needed; got {arrived}")
 
 
+def check_weights(weights: Tensor | None, points: int, name: str) -> None:
+    """Raise unless there are none, or positive, finite ones: one for each reference point."""
+    if weights is None:
+        return
+    check_tensor(weights, name)
+    if weights.shape != (points,):
+        raise ValueError(
+            f"{name}: shape ({points},), one for each reference point, is needed; got {tuple(weights.shape)}"
+        )
+    if not bool((weights.isfinite() & (weights > 0)).all()):
+        raise ValueError(f"{name}: finite weights > 0 are needed")
+
+
 def check_cloud(cloud: Tensor, name: str) -> None:
     """Raise unless `cloud` is a floating-point tensor of shape (N, 3) with finite coordinates.
 

@@ -1,10 +1,9 @@
 """Choose some of many candidates, and test the choice in fresh worlds."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,21 +16,17 @@ from torchcover.coverage.regions import Places
 from torchcover.estimation import Number
 from torchcover.evaluation.progress import Progress
 from torchcover.evaluation.result import sensor_model_words
-from torchcover.evaluation.settings import FILES
 from torchcover.frames import Frame
 from torchcover.geometry.arrays import Bools, Float64
 from torchcover.neighbors import nearest
 from torchcover.placement.choice_space import ChoiceSpace
 from torchcover.placement.common_instants import CommonInstants
 from torchcover.placement.fresh import FreshGain, FreshTest, fresh_test, told
-from torchcover.placement.report_files import PlacementReport
+from torchcover.placement.report_files import PlacementReport, Reported
 from torchcover.placement.subsets import SAME, Candidates, Limits, Subset, best, best_of_several, random_subsets
 from torchcover.report import ChoiceSize, PageTable, Words, draw_choice, file_stems
 from torchcover.simulation import Rig, Sensor
 from torchcover.simulation.regions_of_interest import DEFAULT_BAND_FRAME
-
-if TYPE_CHECKING:
-    import pandas
 
 # Random choices that keep to the limits, as a control.
 DRAWN = 1000
@@ -41,8 +36,8 @@ MOST_SIZES = 12
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class SensorChoice:
-    """What was chosen, and how good that is.
+class SensorChoice(Reported):
+    """What was chosen, and how good that is. Its picture, `sizes.png`, shows what more sensors are worth.
 
     Args:
         space: What there was to choose from.
@@ -151,29 +146,6 @@ class SensorChoice:
 
     def __repr__(self) -> str:
         return f"SensorChoice in {self.space.name}: {self.sentence}"
-
-    def _repr_html_(self) -> str:
-        return self.report._repr_html_()
-
-    def plot(self) -> Figure:
-        """The first of its pictures, what more sensors are worth: a figure of its own, outside pyplot."""
-        return self.report.plot()
-
-    def to_dataframe(self) -> "pandas.DataFrame":
-        """The rows of `candidates.csv`.
-
-        Raises:
-            ModuleNotFoundError: pandas is not there.
-        """
-        return self.report.to_dataframe()
-
-    def save(self, folder: str | Path, *, files: str | Iterable[str] = FILES) -> list[Path]:
-        """Write the files of the command line; see `PlacementReport.save`.
-
-        They are `best.yaml` (of several objectives also `best_OBJECTIVE.yaml`), `candidates.csv`,
-        `sizes.csv`, `search.json`, `sizes.png`, `report.html`, `summary.json`.
-        """
-        return self.report.save(folder, files=files)
 
     @property
     def _record(self) -> dict[str, Any]:

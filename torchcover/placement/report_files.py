@@ -109,6 +109,39 @@ class PlacementReport:
         )
 
 
+class Reported:
+    """What has a report: files, a page, and what a notebook shows of it."""
+
+    @property
+    def report(self) -> PlacementReport:
+        """For its files, its page, and the terminal."""
+        raise NotImplementedError
+
+    def _repr_html_(self) -> str:
+        return self.report._repr_html_()
+
+    def plot(self) -> Figure:
+        """The first of its pictures: a figure of its own, outside pyplot."""
+        return self.report.plot()
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """The rows of its first table: `candidates.csv` of a choice, `evaluations.csv` of a search.
+
+        Raises:
+            ModuleNotFoundError: pandas is not there.
+        """
+        return self.report.to_dataframe()
+
+    def save(self, folder: str | Path, *, files: str | Iterable[str] = FILES) -> list[Path]:
+        """Write the files of the command line; see `PlacementReport.save`.
+
+        They are `best.yaml` (of several objectives also `best_OBJECTIVE.yaml`), `search.json`, `report.html`, the
+        pictures and `summary.json`; of a choice `candidates.csv` and `sizes.csv`, of a search `evaluations.csv` and
+        `pareto.csv`.
+        """
+        return self.report.save(folder, files=files)
+
+
 def _digits(value: object) -> object:
     """As many as anybody can use."""
     return f"{value:.9g}" if isinstance(value, float) and value == value else value

@@ -1,30 +1,24 @@
 """What a search has found, in numbers, words and tables."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from torchcover.evaluation.result import sensor_model_words
-from torchcover.evaluation.settings import FILES
 from torchcover.placement.arm import Arm
 from torchcover.placement.evaluation import OPTIMISER, RANDOM, START, Evaluation
 from torchcover.placement.fresh import FreshGain, FreshTest, amount, told, unit_words
 from torchcover.placement.pareto import hypervolume
-from torchcover.placement.report_files import OF_THE_RUN, PlacementReport
+from torchcover.placement.report_files import OF_THE_RUN, PlacementReport, Reported
 from torchcover.placement.result_pictures import search_pictures
 from torchcover.placement.search import PlacementSearch
 from torchcover.placement.variables import FreeNumber
 from torchcover.report import PageTable, Words, file_stems
 from torchcover.report.wording import UNKNOWN
 from torchcover.simulation import Rig
-
-if TYPE_CHECKING:
-    import pandas
 
 # Of a range: nearer to its end, a number is on it.
 BOUND = 0.005
@@ -58,8 +52,8 @@ class Pick:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class SearchResult:
-    """What `run_search` returns.
+class SearchResult(Reported):
+    """What `run_search` returns. Its first picture shows how the search went.
 
     Args:
         search: With all its evaluations.
@@ -198,29 +192,6 @@ class SearchResult:
 
     def __repr__(self) -> str:
         return f"SearchResult in {self.search.space.name}: {self.sentence}"
-
-    def _repr_html_(self) -> str:
-        return self.report._repr_html_()
-
-    def plot(self) -> Figure:
-        """The first of its pictures, how the search went: a figure of its own, outside pyplot."""
-        return self.report.plot()
-
-    def to_dataframe(self) -> "pandas.DataFrame":
-        """The rows of `evaluations.csv`.
-
-        Raises:
-            ModuleNotFoundError: pandas is not there.
-        """
-        return self.report.to_dataframe()
-
-    def save(self, folder: str | Path, *, files: str | Iterable[str] = FILES) -> list[Path]:
-        """Write the files of the command line; see `PlacementReport.save`.
-
-        They are `best.yaml` (of several objectives also `best_OBJECTIVE.yaml`), `evaluations.csv`, `pareto.csv`,
-        `search.json`, `report.html`, the pictures, and `summary.json`.
-        """
-        return self.report.save(folder, files=files)
 
     def _pick_record(self, pick: Pick) -> dict[str, Any]:
         gains: dict[str, dict[str, Any]] = {}

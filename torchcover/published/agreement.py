@@ -14,14 +14,13 @@ from torchcover.geometry.arrays import Float64, Int64
 from torchcover.published.ranks import (
     DRAWS,
     Ranking,
+    interval95,
     kendall_tau_b,
     permutation_p,
     spearman,
     strongest_by_chance,
 )
 
-# Ends of the intervals.
-LEVELS = 0.025, 0.975
 # What the best of several metrics that mean nothing exceeds in one of twenty orders.
 BY_CHANCE = 0.95
 # Of a table of published results.
@@ -118,6 +117,11 @@ class Relation(NamedTuple):
     value: float
     low: float
     high: float
+
+    @classmethod
+    def of(cls, value: float, drawn: Float64) -> Self:
+        """Of a number, and what it is in draws."""
+        return cls(value, *interval95(value, drawn))
 
     @property
     def words(self) -> str:
@@ -240,7 +244,7 @@ def lead(one: Ranking, other: Ranking, judged: Judged, *, draws: int = DRAWS, pl
     truths, columns = _drawn(judged, draws, placements=placements)
     found = [spearman(each.gains, judged.mean) for each in (one, other)]
     drawn = [spearman(*_along(each, truths, columns)) for each in (one, other)]
-    return _with_ends(float(found[0] - found[1]), drawn[0] - drawn[1])
+    return Relation.of(float(found[0] - found[1]), drawn[0] - drawn[1])
 
 
 def _drawn(judged: Judged, draws: int, *, placements: bool) -> tuple[Float64, Int64]:
@@ -260,14 +264,6 @@ def _along(one: Ranking, truths: Float64, columns: Int64) -> tuple[Float64, Floa
 def _ranked(one: Ranking, truth: Float64, truths: Float64, columns: Int64) -> Ranked:
     drawn = _along(one, truths, columns)
     rho, tau = (
-        _with_ends(float(statistic(one.gains, truth)), statistic(*drawn)) for statistic in (spearman, kendall_tau_b)
+        Relation.of(float(statistic(one.gains, truth)), statistic(*drawn)) for statistic in (spearman, kendall_tau_b)
     )
     return Ranked(one.name, rho, tau, permutation_p(one.gains, truth), one.draws is not None)
-
-
-def _with_ends(value: float, drawn: Float64) -> Relation:
-    known = drawn[~np.isnan(drawn)]
-    if math.isnan(value) or not known.size:
-        return Relation(value, math.nan, math.nan)
-    low, high = np.quantile(known, LEVELS).tolist()
-    return Relation(value, low, high)

@@ -11,13 +11,12 @@ import numpy as np
 
 from torchcover.estimation import Number
 from torchcover.files import csv_text
-from torchcover.published.ranks import LEAST, Ranking, kendall_tau_b
+from torchcover.published.ranks import LEAST, Ranking, interval95, kendall_tau_b
 from torchcover.published.s_mig import unequal_rays
 from torchcover.report import PageTable, Words, json_record, number_words, shown_unit
 
 TITLE, TAU_TITLE = "Metrics of others", "Kendall's tau-b with torchcover's numbers, 95 % over worlds"
 
-INTERVAL = (0.025, 0.975)
 NOT_VALIDATED = "None of these metrics is validated; docs/metrics.md says what each is blind to."
 TOO_FEW = "Kendall's tau needs three rigs or more: two are in one order or in the other by chance; there are {}"
 # Of a table with a row for each rig and number.
@@ -92,9 +91,7 @@ def tau_of(first: Ranking, second: Ranking) -> Tau:
     known = int((~np.isnan(first.gains + second.gains)).sum())
     low = high = math.nan
     if first.drawn_gains is not None and second.drawn_gains is not None:
-        drawn = kendall_tau_b(first.drawn_gains, second.drawn_gains)
-        if not np.isnan(value) and not np.isnan(drawn).all():
-            low, high = (float(end) for end in np.nanquantile(drawn, INTERVAL))
+        low, high = interval95(value, kendall_tau_b(first.drawn_gains, second.drawn_gains))
     return Tau(first.name, second.name, value, low, high, known)
 
 

@@ -107,6 +107,15 @@ def drawn_again(estimate: Estimate, seed: int) -> Float64 | None:
     return None if again is None else again.cpu().numpy()
 
 
+def interval95(value: float, drawn: Float64) -> tuple[float, float]:
+    """Ends of the 95 % interval of a number by what it is in draws; NaN where it, or all of them, are unknown."""
+    known = drawn[~np.isnan(drawn)]
+    if math.isnan(value) or not known.size:
+        return math.nan, math.nan
+    low, high = np.quantile(known, (0.025, 0.975)).tolist()
+    return low, high
+
+
 def midranks(values: ArrayLike) -> Float64:
     """(..., n) ranks from 1, the smallest, on; equal values share the mean of theirs, and what is NaN stays so."""
     own = np.asarray(values, dtype=np.float64)

@@ -173,8 +173,7 @@ class AccumulatedReference:
             return points_m
         heights_m = ground.heights_m(points_m)
         down_m = np.where(np.abs(heights_m) <= ON_GROUND_M, heights_m, 0.0)
-        level_m: NDArray[np.float64] = points_m - down_m[:, None] * np.array([0.0, 0.0, 1.0])
-        return level_m
+        return np.asarray(points_m - down_m[:, None] * np.array([0.0, 0.0, 1.0]))
 
     def _passing(self, recording: Recording, index: int, scans: Mapping[Key, Thinned]) -> dict[Key, NDArray[np.bool_]]:
         """Of the points of each scan, those above ground where nothing is seen for long."""

@@ -161,15 +161,13 @@ def _beside_what_stands(low: Float64, stands: Bools, lower_m: Float64) -> Bools:
     bottom_m = np.full(np.full(2, int(2 * AROUND_M / CELL_M) + 3), np.inf)
     bottom_m[y[stands], x[stands]] = low[stands, 2]
     around_m = np.min([bottom_m[y + dy, x + dx] for dy in (-1, 0, 1) for dx in (-1, 0, 1)], axis=0)
-    beside: Bools = low[:, 2] > around_m - THICK_M
-    return beside
+    return np.asarray(low[:, 2] > around_m - THICK_M)
 
 
 def _squares(across_m: Float64) -> Numbers:
     """(N,) numbers of the squares of (N, 2) places from the first corner."""
     x, y = (across_m / NODE_M).astype(np.int64).T + REACH
-    numbers: Numbers = y * SIDE + x
-    return numbers
+    return np.asarray(y * SIDE + x)
 
 
 def _a_fifth_below(square: Numbers, heights_m: Float64) -> Numbers:
@@ -177,8 +175,7 @@ def _a_fifth_below(square: Numbers, heights_m: Float64) -> Numbers:
     order = np.lexsort((heights_m, square))
     first = np.flatnonzero(np.diff(square[order], prepend=-1))
     count = np.diff(np.append(first, len(order)))
-    chosen: Numbers = order[first + (FIFTH * count).astype(np.int64)]
-    return chosen
+    return np.asarray(order[first + (FIFTH * count).astype(np.int64)])
 
 
 def _around() -> tuple[Numbers, Float64]:

@@ -7,42 +7,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.files import naming
+from torchcover.files import naming, road_user_classes
 from torchcover.geometry import euler_from_rotation, rigid, rotation_from_euler
 from torchcover.geometry.rigid import Matrix
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings.recording import Recording
 from torchcover.recordings.seen import Seen, by_name
-
-# What road users are called where a data set has no names of its own, in lower case -> their class by SUMO's names.
-CLASSES = {
-    "car": "passenger",
-    "suv": "passenger",
-    "taxi": "passenger",
-    "vehicle": "passenger",
-    "passenger": "passenger",
-    "parkedvehicle": "passenger",
-    "priorityvehicle": "emergency",
-    "van": "delivery",
-    "truck": "truck",
-    "lorry": "truck",
-    "bus": "bus",
-    "motorcycle": "motorcycle",
-    "bicycle": "bicycle",
-    "cyclist": "bicycle",
-    "pedestrian": "pedestrian",
-    "person": "pedestrian",
-    "adult": "pedestrian",
-    "child": "child",
-    # Models of two-wheelers, as CARLA calls them.
-    "crossbike": "bicycle",
-    "century": "bicycle",
-    "omafiets": "bicycle",
-    "low_rider": "motorcycle",
-    "ninja": "motorcycle",
-    "yzf": "motorcycle",
-    "zx125": "motorcycle",
-}
 
 
 class Track(NamedTuple):
@@ -168,7 +138,8 @@ def class_of(category: str) -> str | None:
         >>> class_of("Car"), class_of("walker.pedestrian.0007"), class_of("static.barrier")
         ('passenger', 'pedestrian', None)
     """
-    return next((CLASSES[word] for word in reversed(category.strip().lower().split(".")) if word in CLASSES), None)
+    classes = road_user_classes()["usual"]
+    return next((classes[word] for word in reversed(category.strip().lower().split(".")) if word in classes), None)
 
 
 def _labelled(recording: Recording, times_s: NDArray[np.float64], world_T_vehicle: Matrix) -> Iterator[Seen]:

@@ -202,16 +202,14 @@ class Sweeps:
 def voxels(points_m: NDArray[np.float64], side_m: float) -> NDArray[np.int64]:
     """(N,) number of the voxel of each of (N, 3) points."""
     x, y, z = (np.floor(points_m / side_m).astype(np.int64) & ((1 << VOXEL_BITS) - 1)).T
-    numbers: NDArray[np.int64] = (x << 2 * VOXEL_BITS) | (y << VOXEL_BITS) | z
-    return numbers
+    return np.asarray((x << 2 * VOXEL_BITS) | (y << VOXEL_BITS) | z)
 
 
 def first_of_each(numbers: NDArray[np.int64]) -> NDArray[np.int64]:
     """Where each number is seen first, by ascending number; fast where ascending runs follow each other."""
     order = np.argsort(numbers, kind="stable")
     ordered = numbers[order]
-    first: NDArray[np.int64] = order[np.append(True, ordered[1:] != ordered[:-1])[: len(order)]]
-    return first
+    return np.asarray(order[np.append(True, ordered[1:] != ordered[:-1])[: len(order)]])
 
 
 def pose_of(boxes: Boxes, number: int) -> Matrix:

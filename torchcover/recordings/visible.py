@@ -50,8 +50,7 @@ def square_metres(points_m: Float64) -> Float64:
     if len(points_m) <= NEIGHBOURS:
         return np.full(len(points_m), np.pi * WIDEST_M**2 / NEIGHBOURS)
     apart_m, _ = KDTree(points_m).query(points_m, k=NEIGHBOURS + 1)
-    area: Float64 = np.pi * np.minimum(apart_m[:, -1], WIDEST_M) ** 2 / NEIGHBOURS
-    return area
+    return np.asarray(np.pi * np.minimum(apart_m[:, -1], WIDEST_M) ** 2 / NEIGHBOURS)
 
 
 def _places_m(body: BoundingBox, seed: int) -> Float64:
@@ -60,8 +59,7 @@ def _places_m(body: BoundingBox, seed: int) -> Float64:
     share = (np.random.default_rng(seed).random(3) + np.arange(100 * PLACES)[:, None] * ROBERTS) % 1
     places_m = lower_m - [SHELL_M, SHELL_M, 0.0] + share * (upper_m - lower_m + [2 * SHELL_M, 2 * SHELL_M, SHELL_M])
     outside = np.flatnonzero(((places_m < lower_m) | (places_m > upper_m)).any(axis=1))
-    chosen: Float64 = places_m[outside[:PLACES]]
-    return chosen
+    return np.asarray(places_m[outside[:PLACES]])
 
 
 def hide_by_arrays(

@@ -65,6 +65,8 @@ def single_point_of_failure(table: CoverageTable, rig: str) -> str:
         return "Whether one sensor is indispensable is unknown: nothing that was asked about was seen."
     if quantity.key != RADIUS.key and not any(row.summary.numbers[quantity.key].value > 0.0 for row in rows):
         return "Nothing of what was asked about is detected: no failure could take anything away."
+    if len(sensors_of(rows)) == 1:
+        return f"Its only sensor is {sensors_of(rows)[0]}: without it nothing is seen."
     if redundancy is None or redundancy.indispensable is None:
         return "No single point of failure: whichever sensor fails, nothing that is known changes."
     sensor = redundancy.indispensable

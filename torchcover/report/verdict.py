@@ -38,8 +38,7 @@ def on_near_field(table: CoverageTable) -> str:
     of_sides = {SIDES[of[0].region.name]: of for of in near}
     told = {side: _told(of, key) for side, of in of_sides.items()}
     known = [f"{side} {words}" for side, words in told.items() if words]
-    name = body.partition("_")[0]
-    seen = f"{'an' if name[:1] in 'aeiou' else 'a'} {name} is seen"
+    seen = f"{body_words(body)} is seen"
     if known:
         return f"Free places within 3 m where {seen}: {'; '.join(known)}."
     unknown = all(math.isnan(row.summary.numbers[key].error) for of in of_sides.values() for row in of)
@@ -82,15 +81,31 @@ def _told(rows: Sequence[Row], key: str) -> str:
     """A share of one rig with its interval; of several who leads by more than chance; no words if nobody knows."""
     if len(rows) == 1:
         number = rows[0].summary.numbers[key]
-        interval = f"[{_percent(number.low)}, {_percent(number.high)}]"
-        return "" if math.isnan(number.low) else f"{_percent(number.value)} % {interval}"
+        interval = f"[{whole_percent(number.low)}, {whole_percent(number.high)}]"
+        return "" if math.isnan(number.low) else f"{whole_percent(number.value)} % {interval}"
     leader = next((row for row in rows if key in row.best), None)
     if leader is None:
         return ""
     second = max((row for row in rows if row is not leader), key=lambda row: row.summary.numbers[key].value)
-    return ", ".join(f"{row.rig} {_percent(row.summary.numbers[key].value)} %" for row in (leader, second))
+    return ", ".join(f"{row.rig} {whole_percent(row.summary.numbers[key].value)} %" for row in (leader, second))
 
 
-def _percent(share: float) -> str:
-    """Without decimals, but some is not none, and nearly all is not all."""
+def body_words(name: str) -> str:
+    """What a body is called in a sentence.
+
+    Example:
+        >>> body_words("child_110cm"), body_words("adult")
+        ('a child', 'an adult')
+    """
+    plain = name.partition("_")[0]
+    return f"{'an' if plain[:1] in 'aeiou' else 'a'} {plain}"
+
+
+def whole_percent(share: float) -> str:
+    """Without decimals, but some is not none, and nearly all is not all.
+
+    Example:
+        >>> [whole_percent(share) for share in (0.0, 0.001, 0.126, 0.999, 1.0)]
+        ['0', '1', '13', '99', '100']
+    """
     return f"{min(max(round(100 * share), 1), 99) if 0 < share < 1 else 100 * share:.0f}"

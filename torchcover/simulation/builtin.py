@@ -1,9 +1,8 @@
 """The built-in documents: rigs, scenarios, vehicles and LiDAR models by name."""
 
-from importlib.resources import files
-from pathlib import Path
 from typing import Any
 
+from torchcover.files import builtin_folder as builtin_folder
 from torchcover.files import parse_yaml
 
 
@@ -24,15 +23,3 @@ def builtin_documents(kind: str) -> dict[str, dict[str, Any]]:
     """
     folder = builtin_folder(kind)
     return {name: parse_yaml((folder / f"{name}.yaml").read_text(encoding="utf-8")) for name in builtin_names(kind)}
-
-
-def builtin_folder(kind: str) -> Path:
-    """Where the built-in documents of a kind lie.
-
-    Args:
-        kind: As above, or "published", which has tables.
-    """
-    package = Path(str(files("torchcover")))
-    # In a wheel the folder lies inside the package; in a checkout beside it.
-    installed = package / "_datasets"
-    return (installed if installed.is_dir() else package.parent / "datasets") / kind

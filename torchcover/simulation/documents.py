@@ -212,7 +212,14 @@ def _told(detail: ErrorDetails, meant: Place | None = None) -> str:
     if detail["type"] != "value_error":  # a list is a tuple to us, and keys with values are some class
         words = re.sub(" after validation| or instance of .*", "", words)
         words = words.replace("Tuple", "List").replace("tuple", "list")
-    return f"{key[:-1]}{': ' * bool(key)}{words}{arrived}"
+    unit = _with_unit(str(detail["loc"][-1])) if detail["type"] == "extra_forbidden" else ""
+    return f"{key[:-1]}{': ' * bool(key)}{words}{arrived}" + f"; is {unit} meant?" * bool(unit)
+
+
+def _with_unit(key: str, of: type[BaseModel] = Document) -> str:
+    """The key of some document that is this one with a unit behind it; empty if there is none."""
+    known = (name for name in of.model_fields if name.rpartition("_")[0] == key)
+    return next(known, "") or next(filter(None, (_with_unit(key, one) for one in of.__subclasses__())), "")
 
 
 def _follows_from_another(detail: ErrorDetails) -> bool:
@@ -273,21 +280,30 @@ def is_file_name(path_or_name: str | Path) -> bool:
     return Path(path_or_name).suffix in (".yaml", ".yml")
 
 
+def nearest(name: str, known: Sequence[str]) -> str:
+    """What may be meant by a name that is not known: at most three that are like it, or the nearest three.
+
+    Example:
+        >>> nearest("urbn", ["courtyard", "highway", "parking", "urban"])
+        "is 'urban' meant? `torchcover list` has all 4"
+    """
+    alike = get_close_matches(name, known, n=3) or get_close_matches(name, known, n=3, cutoff=0.0)
+    return f"is {' or '.join(map(repr, alike))} meant? `torchcover list` has all {len(known)}"
+
+
 def found(kind: str, path_or_name: str | Path) -> Path:
     """Where a document is: a path that ends in .yaml or .yml, or a built-in one of a kind by its name.
 
-    FileNotFoundError: no built-in one of this name; the message lists the names.
+    FileNotFoundError: no built-in one of this name; the message says the nearest.
     """
     path = Path(path_or_name)
     if is_file_name(path):
         return path
     builtin = builtin_folder(kind) / f"{path_or_name}.yaml"
     if path.name != str(path_or_name) or not builtin.is_file():
-        known = builtin_names(kind)
-        meant = get_close_matches(str(path_or_name), known, n=1)
         raise FileNotFoundError(
-            f"{str(path_or_name)!r} is neither a .yaml file nor one of the built-in {kind}: {', '.join(known)}"
-            + (f"; is {meant[0]!r} meant?" if meant else "")
+            f"{str(path_or_name)!r} is neither a .yaml file nor one of the built-in {kind}; "
+            + nearest(str(path_or_name), builtin_names(kind))
         )
     return builtin
 

@@ -26,6 +26,7 @@ from torchcover import __version__
 from torchcover.files import BadFileError, check_memory, reads, said_gb
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.builtin import builtin_names
+from torchcover.simulation.documents import builtin_hashes
 from torchcover.simulation.scenario import Mover, Scenario
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.sumo.simulating import home
@@ -135,7 +136,7 @@ def _drawn_from(scenario: Scenario) -> str:
     """All that its worlds follow from, but the seed and the run: no sensors, weather or names are among it."""
     assert scenario.traffic is not None  # it draws
     told: list[object] = [__version__, _code(), np.__version__, np.show_config(mode="dicts")["SIMD Extensions"]]
-    told += [shapely.__version__, shapely.geos_version_string, builtin_names("materials")]
+    told += [shapely.__version__, shapely.geos_version_string, builtin_names("materials"), builtin_hashes("road_users")]
     told += [type(scenario.traffic).__name__, scenario.traffic.content(), (scenario.ego or Mover()).content()]
     with suppress(ImportError, OSError):  # there is no SUMO
         told.append((home() / "bin" / "sumo").stat().st_mtime_ns)

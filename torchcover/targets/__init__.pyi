@@ -7,8 +7,8 @@ from .raster import Raster as Raster
 from .result import STATES as STATES
 from .result import Place as Place
 from .result import SideShare as SideShare
+from .result import Spots as Spots
 from .result import TargetMap as TargetMap
-from .survey import Spots as Spots
 from .survey import survey as survey
 from .survey import survey_places as survey_places
 from .target import TARGETS as TARGETS

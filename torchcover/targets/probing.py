@@ -15,7 +15,6 @@ from torchcover.geometry import BoundingBox, overlapping
 from torchcover.metrics import SumsInBlocks
 from torchcover.simulation.reference_sensor import Surroundings
 from torchcover.simulation.regions_of_interest import near_field
-from torchcover.simulation.sensor import Draws
 from torchcover.simulation.simulator import Simulator
 from torchcover.targets.counting import count
 from torchcover.targets.placing import holding, poses, standing, yaws
@@ -133,11 +132,9 @@ class Probes(SumsInBlocks):
             visible = probe.surface.seen_from(place_m, probe.body, standing(vehicle_T_body, z_m), instant)
             for rig, mounted in enumerate(stage.mounted.values()):
                 held = np.any([holding(box, vehicle_T_body, one.vehicle_T_sensor[:3, 3]) for one in mounted], axis=0)
-                sensors = [
-                    SensorStep(one, Draws(np.random.default_rng([seed, index, k]), rays=len(one.range_m)))
-                    for k, one in enumerate(ends[rig], 1)
-                ]
-                step = Step(sensors, z_m, free & probe.room[some] & ~held, visible[None])
+                step = Step(
+                    SensorStep.of_rig(ends[rig], seed, index), z_m, free & probe.room[some] & ~held, visible[None]
+                )
                 seen = count(
                     probe.body, probe.surface, vehicle_T_body, mounted, [step], hits=HITS, threshold_m=THRESHOLD_M
                 )

@@ -51,8 +51,23 @@ class SideShare(NamedTuple):
     seen: float
 
 
+@dataclass(frozen=True, eq=False)
+class Spots:
+    """What some sensors get of a target at P places: the arrays of `TargetMap` that are called so, of one row."""
+
+    state: NDArray[np.uint8]
+    steps: Numbers
+    sensor_points: Float64
+    sensors: Float64
+    seen: Float64
+    least_points: Float64
+    least_sensors: Float64
+    share: Float64
+    visible_m2: Float64
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class TargetMap:
+class TargetMap(Spots):
     """What a rig sees of a target, for every cell of a raster. Rows are y, columns are x; NaN where it cannot stand.
 
     Args:
@@ -97,15 +112,6 @@ class TargetMap:
     threshold_m: float
     seed: int
     step_count: int
-    state: NDArray[np.uint8]
-    steps: Numbers
-    sensor_points: Float64
-    sensors: Float64
-    seen: Float64
-    least_points: Float64
-    least_sensors: Float64
-    share: Float64
-    visible_m2: Float64
 
     @property
     def x_m(self) -> Float64:
@@ -120,14 +126,12 @@ class TargetMap:
     @property
     def points(self) -> Float64:
         """(Y, X) mean number of points on it, of all sensors."""
-        points: Float64 = self.sensor_points.sum(axis=0)
-        return points
+        return np.asarray(self.sensor_points.sum(axis=0))
 
     @property
     def free(self) -> NDArray[np.bool_]:
         """(Y, X) whether it can stand there."""
-        free: NDArray[np.bool_] = self.state == FREE
-        return free
+        return np.asarray(self.state == FREE)
 
     @property
     def enough(self) -> NDArray[np.bool_]:
@@ -155,6 +159,18 @@ class TargetMap:
                 cells = int(there.sum())
                 rows.append(SideShare(name, limit_m, cells, float(self.seen[there].mean()) if cells else math.nan))
         return rows
+
+    def share_seen(self, within_m: float) -> float:
+        """Share of the free places within a distance where it is seen; NaN if none is free."""
+        near = self.free & (self.distance_m <= within_m)
+        return float(self.enough[near].mean()) if near.any() else math.nan
+
+    def losses_m2(self, within_m: float) -> dict[str, float]:
+        """For each sensor, how much more is not seen within a distance when it fails: fewer points than enough."""
+        near = self.enough & (self.distance_m <= within_m)
+        left = self.points - self.sensor_points
+        m2 = (near & (left < self.hits)).sum(axis=(1, 2)) * self.raster.step_m**2
+        return dict(zip(self.sensor_names, m2.tolist(), strict=True))
 
     def unseen_to_m(self) -> dict[str, float]:
         """For each side, how far the farthest free cell without enough points is; 0 if all have, NaN if none is."""
@@ -203,8 +219,7 @@ class TargetMap:
         ):
             end = np.stack([of_x[at], of_y[at]], axis=1) + half_m  # ahead and to the left
             parts.append(np.stack([end, end - half_m * np.array(along), np.full_like(end, math.nan)], axis=1))
-        border_m: Float64 = np.concatenate(parts).reshape(-1, 2)
-        return border_m
+        return np.asarray(np.concatenate(parts).reshape(-1, 2))
 
     def __repr__(self) -> str:
         return f"TargetMap of {self.target} around {self.rig}: {self.raster.shape} places, {self.step_count} steps"

@@ -37,6 +37,14 @@ class SensorStep(NamedTuple):
     ends: Ends
     draws: Draws
 
+    @classmethod
+    def of_rig(cls, ends: Sequence[Ends], seed: int, step: int) -> "list[SensorStep]":
+        """The sensors of a rig, with the numbers of each ray: all places see the same rays err and drop out."""
+        return [
+            cls(one, Draws(np.random.default_rng([seed, step, k]), rays=len(one.range_m)))
+            for k, one in enumerate(ends, 1)
+        ]
+
 
 class Step(NamedTuple):
     """One step.
@@ -101,13 +109,8 @@ class Steps:
             )
             if not stage.scene.moves and self._scenario.repeats:
                 resting = ends, ground_z_m, free
-            # The numbers of each ray: all places see the same rays err and drop out.
-            sensors = [
-                SensorStep(one, Draws(np.random.default_rng([self._seed, index, k]), rays=len(one.range_m)))
-                for k, one in enumerate(ends, 1)
-            ]
             visible = self._visible(stage.scene, instant, standing(self._poses, ground_z_m), index)
-            yield Step(sensors, ground_z_m, free, visible)
+            yield Step(SensorStep.of_rig(ends, self._seed, index), ground_z_m, free, visible)
 
     def _visible(self, scene: Scene, instant: Instant, vehicle_T_target: Float64, index: int) -> NDArray[np.uint8]:
         generator = np.random.default_rng([self._seed, index])

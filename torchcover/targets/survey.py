@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from torchcover.simulation.scenario import Scenario
 from torchcover.targets.counting import count
 from torchcover.targets.placing import Heading, holding, poses, yaws
 from torchcover.targets.raster import Raster
-from torchcover.targets.result import FREE, OCCUPIED, OUTSIDE, TargetMap
+from torchcover.targets.result import FREE, OCCUPIED, OUTSIDE, Spots, TargetMap
 from torchcover.targets.steps import PLACES, Steps
 from torchcover.targets.surface import SAMPLES, Surface
 from torchcover.targets.target import Target
@@ -96,22 +96,8 @@ def survey(
         threshold_m=threshold_m,
         seed=seed,
         step_count=steps,
-        **{name: array.reshape(*array.shape[:-1], *raster.shape) for name, array in spots._asdict().items()},
+        **{name: array.reshape(*array.shape[:-1], *raster.shape) for name, array in vars(spots).items()},
     )
-
-
-class Spots(NamedTuple):
-    """What some sensors get of a target at P places: the arrays of `TargetMap` that are called so, of one row."""
-
-    state: NDArray[np.uint8]
-    steps: NDArray[np.int64]
-    sensor_points: Float64
-    sensors: Float64
-    seen: Float64
-    least_points: Float64
-    least_sensors: Float64
-    share: Float64
-    visible_m2: Float64
 
 
 def survey_places(

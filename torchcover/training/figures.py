@@ -1,6 +1,7 @@
-"""Coverage maps as figures and images, for whichever logger takes them."""
+"""Maps, pictures and rows of results, for whichever logger takes them."""
 
 from collections.abc import Callable, Sequence
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -42,6 +43,47 @@ def log_maps(coverage: Coverage, loggers: Sequence[Any], prefix: str, step: int)
             for take in able:
                 take(f"{prefix}/{tag}", figure, step)
     return [type(logger).__name__ for logger, take in takers if take is None]
+
+
+def log_result(result: Any, logger: Any, *, step: int = 0, tag: str = "torchcover") -> None:  # noqa: ANN401  (see below)
+    """Hand the rows and the picture of a result to a logger: `TAG/rows` and `TAG/picture`.
+
+    Args:
+        result: Any with `to_dataframe()` and `plot()`: what `evaluate`, `survey_target`, `encounter` or a search gave.
+        logger: TensorBoard's `SummaryWriter`, a run of Weights & Biases, the module `mlflow` with an active run, or
+            Lightning's logger of one of them.
+        step: Where on the logger's axis.
+        tag: In front of the names, with a slash between.
+
+    Raises:
+        TypeError: Another logger.
+        ModuleNotFoundError: pandas is not there.
+    """
+    frame, figure = result.to_dataframe(), result.plot()
+    experiment = getattr(logger, "experiment", logger)
+    if callable(getattr(experiment, "add_text", None)):
+        experiment.add_text(f"{tag}/rows", _markdown(frame), step)
+        experiment.add_figure(f"{tag}/picture", figure, step)
+    elif callable(getattr(experiment, "log_table", None)):  # the module, or a client that has to be told the run
+        run = [logger.run_id] if hasattr(logger, "run_id") else []
+        experiment.log_table(*run, data=frame, artifact_file=f"{tag}/rows_{step:08d}.json")
+        experiment.log_figure(*run, figure, f"{tag}/picture_{step:08d}.png")
+    elif type(experiment).__module__.partition(".")[0] == "wandb":
+        from wandb import Image, Table
+
+        shown = {f"{tag}/rows": Table(dataframe=frame), f"{tag}/picture": Image(rgb_image(figure))}
+        experiment.log(shown, step=step)
+    else:
+        raise TypeError(
+            "logger: a SummaryWriter, a run of Weights & Biases, mlflow, or Lightning's logger of one of them is "
+            f"needed; got {type(logger).__name__}"
+        )
+
+
+def _markdown(frame: Any) -> str:  # noqa: ANN401  (a DataFrame)
+    """A table as TensorBoard shows it; bars would end a cell, and it shows HTML as such."""
+    rows = [list(frame.columns), ["---"] * len(frame.columns), *frame.round(4).astype(str).values.tolist()]
+    return "\n".join("| " + " | ".join(escape(str(cell)).replace("|", "&#124;") for cell in row) + " |" for row in rows)
 
 
 def _taker(logger: Any) -> Taker | None:  # noqa: ANN401  (any logger)

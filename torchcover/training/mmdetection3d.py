@@ -21,8 +21,8 @@ def frames_of_data_batch(
 
     Args:
         data_batch: With `inputs["points"]`: one (N, 3 + ...) cloud for each sample, in metres.
-        data_samples: One dict for each sample, with the (M, 3 + ...) reference points and `sample_idx`. The
-            `meta_keys` of `Pack3DDetInputs` carry both there.
+        data_samples: One dict for each sample, with the (M, 3 + ...) reference points, which `PackWithReference` of
+            `torchcover.training.mmengine` carries there, and `sample_idx`.
         reference: Key of the reference points, which a dataset of one's own has to add.
         vehicle_T_lidar: (4, 4) pose of the points' frame; by default they are in the vehicle frame already.
 
@@ -42,8 +42,8 @@ def frames_of_data_batch(
     for k, (cloud, sample) in enumerate(zip(clouds, data_samples, strict=True)):
         if reference not in sample:
             raise ValueError(
-                f"sample {k} has no {reference!r}; add it to the results in the pipeline and to the meta_keys of "
-                "Pack3DDetInputs"
+                f"sample {k} has no {reference!r}; add it to the results in the pipeline, and pack them with "
+                "PackWithReference of torchcover.training.mmengine"
             )
         clouds_of_frame = torch.as_tensor(cloud), torch.as_tensor(sample[reference])
         frames.append(frame_of(*clouds_of_frame, sample.get("sample_idx"), vehicle_T_lidar))

@@ -1,4 +1,4 @@
-"""Coverage as a metric of MMEngine, for MMDetection3D. Importing this registers it."""
+"""Coverage as a metric of MMEngine, for MMDetection3D, and a transform that it needs. Importing this registers both."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -8,7 +8,7 @@ import torch
 
 try:
     from mmengine.evaluator import BaseMetric
-    from mmengine.registry import METRICS
+    from mmengine.registry import METRICS, TRANSFORMS
 except ImportError as error:
     raise ImportError("MMEngineCoverage needs MMEngine: pip install mmengine (or mmengine-lite)") from error
 from mmengine.dist import get_comm_device, get_dist_info
@@ -18,6 +18,34 @@ from torchcover.frames import Frame
 from torchcover.training.batches import UNKNOWN_INDEX, frames_in
 from torchcover.training.counting import CountOnce, Shard
 from torchcover.training.mmdetection3d import frames_of_data_batch
+
+
+@TRANSFORMS.register_module()
+class PackWithReference:
+    """The last transform of a pipeline: packs as another does, and keeps the reference points beside its `meta_keys`.
+
+    Args:
+        pack: The other, such as `Pack3DDetInputs`, or its config.
+        reference: Key of the reference points, which a dataset of one's own has to add.
+
+    Raises:
+        ValueError: When it is called: the results have no reference points.
+    """
+
+    def __init__(self, pack: Any, reference: str = "reference_points") -> None:  # noqa: ANN401  (any transform)
+        self.pack = TRANSFORMS.build(pack) if isinstance(pack, Mapping) else pack
+        self.reference = reference
+
+    def __call__(self, results: Any) -> Any:  # noqa: ANN401  (of one sample, or of each augmentation of it)
+        """What the other packs of it; `data_samples` has the reference points, too."""
+        each = results if isinstance(results, list) else [results]
+        if any(self.reference not in one for one in each):
+            raise ValueError(f"the results have no {self.reference!r}: let the dataset, or a transform before, add it")
+        references = [one[self.reference] for one in each]
+        packed = self.pack(results)
+        for one, reference in zip(packed if isinstance(packed, list) else [packed], references, strict=True):
+            one["data_samples"].set_metainfo({self.reference: reference})
+        return packed
 
 
 @METRICS.register_module()

@@ -201,3 +201,9 @@ def test_a_turn_is_driven_as_slowly_as_its_tightest_piece_asks_for():
     lead_m = np.column_stack([np.linspace(-30.0, -1.0, 30), np.zeros(30)])
     assert turning_mps(np.concatenate([lead_m, arc_m])) == pytest.approx(np.sqrt(TURN_MPS2 * 6.0), rel=0.02)
     assert turning_mps(lead_m) > 100.0
+
+
+def test_a_program_that_finds_no_end_is_ended(tmp_path, monkeypatch):
+    monkeypatch.setattr(simulating, "MOST_S", 0.5)
+    with pytest.raises(ValueError, match=r"SUMO's netgenerate took more than 0\.5 s of processor time"):
+        simulating.run("netgenerate", "--rand", "--rand.iterations", "9999999", "-o", tmp_path / "a.net.xml")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from torchcover.cameras.calibration import Calibration
 from torchcover.detection.boxes import Boxes
-from torchcover.files import naming, read_feather
+from torchcover.files import naming, read_feather, road_user_classes
 from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_quaternion
 from torchcover.geometry.rigid import Matrix
 from torchcover.geometry.trajectory import Trajectory
@@ -35,23 +35,6 @@ POSES = "city_SE3_egovehicle.feather"
 ANNOTATIONS = ("annotations.feather", "annotations_with_ego.feather")
 # Poses and sweeps have their times from one clock.
 MAX_CLOCK_GAP_NS = 10_000_000
-# The cuboids of those who ride are of the riders only; what they ride has one of its own, and is a box without anybody.
-CLASSES = {
-    "regular_vehicle": "passenger",
-    "large_vehicle": "delivery",
-    "truck": "truck",
-    "box_truck": "truck",
-    "truck_cab": "truck",
-    "bus": "bus",
-    "school_bus": "bus",
-    "articulated_bus": "bus",
-    "motorcycle": "motorcycle",
-    "pedestrian": "pedestrian",
-    "official_signaler": "pedestrian",
-    "bicyclist": "pedestrian",
-    "motorcyclist": "pedestrian",
-    "wheeled_rider": "pedestrian",
-}
 EGO_CATEGORY = "ego_vehicle"
 # An annotation belongs to a sweep, and the poses are those of the sweeps and others.
 MAX_ANNOTATION_GAP_S = 0.1
@@ -69,7 +52,6 @@ class Argoverse2(Layout):
     layout: ClassVar[str] = "sensors/lidar/TIME.feather, city_SE3_egovehicle.feather"
     sensors = tuple(LASERS)
     body: BoundingBox | None = BODY
-    classes = CLASSES
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
@@ -81,6 +63,11 @@ class Argoverse2(Layout):
         self._times_ns = np.array([_time_ns(file) for file in self._files])
         self._poses = self._read_poses()
         self.times_s = check_times(self._times_ns * 1e-9, len(self.names), str(self.path.joinpath(*SWEEPS)))
+
+    @property
+    def classes(self) -> Mapping[str, str]:
+        """By the words of the data set."""
+        return road_user_classes()["argoverse2"]
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -99,8 +86,7 @@ class Argoverse2(Layout):
 
     def world_T_vehicle(self, index: int) -> Matrix:
         """The pose of the ego in the city."""
-        pose: Matrix = self._poses[index] @ invert(vehicle_T_ego)
-        return pose
+        return np.asarray(self._poses[index] @ invert(vehicle_T_ego))
 
     def boxes(self, index: int) -> Boxes | None:
         """The cuboids of that sweep; None without the file."""
@@ -179,8 +165,9 @@ def read_objects(path: Path) -> RecordedObjects:
                 f"pose is at {drive.times_s[-1]:g} s: are both of one log?"
             )
         world_T_ego = {time_s: drive.at(time_s) for time_s in np.unique(times_s).tolist()}
+        classes = road_user_classes()["argoverse2"]
         tracks = tuple(
-            track_of(seen, CLASSES.get(seen[0].category), np.stack([world_T_ego[one.time_s] for one in seen]))
+            track_of(seen, classes.get(seen[0].category), np.stack([world_T_ego[one.time_s] for one in seen]))
             for seen in by_name(_seen(cuboids, origin_ns)).values()
             if seen[0].category != EGO_CATEGORY
         )

@@ -151,5 +151,4 @@ def read_timestamps(path: Path) -> NDArray[np.float64]:
             times = np.array(words, dtype="datetime64[ns]")
     except (ValueError, UserWarning) as error:
         raise ValueError(f"lines of date and time are needed: {error}") from error
-    seconds: NDArray[np.float64] = (times - times[0]) / np.timedelta64(1, "s")
-    return seconds
+    return np.asarray((times - times[0]) / np.timedelta64(1, "s"))

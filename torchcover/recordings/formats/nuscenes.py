@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from torchcover.cameras.calibration import read_nuscenes
 from torchcover.detection.boxes import Boxes
-from torchcover.files import naming, read_json_table
+from torchcover.files import naming, read_json_table, road_user_classes
 from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_quaternion
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.clouds.arrays import read_ringed_cloud
@@ -26,21 +26,6 @@ from torchcover.recordings.seen import Seen, SeenObjects, by_name
 vehicle_T_ego = rigid(np.eye(3), [-1.385, 0.0, 0.0])
 # As in the body `renault_zoe`, where its source is.
 SIZE_M = (4.084, 1.730, 1.562)
-# By the beginning of a category; the first that fits counts.
-CLASSES = (
-    ("vehicle.car", "passenger"),
-    ("vehicle.emergency.police", "passenger"),
-    ("vehicle.emergency", "emergency"),
-    ("vehicle.truck", "truck"),
-    ("vehicle.bus", "bus"),
-    ("vehicle.motorcycle", "motorcycle"),
-    ("vehicle.bicycle", "bicycle"),
-    ("human.pedestrian.child", "child"),
-    ("human.pedestrian.wheelchair", None),
-    ("human.pedestrian.stroller", None),
-    ("human.pedestrian.personal_mobility", None),
-    ("human.pedestrian", "pedestrian"),
-)
 CHANNEL = "LIDAR_TOP"
 # Nothing but the car and what is mounted on it can be in its outline of 4.08 x 1.73 m up to a little above the LiDAR.
 BODY = BoundingBox((-2.042, -0.865, 0.05), (2.042, 0.865, 2.04))
@@ -218,7 +203,8 @@ def _scene(samples: list[dict[str, Any]], path: Path, scene: str | None) -> str:
 
 
 def _class(category: str) -> str | None:
-    return next((found for beginning, found in CLASSES if category.lower().startswith(beginning)), None)
+    classes = road_user_classes()["nuscenes"].items()
+    return next((found for beginning, found in classes if category.lower().startswith(beginning)), None)
 
 
 def pose_of(row: dict[str, Any]) -> Matrix:

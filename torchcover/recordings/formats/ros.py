@@ -200,8 +200,7 @@ class RosBag(Layout):
 
     def _world_T_vehicle(self, poses: VehiclePoses, index: int) -> Matrix:
         logged_ns = int(self._logged_ns[self.sensors[0]][index])
-        pose: Matrix = poses.at(np.array([self._stamp_ns(index)]), logged_ns)[0]
-        return pose
+        return np.asarray(poses.at(np.array([self._stamp_ns(index)]), logged_ns)[0])
 
     def _stamp_ns(self, index: int) -> int:
         """When the first sensor's scan was made, which is the time of the instant."""

@@ -106,8 +106,7 @@ def _bounds_of_ranges(polygons: Sequence[Points]) -> tuple[Bounds, Bounds]:
 
 def _along(outline: Points) -> Points:
     """The middle of an arc, where its number stands."""
-    middle: Points = outline[len(outline) // 2]
-    return middle
+    return np.asarray(outline[len(outline) // 2])
 
 
 def _sector(sensor: SensorView, reach_m: float) -> Points:

@@ -128,6 +128,8 @@ def draw_cells(
     The axes have the grid's bounds as limits. Cells are opaque but for an `opacity` from 0 to 1 of each. Returns the
     image, for the colour bar.
     """
+    # Each is drawn with several copies of all pixels, half as large as in float64.
+    array, opacity = array.astype(np.float32), None if opacity is None else opacity.astype(np.float32)
     # Unknown cells are holes through which the ground of the axes shows.
     axes.patch.set(**UNKNOWN, linewidth=0)
     norm = (LogNorm if scale.logarithmic else Normalize)(scale.low, scale.high)
@@ -181,5 +183,6 @@ def _draw_image(axes: Axes, array: NDArray[Any], **colours: Any) -> AxesImage:  
         origin="lower",
         aspect="equal",
         interpolation="nearest" if larger_than_pixel else "antialiased",
+        interpolation_stage="data" if larger_than_pixel else None,  # colours of all pixels take 80 MB
         **colours,
     )

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.estimation import Number
 from torchcover.report.maps.colours import NEVER_PROBED, ColourScale
 from torchcover.report.maps.overlay import SensorView
 from torchcover.report.renderers.layout import PageTable
@@ -70,6 +71,48 @@ class PageMap:
 
 
 @dataclass(frozen=True, eq=False)
+class PagePlan:
+    """Where a body is seen beside a vehicle, from above and true to scale.
+
+    Args:
+        rig: Who sees it.
+        words: A line above it.
+        x: Bounds of the cells forward in metres.
+        y: Bounds to the left.
+        cell_m: Side of a cell.
+        seen_by: (Y, X) by how many sensors; 0 where it is not seen, -1 where it has no room.
+        vehicle_box_m: (4, 2) corners x, y of what distances are from.
+        vehicle_outline_m: (K, 2) what the vehicle looks like.
+        within_m: Up to which distance places count.
+        losses_m2: Sensor -> how much more is not seen within it when this one fails.
+    """
+
+    rig: str
+    words: str
+    x: Bounds
+    y: Bounds
+    cell_m: float
+    seen_by: Sides
+    vehicle_box_m: Array
+    vehicle_outline_m: Array
+    within_m: float
+    losses_m2: Mapping[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class PageRange:
+    """Shares of one kind, of one rig or of several below each other.
+
+    Args:
+        name: What they are of.
+        of_rigs: Name of the rig -> its share, with its interval if there is one.
+    """
+
+    name: str
+    of_rigs: Mapping[str, Number]
+
+
+@dataclass(frozen=True, eq=False)
 class PageRig:
     """A rig as a page shows it.
 
@@ -105,6 +148,8 @@ class Page:
         title: Its name.
         lead: One line below.
         verdict: The answer in sentences, the first of which says most.
+        plans: What shows it, at the top.
+        ranges: How far it is seen, below.
         tables: The numbers.
         pictures: Above them.
         maps: In the order of the menus; differences are to the first rig.
@@ -113,11 +158,14 @@ class Page:
         outlines: Regions that the maps show, by name: (K, 2) corners x, y.
         facts: Heading -> name -> what holds, such as settings.
         more_tables: Below the facts, such as what was left out.
+        most_bytes: What the numbers of the maps may take, before they are packed.
     """
 
     title: str
     lead: str
     verdict: Sequence[str] = ()
+    plans: Sequence[PagePlan] = ()
+    ranges: Sequence[PageRange] = ()
     tables: Sequence[PageTable] = ()
     pictures: Sequence[PagePicture] = ()
     maps: Sequence[PageMap] = ()
@@ -126,3 +174,4 @@ class Page:
     outlines: Sequence[Line] = ()
     facts: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     more_tables: Sequence[PageTable] = ()
+    most_bytes: float = 3.8e6

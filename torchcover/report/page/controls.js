@@ -4,7 +4,7 @@ const FURTHER = 1.4;
 
 class Controls {
   constructor(page) {
-    Object.assign(this, { page, dragged: null });
+    Object.assign(this, { page, pointers: new Map() });
     for (const name of ["quantity", "band", "rig"]) {
       part(name).addEventListener("change", (event) => this.choose(name, event.target.selectedIndex));
     }
@@ -63,14 +63,15 @@ class Controls {
   listen(canvas) {
     const { page } = this, pixel = (event) => [event.offsetX, event.offsetY];
     const point = (event) => { page.probe = page.view.toMetres(...pixel(event)); page.draw(); page.read(); };
-    canvas.addEventListener("pointerdown", (event) => { this.dragged = pixel(event); canvas.setPointerCapture(event.pointerId); });
-    canvas.addEventListener("pointerup", () => { this.dragged = null; });
+    canvas.addEventListener("pointerdown", (event) => {
+      this.pointers.set(event.pointerId, pixel(event));
+      canvas.setPointerCapture(event.pointerId);
+    });
+    for (const end of ["pointerup", "pointercancel", "lostpointercapture"]) {
+      canvas.addEventListener(end, (event) => this.pointers.delete(event.pointerId));
+    }
     canvas.addEventListener("pointermove", (event) => {
-      if (this.dragged) {
-        const [x, y] = pixel(event);
-        page.view.move(this.dragged[0] - x, y - this.dragged[1]);
-        this.dragged = [x, y];
-      }
+      if (this.pointers.has(event.pointerId)) this.drag(event.pointerId, pixel(event));
       point(event);
     });
     canvas.addEventListener("wheel", (event) => {
@@ -79,6 +80,15 @@ class Controls {
       this.zoom(FURTHER ** (-Math.sign(event.deltaY)), pixel(event));
     }, { passive: false });
     canvas.addEventListener("keydown", (event) => this.press(event));
+  }
+
+  // One pointer moves the map; two hold it, and zoom it as they part.
+  drag(id, [x, y]) {
+    const [oldX, oldY] = this.pointers.get(id), [other] = [...this.pointers].filter(([one]) => one !== id);
+    this.pointers.set(id, [x, y]);
+    if (!other) { this.page.view.move(oldX - x, y - oldY); return; }
+    const apart = ([atX, atY]) => Math.max(1, Math.hypot(atX - other[1][0], atY - other[1][1]));
+    this.page.view.zoom(apart([x, y]) / apart([oldX, oldY]), other[1]);
   }
 
   press(event) {
@@ -96,48 +106,59 @@ class Controls {
   }
 }
 
-// Every map, small: to choose one, and on paper.
+// Every map, small: to choose one, and on paper. Each is drawn when it comes into sight; returned is what draws the rest.
 function fillGallery(page, controls) {
   const all = page.choices.flatMap((quantity, q) => quantity.bands.flatMap((band, b) => band.rigs.map((rig, r) => ({ quantity, band, rig, at: { quantity: q, band: b, rig: r } }))));
+  const todo = new Map();
+  const drawn = (canvas) => { todo.get(canvas)?.(); todo.delete(canvas); sight.unobserve(canvas); };
+  const sight = new IntersectionObserver((entries) => {
+    for (const one of entries) if (one.isIntersecting) drawn(one.target);
+  }, { rootMargin: "300px" });
   part("gallery").replaceChildren(...all.map(({ quantity, band, rig, at }) => {
-    const shown = page.shown(rig, false), button = made("button", "", { type: "button" }), figure = made("figure");
-    button.append(cropped(shown, page.content.ego), made("figcaption", `${quantity.name}, ${band.name}: ${rig.name}`));
+    const button = made("button", "", { type: "button" }), figure = made("figure"), canvas = made("canvas");
+    const draw = cropped(canvas, page.content.rasters[rig.map.raster], page.content.ego);
+    todo.set(canvas, () => draw(page.shown(rig, false).image));
+    sight.observe(canvas);
+    button.append(canvas, made("figcaption", `${quantity.name}, ${band.name}: ${rig.name}`));
     button.addEventListener("click", () => {
       Object.assign(page.state, at);
       controls.fillMenus();
       page.refresh();
       part("map").scrollIntoView();
     });
-    figure.append(button, barOf(shown.scale, page.content.luts));
+    figure.append(button, barOf(rig.against ? rig.map.difference : rig.map.scale, page.content.luts));
     return figure;
   }));
+  return () => [...todo.keys()].forEach(drawn);
 }
 
-// What is known of a map, on hatching.
-function cropped(shown, ego) {
-  const { raster } = shown, { x, y } = raster.known, canvas = made("canvas");
+// A canvas as large as what is known of a raster, and what draws an image of all of it there, on hatching.
+function cropped(canvas, raster, ego) {
+  const { x, y } = raster.known;
   const left = Math.round((x[0] - raster.x[0]) / raster.cell), top = Math.round((raster.y[1] - y[1]) / raster.cell);
   const columns = Math.round((x[1] - x[0]) / raster.cell), rows = Math.round((y[1] - y[0]) / raster.cell);
-  const larger = Math.max(1, Math.floor(700 / columns));
-  canvas.width = larger * columns; canvas.height = larger * rows;
-  const pen = canvas.getContext("2d");
-  pen.fillStyle = hatching(pen);
-  pen.fillRect(0, 0, canvas.width, canvas.height);
-  pen.imageSmoothingEnabled = false;
-  pen.drawImage(shown.image, left, top, columns, rows, 0, 0, canvas.width, canvas.height);
-  const pixel = (low, high) => (larger * (high - low)) / raster.cell;
-  pen.beginPath();
-  for (const corner of ego || []) pen.lineTo(pixel(x[0], corner[0]), pixel(corner[1], y[1]));
-  pen.closePath();
-  pen.fillStyle = "white"; pen.fill();
-  pen.strokeStyle = "black"; pen.stroke();
-  return canvas;
+  const larger = columns < 700 ? Math.floor(700 / columns) : 700 / columns;
+  canvas.width = larger * columns; canvas.height = Math.ceil(larger * rows);
+  return (image) => {
+    const pen = canvas.getContext("2d");
+    pen.fillStyle = hatching(pen);
+    pen.fillRect(0, 0, canvas.width, canvas.height);
+    pen.imageSmoothingEnabled = larger < 1;
+    pen.drawImage(image, left, top, columns, rows, 0, 0, canvas.width, canvas.height);
+    const pixel = (low, high) => (larger * (high - low)) / raster.cell;
+    pen.beginPath();
+    for (const corner of ego || []) pen.lineTo(pixel(x[0], corner[0]), pixel(corner[1], y[1]));
+    pen.closePath();
+    pen.fillStyle = "white"; pen.fill();
+    pen.strokeStyle = "black"; pen.stroke();
+  };
 }
 
 // On paper nothing can be opened.
-function printAll(page) {
+function printAll(page, drawGallery) {
   let closed = [];
   window.addEventListener("beforeprint", () => {
+    drawGallery();
     closed = [...document.querySelectorAll("details:not([open])")];
     for (const one of closed) one.open = true;
     page.draw();
@@ -151,8 +172,7 @@ async function start() {
   const bytes = await inflated(part("cells").textContent);
   part("maps").hidden = false;
   const page = new MapPage(content, bytes);
-  fillGallery(page, new Controls(page));
-  printAll(page);
+  printAll(page, fillGallery(page, new Controls(page)));
   return page;
 }
 

@@ -1,5 +1,25 @@
 // The page: menus, what they choose, and what a cell says. All words go in as text, never as markup.
 
+// Of arrays that are decoded and of maps that are drawn: what was not asked for longest is forgotten first.
+const MOST_BYTES = 128e6;
+
+class Kept {
+  constructor() { Object.assign(this, { values: new Map(), bytes: 0 }); }
+
+  get(key, make, bytesOf) {
+    const found = this.values.get(key) || { value: make() };
+    found.bytes ??= bytesOf(found.value);
+    if (!this.values.delete(key)) this.bytes += found.bytes;
+    this.values.set(key, found);
+    for (const [oldest, { bytes }] of this.values) {
+      if (this.bytes <= MOST_BYTES || oldest === key) break;
+      this.values.delete(oldest);
+      this.bytes -= bytes;
+    }
+    return found.value;
+  }
+}
+
 const part = (id) => document.getElementById(id);
 
 function made(tag, text, attributes = {}) {
@@ -11,7 +31,7 @@ function made(tag, text, attributes = {}) {
 
 class MapPage {
   constructor(content, bytes) {
-    Object.assign(this, { content, bytes, decoded: new Map(), kept: new Map(), highs: new Map() });
+    Object.assign(this, { content, bytes, decoded: new Kept(), kept: new Kept(), highs: new Map() });
     this.view = new MapView(part("map"));
     this.state = { quantity: 0, band: 0, rig: 0, single: false, fields: false };
     this.probe = null;
@@ -46,18 +66,18 @@ class MapPage {
 
   numbers(index, raster) {
     if (index === null) return null;
-    if (!this.decoded.has(index)) {
-      const array = this.content.arrays[index];
-      this.decoded.set(index, decoded(array, this.bytes, raster.columns * raster.rows));
-    }
-    return this.decoded.get(index);
+    const size = raster.columns * raster.rows;
+    return this.decoded.get(index, () => decoded(this.content.arrays[index], this.bytes, size), (values) => values.byteLength);
   }
 
   // The cells of a map, or of a difference, as they are drawn: values, weights, their image.
   // Its colours are those of the place that is looked at where `high` is given, else those of all maps.
   shown(choice, single, high = null) {
     const key = `${single} ${this.content.maps.indexOf(choice.map)} ${Boolean(choice.against)} ${high}`;
-    if (this.kept.has(key)) return this.kept.get(key);
+    return this.kept.get(key, () => this.made(choice, single, high), ({ values }) => 3 * values.byteLength);
+  }
+
+  made(choice, single, high) {
     const { map, against } = choice, raster = this.content.rasters[map.raster];
     let values = this.numbers(map.values, raster), weights = this.numbers(map.weights, raster);
     const squares = single ? null : this.numbers(map.sides, raster);
@@ -72,7 +92,6 @@ class MapPage {
     if (high !== null) { scale.high = high; scale.low = against ? -high : scale.low; }
     const shown = { raster, values, weights, squares, full: map.full, isDifference: Boolean(against), scale };
     shown.image = coloured(shown, paletteOf(scale, this.content.luts));
-    this.kept.set(key, shown);
     return shown;
   }
 

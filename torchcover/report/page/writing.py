@@ -12,21 +12,20 @@ from string import Template
 
 import numpy as np
 
+from torchcover.report.page.answer import plans_html, ranges_html, words_html
 from torchcover.report.page.codes import CellBytes
 from torchcover.report.page.content import Array, Page, PageMap, PagePicture, PageRig
 from torchcover.report.page.map_content import ERROR_BITS, VALUE_BITS, map_content
 from torchcover.report.page.rig_drawing import rig_drawing, sensor_table
 from torchcover.report.renderers.layout import PageTable, Words
 
-# Deflated and as base64, at most a quarter more characters.
-MOST_BYTES = 3.8e6
 # Of maps that are beside those with errors.
 MOST_HALVINGS = 2
 VALUE_BYTES, ERROR_BYTES = VALUE_BITS // 8, ERROR_BITS // 8
 NO_ERRORS = "Errors of single cells are left out, so that this file stays small: the .npz files have them."
 
 
-def fitted(maps: Sequence[PageMap], most_bytes: float = MOST_BYTES) -> tuple[list[PageMap], list[str]]:
+def fitted(maps: Sequence[PageMap], most_bytes: float = Page.most_bytes) -> tuple[list[PageMap], list[str]]:
     """Take cells together where maps have no errors beside some that have; leave out errors; take all cells together.
 
     Args:
@@ -108,17 +107,21 @@ def page_html(page: Page) -> str:
         page: What it shows.
     """
     cells = CellBytes()
-    maps, notes = fitted(page.maps)
+    maps, notes = fitted(page.maps, page.most_bytes)
     content = as_json(map_content(replace(page, maps=maps), cells))
     script = "\n".join(map(_file, SCRIPTS))
+    first = plans_html(page.plans) + "".join(map(_picture, page.pictures))
+    more = "".join(f"<li>{words_html(words)}</li>" for words in page.verdict[1:])
+    more = f'<ul class="more">{more}</ul>' if more else ""
     return Template(_file("page.html")).substitute(
         title=escape(page.title),
         lead=escape(page.lead),
-        verdict=_verdict(page.verdict),
+        verdict="".join(f'<p class="verdict">{words_html(words)}</p>' for words in page.verdict[:1]),
+        answer=first + more * bool(first or not maps) + ranges_html(page.ranges),
+        more=more * bool(maps and not first),
         style=_file("page.css"),
         script_hash=script_hash(script),
         tables="\n".join(map(table_html, page.tables)),
-        pictures="\n".join(map(_picture, page.pictures)),
         map_notes=_notes(notes),
         no_rigs="" if page.rigs else " hidden",
         rigs_heading="Rigs" if len(page.rigs) > 1 else "Rig",
@@ -129,11 +132,6 @@ def page_html(page: Page) -> str:
         cells=cells.text(),
         script=script,
     )
-
-
-def _verdict(sentences: Sequence[str]) -> str:
-    words = escape(" ".join(sentences)).replace(" %", "&nbsp;%")
-    return f'<p class="verdict">{words}</p>' if sentences else ""
 
 
 def as_json(content: object) -> str:

@@ -16,26 +16,27 @@ SPECIAL = re.compile(r"[\\`*|\[\]]|<(?=[A-Za-z/!?])|&(?=[\w#]+;)|(?<![^\W_])_|_(
 def render(table: CoverageTable) -> str:
     """The table as Markdown text; what is marked is bold."""
     marks = [f"{BOLD_MARKS[mark]}: {meaning}" for mark, meaning in marks_on(table).items()]
-    notes = [f"* {_escaped(note)}" for note in (*marks, *notes_on(table))]
-    told = _escaped(" ".join(verdict(table)))
+    notes = [f"* {escaped(note)}" for note in (*marks, *notes_on(table))]
+    told = escaped(" ".join(verdict(table)))
     first = [told, ""] if told else []
     return "\n".join([*first, *(line for part in parts_of(table) for line in _lines(part)), *notes, ""])
 
 
 def _lines(part: PageTable) -> Iterator[str]:
     if part.title:
-        yield f"{_escaped(part.title)}\n"
-    yield _line(map(_escaped, part.headings))
+        yield f"{escaped(part.title)}\n"
+    yield _line(map(escaped, part.headings))
     yield _line(["---"] * part.words_first + ["---:"] * (len(part.headings) - part.words_first))
     yield from (_line(map(_cell, row)) for row in part.rows)
     yield ""
 
 
 def _cell(cell: Words) -> str:
-    return f"**{_escaped(cell.text)}**" if cell.mark else _escaped(cell.text)
+    return f"**{escaped(cell.text)}**" if cell.mark else escaped(cell.text)
 
 
-def _escaped(words: str) -> str:
+def escaped(words: str) -> str:
+    """Words that Markdown takes for nothing else."""
     return SPECIAL.sub(r"\\\g<0>", shown(" ".join(words.split())))
 
 

@@ -1,6 +1,8 @@
 """SUMO's programs at work: simulations, roads of OpenDRIVE turned into networks, and what they say when they fail."""
 
+import math
 import os
+import signal
 import subprocess
 from collections.abc import Iterator, Sequence
 from contextlib import closing
@@ -24,17 +26,19 @@ PIECE_BYTES = 1 << 18
 # So many links are named.
 SHOWN = 5
 MAX_TOLD_CHARS = 500
+# Processor time that a program may take which converts a file.
+MOST_S = 600.0
 # They would look for schemas on the network.
 ALWAYS = ("--xml-validation", "never")
 
 
 def run(program: str, *options: str | Path) -> None:
     """Run a program to its end. ImportError: SUMO is not installed. ValueError: it fails; with its own message."""
-    for _ in output_of(program, *options):
+    for _ in output_of(program, *options, cpu_s=MOST_S):
         pass
 
 
-def output_of(program: str, *options: str | Path) -> Iterator[bytes]:
+def output_of(program: str, *options: str | Path, cpu_s: float = math.inf) -> Iterator[bytes]:
     """What a program writes to its standard output, piece by piece; whoever stops asking ends the program."""
     folder = home()
     command = [str(folder / "bin" / program), *ALWAYS, *map(str, options)]
@@ -45,18 +49,20 @@ def output_of(program: str, *options: str | Path) -> Iterator[bytes]:
             stdout=subprocess.PIPE,
             stderr=said,
             env=_environment(folder),
-            preexec_fn=end_with_parent(most_gb()),  # noqa: PLW1509  (one call of the system, no lock)
+            preexec_fn=end_with_parent(most_gb(), cpu_s),  # noqa: PLW1509  (one call of the system, no lock)
         )
         assert process.stdout is not None  # as asked for
         try:
             with closing(process.stdout):
                 while piece := process.stdout.read(PIECE_BYTES):
                     yield piece
-            failed = process.wait() != 0
+            ended = process.wait()
         finally:
             process.kill()
             process.wait()
-        if failed:
+        if ended == -signal.SIGXCPU:
+            raise ValueError(f"SUMO's {program} took more than {cpu_s:g} s of processor time; is the file damaged?")
+        if ended:
             said.seek(0)
             raise ValueError(f"SUMO's {program} fails: {_errors(said.read().decode('utf-8', 'replace').splitlines())}")
 

@@ -98,23 +98,28 @@ class Simulation:
         occupied = np.empty((len(times_s), len(self._signals.offset_s), 2), dtype=bool)
         drives = [(float(times_s[0]) - warm_up_s, warm_up_s)]
         drives += [(float(before), float(after - before)) for before, after in pairwise(times_s)]
-        for number, (start_s, duration_s) in enumerate(drives):
-            self._drive(start_s, duration_s)
+        steps = [int(np.ceil(duration_s / MAX_STEP_S - 1e-9)) for _, duration_s in drives]
+        red = iter(self._red([start_s + step * duration_s / count
+                              for (start_s, duration_s), count in zip(drives, steps, strict=True)
+                              for step in range(count)]))  # fmt: skip
+        for number, count in enumerate(steps):
+            for _ in range(count):
+                self._step(next(red), drives[number][1] / count)
             place_m[number], speed_mps[number] = self.place_m, self.speed_mps
             occupied[number] = self._occupied.reshape(-1, 2)
         return Flow(place_m, speed_mps, occupied)
 
-    def _drive(self, start_s: float, duration_s: float) -> None:
-        steps = int(np.ceil(duration_s / MAX_STEP_S - 1e-9))
-        for step in range(steps):
-            self._step(start_s + step * duration_s / steps, duration_s / steps)
+    def _red(self, times_s: Sequence[float]) -> Bools:
+        """(T, K) whether each gate has no green, or too little of it; lights heed nobody."""
+        left_s = self._signals.green_left_s(times_s).reshape(len(times_s), -1)
+        return ~(left_s[:, self._gates.light] > self._gates.green_needed_s)
 
-    def _step(self, time_s: float, step_s: float) -> None:
+    def _step(self, red: Bools, step_s: float) -> None:
         driver, speed_mps = self._driver, self.speed_mps
         leader_m, leader_mps = self._leader_m(), speed_mps.take(self._leader)
         gap_m = self._gap_m(leader_m)
         # Lines that may be crossed are as far away as can be.
-        line_m = np.where(self._held_up(time_s, leader_m, leader_mps), self._to_line_m, np.inf)
+        line_m = np.where(self._held_up(red, leader_m, leader_mps), self._to_line_m, np.inf)
         stop_m = line_m + driver.standstill_gap_m
         stop_m -= STOP_BEFORE_LINE_M
         tight = tightness(driver, speed_mps, gap_m, speed_mps - leader_mps)
@@ -158,11 +163,9 @@ class Simulation:
         self._occupied = np.zeros(2 * len(self._signals.offset_s), dtype=bool)
         self._occupied[self._gates.light[self._gate[self._committed]]] = True
 
-    def _held_up(self, time_s: float, leader_m: Float64, leader_mps: Float64) -> Bools:
+    def _held_up(self, red: Bools, leader_m: Float64, leader_mps: Float64) -> Bools:
         """(N,) whether one may not cross the next stop line, and need not."""
-        gates = self._gates
-        green = self._signals.green_left_s(time_s).ravel()[gates.light] > gates.green_needed_s
-        held = (~green | self._occupied[gates.other_light])[self._gate]
+        held = (red | self._occupied[self._gates.other_light])[self._gate]
         held |= self._jammed_behind(leader_m, leader_mps)
         held &= ~self._committed
         return held

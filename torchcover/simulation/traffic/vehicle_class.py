@@ -3,24 +3,8 @@
 from collections.abc import Mapping
 from typing import NamedTuple
 
-# SUMO's classes (and children), and the kinds of bodies (`fleet.CATEGORIES`) among which the length decides; cars are
-# those of all others.
-BODIES: Mapping[str, tuple[str, ...]] = {
-    "pedestrian": ("adult",),
-    "child": ("child",),
-    "wheelchair": ("adult",),
-    "bicycle": ("cyclist",),
-    "scooter": ("cyclist",),
-    "moped": ("motorcycle",),
-    "motorcycle": ("motorcycle",),
-    "truck": ("lorry", "truck"),
-    "trailer": ("truck",),
-    "bus": ("bus",),
-    "coach": ("bus",),
-    "tram": ("bus",),
-    "delivery": ("van",),
-    "emergency": ("van",),
-}
+from torchcover.files import road_user_classes
+
 CARS = ("hatchback", "sedan", "suv", "pickup", "van")
 ON_FOOT = ("adult", "child")
 # They need no road, or one that is not built.
@@ -37,8 +21,8 @@ class VehicleType(NamedTuple):
         """The body whose length is nearest among those of the class; None if there is none of this class."""
         if self.vehicle_class in LEFT_OUT:
             return None
-        kinds = BODIES.get(self.vehicle_class, CARS)
+        kinds = road_user_classes()["bodies"].get(self.vehicle_class, CARS)
         if kinds[0] in ON_FOOT:
-            return kinds[0]  # the simulation's lengths of people are all the same
+            return str(kinds[0])  # the simulation's lengths of people are all the same
         bodies = [name for name in lengths_m if name.partition("_")[0] in kinds]
         return min(bodies, key=lambda kind: abs(lengths_m[kind] - self.length_m))

@@ -1,0 +1,140 @@
+"""A report says what its parts say, and no more."""
+
+import json
+import math
+import re
+
+import numpy as np
+import pytest
+
+from torchcover.encounters import EncounterSet
+from torchcover.evaluation import Requirements, report
+from torchcover.evaluation.target_survey import NEAR_M, plan_of, target_verdict
+from torchcover.report import page_html
+from torchcover.simulation import Rig
+
+NASTY = "<b>&amp;roof</b>"
+
+
+def lidar(name, x_m, z_m=0.8):
+    mount = {"x_m": x_m, "z_m": z_m}
+    return {"type": "lidar", "name": name, "model": "velodyne_vlp16", "mount": mount}
+
+
+ONE = Rig.model_validate({"name": "one", "sensors": [lidar("front", 2.6)]})
+TWO = Rig.model_validate({"name": NASTY, "sensors": [lidar("front", 2.6), lidar("rear", -2.6)]})
+CROSSING = {"name": "a", "ego": {"speed_kmh": 30}, "other": {"body": "adult", "speed_kmh": 5, "from_m": 2}}
+NEEDS = {"name": "needs", "requirements": [{"target": "child", "at": {"points_m": [[5.0, 0.0]]}, "points": 5}]}
+
+
+@pytest.fixture(scope="module")
+def found():
+    crossing = EncounterSet.model_validate({"name": "one", "encounters": [CROSSING]})
+    needs = Requirements.model_validate(NEEDS)
+    return report([ONE, TWO], "courtyard", steps=8, encounters=crossing, requirements=needs, workers=0)
+
+
+def test_the_first_sentence_is_the_share_of_places_near_the_vehicle(found):
+    words = found.verdict[0]
+    assert words.startswith("A child of 1.10 m is seen at ")
+    for rig, seen in found.targets.items():
+        near = seen.free & (seen.distance_m <= NEAR_M)
+        share = (near & (seen.least_points >= seen.hits)).sum() / near.sum()
+        assert f"at {100 * share:.0f} % " in words.partition(rig)[0]
+    assert words.index(NASTY) < words.index("one")  # who sees most comes first
+
+
+def test_a_sensor_that_fails_takes_what_it_alone_sees(found):
+    seen = found.targets[NASTY]
+    for k, (sensor, lost_m2) in enumerate(seen.losses_m2(NEAR_M).items()):
+        others = np.delete(seen.sensor_points, k, axis=0).sum(axis=0)
+        lost = seen.free & (seen.distance_m <= NEAR_M) & (seen.points >= seen.hits) & (others < seen.hits)
+        assert seen.sensor_names[k] == sensor
+        assert lost_m2 == pytest.approx(lost.sum() * 0.04)
+    worst = max(seen.losses_m2(NEAR_M).values())
+    (words,) = [one for one in found.verdict if one.startswith(f"{NASTY} most needs")]
+    assert f"{worst:.1f} m² more" in words
+    assert "one has one sensor: without it, it sees nothing." in found.verdict
+
+
+def test_sensors_that_cells_cannot_tell_apart_are_named_together():
+    rig = Rig.model_validate({"name": "sides", "sensors": [
+        {**lidar(side, 0.0), "mount": {"y_m": y_m, "z_m": 1.0}} for side, y_m in (("left", 1.1), ("right", -1.1))
+    ]})  # fmt: skip
+    words = report(rig, "courtyard", steps=8, workers=0).verdict[-1]
+    assert "left and right: without one, up to" in words
+
+
+def test_a_plan_tells_by_how_many_sensors_each_place_is_seen(found):
+    for seen in found.targets.values():
+        plan = plan_of(seen)
+        assert ((plan.seen_by == -1) == ~seen.free).all()
+        assert ((plan.seen_by > 0) == seen.enough).all()
+        assert ((plan.seen_by > 1) == (seen.enough & (seen.least_sensors >= 2))).all()
+        near = seen.free & (seen.distance_m <= NEAR_M)
+        assert f"{(near & (plan.seen_by == 0)).sum():,} of {near.sum():,} places" in plan.words
+
+
+def test_what_was_asked_too_is_told(found):
+    assert "Of 1 encounters of one, each speed counted, always in time: " in " ".join(found.verdict)
+    assert found.verdict[-1].startswith("Of the 1 bounds of needs: one keeps 1; ")
+
+
+def test_the_page_answers_before_anything_else_and_names_are_text(found, tmp_path):
+    text = page_html(found.page)
+    assert NASTY not in text
+    assert text.index("A child of 1.10 m is seen") < text.index("<svg") < text.index('id="maps"')
+    assert text.count('class="plan"') == 2
+    assert len(text) < 500_000
+    written = {path.relative_to(tmp_path).as_posix() for path in found.save(tmp_path)}
+    assert {"report.html", "report.md", "summary.json", "junit.xml", "encounters.csv", "targets/one.npz"} <= written
+    record = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
+    assert record["verdict"] == list(found.verdict)
+    assert (tmp_path / "report.md").read_text(encoding="utf-8").startswith("**A child of 1.10 m is seen")
+
+
+def test_areas_of_the_plan_are_those_of_its_cells(found):
+    """Rectangles of a colour have the area of its cells."""
+    seen = found.targets["one"]
+    text = page_html(found.page)
+    for number in range(2):
+        drawn = re.search(rf'<path class="seen{number}" d="([^"]*)"', text)[1]
+        m2 = sum(float(w) * float(h) for w, h in re.findall(r"h(-?[\d.]+)v([\d.]+)", drawn))
+        assert m2 == pytest.approx((plan_of(seen).seen_by == number).sum() * 0.04)
+
+
+def test_a_budget_ends_the_traffic_once_it_has_intervals():
+    found = report(ONE, "courtyard", steps=64, budget_s=0.01, workers=0)
+    assert found.result.table.first.counts["steps"] == 8
+    assert found.verdict[-1] == "The budget was over after 8 of 64 steps of traffic."
+    assert not found.record["complete"]
+
+
+def test_where_no_place_is_free_nothing_is_claimed(found):
+    from dataclasses import replace
+
+    seen = found.targets["one"]
+    nowhere = replace(seen, state=np.full_like(seen.state, 2))
+    assert math.isnan(nowhere.share_seen(NEAR_M))
+    assert target_verdict({"one": nowhere}) == ("No place within 2 m is free: what is seen there is unknown.",)
+    assert "Not seen at 0 of 0 places" in plan_of(nowhere).words
+
+
+@pytest.mark.parametrize(("given", "words"), [
+    ({"rigs": []}, "1 to 8 rigs fit on a page; got 0"),
+    ({"rigs": [ONE] * 1000}, "1 to 8 rigs fit on a page; got 1000"),
+    ({"rigs": ONE, "budget_s": 0.0}, "seconds above 0 are needed; got 0.0"),
+    ({"rigs": ONE, "scenario": "urban,highway"}, "one kind of world is needed"),
+])  # fmt: skip
+def test_what_fits_on_no_page_is_refused(given, words):
+    with pytest.raises(ValueError, match=re.escape(words)):
+        report(**given)
+
+
+def test_rigs_high_above_see_nothing_beside_the_vehicle_and_say_so():
+    high = Rig.model_validate({"name": "high", "sensors": [lidar("mast", 0.0, 10.0)]})
+    assert (
+        report(high, "courtyard", steps=8, workers=0)
+        .verdict[0]
+        .endswith("seen at 0 % of the places within 2 m by high.")
+    )

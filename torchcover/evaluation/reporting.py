@@ -1,0 +1,244 @@
+"""One page that answers first: all that is asked of some rigs, measured one after the other within a budget."""
+
+import math
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+from torchcover.encounters import EncounterSet, Sightings
+from torchcover.estimation import MIN_BLOCKS
+from torchcover.evaluation.checking import Checked, check
+from torchcover.evaluation.encountering import encounter, encounters_page
+from torchcover.evaluation.measuring import measured
+from torchcover.evaluation.progress import Progress, held_back
+from torchcover.evaluation.requirements import Requirements
+from torchcover.evaluation.result import Result
+from torchcover.evaluation.settings import DEFAULT_STEPS, FILES, Settings, wanted_files
+from torchcover.evaluation.target_survey import (
+    free_space,
+    sides_table,
+    survey_target,
+    target_page,
+    target_record,
+    target_verdict,
+)
+from torchcover.evaluation.task import AnyRig, AnyScenario, distinct_names, loaded, simulation
+from torchcover.files import Publication, small_html
+from torchcover.report import Page, escaped, file_stems, on_range, page_html, ranges_of
+from torchcover.simulation import Rig
+from torchcover.simulation.scenario import Mover
+from torchcover.targets import Target, TargetMap, write_arrays, write_csv
+
+# As many as anybody compares on a page.
+MOST_RIGS = 8
+# So that the page of two rigs is sent by mail without a thought.
+MAP_BYTES = 0.35e6
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """What `report` returns.
+
+    Args:
+        result: What the rigs see in traffic, with bodies beside them, and what is lost with each sensor.
+        targets: By the name of the rig, where it sees the body in free space.
+        steps: How many steps of traffic were asked for; fewer are measured if the budget was over.
+        encounters: When they see whom they are about to collide with; None if that was not asked.
+        checked: Whether they see what they must; likewise.
+    """
+
+    result: Result
+    targets: Mapping[str, TargetMap]
+    steps: int
+    encounters: Sightings | None = None
+    checked: Checked | None = None
+
+    @property
+    def verdict(self) -> tuple[str, ...]:
+        """The answer in sentences, the first of which says most; each has its rule, and none tells what is chance."""
+        first, *losses = target_verdict(self.targets)
+        asked = [*self._met.verdict, *(self.checked.verdict if self.checked else ())]
+        return tuple(filter(None, [first, on_range(self.result.table), *losses, *asked, self.cut_short]))
+
+    @property
+    def cut_short(self) -> str:
+        """That fewer steps were measured than asked for; no words where all were."""
+        done = self.result.table.first.counts["steps"]
+        over = f"The budget was over after {done:,} of {self.steps:,} steps of traffic." * (done < self.steps)
+        return self.result.cut_short or over
+
+    @property
+    def _met(self) -> Page:
+        return encounters_page(self.encounters) if self.encounters else Page("", "")
+
+    @property
+    def page(self) -> Page:
+        """The answer and what shows it; below it the tables and maps that it comes from."""
+        target, *_ = self.targets.values()
+        steps = f"{self.result.table.first.counts['steps']:,} steps of {self.result.source['scenario']}"
+        lead = f"{target.target}, {target.hits} points or more, on flat ground with nothing else; {steps}."
+        of_targets = [target_page(one) for one in self.targets.values()]
+        sides = [
+            replace(sides_table(one), title=f"{rig}: {sides_table(one).title}") for rig, one in self.targets.items()
+        ]
+        tables = [*self._met.tables, *(self.checked.tables() if self.checked else ()), *sides, *self.result.tables]
+        return replace(
+            self.result.page,
+            lead=lead,
+            verdict=self.verdict,
+            plans=[plan for page in of_targets for plan in page.plans],
+            ranges=ranges_of(self.result.table),
+            pictures=self._met.pictures,
+            tables=tables,
+            most_bytes=MAP_BYTES,
+        )
+
+    def _repr_html_(self) -> str:
+        return small_html(self.verdict)
+
+    @property
+    def markdown(self) -> str:
+        """The verdict, for a merge request."""
+        first, *others = map(escaped, self.verdict)
+        return "\n".join([f"**{first}**", "", *(f"- {words}" for words in others), ""])
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """All of it, for JSON."""
+        return {
+            "verdict": list(self.verdict),
+            "complete": not self.cut_short,
+            "traffic": self.result.record,
+            "targets": {rig: target_record(one) for rig, one in self.targets.items()},
+            "encounters": self.encounters.record() if self.encounters else None,
+            "requirements": self.checked.record if self.checked else None,
+        }
+
+    def save(self, folder: str | Path, *, files: str | Iterable[str] = FILES) -> list[Path]:
+        """Write the files of the command line: the numbers first, then the page.
+
+        Args:
+            folder: Where to write `report.html`, `report.md` with the verdict, `summary.json`, and the files that
+                `evaluate`, `targets`, `encounter` and `check` write. Made if it does not exist; files of an earlier run
+                that its `summary.json` lists are deleted.
+            files: What to write beside `summary.json` and `report.md`, as in `Result.save`.
+
+        Returns:
+            The files.
+        """
+        wanted, record = wanted_files(files), self.record
+        with Publication(Path(folder)) as written:
+            with held_back():  # the numbers are safe before anything ends this
+                if "numbers" in wanted:
+                    self._add_numbers(written)
+                written.add_text("report.md", self.markdown)
+                written.publish(record)
+            if "page" in wanted:
+                written.add_text("report.html", page_html(self.page))
+            for stem, figure in self.result.maps() if "maps" in wanted else ():
+                written.add_figure(f"maps/{stem}.png", figure)
+            written.publish(record)
+        return written.paths
+
+    def _add_numbers(self, files: Publication) -> None:
+        self.result.add_numbers(files)
+        for stem, one in zip(file_stems(list(self.targets)), self.targets.values(), strict=True):
+            files.add(f"targets/{stem}.csv", partial(write_csv, one))
+            files.add(f"targets/{stem}.npz", partial(write_arrays, one))
+        if self.encounters:
+            files.add("encounters.csv", self.encounters.write_csv)
+        if self.checked:
+            files.add_text("junit.xml", self.checked.junit)
+
+
+def report(
+    rigs: AnyRig | Sequence[AnyRig],
+    scenario: AnyScenario = "urban",
+    target: Target | str | Path = "child",
+    *,
+    encounters: EncounterSet | str | Path | None = None,
+    requirements: Requirements | str | Path | None = None,
+    vehicle: str | Path | None = None,
+    sensor_model: Literal["ideal", "real"] | None = None,
+    steps: int = DEFAULT_STEPS,
+    seed: int = 0,
+    workers: int | None = None,
+    budget_s: float = math.inf,
+    progress: bool = False,
+) -> Report:
+    """Measure what a meeting asks about rigs: where a body beside them is seen, what fails, how far, how soon.
+
+    Args:
+        rigs: A rig or several, at most 8: each one itself, its built-in name, or its YAML file.
+        scenario: The traffic: one kind of world, as for `evaluate`.
+        target: What is put beside the vehicle, in free space, as for `survey_target`.
+        encounters: A set of encounters, as for `encounter`; none if not given.
+        requirements: What the rigs must see, as for `check`; likewise.
+        vehicle: What carries the rigs, as for `evaluate`.
+        sensor_model: As for `evaluate`.
+        steps: Of the traffic.
+        seed: Of the simulation.
+        workers: As for `evaluate`.
+        budget_s: Seconds: traffic, which comes last, ends when they are over, but not before it has intervals.
+        progress: Whether to show a bar.
+
+    Raises:
+        FileNotFoundError: An unknown name or file.
+        ValueError: A file that cannot be used, a number out of its bounds, no rig or too many, several kinds of world.
+
+    Example:
+        >>> found = report("front_roof_128", "courtyard", steps=8)
+        >>> print(found.verdict[0])
+        Seeing a child of 1.10 m at places within 2 m: front_roof_128 at 58 %.
+    """
+    start_s = time.monotonic()
+    given = [rigs] if isinstance(rigs, str | Path | Rig) else list(rigs)
+    if not 1 <= len(given) <= MOST_RIGS:
+        raise ValueError(f"report: 1 to {MOST_RIGS} rigs fit on a page; got {len(given)}: choose, or use `compare`")
+    if not budget_s > 0:
+        raise ValueError(f"budget: seconds above 0 are needed; got {budget_s}")
+    called = [loaded(rig).model_copy(update={"name": n}) for rig, n in zip(given, distinct_names(given), strict=True)]
+    own: dict[str, Any] = {"vehicle": vehicle, "sensor_model": sensor_model}
+    settings = Settings(called, scenario, steps=steps, seed=seed, redundancy=True, workers=workers, **own)
+    if settings.mixture is not None:
+        raise ValueError("report: one kind of world is needed; for several use `compare`")
+    task = simulation(settings)
+    body = target if isinstance(target, Target) else Target.load(target)
+    carrier = task.frames.scenario.ego
+    assert carrier is not None  # simulated
+    ground = free_space().model_copy(update={"ego": Mover(shape=carrier.shape)})
+    whole = len(called) + (encounters is not None) + (requirements is not None) + steps
+    with Progress(whole, "report", shown=progress) as bar:
+        seen = {}
+        for rig in called:
+            seen[rig.name] = survey_target(rig, body, ground, sensor_model=sensor_model, seed=seed)
+            bar.advance(whole)
+        met = checked = None
+        if encounters is not None:
+            met = encounter(called, encounters, seed=seed, **own)
+            bar.advance(whole)
+        if requirements is not None:
+            checked = check(called, requirements, seed=seed, workers=workers, **own)
+            bar.advance(whole)
+        result = measured(task, settings, _Pace(bar, whole, start_s + budget_s))
+    return Report(result, seen, steps, met, checked)
+
+
+@dataclass(frozen=True)
+class _Pace:
+    """Tells the bar of every step of the traffic, and ends it when the time is over: a `StoppingRule`."""
+
+    bar: Progress
+    whole: int
+    until_s: float
+    words: str = ""
+
+    def is_reached(self, steps: int) -> bool:
+        self.bar.advance(self.whole)
+        return steps >= MIN_BLOCKS and time.monotonic() >= self.until_s
+
+    def expected_steps(self, most: int) -> int:
+        return most
