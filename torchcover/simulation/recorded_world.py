@@ -51,6 +51,8 @@ SQUARE_M, AROUND_M, MOST_SQUARES = 1.0, 160.0, 30_000_000
 CELL_M, HOLE_M, FOOT_M = 0.2, 1.0, 0.6
 # A mover is found again within so much of where it was to be. It has to be found so often, and to get so far.
 AGAIN_M, LEAST_TIMES, LEAST_WAY_M = 2.0, 3, 2.0
+# What is so wide is at least as long as a car, though only its end be seen.
+CAR_M = (4.5, 1.4)
 # What it is called by its length and width.
 CALLED = (((1.3, 1.3), "pedestrian"), ((2.6, 1.3), "bicycle"), ((6.5, np.inf), "car"), ((np.inf, np.inf), "truck"))
 # Of what moves, such a share is seen past; of a wall that comes into sight, and so seems to, none is.
@@ -366,7 +368,7 @@ def _seen_past(seen: Surveyed, scan_s: Float64, times_s: Sequence[float], boxes:
 
 def _go_on(tracks: list[list[tuple[float, Float64, Moved]]], time_s: float, found: Sequence[Moved]) -> None:
     """Append what is found to the track of whatever was to be there, else begin another."""
-    middles_m = [(moved.points_m[:, :2].min(axis=0) + moved.points_m[:, :2].max(axis=0)) / 2 for moved in found]
+    middles_m = [moved.points_m[:, :2].mean(axis=0) for moved in found]
     going = [track for track in tracks if time_s - track[-1][0] <= GAP_S / 2]
     apart_m = sorted(
         (float(np.linalg.norm(last_m + (time_s - last_s) * moved.velocity_mps - middle_m)), number, which)
@@ -405,6 +407,8 @@ def _boxes(track: Sequence[tuple[float, Float64, Moved]], drive: Trajectory, gro
     under_m = np.where(np.isfinite(under_m), under_m, lowest_m)
     seen_m = np.column_stack([ends[:, 1] - ends[:, 0], highest_m - under_m])
     size_m = np.clip(np.quantile(seen_m, USUALLY, axis=0), SMALLEST_M, LARGEST_M)
+    if size_m[1] > CAR_M[1]:
+        size_m[0] = max(size_m[0], CAR_M[0])
     ego = np.einsum("kij,kj->ki", axes, drive.positions_at(times_s)[:, :2])
     far = np.where(ego < ends[:, 0], 1, np.where(ego > ends[:, 1], -1, 0))
     near = np.where(far > 0, ends[:, 0], ends[:, 1])
