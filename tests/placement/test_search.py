@@ -431,6 +431,25 @@ def test_an_optimiser_of_ones_own_plugs_in():
     assert search.plan.optimiser_name == "Halving"
 
 
+def test_what_random_search_found_is_the_best_if_it_is_better():
+    class Corner:
+        def __init__(self, cube, seed):
+            self.asked = 0
+
+        def ask(self):
+            return np.array([1.0, 1.0 - self.asked / 1000])
+
+        def tell(self, unit, value, error):
+            self.asked += 1
+
+    result = searched(evaluations=24, optimiser=Corner)
+    arms = result.search.arms
+    assert result.best.arm == "random"
+    assert arms["random"].gains[arms["random"].best, 0] > arms["optimiser"].gains[arms["optimiser"].best, 0]
+    assert result.rig.sensors[0].mount.x_m == result.best.evaluation.values["roof.x_m"]
+    assert "Random search found that, and the optimiser with the same budget found nothing better" in result.sentence
+
+
 def test_asking_and_telling_is_what_a_run_does():
     run = searched(evaluations=9).search
     search = PlacementSearch(space(), plan(evaluations=9))

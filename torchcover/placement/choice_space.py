@@ -61,7 +61,8 @@ class MountGrid(Document):
         for name in self.region:
             region = carrier.region(name)
             spans = [bounds[1] - bounds[0] for bounds in (region.x_m, region.y_m, region.z_m) if bounds is not None]
-            shares = [_middles(max(round(span / self.spacing_m), 1)) for span in spans]
+            counts = [max(round(span / self.spacing_m), 1) for span in spans]
+            shares = [((np.arange(count) + 0.5) / count).tolist() for count in counts]
             for number, (u, v) in enumerate(product(*shares)):
                 try:
                     point = region.on(carrier.skin, u, v)
@@ -71,11 +72,6 @@ class MountGrid(Document):
                 for yaw, pitch in product(self.yaw_deg, self.pitch_deg):
                     turned = f"_yaw{yaw:g}" * (len(self.yaw_deg) > 1) + f"_pitch{pitch:g}" * (len(self.pitch_deg) > 1)
                     yield f"{name}_{number}{turned}", pose_of(x, y, z, region.heading_deg + yaw, pitch, 0.0)
-
-
-def _middles(count: int) -> list[float]:
-    shares: list[float] = ((np.arange(count) + 0.5) / count).tolist()
-    return shares
 
 
 class CandidateGroup(Document):

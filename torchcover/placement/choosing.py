@@ -93,11 +93,6 @@ class SensorChoice(Reported):
         return dict(zip(self.best.chosen, self.candidates.lost_without(self.best.chosen)[:, 0].tolist(), strict=True))
 
     @property
-    def better_than_drawn(self) -> float:
-        """The share of random choices that are worth less, by the first objective."""
-        return float(np.mean([one.values[0] < self.best.values[0] for one in self.drawn]))
-
-    @property
     def gains(self) -> tuple[FreshGain, ...]:
         """Of the best on fresh worlds."""
         return self.test.gains["best"] if self.test else ()
@@ -172,7 +167,7 @@ class SensorChoice(Reported):
                 "count": len(self.drawn),
                 "median": self.drawn[len(self.drawn) // 2].values[0],
                 "best": self.drawn[-1].values[0],
-                "share_below_best": self.better_than_drawn,
+                "share_below_best": float(np.mean([one.values[0] < self.best.values[0] for one in self.drawn])),
             },
             "now": {"sensors": self.names(self.now), "values": self.candidates.values(self.now).tolist()},
             "fresh": {f"{gain.objective}, {gain.estimate}": gain.record for gain in self.gains} or None,

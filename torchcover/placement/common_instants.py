@@ -356,11 +356,7 @@ class CommonInstants:
 
 def _instants_of(simulators: Sequence[Simulator], worlds: int, per_world: int) -> list[HeldInstant]:
     """The instants of all scenarios, world by world. ValueError: a run through a scenario has fewer instants."""
-    of_worlds = [
-        (scenario, steps)
-        for scenario, simulator in enumerate(simulators)
-        for steps in _steps(simulator, worlds, per_world)
-    ]
+    of_worlds = [(k, steps) for k, one in enumerate(simulators) for steps in _steps(one, worlds, per_world)]
     return [HeldInstant(scenario, step, world) for world, (scenario, steps) in enumerate(of_worlds) for step in steps]
 
 

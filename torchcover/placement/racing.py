@@ -56,11 +56,7 @@ def race(
     known: list[Prefix] = []
     for prefix in prefixes:
         known.append(prefix)
-        if any(_is_below(prefix.estimate, other[len(known) - 1].estimate, objectives) for other in incumbents):
+        against = (gains(prefix.estimate, other[len(known) - 1].estimate) for other in incumbents)
+        if any((gain < -ERRORS_BELOW * error)[:objectives].all() for gain, error in against):
             break
     return tuple(known)
-
-
-def _is_below(estimate: Estimate, other: Estimate, objectives: int | None) -> bool:
-    gain, error = gains(estimate, other)
-    return bool((gain < -ERRORS_BELOW * error)[:objectives].all())

@@ -57,7 +57,7 @@ class SearchResult(Reported):
 
     Args:
         search: With all its evaluations.
-        picks: What was found, the optimiser's first, of several objectives the middle of its front.
+        picks: What was found, the better of both first, of several objectives the middle of a front.
         test: Of them, on fresh worlds: what else the first that is not the start has changed.
         untested: Why there is no test on fresh worlds; empty if there is one.
         seconds: What it took, with what was spent before it was resumed.
@@ -71,8 +71,8 @@ class SearchResult(Reported):
 
     @property
     def best(self) -> Pick | None:
-        """The optimiser's; None if no candidate can be, nor the start."""
-        return next((pick for pick in self.picks if pick.arm == OPTIMISER), None)
+        """The better of what both arms found, in the search; None if no candidate can be, nor the start."""
+        return self.picks[0] if self.picks else None
 
     @property
     def rig(self) -> Rig:
@@ -104,14 +104,14 @@ class SearchResult(Reported):
             yield f"None of {len(others)} candidates can be, the last for this reason: {refused[-1]}."
             return
         if best is None:
-            yield f"No candidate of the optimiser can be in {self._spent(OPTIMISER)}."
+            yield f"None of {len(others)} candidates can be."
         elif best.is_start:
             yield f"Nothing better than {search.space.start.name} was found in {self._spent(OPTIMISER)}."
         elif not best.gains:
-            yield f"Found in {self._spent(OPTIMISER)}, but not tested, so that no gain is shown: {self.untested}."
+            yield f"Found in {self._spent(best.arm)}, but not tested, so that no gain is shown: {self.untested}."
         else:
             yield f"{self._told(best, optimism=True)}."
-        if best is not None and (lacks := _lacks(search.arms[OPTIMISER], search.arms[OPTIMISER].best)):
+        if best is not None and (lacks := _lacks(search.leader, search.leader.best)):
             yield f"No candidate keeps all that must be kept; this one lacks the least: {lacks}."
         if self.test is not None:
             yield f"{self.test.sentence}."
@@ -132,18 +132,21 @@ class SearchResult(Reported):
         return [f"{name} ({found.values[name]:g})" for name, away in ends if away < BOUND]
 
     def _control(self) -> str:
-        """What random search got."""
+        """What the other arm got: random search, unless that found the best."""
         if len(self.search.space.objectives) > 1:
             volumes = self.hypervolumes
             shares = ", ".join(
                 f"{100 * volume / (max(volumes.values()) or 1):.0f} by {name}" for name, volume in volumes.items()
             )
             return f"Hypervolume of the fronts, with the same budget, in per cent of the larger: {shares}."
-        other = next((pick for pick in self.picks if pick.arm == RANDOM), None)
+        is_random = self.best is not None and self.best.arm == RANDOM
+        name = OPTIMISER if is_random else RANDOM
+        who = "Random search found that, and the optimiser" if is_random else "Random search"
+        other = next((pick for pick in self.picks if pick.arm == name), None)
         if other is not None and other.gains:
-            return f"Random search with the same budget: {self._told(other, optimism=False)}."
+            return f"{who} with the same budget: {self._told(other, optimism=False)}."
         what = "no rig" if other is None else "nothing better" if other.is_start else "a rig that was not tested"
-        return f"Random search with the same budget found {what} in {self._spent(RANDOM)}."
+        return f"{who} with the same budget found {what} in {self._spent(name)}."
 
     def _told(self, pick: Pick, *, optimism: bool) -> str:
         gains = pick.gains[: len(self.search.space.objectives)]
@@ -156,7 +159,7 @@ class SearchResult(Reported):
     def report(self) -> PlacementReport:
         """For its files, its page, and the terminal."""
         search, settings = self.search, self.search.plan.settings(self.search.space)
-        ends = [pick for pick in self.picks if pick.arm == OPTIMISER][1:]
+        ends = [pick for pick in self.picks if pick.arm == search.leader.name][1:]
         best_of = zip(file_stems([pick.role for pick in ends]), ends, strict=True)
         several = len(search.space.objectives) > 1
         volumes = self.hypervolumes if several else None

@@ -171,7 +171,7 @@ def _spend(
 
 
 def _standing(search: PlacementSearch) -> str:
-    arm = search.arms[OPTIMISER]
+    arm = search.leader
     if arm.best is None:
         return "nothing that can be yet"
     quantities = search.evaluations[0].prefixes[-1].estimate.quantities
@@ -180,9 +180,9 @@ def _standing(search: PlacementSearch) -> str:
 
 
 def _picks(search: PlacementSearch) -> list[Pick]:
-    """What is tested: of each arm the best, and of several objectives the best of each and the middle of the front."""
+    """What is tested, the leader's first: the best of each arm; of several objectives a front's middle and its ends."""
     picks = []
-    for name in (OPTIMISER, RANDOM):
+    for name in sorted((OPTIMISER, RANDOM), key=lambda name: name != search.leader.name):
         arm = search.arms[name]
         if arm.best is None:
             continue

@@ -68,6 +68,17 @@ class PlacementSearch:
         return self.plan.instants(self.space, self.plan, self.plan.seed, self.plan.worlds)
 
     @property
+    def leader(self) -> Arm:
+        """The arm whose best lacks less, or else gains more; of several objectives the optimiser if both lack alike."""
+        several = len(self.space.objectives) > 1
+
+        def worth(arm: Arm) -> tuple[float, float]:
+            at = arm.best
+            return (-math.inf, 0.0) if at is None else (-arm.lacks[at], 0.0 if several else arm.gains[at, 0])
+
+        return max(self.arms.values(), key=worth)
+
+    @property
     def share_saved(self) -> float:
         """Of the instants that candidates would have been scored at without racing."""
         spent = [one.instants for one in self.evaluations[1:] if one.instants]

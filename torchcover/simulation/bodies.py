@@ -2,6 +2,7 @@
 
 import re
 import warnings
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
@@ -79,11 +80,16 @@ class VehicleShape(Document):
 
     def mesh(self) -> Mesh:
         """All parts in one mesh, in the vehicle frame."""
-        return Vehicle.load(self.vehicle).mesh()
+        return self._read.mesh()
 
     def content(self) -> dict[str, Any]:
         """Its parts, wherever they stand."""
-        return Vehicle.load(self.vehicle).content()
+        return self._read.content()
+
+    @cached_property
+    def _read(self) -> "Vehicle":
+        """Once: every survey asks for its form several times."""
+        return Vehicle.load(self.vehicle)
 
 
 Shape = Annotated[

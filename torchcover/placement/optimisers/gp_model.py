@@ -69,14 +69,10 @@ class GaussianProcess:
 
     def predict(self, places: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of the function, without the noise of a value, at (m, variables) places."""
-        across = self.covariance(places, self.places)
+        across = _kernel(_squared_apart(self.levels, places, self.places), self.log_lengths, self.log_signal)
         explained = torch.linalg.solve_triangular(self.cholesky, across.T, upper=False)
         variance = (self.log_signal.exp() - explained.square().sum(0)).clamp_min(0.0)
         return self.shift + self.scale * (across @ self.weights), self.scale * variance.sqrt()
-
-    def covariance(self, first: Tensor, second: Tensor) -> Tensor:
-        """(n, m) of the function, in its standard units, between (n, variables) and (m, variables) places."""
-        return _kernel(_squared_apart(self.levels, first, second), self.log_lengths, self.log_signal)
 
 
 def _squared_apart(levels: tuple[int, ...], first: Tensor, second: Tensor) -> Tensor:
