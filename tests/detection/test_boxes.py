@@ -310,3 +310,11 @@ def test_an_array_of_numpy_is_refused_by_its_name(call, name):
     rows = torch.ones(2, 7)
     with pytest.raises(TypeError, match=rf"^{name}: .* got a NumPy array of float32; torch.from_numpy\(array\) makes"):
         call(rows.numpy(), rows, Boxes.from_rows(rows))
+
+
+def test_a_warning_of_degrees_names_the_line_that_made_the_boxes():
+    numbers = torch.tensor([[4.0, 2.0, 1.5]])
+    with pytest.warns(UserWarning, match="beyond a full turn, so it may be in degrees") as told:
+        Boxes(numbers, numbers, torch.tensor([90.0]))
+    assert [one.filename for one in told] == [__file__]
+    Boxes(numbers, numbers, torch.tensor([-2 * math.pi]))
