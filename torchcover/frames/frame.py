@@ -102,11 +102,7 @@ class Frame:
     def error_of(self, rig: str | None = None) -> Tensor | None:
         """(N,) how far off the points of one rig were measured, along their rays; None if where they are.
 
-        Args:
-            rig: As in `cloud_of`.
-
-        Raises:
-            ValueError: As there.
+        It takes and refuses a `rig` as `cloud_of` does.
         """
         rig = self._named(rig)
         return self.measured[rig].error_m if rig in self.measured else None

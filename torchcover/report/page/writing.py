@@ -101,11 +101,7 @@ SCRIPTS = ("cells.js", "map.js", "page.js", "controls.js")
 
 
 def page_html(page: Page) -> str:
-    """The text of the file.
-
-    Args:
-        page: What it shows.
-    """
+    """The text of its file."""
     cells = CellBytes()
     maps, notes = fitted(page.maps, page.most_bytes)
     content = as_json(map_content(replace(page, maps=maps), cells))
