@@ -243,7 +243,7 @@ def test_on_a_narrow_terminal_names_fold_but_numbers_stay_whole(pair, regions, r
 def test_on_a_narrow_terminal_numbers_with_errors_stay_whole(trios, regions, steps):
     names = ("a_rig_with_quite_a_long_name", "another_rig_with_a_long_name", "and_one_more_of_those")
     named = dict(zip(names, trios(steps).values(), strict=True))
-    narrowest = narrowest_width(rich_tables(CoverageTable.of(named, regions), two_lines=True), names)
+    narrowest = narrowest_width(rich_tables(CoverageTable.of(named, regions), 1), names)
     assert_whole(named, regions, narrowest, r"\[[+-]?[\d.]+, [+-]?[\d.]+\]|unknown", 11)
     assert narrowest < 100
 
@@ -264,3 +264,24 @@ def test_in_a_file_names_are_whole_however_narrow_it_says_it_is(trio, regions, r
     assert "mean blind spot" in text
     assert "…" not in text
     assert rigs == 1 or all(name in text for name in named)
+
+
+def test_with_many_sensors_each_has_a_row_and_eighty_columns_are_enough():
+    sensors = [f"sensor_number_{at}" for at in range(8)]
+    coverage = metric(thresholds=(0.4,), blocks=16, sensors=sensors)
+    for index in range(16):
+        generator = torch.Generator().manual_seed(index)
+        size_m = torch.tensor([4.0, 2.0, 0.2])
+        clouds = {name: size_m * torch.rand(4, 3, generator=generator) for name in sensors}
+        coverage.update(clouds, size_m * torch.rand(400, 3, generator=generator), place_in_time=index)
+    computed = {"rig": coverage.compute()}
+    narrow, wide = (printed(computed, (NEAR, FAR), width).partition("Change of")[2] for width in (80, 400))
+    assert max(map(len, narrow.splitlines())) <= 80
+    assert max(map(len, wide.splitlines())) > 160
+    table = CoverageTable.of(computed, (NEAR, FAR))
+    for row in table.rows["rig"]:
+        changes = {name: change["detection_0.4m"].value for name, change in row.summary.redundancy.change.items()}
+        rows = re.findall(rf"│ {row.summary.region} .*(sensor_number_\d) │ *(?:! )?([+-][\d.]+)", narrow)
+        assert {name for name, _ in rows} == {name for name, change in changes.items() if change}
+        assert [name for name, _ in rows] == sorted((name for name, _ in rows), key=lambda name: changes[name])
+        assert [float(said) for _, said in rows] == pytest.approx([100 * changes[name] for name, _ in rows], abs=0.06)

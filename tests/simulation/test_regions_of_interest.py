@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchcover import Region, RegionsOfInterest
+from torchcover import Region, RegionsOfInterest, Rig, Scenario, evaluate
 from torchcover.coverage import near_field_regions
 
 ROBOT_M = np.array([[0.5, 0.4], [-0.5, 0.4], [-0.5, -0.4], [0.5, -0.4]])
@@ -128,3 +128,51 @@ def test_the_sides_are_named_by_their_reach():
     names = [region.name for region in near_field_regions((-1.0, 1.0), (-1.0, 1.0), reach_m=1.5)]
     assert names == ["front_1.5m", "rear_1.5m", "left_1.5m", "right_1.5m"]
     assert math.prod(near_field_regions((-1.0, 1.0), (-1.0, 1.0))[2].x) == -1.0
+
+
+# Rooms.
+
+
+def office(size_m=(14.0, 10.0), ego=None, **others):
+    floor = {"name": "floor", "ground": True, "shape": {"type": "plane", "size_m": size_m}}
+    ego = {"shape": {"type": "box", "size_m": (0.9, 0.6, 0.5)}} | (ego or {})
+    return Scenario.model_validate({"name": "office", "ego": ego, "bodies": [floor], **others})
+
+
+def test_a_room_is_what_stands_around_the_ego_in_its_frame_wherever_it_drives(tmp_path):
+    np.testing.assert_allclose(office().room_m(), [(-7, 7), (-5, 5)])
+    turned = office(ego={"pose": {"x_m": -3.0, "yaw_deg": 90.0}})
+    np.testing.assert_allclose(turned.room_m(), [(-5, 5), (-10, 4)], atol=1e-9)
+    (tmp_path / "way.csv").write_text("t,x,y,z,roll,pitch,yaw\n0,-5,0,0,0,0,0\n2,5,1,0,0,0,0\n")
+    driving = office(ego={"trajectory": tmp_path / "way.csv"}, duration_s=2.0)
+    np.testing.assert_allclose(driving.room_m(), [(-12, 12), (-6, 5)], atol=1e-9)
+
+
+def test_what_is_no_room_is_none_and_what_is_smaller_than_the_vehicle_is_a_mistake():
+    assert office((100.0, 10.0)).room_m() is None
+    assert office(ego={"pose": {"x_m": 20.0}}).room_m() is None
+    assert Scenario.load("urban").room_m() is None
+    with pytest.raises(
+        ValueError, match=r"'office': all that stands in it is 0.014 x 0.01 m, smaller than box; is the"
+    ):
+        office((0.014, 0.010)).room_m()
+
+
+@pytest.mark.parametrize(
+    ("max_range_m", "name", "x", "forward"),
+    [(100.0, "room", (-7.0, 7.0), ["5m"]), (6.0, "range", (-6.25, 6.25), ["5m"]), (3.0, "range", (-3.5, 3.5), [])],
+)
+def test_grid_and_regions_fit_the_room_and_the_range(max_range_m, name, x, forward):
+    rig = Rig.model_validate(
+        {"name": "r", "sensors": [{"name": "s", "mount": {"x_m": 0.2, "z_m": 1.0}, "channels": 2, "columns": 4,
+         "vertical_fov_deg": (-30, 0), "horizontal_fov_deg": 360, "max_range_m": max_range_m}]}
+    )  # fmt: skip
+    result = evaluate(rig, office(), steps=1, rays=256, probe="none")
+    grid = result.coverage.grid
+    assert grid.x == x
+    near = ["front_3m", "rear_3m", "left_3m", "right_3m"]
+    assert [region.name for region in result.regions] == [*forward, name, *near]
+    whole = next(region for region in result.regions if region.name == name)
+    assert (whole.x, whole.y) == (grid.x, grid.y)
+    asked = RegionsOfInterest(grid={"x_m": (-10.0, 50.0)})
+    assert evaluate(rig, office(), steps=1, rays=256, probe="none", ask=asked).coverage.grid.x == (-10.0, 50.0)

@@ -1,5 +1,7 @@
 """Stages: which worlds are built, which are kept, and what they share."""
 
+import gc
+import weakref
 from types import SimpleNamespace
 
 import numpy as np
@@ -59,6 +61,18 @@ def test_no_more_worlds_are_kept_than_the_budget_has_room_for(monkeypatch, built
         made.scene_of(6 * run)
     # Two worlds at most: 2 takes the place of 1, which was asked for longest ago.
     assert built == ([0, 1, 2, 1] if room_for / workers > 2 else [0, 1, 0, 2, 0, 1])
+
+
+def test_a_world_that_is_dropped_is_gone_without_a_collection_of_garbage():
+    made = Simulator(SHORT, {"roof": Rig.load("front_roof_128")}, PaperReference(8, 8), kept_bytes=0.0)
+    made.step(0)
+    first = weakref.ref(made.scene_of(0)[0])
+    gc.disable()
+    try:
+        made.step(6)
+        assert first() is None
+    finally:
+        gc.enable()
 
 
 def test_worlds_share_what_is_the_same_in_all():

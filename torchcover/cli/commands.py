@@ -243,7 +243,7 @@ def report(
     **settings: Any,  # noqa: ANN401
 ) -> None:
     """One page for a meeting: would it see a child, what fails with a sensor, how far does it see, and how soon."""
-    from torchcover.cli.printing import print_files
+    from torchcover.cli.printing import print_files, print_verdict
     from torchcover.evaluation import report
     from torchcover.files import claimed
     from torchcover.report import Terminal
@@ -264,8 +264,7 @@ def report(
         written = found.save(out, files=files)
     console = Terminal()
     print_files(written, out, console)
-    for words in found.verdict:
-        console.print(words, markup=False, soft_wrap=True)
+    print_verdict(found.verdict, console)
     if found.result.run is not None:
         found.result.run.raise_failure()
 

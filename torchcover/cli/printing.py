@@ -26,6 +26,13 @@ def print_result(result: Result, files: Sequence[Path], out: Path, *, explain: b
     else:
         _print_world(result, console, explain=explain)
     print_files(files, out, console)
+    print_verdict(result.verdict, console)
+
+
+def print_verdict(sentences: Sequence[str], console: Terminal) -> None:
+    """The answer, which is the last thing that is read."""
+    for words in sentences:
+        console.print(words, markup=False, soft_wrap=True)
 
 
 def _print_world(result: Result, console: Terminal, *, explain: bool) -> None:
@@ -41,9 +48,8 @@ def _print_world(result: Result, console: Terminal, *, explain: bool) -> None:
         )
     for line in result.run.skipped if result.run else ():
         console.print(f"skipped: {line}", style="yellow", markup=False)
-    for line in (*result.target_lines, " ".join(result.verdict)):
-        if line:
-            console.print(line, markup=False, soft_wrap=True)
+    for line in result.target_lines:
+        console.print(line, markup=False, soft_wrap=True)
 
 
 def print_files(files: Sequence[Path], out: Path, console: Terminal) -> None:

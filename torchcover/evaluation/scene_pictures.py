@@ -73,13 +73,14 @@ def scenario_pictures(
         seed: Seed of the simulation.
     """
     frames = _frames(scenario, rig, vehicle, max(steps), seed)
+    x_m, y_m = frames.scenario.room_m() or (GRID_X_M, GRID_Y_M)
     for step in steps:
         frame = frames[step]
         scene, step_of_world = frames.simulator.scene_of(step)
         time_s = step_of_world * scene.world.time_step_s
         yield draw_scene(
-            GRID_X_M,
-            GRID_Y_M,
+            x_m,
+            y_m,
             standing=_standing(scene.world, time_s),
             ego_outline_m=scene.ego_box.outline_m,
             actors=_actor_marks(scene.world, time_s),

@@ -9,9 +9,11 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Generic, NamedTuple, TypeVar
 
+import numpy as np
 import torch
 
 from torchcover import __version__
+from torchcover.coverage import Region
 from torchcover.coverage.grid import BandFrame
 from torchcover.evaluation.observers import AnyObserver
 from torchcover.evaluation.settings import DEFAULT_STEPS, OPTIONS, Settings
@@ -31,6 +33,7 @@ from torchcover.simulation import (
 )
 from torchcover.simulation.recorded_rig import recorded_body
 from torchcover.simulation.regions_of_interest import DEFAULT_BAND_FRAME
+from torchcover.simulation.scenario import ROOM_M
 from torchcover.simulation.simulated_frames import DEFAULT_REFERENCE
 
 AnyRig = Rig | str | Path
@@ -139,7 +142,7 @@ def simulation(settings: Settings, *, boxes: bool = False) -> Task[SimulatedFram
     loaded_world = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
     world = with_ego(loaded_world, carried, settings.vehicle)
     asked = (settings.ask or RegionsOfInterest()).around(
-        world.ego_box().outline_m, settings.cell_m, _band_frame(settings)
+        world.ego_box().outline_m, settings.cell_m, _band_frame(settings), _within(world, carried)
     )
     frames = SimulatedFrames(
         world,
@@ -224,6 +227,21 @@ def _recording(frames: FrameSource, settings: Settings) -> Task[FrameSource]:
     band_frame = settings.band_frame or ("ground" if frames.has_heights() else "vehicle")
     asked = (settings.ask or RegionsOfInterest()).around(frames.ego_outline_m, settings.cell_m, band_frame)
     return Task(chosen, given, sensors, frames.description, asked, settings.steps)
+
+
+def _within(world: Scenario, rigs: Mapping[str, Rig]) -> Region | None:
+    """The room that the ego is in, or what its sensors reach; None if both are large."""
+    reach_m = max(
+        world.reach_m(sensor, rig.weather) + float(np.linalg.norm(sensor.mount.matrix()[:2, 3]))
+        for rig in rigs.values()
+        for sensor in rig.sensors
+    )
+    room = world.room_m()
+    if reach_m > ROOM_M:
+        return Region("room", *room) if room else None
+    (x0, x1), (y0, y1) = room or ((-reach_m, reach_m), (-reach_m, reach_m))
+    within = (max(x0, -reach_m), min(x1, reach_m)), (max(y0, -reach_m), min(y1, reach_m))
+    return Region("room" if within == room else "range", *within)
 
 
 def spread_s(scenario: Scenario, given_s: float | None) -> float:

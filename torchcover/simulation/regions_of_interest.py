@@ -16,6 +16,8 @@ from torchcover.simulation.documents import Bounds, Coordinate, Document, Readab
 GRID_X_M = (-40.0, 160.0)
 GRID_Y_M = (-40.0, 40.0)
 CELL_M = 0.25
+# In front, where nothing is to be seen beyond a room, or beyond the range of the sensors.
+NEAR_RANGES_M = (5.0, 10.0, 20.0)
 # What height bands are over, where nothing else is said.
 DEFAULT_BAND_FRAME: BandFrame = "ground"
 
@@ -78,7 +80,8 @@ class RegionsOfInterest(Readable):
         heights: Name of each height band -> lower and upper bound of z in metres; they may overlap. Not given: the
             paper's, ground and obstacle.
         grid: Extent and cell. Not given: x from -40 to 160 m, y from -40 to 40 m, more if regions need it, and cells
-            of 0.25 m.
+            of 0.25 m; where neither it nor regions are given, in a room of at most 40 m around the ego, or with sensors
+            that reach no farther, that, with the regions 5m, 10m, 20m as far as they fit, and `room` or `range`.
 
     Raises:
         ValueError: Bounds that are inverted, equal or not finite, a polygon that crosses itself.
@@ -99,6 +102,7 @@ class RegionsOfInterest(Readable):
         ego_outline_m: Float64 | None = None,
         cell_m: float | None = None,
         band_frame: BandFrame = DEFAULT_BAND_FRAME,
+        within: Region | None = None,
     ) -> "Asked":
         """What follows for one vehicle.
 
@@ -106,6 +110,8 @@ class RegionsOfInterest(Readable):
             ego_outline_m: (K, 2) corners x, y of the vehicle; None if unknown: then there is no near field.
             cell_m: Side of a cell, whatever `grid` says.
             band_frame: What the height bands are over, as in `BevGrid`.
+            within: Beyond which nothing is to be seen, such as a room: where neither regions nor the extent of the grid
+                are asked for, the grid is that, with the near field, and its name that of a region.
 
         Raises:
             ValueError: A region that the grid does not hold, or that holds no cell centre; a grid that cannot be.
@@ -116,12 +122,21 @@ class RegionsOfInterest(Readable):
         vehicle = None if ego_outline_m is None else _bounds(ego_outline_m)
         cell_m = cell_m or self.grid.cell_m or CELL_M
         named = tuple(region.called(name) for name, region in self.regions.items())
-        grid = self._grid(named, cell_m, band_frame)
+        if named or self.grid.x_m or self.grid.y_m:
+            within = None
+        grid = (
+            self._grid(named, cell_m, band_frame)
+            if within is None
+            else self._fitted(within, vehicle, cell_m, band_frame)
+        )
         if named:
             check_regions(named, grid)
             _warn_of_hidden(named, vehicle)
             return Asked(grid, named, (*(_area(region) for region in named), (grid.x, grid.y)), named)
-        forward = tuple(region for region in forward_regions() if region.fits(grid))
+        ranges = forward_regions() if within is None else forward_regions(NEAR_RANGES_M)
+        forward = tuple(region for region in ranges if region.fits(grid))
+        if within is not None:
+            forward = *forward, Region(within.name, grid.x, grid.y)
         check_regions(forward, grid)
         near = () if ego_outline_m is None else near_field(ego_outline_m)
         if not self.heights:  # of what is above the ground there, bodies are put there
@@ -131,6 +146,18 @@ class RegionsOfInterest(Readable):
         around = (_around(near),) if near else ()
         usual = (*forward, *near) or (Region("grid", grid.x, grid.y),)
         return Asked(grid, usual, (*map(_area, forward), *around, (grid.x, grid.y)), forward or usual)
+
+    def _fitted(self, within: Region, vehicle: Area | None, cell_m: float, band_frame: BandFrame) -> BevGrid:
+        """Of whole cells around what can be seen and the near field."""
+        areas = [_area(within)] + ([] if vehicle is None else [_around(near_field_regions(*vehicle))])
+        x, y = (
+            (
+                round(math.floor(min(low for low, _ in of) / cell_m) * cell_m, 9),
+                round(math.ceil(max(high for _, high in of) / cell_m) * cell_m, 9),
+            )
+            for of in zip(*areas, strict=True)
+        )
+        return BevGrid(x, y, cell_m, self.heights or PAPER_HEIGHTS, band_frame)
 
     def _grid(self, regions: tuple[Region, ...], cell_m: float, band_frame: BandFrame) -> BevGrid:
         x = self.grid.x_m or _holding(GRID_X_M, [region.x for region in regions], cell_m)

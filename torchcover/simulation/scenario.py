@@ -6,7 +6,7 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 from pydantic import NonNegativeFloat, PlainValidator, PositiveFloat, TypeAdapter, ValidationInfo, model_validator
 
-from torchcover.geometry import BoundingBox, rigid
+from torchcover.geometry import BoundingBox, invert, rigid, transform
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings.formats.track_tables import read_trajectory
 from torchcover.simulation.bodies import Body, Shape, VehicleShape, called, mover_mesh
@@ -25,6 +25,8 @@ from torchcover.simulation.world import Actor, World, steps_of
 
 # What carries a rig that names no vehicle, unless the document says otherwise.
 DEFAULT_EGO = VehicleShape(type="vehicle", vehicle="suv")
+# A hall that reaches no farther is one; and so many places of the ego are looked at.
+ROOM_M, PLACES_ALONG = 40.0, 64
 
 
 def _traffic(content: Any, info: ValidationInfo) -> Traffic | None:  # noqa: ANN401  (whatever stood in the file)
@@ -58,11 +60,13 @@ class Mover(Document):
 
     def actor(self, name: str, category: str) -> Actor:
         """Build it."""
+        return Actor(name, category, self.mesh(name, category), self.path())
+
+    def path(self) -> Trajectory:
+        """Where it is at all times."""
         if self.trajectory is not None:
-            trajectory = read_trajectory(self.trajectory)
-        else:
-            trajectory = Trajectory.from_poses([0.0], (self.pose or Pose()).matrix()[None])
-        return Actor(name, category, self.mesh(name, category), trajectory)
+            return read_trajectory(self.trajectory)
+        return Trajectory.from_poses([0.0], (self.pose or Pose()).matrix()[None])
 
     def mesh(self, name: str, category: str) -> Mesh:
         """Its body in its own frame; an SUV where that was left open."""
@@ -237,6 +241,44 @@ class Scenario(BuiltIn):
             [4.9, 1.94, 1.63]
         """
         return BoundingBox.around(self.ego_mesh().vertices_m)
+
+    def room_m(self) -> tuple[tuple[float, float], tuple[float, float]] | None:
+        """Bounds x and y of all that stands around the ego, in its frame, wherever it drives.
+
+        Returns:
+            None if that is no room or hall: it reaches farther than 40 m, the ego is beside it, or traffic makes it.
+
+        Raises:
+            ValueError: What stands around the ego is smaller than its body.
+
+        Example:
+            >>> Scenario.load("courtyard").room_m() is None
+            True
+        """
+        if self.traffic is not None or self.ego is None:
+            return None
+        places = [pose.matrix() for body in self.bodies for pose in body.poses]
+        meshes = [mesh for body in self.bodies for mesh in [body.shape.mesh()] * len(body.poses)]
+        moved = [mesh.moved(place).vertices_m for mesh, place in zip(meshes, places, strict=True)]
+        all_m, path = np.concatenate(moved), self.ego.path()
+        (x0, y0, _), (x1, y1, z1) = all_m.min(axis=0).tolist(), all_m.max(axis=0).tolist()
+        outline_m = np.array([(x0, y0, z1), (x0, y1, z1), (x1, y0, z1), (x1, y1, z1)])
+        times_s = np.linspace(path.times_s[0], path.times_s[-1], PLACES_ALONG if path.moves else 1)
+        corners_m = np.stack([transform(invert(pose), outline_m)[:, :2] for pose in path.at_each(times_s)])
+        # A room that the ego turns in is as large as what it sweeps.
+        low_m, high_m = corners_m.min(axis=(0, 1)), corners_m.max(axis=(0, 1))
+        if (corners_m.min(axis=1) > 0).any() or (corners_m.max(axis=1) < 0).any():
+            return None
+        if (high_m - low_m < self.ego_box().size_m[:2]).all():
+            across = " x ".join(f"{length:.2g}" for length in high_m - low_m)
+            raise ValueError(
+                f"scenario {self.name!r}: all that stands in it is {across} m, smaller than {self.ego_name}; is the "
+                "`metres_per_unit` of a mesh that of its file?"
+            )
+        if max(-low_m.min(), high_m.max()) > ROOM_M:
+            return None
+        (x0, y0), (x1, y1) = low_m.tolist(), high_m.tolist()
+        return (x0, x1), (y0, y1)
 
     def world(self, seed: int = 0, episode: int = 0, ego: Mesh | None = None) -> World:
         """Build it.

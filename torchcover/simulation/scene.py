@@ -156,6 +156,10 @@ class Scene:
             self._instants[step, within_m] = self._at(step, within_m)
         return self._instants[step, within_m]
 
+    def forget_instants(self) -> None:
+        """Let it go at once, when nobody else needs it: they know it, and it them, until a collection of garbage."""
+        self._instants.clear()
+
     def _at(self, step: int, within_m: float) -> "Instant":
         time_s = step * self.world.time_step_s
         world_T_vehicle = self.world.ego.trajectory.at(time_s)

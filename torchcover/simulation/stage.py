@@ -126,7 +126,8 @@ class Scenes:
             most_bytes = min(KEPT_BYTES, KEPT_SHARE * machine_bytes() / (workers.num_workers if workers else 1))
         sizes = [scene.bytes for scene in self._kept.values()]
         while sizes and sum(sizes) + max(sizes) > most_bytes:
-            del self._kept[next(iter(self._kept))], sizes[0]
+            self._kept.pop(next(iter(self._kept))).forget_instants()
+            del sizes[0]
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_kept": {}, "_solids": Solids(), "_ego": None}

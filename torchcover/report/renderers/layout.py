@@ -7,10 +7,11 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 from torchcover.estimation import Quantity
-from torchcover.report.failures import failure_headings, failure_title, failure_words, sensors_of
+from torchcover.report.failures import decisive, failure_headings, failure_title, failure_words, sensors_of
 from torchcover.report.renderers.records import COLUMNS
 from torchcover.report.table import CoverageTable, Row
 from torchcover.report.wording import (
+    UNKNOWN,
     capitalised,
     difference_heading,
     difference_words,
@@ -53,18 +54,20 @@ class PageTable:
     notes: Sequence[str] = ()
 
 
-def parts_of(table: CoverageTable) -> list[PageTable]:
+def parts_of(table: CoverageTable, *, sensors_in_rows: bool = False) -> list[PageTable]:
     """The parts of a table.
 
     Args:
         table: The table.
+        sensors_in_rows: With redundancy a row for each sensor with which something is lost, instead of columns.
 
     Returns:
         For one rig one part, a column for each quantity. For several the paper's layout: a part for each quantity, a
         column for each rig; and, if there are errors, as many parts with the differences to the first rig. Then the
         same of bodies beside the vehicle. With redundancy a part for each rig more, a column for each of its sensors.
     """
-    failures = [_of_failures(table, rig) for rig in table.rigs if sensors_of(table.rows[rig])]
+    of_failures = _of_each_failure if sensors_in_rows else _of_failures
+    failures = [of_failures(table, rig) for rig in table.rigs if sensors_of(table.rows[rig])]
     of_bodies = list(zip(*table.bodies.values(), strict=True))
     parts = _of_rows(table, table.places, table.quantities)
     return [*parts, *(_of_rows(table, of_bodies, table.body_quantities) if of_bodies else ()), *failures]
@@ -92,6 +95,26 @@ def _of_failures(table: CoverageTable, rig: str) -> PageTable:
         cells = [Words(text, "significant" if marked else "") for text, marked in failure_words(table, row)]
         rows.append((Words(row.summary.region), Words(row.summary.height), *cells))
     return PageTable(failure_title(table, rig), [*PLACE_HEADINGS, *failure_headings(table, rig)], rows, PLACES)
+
+
+def _of_each_failure(table: CoverageTable, rig: str) -> PageTable:
+    """As narrow as it can be: by how many sensors a place is seen, and what it loses with each, most first."""
+    names, rows = sensors_of(table.rows[rig]), []
+    headings = failure_headings(table, rig)
+    seen = len(headings) - len(names) - 1
+    for row in table.rows[rig]:
+        words = failure_words(table, row)
+        lost = sorted(
+            (row.summary.redundancy.change[name][decisive(table).key].gain, name, *said)
+            for name, said in zip(names, words[seen:-1], strict=True)
+            if row.summary.redundancy and said[0] not in ("0", UNKNOWN)
+        )
+        for at, (_, name, text, marked) in enumerate(lost or [(0.0, words[-1][0], "", False)]):
+            of_place = [said[0] if at == 0 else "" for said in words[: min(seen, 1)]]
+            last = Words(text, "significant" if marked else "")
+            rows.append((Words(row.summary.region), Words(row.summary.height), *map(Words, (*of_place, name)), last))
+    headings = [*PLACE_HEADINGS, *["sensors\nthat see it"][:seen], "without", "change"]
+    return PageTable(failure_title(table, rig), headings, rows, PLACES)
 
 
 def _part(

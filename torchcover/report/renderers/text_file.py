@@ -49,32 +49,32 @@ def print_table(table: CoverageTable, console: Console | None = None) -> None:
         console: Where to; the terminal if not given.
     """
     console = console or Terminal()
-    tables = rich_tables(table)
-    if console.is_terminal and narrowest_width(tables) > console.width:
-        tables = rich_tables(table, two_lines=True)
     folded = table.rigs if console.is_terminal and len(table.rigs) > 1 else ()
+    tables = rich_tables(table, console.width if console.is_terminal else None)
     # Rather lines that are too long than numbers that are cut off; in a file the names are whole too.
-    console.width = max(console.width, narrowest_width(tables, folded))
-    for part in tables:
+    widths = [max(console.width, narrowest_width([part], folded)) for part in tables]
+    for part, width in zip(tables, widths if console.is_terminal else [max(widths)] * len(tables), strict=True):
+        console.width = width
         console.print(part)
 
 
-def rich_tables(table: CoverageTable, *, two_lines: bool = False) -> list[Table]:
+def rich_tables(table: CoverageTable, width: int | None = None) -> list[Table]:
     """The parts of a table for `rich.console.Console.print`.
 
     The best number of each row is bold and marked `*`; a difference that is more than chance is bold and marked `!`.
 
-    `two_lines`: whether intervals stand below their numbers. Returns a table for each part; what they hold under, and
-    what went wrong, is the caption of the last.
+    `width`: characters in a line; where more are needed, intervals stand below numbers, and sensors in rows. Returns a
+    table for each part; what they hold under, and what went wrong, is the caption of the last.
     """
     parts = parts_of(table)
-    if two_lines:
-        parts = [replace(part, rows=[[*map(_below, row)] for row in part.rows]) for part in parts]
-    lines = [
-        line for part in parts for row in part.rows for cell in row[2:-1] for line in _text(cell).plain.split("\n")
-    ]
-    widest = max(map(cell_len, lines), default=0)
-    tables = [_rich_table(part, widest) for part in parts]
+    if width is not None and narrowest_width([*map(_rich_table, parts)]) > width:
+        folded = table.rigs if len(table.rigs) > 1 else ()
+        forms = [[*map(_below, each)] for each in (parts, parts_of(table, sensors_in_rows=True))]
+        parts = [
+            form if narrowest_width([_rich_table(form)], folded) <= width else narrow
+            for form, narrow in zip(*forms, strict=True)
+        ]
+    tables = [*map(_rich_table, parts)]
     marks = [f"{SIGNS[mark]} {meaning}" for mark, meaning in marks_on(table).items()]
     tables[-1].caption = Text("\n".join([*marks, *notes_on(table)]))
     return tables
@@ -102,23 +102,27 @@ def _in_words(table: PageTable) -> Table:
 def narrowest_width(tables: Sequence[Table], folded: Sequence[str] = ()) -> int:
     """Characters in a line that tables need at least.
 
-    `tables`: tables for rich, whose numbers stay whole; `folded`: headings, each of one column, that may be folded to
-    the width of the numbers below.
+    `tables`: tables for rich, whose numbers stay whole; `folded`: headings that may be folded to the width of the
+    numbers below.
     """
     console = Console(width=MAX_LINE_CHARS)
-    natural = max(Measurement.get(console, console.options, table).maximum for table in tables)
-    numbers = max(column.min_width or 0 for table in tables for column in table.columns)
-    return natural - sum(max(0, cell_len(name) - numbers) for name in folded)
+    natural = [Measurement.get(console, console.options, table).maximum for table in tables]
+    spared = [
+        sum(max(0, cell_len(str(of.header)) - (of.min_width or 0)) for of in table.columns if str(of.header) in folded)
+        for table in tables
+    ]
+    return max(width - less for width, less in zip(natural, spared, strict=True))
 
 
-def _rich_table(part: PageTable, widest: int) -> Table:
+def _rich_table(part: PageTable) -> Table:
     """With a line after the rows of each region."""
     left: dict[str, Any] = {"title_justify": "left", "caption_justify": "left"}
     table = Table(title=Text(part.title) if part.title else None, title_style="bold", caption_style="", **left)
     for name in part.headings[:2]:
         table.add_column(name, no_wrap=True)
-    for name in part.headings[2:-1]:
+    for at, name in enumerate(part.headings[2:-1], 2):
         # As Text, for names may hold what rich takes for markup. Names are folded, numbers never.
+        widest = max((cell_len(line) for row in part.rows for line in _text(row[at]).plain.split("\n")), default=0)
         table.add_column(Text(name), justify="right", overflow="fold", min_width=widest)
     table.add_column(part.headings[-1], justify="right", no_wrap=True)
     for _, rows in groupby(part.rows, itemgetter(0)):
@@ -128,8 +132,11 @@ def _rich_table(part: PageTable, widest: int) -> Table:
     return table
 
 
-def _below(cell: Words) -> Words:
-    return cell._replace(text=cell.text.replace("  [", "\n["))
+def _below(part: PageTable) -> PageTable:
+    """With intervals below their numbers."""
+    return replace(
+        part, rows=[[cell._replace(text=cell.text.replace("  [", "\n[")) for cell in row] for row in part.rows]
+    )
 
 
 def _text(cell: Words) -> Text:
