@@ -109,7 +109,7 @@ def version(show: Annotated[bool, typer.Option("--version", help="Print the vers
 
 
 for command in (commands.report, evaluate, compare, commands.study, commands.record, commands.rig, commands.robot,
-                commands.calibrate, commands.show, commands.targets, commands.check, commands.encounter,
+                commands.calibrate, commands.world, commands.show, commands.targets, commands.check, commands.encounter,
                 commands.search):  # fmt: skip
     app.command()(command)
 app.command("list")(commands.list_builtin)

@@ -103,6 +103,31 @@ def rig(
     typer.echo(as_yaml(document), nl=False)
 
 
+@with_options(options.of_corrections())
+def world(
+    recording: Annotated[Path, typer.Argument(help="A drive with poses, of any layout in docs/recordings.md.")],
+    out: Annotated[
+        Path, typer.Option("--out", help="Folder for scenario.yaml and its files.", callback=options.check_out)
+    ],
+    steps: Annotated[int | None, typer.Option(min=1, help="How many of its frames, from the first on (all).")] = None,
+    recording_format: options.Format = None,
+    vehicle: Annotated[
+        str | None, typer.Option(help="Vehicle that recorded it: a name, a file, or x0,x1,y0,y1,z0,z1 of its body.")
+    ] = None,
+    vehicle_frame: options.VehicleFrame = None,
+    mount: options.Mount = None,
+    **corrections: Any,  # noqa: ANN401
+) -> None:
+    """Make a drive a scenario: the ground and all that stands as it was seen, what moves on its tracks."""
+    from torchcover.recordings.corrected import corrected
+    from torchcover.recordings.corrections import Corrections
+    from torchcover.simulation import write_world
+
+    opened = options.opened(recording, recording_format, vehicle, vehicle_frame, mount)
+    told = write_world(corrected(opened, Corrections(**corrections)), out, steps=steps)
+    typer.echo(f"{told}. Wrote {out}; try rigs in it: torchcover evaluate RIG --scenario {out / 'scenario.yaml'}")
+
+
 def robot(
     urdf: Annotated[Path, typer.Argument(help="URDF file; of xacro what `xacro FILE` prints.")],
     package: Annotated[

@@ -155,6 +155,17 @@ class AccumulatedReference:
         weights = (square_metres(level_m) * share).astype(np.float32)
         return InVehicle(points_m.astype(np.float32), dropped, weights)
 
+    def told_apart(self, recording: Recording, index: int) -> dict[Key, tuple[NDArray[np.float64], NDArray[np.int8]]]:
+        """Of each scan of the window `Thinned.still_m`, and (N,) 0 if it stands, 1 if it passes, 2 if seen past."""
+        votes = self._sweeps.votes(recording, self._taking_part(recording), index)
+        scans = {key: self._sweeps.thinned(recording, *key) for key in votes}
+        passing, within = self._passing(recording, index, scans), set(self._sweeps.instants(recording, index))
+        return {
+            key: (scan.still_m, np.where(votes[key] >= VOTES, 2, passing[key]).astype(np.int8))
+            for key, scan in scans.items()
+            if key[1] in within
+        }
+
     def _on_ground(self, recording: Recording, index: int, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """(N, 3) points, those near the ground put on it."""
         ground = self._sweeps.ground(recording, index)

@@ -16,6 +16,7 @@ from .rays import into_tiles as into_tiles
 from .recorded_returns import LidarCalibration as LidarCalibration
 from .recorded_returns import calibrate as calibrate
 from .recorded_rig import rig_document as rig_document
+from .recorded_world import write_world as write_world
 from .reference_sensor import ReferenceScan as ReferenceScan
 from .reference_sensor import ReferenceSensor as ReferenceSensor
 from .reference_sensor import Surroundings as Surroundings

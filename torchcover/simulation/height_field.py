@@ -36,16 +36,17 @@ class Slopes(NamedTuple):
     """Ground with a height at each corner of a raster; two triangles are between four of them.
 
     `lower_m` (2,) is the first corner; `corners_m` (rows, columns) are heights, rows along y; `wanted` (rows - 1,
-    columns - 1) which squares rays may hit.
+    columns - 1) which squares rays may hit, of sides `cell_m`.
     """
 
     lower_m: Float64
     corners_m: Float64
     wanted: Bools
+    cell_m: float = CELL_M
 
     def heights_m(self, places_m: Float64) -> Float64:
         """(N,) at (N, 2) places."""
-        return HeightField(self.lower_m, self.corners_m, CELL_M).heights_m(places_m)
+        return HeightField(self.lower_m, self.corners_m, self.cell_m).heights_m(places_m)
 
     def mesh(self) -> Mesh:
         """The squares that are wanted, as one sheet."""
@@ -55,7 +56,7 @@ class Slopes(NamedTuple):
         right, above, across = here + 1, here + columns, here + columns + 1
         faces = np.concatenate([np.stack([here, right, across], axis=1), np.stack([here, across, above], axis=1)])
         used, faces = np.unique(faces, return_inverse=True)
-        places_m = self.lower_m + CELL_M * np.stack([used % columns, used // columns], axis=1)
+        places_m = self.lower_m + self.cell_m * np.stack([used % columns, used // columns], axis=1)
         return Mesh(np.column_stack([places_m, self.corners_m.reshape(-1)[used]]), faces.reshape(-1, 3)).made_of("road")
 
 

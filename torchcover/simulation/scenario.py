@@ -96,7 +96,7 @@ class Scenario(BuiltIn):
             takes its place, or an SUV.
         bodies: What never moves, in the world frame.
         actors: What moves, or may be recognised.
-        boxes: File of recorded boxes that are actors too; relative to the document.
+        boxes: File of recorded boxes that are actors too, with bodies as of `tracks`; relative to the document.
         time_step_s: Time between two frames.
         duration_s: Time of the last frame; frames beyond it start again at 0.
         weather: Clear and dry if not given.

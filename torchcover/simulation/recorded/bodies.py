@@ -1,7 +1,6 @@
 """The body that stands for a recorded box."""
 
 import math
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +9,9 @@ from torchcover.files import reads
 from torchcover.geometry import BoundingBox
 from torchcover.recordings.formats.track_tables import check_gaps, read_box_tracks
 from torchcover.recordings.objects import Track
+from torchcover.simulation.bodies import Vehicle
 from torchcover.simulation.shapes import Box, Mesh
-from torchcover.simulation.traffic.fleet import CATEGORIES
+from torchcover.simulation.traffic.fleet import CATEGORIES, load_bodies
 from torchcover.simulation.traffic.vehicle_class import VehicleType
 from torchcover.simulation.world import Actor
 
@@ -25,9 +25,12 @@ USUAL_HEIGHT_M = 1.5
 class Bodies:
     """The built-in bodies, scaled to recorded boxes; those of one size share one mesh."""
 
-    def __init__(self, meshes: Mapping[str, Mesh]) -> None:
-        self._meshes = meshes
-        self._sizes_m = {kind: np.array(BoundingBox.around(mesh.vertices_m).size_m) for kind, mesh in meshes.items()}
+    def __init__(self) -> None:
+        # A box is all of a truck.
+        self._meshes = {**load_bodies(), "truck": Vehicle.load("truck").mesh()}
+        self._sizes_m = {
+            kind: np.array(BoundingBox.around(mesh.vertices_m).size_m) for kind, mesh in self._meshes.items()
+        }
         self._lengths_m = {kind: float(size_m[0]) for kind, size_m in self._sizes_m.items()}
         self._made: dict[tuple[str | None, tuple[float, float, float]], Mesh] = {}
 
@@ -48,23 +51,18 @@ class Bodies:
 
     def _scaled(self, kind: str | None, size_m: tuple[float, float, float]) -> Mesh:
         if kind is None:
-            return box_mesh(size_m)
+            return Box(type="box", size_m=size_m).mesh().made_of("car_paint")
         mesh = self._meshes[kind]
         return mesh._replace(vertices_m=mesh.vertices_m * (np.array(size_m) / self._sizes_m[kind]))
 
 
 @reads("a file of boxes")
 def read_boxes(path: Path) -> tuple[Actor, ...]:
-    """Read recorded boxes as actors that are boxes; see `read_box_tracks`."""
-    tracks = read_box_tracks(path)
+    """Read recorded boxes as actors; see `read_box_tracks`."""
+    tracks, bodies = read_box_tracks(path), Bodies()
     for track in tracks:
         try:
             check_gaps(track.trajectory.times_s)
         except ValueError as error:
             raise ValueError(f"id {track.name}: {error}") from error
-    return tuple(Actor(track.name, track.category, box_mesh(track.size_m), track.trajectory) for track in tracks)
-
-
-def box_mesh(size_m: tuple[float, float, float]) -> Mesh:
-    """A box of a length, width and height that stands on its origin."""
-    return Box(type="box", size_m=size_m).mesh().made_of("car_paint")
+    return tuple(Actor(track.name, *bodies.of(track), track.trajectory) for track in tracks)

@@ -15,7 +15,7 @@ from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings.formats import read_objects
 from torchcover.recordings.formats.track_tables import read_trajectory
 from torchcover.recordings.objects import Ego, RecordedObjects
-from torchcover.simulation.bodies import Vehicle, sound_mesh
+from torchcover.simulation.bodies import sound_mesh
 from torchcover.simulation.documents import PathBeside, Pose, builtin_hashes
 from torchcover.simulation.height_field import Plain, Slopes
 from torchcover.simulation.recorded.bodies import Bodies
@@ -113,12 +113,11 @@ class RecordedTraffic(Traffic):
 
         Who is where the ego is at an instant is left out, with a warning.
         """
-        # A box is all of a truck.
-        run, bodies = self._run, {**load_bodies(), "truck": Vehicle.load("truck").mesh()}
+        run = self._run
         drive = self._shown(run.drive)
-        mesh = bodies["suv"] if ego is None else ego
+        mesh = load_bodies()["suv"] if ego is None else ego
         driver = Actor(EGO, "car", mesh, Trajectory(drive.times_s, drive.positions_m, drive.angles_deg))
-        others = list(self._actors(driver.trajectory, Bodies(bodies)))
+        others = list(self._actors(driver.trajectory, Bodies()))
         shown = self._apart(driver, others)
         left_out = len(others) - len(shown)
         stood: tuple[Mesh, ...] = ()
