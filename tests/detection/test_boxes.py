@@ -327,3 +327,11 @@ def test_boxes_and_what_was_seen_of_them_stay_as_they_are():
     for made, name in ((boxes, "centre_m"), (BoxVisibility(one, one, one, one, one, 0.4), "share")):
         with pytest.raises(dataclasses.FrozenInstanceError):
             setattr(made, name, one)
+
+
+def test_the_skin_is_of_the_top_and_not_of_the_bottom():
+    boxes = Boxes.from_rows(torch.tensor([[0.0, 0.0, 0.0, 8.0, 4.0, 2.0, 0.0]]).double())
+    heights_m = [1.0 + SKIN_M, 1.0 + SKIN_M + 1e-9, SKIN_M - 1.0, SKIN_M - 1.0 + 1e-9]
+    points = torch.tensor([[0.5, -0.5, height_m] for height_m in heights_m]).double()
+    points[:, 2] = torch.tensor(heights_m, dtype=torch.float64)
+    assert points_in_boxes(points, boxes).point.tolist() == [0, 3]
