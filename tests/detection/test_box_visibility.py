@@ -86,6 +86,27 @@ def test_a_box_that_only_the_rig_saw_is_known_by_the_sides_that_face_the_vehicle
     torch.testing.assert_close(both.share[[0, 2]], seen.share[[0, 2]])
 
 
+@pytest.mark.parametrize("turn_rad", [0.3, 1.2, 2.5, -0.7])
+def test_of_a_box_that_only_the_rig_saw_as_much_is_seen_wherever_it_stands_around_the_vehicle(turn_rad):
+    """In the middles of both of its sides that face the vehicle, and beside it at the same distance elsewhere."""
+    row, sides = [12.0, 3.0, 1.0, 4.0, 2.0, 2.0, 0.4], torch.tensor([[-2.0, 0.0, 0.0], [0.0, 1.0, 0.0]]).double()
+
+    def around(points, angle):
+        cosine, sine = math.cos(angle), math.sin(angle)
+        return points @ torch.tensor([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]]).double()
+
+    found = []
+    for turn in (0.0, turn_rad):
+        centre = around(torch.tensor([row[:3]]).double(), turn)
+        boxes = Boxes.from_rows(torch.cat([centre, torch.tensor([[*row[3:6], row[6] + turn]]).double()], dim=1))
+        sensor = around(sides, row[6] + turn) + centre
+        found.append(unweighted(sensor, torch.tensor([[90.0, 0.0, 1.0]]).double(), boxes, threshold=0.5))
+    circles, areas = 2 * math.pi * 0.5**2, 2 * 2 + 4 * 2
+    assert found[0].share.item() == pytest.approx(circles / areas, abs=0.03)
+    assert found[1].share.item() == pytest.approx(found[0].share.item(), abs=0.01)
+    assert found[1].mean_radius_m.item() == pytest.approx(found[0].mean_radius_m.item(), rel=1e-6)
+
+
 def test_the_nearest_sensor_point_may_lie_outside_the_box():
     """At 0.3 m in front of the box, below the threshold: seen, although no point of the rig is in the box."""
     seen = unweighted(torch.tensor([[7.7, 0.0, 1.0]]), torch.tensor([[8.0, 0.0, 1.0]]), TWO)
