@@ -25,9 +25,9 @@ RIGHT = {
     "poses off by 5 cm and 0.1 degrees": "",
     "rain or dust, a tenth of the points": "",
     "the first two sweeps": "",
-    "stands": "",
 }
 WRONG = {
+    "stands": "measure where it drives",
     "rotations x, y, z, w": "--quaternions xyzw",
     "poses are vehicle_T_world": "--poses inverse",
     "x and y of poses exchanged": "--poses yx",
