@@ -45,7 +45,7 @@ def main():
             data = mutated(every, number, seed)
             outcome = attempt(kind, data, Path(folder), messages)
             _add(found[kind.name], outcome)
-        bombs = [(name, *attempt(kind, kind.data, Path(folder), messages)) for name, kind in _bombs()]
+        bombs = [(name, *attempt(kind, kind.data, Path(folder), messages)) for name, kind in _bombs(every)]
         pipes = [(f"a FIFO called {kind.name}", *_attempt_pipe(kind, Path(folder))) for kind in every]
     columns = ("read", "bad", "foreign", "unnamed", "slow", "large", "seconds", "MB")
     total = Counter()
@@ -141,9 +141,9 @@ def _add(counts, outcome):
         print(what[:300])
 
 
-def _bombs():
+def _bombs(every):
     """Small files that claim, or really become, gigabytes."""
-    clouds = {kind.name: kind for kind in kinds(tempfile.gettempdir())}
+    clouds = {kind.name: kind for kind in every}
 
     def of(name, data):
         return Kind(name, data, clouds[name].read, clouds[name].beside)

@@ -21,19 +21,20 @@ ROOT = Path(__file__).parents[1]
 COMMAND = ["evaluate", "front_roof_128", "--scenario", "urban", "--steps", "64"]
 ROUNDS = 2
 START, WORLDS, RIG, REFERENCE, MOVING = "start", "worlds", "rig rays", "reference", "what moves"
-SEARCH, SUMS, MAPS, FILES = "search", "sums", "maps", "other files"
+SEARCH, SUMS, BODIES, MAPS, FILES = "search", "sums", "bodies beside the vehicle", "maps", "other files"
 STARTED, AGAIN = "as it is started: processor time", "the same again, with worlds from disk"
 EMBREE, BARE_SEARCH, TORCH = "bare Embree", "bare search", "`import torch`"
-PARTS = (START, WORLDS, RIG, REFERENCE, MOVING, SEARCH, SUMS, MAPS, FILES)
+PARTS = (START, WORLDS, RIG, REFERENCE, MOVING, SEARCH, SUMS, BODIES, MAPS, FILES)
 # Function -> what it is part of.
 WATCHED = {
     "torchcover.simulation.stage:Stages.of_run": WORLDS,
-    "torchcover.simulation.simulator:Simulator._scan_rig": RIG,
+    "torchcover.simulation.simulator:Simulator._scans": RIG,
     "torchcover.simulation.surface_reference:SurfaceReference.scan": REFERENCE,
     "torchcover.simulation.scene:Scene.at": MOVING,
     "torchcover.neighbors.query:_nearest": SEARCH,
     "torchcover.coverage.metric:CoverageMetric.sums_of": SUMS,
     "torchcover.coverage.metric:CoverageMetric.add": SUMS,
+    "torchcover.targets.probing:Probes.sums_of": BODIES,
     "torchcover.report.maps.figures:draw_side_by_side": MAPS,
     "torchcover.files.publishing:Publication.add_figure": MAPS,
     "torchcover.evaluation.result:Result.save": FILES,

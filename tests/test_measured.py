@@ -10,11 +10,18 @@ import pytest
 import typer
 
 import benchmarks.__main__
-from benchmarks import measured
+from benchmarks import measured, run
 from torchcover.cli.app import app
 
 COMMANDS = typer.main.get_command(app)
 DOCS = Path(__file__).parent.parent / "docs"
+
+
+@pytest.mark.parametrize("place", run.WATCHED)
+def test_what_the_default_run_is_divided_into_is_there(place):
+    """A part that is called otherwise by now would be counted as another one."""
+    owner, name = run.owner_of(place)
+    assert callable(getattr(owner, name))
 
 
 def test_what_a_command_prints_takes_the_place_of_what_it_printed_before(tmp_path):

@@ -162,11 +162,7 @@ class BevGrid:
         return self._cells_of(points, height)[0]
 
     def bins(self, points: Tensor, height: Tensor | None = None) -> Bins:
-        """The cells that points are in, several where bands overlap.
-
-        Args:
-            points: As in `cell_of`.
-            height: As in `cell_of`.
+        """The cells that points are in, several where bands overlap; it takes what `cell_of` takes.
 
         Raises:
             ValueError: Another shape, heights that are missing or of no use.
@@ -186,14 +182,7 @@ class BevGrid:
         return Bins(inside, of, cells[tier, inside[of]])
 
     def points_by_column(self, points: Tensor, height: Tensor | None = None) -> Tensor:
-        """How many points lie above each square of ground, in each band: what counting `bins` gives, sooner.
-
-        Args:
-            points: As in `cell_of`.
-            height: As in `cell_of`.
-
-        Returns:
-            (Y, X) float64.
+        """(Y, X) float64: how many points lie above each square of ground in each band, as by counting `bins`, sooner.
 
         Raises:
             ValueError: Another shape, heights that are missing or of no use.

@@ -194,13 +194,7 @@ class CoverageMetric(SumsInBlocks):
     def sums_of(self, sensor: SensorClouds, reference: Clouds, **given: Any) -> list[StepSums]:  # noqa: ANN401
         """What `update` adds for each step: the same in any process, where the metric has the same parameters.
 
-        Args:
-            sensor: As there.
-            reference: Likewise.
-            given: What else `update` takes.
-
-        Raises:
-            ValueError, TypeError: As there.
+        It takes and refuses what `update` does.
         """
         given = dict.fromkeys(("weights", "height", "place_in_time", "error")) | given
         how: dict[str, Any] = {"grid": self.grid, "square_metres": self.square_metres, "names": self.sensors}

@@ -20,10 +20,7 @@ OF_BODIES = (attrgetter("bodies.estimate"),)
 
 
 def check_paired(coverages: Mapping[str, Coverage]) -> None:
-    """Check that the coverages may be compared cell by cell.
-
-    Args:
-        coverages: By the name of the rig.
+    """Check that the coverages, by the names of their rigs, may be compared cell by cell.
 
     Raises:
         ValueError: Fewer than two, or two that differ in the grid, its band frame, the thresholds, the limit of the

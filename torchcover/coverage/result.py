@@ -129,10 +129,7 @@ class Coverage:
         return figure
 
     def to_dataframe(self, regions: Sequence[Region] | None = None) -> "pandas.DataFrame":
-        """The numbers of `scalars`, a row for each region and height band, or body beside the vehicle.
-
-        Args:
-            regions: As in `summary`.
+        """The numbers of `scalars`, a row for each region of `summary` and height band, or body beside the vehicle.
 
         Raises:
             ModuleNotFoundError: pandas is not there.
@@ -300,10 +297,7 @@ class Coverage:
         return estimators
 
     def scalars(self, regions: Sequence[Region] | None = None) -> dict[str, float]:
-        """The summary as a flat dict for a logger.
-
-        Args:
-            regions: As in `summary`.
+        """The summary as a flat dict for a logger, of the regions that `summary` takes.
 
         Returns:
             `"radius_m/20m/ground"`, `"detection_0.4m/20m/ground"`, `"known_share/20m/ground"` and so on, and

@@ -273,12 +273,9 @@ class Estimate:
         return Estimate(self.quantities, *both, torch.minimum(self.effective, other.effective))
 
     def differences(self, other: "Estimate") -> dict[str, Difference]:
-        """The differences to another rig over the same steps, by the keys of the quantities.
+        """The differences to the same numbers of another rig over the same steps, by the keys of the quantities.
 
         What is from fewer than 8 blocks in effect has no interval, and is neither significant nor chance.
-
-        Args:
-            other: The same numbers of the other rig.
         """
         # Two infinite numbers are equal; their difference would be NaN, which means unknown.
         values = (self.value - other.value).where(self.value != other.value, 0.0)

@@ -81,15 +81,9 @@ def terminable(told: Callable[[Sequence[int]], object]) -> Iterator[list[int]]:
     `told`: called whenever one comes, at once, with all that have come. Returns a list of those that have come.
     """
     program = _Program(told)
-    before = {number: signal.getsignal(number) for number in ENDS}
-    taken = [number for number, handler in before.items() if handler not in (signal.SIG_IGN, None)]
-    for number in taken:
-        signal.signal(number, program)
-    try:
+    taken = [number for number in ENDS if signal.getsignal(number) not in (signal.SIG_IGN, None)]
+    with _handled(taken, program):
         yield program.arrived
-    finally:
-        for number in taken:
-            signal.signal(number, before[number])
 
 
 @contextmanager
@@ -109,18 +103,22 @@ def held_back() -> Iterator[list[int]]:
         if not isinstance(handler, _Program) or handler.ends(number):
             arrived.append(number)
 
-    taken = [number for number, handler in before.items() if handler is not None]
-    for number in taken:
-        signal.signal(number, hold)
-    try:
+    with _handled([number for number, handler in before.items() if handler is not None], hold):
         yield arrived
-    finally:
-        for number in taken:
-            signal.signal(number, before[number])
     for number in arrived:
         if isinstance(before[number], _Program):
             raise KeyboardInterrupt
         signal.raise_signal(number)  # what it would have done: nothing, where it is ignored
+
+
+@contextmanager
+def _handled(numbers: Sequence[int], handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+    before = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, own in before.items():
+            signal.signal(number, own)
 
 
 class _Program:

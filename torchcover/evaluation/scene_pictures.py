@@ -95,9 +95,6 @@ def scenario_pictures(
 def vehicle_picture(vehicle: Vehicle) -> Figure:
     """A vehicle from all sides, with its mount regions.
 
-    Args:
-        vehicle: The vehicle.
-
     Raises:
         ValueError: Nothing of the vehicle is seen in a part of a region.
     """

@@ -102,11 +102,7 @@ class Frame:
     def error_of(self, rig: str | None = None) -> Tensor | None:
         """(N,) how far off the points of one rig were measured, along their rays; None if where they are.
 
-        Args:
-            rig: As in `cloud_of`.
-
-        Raises:
-            ValueError: As there.
+        It takes and refuses a `rig` as `cloud_of` does.
         """
         rig = self._named(rig)
         return self.measured[rig].error_m if rig in self.measured else None
@@ -175,9 +171,6 @@ class Frame:
     def heights_in(self, band_frame: BandFrame) -> Tensor | None:
         """The heights of the reference points that such height bands need: None for those over z of the vehicle.
 
-        Args:
-            band_frame: What the bands are over.
-
         Raises:
             ValueError: Bands over the ground, and the heights above it are unknown; bands over z, and the points have
                 square metres and heights: that is how points are drawn within bands over the ground.
@@ -212,13 +205,10 @@ class Frame:
 
 @dataclass(frozen=True, repr=False)
 class FrameBatch:
-    """Frames side by side, as `CoverageMetric.update` takes them.
+    """Frames side by side, in order, as `CoverageMetric.update` takes them.
 
     `metric.update(batch.sensor, batch.reference, error=batch.errors_of(), weights=batch.weights,
     height=batch.heights_in(grid.band_frame), place_in_time=batch.place_in_time)`.
-
-    Args:
-        frames: The frames in order.
     """
 
     frames: tuple[Frame, ...]

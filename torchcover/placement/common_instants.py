@@ -262,9 +262,6 @@ class CommonInstants:
     def prefixes(self, rig: Rig) -> Iterator[Prefix]:
         """What is known of a rig after three instants more at a time; nothing is scored before it is asked for.
 
-        Args:
-            rig: The sensors.
-
         Raises:
             ValueError: The rig cannot be mounted: a sensor inside the vehicle or another body, or below the ground.
         """

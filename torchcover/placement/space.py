@@ -223,21 +223,13 @@ class SearchSpace(VehicleSpace):
         }
 
     def violations(self, rig: Rig) -> tuple[str, ...]:
-        """Why a rig cannot be, in words; nothing if it can. Self-hits are not among it: they are known after a scan.
-
-        Args:
-            rig: A rig of the space.
-        """
+        """Why a rig cannot be, in words; nothing if it can. Self-hits are not among it: they are known after a scan."""
         wrong = (misplaced(sensor, self.carrier.skin) for sensor in rig.sensors if sensor.name in self.free)
         places = tuple(each for each in wrong if each is not None)
         return (*places, *self.constraints.broken_by(rig, self.free, self.cost_eur(rig)))
 
     def cost_eur(self, rig: Rig) -> float | None:
-        """What a rig costs: its models, and a mount for each; None if the space has no prices.
-
-        Args:
-            rig: A rig of the space.
-        """
+        """What a rig costs: its models, and a mount for each; None if the space has no prices."""
         if not self.cost:
             return None
         return sum(price_eur(self.cost, sensor.name, getattr(sensor, "model", None)) for sensor in rig.sensors)

@@ -47,11 +47,6 @@ class Sights:
         """(M,) metres from each reference point to the nearest point of the rig; infinite where none is within reach.
 
         Points that were measured farther off than that are none.
-
-        Args:
-            frame: The frame.
-            rig: Name of the rig.
-            within_m: The reach.
         """
         if self.by_sensor:
             return self.of_sensors(frame, rig, within_m).amin(dim=0)

@@ -89,7 +89,8 @@ def track_of(seen: Sequence[Seen], vehicle_class: str | None, world_T_source: Ma
     world_T_box = np.stack([one.world_T_box for one in seen])
     if world_T_source is not None:
         world_T_box = world_T_source @ world_T_box
-    checked_size(name, sizes_m.min(axis=0))
+    for size_m in sizes_m:
+        checked_size(name, size_m)
     length, width, height = checked_size(name, np.median(sizes_m, axis=0))
     places_m = world_T_box[:, :3, 3] - sizes_m[:, 2:] / 2 * world_T_box[:, :3, 2]
     angles_deg = euler_from_rotation(world_T_box[:, :3, :3])

@@ -319,8 +319,7 @@ def reference_called(name: str | None = None, rays: int | None = None, asked: As
 def reference_of_objects(asked: Asked | None = None) -> SurfaceReference:
     """The default reference sensor with 64 points for each object in range: one that knows how visible they are.
 
-    Args:
-        asked: As in `reference_called`.
+    `asked` is as in `reference_called`.
 
     Example:
         >>> reference_of_objects().object_points

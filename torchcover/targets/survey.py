@@ -116,18 +116,8 @@ def survey_places(
 ) -> Spots:
     """What some sensors see of a target at places; all that is not said here is as in `survey`.
 
-    Args:
-        rig: All sensors.
-        scenario: The world.
-        target: What is placed.
-        positions_m: (P, 2) where, in the vehicle frame.
-        counting: Numbers of the sensors that count, all if not given; the others are in the way as ever.
-        steps: As all that follows, as there.
-        every_s: As there.
-        seed: As there.
-        hits: As there.
-        threshold_m: As there.
-        heading: As there.
+    `positions_m`: (P, 2) where, in the vehicle frame; `counting`: numbers of the sensors that count, all if not given;
+    the others are in the way as ever.
     """
     _check(steps, seed, hits, threshold_m)
     scenario = with_ego(scenario, {rig.name: rig})

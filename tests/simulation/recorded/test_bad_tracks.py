@@ -144,6 +144,7 @@ def test_tables_of_nuscenes(tmp_path):
     good = json.loads(annotations.read_text())
     for change, message in (
         ({"size": [0.0, 4.0, 1.0]}, "id a1: a box needs a positive length"),
+        ({"size": [2.0, 4.0, float("inf")]}, "id a1: a box needs a positive length"),
         ({"size": [1.8]}, "not enough values to unpack"),
         ({"rotation": [0, 0, 0, 0]}, "quaternion of norm 0"),
         ({"translation": [float("nan"), 0, 0]}, "id a1: .*NaN"),

@@ -161,6 +161,16 @@ def test_what_sumo_says_is_passed_on_and_entities_never_get_to_it(tmp_path):
         Sumo(net=net, routes=(tmp_path / "none.xml",), duration_s=2.0).world(0)
 
 
+def test_a_network_that_takes_more_memory_than_it_may_says_what_to_do(tmp_path, monkeypatch):
+    (tmp_path / "bin").mkdir()
+    program = tmp_path / "bin" / "sumo"
+    program.write_text("#!/bin/sh\necho 'Error: std::bad_alloc while parsing' >&2\nexit 1\n")
+    program.chmod(0o700)
+    monkeypatch.setattr(simulating, "home", lambda: tmp_path)
+    with pytest.raises(ValueError, match=r"bad_alloc while parsing; it may take 3 GB: .* TORCHCOVER_MAX_FILE_GB to"):
+        simulating.run("sumo")
+
+
 def test_a_simulation_that_is_over_before_the_run_begins_is_refused(tmp_path):
     net, routes = DrawnStreets().build(tmp_path, np.random.default_rng(0)), tmp_path / "r.xml"
     routes.write_text("<routes/>")

@@ -11,7 +11,7 @@ from torchcover.simulation.sumo import Sumo
 from torchcover.simulation.traffic.fleet import REAR_OF
 from torchcover.simulation.traffic.procedural import Procedural
 
-from .towns import DRIVE, drive, edge, fcd, street, together, vehicle, write_net
+from .towns import DRIVE, WALK, drive, edge, fcd, street, together, vehicle, write_net
 
 UTM = (512_345.0, 5_405_678.0)
 
@@ -94,6 +94,15 @@ def test_a_vehicle_that_is_told_longer_than_its_street_is_as_long_as_the_longest
     world = made(tmp_path, *edges, steps=steps, ego_id="ego", routes=(tmp_path / "r.xml",)).world(0)
     assert [actor.name for actor in world.actors] in ([], ["truck long 0", "rear of truck long 0"])
     assert all(np.ptp(actor.mesh.vertices_m[:, 0]) < 14.0 for actor in world.actors)
+
+
+def test_who_is_too_wide_for_the_lane_between_two_kerbs_is_left_out(tmp_path):
+    kerbs = [(WALK, 2.0, [(0.0, y, 0.0), (400.0, y, 0.0)]) for y in (-2.1, 2.1)]
+    lane = edge("east", kerbs[0], (DRIVE, 2.2, [(0.0, 0.0, 0.0), (400.0, 0.0, 0.0)]), kerbs[1])
+    steps = together(drive(), drive("bus", start=90.0, type="bus"), drive("cyclist", start=120.0, type="bicycle"))
+    with pytest.warns(UserWarning, match=r"has 1 of 2 road users .* \('bus'\)"):
+        world = made(tmp_path, lane, steps=steps, ego_id="ego").world(0)
+    assert [actor.category for actor in world.actors] == ["cyclist"]
 
 
 def test_people_walk_on_the_pavement_and_step_down(tmp_path):

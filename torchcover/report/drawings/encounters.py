@@ -4,8 +4,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib import colormaps
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+
+from torchcover.report.maps.sheet import charts
 
 COLOURS = "tab10"
 
@@ -27,10 +28,8 @@ def draw_encounters(
     """
     across = min(len(panels), 3)
     down = -(-len(panels) // across)
-    figure = Figure(figsize=(1.5 + 4.2 * across, 0.8 + 3.6 * down), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
-    figure.suptitle(title, parse_math=False)
-    views = figure.subplots(down, across, squeeze=False, sharey=True).ravel()
+    figure, grid = charts(down, across, (1.5 + 4.2 * across, 0.8 + 3.6 * down), title, sharey=True)
+    views = [axes for row in grid for axes in row]
     for axes, (name, bands, needed) in zip(views, panels, strict=False):
         for number, (rig, band) in enumerate(bands.items()):
             speed_kmh, low_s, high_s = np.array(band).T

@@ -19,9 +19,6 @@ WRITERS: dict[str, type[FFMpegWriter] | type[PillowWriter]] = {".gif": PillowWri
 def check_film(path: Path) -> None:
     """Refuse, before the first figure is drawn, a film that could not be written.
 
-    Args:
-        path: The file.
-
     Raises:
         ValueError: Neither .gif nor .mp4.
         FileNotFoundError: .mp4, and the program ffmpeg is not there.

@@ -25,6 +25,7 @@ from torchcover.report.maps.sheet import (
     HEADING_POINTS,
     Bounds,
     fit_paper,
+    lower_left,
     stack_views,
     write_heading,
     write_legend,
@@ -199,8 +200,7 @@ def draw_depths(images: Mapping[str, Image], *, title: str, subtitle: str = "") 
     )
     colours.minorformatter = NullFormatter()
     write_title(views[0], title, subtitle, lift_points=HEADING_POINTS)
-    lowest = min(views, key=lambda axes: (axes.get_position().y0, axes.get_position().x0))
-    write_legend(lowest, _entries(arrays), columns=2)
+    write_legend(lower_left(views), _entries(arrays), columns=2)
     fit_paper(figure)
     return figure
 

@@ -5,10 +5,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
+
+from torchcover.report.maps.sheet import charts
 
 Float64 = NDArray[np.float64]
 
@@ -173,7 +174,4 @@ def draw_choice(
 
 
 def _sheet(rows: int, columns: int, title: str) -> tuple[Figure, list[list[Axes]]]:
-    figure = Figure(figsize=(max(4.2 * columns, 6.4), 3.6 * rows + 0.9), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
-    figure.suptitle(title, parse_math=False)
-    return figure, [list(row) for row in figure.subplots(rows, columns, squeeze=False)]
+    return charts(rows, columns, (max(4.2 * columns, 6.4), 3.6 * rows + 0.9), title)

@@ -5,9 +5,10 @@ from collections.abc import Mapping, Sequence
 
 from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
+
+from torchcover.report.maps.sheet import charts
 
 MARKERS = "osD^vP*X"
 COLORMAP = "viridis"
@@ -28,10 +29,7 @@ def draw_work_precision(panels: Mapping[str, Lines], *, title: str, legend_title
     Returns:
         A figure of its own, outside pyplot. Lines differ in marker and colour, by their order.
     """
-    figure = Figure(figsize=(12.0, 5.6), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
-    figure.suptitle(title, parse_math=False)
-    views = figure.subplots(1, len(panels), squeeze=False)[0]
+    figure, (views,) = charts(1, len(panels), (12.0, 5.6), title)
     for axes, (label, lines) in zip(views, panels.items(), strict=True):
         _draw_panel(axes, label, lines)
     handles, labels = views[0].get_legend_handles_labels()

@@ -96,7 +96,7 @@ def draw_side_by_side(
         own = (sensors or {}).get(name, ())
         entries += draw_sensors(sheet, own, named=not name) if directions else draw_places(sheet, own)
     write_title(sheets[0].axes, title, subtitle, lift_points=HEADING_POINTS if any(arrays) else 0.0)
-    write_legend(lower_left(sheets), entries, sheets[0].legend_columns)
+    write_legend(lower_left(sheet.axes for sheet in sheets), entries, sheets[0].legend_columns)
     fit_paper(sheets[0].figure)
     return sheets[0].figure
 

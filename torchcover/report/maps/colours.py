@@ -90,12 +90,7 @@ def scale_of(quantity: Quantity, values: Tensor) -> ColourScale:
 
 
 def difference_scale(quantity: Quantity, differences: Tensor) -> ColourScale:
-    """Scale for differences: white is none, blue is better, red is worse, both to the 98th percentile of the size.
-
-    Args:
-        quantity: What differs.
-        differences: As in `scale_of`.
-    """
+    """Scale for differences: white is none, blue is better, red is worse, both to the 98th percentile of the size."""
     end = _robust_end(differences.abs())
     colormap = "RdBu_r" if quantity.lower_is_better else "RdBu"
     return ColourScale(f"difference, {quantity.title}", shown_unit(quantity.unit).difference_name, colormap, -end, end)

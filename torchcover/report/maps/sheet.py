@@ -1,7 +1,7 @@
 """The paper under a picture: as large as what is on it; every cell of a map a whole number of pixels."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -119,6 +119,16 @@ def stack_views(views: Sequence[tuple[Bounds, Bounds]], *, width_in: float) -> t
     return figure, axes
 
 
+def charts(
+    rows: int, columns: int, size_in: tuple[float, float], title: str, *, sharey: bool = False
+) -> tuple[Figure, list[list[Axes]]]:
+    """Empty charts in rows under a title, which matplotlib arranges: a figure of its own, outside pyplot."""
+    figure = Figure(figsize=size_in, dpi=DOTS_PER_INCH, layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(title, parse_math=False)
+    return figure, [list(row) for row in figure.subplots(rows, columns, squeeze=False, sharey=sharey)]
+
+
 def write_title(axes: Axes, title: str, subtitle: str, lift_points: float = 0.0) -> None:
     """Write two lines above the map, the second smaller, both as they are: `$` is no formula."""
     axes.annotate(title, (0, 1), (0, 22 + lift_points), fontsize=11, fontweight="bold", **ABOVE)
@@ -130,9 +140,9 @@ def write_heading(axes: Axes, heading: str) -> None:
     axes.annotate(heading, (0, 1), (0, 5), fontsize=9, fontweight="bold", **ABOVE)
 
 
-def lower_left(sheets: Sequence[Sheet]) -> Axes:
-    """The map in the lower left corner, under which the legend of all has its place."""
-    return min((sheet.axes for sheet in sheets), key=lambda axes: (axes.get_position().y0, axes.get_position().x0))
+def lower_left(views: Iterable[Axes]) -> Axes:
+    """The one in the lower left corner, under which the legend of all has its place."""
+    return min(views, key=lambda axes: (axes.get_position().y0, axes.get_position().x0))
 
 
 def write_legend(axes: Axes, entries: Sequence[Artist], columns: int) -> None:

@@ -28,10 +28,6 @@ NO_ERRORS = "Errors of single cells are left out, so that this file stays small:
 def fitted(maps: Sequence[PageMap], most_bytes: float = Page.most_bytes) -> tuple[list[PageMap], list[str]]:
     """Take cells together where maps have no errors beside some that have; leave out errors; take all cells together.
 
-    Args:
-        maps: All of a page.
-        most_bytes: What they may take.
-
     Returns:
         The maps, and what was left out in words.
     """
@@ -101,11 +97,7 @@ SCRIPTS = ("cells.js", "map.js", "page.js", "controls.js")
 
 
 def page_html(page: Page) -> str:
-    """The text of the file.
-
-    Args:
-        page: What it shows.
-    """
+    """The text of its file."""
     cells = CellBytes()
     maps, notes = fitted(page.maps, page.most_bytes)
     content = as_json(map_content(replace(page, maps=maps), cells))

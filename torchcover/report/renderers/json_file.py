@@ -17,9 +17,6 @@ def render(table: CoverageTable) -> str:
 def table_dict(table: CoverageTable) -> dict[str, Any]:
     """Everything of a table that JSON can hold, for `summary.json`.
 
-    Args:
-        table: The table.
-
     Returns:
         A dict that `json.dumps(..., allow_nan=False)` takes: lengths in metres, detection and shares in [0, 1]; the
         counts of several rigs by their names. A difference is this rig minus the first. JSON has neither NaN nor

@@ -170,9 +170,10 @@ def _keep_off(
             np.array([users[number].sizes_m[is_rear] for number, is_rear in look]).reshape(-1, 2), counts, axis=0
         )
         looked_at = [(rears if is_rear else poses)[number][at] for (number, is_rear), at in look.items()]
-        push_m = _push_m(obstacles, np.concatenate([np.empty((0, 3)), *looked_at]), size_m)
+        sides_m = _push_m(obstacles, np.concatenate([np.empty((0, 3)), *looked_at]), size_m)
         over_m[[number for number, _ in look]] = 0.0
-        np.maximum.at(over_m, of, np.abs(push_m))
+        np.maximum.at(over_m, of, np.abs(sides_m).max(axis=0))
+        push_m = sides_m.sum(axis=0)
         met = np.unique(of[push_m != 0.0]).tolist()
         if not met or swing == SWINGS:
             break
@@ -252,7 +253,7 @@ def _overlap(one: Float64, size_m: Float64, other: Float64, other_size_m: Float6
 
 
 def _push_m(obstacles: NDArray[np.object_], poses: Float64, size_m: Float64) -> Float64:
-    """(K,) how far K rectangles have to go to their left to be off obstacles, or to their right if that is negative."""
+    """(2, K) how far K rectangles have to go to their right, negative, and to their left to be off obstacles."""
     outlines = shapely.polygons(corners_m(poses, size_m))
     part, body = shapely.STRtree(outlines).query(obstacles, predicate="intersects")
     common = shapely.intersection(outlines[body], obstacles[part])
@@ -265,11 +266,9 @@ def _push_m(obstacles: NDArray[np.object_], poses: Float64, size_m: Float64) -> 
     # A piece lies on the side where its middle is.
     half_m = size_m[body, 1] / 2
     need_m = np.where(low_m + high_m > 0, low_m - half_m, high_m + half_m)
-    pushed = np.zeros(len(poses))
-    for worst in (np.minimum, np.maximum):
-        of_side = np.zeros(len(poses))
+    pushed = np.zeros((2, len(poses)))
+    for worst, of_side in zip((np.minimum, np.maximum), pushed, strict=True):
         worst.at(of_side, body, need_m)
-        pushed += of_side
     return pushed
 
 

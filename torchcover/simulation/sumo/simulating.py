@@ -13,6 +13,7 @@ from tempfile import TemporaryFile
 from xml.etree import ElementTree
 
 from torchcover.files import end_with_parent, most_gb, parse_xml, reads
+from torchcover.files.bad_file import VARIABLE
 from torchcover.simulation.sumo.floating import ATTRIBUTES
 from torchcover.simulation.traffic.assemble import HORIZON_M
 
@@ -64,7 +65,10 @@ def output_of(program: str, *options: str | Path, cpu_s: float = math.inf) -> It
             raise ValueError(f"SUMO's {program} took more than {cpu_s:g} s of processor time; is the file damaged?")
         if ended:
             said.seek(0)
-            raise ValueError(f"SUMO's {program} fails: {_errors(said.read().decode('utf-8', 'replace').splitlines())}")
+            told = _errors(said.read().decode("utf-8", "replace").splitlines())
+            if "bad_alloc" in told:
+                told += f"; it may take {most_gb():g} GB: take a piece of the network, or set {VARIABLE} to more"
+            raise ValueError(f"SUMO's {program} fails: {told}")
 
 
 def _errors(lines: Sequence[str]) -> str:
