@@ -308,7 +308,7 @@ def check(
     **settings: Any,  # noqa: ANN401
 ) -> None:
     """Is it enough? Exit code 0: all is checked and kept; 1: something is not kept; 3: something is not checked."""
-    from torchcover.cli.printing import print_files
+    from torchcover.cli.printing import print_files, print_verdict
     from torchcover.evaluation import check
     from torchcover.files import claimed
     from torchcover.report import Terminal, print_whole
@@ -318,6 +318,7 @@ def check(
         written = found.save(out)
     print_whole(found.tables())
     print_files(written, out, Terminal())
+    print_verdict(found.verdict, Terminal())
     raise typer.Exit(found.exit_code)
 
 
@@ -347,9 +348,16 @@ def encounter(
     **settings: Any,  # noqa: ANN401
 ) -> None:
     """Would it see the child in time? Of crossings and other encounters: the time to collision at detection."""
-    from torchcover.cli.printing import print_files
+    from torchcover.cli.printing import print_files, print_verdict
     from torchcover.encounters import Criterion
-    from torchcover.evaluation import encounter, encounter_film, met_in_recording, met_in_traffic, save_encounters
+    from torchcover.evaluation import (
+        encounter,
+        encounter_film,
+        encounters_verdict,
+        met_in_recording,
+        met_in_traffic,
+        save_encounters,
+    )
     from torchcover.files import claimed
     from torchcover.report import Terminal, check_film, print_whole, write_film
 
@@ -379,6 +387,7 @@ def encounter(
         write_film(film, encounter_film((rigs or [])[0], found, **told), per_s=10)
     print_whole(found.tables())
     print_files(written, out, Terminal())
+    print_verdict(encounters_verdict(found), Terminal())
 
 
 @with_options(of_evaluate("sensor_model"))

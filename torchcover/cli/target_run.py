@@ -5,9 +5,9 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from torchcover.cli.printing import print_files
+from torchcover.cli.printing import print_files, print_verdict
 from torchcover.evaluation import save_targets, survey_target
-from torchcover.evaluation.target_survey import places_table, sides_table
+from torchcover.evaluation.target_survey import places_table, sides_table, target_verdict
 from torchcover.files import claimed
 from torchcover.report import Terminal, print_whole
 from torchcover.simulation import Rig
@@ -43,6 +43,7 @@ def run(
         written = save_targets(seen, out, Rig.load(rig).sensors, files=files)
     _print(seen)
     print_files(written, out, Terminal())
+    print_verdict(target_verdict({seen.rig: seen}), Terminal())
 
 
 def parsed_raster(text: str) -> Raster:

@@ -3,6 +3,7 @@ from .checking import check as check
 from .checkpoint import Checkpoint as Checkpoint
 from .encountering import encounter as encounter
 from .encountering import encounter_film as encounter_film
+from .encountering import encounters_verdict as encounters_verdict
 from .encountering import met_in_recording as met_in_recording
 from .encountering import met_in_traffic as met_in_traffic
 from .encountering import save_encounters as save_encounters

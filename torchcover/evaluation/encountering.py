@@ -232,7 +232,7 @@ def save_encounters(found: Sightings, folder: str | Path, *, files: str | Iterab
         files: What to write beside `summary.json`, as in `Result.save`; "maps" is the picture.
     """
     wanted = wanted_files(files)
-    record = found.record()
+    record = {"verdict": list(encounters_verdict(found)), **found.record()}
     with Publication(Path(folder)) as written:
         with held_back():
             if "numbers" in wanted:

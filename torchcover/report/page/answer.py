@@ -1,5 +1,6 @@
 """What a page shows first: plans of where a body is seen, what fails with a sensor, and how far is seen; as HTML."""
 
+import math
 from collections.abc import Sequence
 from html import escape
 from itertools import groupby
@@ -8,7 +9,7 @@ from torchcover.report.failures import decisive
 from torchcover.report.page.content import PagePlan, PageRange
 from torchcover.report.table import CoverageTable
 from torchcover.report.verdict import BANDS
-from torchcover.report.wording import capitalised, number_words, square_metres
+from torchcover.report.wording import UNKNOWN, capitalised, number_words, square_metres
 
 # Of the plan, beyond which nothing is drawn; lines are so far from the vehicle.
 REACH_M = 3.4
@@ -52,14 +53,14 @@ def ranges_html(ranges: Sequence[PageRange]) -> str:
     for one in ranges:
         for at, (rig, number) in enumerate(one.of_rigs.items()):
             name = f'<th scope="rowgroup" rowspan="{len(one.of_rigs)}">{escape(one.name)}</th>' if at == 0 else ""
-            ends = number.low if number.low == number.low else number.value, number.value, number.high
-            low, value, high = (100 * end if end == end else 100 * number.value for end in ends)
-            bar = f'<line x1="{low:.1f}" x2="{high:.1f}" y1="4" y2="4" class="rig{at % 2}"/>'
-            dot = f'<circle cx="{value:.1f}" cy="4" r="1.6" class="rig{at % 2}"/>' if value == value else ""
-            drawn = (
-                f'<svg viewBox="-3 0 106 8" aria-hidden="true"><path d="M0 8V7H100V8" class="axis"/>{bar}{dot}</svg>'
-            )
-            words = words_html(f"{number_words(number)} %")
+            marks, words = "", UNKNOWN
+            if not math.isnan(number.value):
+                value, words = 100 * number.value, words_html(f"{number_words(number)} %")
+                marks = f'<circle cx="{value:.1f}" cy="4" r="1.6" class="rig{at % 2}"/>'
+            if not math.isnan(number.low):
+                ends = f'x1="{100 * number.low:.1f}" x2="{100 * number.high:.1f}"'
+                marks += f'<line {ends} y1="4" y2="4" class="rig{at % 2}"/>'
+            drawn = f'<svg viewBox="-3 0 106 8" aria-hidden="true"><path d="M0 8V7H100V8" class="axis"/>{marks}</svg>'
             lines.append(f'<tr>{name}<th scope="row">{escape(rig)}</th><td>{drawn}</td><td>{words}</td></tr>')
     return f'<h2>How far</h2><div class="wide"><table class="ranges"><tbody>{"".join(lines)}</tbody></table></div>'
 
