@@ -34,6 +34,7 @@ BENCHMARKS = (
     "placement",
     "optimisers",
     "choices",
+    "nothing",
     "published",
     "voxels",
     "streets",

@@ -43,14 +43,16 @@ def main(arguments=()):
     worse = sum(any(change.is_worse for change in one.changes) for one in tests)
     better = sum(any(change.p <= 0.05 and change.test.gain > 0 for change in one.changes) for one in tests)
     gained = sum(one.best.gains[0].test.significant for one in found if one.best.gains)
-    rows = [(len(found), len(tests), len(tests[0].changes), worse, better, gained)]
+    numbers = max((len(one.changes) for one in tests), default=0)
+    rows = [(len(found), len(tests), numbers, worse, better, gained)] * bool(found)
     table(("searches", "tested", "numbers each", "say worse", "say better", "say gained or lost"), rows)
     print()
     plan, rows = {"evaluations": options.evaluations}, []
     for what, more in (("none", {}), ("a child ahead", {"requirements": {"requirements": [CHILD]}})):
         result, seconds = searched(SPACE | more, **plan)
-        rows.append((what, seconds, seconds / (rows[0][1] if rows else seconds), result.sentence))
-    table(("requirement", "seconds", "times", "it said"), rows)
+        gained = result.best.gains[0].words if result.best.gains else "-"
+        rows.append((what, seconds, seconds / (rows[0][1] if rows else seconds), gained))
+    table(("requirement", "seconds", "times", "gained (points)"), rows)
 
 
 if __name__ == "__main__":
