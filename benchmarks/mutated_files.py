@@ -60,7 +60,7 @@ def main():
         reading.end()
     children_mb = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
     print(
-        f"{arguments.files:,} files of each of {len(arguments.seeds)} seeds. The largest size of this process was "
+        f"{arguments.files:,} files of each seed: {arguments.seeds}. The largest size of this process was "
         f"{_largest_mb():.0f} MB, of one that reads for it {children_mb:.0f} MB.\n"
     )
     table(

@@ -1,5 +1,6 @@
 """Boxes, the points in them, and the boxes of simulated frames."""
 
+import dataclasses
 import math
 import pickle
 import warnings
@@ -11,7 +12,7 @@ from torch.utils.data import DataLoader
 
 from torchcover import Scenario
 from torchcover.data import Frame, SimulatedFrames, collate_frames
-from torchcover.detection import Boxes, box_visibility, match, points_in_boxes
+from torchcover.detection import Boxes, BoxVisibility, box_visibility, match, points_in_boxes
 from torchcover.detection.inside import SKIN_M
 from torchcover.simulation import PaperReference, Rig
 
@@ -310,3 +311,19 @@ def test_an_array_of_numpy_is_refused_by_its_name(call, name):
     rows = torch.ones(2, 7)
     with pytest.raises(TypeError, match=rf"^{name}: .* got a NumPy array of float32; torch.from_numpy\(array\) makes"):
         call(rows.numpy(), rows, Boxes.from_rows(rows))
+
+
+def test_a_warning_of_degrees_names_the_line_that_made_the_boxes():
+    numbers = torch.tensor([[4.0, 2.0, 1.5]])
+    with pytest.warns(UserWarning, match="beyond a full turn, so it may be in degrees") as told:
+        Boxes(numbers, numbers, torch.tensor([90.0]))
+    assert [one.filename for one in told] == [__file__]
+    Boxes(numbers, numbers, torch.tensor([-2 * math.pi]))
+
+
+def test_boxes_and_what_was_seen_of_them_stay_as_they_are():
+    boxes = Boxes.from_rows(torch.tensor([[5.0, 0.0, 0.75, 4.0, 2.0, 1.5, 0.0]]))
+    one = torch.ones(1)
+    for made, name in ((boxes, "centre_m"), (BoxVisibility(one, one, one, one, one, 0.4), "share")):
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            setattr(made, name, one)
