@@ -57,11 +57,16 @@ def on_files(files, config):
     return files
 
 
+def on_page_markdown(markdown, **_):
+    """On the site, the notebook is a page."""
+    return markdown.replace("](notebook.ipynb)", "](notebook.md)")
+
+
 def first_page():
     """The README, with its links seen from `docs`."""
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     text = re.sub(r"\]\(docs/([^)]*)\)", lambda link: f"]({link[1]})", text)
-    text = text.replace("](measured)", "](measured/README.md)").replace("](notebook.ipynb)", "](notebook.md)")
+    text = text.replace("](measured)", "](measured/README.md)")
     # What is not part of the site is named, not linked.
     return re.sub(r"\[([^\]]*)\]\((CONTRIBUTING|CHANGELOG)\.md\)", r"\1 (\2.md)", text)
 

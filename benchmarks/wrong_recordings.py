@@ -25,9 +25,9 @@ RIGHT = {
     "poses off by 5 cm and 0.1 degrees": "",
     "rain or dust, a tenth of the points": "",
     "the first two sweeps": "",
-    "stands": "",
 }
 WRONG = {
+    "stands": "measure where it drives",
     "rotations x, y, z, w": "--quaternions xyzw",
     "poses are vehicle_T_world": "--poses inverse",
     "x and y of poses exchanged": "--poses yx",
@@ -136,6 +136,8 @@ def main(argv):
                     for each in recordings
                     if not mended or matters(each, fault)
                 ]
+                # An ego that stands at a light is told of, too.
+                said = [[doubt for doubt in doubts if fault == "stands" or "stands in" not in doubt] for doubts in said]
                 found, right = sum(map(bool, said)), sum(mended in " ".join(doubts) for doubts in said if doubts)
                 row.append(f"{found} / {right} of {len(said)}" if mended else f"{found} of {len(said)}")
             rows.append(row)

@@ -171,3 +171,20 @@ def test_a_recording_that_does_not_say_that_it_is_whole(tmp_path):
     ]
     (tmp_path / "recording.json").write_text('{"frames": ["f0", "f1"]}')
     assert doubts(street) == []
+
+
+def test_a_vehicle_that_stands_is_no_judge_of_its_own_sensors():
+    def doubts(way_m, sensors=None, steps=30):
+        drive = Drive(steps=steps, labelled=False)
+        drive.rigs = {"one": ("right",)}
+        place = drive.world_T_vehicle
+        drive.world_T_vehicle = lambda index: rigid(np.eye(3), place(index)[:3, 3] * way_m / 1.5)
+        told = RecordedFrames(drive, reference=AccumulatedReference(2.0, sensors=sensors)).doubts()
+        return [doubt for doubt in told if "the vehicle stands" in doubt]
+
+    (told,) = doubts(0.0)
+    assert "stands in 5 of 5 windows" in told
+    assert doubts(0.01)
+    assert not doubts(1.5)
+    assert not doubts(0.0, sensors=("left",))  # another one judges
+    assert not doubts(0.0, steps=2)  # too short a time to say so

@@ -84,6 +84,20 @@ SCRIPT = """
   found.gallery = [...document.querySelectorAll("#gallery figcaption")].map((one) => one.textContent);
   document.querySelectorAll("#gallery button")[4].click();
   found.from_gallery = map.getAttribute("aria-label");
+  const touch = (kind, pointerId, right) => {
+    const box = map.getBoundingClientRect();
+    map.dispatchEvent(new PointerEvent(kind, { clientX: box.left + 300 + right, clientY: box.top + 200, pointerId }));
+  };
+  const wide = page.view.metres;
+  touch("pointerdown", 7, 0); touch("pointerdown", 8, 100); touch("pointermove", 8, 200);
+  found.pinched = wide / page.view.metres;
+  touch("pointercancel", 7, 0); touch("lostpointercapture", 8, 200);
+  const held = [...page.view.centre];
+  touch("pointermove", 7, 90); touch("pointermove", 8, 10);
+  found.let_go = held.every((value, axis) => value === page.view.centre[axis]);
+  const kept = new Kept();
+  for (const name of ["a", "b", "a", "c"]) kept.get(name, () => name, () => 60e6);
+  found.remembered = [[...kept.values.keys()].sort(), kept.bytes];
   found.title = document.title;
   found.scripts = document.scripts.length;
   found.bold = document.querySelectorAll("b").length;
@@ -245,6 +259,15 @@ def test_a_wide_table_fits_the_paper_and_breaks_no_short_heading(tmp_path):
     dom, console = browsed(text, tmp_path / "page.html", script)
     assert console == []
     assert "<title>true,1</title>" in dom
+
+
+def test_two_fingers_zoom_and_pointers_that_are_lost_let_go(seen):
+    assert seen[0]["pinched"] == pytest.approx(2.0)
+    assert seen[0]["let_go"]
+
+
+def test_what_was_not_looked_at_longest_is_forgotten_within_a_budget_of_memory(seen):
+    assert seen[0]["remembered"] == [["a", "c"], 120e6]
 
 
 def test_names_are_text(seen):

@@ -36,6 +36,8 @@ STEP_M, WAY_M, SIDEWAYS_DEG, MOST_OF_WAY = (0.05, 20.0), 5.0, (45.0, 135.0), 0.8
 FASTEST_MPS = 100.0
 # Half of the points of a LiDAR are nearer, in metres; and in centimetres.
 FARTHEST_USUAL_M, FARTHEST_USUAL_CM = 300.0, 4000.0
+# Who moves less within a window stands.
+MOVES_M = 1.0
 # So high above the ground, so many points are the vehicle's own.
 OWN_ABOVE_M, OWN_POINTS = 0.3, 20
 
@@ -84,7 +86,11 @@ def suspicions(recording: Recording, reference: Reference, rigs: Mapping[str, Se
         *(wrong_motion(recording) if disagreeing is None else [disagreeing]),
         nothing_labelled(recording, many),
         unmarked(recording),
-        alone_in_window(recording, reference) if isinstance(reference, AccumulatedReference) else None,
+        *(
+            (alone_in_window(recording, reference), standing(recording, reference, judged, many))
+            if isinstance(reference, AccumulatedReference)
+            else ()
+        ),
     ]
     return [f"{recording.path}: {doubt}" for doubt in doubts if doubt is not None]
 
@@ -241,6 +247,26 @@ def alone_in_window(recording: Recording, reference: AccumulatedReference) -> st
     return (
         f"its instants are {apart_s:g} s apart, and a window of {reference.window_s:g} s reaches none but its own: are "
         "the times in seconds? Else ask for a longer window (--window-s)"
+    )
+
+
+def standing(recording: Recording, reference: AccumulatedReference, judged: Iterable[str], many: int) -> str | None:
+    """Whether a judged sensor is its own reference in windows in which it hardly moves."""
+    taking_part, times_s = recording.sensors if reference.sensors is None else reference.sensors, recording.times_s
+    if times_s is None or not set(taking_part) & set(judged):
+        return None
+    ways_m = []
+    for position in _spread(many, FRAMES):
+        instants = reference.sweeps.instants(recording, recording.frames[position])
+        poses = [pose for instant in instants if (pose := recording.world_T_vehicle(instant)) is not None]
+        if np.ptp(times_s[instants]) >= reference.window_s / 2 > 0:
+            ways_m.append(float(np.linalg.norm(np.ptp([pose[:3, 3] for pose in poses], axis=0))))
+    still = sum(way_m < MOVES_M for way_m in ways_m)
+    if not ways_m or still < len(ways_m) / 2:
+        return None
+    return (
+        f"the vehicle stands in {still} of {len(ways_m)} windows, where its own scans show little but what they see at "
+        "the instant, and numbers are far too good: measure where it drives, or against a sensor that is not judged"
     )
 
 
