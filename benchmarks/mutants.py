@@ -159,6 +159,7 @@ def tested(tree: str, printed: str, tests: list[str]) -> None:
     os.dup2(output, 2)
     os.chdir(tree)
     sys.path.insert(0, tree)
+    multiprocessing.set_start_method(None, force=True)  # that of a process that nobody serves
     for name in [name for name in sys.modules if name.split(".")[0] in ("benchmarks", "tests", "torchcover")]:
         del sys.modules[name]
     order = Quickest(Path(tree, "durations.json"))
