@@ -60,7 +60,7 @@ def draw_four_views(radius, points, grid, *, steps, title, ego_outline_m, sensor
     for sheet in (sectors, histogram, *maps):
         entries += draw_ego(sheet.axes, ego_outline_m)
     write_title(sectors.axes, title, steps_and_cell(steps, grid), lift_points=HEADING_POINTS)
-    write_legend(lower_left(maps), entries, sectors.legend_columns)
+    write_legend(lower_left(sheet.axes for sheet in maps), entries, sectors.legend_columns)
     fit_paper(sectors.figure)
     return sectors.figure
 
