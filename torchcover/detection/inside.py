@@ -37,6 +37,9 @@ def points_in_boxes(points: Tensor, boxes: Boxes, *, skin_m: float = SKIN_M) -> 
         boxes: K boxes in the same frame, on the same device.
         skin_m: How much thicker.
 
+    Returns:
+        `Inside(box, point)`: (P,) int64 each, one entry for each pair.
+
     Raises:
         TypeError: The points are no tensor.
 

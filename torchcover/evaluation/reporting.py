@@ -185,6 +185,9 @@ def report(
         budget_s: Seconds: traffic, which comes last, ends when they are over, but not before it has intervals.
         progress: Whether to show a bar.
 
+    Returns:
+        Its answer in `verdict`; `save` writes the page.
+
     Raises:
         FileNotFoundError: An unknown name or file.
         ValueError: A file that cannot be used, a number out of its bounds, no rig or too many, several kinds of world.
@@ -192,7 +195,7 @@ def report(
     Example:
         >>> found = report("front_roof_128", "courtyard", steps=8)
         >>> print(found.verdict[0])
-        Seeing a child of 1.10 m at places within 2 m: front_roof_128 at 58 %.
+        A child of 1.10 m is seen at 35 % of the places within 2 m by front_roof_128.
     """
     start_s = time.monotonic()
     given = [rigs] if isinstance(rigs, str | Path | Rig) else list(rigs)

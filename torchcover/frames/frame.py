@@ -346,6 +346,9 @@ def collate_frames(frames: Sequence[Frame]) -> FrameBatch:
     Args:
         frames: Frames whose clouds may differ in size.
 
+    Returns:
+        A `FrameBatch` of all of them.
+
     Example:
         >>> frame = Frame({"rig": torch.zeros(5, 3)}, torch.zeros(9, 3), index=0, name="a")
         >>> [len(cloud) for cloud in collate_frames([frame, frame]).reference]

@@ -88,6 +88,9 @@ def read_robot(path: Path, packages: Mapping[str, str | Path] | None = None) -> 
         packages: Name of a ROS package -> its folder. Others are looked for around the file: a folder of this name, or
             one that has the rest of the path.
 
+    Returns:
+        The robot: its body in the vehicle frame, in metres, and the keys of its sensors as in YAML.
+
     Raises:
         BadFileError: Not a URDF; links that are no tree; meshes that are missing, all of them named; a sensor without
             what it needs; numbers that are none.

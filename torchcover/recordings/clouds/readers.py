@@ -53,6 +53,9 @@ def read_cloud(path: Path) -> Points:
     name the columns); `.las` and `.laz` (the latter with `torchcover[las]`). In a file without names the first three
     columns are x y z.
 
+    Args:
+        path: The file.
+
     Returns:
         (N, 3) points in metres in the file's own frame, non-finite ones included: float64 where the file stores
         float64 or text, so that UTM-sized coordinates keep their digits, else float32. N may be 0.
