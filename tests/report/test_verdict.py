@@ -1,5 +1,6 @@
 """No sentence says what may be chance, and each number in it is one of the table."""
 
+import math
 import re
 from dataclasses import replace
 
@@ -20,6 +21,8 @@ def with_bodies(table, shares, best=None):
     for rig, share in shares.items():
         row = table.rows[rig][0]
         number = row.summary.numbers[key]._replace(value=share)
+        if len(shares) == 1 and share in (0.0, 1.0):  # all blocks say so
+            number = number._replace(error=math.nan, low=math.nan, high=math.nan)
         summary = replace(row.summary, region="front_3m", height="child_110cm", numbers={key: number})
         bodies[rig] = (Row(rig, Region("front_3m", (2.0, 5.0), (-1.0, 1.0)), summary,
                            frozenset({key} if rig == best else ()), {}),)  # fmt: skip
@@ -44,13 +47,17 @@ def test_of_several_only_who_leads_by_more_than_chance_is_told(trio):
 
 
 def test_without_errors_nothing_is_told(pair, blind, trios, regions):
-    for coverages in (pair, blind, {"few": pair["few"]}, trios(4)):
+    for coverages in (pair, blind, {"few": pair["few"]}):
         assert verdict(CoverageTable.of(coverages, AHEAD)) == ()
+    (sentence,) = verdict(CoverageTable.of(trios(4), AHEAD))
+    assert sentence.startswith("Too few steps for an answer")
     assert verdict(CoverageTable.of(pair, regions[1:])) == ()
 
 
 @pytest.mark.parametrize(("shares", "best", "sentence"), [
     ({"many": 0.997}, None, "Free places within 3 m where a child is seen: in front 99 % ["),
+    ({"many": 0.0}, None, "Free places within 3 m where a child is seen: in front 0 %."),
+    ({"many": 1.0}, None, "Free places within 3 m where a child is seen: in front 100 %."),
     ({"few": 0.004, "many": 1.0}, "many", "where a child is seen: in front many 100 %, few 1 %."),
     ({"few": 0.5, "many": 0.6}, None, "Of the places within 3 m where a child is seen, no rig has more than"),
 ])  # fmt: skip

@@ -124,7 +124,9 @@ class Result:
     @property
     def verdict(self) -> tuple[str, ...]:
         """The answer in sentences, the first of which says most; none tells what may be chance."""
-        return verdict(self.table)
+        of_rigs = self.source.get("sensor_model")
+        models = set(of_rigs.values()) if isinstance(of_rigs, Mapping) else set()
+        return (*verdict(self.table), *(sensor_model_words(of_rigs) if len(models) > 1 else ()))
 
     @property
     def tables(self) -> list[PageTable]:

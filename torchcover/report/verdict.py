@@ -11,6 +11,7 @@ from torchcover.report.table import CoverageTable, Row
 # The range that is told is that of the region ahead that reaches farthest, but no farther than this.
 RANGE_M = 80.0
 BANDS = {"ground": "the ground", "obstacle": "obstacles"}
+TOO_FEW = "Too few steps for an answer: more `--steps`, far enough apart, give intervals."
 SIDES = {"front_3m": "in front", "rear_3m": "behind", "left_3m": "on the left", "right_3m": "on the right"}
 
 
@@ -22,10 +23,11 @@ def verdict(table: CoverageTable) -> tuple[str, ...]:
 
     Returns:
         Sentences: on bodies beside the vehicle, on the range, on the failure of a sensor; those that there are numbers
-        for.
+        for, or that steps are too few.
     """
-    told = (rule(table) for rule in RULES)
-    return tuple(sentence for sentence in told if sentence)
+    told = tuple(filter(None, (rule(table) for rule in RULES)))
+    asked = table.first.blocks is not None
+    return (TOO_FEW,) if asked and not told and (table.first.blocks or 0) < MIN_BLOCKS else told
 
 
 def on_near_field(table: CoverageTable) -> str:
@@ -36,7 +38,8 @@ def on_near_field(table: CoverageTable) -> str:
     body, key = rows[0][0].summary.height, table.body_quantities[0].key
     near = [of for of in rows if of[0].summary.height == body and of[0].region.name in SIDES]
     of_sides = {SIDES[of[0].region.name]: of for of in near}
-    told = {side: _told(of, key) for side, of in of_sides.items()}
+    enough = (table.first.blocks or 0) >= MIN_BLOCKS
+    told = {side: _told(of, key, enough=enough) for side, of in of_sides.items()}
     known = [f"{side} {words}" for side, words in told.items() if words]
     seen = f"{body_words(body)} is seen"
     if known:
@@ -53,7 +56,7 @@ def on_range(table: CoverageTable) -> str:
         return ""
     key, where = decisive(table).key, f"to {region.x[1]:g} m ahead"
     bands = [of for of in table.places if of[0].region is region]
-    told = {BANDS.get(of[0].summary.height, of[0].summary.height): _told(of, key) for of in bands}
+    told = {BANDS.get(of[0].summary.height, of[0].summary.height): _told(of, key, enough=True) for of in bands}
     known = [f"of {band} {words}" for band, words in told.items() if words]
     if known:
         return f"Detected {where}: {'; '.join(known)}."
@@ -77,12 +80,14 @@ def on_failure(table: CoverageTable) -> str:
 RULES: tuple[Callable[[CoverageTable], str], ...] = (on_near_field, on_range, on_failure)
 
 
-def _told(rows: Sequence[Row], key: str) -> str:
+def _told(rows: Sequence[Row], key: str, *, enough: bool) -> str:
     """A share of one rig with its interval; of several who leads by more than chance; no words if nobody knows."""
     if len(rows) == 1:
         number = rows[0].summary.numbers[key]
-        interval = f"[{whole_percent(number.low)}, {whole_percent(number.high)}]"
-        return "" if math.isnan(number.low) else f"{whole_percent(number.value)} % {interval}"
+        # Where all blocks say the same there is no interval, and nothing is left to chance.
+        agreed = math.isnan(number.low) and number.value in (0.0, 1.0) and enough
+        interval = "" if agreed else f" [{whole_percent(number.low)}, {whole_percent(number.high)}]"
+        return f"{whole_percent(number.value)} %{interval}" if agreed or not math.isnan(number.low) else ""
     leader = next((row for row in rows if key in row.best), None)
     if leader is None:
         return ""

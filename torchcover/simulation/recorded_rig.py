@@ -121,8 +121,7 @@ def _lidar(recording: Recording, name: str, known: SensorCalibrations, model: st
     mounted += f", its rays' origin {found.origin_m:+.2f} m higher" if found.origin_m else ""
     return {"type": "lidar", "name": name, "mount": _pose(mount), **_pattern(found)}, (
         f"{mounted}; estimated from {count} scan{'s' * (count > 1)}: {len(found.elevations_deg)} rows (those that "
-        f"returned anything), {found.columns:,} columns, ranges of the nearest and the farthest return"
-        + (undone and f"; {undone}")
+        f"returned anything), {found.columns:,} columns, the range of the farthest return" + (undone and f"; {undone}")
     )
 
 
@@ -131,7 +130,6 @@ def _pattern(found: ScanEstimate) -> dict[str, Any]:
         "elevations_deg": [round(float(elevation), 3) + 0.0 for elevation in found.elevations_deg],
         "horizontal_fov_deg": round(found.horizontal_fov_deg, 3),
         "columns": found.columns,
-        "min_range_m": math.floor(found.min_range_m * 100) / 100,
         "max_range_m": math.ceil(found.max_range_m * 10) / 10,
     }
 

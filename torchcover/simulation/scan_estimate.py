@@ -35,7 +35,7 @@ Lasers = list[NDArray[np.integer]] | None
 class ScanEstimate(NamedTuple):
     """A scan pattern: (R,) elevations of the rows that returned anything, the highest first, and how many columns.
 
-    `horizontal_fov_deg` is 360 for a full turn, `centre_deg` the azimuth of its middle; ranges are of the nearest and
+    `horizontal_fov_deg` is 360 for a full turn, `centre_deg` the azimuth of its middle; the range is that of
     the farthest return. `origin_m` is the height above the origin of the frame that the rays leave from, on average; 0
     if they need no other.
     """
@@ -44,7 +44,6 @@ class ScanEstimate(NamedTuple):
     columns: int
     horizontal_fov_deg: float
     centre_deg: float
-    min_range_m: float
     max_range_m: float
     origin_m: float
 
@@ -85,7 +84,6 @@ def estimate_scan(scans: Sequence[Float64], lasers: Lasers = None) -> ScanEstima
         max(1, round(fov_deg / step_deg)),
         fov_deg,
         centre_deg,
-        float(range_m.min()),
         float(range_m.max()),
         origin_m,
     )

@@ -62,7 +62,8 @@ def ranges_html(ranges: Sequence[PageRange]) -> str:
                 marks += f'<line {ends} y1="4" y2="4" class="rig{at % 2}"/>'
             drawn = f'<svg viewBox="-3 0 106 8" aria-hidden="true"><path d="M0 8V7H100V8" class="axis"/>{marks}</svg>'
             lines.append(f'<tr>{name}<th scope="row">{escape(rig)}</th><td>{drawn}</td><td>{words}</td></tr>')
-    return f'<h2>How far</h2><div class="wide"><table class="ranges"><tbody>{"".join(lines)}</tbody></table></div>'
+    table = f'<table class="ranges"><tbody>{"".join(lines)}</tbody></table>'
+    return f'<h2>How far: share that is detected</h2><div class="wide">{table}</div>'
 
 
 def _plan(plan: PagePlan, most_m2: float) -> str:
