@@ -1,5 +1,7 @@
 """What sensors make of their hits, and the weather: named in every result, and never to the good of a rig."""
 
+from dataclasses import replace
+
 import pytest
 
 from torchcover.evaluation import evaluate
@@ -74,6 +76,13 @@ def test_every_result_names_its_sensor_model_and_the_weather(worse):
     assert set(real.record["sensor_model"].values()) == {"real"}
     assert real.record["weather"]["roof, fog_50m"] == "fog_50m"
     assert "Weather: clear, fog_200m, fog_50m, rain_50mm_h." in str(real)
+
+
+def test_a_difference_of_sensor_models_is_said_with_the_answer(worse):
+    _, real = worse
+    mixed = replace(real, source={**real.source, "sensor_model": {"a": "real", "b": "ideal"}})
+    assert mixed.verdict[-1] == "Sensor models: a real, b ideal: differences are of both."
+    assert not any("Sensor model" in sentence for one in worse for sentence in one.verdict)
 
 
 def test_the_paper_measures_with_ideal_sensors():

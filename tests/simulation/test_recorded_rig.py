@@ -112,6 +112,7 @@ def test_rows_of_a_vehicle_in_motion_are_those_of_its_rays(drive, said):
     rig = rig_document(drive)
     (lidar,) = Rig.model_validate(rig).sensors
     assert re.search(said, rig["description"])
+    assert "min_range_m" not in rig["sensors"][0]  # of the nearest return it would be blind to all that comes nearer
     true_deg = drive.lidar.rows_deg()
     assert len(lidar.rows_deg()) == len(true_deg)
     np.testing.assert_allclose(lidar.rows_deg(), np.sort(true_deg)[::-1], atol=0.05)
