@@ -57,6 +57,13 @@ def test_a_sensor_that_fails_takes_what_it_alone_sees(found):
     assert "one has one sensor: without it, it sees nothing." in found.verdict
 
 
+def test_a_difference_of_sensor_models_is_said(found):
+    source = {**found.result.source, "sensor_model": {"one": "real", "two": "ideal"}}
+    mixed = replace(found, result=replace(found.result, source=source))
+    assert "Sensor models: one real, two ideal: differences are of both." in mixed.verdict
+    assert not any("Sensor model" in sentence for sentence in found.verdict)
+
+
 def test_sensors_that_cells_cannot_tell_apart_are_named_together():
     rig = Rig.model_validate({"name": "sides", "sensors": [
         {**lidar(side, 0.0), "mount": {"y_m": y_m, "z_m": 1.0}} for side, y_m in (("left", 1.1), ("right", -1.1))

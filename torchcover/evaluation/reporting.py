@@ -61,7 +61,8 @@ class Report:
         """The answer in sentences, the first of which says most; each has its rule, and none tells what is chance."""
         first, *losses = target_verdict(self.targets)
         asked = [*self._met.verdict, *(self.checked.verdict if self.checked else ())]
-        return tuple(filter(None, [first, on_range(self.result.table), *losses, *asked, self.cut_short]))
+        told = [first, on_range(self.result.table), *self.result.mixed_models, *losses, *asked, self.cut_short]
+        return tuple(filter(None, told))
 
     @property
     def cut_short(self) -> str:

@@ -124,9 +124,14 @@ class Result:
     @property
     def verdict(self) -> tuple[str, ...]:
         """The answer in sentences, the first of which says most; none tells what may be chance."""
+        return (*verdict(self.table), *self.mixed_models)
+
+    @property
+    def mixed_models(self) -> list[str]:
+        """That rigs were measured with different sensor models, in words; none where all had the same."""
         of_rigs = self.source.get("sensor_model")
-        models = set(of_rigs.values()) if isinstance(of_rigs, Mapping) else set()
-        return (*verdict(self.table), *(sensor_model_words(of_rigs) if len(models) > 1 else ()))
+        differ = isinstance(of_rigs, Mapping) and len(set(of_rigs.values())) > 1
+        return sensor_model_words(of_rigs) if differ else []
 
     @property
     def tables(self) -> list[PageTable]:
