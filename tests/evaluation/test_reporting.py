@@ -119,7 +119,6 @@ def test_a_budget_ends_the_traffic_once_it_has_intervals():
 
 
 def test_where_no_place_is_free_nothing_is_claimed(found):
-    from dataclasses import replace
 
     seen = found.targets["one"]
     nowhere = replace(seen, state=np.full_like(seen.state, 2))
