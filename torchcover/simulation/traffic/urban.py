@@ -212,8 +212,8 @@ def _in_place(
         first_m, last_m = np.sort(line.places_at(built_m if of_main else ends_m[junction[id(line.street)]]))
         step, agent = np.nonzero((places_m < first_m) | (places_m > last_m))
         if of_main and CATEGORIES.get(agents[on_lane[0]].kind) == "pedestrian":
-            # On the inside of a turn the pavement goes on.
-            stop = streets.course.turns != np.sign(line.left_m)
+            # In a turn the pavement goes on.
+            stop = streets.has_lights
             middles_m, halves_m = streets.junctions_m[stop][:: line.way], streets.cross_kerbs_m[stop][:: line.way]
             first_m, last_m = np.sort(line.places_at(middles_m + np.array([[-1.0], [1.0]]) * halves_m), axis=0)
             next_one = np.minimum(np.searchsorted(last_m, np.ascontiguousarray(places_m.T)).T, len(last_m) - 1)
