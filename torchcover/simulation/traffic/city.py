@@ -25,8 +25,8 @@ LANE_SIDE_M = 2.2
 PARKED = {"suv": 3.0, "sedan": 3.0, "hatchback": 3.0, "pickup": 0.8, "van": 1.0}
 # The block between two streets that meet the main street where it turns.
 CORNER_M, CORNER_DEPTH_M, LANES_M = 100.0, 70.0, 130.0
-# Half of the width that a gap between pavements has at most; of what is smaller than a square there is none.
-WEDGE_M, LEAST_M2 = 10.0, 1.0
+# Half of the width that a gap between pavements has at most.
+WEDGE_M = 10.0
 APART_M = 1e-3
 # Streets in plan: corners so far apart, and a little narrower than they are, for those are on their curves' chords.
 STREET_EVERY_M, WITHIN_M = 4.0, 0.2
@@ -83,7 +83,7 @@ class City:
         fronts = [(main, front) for front in self._frontages(seen_m)]
         turns = (self._streets.course.turns != 0) & self._territory.covers(self._streets.junctions_m)
         fronts += [self._corner(index) for index in np.flatnonzero(turns).tolist()]
-        blocks, outlines, floors, sides = [], [], list[shapely.Geometry](), list[Side]()
+        blocks, outlines, aprons, sides = [], [], list[shapely.Geometry](), list[Side]()
         for site, front in fronts:
             is_built = self._built_share == 1.0 or self._shapes.random() < self._built_share
             depth_m = BLOCK_DEPTH_M if front.junctions else CORNER_DEPTH_M
@@ -95,25 +95,27 @@ class City:
             sides += self._sides(site.street, front, zone)
             for end in range(len(front.junctions)):
                 edge_m, apron = self._end(site, front, end, is_built)
-                floors += apron
+                aprons += apron
                 sides += _across(edge_m if front.side == 1 - 2 * end else edge_m[::-1], self._section.sidewalk_m, zone)
         driven, walked = self._in_plan()
-        floors = self._whole(outlines, floors, driven)
+        nets, aprons = shapely.union_all(outlines), shapely.union_all(aprons)
+        whole = nets.union(aprons)
+        if not self._streets.main.is_straight:
+            between = self._between(whole, shapely.union_all(driven))
+            whole, aprons = whole.union(between), aprons.union(between)
         # A little apart, so that no outline meets itself.
-        rest = shapely.union_all(floors).difference(shapely.union_all(outlines))
-        rest = shapely.set_precision(rest.buffer(-APART_M, join_style="mitre"), APART_M / 10)
-        for part in shapely.get_parts(rest):
-            if part.geom_type == "Polygon" and part.area > LEAST_M2:
-                blocks.append(plateau(shapely.segmentize(part, PIECE_M), self._hills.heights_m))
+        rest = aprons.difference(nets).buffer(-APART_M, join_style="mitre")
+        rest = shapely.get_parts(shapely.set_precision(rest, APART_M / 10))
+        blocks.append(plateau(shapely.segmentize(rest, PIECE_M), self._hills.heights_m))
         self._park([(site, self._parked(front)) for site, front in fronts])
-        stood = stand(sides, driven, walked, floors, self._hills.heights_m, self._roadside, self._generator)
+        stood = stand(sides, driven, walked, shapely.get_parts(whole), self._hills.heights_m, self._roadside, self._generator)
         pavements = few(blocks)
         return Scenery((self._ground(seen_m), *pavements, *few(*stood)), tuple(range(1 + len(pavements))))
 
     def _in_plan(self) -> tuple[list[shapely.Geometry], list[shapely.Geometry]]:
         """All streets, without and with the sidewalks along them."""
         stations_m = [self._territory.stations_m(STREET_EVERY_M)]
-        bodies_m = self._streets.cross_ends_m() + np.array([-LONGEST_HALF_M, LONGEST_HALF_M])
+        bodies_m = self._streets.cross_ends_m + np.array([-LONGEST_HALF_M, LONGEST_HALF_M])
         for street, ends_m in zip(self._streets.crossing, bodies_m, strict=True):
             stations_m.append(ends_m if street.is_straight else np.arange(-LANES_M, LANES_M, STREET_EVERY_M))
         streets = zip([self._streets.main, *self._streets.crossing], stations_m, strict=True)
@@ -167,17 +169,11 @@ class City:
         left_m = inwards * int(self._streets.course.turns[index]) * kerb_m
         return onto_m + left_m * np.array([-ahead[1], ahead[0]]), [area, _strip(around_m, inside_m)]
 
-    def _whole(
-        self, outlines: list[shapely.Geometry], aprons: list[shapely.Geometry], driven: list[shapely.Geometry]
-    ) -> list[shapely.Geometry]:
-        """Pavements in plan, and what is narrow between them but no street: wedges, and where the street comes back."""
-        whole = shapely.union_all([*outlines, *aprons])
-        if not self._streets.main.is_straight:
-            closed = whole.buffer(WEDGE_M, join_style="mitre").buffer(-WEDGE_M, join_style="mitre")
-            streets = shapely.union_all(driven).buffer(2 * WITHIN_M, join_style="mitre")
-            between = closed.difference(whole.union(streets)).buffer(-WITHIN_M, join_style="mitre")
-            whole = whole.union(between.buffer(WITHIN_M, join_style="mitre"))
-        return list(shapely.get_parts(whole))
+    def _between(self, whole: shapely.Geometry, streets: shapely.Geometry) -> shapely.Geometry:
+        """In plan, what is narrow between pavements but no street: wedges, and where the main street comes back."""
+        closed = whole.simplify(WITHIN_M / 2).buffer(WEDGE_M, join_style="mitre").buffer(-WEDGE_M, join_style="mitre")
+        between = closed.difference(streets.buffer(2 * WITHIN_M, join_style="mitre")).difference(whole)
+        return between.buffer(-WITHIN_M, join_style="mitre").buffer(WITHIN_M, join_style="mitre")
 
     def _ground(self, seen_m: Bounds) -> Mesh:
         """Under everything: as far as lanes go, or as far as it can be seen."""

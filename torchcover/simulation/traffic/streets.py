@@ -133,6 +133,7 @@ class Streets:
         """(J,) from the middle of each cross street to its kerb, of those that meet in a turn, too."""
         return np.asarray(self.cross_lanes_each_way * self.section.lane_m + GUTTER_M)
 
+    @cached_property
     def cross_ends_m(self) -> Float64:
         """(J, 2) stations between which a cross street, in all its width, is far from all others of its kind."""
         whole = Territory(self.main, (-self.reach_m, self.reach_m))

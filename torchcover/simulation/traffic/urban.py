@@ -199,7 +199,7 @@ def _in_place(
     And let nobody be where their cross street ends, nor where the main street is not built.
     """
     junction = {id(street): index for index, street in enumerate(streets.crossing)}
-    ends_m = streets.cross_ends_m()
+    ends_m = streets.cross_ends_m
     if streets.main.is_straight:  # it never comes back
         built_m = (-2 * streets.reach_m, 2 * streets.reach_m)
     radius_m = np.array([fleet.length_m(agent.kind) / 2 for agent in agents])
