@@ -48,9 +48,9 @@ class Paths(NamedTuple):
         own = [np.column_stack([self.positions_m[:, k, :2], np.deg2rad(self.yaw_deg[:, k])]) for k in fronts]
         if not fronts:
             return self
-        rears = np.stack(rears_of([self.kinds[front] for front in fronts], own, start), axis=1)
-        positions_m = np.concatenate([self.positions_m, rears * [1.0, 1.0, 0.0]], axis=1)
-        yaw_deg = np.concatenate([self.yaw_deg, np.rad2deg(rears[..., 2])], axis=1)
+        poses = np.stack(rears_of([self.kinds[front] for front in fronts], own, start), axis=1)
+        positions_m = np.concatenate([self.positions_m, poses * [1.0, 1.0, 0.0]], axis=1)
+        yaw_deg = np.concatenate([self.yaw_deg, np.rad2deg(poses[..., 2])], axis=1)
         return Paths(positions_m, yaw_deg, (*self.kinds, *(DRAWS[self.kinds[front]].rear for front in fronts)), fronts)
 
 
@@ -70,9 +70,7 @@ def paths(lanes: Sequence[Lane], agents: Sequence[Agent], place_m: Float64) -> P
     return Paths(positions_m, yaw_deg, kinds).with_rears(start)
 
 
-def _along(
-    lanes: Sequence[Lane], lane_of: Int64, place_m: Float64
-) -> Iterator[tuple[slice | Int64, Float64]]:
+def _along(lanes: Sequence[Lane], lane_of: Int64, place_m: Float64) -> Iterator[tuple[slice | Int64, Float64]]:
     """Those on the same lane, and their (T, N, 3) poses. Mostly they are numbered in turn, and taken without a copy."""
     order = np.argsort(lane_of, kind="stable")
     for on_lane in np.split(order, np.flatnonzero(np.diff(lane_of[order])) + 1):

@@ -81,7 +81,7 @@ class City:
             self._streets.main, self._territory, self._hills, self._streets.kerb_m + BLOCK_DEPTH_M + 10.0
         )
         fronts = [(main, front) for front in self._frontages(seen_m)]
-        turns = (self._streets.course.turns != 0) & self._territory.covers(self._streets.junctions_m)
+        turns = ~self._streets.has_lights & (np.abs(self._streets.junctions_m - np.mean(seen_m)) < np.ptp(seen_m) / 2)
         fronts += [self._corner(index) for index in np.flatnonzero(turns).tolist()]
         blocks, outlines, aprons, sides = [], [], list[shapely.Geometry](), list[Side]()
         for site, front in fronts:
@@ -108,7 +108,9 @@ class City:
         rest = shapely.get_parts(shapely.set_precision(rest, APART_M / 10))
         blocks.append(plateau(shapely.segmentize(rest, PIECE_M), self._hills.heights_m))
         self._park([(site, self._parked(front)) for site, front in fronts])
-        stood = stand(sides, driven, walked, shapely.get_parts(whole), self._hills.heights_m, self._roadside, self._generator)
+        stood = stand(
+            sides, driven, walked, shapely.get_parts(whole), self._hills.heights_m, self._roadside, self._generator
+        )
         pavements = few(blocks)
         return Scenery((self._ground(seen_m), *pavements, *few(*stood)), tuple(range(1 + len(pavements))))
 
@@ -120,6 +122,7 @@ class City:
             stations_m.append(ends_m if street.is_straight else np.arange(-LANES_M, LANES_M, STREET_EVERY_M))
         streets = zip([self._streets.main, *self._streets.crossing], stations_m, strict=True)
         lines = [shapely.LineString(street.poses(along_m, 0.0)[:, :2]) for street, along_m in streets]
+        lines = shapely.simplify(lines, WITHIN_M / 4)
         half_m = [self._section.kerb_m, *self._streets.carriageways_m.tolist()]
         driven, walked = (
             shapely.buffer(lines, np.array(half_m) - WITHIN_M + wider_m, cap_style="flat").tolist()
@@ -153,7 +156,7 @@ class City:
         face_m, sidewalk_m = site.street.poses(corner_m, y_m)[:, :2], self._section.sidewalk_m
         inside_m = -inwards * front.side * sidewalk_m
         if not self._streets.course.turns[index]:
-            return face_m[1:], [_strip(face_m, inside_m)] * (not is_built)
+            return face_m[1:], [] if is_built else [_strip(face_m, inside_m)]
         middle_m, half_m = float(self._streets.junctions_m[index]), float(self._streets.cross_kerbs_m[index])
         around_m = site.street.poses(np.linspace(corner_m, middle_m, 17), front.side * front.kerb_m)[:, :2]
         way_m, kerb_m = np.linspace(-half_m, half_m + CORNER_M, 97), float(self._streets.carriageways_m[index])
@@ -171,7 +174,7 @@ class City:
 
     def _between(self, whole: shapely.Geometry, streets: shapely.Geometry) -> shapely.Geometry:
         """In plan, what is narrow between pavements but no street: wedges, and where the main street comes back."""
-        closed = whole.simplify(WITHIN_M / 2).buffer(WEDGE_M, join_style="mitre").buffer(-WEDGE_M, join_style="mitre")
+        closed = whole.buffer(WEDGE_M, join_style="mitre").buffer(-WEDGE_M, join_style="mitre")
         between = closed.difference(streets.buffer(2 * WITHIN_M, join_style="mitre")).difference(whole)
         return between.buffer(-WITHIN_M, join_style="mitre").buffer(WITHIN_M, join_style="mitre")
 

@@ -112,10 +112,10 @@ class Streets:
 
         They have station 0 on the junction, to which a straight one comes from the right of the main street.
         """
-        streets = []
-        for station, turn, half in zip(self.junctions_m, self.course.turns, self.course.halves_m, strict=True):
-            if turn == 0:
-                x, y, yaw_deg = self.main.poses(station, 0.0)
+        streets, middles = [], self.main.poses(self.junctions_m, 0.0)
+        for index, (station, half) in enumerate(zip(self.junctions_m, self.course.halves_m, strict=True)):
+            if self.course.turns[index] == 0:
+                x, y, yaw_deg = middles[index]
                 streets.append(Alignment([0.0], [0.0], (x, y, np.deg2rad(yaw_deg + 90.0))))
                 continue
             # The same turn, opposite of where the main street would go on to and come from.
