@@ -27,7 +27,7 @@ PARKED = {"suv": 3.0, "sedan": 3.0, "hatchback": 3.0, "pickup": 0.8, "van": 1.0}
 CORNER_M, CORNER_DEPTH_M, LANES_M = 100.0, 70.0, 130.0
 # Half of the width that a gap between pavements has at most.
 WEDGE_M = 10.0
-APART_M = 1e-3
+APART_M, SNAPPED_M = 1e-3, 1e-4
 # Streets in plan: corners so far apart, and a little narrower than they are, for those are on their curves' chords.
 STREET_EVERY_M, WITHIN_M = 4.0, 0.2
 # Beyond a sensor's range the ground goes on a little.
@@ -98,14 +98,13 @@ class City:
                 aprons += apron
                 sides += _across(edge_m if front.side == 1 - 2 * end else edge_m[::-1], self._section.sidewalk_m, zone)
         driven, walked = self._in_plan()
-        nets, aprons = shapely.union_all(outlines), shapely.union_all(aprons)
-        whole = nets.union(aprons)
+        nets, whole = shapely.union_all(outlines), shapely.union_all([*outlines, *aprons], grid_size=SNAPPED_M)
         if not self._streets.main.is_straight:
-            between = self._between(whole, shapely.union_all(driven))
-            whole, aprons = whole.union(between), aprons.union(between)
+            aprons.append(self._between(whole, shapely.union_all(driven)))
+            whole = shapely.union_all([whole, aprons[-1]], grid_size=SNAPPED_M)
         # A little apart, so that no outline meets itself.
-        rest = aprons.difference(nets).buffer(-APART_M, join_style="mitre")
-        rest = shapely.get_parts(shapely.set_precision(rest, APART_M / 10))
+        rest = shapely.union_all(aprons, grid_size=SNAPPED_M).difference(nets).buffer(-APART_M, join_style="bevel")
+        rest = shapely.get_parts(shapely.set_precision(rest, SNAPPED_M))
         blocks.append(plateau(shapely.segmentize(rest, PIECE_M), self._hills.heights_m))
         self._park([(site, self._parked(front)) for site, front in fronts])
         stood = stand(
@@ -174,9 +173,10 @@ class City:
 
     def _between(self, whole: shapely.Geometry, streets: shapely.Geometry) -> shapely.Geometry:
         """In plan, what is narrow between pavements but no street: wedges, and where the main street comes back."""
-        closed = whole.buffer(WEDGE_M, join_style="mitre").buffer(-WEDGE_M, join_style="mitre")
-        between = closed.difference(streets.buffer(2 * WITHIN_M, join_style="mitre")).difference(whole)
-        return between.buffer(-WITHIN_M, join_style="mitre").buffer(WITHIN_M, join_style="mitre")
+        with np.errstate(all="ignore"):  # of what GEOS divides by zero in passing, nothing remains
+            closed = whole.buffer(WEDGE_M, join_style="mitre").buffer(-WEDGE_M, join_style="mitre")
+        between = closed.difference(streets.buffer(2 * WITHIN_M, join_style="bevel")).difference(whole)
+        return between.buffer(-WITHIN_M, join_style="bevel").buffer(WITHIN_M, join_style="bevel")
 
     def _ground(self, seen_m: Bounds) -> Mesh:
         """Under everything: as far as lanes go, or as far as it can be seen."""
