@@ -278,6 +278,15 @@ def test_states_come_back_bit_for_bit(tmp_path):
         assert back[name].numpy().tobytes() == tensor.numpy().tobytes()
 
 
+def test_a_state_may_be_larger_than_what_the_first_zips_held(tmp_path, monkeypatch):
+    """2 GiB, which are 1 kB here."""
+    monkeypatch.setattr(zipfile, "ZIP64_LIMIT", 1000)
+    path, state = tmp_path / "a.npz", {"large": torch.arange(1000)}
+    header = {"identity": {}, "run": {"steps": 1, "counts": {}, "skipped": [], "seconds": 0.0}}
+    write_checkpoint(path, header, {"one": state})
+    assert torch.equal(read_state(path, read_header(path), "one")["large"], state["large"])
+
+
 def test_a_damaged_checkpoint_is_named(frame_of, path):
     measured(Drive(frame_of), path, steps=3)
     data = bytearray(path.read_bytes())
