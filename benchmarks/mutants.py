@@ -55,7 +55,10 @@ SWAPPED = {
 RENAMED = {"min": "max", "max": "min", "all": "any", "any": "all", "minimum": "maximum", "maximum": "minimum",
            "floor": "ceil", "ceil": "floor", "cos": "sin", "sin": "cos"}  # fmt: skip
 # Looked at, and the same as what they were made of: file, what stood there, what it became; and why.
-EQUAL: dict[tuple[str, str, str], str] = {}
+EQUAL = {
+    ("ranks.py", "torch.empty(int(length), dtype=torch.uint8)", "torch.empty(int(length))"):
+        "gloo fills as many bytes as were sent, and an unpickler stops where its object ends",
+}  # fmt: skip
 # Of unions of types, which fail where they are made.
 OF_TYPES = re.compile(r"\|.*\b(None|str|int|float|bool|[A-Z]\w*)\b|\b(None|str|int|float|bool|[A-Z]\w*)\b.*\|")
 # A test that hangs has noticed: it takes this many times what all tests take without a change.
@@ -85,7 +88,7 @@ def main(words):
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--count", type=int, default=25, help="mutants of each room")
     asked = parser.parse_args(words)
-    rows, survivors = [], []
+    rows, survivors, every_equal = [], [], []
     os.environ |= {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
     SERVER.set_forkserver_preload(LOADED)
     with tempfile.TemporaryDirectory() as folder:
@@ -103,14 +106,20 @@ def main(words):
             most_s = MOST_TIMES * (time.monotonic() - start_s)
             survived = [mutant for mutant in found if survives(room, mutant, tree, most_s)]
             equal = [one for one in survived if (one.path.name, one.before, one.after) in EQUAL]
-            killed, valid = len(found) - len(survived), len(found) - len(equal)
-            rows.append((room, len(found), len(equal), killed, f"{100 * killed / max(valid, 1):.0f} %"))
-            survivors += [mutant for mutant in survived if mutant not in equal]
-    table(("room", "mutants", "equal", "killed", "of those not equal"), rows)
-    if survivors:
+            killed, others = len(found) - len(survived), len(found) - len(equal)
+            rows.append((room, asked.seed, len(found), len(equal), killed, f"{100 * killed / max(others, 1):.0f} %"))
+            survivors += [(*cells(one), "") for one in survived if one not in equal]
+            every_equal += [(*cells(one), EQUAL[one.path.name, one.before, one.after]) for one in equal]
+    table(("room", "seed", "valid", "equal", "killed", "of those not equal"), rows)
+    if shown := survivors + every_equal:
         print()
-        named = [(f"{one.path}:{one.line}", f"`{one.before}`", f"`{one.after}`") for one in survivors]
-        table(("survived", "was", "became"), named)
+        table(("not killed", "was", "became", "equal because"), shown)
+
+
+def cells(mutant: Mutant) -> list[str]:
+    """A change as cells of a table."""
+    texts = (" ".join(text.replace("|", r"\|").split()) for text in (mutant.before, mutant.after))
+    return [f"{mutant.path}:{mutant.line}", *(f"`{text}`" for text in texts)]
 
 
 def survives(room: str, mutant: Mutant, tree: Path, most_s: float) -> bool:

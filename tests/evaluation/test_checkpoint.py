@@ -7,6 +7,8 @@ import random
 import signal
 import time
 import zipfile
+from collections import Counter
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -167,6 +169,28 @@ def test_looks_at_a_target_error_go_on_as_they_would_have(frame_of, path, monkey
         cut_short(Drive(frame_of), path, seen=Seen(at, press), **target)
     assert bits(measured(Drive(frame_of), path, **target)) == bits(whole)
     assert bits(measured(Drive(frame_of, range(STEPS)), path, **target)) == bits(whole)
+
+
+@pytest.mark.parametrize(("write_s", "pause_s"), [(0.0, 60.0), (2.0, 60.0), (9.0, 180.0)])
+def test_it_is_written_every_minute_and_more_seldom_where_that_took_a_twentieth_of_the_time(
+    tmp_path, monkeypatch, write_s, pause_s
+):
+    now_s, written_s = 0.0, []
+
+    def write(*_):
+        nonlocal now_s
+        now_s += write_s
+        written_s.append(now_s)
+
+    monkeypatch.setattr(checkpoint, "time", SimpleNamespace(monotonic=lambda: now_s))
+    monkeypatch.setattr(checkpoint, "write_checkpoint", write)
+    journal = checkpoint.Journal(Checkpoint(tmp_path / "a.npz"), {}, {})
+    run = SimpleNamespace(steps=1, counts=Counter(), skipped=[], seconds=0.0)
+    while now_s < 1800.0:
+        now_s += 1.0
+        journal.write_if_due(run)
+    assert np.diff(written_s, prepend=0.0).tolist() == [60.0 + write_s, *[pause_s + write_s] * (len(written_s) - 1)]
+    assert len(written_s) >= 9
 
 
 @pytest.mark.usefixtures("_at_every_step")

@@ -18,7 +18,7 @@ import torchcover
 from torchcover.data import BadFrameError, FrameDataset, SimulatedFrames
 from torchcover.evaluation import Ranks, joined_ranks
 
-LONGEST_S = 60.0
+LONGEST_S = 30.0
 
 
 class Drive(FrameDataset):
@@ -183,6 +183,16 @@ def test_rank_0_waits_for_one_that_is_gone_for_a_while_only(monkeypatch):
     begin_s = time.monotonic()
     Ranks(HashStore(), 0, 2).part()
     assert 0.3 <= time.monotonic() - begin_s < 3.0
+
+
+def test_the_first_failure_is_the_one_that_is_told_of():
+    first, second = (Ranks(store, rank, 2) for store in [HashStore()] for rank in range(2))
+    assert first.failure is second.failure is None
+    second.tell(KeyboardInterrupt())
+    first.tell(ValueError("too late"))
+    assert first.failure == second.failure == "rank 1: KeyboardInterrupt"
+    with pytest.raises(ChildProcessError, match=r"^rank 1: KeyboardInterrupt$"):
+        first.check_others()
 
 
 @pytest.mark.parametrize("failing", range(3))
