@@ -311,6 +311,26 @@ def test_a_state_may_be_larger_than_what_the_first_zips_held(tmp_path, monkeypat
     assert torch.equal(read_state(path, read_header(path), "one")["large"], state["large"])
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"shape": [-1, 3]}, r"an array of int64 and the shape \(-1, 3\)"),
+        ({"shape": [-2, -3]}, r"an array of int64 and the shape \(-2, -3\)"),
+        ({"shape": [2, 4]}, "cannot reshape"),
+        ({"dtype": "<U2"}, r"an array of <U2 and the shape \(2, 3\)"),
+        ({"shape": [10**9, 10**9]}, "reading it takes"),
+    ],
+)
+def test_an_array_that_its_header_describes_wrongly_is_refused(tmp_path, change, message):
+    path = tmp_path / "a.npz"
+    header = {"identity": {}, "run": {"steps": 1, "counts": {}, "skipped": [], "seconds": 0.0}}
+    write_checkpoint(path, header, {"one": {"of it": torch.arange(6).view(2, 3)}})
+    header = read_header(path)
+    header["states"]["one"]["dict"]["of it"]["tensor"] |= change
+    with pytest.raises(BadFileError, match=rf"a\.npz: .*{message}"):
+        read_state(path, header, "one")
+
+
 def test_a_damaged_checkpoint_is_named(frame_of, path):
     measured(Drive(frame_of), path, steps=3)
     data = bytearray(path.read_bytes())

@@ -8,6 +8,7 @@ import socket
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from datetime import timedelta
 from queue import SimpleQueue
 
 import pytest
@@ -17,6 +18,7 @@ from torch.distributed import FileStore, HashStore
 import torchcover
 from torchcover.data import BadFrameError, FrameDataset, SimulatedFrames
 from torchcover.evaluation import Ranks, joined_ranks
+from torchcover.evaluation.ranks import ABORTED
 
 LONGEST_S = 30.0
 
@@ -152,6 +154,7 @@ def test_ranks_merge_in_order_and_none_of_them_many(size):
 def in_threads(work, size=3):
     """What `work(ranks)` gives or raises in ranks that have no more in common than a store."""
     store = HashStore()
+    store.set_timeout(timedelta(seconds=LONGEST_S / 3))
 
     def outcome(rank):
         try:
@@ -164,8 +167,9 @@ def in_threads(work, size=3):
 
 
 @pytest.mark.parametrize("late", range(3))
-def test_ranks_leave_when_all_is_written_and_rank_0_as_the_last_one(late):
-    happened = []
+def test_ranks_leave_when_all_is_written_and_rank_0_as_the_last_one(monkeypatch, late):
+    monkeypatch.setattr("torchcover.evaluation.ranks.PARTING_S", 20.0)
+    happened, begin_s = [], time.monotonic()
 
     def work(rank):
         time.sleep(0.3 * (rank.rank == late))
@@ -176,6 +180,7 @@ def test_ranks_leave_when_all_is_written_and_rank_0_as_the_last_one(late):
     assert in_threads(work) == [None] * 3
     assert happened.index("written") < happened.index("left")
     assert happened.count("ready") == happened[: happened.index("closed")].count("ready") == 2
+    assert time.monotonic() - begin_s < 10.0
 
 
 def test_rank_0_waits_for_one_that_is_gone_for_a_while_only(monkeypatch):
@@ -193,6 +198,17 @@ def test_the_first_failure_is_the_one_that_is_told_of():
     assert first.failure == second.failure == "rank 1: KeyboardInterrupt"
     with pytest.raises(ChildProcessError, match=r"^rank 1: KeyboardInterrupt$"):
         first.check_others()
+
+
+def test_who_waits_for_what_rank_0_is_about_learns_that_it_has_ended():
+    def work(rank):
+        if rank.rank == 0:
+            rank.tell(MemoryError(), ABORTED)
+        else:
+            rank.check_same({"seed": "1"})
+
+    found = in_threads(work)
+    assert list(map(repr, found)) == ["None", *["ChildProcessError('rank 0: MemoryError')"] * 2]
 
 
 @pytest.mark.parametrize("failing", range(3))
