@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 from torchcover.cameras import Camera, inverse
+from torchcover.cameras.models import build_lens
 from torchcover.cameras.start import make_start_table
 from torchcover.cameras.valid_region import find_region
 
@@ -131,6 +132,19 @@ def test_every_point_of_the_valid_region_is_found_again(radial, tangential, k3, 
     table = make_start_table(distortion, np.inf, 1e3)
     _, _, status = inverse.solve(distortion, region, table, at.u, at.v, (500.0, 500.0))
     assert (status == inverse.ANSWERED).all()
+
+
+@pytest.mark.parametrize("name", ["fold", "crooked fold", "fisheye 190", "fisheye fold", "woodscape"])
+def test_the_reach_holds_the_image_of_the_whole_edge_and_little_more(name, make_camera):
+    camera = make_camera(name)
+    lens = build_lens(camera.model, camera.coefficients.tolist(), trainable=False)
+    region = find_region(lens.distortion, lens.chart.limit)
+    azimuth = np.linspace(-np.pi, np.pi, 997)
+    a, b = (region.edge(np.cos(azimuth), np.sin(azimuth)) * way(azimuth) for way in (np.cos, np.sin))
+    image = lens.distortion.linearise(a, b)
+    distorted = np.hypot(image.u, image.v)
+    assert region.reach.holds(distorted, image.u, image.v).all()
+    assert not region.reach.holds(1.002 * distorted, image.u, image.v).any()
 
 
 def test_of_two_images_the_one_nearer_the_axis_is_chosen(make_camera):
