@@ -48,6 +48,7 @@ ROOMS = {
         ("evaluation/test_checkpoint.py", "evaluation/test_ranks.py"),
     ),
 }  # fmt: skip
+OF_ALL = ("test_names.py",)
 SWAPPED = {
     ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
     ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.FloorDiv: ast.Div,
@@ -174,9 +175,8 @@ def function_at(mutant: Mutant) -> str:
 def failures(room: str, within: str, tree: Path, most_s: float | None = None) -> str:
     """What the tests of a room print if they do not pass, first those that call what is within; else nothing."""
     printed = tree / "printed.txt"
-    run = SERVER.Process(
-        target=tested, args=(str(tree), str(printed), [f"tests/{one}" for one in ROOMS[room][1]], within)
-    )
+    tests = [f"tests/{name}" for name in (*ROOMS[room][1], *OF_ALL)]
+    run = SERVER.Process(target=tested, args=(str(tree), str(printed), tests, within))
     run.start()
     run.join(most_s)
     if run.is_alive():
