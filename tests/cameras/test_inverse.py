@@ -181,6 +181,13 @@ def test_where_kornia_diverges_the_answer_is_right():
     assert (camera.project(rays.reshape(-1, 3))[0] - grid(camera)[::16, ::16].reshape(-1, 2)).abs().max() <= 1e-9
 
 
+@pytest.mark.parametrize("name", ["barrel", "pincushion", "rational", "prism", "tilted", "short", "mei", "fisheye 190"])
+def test_of_ordinary_lenses_a_few_newton_steps_find_every_pixel(name, make_camera, monkeypatch):
+    """As each step doubles the digits, none of them is left for the patient search."""
+    monkeypatch.setattr(inverse, "_MAX_STEPS", 0)
+    assert make_camera(name).pixel_counts()["pixels_unconverged"] == 0
+
+
 @pytest.mark.parametrize("name", ["pinhole", "fisheye 220", "mei plain", "eucm", "double sphere"])
 def test_no_distortion_no_solver(name, make_camera, monkeypatch):
     def refuse(*_):
