@@ -68,7 +68,16 @@ EQUAL = {
      "zip(*map(_without_each, of_sensors))"): "each has a row a sensor",
     ("packets.py", "better = (squared < least) | ((squared == least) & (index < found[i]))",
      "(index <= found[i])"): "at equal indices nothing changes",
+    ("packets.py", "boxes[node, axis + 3] = max(boxes[left, axis + 3], boxes[right, axis + 3])",
+     "(axis - 3)"): "of six columns the third from the end is the fourth",
     ("packets.py", "nearer, as_near = np.int32(0), np.int32(0)", "1"): "more boxes are looked into for one answer",
+    ("valid_region.py", "_PLANE_RADII = np.concatenate([np.tan(np.linspace(0.0, np.pi / 2, 512, endpoint=False)), "
+     "np.geomspace(400.0, 1e8, 32)])", "513"): "one radius more is looked at",
+    ("surface.py", "place = _interleaved(np.clip(middle_m - middle_m.min(axis=1, keepdims=True), 0, 2**20)"
+     ".astype(np.int64))", "(middle_m + middle_m.min(axis=1, keepdims=True))"): "any order of the patches will do",
+    ("local_ground.py", "SLACK_M = 1e-3", "0.002"): "wider bounds hold as well",
+    ("rigid.py", "np.matmul(points_m[rows].astype(np.float64, copy=False) + shift, rotation.T, out=moved[rows])",
+     "points_m[rows].astype(np.float64)"): "a copy more, of the same numbers",
     ("kdtree.py", "SAMPLE = 1024", "1025"): "a larger sample only decides about the speed",
 }  # fmt: skip
 # Of unions of types, which fail where they are made.
