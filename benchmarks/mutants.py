@@ -83,7 +83,7 @@ EQUAL = {
 # Of unions of types, which fail where they are made.
 OF_TYPES = re.compile(r"\|.*\b(None|str|int|float|bool|[A-Z]\w*)\b|\b(None|str|int|float|bool|[A-Z]\w*)\b.*\|")
 # A test that hangs has noticed: it takes this many times what all tests take without a change.
-MOST_TIMES = 5.0
+MOST_TIMES = 3.0
 # Slower tests come last.
 SLOW_S = 1.0
 TIMES_S = count(1_000_000_000)
