@@ -20,6 +20,7 @@ import threading
 import time
 from collections.abc import Iterator
 from itertools import accumulate, count
+from multiprocessing.forkserver import _forkserver
 from pathlib import Path
 from typing import NamedTuple
 
@@ -137,6 +138,7 @@ def main(words):
             rows.append((room, asked.seed, len(found), len(equal), killed, f"{100 * killed / max(others, 1):.0f} %"))
             survivors += [(*cells(one), "") for one in survived if one not in equal]
             every_equal += [(*cells(one), EQUAL[one.key]) for one in equal]
+    _forkserver._stop()  # nobody else waits for it, and its processor time would be nobody's
     table(("room", "seed", "valid", "equal", "killed", "of those not equal"), rows)
     if shown := survivors + every_equal:
         print()
