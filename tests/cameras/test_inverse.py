@@ -134,6 +134,17 @@ def test_every_point_of_the_valid_region_is_found_again(radial, tangential, k3, 
     assert (status == inverse.ANSWERED).all()
 
 
+@pytest.mark.parametrize("name", RADIAL)
+def test_the_radii_at_which_the_image_turns_back_are_known(name):
+    distortion = build_lens(*RADIAL[name], trainable=False).distortion
+    scan = np.linspace(0.0, 3.0, 30_001)
+    with np.errstate(all="ignore"):
+        turns = scan[1:-1][np.diff(np.sign(np.diff(distortion.radial(scan)))) != 0]
+    assert (len(turns) > 0) == (name != "k1 0.6")
+    for turn in turns:
+        assert np.abs(distortion.critical_radii() - turn).min() < 2 * scan[1]
+
+
 @pytest.mark.parametrize("name", ["fold", "crooked fold", "fisheye 190", "fisheye fold", "woodscape"])
 def test_the_reach_holds_the_image_of_the_whole_edge_and_little_more(name, make_camera):
     camera = make_camera(name)
