@@ -608,6 +608,16 @@ def test_a_broken_backend_that_was_named_is_an_error_of_one_line(monkeypatch, tm
     )
 
 
+# Where pairs are compared on a GPU
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("scale", [1e-9, 1.0, 1e9])
+def test_by_squared_differences_the_same_are_nearest(monkeypatch, dtype, scale):
+    monkeypatch.setattr(cdist, "_distances", cdist._squared_distances)
+    assert_exact(random_cloud(300, 70, scale, dtype), random_cloud(500, 71, scale, dtype), "cdist")
+
+
 # Where the memory of a GPU is too small
 
 

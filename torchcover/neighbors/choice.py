@@ -25,8 +25,7 @@ DEVICES = {"kdtree": ("cpu",), "packets": ("cpu",), "warp": ("cpu", "cuda")}
 GAINED_PER_QUERY_S = 3e-7
 GAINED_PER_POINT_S = 8e-9
 LEAST_GAIN_S = 5e-3
-# So many pairs take longer to compare on a GPU than to search on the CPU, by the bandwidth of its memory: 4 bytes a
-# pair, written and read, at 1 TB/s. Never run on a GPU.
+# So many pairs take as long to compare on an H200 as 16 cores take to search: 14 ms (docs/measured/gpu.md).
 MAX_PAIRS_ON_THE_DEVICE = 10**9
 
 # What brings the libraries that are not always there.
