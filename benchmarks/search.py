@@ -161,7 +161,7 @@ def optional():
 
 
 def on_cuda():
-    """Searches of clouds that are brought to the first GPU, CuPy's where it is installed. Never run."""
+    """Searches of clouds that are brought to the first GPU, CuPy's where it is installed."""
 
     def warp(query, points):
         nearest(torch.from_numpy(query).cuda(), torch.from_numpy(points).cuda(), backend="warp").index.cpu()

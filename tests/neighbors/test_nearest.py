@@ -12,6 +12,7 @@ from pykdtree.kdtree import KDTree
 
 from torchcover import blind_spot_radius, nearest
 from torchcover.neighbors import BACKENDS, cdist, check_cloud, choice, kdtree
+from torchcover.neighbors.query import _rescale
 
 DTYPES = [torch.float16, torch.bfloat16, torch.float32, torch.float64]
 # Rounding of the search decides between points that are this close to equally near; the distance is rounded once.
@@ -187,6 +188,17 @@ def test_extents_whose_squares_leave_the_range_of_the_type(backend, scale, dtype
     resolution = float(torch.finfo(dtype).smallest_normal * torch.finfo(dtype).eps)
     np.testing.assert_allclose(distance.double().numpy(), expected, rtol=ULPS[dtype], atol=2 * resolution)
     assert (distance > 0).all()
+
+
+@pytest.mark.parametrize("scale", [2.0**exponent for exponent in (-1000, -600, -599, 300, 301, 1000)])
+def test_what_is_scaled_for_the_search_is_scaled_by_a_power_of_two(scale):
+    """Not a bit is rounded, so that not a tie is broken."""
+    query, points = (random_cloud(count, count, dtype=torch.float32).double() for count in (30, 40))
+    *scaled, reach = _rescale(query * scale, points * scale, 3.0 * scale)
+    ratio = reach / 3.0
+    assert math.frexp(ratio)[0] == 0.5
+    assert all(torch.equal(one, cloud * ratio) for one, cloud in zip(scaled, (query, points), strict=True))
+    assert 0.5 <= max(float(cloud.abs().max()) for cloud in scaled) < 1.0
 
 
 @backends
@@ -603,6 +615,16 @@ def test_a_broken_backend_that_was_named_is_an_error_of_one_line(monkeypatch, tm
         f"backend '{backend}' does not work here (libllvm: no such file); try 'auto', or "
         f"pip install 'torchcover[{extra}]' anew"
     )
+
+
+# Where pairs are compared on a GPU
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("scale", [1e-9, 1.0, 1e9])
+def test_by_squared_differences_the_same_are_nearest(monkeypatch, dtype, scale):
+    monkeypatch.setattr(cdist, "_distances", cdist._squared_distances)
+    assert_exact(random_cloud(300, 70, scale, dtype), random_cloud(500, 71, scale, dtype), "cdist")
 
 
 # Where the memory of a GPU is too small
