@@ -1,6 +1,7 @@
 """A rig: the sensors of a vehicle, where they are mounted, and what carries them."""
 
 from collections.abc import Mapping
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
@@ -22,6 +23,10 @@ def read_sensor(content: Any, info: ValidationInfo) -> Sensor:  # noqa: ANN401  
     kind = content.get("type", "lidar") if isinstance(content, dict) else getattr(content, "type", type(content))
     if not isinstance(kind, str) or kind not in SENSORS:
         raise ValueError(f"type: a sensor is a {' or a '.join(map(repr, SENSORS))}; got {kind!r}")
+    if isinstance(content, dict) and not get_close_matches("mount", map(str, content)):
+        raise ValueError(
+            "mount: missing; metres from the ground under the middle of the vehicle, as in {x_m: 1.5, z_m: 1.7}"
+        )
     return TypeAdapter(SENSORS[kind]).validate_python(content, context=info.context)
 
 
@@ -115,7 +120,7 @@ def _written(sensor: Sensor) -> dict[str, Any]:
     """The keys of a sensor, without those that its model stands for."""
     assert isinstance(sensor, Document)  # as all sensors of a rig
     keys = sensor.model_dump(mode="json", exclude_unset=True)
-    keys = {key: keys[key] for key in ("type", "name", "mount") if key in keys} | keys
+    keys = {key: keys[key] for key in ("type", "name") if key in keys} | {"mount": {}} | keys
     if isinstance(sensor, Lidar) and sensor.model is not None:
         if is_file_name(sensor.model):
             return {key: value for key, value in keys.items() if key != "model"}
