@@ -32,7 +32,7 @@ class Criterion:
                 raise ValueError(f"{name}: {unit} above 0 are needed; got {getattr(self, name)}")
         if not 0 <= self.latency_s <= MOST_LATENCY_S:
             raise ValueError(
-                f"latency_s: 0 to {MOST_LATENCY_S:g} seconds are needed; got {self.latency_s:g}, are these milliseconds?"
+                f"latency_s: 0 to {MOST_LATENCY_S:g} seconds are needed; got {self.latency_s:g}, is that milliseconds?"
             )
 
     def needed_s(self, speed_mps: float, towards_mps: float = 0.0) -> float:

@@ -1,10 +1,10 @@
 """A table as text for a terminal."""
 
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import groupby
-from operator import attrgetter, itemgetter
+from operator import itemgetter
 from typing import Any
 
 from rich.cells import cell_len
@@ -96,12 +96,9 @@ def print_whole(tables: Sequence[PageTable]) -> None:
 
 def _in_words(table: PageTable, limit: int) -> Table:
     """The first column left, the others right; no words are markup. The widest are folded until it is `limit` wide."""
-    columns = list(zip(*(map(attrgetter("text"), row) for row in table.rows), strict=True)) or [()] * len(table.headings)
-    widths = [max(map(_longest, (name, *cells))) for name, cells in zip(table.headings, columns, strict=True)]
-    least = [
-        max((min(_longest(" ".join(name.split()), " "), LEAST_HEADING_CHARS), *(_longest(cell, " ") for cell in cells)))
-        for name, cells in zip(table.headings, columns, strict=True)
-    ]
+    columns = [(name, [row[at].text for row in table.rows]) for at, name in enumerate(table.headings)]
+    widths = [_longest([name, *cells], "\n") for name, cells in columns]
+    least = [max(min(_longest([name]), LEAST_HEADING_CHARS), _longest(cells)) for name, cells in columns]
     beside = int(sum(least) + 3 * len(least) < limit)
     room = max(limit - 1 - (1 + 2 * beside) * len(least), sum(least))
     folded = sum(widths) > room
@@ -119,8 +116,9 @@ def _in_words(table: PageTable, limit: int) -> Table:
     return shown
 
 
-def _longest(text: str, between: str = "\n") -> int:
-    return max(map(cell_len, text.split(between)))
+def _longest(texts: Iterable[str], between: str | None = None) -> int:
+    """Of all words, or of what else is between."""
+    return max((cell_len(part) for text in texts for part in text.split(between)), default=0)
 
 
 def narrowest_width(tables: Sequence[Table], folded: Sequence[str] = ()) -> int:
