@@ -23,11 +23,14 @@ def read_sensor(content: Any, info: ValidationInfo) -> Sensor:  # noqa: ANN401  
     kind = content.get("type", "lidar") if isinstance(content, dict) else getattr(content, "type", type(content))
     if not isinstance(kind, str) or kind not in SENSORS:
         raise ValueError(f"type: a sensor is a {' or a '.join(map(repr, SENSORS))}; got {kind!r}")
-    if isinstance(content, dict) and not get_close_matches("mount", map(str, content)):
-        raise ValueError(
-            "mount: missing; metres from the ground under the middle of the vehicle, as in {x_m: 1.5, z_m: 1.7}"
-        )
     return TypeAdapter(SENSORS[kind]).validate_python(content, context=info.context)
+
+
+def _read_mounted(content: Any, info: ValidationInfo) -> Sensor:  # noqa: ANN401
+    if isinstance(content, dict) and not get_close_matches("mount", map(str, content)):
+        where = "metres from the ground under the middle of the vehicle, as in {x_m: 1.5, z_m: 1.7}"
+        raise ValueError(f"mount: missing; {where}")
+    return read_sensor(content, info)
 
 
 class Rig(BuiltIn):
@@ -52,7 +55,7 @@ class Rig(BuiltIn):
     description: str = ""
     vehicle: NameOrFile | None = None
     weather: Weather | None = None
-    sensors: tuple[Annotated[Sensor, PlainValidator(read_sensor)], ...] = Field(min_length=1)
+    sensors: tuple[Annotated[Sensor, PlainValidator(_read_mounted)], ...] = Field(min_length=1)
 
     @model_validator(mode="after")
     def _check_names(self) -> Self:
