@@ -12,7 +12,8 @@ encounters:
 """
 
 
-def test_rigs_side_by_side_in_words_and_files(torchcover, worlds):
+def test_rigs_side_by_side_in_words_and_files(torchcover, worlds, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")  # so that no cell is folded
     (worlds / "two.yaml").write_text(SET)
     arguments = ("--set", worlds / "two.yaml", "--phases", "2", "--points", "1", "--looks", "1", "--vehicle", "suv")
     ended, printed, _ = torchcover("encounter", worlds / "low.yaml", worlds / "both.yaml", *arguments)

@@ -34,8 +34,6 @@ from torchcover.targets import Target, TargetMap, write_arrays, write_csv
 
 # As many as anybody compares on a page.
 MOST_RIGS = 8
-# So that the page of two rigs is sent by mail without a thought.
-MAP_BYTES = 0.35e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +92,6 @@ class Report:
             ranges=ranges_of(self.result.table),
             pictures=self._met.pictures,
             tables=tables,
-            most_bytes=MAP_BYTES,
         )
 
     def _repr_html_(self) -> str:

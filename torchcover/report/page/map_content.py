@@ -11,7 +11,6 @@ from torchcover.report.maps.overlay import SensorView
 from torchcover.report.page.codes import CellBytes
 from torchcover.report.page.content import Array, Line, Page, PageMap
 
-VALUE_BITS, ERROR_BITS = 16, 8
 # The near field, in lengths of the ego to all sides.
 NEAR, NEAR_LENGTHS = "near the ego", 2.0
 # JSON knows no infinity; beyond every map all ranges are alike.
@@ -44,16 +43,20 @@ def _map(one: PageMap, raster: int, cells: CellBytes) -> dict[str, Any]:
         "rig": one.rig,
         "raster": raster,
         "unknown": one.unknown,
-        "values": cells.add(one.values, VALUE_BITS),
-        "errors": None if one.errors is None else cells.add(one.errors, ERROR_BITS),
-        "weights": None if one.weights is None else cells.add(one.weights, VALUE_BITS),
+        **arrays_of(one, cells),
         "weight_name": one.weight_name,
         "full": one.full_weight,
-        "sides": None if one.sides is None else cells.add(one.sides, ERROR_BITS),
         "scale": _scale(one.scale),
         "difference": None if one.difference is None else _scale(one.difference),
         "lines": _lines(one.lines),
     }
+
+
+def arrays_of(one: PageMap, cells: CellBytes) -> dict[str, int | None]:
+    """Its numbers, as places in the arrays of the cells."""
+    bits = {"values": one.bits, "errors": 8, "weights": one.bits, "sides": 8}
+    arrays = {name: getattr(one, name) for name in bits}
+    return {name: None if array is None else cells.add(array, bits[name]) for name, array in arrays.items()}
 
 
 def _raster(maps: Sequence[PageMap]) -> dict[str, Any]:
