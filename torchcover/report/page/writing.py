@@ -19,8 +19,8 @@ from torchcover.report.page.map_content import arrays_of, map_content
 from torchcover.report.page.rig_drawing import rig_drawing, sensor_table
 from torchcover.report.renderers.layout import PageTable, Words
 
-# What the numbers of the maps may take in the file, so that it is sent by mail without a thought; and how much less that
-# is than before they are packed, at the very most.
+# What the numbers of the maps may take in a file that is sent by mail without a thought; and how many times that they
+# may take before they are packed.
 MOST_CHARS, MOST_PACKED = 440_000, 8
 ROUNDED = "Numbers of single cells are rounded, those of a wide scale by up to 4 %"
 NO_ERRORS = "errors of single cells are left out"
