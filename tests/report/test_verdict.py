@@ -50,7 +50,9 @@ def test_without_errors_nothing_is_told(pair, blind, trios, regions):
     for coverages in (pair, blind, {"few": pair["few"]}):
         assert verdict(CoverageTable.of(coverages, AHEAD)) == ()
     (sentence,) = verdict(CoverageTable.of(trios(4), AHEAD))
-    assert sentence == "Too few steps for an answer: 8 or more, far enough apart, give intervals (`--steps`)."
+    assert sentence == (
+        "Too few steps for an answer: 4 are 4 blocks of time, and intervals need 8, here some 8 steps (`--steps`)."
+    )
     assert verdict(CoverageTable.of(pair, regions[1:])) == ()
 
 

@@ -32,8 +32,14 @@ def verdict(table: CoverageTable) -> tuple[str, ...]:
 
 def too_few(table: CoverageTable, what: str) -> str:
     """That steps are too few for intervals, where these were asked for, and so for some answer."""
-    few = table.first.blocks is not None and table.first.blocks < MIN_BLOCKS
-    return f"Too few steps for {what}: {MIN_BLOCKS} or more, far enough apart, give intervals (`--steps`)." * few
+    steps, blocks = table.first.counts["steps"], table.first.blocks
+    if blocks is None or blocks >= MIN_BLOCKS:
+        return ""
+    needed = MIN_BLOCKS * math.ceil(steps / max(blocks, 1))
+    return (
+        f"Too few steps for {what}: {steps:,} are {blocks} blocks of time, and intervals need {MIN_BLOCKS}, here some "
+        f"{needed:,} steps (`--steps`)."
+    )
 
 
 def on_near_field(table: CoverageTable) -> str:

@@ -13,6 +13,7 @@ from torchcover.report.page.content import Array, Line, Page, PageMap
 
 # The near field, in lengths of the ego to all sides.
 NEAR, NEAR_LENGTHS = "near the ego", 2.0
+BESIDE = "beside the ego"
 # JSON knows no infinity; beyond every map all ranges are alike.
 FARTHEST_M = 1e6
 
@@ -87,12 +88,15 @@ def _views(page: Page) -> list[dict[str, Any]]:
         low, high = page.ego_outline_m.min(axis=0), page.ego_outline_m.max(axis=0)
         reach = NEAR_LENGTHS * (high[0] - low[0])
         views.insert(0, (NEAR, np.array([low - reach, high + reach])))
+    if page.maps:  # which is what is told of, and may be of a part of what others show
+        views.insert(0, (BESIDE, np.array([page.maps[0].x, page.maps[0].y]).T))
     ends = np.array([[(one.x[0], one.y[0]), (one.x[1], one.y[1])] for one in page.maps])
     found = []
     for name, points_m in views if page.maps else ():
         low = np.maximum(points_m.min(axis=0), ends[:, 0].min(axis=0))
         high = np.minimum(points_m.max(axis=0), ends[:, 1].max(axis=0))
-        if (low < high).all():
+        whole = name == BESIDE and (low <= ends[:, 0].min(axis=0)).all() and (high >= ends[:, 1].max(axis=0)).all()
+        if (low < high).all() and not whole:
             found.append({"name": name, "x": [low[0], high[0]], "y": [low[1], high[1]]})
     return found
 

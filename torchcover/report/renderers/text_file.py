@@ -24,7 +24,7 @@ SIGNS = {"best": "*", "significant": "!"}
 # More characters than any table has in a line.
 MAX_LINE_CHARS = 10_000
 # Words of headings that are longer may be cut, where there are too many columns.
-LEAST_HEADING_CHARS = 8
+LEAST_HEADING_CHARS = 10
 
 
 class Terminal(Console):
