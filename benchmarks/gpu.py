@@ -23,9 +23,8 @@ RIG, SCENARIO = "front_roof_128", "urban"
 TESTS = ("tests/stability/test_stability.py", "tests/neighbors/test_packets.py", "tests/simulation/test_raycaster.py",
          "tests/simulation/test_simulated.py", "tests/coverage/test_on_a_device.py")  # fmt: skip
 OF_A_GPU = "cuda or GPU or gpu"
-HOW = ("--numprocesses", "8", "--quiet", "--no-header", "--tb=short", "-p", "no:cacheprovider")
+HOW = ("--numprocesses", "8", "--quiet", "--no-header", "--tb=short", "-p", "no:cacheprovider", "-p", "no:benchmark")
 ROUNDS = 5
-MOST_PAIRS = 2 * 10**10  # compared with each other, for those who have no Warp
 
 
 def main(arguments=()):
@@ -45,7 +44,7 @@ def main(arguments=()):
         print(f"Tests that need a GPU: {told.stdout.strip().splitlines()[-1].strip('= ')}\n")
         print(told.stdout[-6000:] * bool(told.returncode))
     header = ("clouds", "queries", "points", "CPU, `auto` (ms)", "Warp (ms)", "with transfers (ms)", "CuPy (ms)",
-              "`cdist` (ms)", "other points", "farther by, at most")  # fmt: skip
+              "other points", "farther by, at most")  # fmt: skip
     table(header, searches(device, options.points))
     print()
     table(("metric update", "CPU (ms)", "device (ms)", "CPU / device"), updates(device))
@@ -96,10 +95,8 @@ def searched(name, query, points, device):
         nearest(query.to(device), points.to(device), backend="warp").distance.cpu()
 
     moved_ms = wall_ms(from_and_to_the_cpu, device)
-    few = device.type == "cuda" and len(query) * len(points) <= MOST_PAIRS
-    all_pairs_ms = wall_ms(partial(nearest, *there, backend="cdist"), device) if few else ""
     counts = f"{len(query):,}", f"{len(points):,}"
-    return name, *counts, cpu_ms, warp_ms, moved_ms, by_cupy_ms(*there), all_pairs_ms, differ, farther
+    return name, *counts, cpu_ms, warp_ms, moved_ms, by_cupy_ms(*there), differ, farther
 
 
 def by_cupy_ms(query, points):

@@ -75,7 +75,7 @@ def on_rigs(name, numbers, seed, budget_s, scenario):
             optimiser.tell(unit, value, float(np.nan_to_num(error[0] * left)))
             if found[-1].instants == start[-1].instants and value > most:
                 best, most = found, value
-    return -100 * most, asked
+    return 100 * most, asked
 
 
 def main(arguments=()):
@@ -106,7 +106,8 @@ def main(arguments=()):
             error = against.std(ddof=1) / np.sqrt(len(against))
             left = f"{np.median(each):.2f}", f"{each.mean():.2f}"
             rows.append((numbers, name, f"{asked[name].mean():.0f}", *left, f"{against.mean():+.2f} ± {error:.2f}"))
-    table(("numbers", "optimiser", "candidates", "left below (median)", "mean", "more than random's ± error"), rows)
+    told = "gain (median)" if options.scenario else "left below (median)"
+    table(("numbers", "optimiser", "candidates", told, "mean", "more than random's ± error"), rows)
 
 
 if __name__ == "__main__":

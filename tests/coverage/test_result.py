@@ -4,12 +4,15 @@ import json
 import math
 import pickle
 import re
+from dataclasses import is_dataclass
+from importlib import import_module
+from pkgutil import walk_packages
 
 import numpy as np
 import pytest
 import torch
 
-from torchcover import BevGrid, Coverage, CoverageMetric, Region
+from torchcover import BevGrid, Coverage, CoverageMetric, Region, coverage
 from torchcover.coverage import Layer, Maximum, MeanOfMeans, PooledMean, Quantiles, StepQuantiles, differences
 from torchcover.coverage.blocks import KnownCells
 from torchcover.files import BadFileError
@@ -189,6 +192,15 @@ def test_a_file_can_be_read_by_numpy_alone(tmp_path):
             layer.flat[file["cell"]] = file[key]
             np.testing.assert_array_equal(layer, expected)
         assert header["grid"]["cell"] == 0.5
+
+
+def test_what_was_measured_is_not_exchanged_afterwards():
+    modules = [import_module(one.name) for one in walk_packages(coverage.__path__, "torchcover.coverage.")]
+    records = {
+        one for module in modules for one in vars(module).values() if is_dataclass(one) and isinstance(one, type)
+    }
+    assert len(records) > 8
+    assert [one.__name__ for one in records if not one.__dataclass_params__.frozen] == []
 
 
 def test_a_result_survives_pickling():

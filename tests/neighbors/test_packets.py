@@ -108,6 +108,19 @@ def test_the_index_is_the_slow_twins(name, backend):
     np.testing.assert_array_equal(search(query, points, backend), slow_twin(query, points))
 
 
+@if_installed
+@pytest.mark.parametrize("name", ["random", "ties", "every point 8 times", "all equal", "17 points", "one point"])
+def test_the_loops_as_python_runs_them_find_the_same_and_stay_within_their_arrays(name, installed, monkeypatch):
+    """Compiled ones do not look where they write."""
+    for function, compiled in vars(packets).copy().items():
+        if hasattr(compiled, "py_func"):
+            monkeypatch.setattr(packets, function, compiled.py_func)
+    monkeypatch.setattr(packets, "CROWD", 20)
+    query, points = (cloud[:count] for cloud, count in zip(CLOUDS[name], (70, 90), strict=True))
+    with np.errstate(over="ignore"):
+        np.testing.assert_array_equal(search(query, points, "packets"), slow_twin(query, points))
+
+
 @clouds
 @pytest.mark.parametrize("backend", [name for name in BACKENDS if name != "packets"])
 def test_in_float64_too(name, backend):

@@ -22,7 +22,7 @@ Float64 = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
 # Positions that are cast at together. A constant, so that nothing depends on threads.
-CHUNK = 256
+CHUNK = 128
 # More than any count.
 NEVER = np.iinfo(np.int64).max
 
