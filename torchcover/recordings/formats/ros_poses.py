@@ -100,10 +100,7 @@ class VehiclePoses:
     def _around(self, logged_ns: int) -> Mapping[str, PoseSeries]:
         if self._last[0] != logged_ns:
             messages = self._bag.messages(self._topic, logged_ns - WINDOW_NS, logged_ns + WINDOW_NS)
-            self._last = (
-                logged_ns,
-                series_of(messages, self._bag.types[self._topic], self._topic),
-            )
+            self._last = (logged_ns, series_of(messages, self._bag.types[self._topic], self._topic))
         return self._last[1]
 
 
