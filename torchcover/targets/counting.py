@@ -178,12 +178,7 @@ class _OnGround(NamedTuple):
 
     @classmethod
     def of(
-        cls,
-        surface: Surface,
-        placed: Moving,
-        mounted: Sequence[MountedSensor],
-        met: Sequence[Met],
-        threshold_m: float,
+        cls, surface: Surface, placed: Moving, mounted: Sequence[MountedSensor], met: Sequence[Met], threshold_m: float
     ) -> Self:
         near = [
             surface.near(_in_target(sensor, one, placed.vehicle_T_part), threshold_m)
