@@ -19,8 +19,8 @@ from torchcover.report.page.map_content import arrays_of, map_content
 from torchcover.report.page.rig_drawing import rig_drawing, sensor_table
 from torchcover.report.renderers.layout import PageTable, Words
 
-# What maps and pictures may take in a file that is sent by mail without a thought, and the maps in any case; and how many
-# times that they may take before they are packed.
+# What maps and pictures may take in a file that is sent by mail without a thought, and the maps in any case; and how
+# many times that they may take before they are packed.
 MOST_CHARS, LEAST_CHARS, MOST_PACKED = 440_000, 100_000, 8
 ROUNDED = "Numbers of single cells are rounded, those of a wide scale by up to 4 %"
 NO_ERRORS = "errors of single cells are left out"
