@@ -6,7 +6,7 @@ import pytest
 from torchcover.recordings import open_recording
 from torchcover.simulation import Rig, calibrate
 from torchcover.simulation.material import Material
-from torchcover.simulation.recorded_returns import fit_returns, ground_rays, road_profile
+from torchcover.simulation.recorded_returns import HALF_LANES_M, NEAREST_M, fit_returns, ground_rays, road_profile
 from torchcover.simulation.returns import log_excess, return_probability
 
 RANGE_M, SPREAD, NOISE_M, HEIGHT_M = 60.0, 0.25, 0.02, 1.9
@@ -105,6 +105,20 @@ def test_the_road_is_found_where_it_tilts_and_bends():
     assert (
         np.abs(profile.height_m(np.stack([x, y, height_m], axis=-1).reshape(-1, 3)) - height_m.reshape(-1)).max() < 0.02
     )
+
+
+def test_what_lies_beside_the_lanes_is_no_road():
+    x, y = np.meshgrid(np.linspace(-60, 60, 121), np.linspace(-20, 20, 81))
+    lanes = np.abs(y) < HALF_LANES_M
+    points_m = np.stack([x, y, 0.02 * x + 0.3 * ~lanes], axis=-1)
+    whole, alone = road_profile(points_m.reshape(-1, 3)), road_profile(points_m[lanes])
+    np.testing.assert_allclose(whole.height_m(points_m[lanes]), alone.height_m(points_m[lanes]), atol=1e-9)
+
+
+def test_rays_to_what_is_near_are_in_nobodys_count(sweeps):
+    """The steep ones: they return, whatever the LiDAR."""
+    assert np.tan(np.deg2rad(RIG.sensors[0].rows_deg())).min() < -HEIGHT_M / 5
+    assert ground_rays(sweeps, RIG.sensors[0]).range_m.min() > NEAREST_M
 
 
 def test_near_road_cannot_tell_how_far_a_lidar_sees(sweeps, tmp_path):
