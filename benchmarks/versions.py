@@ -1,8 +1,8 @@
 """Every test on each version of Python, from the sdist and outside the repository, in an environment of its own.
 
 `python -m benchmarks.versions [VERSION ...]`, as in `3.13`, or `lowest`: Python 3.11 with the lowest versions of all
-dependencies, among them a torch that comes with gigabytes for CUDA. Interpreters are those on the PATH and of pyenv, which
-makes one that is missing. A quarter of an hour each on two cores; what was printed stays in `out/versions`.
+dependencies, among them a torch that comes with gigabytes for CUDA. Interpreters are those on the PATH and of pyenv,
+which makes one that is missing. A quarter of an hour each on two cores; what was printed stays in `out/versions`.
 """
 
 import os
