@@ -151,7 +151,11 @@ class AccumulatedReference:
         dropped["hidden"] = int((share == 0).sum())
         points_m, level_m, share = points_m[share > 0], level_m[share > 0], share[share > 0]
         if not len(points_m):
-            raise ValueError(f"no reference point is left of the scans within {self.window_s / 2:g} s of this instant")
+            raise ValueError(
+                f"no reference point is left of the scans within {self.window_s / 2:g} s of this instant, of which "
+                f"{dropped['sweeps']} were used and {dropped['sweeps_skipped']} not, as where poses jump; "
+                "--skip-bad-frames leaves it out"
+            )
         weights = (square_metres(level_m) * share).astype(np.float32)
         return InVehicle(points_m.astype(np.float32), dropped, weights)
 
