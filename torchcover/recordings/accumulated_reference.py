@@ -30,10 +30,10 @@ USUAL_BODY = BoundingBox((-2.4, -0.95, 0.0), (2.4, 0.95, 1.7))
 # detection and per cent of the radius (rms over regions and bands); and points that differences of rigs were off.
 # From docs/measured/recordings.md, by the window in seconds, and whether there are boxes.
 OFF = {
-    (2.0, True): {"towns": (5, 27), "highways": (6, 18)},
-    (2.0, False): {"towns": (9, 38), "highways": (6, 18)},
-    (5.0, True): {"towns": (5, 27), "highways": (6, 18)},
-    (5.0, False): {"towns": (9, 38), "highways": (6, 18)},
+    (2.0, True): {"towns": (7, 36), "highways": (7, 36)},
+    (2.0, False): {"towns": (11, 52), "highways": (11, 52)},
+    (5.0, True): {"towns": (7, 36), "highways": (7, 36)},
+    (5.0, False): {"towns": (11, 52), "highways": (11, 52)},
 }
 DIFFERENCE_OFF = 4
 
