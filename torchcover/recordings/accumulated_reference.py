@@ -11,7 +11,7 @@ from torchcover.geometry import BoundingBox, invert, transform
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.in_vehicle import InVehicle, within
 from torchcover.recordings.movers import COMPARED_S, WITHIN_M, Moved, movers
-from torchcover.recordings.recording import Recording, is_labelled
+from torchcover.recordings.recording import Recording
 from torchcover.recordings.seen_past import Key
 from torchcover.recordings.sweeps import Sweeps, Thinned, first_of_each, pose_of
 from torchcover.recordings.visible import seen_share, square_metres
@@ -26,15 +26,10 @@ MOVES_MPS, KNOWN_POINTS = 0.5, 50
 # Where a recording does not say how large its vehicle is.
 USUAL_BODY = BoundingBox((-2.4, -0.95, 0.0), (2.4, 0.95, 1.7))
 
-# How far such numbers were off in simulated drives, rounded up: the most of the rigs that were looked at, points of
-# detection and per cent of the radius (rms over regions and bands); and points that differences of rigs were off.
-# From docs/measured/recordings.md, by the window in seconds, and whether there are boxes.
-OFF = {
-    (2.0, True): {"towns": (7, 36), "highways": (7, 36)},
-    (2.0, False): {"towns": (11, 52), "highways": (11, 52)},
-    (5.0, True): {"towns": (7, 36), "highways": (7, 36)},
-    (5.0, False): {"towns": (11, 52), "highways": (11, 52)},
-}
+# How far such numbers were off in simulated drives by the window in seconds, with boxes or without: points of detection
+# and per cent of the radius (rms over regions and bands; the most of several rigs, rounded up); and points that
+# differences of rigs were off. From docs/measured/recordings.md.
+OFF = {2.0: {"towns": (8, 28), "highways": (5, 18)}, 5.0: {"towns": (7, 22), "highways": (4, 16)}}
 DIFFERENCE_OFF = 4
 
 
@@ -230,9 +225,7 @@ class AccumulatedReference:
         """Settings, and what such a reference cannot know."""
         taking_part = self._taking_part(recording)
         among = [sensor for sensor in taking_part if sensor in judged] if self.window_s else []
-        labelled = is_labelled(recording)
-        measured_s = min((window_s for window_s, _ in OFF), key=lambda window_s: abs(window_s - self.window_s))
-        off = OFF[measured_s, labelled]
+        measured_s, off = min(OFF.items(), key=lambda measured: abs(measured[0] - self.window_s))
         told = ", ".join(
             f"{points} points of detection and {share} % of radii in {of}" for of, (points, share) in off.items()
         )
@@ -240,7 +233,7 @@ class AccumulatedReference:
             f"Reference: accumulated from {', '.join(taking_part)} over {self.window_s:g} s, one point in "
             f"{self.voxel_m:g} m, cleaned by rays.",
             "What none of them saw in that time is unknown, and in no number.",
-            f"In simulated drives, with windows of {measured_s:g} s and with{'' if labelled else 'out'} boxes, such "
+            f"In simulated drives, with windows of {measured_s:g} s, boxes or none, such "
             f"numbers were off the truth, beyond their intervals, by (rms) {told}; differences between two rigs by "
             f"{DIFFERENCE_OFF} points.",
         ]
@@ -254,7 +247,7 @@ class AccumulatedReference:
             "judged_among_them": among,
             "window_s": self.window_s,
             "voxel_m": self.voxel_m,
-            "off": {"window_s": measured_s, "labels": labelled, "points_and_percent": off},
+            "off": {"window_s": measured_s, "points_and_percent": off},
             "notes": notes,
         }
 

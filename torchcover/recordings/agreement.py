@@ -86,7 +86,7 @@ class Surfaces:
         return float(np.exp(-squared / 2).sum() / len(points_m)) / self._own
 
 
-class Beside:
+class TwoSensors:
     """What two sensors see at the first of a pair of instants, between which the vehicle moves."""
 
     def __init__(self, recording: Recording, sensors: Sequence[str], pair: "Pair") -> None:
@@ -156,7 +156,7 @@ def disagreement(recording: Recording, sensor: str, many: int) -> str | None:
     return mended and f"two scans of {sensor} agree to {given:.0%} once its poses move them, and to {mended}"
 
 
-def _mean(pairs: Sequence[Pair | Beside], corrections: Corrections) -> float:
+def _mean(pairs: Sequence[Pair | TwoSensors], corrections: Corrections) -> float:
     return float(np.mean([pair.agreement(corrections) for pair in pairs]))
 
 
@@ -167,7 +167,7 @@ def _late(pairs: Sequence[Pair], given: float) -> str | None:
     return f"{agreed:.0%} if they are late (early, if negative): --lag {lag_s:.2f}"
 
 
-def _best_lag(pairs: Sequence[Pair | Beside]) -> tuple[float, float]:
+def _best_lag(pairs: Sequence[Pair | TwoSensors]) -> tuple[float, float]:
     """The lag with which they agree best, and how well; 0 where ragged noise has many that are better."""
     by_lag = np.array([_mean(pairs, Corrections(lag_s=lag_s)) for lag_s in LAGS_S])
     best = int(by_lag.argmax())
@@ -181,7 +181,7 @@ def clocks_apart(recording: Recording, sensors: Sequence[str], many: int) -> lis
     pairs, found = [pair for pair in _chosen(list(_stretches(recording, many))) if pair.way_m > STANDS_M], []
     for sensor in sensors[1:]:
         try:
-            looks = [Beside(recording, (sensors[0], sensor), pair) for pair in pairs]
+            looks = [TwoSensors(recording, (sensors[0], sensor), pair) for pair in pairs]
         except (OSError, ValueError):
             continue  # whoever measures it will say so
         looks = [look for look in looks if look.enough]

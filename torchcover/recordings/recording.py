@@ -194,13 +194,3 @@ def _read_marker(path: Path) -> dict[str, Any]:
     if not isinstance(said, dict) or not isinstance(said.get("frames"), list):
         raise ValueError("frames are needed, by their names; it says none")
     return {"content": {}, **said}
-
-
-def is_labelled(recording: Recording) -> bool:
-    """Whether the first frame whose boxes can be read has any, or says that there are none."""
-    for instant in recording.frames:
-        try:
-            return recording.boxes(instant) is not None
-        except (OSError, ValueError):
-            continue  # whoever measures it will say so
-    return False
