@@ -38,6 +38,7 @@ BENCHMARKS = (
     "published",
     "voxels",
     "streets",
+    "gpu",
 )
 
 

@@ -27,8 +27,8 @@ COMMANDS = re.compile(
 STAMP = re.compile(r"\*Printed in (?P<seconds>\d+) s of processor time(?:, by the code of (?P<commit>[0-9a-f]+))?\.\*")
 # Files that whoever runs the command has to give.
 NEEDED = re.compile(r"(?<![\w/.-])[A-Z]{3,}(?![\w=])")
-# Hours, as root.
-BY_HAND = ("versions",)
+# Hours, of versions as root; and what needs another machine.
+BY_HAND = ("versions", "mutants", "gpu")
 PICTURES = re.compile(r"docs/images/\S+\.png")
 MOST_PIXELS, COLOURS = (1200, 1600), 256
 TABLE = re.compile(r"(<!-- first table of (?P<page>\S+) -->\n\n)(?:.*?)(\n<!-- /first table -->\n)", re.DOTALL)

@@ -2,8 +2,11 @@
 
 import argparse
 import time
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 
 import numpy as np
+import torch
 
 from benchmarks.timing import table
 from torchcover.placement import OPTIMISERS, CommonInstants, Cube, SearchSpace
@@ -72,7 +75,7 @@ def on_rigs(name, numbers, seed, budget_s, scenario):
             optimiser.tell(unit, value, float(np.nan_to_num(error[0] * left)))
             if found[-1].instants == start[-1].instants and value > most:
                 best, most = found, value
-    return -100 * most, asked
+    return 100 * most, asked
 
 
 def main(arguments=()):
@@ -83,25 +86,28 @@ def main(arguments=()):
     parser.add_argument("--optimisers", default="gp,random")
     parser.add_argument("--seeds", type=int, default=8)
     parser.add_argument("--scenario", help="real rigs in it, 90 s each, instead of surfaces")
+    parser.add_argument("--processes", type=int, default=1, help="runs at the same time: budgets are processor time")
     options = parser.parse_args(arguments)
+    if options.scenario:
+        each = partial(on_rigs, budget_s=options.budget_s, scenario=options.scenario)
+    else:
+        each = partial(on_surface, budget_s=options.budget_s, candidate_s=options.candidate_s)
+    names = options.optimisers.split(",")
+    cases = [(name, numbers) for numbers in map(int, options.numbers.split(",")) for name in names]
+    with ProcessPoolExecutor(options.processes, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+        runs = {case: [pool.submit(each, *case, seed) for seed in range(options.seeds)] for case in cases}
     rows = []
     for numbers in map(int, options.numbers.split(",")):
         found, asked = {}, {}
-        for name in options.optimisers.split(","):
-            if options.scenario:
-                runs = [
-                    on_rigs(name, numbers, seed, options.budget_s, options.scenario) for seed in range(options.seeds)
-                ]
-            else:
-                costs = options.budget_s, options.candidate_s
-                runs = [on_surface(name, numbers, seed, *costs) for seed in range(options.seeds)]
-            found[name], asked[name] = np.array(runs).T
+        for name in names:
+            found[name], asked[name] = np.array([run.result() for run in runs[name, numbers]]).T
         for name, each in found.items():
             against = each - found.get("random", np.nan)
             error = against.std(ddof=1) / np.sqrt(len(against))
             left = f"{np.median(each):.2f}", f"{each.mean():.2f}"
             rows.append((numbers, name, f"{asked[name].mean():.0f}", *left, f"{against.mean():+.2f} ± {error:.2f}"))
-    table(("numbers", "optimiser", "candidates", "left below (median)", "mean", "more than random's ± error"), rows)
+    told = "gain (median)" if options.scenario else "left below (median)"
+    table(("numbers", "optimiser", "candidates", told, "mean", "more than random's ± error"), rows)
 
 
 if __name__ == "__main__":

@@ -100,6 +100,21 @@ def test_the_sums_stay_on_the_device():
     assert max((count for _, count in gpu.to_host), default=0) <= 2 * 20 * 20
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_a_gpu_adds_up_what_the_cpu_does():
+    """But for the order in which float64 is added up, and the last bit of a distance."""
+    grid = BevGrid(x=(0.0, 20.0), y=(0.0, 20.0), cell=1.0, heights={"low": (0.0, 4.0), "high": (4.0, 20.0)})
+    options = {"max_radius": 30.0, "blocks": 8, "aggregations": (Maximum(), PooledMean()), "square_metres": True}
+    metrics = [CoverageMetric(grid, (0.4, 1.0), **options).to(device) for device in ("cpu", "cuda")]
+    for metric in metrics:
+        for clouds in each_step():
+            sensor, reference, weights = (cloud.to(metric.device) for cloud in clouds)
+            metric.update(sensor, reference, weights=weights)
+    expected, found = (metric.compute() for metric in metrics)
+    for key, layer in expected.layers.items():
+        torch.testing.assert_close(found.layers[key].values.cpu(), layer.values, rtol=1e-6, atol=0, equal_nan=True)
+
+
 def test_what_was_seen_of_boxes_stays_on_the_device(monkeypatch):
     monkeypatch.setattr(choice, "_works", lambda *_: False)
     boxes = Boxes.from_rows(

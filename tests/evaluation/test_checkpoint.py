@@ -7,6 +7,8 @@ import random
 import signal
 import time
 import zipfile
+from collections import Counter
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -169,6 +171,28 @@ def test_looks_at_a_target_error_go_on_as_they_would_have(frame_of, path, monkey
     assert bits(measured(Drive(frame_of, range(STEPS)), path, **target)) == bits(whole)
 
 
+@pytest.mark.parametrize(("write_s", "pause_s"), [(0.0, 60.0), (2.0, 60.0), (9.0, 180.0)])
+def test_it_is_written_every_minute_and_more_seldom_where_that_took_a_twentieth_of_the_time(
+    tmp_path, monkeypatch, write_s, pause_s
+):
+    now_s, written_s = 0.0, []
+
+    def write(*_):
+        nonlocal now_s
+        now_s += write_s
+        written_s.append(now_s)
+
+    monkeypatch.setattr(checkpoint, "time", SimpleNamespace(monotonic=lambda: now_s))
+    monkeypatch.setattr(checkpoint, "write_checkpoint", write)
+    journal = checkpoint.Journal(Checkpoint(tmp_path / "a.npz"), {}, {})
+    run = SimpleNamespace(steps=1, counts=Counter(), skipped=[], seconds=0.0)
+    while now_s < 1800.0:
+        now_s += 1.0
+        journal.write_if_due(run)
+    assert np.diff(written_s, prepend=0.0).tolist() == [60.0 + write_s, *[pause_s + write_s] * (len(written_s) - 1)]
+    assert len(written_s) >= 9
+
+
 @pytest.mark.usefixtures("_at_every_step")
 def test_what_one_observer_has_seen_and_another_has_not_is_not_kept(frame_of, path):
     with pytest.raises(ZeroDivisionError):
@@ -276,6 +300,35 @@ def test_states_come_back_bit_for_bit(tmp_path):
     for name, tensor in state.items():
         assert (back[name].shape, back[name].dtype) == (tensor.shape, tensor.dtype)
         assert back[name].numpy().tobytes() == tensor.numpy().tobytes()
+
+
+def test_a_state_may_be_larger_than_what_the_first_zips_held(tmp_path, monkeypatch):
+    """2 GiB, which are 1 kB here."""
+    monkeypatch.setattr(zipfile, "ZIP64_LIMIT", 1000)
+    path, state = tmp_path / "a.npz", {"large": torch.arange(1000)}
+    header = {"identity": {}, "run": {"steps": 1, "counts": {}, "skipped": [], "seconds": 0.0}}
+    write_checkpoint(path, header, {"one": state})
+    assert torch.equal(read_state(path, read_header(path), "one")["large"], state["large"])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"shape": [-1, 3]}, r"an array of int64 and the shape \(-1, 3\)"),
+        ({"shape": [-2, -3]}, r"an array of int64 and the shape \(-2, -3\)"),
+        ({"shape": [2, 4]}, "cannot reshape"),
+        ({"dtype": "<U2"}, r"an array of <U2 and the shape \(2, 3\)"),
+        ({"shape": [10**9, 10**9]}, "reading it takes"),
+    ],
+)
+def test_an_array_that_its_header_describes_wrongly_is_refused(tmp_path, change, message):
+    path = tmp_path / "a.npz"
+    header = {"identity": {}, "run": {"steps": 1, "counts": {}, "skipped": [], "seconds": 0.0}}
+    write_checkpoint(path, header, {"one": {"of it": torch.arange(6).view(2, 3)}})
+    header = read_header(path)
+    header["states"]["one"]["dict"]["of it"]["tensor"] |= change
+    with pytest.raises(BadFileError, match=rf"a\.npz: .*{message}"):
+        read_state(path, header, "one")
 
 
 def test_a_damaged_checkpoint_is_named(frame_of, path):

@@ -8,17 +8,19 @@ import socket
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from datetime import timedelta
 from queue import SimpleQueue
 
 import pytest
 import torch
-from torch.distributed import FileStore
+from torch.distributed import FileStore, HashStore
 
 import torchcover
 from torchcover.data import BadFrameError, FrameDataset, SimulatedFrames
 from torchcover.evaluation import Ranks, joined_ranks
+from torchcover.evaluation.ranks import ABORTED
 
-LONGEST_S = 60.0
+LONGEST_S = 30.0
 
 
 class Drive(FrameDataset):
@@ -147,6 +149,83 @@ def test_ranks_merge_in_order_and_none_of_them_many(size):
         first = next(pool.map(merged, ranks))
     assert first.names == [name for rank in range(size) for name in (f"{rank}", f"{rank} too")]
     assert max(rank.received for rank in ranks) == math.ceil(math.log2(size))
+
+
+def in_threads(work, size=3):
+    """What `work(ranks)` gives or raises in ranks that have no more in common than a store."""
+    store = HashStore()
+    store.set_timeout(timedelta(seconds=LONGEST_S / 3))
+
+    def outcome(rank):
+        try:
+            return work(Ranks(store, rank, size))
+        except Exception as error:
+            return error
+
+    with ThreadPoolExecutor(size) as pool:
+        return list(pool.map(outcome, range(size)))
+
+
+@pytest.mark.parametrize("late", range(3))
+def test_ranks_leave_when_all_is_written_and_rank_0_as_the_last_one(monkeypatch, late):
+    monkeypatch.setattr("torchcover.evaluation.ranks.PARTING_S", 20.0)
+    happened, begin_s = [], time.monotonic()
+
+    def work(rank):
+        time.sleep(0.3 * (rank.rank == late))
+        happened.append(("written", "ready", "ready")[rank.rank])
+        rank.part()
+        happened.append(("closed", "left", "left")[rank.rank])
+
+    assert in_threads(work) == [None] * 3
+    assert happened.index("written") < happened.index("left")
+    assert happened.count("ready") == happened[: happened.index("closed")].count("ready") == 2
+    assert time.monotonic() - begin_s < 10.0
+
+
+def test_rank_0_waits_for_one_that_is_gone_for_a_while_only(monkeypatch):
+    monkeypatch.setattr("torchcover.evaluation.ranks.PARTING_S", 0.3)
+    begin_s = time.monotonic()
+    Ranks(HashStore(), 0, 2).part()
+    assert 0.3 <= time.monotonic() - begin_s < 3.0
+
+
+def test_the_first_failure_is_the_one_that_is_told_of():
+    first, second = (Ranks(store, rank, 2) for store in [HashStore()] for rank in range(2))
+    assert first.failure is second.failure is None
+    second.tell(KeyboardInterrupt())
+    first.tell(ValueError("too late"))
+    assert first.failure == second.failure == "rank 1: KeyboardInterrupt"
+    with pytest.raises(ChildProcessError, match=r"^rank 1: KeyboardInterrupt$"):
+        first.check_others()
+
+
+def test_who_waits_for_what_rank_0_is_about_learns_that_it_has_ended():
+    def work(rank):
+        if rank.rank == 0:
+            rank.tell(MemoryError(), ABORTED)
+        else:
+            rank.check_same({"seed": "1"})
+
+    found = in_threads(work)
+    assert list(map(repr, found)) == ["None", *["ChildProcessError('rank 0: MemoryError')"] * 2]
+
+
+@pytest.mark.parametrize("failing", range(3))
+def test_who_ends_all_ends_with_its_own_error_and_the_others_with_words_of_it(failing):
+    def work(rank):
+        try:
+            with rank.aborting():
+                if rank.rank == failing:
+                    raise ValueError("no  such\nthing")
+                rank._wait_for(["never"])
+        finally:
+            rank.part()
+
+    words = f"rank {failing}: ValueError: no such thing"
+    for rank, error in enumerate(in_threads(work)):
+        expected = ValueError("no  such\nthing") if rank == failing else ChildProcessError(words)
+        assert repr(error) == repr(expected)
 
 
 def test_a_run_over_ranks_goes_on_from_its_checkpoints(frame_of, tmp_path):

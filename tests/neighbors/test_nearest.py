@@ -12,6 +12,7 @@ from pykdtree.kdtree import KDTree
 
 from torchcover import blind_spot_radius, nearest
 from torchcover.neighbors import BACKENDS, cdist, check_cloud, choice, kdtree
+from torchcover.neighbors.query import _rescale
 
 DTYPES = [torch.float16, torch.bfloat16, torch.float32, torch.float64]
 # Rounding of the search decides between points that are this close to equally near; the distance is rounded once.
@@ -189,6 +190,17 @@ def test_extents_whose_squares_leave_the_range_of_the_type(backend, scale, dtype
     assert (distance > 0).all()
 
 
+@pytest.mark.parametrize("scale", [2.0**exponent for exponent in (-1000, -600, -599, 300, 301, 1000)])
+def test_what_is_scaled_for_the_search_is_scaled_by_a_power_of_two(scale):
+    """Not a bit is rounded, so that not a tie is broken."""
+    query, points = (random_cloud(count, count, dtype=torch.float32).double() for count in (30, 40))
+    *scaled, reach = _rescale(query * scale, points * scale, 3.0 * scale)
+    ratio = reach / 3.0
+    assert math.frexp(ratio)[0] == 0.5
+    assert all(torch.equal(one, cloud * ratio) for one, cloud in zip(scaled, (query, points), strict=True))
+    assert 0.5 <= max(float(cloud.abs().max()) for cloud in scaled) < 1.0
+
+
 @backends
 def test_one_point_far_away_does_not_spoil_the_others(backend):
     points = cloud([2, 0, 0], [1, 0, 0], [1e30, 0, 0])
@@ -320,6 +332,15 @@ def test_auto_takes_packets_in_float32_where_a_call_gains_its_share_of_loading_t
     monkeypatch.setitem(BACKENDS, chosen, "torchcover.neighbors.cdist")
     clouds = (random_cloud(count, 21, dtype=dtype) for count in counts)
     assert choice.choose_search(*clouds, "auto") is cdist.search
+
+
+@pytest.mark.parametrize(("scale", "chosen"), [((1, 0, 0), False), ((1, 1, 0), False), ((1, 1, 1), True)])
+def test_packets_do_not_pay_around_points_on_a_line_or_in_a_plane(scale, chosen, monkeypatch):
+    """All of a packet's queries are compared with what is near any of them; flat boxes of the tree are soon passed."""
+    monkeypatch.setattr(choice, "_works", lambda *_: True)
+    query, points = random_cloud(100_000, 22), random_cloud(300_000, 23) * torch.tensor(scale, dtype=torch.float32)
+    assert (choice.backend_of_several(query, [points]) == "packets") is chosen
+    assert choice.backend_of_several(points, [points]) == "packets"  # queries among them are near few
 
 
 @pytest.fixture
@@ -594,6 +615,16 @@ def test_a_broken_backend_that_was_named_is_an_error_of_one_line(monkeypatch, tm
         f"backend '{backend}' does not work here (libllvm: no such file); try 'auto', or "
         f"pip install 'torchcover[{extra}]' anew"
     )
+
+
+# Where pairs are compared on a GPU
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("scale", [1e-9, 1.0, 1e9])
+def test_by_squared_differences_the_same_are_nearest(monkeypatch, dtype, scale):
+    monkeypatch.setattr(cdist, "_distances", cdist._squared_distances)
+    assert_exact(random_cloud(300, 70, scale, dtype), random_cloud(500, 71, scale, dtype), "cdist")
 
 
 # Where the memory of a GPU is too small

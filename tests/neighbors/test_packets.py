@@ -15,7 +15,9 @@ from torchcover import nearest
 
 ROOT = Path(__file__).parents[2]
 INSTALLED = find_spec("numba") is not None
-BACKENDS = [name for name, library in (("packets", "numba"), ("warp", "warp")) if find_spec(library)]
+BACKENDS = ["packets"] * INSTALLED
+if find_spec("warp"):
+    BACKENDS += ["warp", "warp on a GPU"] if torch.cuda.is_available() else ["warp"]
 if INSTALLED:
     from torchcover.neighbors import packets
     from torchcover.neighbors.packets import along_the_curve
@@ -83,9 +85,13 @@ def slow_twin(query, points):
     return (x * x + y * y + z * z).argmin(axis=1)
 
 
+def there(cloud, backend):
+    return torch.from_numpy(cloud).to("cuda" if "GPU" in backend else "cpu")
+
+
 def search(query, points, backend):
-    clouds = (torch.from_numpy(cloud) for cloud in (query, points))
-    return import_module(f"torchcover.neighbors.{backend}").search(*clouds, math.inf, 1.0).numpy()
+    module = import_module(f"torchcover.neighbors.{backend.split()[0]}")
+    return module.search(there(query, backend), there(points, backend), math.inf, 1.0).cpu().numpy()
 
 
 @pytest.fixture
@@ -102,8 +108,21 @@ def test_the_index_is_the_slow_twins(name, backend):
     np.testing.assert_array_equal(search(query, points, backend), slow_twin(query, points))
 
 
+@if_installed
+@pytest.mark.parametrize("name", ["random", "ties", "every point 8 times", "all equal", "17 points", "one point"])
+def test_the_loops_as_python_runs_them_find_the_same_and_stay_within_their_arrays(name, installed, monkeypatch):
+    """Compiled ones do not look where they write."""
+    for function, compiled in vars(packets).copy().items():
+        if hasattr(compiled, "py_func"):
+            monkeypatch.setattr(packets, function, compiled.py_func)
+    monkeypatch.setattr(packets, "CROWD", 20)
+    query, points = (cloud[:count] for cloud, count in zip(CLOUDS[name], (70, 90), strict=True))
+    with np.errstate(over="ignore"):
+        np.testing.assert_array_equal(search(query, points, "packets"), slow_twin(query, points))
+
+
 @clouds
-@pytest.mark.parametrize("backend", [name for name in BACKENDS if name == "warp"])
+@pytest.mark.parametrize("backend", [name for name in BACKENDS if name != "packets"])
 def test_in_float64_too(name, backend):
     """With coordinates that float32 does not hold, and ties where there were some."""
     query, points = (cloud.astype(np.float64) / 3 for cloud in CLOUDS[name])
@@ -129,7 +148,8 @@ def test_the_order_of_the_queries_their_parts_and_the_threads_change_nothing(nam
 @backends
 @pytest.mark.parametrize("quantile", [0.0, 0.5, 1.0])
 def test_a_bound_only_leaves_out_what_is_beyond(name, backend, quantile):
-    query, points = (torch.from_numpy(cloud) for cloud in CLOUDS[name])
+    query, points = (there(cloud, backend) for cloud in CLOUDS[name])
+    backend = backend.split()[0]
     everything = nearest(query, points, backend=backend)
     limit = float(everything.distance.quantile(quantile, interpolation="nearest"))
     bounded = nearest(query, points, max_distance=limit, backend=backend)

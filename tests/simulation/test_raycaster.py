@@ -6,6 +6,7 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
+import torch
 
 from torchcover.geometry import rigid, rotation_from_euler
 from torchcover.simulation import raycaster
@@ -18,11 +19,17 @@ NUMBERS = np.random.default_rng
 MOUNTAIN = Mesh(np.array([[1e6, 0, 0], [1e6, 100, 0], [1e6, 0, 100]]), np.array([[0, 1, 2]]))
 
 
-@pytest.fixture(params=["Embree", *["Warp"] * bool(find_spec("warp"))], autouse=True)
+LIBRARIES = ["Embree"]
+if find_spec("warp"):
+    LIBRARIES += ["Warp", "Warp on a GPU"] if torch.cuda.is_available() else ["Warp"]
+
+
+@pytest.fixture(params=LIBRARIES, autouse=True)
 def library(request, monkeypatch):
-    """Whoever casts, casts alike: every test here is about both."""
-    if request.param == "Warp":
-        monkeypatch.setitem(globals(), "RayCaster", partial(raycaster.RayCaster, device="cpu"))
+    """Whoever casts, casts alike, and wherever: every test here is about all."""
+    if request.param.startswith("Warp"):
+        device = "cuda:0" if "GPU" in request.param else "cpu"
+        monkeypatch.setitem(globals(), "RayCaster", partial(raycaster.RayCaster, device=device))
     return request.param
 
 

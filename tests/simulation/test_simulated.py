@@ -52,10 +52,11 @@ def test_a_frame_does_not_depend_on_workers():
 
 @pytest.mark.skipif(not find_spec("warp"), reason="Warp is not installed")
 @pytest.mark.parametrize("scenario", ["courtyard", "urban"])
-def test_rays_of_warp_end_where_those_of_embree_do(scenario):
+@pytest.mark.parametrize("device", ["cpu", *["cuda:0"] * torch.cuda.is_available()])
+def test_rays_of_warp_end_where_those_of_embree_do(scenario, device):
     """But for rounding, and for rays that pass an edge on the other side."""
     by_embree, by_warp = (
-        SimulatedFrames(scenario, "kitti", steps=2, every_s=1.0, device=device)[1] for device in (None, "cpu")
+        SimulatedFrames(scenario, "kitti", steps=2, every_s=1.0, device=each)[1] for each in (None, device)
     )
     for one, other in ((by_embree.sensor, by_warp.sensor), (by_embree.reference, by_warp.reference)):
         for queries, points in ((one, other), (other, one)):

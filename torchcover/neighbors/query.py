@@ -88,7 +88,7 @@ def nearest(
         points: (M, 3) floating-point coordinates on the same device. M = 0 is allowed.
         max_distance: Only points within this distance count. A finite value makes the search faster.
         backend: "cdist" (any device), "kdtree" (CPU), "packets" (CPU, float32; needs `torchcover[fast]`; wider types
-            are left to the KD-tree), "warp" (CUDA, and slowly CPU; needs `torchcover[warp]`; never run on a GPU) or
+            are left to the KD-tree), "warp" (CUDA, and slowly CPU; needs `torchcover[warp]`) or
             "auto" (by device, type and size; packets and Warp only where they are installed).
         memory_mb: Most memory in megabytes that "cdist" may use for the pairs under comparison, beside a few arrays as
             long as the clouds.

@@ -4,8 +4,6 @@ The walk keeps no stack. Of two children it takes the nearer one and notes in a 
 and the bits of its ancestors say where to go on. The squared distance to a box is never above that to a point in it,
 because rounding keeps order, so nothing nearer is passed over. Of several points at the same squared distance, in the
 type of the clouds, the one with the smallest index is named: the result is the same for any order and division.
-
-Never run on a GPU.
 """
 
 # The types of Warp's functions are Warp's own.

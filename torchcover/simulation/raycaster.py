@@ -252,12 +252,7 @@ class RayCaster:
         return answer
 
     def _leave_faces(
-        self,
-        origin_m: NDArray[np.floating],
-        directions: Float32,
-        limit_m: Float32,
-        hits: Hits,
-        faces: Int64,
+        self, origin_m: NDArray[np.floating], directions: Float32, limit_m: Float32, hits: Hits, faces: Int64
     ) -> None:
         """Let the rays go on that hit a face whose plane they start on: by rounding alone, as they leave it."""
 

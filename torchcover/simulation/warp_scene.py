@@ -3,8 +3,6 @@
 Warp's own query of a mesh lets rays slip between boxes without thickness, so boxes are grown here, and faces are asked
 in float64: two that share an edge compute the same number for it with opposite signs, and no ray passes between them.
 Of several faces at the same range the first is met.
-
-Never run on a GPU.
 """
 
 # The types of Warp's functions are Warp's own.

@@ -19,13 +19,7 @@ from torchcover.simulation.traffic.idm import Driver
 from torchcover.simulation.traffic.procedural import MostPeople, MostVehicles, Procedural
 from torchcover.simulation.traffic.scenery import Scenery
 from torchcover.simulation.traffic.signals import CROSS, MAIN
-from torchcover.simulation.traffic.streets import (
-    FOOTPATHS_M,
-    WAITING_BEHIND_KERB_M,
-    Section,
-    Streets,
-    plan,
-)
+from torchcover.simulation.traffic.streets import FOOTPATHS_M, WAITING_BEHIND_KERB_M, Section, Streets, plan
 from torchcover.simulation.world import Actor
 
 WARM_UP_S = 20.0
