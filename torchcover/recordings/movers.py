@@ -47,7 +47,8 @@ def movers(scans_m: Sequence[Float64], apart_s: Float64) -> list[Moved]:
     found: list[Moved] = []
     apart_s, of_time = np.unique(apart_s, return_inverse=True)
     scans_m = [
-        np.concatenate([scans_m[scan] for scan in np.flatnonzero(of_time == time)]) for time in range(len(apart_s))
+        np.concatenate([scans_m[scan] for scan in np.flatnonzero(of_time == time).tolist()])
+        for time in range(len(apart_s))
     ]
     if sum(map(len, scans_m)) < FEWEST or len(scans_m) < 2:
         return found
