@@ -42,14 +42,9 @@ def movers(scans_m: Sequence[Float64], apart_s: Float64) -> list[Moved]:
     """What moves, or has stood for a moment only.
 
     `scans_m`: (N, 3) points of each scan that belong to nothing that stands; `apart_s`: (S,) when each scan was, from
-    the instant on. Scans of one time are one: what only one of two sensors sees is there.
+    the instant on.
     """
     found: list[Moved] = []
-    apart_s, of_time = np.unique(apart_s, return_inverse=True)
-    scans_m = [
-        np.concatenate([scans_m[scan] for scan in np.flatnonzero(of_time == time).tolist()])
-        for time in range(len(apart_s))
-    ]
     if sum(map(len, scans_m)) < FEWEST or len(scans_m) < 2:
         return found
     lower_m = np.min([points_m[:, :2].min(axis=0) for points_m in scans_m if len(points_m)], axis=0) - 2 * CELL_M
@@ -59,7 +54,9 @@ def movers(scans_m: Sequence[Float64], apart_s: Float64) -> list[Moved]:
     left = [np.ones(len(points_m), np.bool_) for points_m in scans_m]
     together = sorted(map(int, np.flatnonzero(np.abs(apart_s) <= TOGETHER_S)), key=lambda one: abs(apart_s[one]))
     for scan in together:
-        others = np.sort(np.argsort(np.abs(apart_s - apart_s[scan]), kind="stable")[1 : COMPARED + 1])
+        times_s = np.unique(apart_s[apart_s != apart_s[scan]])
+        compared_s = times_s[np.argsort(np.abs(times_s - apart_s[scan]), kind="stable")[:COMPARED]]
+        others = np.flatnonzero(np.isin(apart_s, compared_s))
         since_s = np.ascontiguousarray(apart_s[others] - apart_s[scan])
         rows = np.flatnonzero(left[scan])
         for cluster in _clusters(cells[scan][rows], shape):
