@@ -15,7 +15,19 @@ import torch
 
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric
 from torchcover.coverage.quantity import RADIUS
-from torchcover.report import Line, Page, PageMap, PageRig, PageTable, SensorView, Words, maps_of, page_html, scale_of
+from torchcover.report import (
+    Line,
+    Page,
+    PageMap,
+    PagePicture,
+    PageRig,
+    PageTable,
+    SensorView,
+    Words,
+    maps_of,
+    page_html,
+    scale_of,
+)
 from torchcover.report.page.codes import CellBytes, encoded
 from torchcover.report.page.content import Array
 from torchcover.report.page.writing import fitted
@@ -357,7 +369,9 @@ def noisy(rigs: int) -> list[PageMap]:
 
 @pytest.mark.parametrize("rigs", [1, 3])
 def test_no_page_has_more_than_half_a_megabyte(rigs):
-    assert len(page_html(Page("rig", "lead", maps=noisy(rigs)))) < 0.5e6
+    pictures = [PagePicture("a", bytes(150_000))]
+    for given in ({}, {"pictures": pictures}):
+        assert len(page_html(Page("rig", "lead", maps=noisy(rigs), **given))) < 0.5e6
 
 
 def test_cells_taken_together_have_their_mean_by_weight_and_the_page_says_so():

@@ -67,6 +67,26 @@ def test_a_plain_gives_back_what_it_was_made_with(sweeps, tmp_path):
     assert rig.sensors[0].range_at_10_percent_m == round(found.fit.range_at_10_percent_m, 1)
 
 
+def test_errors_are_those_of_the_curvature_of_what_is_likely(sweeps):
+    rays = ground_rays(sweeps, RIG.sensors[0])
+    fit, returned = fit_returns(rays, ROAD), rays.returned / rays.rays
+
+    def surprise(log_range, log_spread):
+        excess = log_excess(
+            rays.range_m, rays.cos_incidence, ROAD.share, ROAD.incidence_exponent, float(np.exp(log_range))
+        )
+        seen = return_probability(excess, float(np.exp(log_spread)), ROAD.spread)
+        prior = ((log_spread - np.log(0.3)) / 0.7) ** 2 / 2
+        return prior - (returned * np.log(seen) + (1 - returned) * np.log1p(-seen)).sum()
+
+    x, y, step = np.log(fit.range_at_10_percent_m), np.log(fit.spread), 0.02
+    grid = np.array([[surprise(x + i * step, y + j * step) for j in (-1, 0, 1)] for i in (-1, 0, 1)])
+    mixed = (grid[2, 2] - grid[0, 2] - grid[2, 0] + grid[0, 0]) / 4
+    curvature = np.array([[np.diff(grid[:, 1], 2)[0], mixed], [mixed, np.diff(grid[1], 2)[0]]]) / step**2
+    expected = np.sqrt(np.diag(np.linalg.inv(curvature)))
+    assert [fit.range_error, fit.spread_error] == pytest.approx(expected, rel=0.1)
+
+
 def test_half_of_the_turn_predicts_the_other_half(sweeps):
     rays = ground_rays(sweeps, RIG.sensors[0])
     ahead = np.abs(rays.azimuth_deg) < 90

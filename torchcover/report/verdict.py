@@ -35,11 +35,8 @@ def too_few(table: CoverageTable, what: str) -> str:
     steps, blocks = table.first.counts["steps"], table.first.blocks
     if blocks is None or blocks >= MIN_BLOCKS:
         return ""
-    needed = MIN_BLOCKS * math.ceil(steps / max(blocks, 1))
-    return (
-        f"Too few steps for {what}: {steps:,} are {blocks} blocks of time, and intervals need {MIN_BLOCKS}, here some "
-        f"{needed:,} steps (`--steps`)."
-    )
+    needed = f"{MIN_BLOCKS}, here some {MIN_BLOCKS * math.ceil(steps / max(blocks, 1)):,} steps (`--steps`)"
+    return f"Too few steps for {what}: {steps:,} are {blocks} blocks of time, and intervals need {needed}."
 
 
 def on_near_field(table: CoverageTable) -> str:

@@ -28,8 +28,7 @@ def read_sensor(content: Any, info: ValidationInfo) -> Sensor:  # noqa: ANN401  
 
 def _read_mounted(content: Any, info: ValidationInfo) -> Sensor:  # noqa: ANN401
     if isinstance(content, dict) and not get_close_matches("mount", map(str, content)):
-        where = "metres from the ground under the middle of the vehicle, as in {x_m: 1.5, z_m: 1.7}"
-        raise ValueError(f"mount: missing; {where}")
+        raise ValueError("mount: missing; metres from the ground under the vehicle's middle, as {x_m: 1.5, z_m: 1.7}")
     return read_sensor(content, info)
 
 

@@ -19,9 +19,9 @@ from torchcover.report.page.map_content import arrays_of, map_content
 from torchcover.report.page.rig_drawing import rig_drawing, sensor_table
 from torchcover.report.renderers.layout import PageTable, Words
 
-# What the numbers of the maps may take in a file that is sent by mail without a thought; and how many times that they
-# may take before they are packed.
-MOST_CHARS, MOST_PACKED = 440_000, 8
+# What maps and pictures may take in a file that is sent by mail without a thought, and the maps in any case; and how
+# many times that they may take before they are packed.
+MOST_CHARS, LEAST_CHARS, MOST_PACKED = 440_000, 100_000, 8
 ROUNDED = "Numbers of single cells are rounded, those of a wide scale by up to 4 %"
 NO_ERRORS = "errors of single cells are left out"
 
@@ -96,10 +96,10 @@ SCRIPTS = ("cells.js", "map.js", "page.js", "controls.js")
 def page_html(page: Page) -> str:
     """The text of its file."""
     cells = CellBytes()
-    maps, notes = fitted(page.maps)
+    first = plans_html(page.plans) + "".join(map(_picture, page.pictures))
+    maps, notes = fitted(page.maps, max(MOST_CHARS - len(first), LEAST_CHARS))
     content = as_json(map_content(replace(page, maps=maps), cells))
     script = "\n".join(map(_file, SCRIPTS))
-    first = plans_html(page.plans) + "".join(map(_picture, page.pictures))
     more = "".join(f"<li>{words_html(words)}</li>" for words in page.verdict[1:])
     more = f'<ul class="more">{more}</ul>' if more else ""
     return Template(_file("page.html")).substitute(
