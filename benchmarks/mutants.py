@@ -20,6 +20,7 @@ import threading
 import time
 from collections.abc import Iterator
 from itertools import accumulate, count
+from multiprocessing.forkserver import _forkserver
 from pathlib import Path
 from typing import NamedTuple
 
@@ -48,6 +49,7 @@ ROOMS = {
         ("evaluation/test_checkpoint.py", "evaluation/test_ranks.py"),
     ),
 }  # fmt: skip
+OF_ALL = ("test_names.py",)
 SWAPPED = {
     ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
     ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.FloorDiv: ast.Div,
@@ -57,15 +59,31 @@ RENAMED = {"min": "max", "max": "min", "all": "any", "any": "all", "minimum": "m
            "floor": "ceil", "ceil": "floor", "cos": "sin", "sin": "cos"}  # fmt: skip
 # Whose arguments may come in any order.
 COMMUTATIVE = ("min", "max", "minimum", "maximum", "equal", "promote_types")
-# Looked at, and the same as what they were made of: file, what stood there, what it became; and why.
+# Looked at, and the same as what they were made of: file, line, what became of it; and why.
 EQUAL = {
-    ("ranks.py", "torch.empty(int(length), dtype=torch.uint8)", "torch.empty(int(length))"):
-        "gloo fills as many bytes as were sent, and an unpickler stops where its object ends",
+    ("ranks.py", "data = data if self.rank == 0 else torch.empty(int(length), dtype=torch.uint8)",
+     "torch.empty(int(length))"): "gloo fills as many bytes as were sent, and an unpickler stops where its object ends",
+    ("ranks.py", "data = torch.empty(int(length), dtype=torch.uint8)",
+     "torch.empty(int(length))"): "gloo fills as many bytes as were sent, and an unpickler stops where its object ends",
+    ("redundancy.py", "for radius, *others in zip(*map(_without_each, of_sensors), strict=True):",
+     "zip(*map(_without_each, of_sensors))"): "each has a row a sensor",
+    ("packets.py", "better = (squared < least) | ((squared == least) & (index < found[i]))",
+     "(index <= found[i])"): "at equal indices nothing changes",
+    ("packets.py", "boxes[node, axis + 3] = max(boxes[left, axis + 3], boxes[right, axis + 3])",
+     "(axis - 3)"): "of six columns the third from the end is the fourth",
+    ("packets.py", "nearer, as_near = np.int32(0), np.int32(0)", "1"): "more boxes are looked into for one answer",
+    ("valid_region.py", "_PLANE_RADII = np.concatenate([np.tan(np.linspace(0.0, np.pi / 2, 512, endpoint=False)), "
+     "np.geomspace(400.0, 1e8, 32)])", "513"): "one radius more is looked at",
+    ("raycaster.py", "scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))",
+     "4"): "a ray to begin with, whose answer nobody looks at",
+    ("rigid.py", "np.matmul(points_m[rows].astype(np.float64, copy=False) + shift, rotation.T, out=moved[rows])",
+     "points_m[rows].astype(np.float64)"): "a copy more, of the same numbers",
+    ("kdtree.py", "SAMPLE = 1024", "1025"): "a larger sample only decides about the speed",
 }  # fmt: skip
 # Of unions of types, which fail where they are made.
 OF_TYPES = re.compile(r"\|.*\b(None|str|int|float|bool|[A-Z]\w*)\b|\b(None|str|int|float|bool|[A-Z]\w*)\b.*\|")
 # A test that hangs has noticed: it takes this many times what all tests take without a change.
-MOST_TIMES = 5.0
+MOST_TIMES = 3.0
 # Slower tests come last.
 SLOW_S = 1.0
 TIMES_S = count(1_000_000_000)
@@ -83,6 +101,12 @@ class Mutant(NamedTuple):
     before: str
     after: str
     text: str
+
+    @property
+    def key(self) -> tuple[str, str, str]:
+        """What `EQUAL` knows it by."""
+        line = (ROOT / self.path).read_text(encoding="utf-8").splitlines()[self.line - 1]
+        return self.path.name, line.strip(), self.after
 
 
 def main(words):
@@ -108,11 +132,12 @@ def main(words):
                 sys.exit(f"tests of {room} fail without a change:\n{told}")
             most_s = MOST_TIMES * (time.monotonic() - start_s)
             survived = [mutant for mutant in found if survives(room, mutant, tree, most_s)]
-            equal = [one for one in survived if (one.path.name, one.before, one.after) in EQUAL]
+            equal = [one for one in survived if one.key in EQUAL]
             killed, others = len(found) - len(survived), len(found) - len(equal)
             rows.append((room, asked.seed, len(found), len(equal), killed, f"{100 * killed / max(others, 1):.0f} %"))
             survivors += [(*cells(one), "") for one in survived if one not in equal]
-            every_equal += [(*cells(one), EQUAL[one.path.name, one.before, one.after]) for one in equal]
+            every_equal += [(*cells(one), EQUAL[one.key]) for one in equal]
+    _forkserver._stop()  # nobody else waits for it, and its processor time would be nobody's
     table(("room", "seed", "valid", "equal", "killed", "of those not equal"), rows)
     if shown := survivors + every_equal:
         print()
@@ -160,9 +185,8 @@ def function_at(mutant: Mutant) -> str:
 def failures(room: str, within: str, tree: Path, most_s: float | None = None) -> str:
     """What the tests of a room print if they do not pass, first those that call what is within; else nothing."""
     printed = tree / "printed.txt"
-    run = SERVER.Process(
-        target=tested, args=(str(tree), str(printed), [f"tests/{one}" for one in ROOMS[room][1]], within)
-    )
+    tests = [f"tests/{name}" for name in (*ROOMS[room][1], *OF_ALL)]
+    run = SERVER.Process(target=tested, args=(str(tree), str(printed), tests, within))
     run.start()
     run.join(most_s)
     if run.is_alive():

@@ -111,6 +111,9 @@ def cases():
         yield "in a plane", *(random.uniform(-50, 50, (2, count, 3)).astype(np.float32) * np.float32([1, 1, 0]))
         query = random.uniform(-50, 50, (count, 3)).astype(np.float32)
         yield "far apart", query, random.permutation(query) + np.float32([1e4, 0, 0])
+        points = random.uniform(-50, 50, (10 * count, 3)).astype(np.float32)
+        yield "around a line", query, points * np.float32([1, 0, 0])
+        yield "around a plane", query, points * np.float32([1, 1, 0])
 
 
 def packets(query, points):

@@ -33,6 +33,7 @@ GROUND_M, GROUND_SECTOR_DEG = 0.2, 2.0
 OWN_M = 2.5
 # Boxes that people drew are off by centimetres: accelerations within half a second are theirs.
 LABELS_TREMBLE_S = 0.5
+LOG_S = 15.0
 DISTANCES_M = (25.0, 50.0, 75.0)
 KINDS = ("car", "lorry or bus", "two wheels", "person", "other")
 
@@ -106,14 +107,24 @@ def mean_row(found, keys):
 
 def objects(scenes):
     """A row of counts by kind, by distance and of all, and rows of sizes by kind."""
-    moments = [moment for scene in scenes for moment in near(scene)]
+    timed = [pair for scene in scenes for pair in zip(scene.times_s, near(scene), strict=True)]
+    moments = [moment for _, moment in timed]
     counts = np.array([[sum(body.kind == kind for body, _, _ in moment) for kind in KINDS] for moment in moments])
     rings = np.array([[sum(away < far for _, away, _ in moment) for far in DISTANCES_M] for moment in moments])
     bodies = {id(body): body for moment in moments for body, _, _ in moment}.values()
     sizes = {kind: np.array([body.size_m for body in bodies if body.kind == kind]) for kind in KINDS}
-    driving = [speed for moment in moments for body, _, speed in moment if body.kind == "car" and body.ever_moves]
+    driving = [
+        speed for time_s, moment in timed for body, _, speed in moment if body.kind == "car" and drives(body, time_s)
+    ]
     people = [speed for moment in moments for body, _, speed in moment if body.kind == "person" and body.ever_moves]
     return counts, rings, sizes, np.array(driving), np.array(people)
+
+
+def drives(body, time_s):
+    """Whether it gets anywhere around a time, in as long as a log takes: who waits for longer looks parked there."""
+    places_m = body.trajectory.positions_at(time_s + LOG_S * np.linspace(-0.5, 0.5, 16))[:, :2]
+    places_m = places_m[~np.isnan(places_m[:, 0])]
+    return bool(len(places_m) and np.linalg.norm(np.ptp(places_m, axis=0)) > 1.0)
 
 
 def spread(values, digits=2):
@@ -167,7 +178,7 @@ def main():
         ("street", "kind", "bodies", "length", "width", "height"),
         [(name, kind, len(size), *(spread(column) for column in size.T)) for name, kind, size in sized],
     )
-    print("\nTraffic: cars that drive (m/s, share that stands), people who walk, gaps ahead, and kerbs.\n")
+    print("\nTraffic: cars that drive within 15 s (m/s, share that stands), people who walk, gaps ahead, and kerbs.\n")
     rows = []
     for name, (_, _, _, driving, walking) in found.items():
         both = [gaps_m(scene) for scene in scenes[name]]

@@ -96,7 +96,7 @@ def test_commands_of_pages_exist(page):
                 known = {flag for one in COMMANDS.commands[name].params for flag in (*one.opts, *one.secondary_opts)}
                 assert {option for option in options if option.startswith("--")} <= known
             case [name, *_]:
-                assert name in ("cp", "rm", "cat", "wait", "make"), name
+                assert name in ("cp", "rm", "cat", "wait", "make", "chromium"), name
 
 
 def test_quoted_tables_are_those_of_their_pages():

@@ -1,10 +1,12 @@
-"""Names mean one thing: what a reader has learnt of one in a room holds in all others."""
+"""Names mean one thing, and records stay as they are: what a reader has learnt in a room holds in all others."""
 
 import ast
 from collections import defaultdict
 from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1] / "torchcover"
+# Records that grow while they are made.
+GROWING = {"Mounts", "Run", "_Element"}
 
 
 def public_classes(folder):
@@ -27,3 +29,14 @@ def test_a_second_class_of_a_name_would_be_found(tmp_path):
     for file in ("one.py", "other.py"):
         Path(tmp_path, file).write_text("class Scan: ...\nclass _Own: ...\n", encoding="utf-8")
     assert public_classes(tmp_path) == {"Scan": ["one.py", "other.py"]}
+
+
+def test_records_are_frozen():
+    found = {}
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            for made in map(ast.unparse, node.decorator_list if isinstance(node, ast.ClassDef) else ()):
+                if "dataclass" in made:
+                    found[node.name] = made
+    assert len(found) > 100
+    assert {name for name, made in found.items() if "frozen=True" not in made} == GROWING

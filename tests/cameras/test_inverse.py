@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 from torchcover.cameras import Camera, inverse
+from torchcover.cameras.models import build_lens
 from torchcover.cameras.start import make_start_table
 from torchcover.cameras.valid_region import find_region
 
@@ -133,6 +134,30 @@ def test_every_point_of_the_valid_region_is_found_again(radial, tangential, k3, 
     assert (status == inverse.ANSWERED).all()
 
 
+@pytest.mark.parametrize("name", RADIAL)
+def test_the_radii_at_which_the_image_turns_back_are_known(name):
+    distortion = build_lens(*RADIAL[name], trainable=False).distortion
+    scan = np.linspace(0.0, 3.0, 30_001)
+    with np.errstate(all="ignore"):
+        turns = scan[1:-1][np.diff(np.sign(np.diff(distortion.radial(scan)))) != 0]
+    assert (len(turns) > 0) == (name != "k1 0.6")
+    for turn in turns:
+        assert np.abs(distortion.critical_radii() - turn).min() < 2 * scan[1]
+
+
+@pytest.mark.parametrize("name", ["fold", "crooked fold", "fisheye 190", "fisheye fold", "woodscape"])
+def test_the_reach_holds_the_image_of_the_whole_edge_and_little_more(name, make_camera):
+    camera = make_camera(name)
+    lens = build_lens(camera.model, camera.coefficients.tolist(), trainable=False)
+    region = find_region(lens.distortion, lens.chart.limit)
+    azimuth = np.linspace(-np.pi, np.pi, 997)
+    a, b = (region.edge(np.cos(azimuth), np.sin(azimuth)) * way(azimuth) for way in (np.cos, np.sin))
+    image = lens.distortion.linearise(a, b)
+    distorted = np.hypot(image.u, image.v)
+    assert region.reach.holds(distorted, image.u, image.v).all()
+    assert not region.reach.holds(1.002 * distorted, image.u, image.v).any()
+
+
 def test_of_two_images_the_one_nearer_the_axis_is_chosen(make_camera):
     camera = make_camera("fold")
     rays, valid = camera.rays(dtype=torch.float64)
@@ -165,6 +190,13 @@ def test_where_kornia_diverges_the_answer_is_right():
     rays, valid = camera.rays(grid(camera)[::16, ::16])
     assert valid.all()
     assert (camera.project(rays.reshape(-1, 3))[0] - grid(camera)[::16, ::16].reshape(-1, 2)).abs().max() <= 1e-9
+
+
+@pytest.mark.parametrize("name", ["barrel", "pincushion", "rational", "prism", "tilted", "short", "mei", "fisheye 190"])
+def test_of_ordinary_lenses_a_few_newton_steps_find_every_pixel(name, make_camera, monkeypatch):
+    """As each step doubles the digits, none of them is left for the patient search."""
+    monkeypatch.setattr(inverse, "_MAX_STEPS", 0)
+    assert make_camera(name).pixel_counts()["pixels_unconverged"] == 0
 
 
 @pytest.mark.parametrize("name", ["pinhole", "fisheye 220", "mei plain", "eucm", "double sphere"])

@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import re
 import subprocess
 import sys
 from itertools import count
@@ -290,11 +291,17 @@ def test_an_output_without_the_signs_of_the_tables_gets_question_marks_not_an_er
 
 def test_list_names_everything_built_in_and_what_it_is_made_of(torchcover):
     code, printed, _ = torchcover("list")
-    lines = [line.split(maxsplit=1) for line in printed.splitlines()]
-    said = {name: rest[0] for name, *rest in filter(None, lines) if rest}
     assert code == 0
-    for kind in ("rigs", "scenarios", "lidars", "vehicles"):
-        assert set(builtin_names(kind)) <= set(said)
+    assert len(printed.splitlines()) < 60
+    assert max(map(len, printed.splitlines())) <= 100
+    named, said = set(re.split(r"[\s,]+", printed)), {}
+    for kind in ("rigs", "scenarios", "lidars", "vehicles", "requirements"):
+        assert set(builtin_names(kind)) <= named
+        lines = [line.split(maxsplit=1) for line in torchcover("list", kind)[1].splitlines()]
+        of_kind = {name: rest[0] for name, *rest in filter(None, lines) if rest}
+        assert set(builtin_names(kind)) <= set(of_kind)
+        assert not said.keys() & of_kind.keys()
+        said |= of_kind
     assert said["nuscenes_cameras"].startswith("6 cameras  The six cameras of the nuScenes cars (Renault Zoe)")
     assert said["velodyne_vlp16"].startswith("16 rows, 100 m   Velodyne VLP-16.")
     assert said["courtyard"].startswith("static")

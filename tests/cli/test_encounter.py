@@ -12,7 +12,8 @@ encounters:
 """
 
 
-def test_rigs_side_by_side_in_words_and_files(torchcover, worlds):
+def test_rigs_side_by_side_in_words_and_files(torchcover, worlds, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")  # so that no cell is folded
     (worlds / "two.yaml").write_text(SET)
     arguments = ("--set", worlds / "two.yaml", "--phases", "2", "--points", "1", "--looks", "1", "--vehicle", "suv")
     ended, printed, _ = torchcover("encounter", worlds / "low.yaml", worlds / "both.yaml", *arguments)
@@ -46,7 +47,8 @@ def test_rigs_side_by_side_in_words_and_files(torchcover, worlds):
         (SET.replace("name: two", "name: [two]"), [], "name: "),
         (SET, ["--points", "0"], "points: a number >= 1"),
         (SET, ["--deceleration-mps2", "0"], "deceleration_mps2: m/s2 above 0"),
-        (SET, ["--latency-s", "-1"], "latency_s: seconds of 0 or more"),
+        (SET, ["--latency-s", "-1"], "latency_s: 0 to 10 seconds"),
+        (SET, ["--latency-s", "300"], "latency_s: 0 to 10 seconds are needed; got 300, is that milliseconds?"),
         (SET, ["--set", "crosing_like"], "is 'crossing_like' meant?"),
         (SET, ["--film", "a.png"], "a film is a .gif or .mp4 file"),
         (SET, ["--worlds", "16"], "--worlds: of no use with a set; leave it out"),

@@ -77,9 +77,12 @@ def test_a_mesh_and_the_vehicle_of_it_say_their_size_and_what_is_doubtful(torchc
         code, printed, warned = torchcover("show", tmp_path / name, "--out", tmp_path)
         assert code == 0
         assert told in printed
+        half_m = float(size.split()[2]) / 2  # a box of trimesh's is about the origin
+        assert f"Moved by x +0.00, y +0.00, z {half_m:+.2f} m: mounts are measured from the ground" in printed
         assert (tmp_path / "car.png").is_file()
         assert doubt in warned
         assert bool(warned) == bool(doubt)
+    assert "Moved" not in torchcover("show", "suv", "--out", tmp_path)[1]
     code, _, error = torchcover("show", tmp_path / "none.obj")
     assert code == 2
     assert "none.obj" in error

@@ -10,6 +10,8 @@ from torchcover.cli import app
 
 
 def test_a_small_study_writes_tables_a_diagram_and_an_advice(torchcover, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")  # so that no heading is folded
+
     def timed(words, **_):
         """The command that is timed, in this process, which has imported all that it needs."""
         assert words[:3] == [sys.executable, "-m", "torchcover"]

@@ -115,9 +115,10 @@ def test_the_nearest_sensor_point_may_lie_outside_the_box():
     assert seen.sensor_points[0] == 0
 
 
-def test_a_radius_of_exactly_the_threshold_counts_as_seen():
-    seen = unweighted(torch.tensor([[8.5, 0.0, 1.0]]), torch.tensor([[8.0, 0.0, 1.0]]), TWO, threshold=0.5)
-    assert seen.share[0] == 1.0
+@pytest.mark.parametrize("threshold", [0.5, 0.0])
+def test_a_radius_of_exactly_the_threshold_counts_as_seen(threshold):
+    sensor = torch.tensor([[8.0 + threshold, 0.0, 1.0]])
+    assert unweighted(sensor, torch.tensor([[8.0, 0.0, 1.0]]), TWO, threshold=threshold).share[0] == 1.0
 
 
 def test_a_rig_that_saw_nothing_is_blind():

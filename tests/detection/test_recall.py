@@ -1,6 +1,7 @@
 """Matching, and recall and precision over visibility and distance."""
 
 import math
+from dataclasses import replace
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -319,6 +320,9 @@ def test_intervals_are_wilson_s_and_unknown_without_trials():
         assert ratio.low[k].item() == pytest.approx(exact.low, abs=1e-12)
         assert ratio.high[k].item() == pytest.approx(exact.high, abs=1e-12)
     assert torch.stack([ratio.value[5], ratio.low[5], ratio.high[5]]).isnan().all()
+    # Tensors cannot say whether they are equal: each is what it is.
+    assert len({ratio, replace(ratio)}) == 2
+    assert ratio != replace(ratio)
 
 
 @pytest.mark.parametrize(
@@ -398,6 +402,7 @@ def test_a_plot_of_recall_has_a_point_and_its_wilson_interval_for_every_bin_with
         expected = torch.stack([curve.recall.low[at], curve.recall.high[at]], dim=1)[[0, 1, 3]]
         np.testing.assert_allclose(ends, expected, atol=1e-12)
         assert [label.get_text().split("\n")[1] for label in axes.get_xticklabels()] == ["1", "1", "0", "1"]
+        assert axes.get_xlabel() == "visibility of the object; below, objects"
         plt.close(figure)
     with pytest.raises(ValueError, match=r"score_threshold: one of \(0.0, 0.5\) is needed; got 0.4"):
         metric.plot(score_threshold=0.4)

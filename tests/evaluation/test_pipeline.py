@@ -381,6 +381,14 @@ def test_what_there_is_outlives_a_worker_that_is_killed(frames):
         run.raise_failure()
 
 
+@pytest.mark.parametrize("method", ["spawn", "forkserver"])
+def test_workers_may_be_started_in_other_ways_than_by_a_fork(frames, method, monkeypatch):
+    monkeypatch.setattr(pipeline, "start_method", lambda: method)
+    names = Names()
+    observe(frames, [names], workers=1)
+    assert names.names == ["f0", "f1", "f2", "f3", "f4", "f5"]
+
+
 @pytest.mark.parametrize(("method", "tells"), [("fork", False), ("spawn", True), ("forkserver", True)])
 def test_a_program_that_starts_itself_is_told_how_it_should(method, tells, monkeypatch):
     monkeypatch.setattr(multiprocessing, "get_start_method", lambda **_: method)

@@ -334,6 +334,15 @@ def test_auto_takes_packets_in_float32_where_a_call_gains_its_share_of_loading_t
     assert choice.choose_search(*clouds, "auto") is cdist.search
 
 
+@pytest.mark.parametrize(("scale", "chosen"), [((1, 0, 0), False), ((1, 1, 0), False), ((1, 1, 1), True)])
+def test_packets_do_not_pay_around_points_on_a_line_or_in_a_plane(scale, chosen, monkeypatch):
+    """All of a packet's queries are compared with what is near any of them; flat boxes of the tree are soon passed."""
+    monkeypatch.setattr(choice, "_works", lambda *_: True)
+    query, points = random_cloud(100_000, 22), random_cloud(300_000, 23) * torch.tensor(scale, dtype=torch.float32)
+    assert (choice.backend_of_several(query, [points]) == "packets") is chosen
+    assert choice.backend_of_several(points, [points]) == "packets"  # queries among them are near few
+
+
 @pytest.fixture
 def untried():
     """Whether numba and Warp work is asked anew, and afterwards again."""

@@ -4,6 +4,7 @@ import math
 import sys
 from importlib import import_module
 from importlib.util import find_spec
+from itertools import permutations
 from pathlib import Path
 
 import numpy as np
@@ -127,6 +128,15 @@ def test_in_float64_too(name, backend):
     """With coordinates that float32 does not hold, and ties where there were some."""
     query, points = (cloud.astype(np.float64) / 3 for cloud in CLOUDS[name])
     np.testing.assert_array_equal(search(query, points, backend), slow_twin(query, points))
+
+
+@backends
+def test_of_ties_all_around_the_first_is_named_wherever_it_lies(backend):
+    """Every leaf holds one place, and all are as far away as the nearest one."""
+    places = {each for x in (-3, 3) for y in (-4, 4) for each in permutations((x, y, 0))}
+    points = np.repeat(np.array(sorted(places), dtype=np.float32), 32, axis=0)
+    for first in range(len(places)):
+        assert search(np.zeros((1, 3), np.float32), np.roll(points, 32 * first, axis=0), backend).tolist() == [0]
 
 
 @clouds

@@ -151,11 +151,13 @@ def test_the_fresh_test_is_about_other_worlds_and_says_what_was_optimism(instant
         np.testing.assert_equal(gain.optimism, gain.search_gain - expected[gain.objective].value)
     assert found[1].test.p < 0.5
     assert {change.what for change in test.changes} == others.keys()
-    # What an objective is made of sums up to it, whatever else the parts are.
+    # What a gain is made of sums up to it, whatever else the parts are; a loss has no share of a gain.
     for name in ("near", "far", "bay"):
         shares = [change.shares[name] for change in test.changes if name in change.shares]
         assert len(shares) == len(instants.objectives[name].places)
         assert sum(shares) == pytest.approx(1)
+    lost = fresh_test({"lower": low}, high, instants, test_seed=1, worlds=2)
+    assert not any(change.shares for change in lost.changes)
     with pytest.raises(ValueError, match="seed: another one than that of these worlds is needed; got 0 for both"):
         instants.anew(0, 4, {})
     with pytest.raises(ValueError, match="one whose worlds are drawn is needed; 'yard' is the same for any seed"):

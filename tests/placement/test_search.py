@@ -126,12 +126,11 @@ def test_what_no_candidate_keeps_ends_with_the_least_bad_and_by_how_much():
     assert f"{found:.2%} of {name}" in [row[-1] for row in result.report.rows["evaluations.csv"]]
 
 
-def test_what_bodies_require_is_looked_at_where_it_decides_and_ends_the_choice_of_what_lacks_it(monkeypatch):
-    """A child needs the nose at least 5 degrees down, as one would have it; so it costs near what it must."""
-    checked = []
+def needing(pitch_deg, checked):
+    """What looks for a child that needs the nose so far down."""
 
     def looks(rig, asked, world, **settings):
-        margin = rig.sensors[0].mount.pitch_deg - 5.0
+        margin = rig.sensors[0].mount.pitch_deg - pitch_deg
         checked.append(rig.name)
         (one,) = asked.requirements
         (bound,) = one.bounds
@@ -139,12 +138,34 @@ def test_what_bodies_require_is_looked_at_where_it_decides_and_ends_the_choice_o
         verdict = Verdict(one.words, bound, "kept" if margin >= 0 else "not kept", 0, 0, 0, margin, *counts)
         return Checked(asked, {rig.name: [verdict]}, {})
 
-    monkeypatch.setattr("torchcover.placement.search.check", looks)
+    return looks
+
+
+def test_what_bodies_require_is_looked_at_where_it_decides_and_ends_the_choice_of_what_lacks_it(monkeypatch):
+    """A child needs the nose at least 5 degrees down, as one would have it; so it costs near what it must."""
+    checked = []
+    monkeypatch.setattr("torchcover.placement.search.check", needing(5.0, checked))
     result = searched(of=space(requirements=required(points=5)), evaluations=30)
     assert result.search.evaluations[0].lacks == {"child_110cm, points_m [[5.0, 0.0]], points >= 5": 1}
     assert 5 <= result.best.evaluation.values["roof.pitch_deg"] < 9
     assert result.best.evaluation.lacks == {}
     assert len(checked) < 20
+
+
+def test_where_nobody_keeps_what_bodies_require_who_lacks_more_is_dropped_at_once(monkeypatch):
+    """A child needs the nose farther down than it goes: the farthest down lacks the least, whatever it gains."""
+    checked = []
+    monkeypatch.setattr("torchcover.placement.search.check", needing(50.0, checked))
+    search = searched(of=space(requirements=required(points=5)), evaluations=30).search
+    assert len(checked) == len(search.evaluations) == 31
+    for arm in search.arms.values():
+        assert len(arm.evaluations) > 8
+        for at, one in enumerate(arm.evaluations):
+            dropped = one.instants < 18
+            assert one.instants in (3, 18)
+            assert dropped == (at > 0 and arm.lacks[at] > arm.lacks[:at].min())
+        assert arm.lacks[arm.best] == arm.lacks.min()
+    assert search.share_saved > 0.3
 
 
 def test_a_child_is_looked_for_around_the_vehicle_of_the_space():
@@ -161,6 +182,20 @@ def test_a_child_is_looked_for_around_the_vehicle_of_the_space():
 def test_a_bound_in_the_wrong_direction_is_refused_with_the_space():
     with pytest.raises(ValueError, match=r"most: of detection_0\.4m more is better; least is meant"):
         space(requirements=required({"least": 0.9}, {"most": 0.5}))
+
+
+def test_a_band_that_is_none_of_the_search_is_refused_with_the_space():
+    """What a search measured between other heights would be none of what is required."""
+    asked = required({"least": 0.4})
+    assert space(requirements=asked | {"heights": {"ground": [-0.5, 0.5], "low": [0.0, 0.2]}}).floors
+    asked["heights"] = {"ground": [-0.2, 0.2]}
+    with pytest.raises(ValueError, match=r"'ground' is \(-0\.2, 0\.2\) there"):
+        space(requirements=asked)
+    asked["requirements"][0]["height"] = "low"
+    with pytest.raises(ValueError, match="no height band is called 'low'"):
+        space(requirements=asked)
+    with pytest.raises(ValueError, match=r"'low' is \(0\.0, 0\.3\) there"):
+        space(requirements=asked | {"heights": {"low": [0.0, 0.3]}})
 
 
 def only_x(rig):

@@ -12,6 +12,7 @@ from torchcover.coverage.quantity import RADIUS, detection
 from torchcover.estimation import Difference
 from torchcover.placement import PlacementSearch, run_search
 from torchcover.placement.fresh import FreshGain, told
+from torchcover.report.page.answer import words_html
 from torchcover.simulation import Rig
 
 
@@ -90,7 +91,9 @@ def test_the_record_has_seeds_gains_and_what_was_saved(one):
 def test_the_page_shows_the_gains_the_rigs_and_the_pictures(one):
     result, folder, _ = one
     page = (folder / "report.html").read_text()
-    assert result.sentence in page
+    first, *others = re.split(r"(?<=[.]) (?=[A-Z])", result.sentence)
+    assert f'<p class="verdict">{words_html(first)}</p>' in page
+    assert all(f"<li>{words_html(words)}</li>" in page for words in others)
     assert page.count("data:image/png;base64,") == 2
     assert "start: front_roof_32" in page
     assert "optimiser: roof_best" in page

@@ -15,7 +15,19 @@ import torch
 
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric
 from torchcover.coverage.quantity import RADIUS
-from torchcover.report import Line, Page, PageMap, PageRig, PageTable, SensorView, Words, maps_of, page_html, scale_of
+from torchcover.report import (
+    Line,
+    Page,
+    PageMap,
+    PagePicture,
+    PageRig,
+    PageTable,
+    SensorView,
+    Words,
+    maps_of,
+    page_html,
+    scale_of,
+)
 from torchcover.report.page.codes import CellBytes, encoded
 from torchcover.report.page.content import Array
 from torchcover.report.page.writing import fitted
@@ -356,21 +368,29 @@ def noisy(rigs: int) -> list[PageMap]:
 
 
 @pytest.mark.parametrize("rigs", [1, 3])
-def test_no_page_of_the_usual_grid_has_five_megabytes(rigs):
-    assert len(page_html(Page("rig", "lead", maps=noisy(rigs)))) < 5e6
+def test_no_page_has_more_than_half_a_megabyte(rigs):
+    pictures = [PagePicture("a", bytes(150_000))]
+    for given in ({}, {"pictures": pictures}):
+        assert len(page_html(Page("rig", "lead", maps=noisy(rigs), **given))) < 0.5e6
 
 
 def test_cells_taken_together_have_their_mean_by_weight_and_the_page_says_so():
     whole = noisy(1)[0]
     known = replace(whole, values=np.where(np.arange(800) < 700, whole.values, np.nan))
-    (same,), silence = fitted([known])
+    (same,), silence = fitted([known], most_chars=10**7)
     assert same is known
     assert silence == []
-    (coarse,), notes = fitted([known], most_bytes=3e5)
+    (rounded,), notes = fitted([known], most_chars=950_000)
+    assert rounded.values is known.values
+    assert (rounded.bits, rounded.errors is known.errors, notes[0][:7]) == (8, True, "Numbers")
+    few = replace(known, values=known.values[:8, :12], errors=None, weights=None, sides=None, cell_m=1.0)
+    (coarse, still_few), notes = fitted([known, few], most_chars=200_000)
+    assert still_few.cell_m == 1.0  # it takes next to nothing, and would have nothing left
+    assert coarse.errors is None
     assert coarse.cell_m == 0.5
     assert coarse.values.shape == (160, 400)
     four = np.s_[10:12, 20:22]
     assert coarse.values[5, 10] == pytest.approx(np.average(known.values[four], weights=known.weights[four]))
     assert np.isnan(coarse.values[:, 350:]).all()
-    assert "Some maps show 2 x 2 cells as one" in notes[-1]
-    assert notes[-1] in page_html(Page("rig", "lead", maps=[known] * 9))
+    assert "errors of single cells are left out; some maps show 2 x 2 cells as one" in notes[-1]
+    assert re.search(r"show \d x \d cells as one, so that", page_html(Page("rig", "lead", maps=noisy(1))))

@@ -8,7 +8,7 @@ import torch
 from rich.console import Console
 
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric, Region
-from torchcover.report import CoverageTable, print_table
+from torchcover.report import CoverageTable, PageTable, Words, print_table, print_whole
 from torchcover.report.renderers.records import COLUMNS
 from torchcover.report.renderers.text_file import narrowest_width, rich_tables
 
@@ -264,6 +264,29 @@ def test_in_a_file_names_are_whole_however_narrow_it_says_it_is(trio, regions, r
     assert "mean blind spot" in text
     assert "…" not in text
     assert rigs == 1 or all(name in text for name in named)
+
+
+@pytest.mark.parametrize("rigs", [1, 3, 5])
+def test_tables_of_words_are_folded_to_eighty_columns_where_the_width_is_not_known(capsys, rigs):
+    names, met = [f"rig_number_{at}" for at in range(rigs)], "child from behind a parked car: hatchback"
+    times = [[f"{1.5 + speed / 100 + at:.2f} to 9.{speed}, too late" for at in range(rigs)] for speed in (10, 20, 30)]
+    rows = [[Words(text) for text in (met, str(10 * k), "0.73", *of)] for k, of in enumerate(times, 1)]
+    headings = ("encounter", "km/h", "needed\n(s)", *(f"{name}\n(s)" for name in names))
+    print_whole([PageTable("Time to collision at detection", headings, rows)])
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) == 80
+    # Nothing is cut but names in headings, and what is the same as in the row above is not said again.
+    words = " ".join(lines).replace("│", " ").split()
+    assert words.count("hatchback") == 1
+    for of in times:
+        assert all(words.count(text.split()[0]) == 1 for text in of)
+    assert words.count("late") == 3 * rigs
+
+
+def test_a_table_of_words_that_fits_is_not_folded(capsys):
+    print_whole([PageTable("", ("a b", "c"), [[Words("one two"), Words("3")], [Words("one two"), Words("4")]])])
+    printed = capsys.readouterr().out
+    assert (printed.count("one two"), len(printed.splitlines()[0])) == (2, 15)
 
 
 def test_with_many_sensors_each_has_a_row_and_eighty_columns_are_enough():

@@ -14,13 +14,13 @@ AHEAD = (Region("near", (0.0, 4.0), (-5.0, 5.0)), Region("far", (0.0, 12.0), (-5
          Region("behind", (-8.0, -6.0), (-5.0, 5.0)))  # fmt: skip
 
 
-def with_bodies(table, shares, best=None):
+def with_bodies(table, shares, best=None, places=30):
     """The table with a child beside the vehicle: its rows of detection stand for the share of places."""
     key = table.means[1].key
     bodies = {}
     for rig, share in shares.items():
         row = table.rows[rig][0]
-        number = row.summary.numbers[key]._replace(value=share)
+        number = row.summary.numbers[key]._replace(value=share, count=places)
         if len(shares) == 1 and share in (0.0, 1.0):  # all blocks say so
             number = number._replace(error=math.nan, low=math.nan, high=math.nan)
         summary = replace(row.summary, region="front_3m", height="child_110cm", numbers={key: number})
@@ -50,7 +50,9 @@ def test_without_errors_nothing_is_told(pair, blind, trios, regions):
     for coverages in (pair, blind, {"few": pair["few"]}):
         assert verdict(CoverageTable.of(coverages, AHEAD)) == ()
     (sentence,) = verdict(CoverageTable.of(trios(4), AHEAD))
-    assert sentence.startswith("Too few steps for an answer")
+    assert sentence == (
+        "Too few steps for an answer: 4 are 4 blocks of time, and intervals need 8, here some 8 steps (`--steps`)."
+    )
     assert verdict(CoverageTable.of(pair, regions[1:])) == ()
 
 
@@ -65,3 +67,10 @@ def test_bodies_come_first(trio, shares, best, sentence):
     table = with_bodies(CoverageTable.of({name: trio[name] for name in shares}, AHEAD), shares, best)
     first, *_ = verdict(table)
     assert sentence in first
+
+
+def test_few_places_that_all_say_the_same_are_no_answer(trio):
+    table = CoverageTable.of({"many": trio["many"]}, AHEAD)
+    for places, told in ((29, False), (30, True)):
+        words = " ".join(verdict(with_bodies(table, {"many": 1.0}, places=places)))
+        assert ("where a child is seen: in front 100 %" in words) == told

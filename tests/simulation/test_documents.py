@@ -68,6 +68,8 @@ def test_every_built_in_document_is_valid_and_carries_its_file_name(kind):
         ("columns: 8", "columns: 0", r"sensors\.0\.columns: .*greater than 0 \(got 0\)"),
         ("columns: 8", "columns: many", r"sensors\.0\.columns: .*integer.*got 'many'"),
         ("x_m: 1.0", "x: 1.0", r"sensors\.0\.mount\.x: Extra inputs"),
+        ("    mount:", "    mounts:", r"sensors\.0\.mounts: Extra inputs .*; is mount meant\?$"),
+        ("    mount:", "    place:", r"sensors\.0: mount: missing; metres from the ground"),
         ("x_m: 1.0", "x_m: .nan", r"sensors\.0\.mount\.x_m: .*finite"),
         ("x_m: 1.0", "x_m: .inf", r"sensors\.0\.mount\.x_m: .*finite"),
         ("x_m: 1.0", "quaternion_wxyz: [0, 0, 0, 0]", r"sensors\.0\.mount: a quaternion of norm 0"),
@@ -120,6 +122,12 @@ def test_a_key_that_is_there_twice_is_an_error_in_every_document(tmp_path, kind)
     with pytest.raises(ValueError, match=f"the key '{key}' is there twice, in line .* and in line ") as caught:
         read(path)
     assert str(caught.value).startswith(f"{path}: ")
+
+
+def test_a_sensor_made_without_a_mount_is_one_at_the_origin_when_it_was_written(tmp_path):
+    given = {"channels": 4, "vertical_fov_deg": (-10, 10), "horizontal_fov_deg": 360, "columns": 8, "max_range_m": 50}
+    Rig(name="r", sensors=(Lidar(name="a", **given),)).save(tmp_path / "rig.yaml")
+    assert Rig.load(tmp_path / "rig.yaml").sensors[0].mount == Pose()
 
 
 def test_whole_numbers_lists_and_numpys_numbers_may_stand_for_what_is_kept():

@@ -29,7 +29,7 @@ PUBLISHED = {
 RIG = """
 name: r
 sensors:
-  - {{type: lidar, name: top, {keys}}}
+  - {{type: lidar, name: top, mount: {{}}, {keys}}}
 """
 
 

@@ -130,6 +130,12 @@ def test_steep_faces_and_what_is_far_above_are_nobodys_ground():
     assert math.isclose(heights(ground_of([PLANE, roof], [(0, 0, 3.3)]), [0, 0, 4])[0], 0.8, abs_tol=1e-5)
 
 
+@pytest.mark.parametrize(("top_m", "height_m"), [(0.95, 2.05), (1.05, 3.0)])
+def test_who_is_on_a_surface_has_it_within_a_metre(top_m, height_m):
+    ground = ground_of([PLANE, solid((9, 9, 0.2), 0, 0, top_m - 0.2)])
+    assert math.isclose(heights(ground, [0, 0, 3])[0], height_m, abs_tol=1e-5)
+
+
 def test_bounds_of_heights_hold_every_point_of_a_triangle():
     bumpy = sheet(lambda x, y: 2 * np.sin(x / 9) + np.cos(y / 7) + 0.02 * x, half=100, every=4)
     ground = ground_of([bumpy, solid((9, 9, 0.15), 30, 0, 3.0), solid((20, 20, 1), -40, 0, 6.0)], [(0, 0, 1)])

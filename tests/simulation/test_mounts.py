@@ -7,6 +7,7 @@ import pytest
 
 from torchcover.simulation import Lidar, PaperReference, Pose, Rig, Scenario, Simulator
 from torchcover.simulation.instant import Instant
+from torchcover.simulation.rig import with_ego
 from torchcover.simulation.scene import Scene
 
 EGO = {"shape": {"type": "box", "size_m": [4, 2, 1]}}
@@ -33,6 +34,25 @@ def simulator(tmp_path, mount, *, speed_mps=0.0, bodies=(), actors=()):
 def test_a_sensor_below_the_ground_is_refused_by_name(tmp_path, mount, speed_mps):
     with pytest.raises(ValueError, match=r"rig 'mine': sensor 'top' at .* lies below the ground, or inside a wall"):
         simulator(tmp_path, mount, speed_mps=speed_mps).step(0)
+
+
+def test_a_sensor_far_from_the_vehicle_is_taken_for_one_in_other_units(tmp_path):
+    # The box of the ego ends at 2 m ahead and 1 m up: 20 m from its upper front edge on either axis.
+    assert len(simulator(tmp_path, {"x_m": 2.0, "z_m": 20.9}).step(0).clouds["mine"]) > 0
+    with pytest.raises(ValueError, match=r"'top' at .* lies 1799 m away from the ego .*in metres.* millimetres\?"):
+        simulator(tmp_path, {"z_m": 1800.0}).step(0)
+    with pytest.raises(ValueError, match=r"'top' at .* lies 20 m away from the ego"):
+        simulator(tmp_path, {"x_m": -22.1, "z_m": 0.5}).step(0)
+
+
+def test_only_another_vehicle_than_that_of_the_rig_is_said_to_be_in_the_way():
+    kitti = Rig.load("kitti")
+    low = kitti.sensors[0].model_copy(update={"mount": Pose(z_m=0.8)})
+    low = kitti.model_copy(update={"sensors": (low,)})
+    for vehicle, said in ((None, "move its mount$"), ("suv", r"own vehicle \(--vehicle volkswagen_passat_estate\)$")):
+        world = with_ego(Scenario.load("courtyard"), {"kitti": low}, vehicle)
+        with pytest.raises(ValueError, match=said):
+            Simulator(world, {"kitti": low}, PaperReference(rows=4, columns=4)).step(0)
 
 
 def test_a_sensor_in_a_wall_or_in_another_vehicle_is_refused(tmp_path):

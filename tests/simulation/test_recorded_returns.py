@@ -6,7 +6,7 @@ import pytest
 from torchcover.recordings import open_recording
 from torchcover.simulation import Rig, calibrate
 from torchcover.simulation.material import Material
-from torchcover.simulation.recorded_returns import fit_returns, ground_rays, road_profile
+from torchcover.simulation.recorded_returns import HALF_LANES_M, NEAREST_M, fit_returns, ground_rays, road_profile
 from torchcover.simulation.returns import log_excess, return_probability
 
 RANGE_M, SPREAD, NOISE_M, HEIGHT_M = 60.0, 0.25, 0.02, 1.9
@@ -67,6 +67,26 @@ def test_a_plain_gives_back_what_it_was_made_with(sweeps, tmp_path):
     assert rig.sensors[0].range_at_10_percent_m == round(found.fit.range_at_10_percent_m, 1)
 
 
+def test_errors_are_those_of_the_curvature_of_what_is_likely(sweeps):
+    rays = ground_rays(sweeps, RIG.sensors[0])
+    fit, returned = fit_returns(rays, ROAD), rays.returned / rays.rays
+
+    def surprise(log_range, log_spread):
+        excess = log_excess(
+            rays.range_m, rays.cos_incidence, ROAD.share, ROAD.incidence_exponent, float(np.exp(log_range))
+        )
+        seen = return_probability(excess, float(np.exp(log_spread)), ROAD.spread)
+        prior = ((log_spread - np.log(0.3)) / 0.7) ** 2 / 2
+        return prior - (returned * np.log(seen) + (1 - returned) * np.log1p(-seen)).sum()
+
+    x, y, step = np.log(fit.range_at_10_percent_m), np.log(fit.spread), 0.02
+    grid = np.array([[surprise(x + i * step, y + j * step) for j in (-1, 0, 1)] for i in (-1, 0, 1)])
+    mixed = (grid[2, 2] - grid[0, 2] - grid[2, 0] + grid[0, 0]) / 4
+    curvature = np.array([[np.diff(grid[:, 1], 2)[0], mixed], [mixed, np.diff(grid[1], 2)[0]]]) / step**2
+    expected = np.sqrt(np.diag(np.linalg.inv(curvature)))
+    assert [fit.range_error, fit.spread_error] == pytest.approx(expected, rel=0.1)
+
+
 def test_half_of_the_turn_predicts_the_other_half(sweeps):
     rays = ground_rays(sweeps, RIG.sensors[0])
     ahead = np.abs(rays.azimuth_deg) < 90
@@ -105,6 +125,20 @@ def test_the_road_is_found_where_it_tilts_and_bends():
     assert (
         np.abs(profile.height_m(np.stack([x, y, height_m], axis=-1).reshape(-1, 3)) - height_m.reshape(-1)).max() < 0.02
     )
+
+
+def test_what_lies_beside_the_lanes_is_no_road():
+    x, y = np.meshgrid(np.linspace(-60, 60, 121), np.linspace(-20, 20, 81))
+    lanes = np.abs(y) < HALF_LANES_M
+    points_m = np.stack([x, y, 0.02 * x + 0.3 * ~lanes], axis=-1)
+    whole, alone = road_profile(points_m.reshape(-1, 3)), road_profile(points_m[lanes])
+    np.testing.assert_allclose(whole.height_m(points_m[lanes]), alone.height_m(points_m[lanes]), atol=1e-9)
+
+
+def test_rays_to_what_is_near_are_in_nobodys_count(sweeps):
+    """The steep ones: they return, whatever the LiDAR."""
+    assert np.tan(np.deg2rad(RIG.sensors[0].rows_deg())).min() < -HEIGHT_M / 5
+    assert ground_rays(sweeps, RIG.sensors[0]).range_m.min() > NEAREST_M
 
 
 def test_near_road_cannot_tell_how_far_a_lidar_sees(sweeps, tmp_path):

@@ -119,6 +119,16 @@ def test_rows_of_a_vehicle_in_motion_are_those_of_its_rays(drive, said):
     np.testing.assert_allclose(lidar.mount.matrix(), drive.mount, atol=1e-5)
 
 
+def test_of_frames_seconds_apart_no_motion_is_undone_and_no_clock_is_blamed():
+    drive = Turning(told=("rows",))
+    drive.times_s = 100.0 * drive.times_s
+    said = rig_document(drive)["description"]
+    assert "motion within a turn not undone, for frames are 10 s apart (at most 0.25 s are needed" in said
+    drive.told_of = ("rows", "offsets_s")
+    with pytest.raises(ValueError, match=r"the poses before and after .* are 10 s apart; .* at most 1 s apart"):
+        rig_document(drive)
+
+
 def test_clouds_stored_laser_by_laser_need_no_rows_that_can_be_told_apart():
     # The lasers of the upper half leave 0.1 m above the others: no elevation is that of one laser.
     lidar = Lidar.model_validate({"name": "a", "model": "velodyne_hdl64e", "columns": 400})

@@ -202,7 +202,8 @@ def test_a_rig_is_written_with_the_material_of_a_housing_wherever_it_goes(tmp_pa
     (tmp_path / "there").mkdir()
     (tmp_path / "own.yaml").write_text(yaml.safe_dump({"name": "own", "reflectivity": 0.4}))
     body = {"name": "mast", "shape": {"type": "cylinder", "radius_m": 0.1, "height_m": 1.0}, "material": "own.yaml"}
-    (tmp_path / "rig.yaml").write_text(yaml.safe_dump({"name": "r", "sensors": [KEYS | {"housing": [body]}]}))
+    sensor = KEYS | {"mount": {}, "housing": [body]}
+    (tmp_path / "rig.yaml").write_text(yaml.safe_dump({"name": "r", "sensors": [sensor]}))
     rig = Rig.load("rig.yaml")
     rig.save("there/again.yaml")
     monkeypatch.chdir(tmp_path / "there")

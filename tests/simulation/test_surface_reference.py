@@ -51,6 +51,13 @@ def test_an_open_sheet_is_seen_from_either_side(at, tmp_path, turned):
     agrees(sums(scenario(sheet, FLOOR), sensor), 8 * 1.5 - 2 * 1)
 
 
+def test_of_a_face_that_is_seen_edge_on_there_is_nothing(at, tmp_path):
+    upright = np.array(rectangle((-2, 2), (0, 3)))[..., [2, 0, 1]] + [12, 0, 0]
+    at([12.0, -5.0, 1.0])
+    sensor = SurfaceReference((AHEAD,), rays=400, places=1, bands_m=((0.5, 2.0),))
+    assert not sums(scenario(sheet_file(tmp_path, upright), FLOOR), sensor).any()
+
+
 def test_a_sheet_with_a_face_on_either_side_counts_once(at, tmp_path):
     one = np.array(rectangle((-2, 2), (0, 3)))[..., [2, 0, 1]] + [12, 0, 0]
     at([2.5, 0.3, 1.0])

@@ -90,7 +90,7 @@ def _radii(distortion: Distortion, limit: float) -> Float64:
     critical = np.sort(distortion.critical_radii())
     middles = (critical[:-1] + critical[1:]) / 2.0
     plain = np.append(_PLANE_RADII, HORIZON) if limit >= HORIZON else np.linspace(0.0, limit, 512)
-    radii = np.unique(np.concatenate([plain, critical, middles, critical[-1:] * 1.01]))
+    radii = np.unique(np.concatenate([plain, critical, middles]))
     return radii[radii <= limit]
 
 

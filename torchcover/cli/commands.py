@@ -463,7 +463,8 @@ def parsed_budget(text: str) -> float:
 
 def list_builtin(
     word: Annotated[
-        str | None, typer.Argument(help="Only those with this word, with all that is said of them.")
+        str | None,
+        typer.Argument(help="A kind, as `rigs`: what each is. Or any word: those with it, with all that is said."),
     ] = None,
 ) -> None:
     """List the built-in rigs, scenarios, LiDAR models, vehicles, materials, weather, encounters and requirements."""

@@ -17,36 +17,47 @@ ABSENT = {"FMVSS 111": {"description": "Not built in: the places of its cylinder
 
 
 def run(word: str | None) -> None:
-    """Print what is built in: what each consists of, and its first sentence.
+    """Print what is built in: the names of each kind.
 
     Args:
-        word: Only those with it in a column; their descriptions are then printed whole.
+        word: A kind: what each of it consists of, and its first sentence. Or only those with it in a column, and all
+            that is said of them.
 
     Raises:
         ValueError: There is none with that word.
     """
     width = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
+    kinds = {
+        "rigs": _sensors,
+        "scenarios": _traffic,
+        "lidars": _rows,
+        "vehicles": None,
+        "materials": _reflectivity,
+        "weather": None,
+        "encounters": None,
+        "requirements": None,
+    }
     found = False
-    for kind, what_of in (
-        ("rigs", _sensors),
-        ("scenarios", _traffic),
-        ("lidars", _rows),
-        ("vehicles", None),
-        ("materials", _reflectivity),
-        ("weather", None),
-        ("encounters", None),
-        ("requirements", None),
-    ):
+    for kind, what_of in kinds.items():
+        if word in kinds and word != kind:
+            continue
+        documents = builtin_documents(kind) | (ABSENT if kind == "requirements" else {})
+        if word is None:
+            names = textwrap.fill(", ".join(documents), width or 80, initial_indent="  ", subsequent_indent="  ")
+            typer.echo(f"{kind} ({len(documents)})\n{names}\n")
+            continue
         rows = []
-        for name, document in (builtin_documents(kind) | (ABSENT if kind == "requirements" else {})).items():
+        for name, document in documents.items():
             cells = [name, what_of(document)] if what_of else [name]
             description = " ".join(document["description"].split())
-            if word is None or word.lower() in " ".join((*cells, description)).lower():
-                rows.append((*cells, _first_sentence(description) if word is None else description))
+            if word == kind or word.lower() in " ".join((*cells, description)).lower():
+                rows.append((*cells, _first_sentence(description) if word == kind else description))
         if rows:
-            typer.echo("\n".join((kind, *_lines(rows, width, one_line_each=word is None))) + "\n")
+            typer.echo("\n".join((kind, *_lines(rows, width, one_line_each=word == kind))) + "\n")
             found = True
-    if not found:
+    if word is None:
+        typer.echo("What each of a kind is: torchcover list rigs; all that is said of one: torchcover list NAME")
+    elif not found:
         raise ValueError(f"nothing built in with {word!r}; torchcover list prints all there is")
 
 

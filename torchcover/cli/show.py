@@ -24,6 +24,8 @@ DEFAULT_RIG = "front_roof_128"
 KINDS = {"rig": "sensors", "scenario": "ego", "vehicle": "parts"}
 # A film shows this much, at this pace; both may be a little off, for steps are whole.
 FILM_S, PER_S = 10.0, 5.0
+# What is told of how a body is moved has so many metres in its last place.
+SMALLEST_MOVE_M = 0.01
 
 
 def run(
@@ -55,6 +57,11 @@ def run(
         _say(console, body.description)
         length_m, width_m, height_m = np.ptp(mover_mesh(name, shape).vertices_m, axis=0)  # with what is doubtful of it
         _say(console, f"{length_m:.2f} m long (x, forward), {width_m:.2f} m wide (y), {height_m:.2f} m high (z, up)")
+        corners_m = np.concatenate([mesh.vertices_m for part in body.parts for mesh in part.meshes()])
+        moved_m = -np.append((corners_m.min(axis=0) + corners_m.max(axis=0))[:2] / 2, corners_m[:, 2].min())
+        if np.abs(moved_m).max() >= SMALLEST_MOVE_M:
+            by = ", ".join(f"{axis} {metres:+.2f}" for axis, metres in zip("xyz", moved_m.round(2) + 0.0, strict=True))
+            _say(console, f"Moved by {by} m: mounts are measured from the ground under the middle of its bounding box")
         _write(console, out / Path(name).stem, [("", vehicle_picture(body))])
         return
     if kind == "rig":

@@ -4,6 +4,9 @@ import math
 from dataclasses import dataclass
 from typing import Annotated
 
+# No brakes take longer.
+MOST_LATENCY_S = 10.0
+
 
 @dataclass(frozen=True)
 class Criterion:
@@ -27,8 +30,10 @@ class Criterion:
         for name, unit in (("deceleration_mps2", "m/s2"), ("within_s", "seconds")):
             if not 0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name}: {unit} above 0 are needed; got {getattr(self, name)}")
-        if not 0 <= self.latency_s < math.inf:
-            raise ValueError(f"latency_s: seconds of 0 or more are needed; got {self.latency_s}")
+        if not 0 <= self.latency_s <= MOST_LATENCY_S:
+            raise ValueError(
+                f"latency_s: 0 to {MOST_LATENCY_S:g} seconds are needed; got {self.latency_s:g}, is that milliseconds?"
+            )
 
     def needed_s(self, speed_mps: float, towards_mps: float = 0.0) -> float:
         """The time to collision at which braking still prevents it; only the ego brakes, the other goes on.

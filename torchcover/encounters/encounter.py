@@ -215,9 +215,10 @@ class EncounterSet(BuiltIn):
                     found.append(Encounter.model_validate(one, context=info.context))
                     name = found[-1].name
                     if first.setdefault(name, number) < number:
-                        raise ValueError(f"encounters.{number}: encounters.{first[name]} is called {name!r}, too")
-            except ValidationError as error:
-                raise ValueError(f"encounters.{number}: {explain(error)}") from error
+                        raise ValueError(f"encounters.{first[name]} is called {name!r}, too")
+            except ValueError as error:
+                words = explain(error) if isinstance(error, ValidationError) else error
+                raise ValueError(f"encounters.{number}: {words}") from error
         return {**content, "encounters": tuple(found)}
 
     @model_validator(mode="after")

@@ -23,14 +23,7 @@ from torchcover.evaluation.task import AnyRig, as_called
 from torchcover.files import Publication
 from torchcover.geometry import invert, outlines_at
 from torchcover.recordings import Recording, open_recording
-from torchcover.report import (
-    ActorMark,
-    Page,
-    PagePicture,
-    StandingFaces,
-    draw_scene,
-    page_html,
-)
+from torchcover.report import ActorMark, Page, PagePicture, StandingFaces, draw_scene, page_html
 from torchcover.simulation import Draws, PaperReference, Rig, Scenario, Simulator, with_ego
 from torchcover.simulation.bodies import called
 

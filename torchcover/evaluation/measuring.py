@@ -69,11 +69,7 @@ def measured(task: Task[FrameSource], settings: Settings, until: StoppingRule | 
         observed={name: seen[name].compute() for name in settings.observers},
         metrics=compared(metrics.after(seen), coverages, task.asked.awaited, settings.seed) if metrics else None,
         left_out=left_out(
-            run.counts,
-            list(coverages.values()),
-            settings.aggregations,
-            sensors,
-            workers=settings.workers or 0,
+            run.counts, list(coverages.values()), settings.aggregations, sensors, workers=settings.workers or 0
         ),
     )
     if result.cut_short:
@@ -184,12 +180,7 @@ def _states(coverage: Observers, others: Observers, watch: TargetWatch | None) -
 
 
 def metric_of(
-    settings: Settings,
-    asked: Asked,
-    sensors: Sequence[str] = (),
-    *,
-    square_metres: bool,
-    blocks: int = BLOCKS,
+    settings: Settings, asked: Asked, sensors: Sequence[str] = (), *, square_metres: bool, blocks: int = BLOCKS
 ) -> CoverageMetric:
     """An empty metric of what `evaluate` is to measure, with the names of the sensors for redundancy.
 

@@ -291,13 +291,15 @@ class FramesOrErrors(Dataset[Any]):
 def _each(
     frames: MeasuredFrames, tasks: Iterable[list[int]], workers: int, run: Run, *, skip_bad_frames: bool
 ) -> Iterator[MeasuredFrame]:
+    method = start_method()
     loader = DataLoader(
         FramesOrErrors(frames),
         batch_sampler=tasks,
         collate_fn=list,
         num_workers=workers,
-        worker_init_fn=end_with_parent(),
-        multiprocessing_context=start_method() if workers else None,
+        # What a server forks has that as its parent, which ends with this process.
+        worker_init_fn=None if method == "forkserver" else end_with_parent(),
+        multiprocessing_context=method if workers else None,
         prefetch_factor=1 if workers else None,  # what is made ahead waits in shared memory
     )
     for batch in loader:

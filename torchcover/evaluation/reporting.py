@@ -27,15 +27,13 @@ from torchcover.evaluation.target_survey import (
 )
 from torchcover.evaluation.task import AnyRig, AnyScenario, distinct_names, loaded, simulation
 from torchcover.files import Publication, small_html
-from torchcover.report import Page, escaped, file_stems, on_range, page_html, ranges_of
+from torchcover.report import Page, escaped, file_stems, on_range, page_html, ranges_of, too_few
 from torchcover.simulation import Rig
 from torchcover.simulation.scenario import Mover
 from torchcover.targets import Target, TargetMap, write_arrays, write_csv
 
 # As many as anybody compares on a page.
 MOST_RIGS = 8
-# So that the page of two rigs is sent by mail without a thought.
-MAP_BYTES = 0.35e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +58,9 @@ class Report:
     def verdict(self) -> tuple[str, ...]:
         """The answer in sentences, the first of which says most; each has its rule, and none tells what is chance."""
         first, *losses = target_verdict(self.targets)
+        range_words = on_range(self.result.table) or too_few(self.result.table, "ranges")
         asked = [*self._met.verdict, *(self.checked.verdict if self.checked else ())]
-        told = [first, on_range(self.result.table), *self.result.mixed_models, *losses, *asked, self.cut_short]
+        told = [first, range_words, *self.result.mixed_models, *losses, *asked, self.cut_short]
         return tuple(filter(None, told))
 
     @property
@@ -94,7 +93,6 @@ class Report:
             ranges=ranges_of(self.result.table),
             pictures=self._met.pictures,
             tables=tables,
-            most_bytes=MAP_BYTES,
         )
 
     def _repr_html_(self) -> str:

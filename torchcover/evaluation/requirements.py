@@ -15,7 +15,6 @@ from pydantic import (
     AfterValidator,
     Discriminator,
     Field,
-    NonNegativeFloat,
     PositiveFloat,
     PositiveInt,
     Tag,
@@ -26,6 +25,7 @@ from pydantic import (
 from torchcover.coverage import AGGREGATIONS
 from torchcover.coverage.quantity import RADIUS, detection, over_known, seen_by_two, sensors_seeing
 from torchcover.encounters import Criterion, EncounterSet
+from torchcover.encounters.criterion import MOST_LATENCY_S
 from torchcover.geometry import BoundingBox
 from torchcover.simulation import RegionsOfInterest, Sensor, builtin_names
 from torchcover.simulation.documents import SEVERAL, Bounds, BuiltIn, Coordinate, Document, NameOrFile, beside, by_name
@@ -379,7 +379,7 @@ class InTime(Document):
     """
 
     deceleration: PositiveFloat = 9.0
-    latency_s: NonNegativeFloat = 0.5
+    latency_s: Annotated[float, Field(ge=0, le=MOST_LATENCY_S)] = 0.5
 
 
 class EncounterRequirement(_Requirement):

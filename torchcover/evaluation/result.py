@@ -227,11 +227,7 @@ class Result:
         """
         views = {name: sensor_views(sensors) for name, sensors in self.sensors.items()}
         return map_figures(
-            self.coverages,
-            ego_outline_m=self.ego_outline_m,
-            sensors=views,
-            vehicle=self.vehicle,
-            layer=layer,
+            self.coverages, ego_outline_m=self.ego_outline_m, sensors=views, vehicle=self.vehicle, layer=layer
         )
 
     def save(self, folder: str | Path, *, files: str | Iterable[str] = FILES) -> list[Path]:

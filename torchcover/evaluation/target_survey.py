@@ -97,10 +97,7 @@ def survey_target(
 
 
 def in_world(
-    rig: AnyRig,
-    scenario: AnyScenario | None,
-    vehicle: str | Path | None,
-    sensor_model: Literal["ideal", "real"] | None,
+    rig: AnyRig, scenario: AnyScenario | None, vehicle: str | Path | None, sensor_model: Literal["ideal", "real"] | None
 ) -> tuple[Rig, Scenario, int]:
     """The rig, the world whose ego carries it, and how many steps are usual; as `survey_target` is asked.
 
@@ -126,11 +123,7 @@ def free_space() -> Scenario:
 
 
 def save_targets(
-    seen: TargetMap,
-    folder: str | Path,
-    sensors: Sequence[Sensor] = (),
-    *,
-    files: str | Iterable[str] = FILES,
+    seen: TargetMap, folder: str | Path, sensors: Sequence[Sensor] = (), *, files: str | Iterable[str] = FILES
 ) -> list[Path]:
     """Write the files of the command line: the numbers first, then the page and the picture.
 

@@ -7,7 +7,10 @@ import signal
 import sys
 from collections.abc import Callable
 from functools import partial
+from multiprocessing import parent_process
+from multiprocessing.process import BaseProcess
 from pathlib import Path
+from threading import Thread
 
 if sys.platform == "linux":
     import resource
@@ -57,5 +60,13 @@ def _end_with(parent: int, memory_gb: float, cpu_s: float, *_: object) -> None:
     if memory_gb < math.inf:
         _lower(resource.RLIMIT_AS, int(memory_gb * 1e9))
     _prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:  # which has ended before this was asked for
-        os.kill(os.getpid(), signal.SIGKILL)
+    if os.getppid() != parent:  # which has ended before this was asked for, or had a server fork this one
+        if (starter := parent_process()) and starter.pid == parent:
+            Thread(target=_end_after, args=(starter,), daemon=True).start()
+        else:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _end_after(starter: BaseProcess) -> None:
+    starter.join()
+    os.kill(os.getpid(), signal.SIGKILL)

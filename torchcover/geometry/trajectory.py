@@ -45,9 +45,9 @@ class Trajectory:
             numbers = np.column_stack([self.times_s, self.positions_m, self.angles_deg])
             bad = np.flatnonzero(~np.isfinite(numbers).all(axis=1))
             raise ValueError(f"a trajectory has NaN or infinite numbers in {len(bad)} of {count} poses, first {bad[0]}")
-        steps = np.diff(self.times_s)
-        if (steps <= 0).any():
-            at = int(np.argmax(steps <= 0))
+        late = self.times_s[1:] <= self.times_s[:-1]
+        if late.any():
+            at = int(np.argmax(late))
             raise ValueError(
                 f"the times of a trajectory must ascend; pose {at + 1} is at {self.times_s[at + 1]:g} s, "
                 f"after {self.times_s[at]:g} s"

@@ -19,12 +19,20 @@ BACKENDS = {
 # The kinds of devices that each runs on; "cdist" on any.
 DEVICES = {"kdtree": ("cpu",), "packets": ("cpu",), "warp": ("cpu", "cuda")}
 
-# Once loaded, packets are faster than the KD-tree for any clouds, by at least so much (docs/measured/performance.md,
-# search). Loading numba takes each process half a second, which a hundred calls should earn. By sizes alone: a choice
-# that depended on what was searched before would change the last bits of a run with its workers.
+# Once loaded, packets are faster than the KD-tree for nearly any clouds, by at least so much
+# (docs/measured/performance.md, search). Loading numba takes each process half a second, which a hundred calls should
+# earn. By the clouds alone: a choice by what was searched before would change the last bits of a run with its workers.
 GAINED_PER_QUERY_S = 3e-7
 GAINED_PER_POINT_S = 8e-9
 LEAST_GAIN_S = 5e-3
+# Points that are flat along an axis, next to the queries, fill flat boxes of the KD-tree, while all queries of a packet
+# are compared with what is near any of them: this takes so long for each query and point near it. In practice packets
+# gain more than is counted above, and are slower only if that is more than so much.
+FLAT_SHARE = 1e-3
+NEAR_S = 6e-11
+LOST_PER_QUERY_S, LOST_PER_POINT_S = 2e-7, 4e-8
+# Queries of a packet, and by how many points the extent of a cloud is told.
+PACKET, SAMPLE = 64, 1024
 # So many pairs take as long to compare on an H200 as 16 cores take to search: 14 ms (docs/measured/gpu.md).
 MAX_PAIRS_ON_THE_DEVICE = 10**9
 
@@ -72,7 +80,30 @@ def _packets_pay(query: Tensor, clouds: Sequence[Tensor]) -> bool:
     gain_s = GAINED_PER_QUERY_S * len(query) * len(clouds) + GAINED_PER_POINT_S * sum(map(len, clouds))
     if query.dtype == torch.float64 or gain_s < LEAST_GAIN_S:  # packets are for float32
         return False
+    lost_s = sum(_lost_s(query, cloud) for cloud in clouds)
+    if lost_s > LOST_PER_QUERY_S * len(query) * len(clouds) + LOST_PER_POINT_S * sum(map(len, clouds)):
+        return False
     return _works("packets", query.device, "the KD-tree searches")
+
+
+def _lost_s(query: Tensor, points: Tensor) -> float:
+    """What packets lose to the KD-tree where points lie on a line or in a plane along the axes, and queries do not."""
+    if len(query) == 0 or len(points) == 0:
+        return 0.0
+    (low, high), (least, most) = (
+        cloud.detach()[:: max(1, len(cloud) // SAMPLE)].double().aminmax(dim=0) for cloud in (query, points)
+    )
+    asked, extent = high - low, most - least
+    flat = (extent <= FLAT_SHARE * asked) & (asked > 0)
+    if not flat.any():
+        return 0.0
+    spread = asked[asked > 0]
+    packet = (PACKET / len(query) * spread.prod()) ** (1 / len(spread))
+    # What is as near to one query of a packet as to another, seen from half of the way to the farthest point.
+    away = torch.maximum(most - low, high - least)[flat].norm() / 2
+    reach = packet + (2 * away * packet).sqrt()
+    near = len(points) * (reach / extent[~flat]).clamp(max=1).prod()
+    return float(NEAR_S * len(query) * near)
 
 
 def _search_of(backend: str) -> Search:

@@ -1,5 +1,6 @@
 """An arm of a search: an optimiser, what it was told, and the candidates that others have to beat."""
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -64,6 +65,11 @@ class Arm:
         """(evaluations,) what they lack of what must be kept, in all, each as a share of that."""
         return np.array([sum(each.values()) for each in self._lacks], dtype=np.float64)
 
+    @property
+    def least_lack(self) -> float:
+        """What the front lacks; inf if nothing can be yet."""
+        return min(self.lacks[self.complete], default=math.inf)
+
     def lacking(self, at: int) -> Mapping[str, float]:
         """What it is that a candidate lacks, by name."""
         return self._lacks[at]
@@ -103,7 +109,7 @@ class Arm:
     @property
     def incumbents(self) -> list[tuple[Prefix, ...]]:
         """What the front scored; nothing if it lacks anything, as what lacks less may gain less."""
-        return [] if self.front and self._lacks[self.front[0]] else [self.evaluations[at].prefixes for at in self.front]
+        return [] if self.least_lack else [self.evaluations[at].prefixes for at in self.front]
 
     def ask(self, number: int) -> Float64 | None:
         """Where to look next, (variables,); None when there is nothing left."""
@@ -135,12 +141,11 @@ class Arm:
         return bool((gain < -errors * error)[kept].any())
 
     def may_lead(self, prefixes: Sequence[Prefix]) -> bool:
-        """Whether a rig that was scored at all instants is one that no other beats, or all others lack something."""
-        if prefixes[-1].instants < self.evaluations[0].instants:
-            return False
-        gain, front = gains(prefixes[-1].estimate, self.evaluations[0].prefixes[-1].estimate)[0], self.front
-        beaten = (self.gains[front] >= gain[: self._objectives]).all(axis=1).any()
-        return not beaten or bool(self._lacks[front[0]])
+        """Whether all others lack something; or of a rig that was scored at all instants, whether no other beats it."""
+        if self.least_lack or prefixes[-1].instants < self.evaluations[0].instants:
+            return self.least_lack > 0
+        gain = gains(prefixes[-1].estimate, self.evaluations[0].prefixes[-1].estimate)[0]
+        return not (self.gains[self.front] >= gain[: self._objectives]).all(axis=1).any()
 
     def _told(self) -> Float64:
         """(evaluations, objectives) what optimisers are told of: gains, less what the lacks cost."""

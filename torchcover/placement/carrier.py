@@ -7,6 +7,7 @@ from typing import Annotated, NamedTuple
 
 from pydantic import AfterValidator, Field
 
+from torchcover.coverage.grid import PAPER_HEIGHTS
 from torchcover.evaluation.requirements import RegionRequirement, Requirements
 from torchcover.geometry import BoundingBox
 from torchcover.geometry.arrays import Float64
@@ -115,10 +116,15 @@ class VehicleSpace(Readable):
         """Of regions; what bodies and encounters require is measured on its own."""
         asked, found = self.requirements, dict[str, tuple[Objective, float]]()
         for one in asked.requirements if asked else ():
-            if not isinstance(one, RegionRequirement):
+            if asked is None or not isinstance(one, RegionRequirement):
                 continue
-            own = (asked.regions or {}) if asked else {}
-            region = {one.region: own[one.region]} if one.region in own else one.region
+            usual_m, own_m = PAPER_HEIGHTS.get(one.height), asked.heights.get(one.height)
+            if usual_m is None or own_m not in (None, usual_m):
+                raise ValueError(
+                    f"requirements: a search has the bands {dict(PAPER_HEIGHTS)} alone, and {one.height!r} is {own_m} "
+                    "there; leave heights out, or check what was found"
+                )
+            region = {one.region: asked.regions[one.region]} if one.region in asked.regions else one.region
             for key in (one.number, *(f"{one.number}_without_{name}" for name in one.without)):
                 each = Objective(number=key, region=region, band=one.height)
                 found |= {f"{REQUIRED}{each.words}, {bound.words}": (each, bound.value) for bound in one.bounds}

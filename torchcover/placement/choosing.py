@@ -266,10 +266,7 @@ def choose(
 
 
 def seen_by(rig: Rig, instants: CommonInstants) -> tuple[Bools, float]:
-    """(T P,) which reference points have a point of a rig within each threshold; the share of rays on the vehicle.
-
-    ValueError: the rig cannot be mounted.
-    """
+    """(T P,) which reference points have a point of a rig within each threshold; the share of rays on the vehicle."""
     questions, rays, self_hits = instants.questions, 0, 0
     near: list[list[Bools]] = [[] for _ in questions.thresholds_m]
     for frame in instants.frames(rig):

@@ -96,10 +96,7 @@ def check_prices(
     sensors: Sequence[Sensor],
     free: Mapping[str, FreeSensor],
 ) -> None:
-    """Whether all that may be chosen has a price, and the cheapest of it is not dearer than a limit, if there is one.
-
-    ValueError: a price is missing, is one of nothing, or the limit is below the cheapest rig.
-    """
+    """ValueError: a price is missing, is one of nothing, or the limit, if there is one, is below the cheapest rig."""
     if not cost:
         if max_cost_eur is not None:
             raise ValueError("constraints.max_cost_eur: nothing has a price; give them as cost")

@@ -174,8 +174,8 @@ def fresh_test(
     shares: dict[str, dict[str, float]] = {name: {} for name in tests}
     for objective, each in parts.items():
         whole = sum(found[part].gain for part in each)
-        for part in each:
-            shares[part][objective] = found[part].gain / whole if whole else math.nan
+        for part in each if found[objective].significant and whole > 0 else ():  # of no gain there is no share
+            shares[part][objective] = found[part].gain / whole
     changes = [
         SideEffect(name, test, p, shares[name])
         for (name, test), p in zip(tests.items(), holm([test.p for test in tests.values()]), strict=True)

@@ -1,6 +1,7 @@
 """What a search, and a choice, write: the same kinds of files and one page."""
 
 import json
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -97,7 +98,8 @@ class PlacementReport:
         facts = {"Settings": self.settings, "Run": [name for name in OF_THE_RUN if name in record]}
         return Page(
             title=self.title,
-            lead=self.sentence,
+            lead="Measured by torchcover.",
+            verdict=re.split(r"(?<=[.]) (?=[A-Z])", self.sentence),
             tables=self.tables,
             pictures=pictures,
             rigs=[

@@ -89,10 +89,7 @@ class _Journal:
         self._journal = Journal(checkpoint, identity, {"search": search})
 
     def restore(self) -> None:
-        """Go on from what is there.
-
-        ValueError: it is of another search. BadFileError: the start scores something else than it did.
-        """
+        """Go on from what is there. ValueError or BadFileError: it is of another search, or start."""
         self._journal.restore(Run())
         if not self._search.evaluations:
             return
@@ -138,10 +135,7 @@ class _Budget:
         return len(self._search.evaluations) + int(left_s / max(self.one_s, 1e-9))
 
     def check(self) -> None:
-        """Find out whether there is time for a candidate of each arm, if there was none before.
-
-        ValueError: there is not.
-        """
+        """ValueError: there is no time for a candidate of each arm, and there was none before."""
         if len(self._search.evaluations) > 1 or self._clock() + 2 * self.one_s <= self.until:
             return
         spent_s = self._clock() - self._began

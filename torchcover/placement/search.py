@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -20,6 +20,7 @@ from torchcover.placement.optimisers.optimiser import Unit
 from torchcover.placement.plan import SearchPlan, levels_of
 from torchcover.placement.racing import ERRORS_BELOW, Prefix, race
 from torchcover.placement.space import SearchSpace
+from torchcover.simulation import Rig
 
 # What is drawn by the control is nothing that the optimiser draws.
 SEEDS = {OPTIMISER: 0, RANDOM: 1}
@@ -145,39 +146,39 @@ class PlacementSearch:
     def evaluate(self, candidate: Evaluation) -> None:
         """Score a candidate and tell it: at a few instants at a time, until it is beaten or was scored at all."""
         began = time.perf_counter()
-        incumbents = self.arms[candidate.arm].incumbents if candidate.number else []
+        incumbents, lacks = self.arms[candidate.arm].incumbents if candidate.number else [], dict[str, float]()
         try:
-            prefixes = race(self._scored(candidate), incumbents, len(self.space.objectives))
+            prefixes = race(self._scored(candidate, lacks), incumbents, len(self.space.objectives))
         except ValueError as error:
             self.refuse(candidate, str(error), seconds=time.perf_counter() - began)
         else:
-            candidate = replace(candidate, lacks=self._lacks(candidate, prefixes))
-            self.tell(candidate, prefixes, seconds=time.perf_counter() - began)
+            self.tell(replace(candidate, lacks=lacks), prefixes, seconds=time.perf_counter() - began)
 
-    def _scored(self, candidate: Evaluation) -> Iterator[Prefix]:
+    def _scored(self, candidate: Evaluation, lacks: dict[str, float]) -> Iterator[Prefix]:
+        """Until it cannot win; `lacks` becomes what it lacks, looked at where that decides, as it takes so long."""
         assert candidate.rig is not None  # while it is asked for
-        known: list[Prefix] = []
+        known, arm, looked = list[Prefix](), self.arms.get(candidate.arm), False
         for prefix in self.instants.prefixes(candidate.rig):
-            if candidate.number and (why := self._too_many_self_hits(prefix)):
+            if arm and (why := self._too_many_self_hits(prefix)):
                 raise ValueError(why)  # no need to look at more instants
             known.append(prefix)
             yield prefix
-            if candidate.number and self.arms[candidate.arm].is_worse(known, ERRORS_BELOW):
+            if not looked and (arm is None or arm.may_lead(known)):
+                lacks |= self._lacks(candidate.rig)
+                looked = True
+            if arm and (arm.is_worse(known, ERRORS_BELOW) or sum(lacks.values()) > arm.least_lack):
                 return
 
-    def _lacks(self, candidate: Evaluation, prefixes: Sequence[Prefix]) -> dict[str, float]:
-        """Of what bodies and encounters require; looked at where it decides, as it takes as long as the rest.
+    def _lacks(self, rig: Rig) -> dict[str, float]:
+        """Of what bodies and encounters require.
 
         Of each bound that is not kept, the mean of the share of places that do not keep it and of what the worst lacks.
         """
-        required = self.space.to_check
-        if required is None or (candidate.number and not self.arms[candidate.arm].may_lead(prefixes)):
-            return {}
-        assert candidate.rig is not None  # while it is asked for
-        ego = self.space.scenarios[0].ego
-        world = required.scenario or free_space().model_copy(update={"ego": ego})
-        (found,) = check(candidate.rig, required, world, sensor_model=self.plan.sensor_model).verdicts.values()
-        lacks = {}
+        lacks, required = dict[str, float](), self.space.to_check
+        if required is None:
+            return lacks
+        world = required.scenario or free_space().model_copy(update={"ego": self.space.scenarios[0].ego})
+        (found,) = check(rig, required, world, sensor_model=self.plan.sensor_model).verdicts.values()
         for one in found:
             worst = 1.0 if math.isnan(one.margin) else max(-one.margin / (abs(one.bound.value) or 1.0), 0.0)
             if one.state != "kept":

@@ -16,10 +16,7 @@ class FreeNumber(NamedTuple):
     high: float
 
     def at(self, u: float) -> float:
-        """The value at a share from 0 to 1 of the way from the lowest to the highest.
-
-        ValueError: the share is not from 0 to 1.
-        """
+        """The value at a share of the way from the lowest to the highest. ValueError: it is not from 0 to 1."""
         _check_share(self.name, u)
         return min(max(round(self.low + u * (self.high - self.low), DECIMALS), self.low), self.high)
 

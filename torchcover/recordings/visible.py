@@ -63,12 +63,7 @@ def _places_m(body: BoundingBox, seed: int) -> Float64:
 
 
 def hide_by_arrays(
-    points_m: Float64,
-    place_m: Float64,
-    body_m: Float64,
-    bins_rad: Float64,
-    reach_m: Float64,
-    hidden: NDArray[np.bool_],
+    points_m: Float64, place_m: Float64, body_m: Float64, bins_rad: Float64, reach_m: Float64, hidden: NDArray[np.bool_]
 ) -> None:
     """Mark the points that a body, or others at any size of bins, hide from a place, where numba is missing."""
     with np.errstate(divide="ignore", invalid="ignore"):

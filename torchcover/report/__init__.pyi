@@ -55,6 +55,7 @@ from .table import CoverageTable as CoverageTable
 from .table import Row as Row
 from .verdict import body_words as body_words
 from .verdict import on_range as on_range
+from .verdict import too_few as too_few
 from .verdict import verdict as verdict
 from .verdict import whole_percent as whole_percent
 from .wording import capitalised as capitalised

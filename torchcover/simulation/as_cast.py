@@ -20,6 +20,8 @@ AT_DEG, BEFORE, FINER = np.arange(-180.0, 180.0, 45.0).tolist(), (0.0, 0.25, 0.5
 # So many points are looked at to find out, of a vehicle that moves so far in a turn; they have to lie so much closer.
 # So much of a turn is left out at its ends.
 LOOKED_AT, MOVES_M, CLOSER, SEAM = 8_000, 0.05, 0.8, 0.035
+# No LiDAR turns more slowly: of frames that are farther apart, how long a turn takes is not known.
+LONGEST_TURN_S = 0.25
 
 
 class Turn(NamedTuple):
@@ -91,6 +93,9 @@ def as_cast(
         return cast, rows, "each ray at its own time"
     if not all(moving) or not scans:
         return as_they_are, rows, ""
+    if (apart_s := max(scan.turn_s for scan in scans)) > LONGEST_TURN_S:
+        needed = f"at most {LONGEST_TURN_S:g} s are needed, or times of the points, or a standing vehicle"
+        return as_they_are, rows, f"motion within a turn not undone, for frames are {apart_s:g} s apart ({needed})"
     some = [slice(None, None, max(1, len(scan.points_m) * len(scans) // LOOKED_AT)) for scan in scans]
     few = None if rows is None else [of[which] for of, which in zip(rows, some, strict=True)]
 

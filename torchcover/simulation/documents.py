@@ -212,14 +212,19 @@ def _told(detail: ErrorDetails, meant: Place | None = None) -> str:
     if detail["type"] != "value_error":  # a list is a tuple to us, and keys with values are some class
         words = re.sub(" after validation| or instance of .*", "", words)
         words = words.replace("Tuple", "List").replace("tuple", "list")
-    unit = _with_unit(str(detail["loc"][-1])) if detail["type"] == "extra_forbidden" else ""
-    return f"{key[:-1]}{': ' * bool(key)}{words}{arrived}" + f"; is {unit} meant?" * bool(unit)
+    alike = _alike(str(detail["loc"][-1])[:MAX_QUOTED]) if detail["type"] == "extra_forbidden" else ""
+    return f"{key[:-1]}{': ' * bool(key)}{words}{arrived}" + f"; is {alike} meant?" * bool(alike)
 
 
-def _with_unit(key: str, of: type[BaseModel] = Document) -> str:
-    """The key of some document that is this one with a unit behind it; empty if there is none."""
-    known = (name for name in of.model_fields if name.rpartition("_")[0] == key)
-    return next(known, "") or next(filter(None, (_with_unit(key, one) for one in of.__subclasses__())), "")
+def _alike(key: str) -> str:
+    """The key of some document that is this one with a unit behind it, or nearly this one; empty if there is none."""
+    known = sorted(_keys(Document))
+    with_unit = [name for name in known if name.rpartition("_")[0] == key]
+    return next(iter(with_unit or get_close_matches(key, known, n=1, cutoff=0.8)), "")
+
+
+def _keys(of: type[BaseModel]) -> set[str]:
+    return set(of.model_fields).union(*map(_keys, of.__subclasses__()))
 
 
 def _follows_from_another(detail: ErrorDetails) -> bool:

@@ -219,12 +219,7 @@ class Instant:
         return outlines(self.moving.corners_m, origin_m)
 
     def cast(
-        self,
-        vehicle_T_sensor: Matrix,
-        tile: Tile,
-        limit_m: Float32,
-        bodies: Outlines,
-        own_m: Float32 | None = None,
+        self, vehicle_T_sensor: Matrix, tile: Tile, limit_m: Float32, bodies: Outlines, own_m: Float32 | None = None
     ) -> tuple[Float32, Hits, int]:
         """Cast n rays of a tile: (3, n) directions in the vehicle frame, hits, and how many were cast at what moves.
 

@@ -211,10 +211,9 @@ class RayCaster:
         origins = np.ndarray(
             (directions.shape[1], 3), np.float32, origin_m.astype(np.float32).tobytes(), strides=(0, 4)
         )
-        answer = self._scene.run(origins, directions.T, dists=limit_m.copy(), output=True)
-        hits = Hits(answer["tfar"], answer["geomID"], answer["primID"])
+        hits = self.cast_from_each(origins, directions, limit_m)
         if len(self.touched(origin_m)):
-            self._leave_faces(origin_m, directions, limit_m, hits, self._numbers(answer))
+            self._leave_faces(origin_m, directions, limit_m, hits)
         return hits
 
     def cast_from_each(self, origins_m: Float32, directions: Float32, limit_m: Float32) -> Hits:
@@ -231,14 +230,13 @@ class RayCaster:
 
     def faces_met(self, origins_m: NDArray[np.floating], directions: NDArray[np.floating], limit_m: float) -> Int64:
         """(N,) which face each ray meets first within a limit, counted through those of all bodies; -1 for none."""
-        starts_m, towards = origins_m.astype(np.float32), directions.astype(np.float32)
-        ends_m = np.full(len(starts_m), limit_m, dtype=np.float32)
-        answer = self._scene.run(starts_m, towards, dists=ends_m, output=True)
-        return np.asarray(np.where(answer["geomID"] >= 0, self._numbers(answer), -1))
+        ends_m = np.full(len(origins_m), limit_m, dtype=np.float32)
+        hits = self.cast_from_each(origins_m.astype(np.float32), directions.astype(np.float32).T, ends_m)
+        return np.asarray(np.where(hits.body >= 0, self._numbers(hits), -1))
 
-    def _numbers(self, answer: dict[str, NDArray[Any]]) -> Int64:
+    def _numbers(self, hits: Hits) -> Int64:
         """(N,) which of all faces each ray hit; any number where it hit none."""
-        return np.asarray(self._first_face[np.maximum(answer["geomID"], 0)] + np.maximum(answer["primID"], 0))
+        return np.asarray(self._first_face[np.maximum(hits.body, 0)] + np.maximum(hits.triangle, 0))
 
     def touched(self, place_m: NDArray[np.floating]) -> Int64:
         """Numbers of the bodies on whose faces a place lies: hardly any does, and the faces are sooner asked than rays.
@@ -251,20 +249,13 @@ class RayCaster:
             self._last_asked = (place_m.tobytes(), answer)
         return answer
 
-    def _leave_faces(
-        self,
-        origin_m: NDArray[np.floating],
-        directions: Float32,
-        limit_m: Float32,
-        hits: Hits,
-        faces: Int64,
-    ) -> None:
+    def _leave_faces(self, origin_m: NDArray[np.floating], directions: Float32, limit_m: Float32, hits: Hits) -> None:
         """Let the rays go on that hit a face whose plane they start on: by rounding alone, as they leave it."""
 
         def starts_on_plane(faces: Int64) -> Bools:
             return np.asarray(self._faces.from_plane_m(origin_m, faces) <= self._faces.contact_m[faces])
 
-        rays, travelled_m = np.flatnonzero(hits.body >= 0), 0.0
+        rays, travelled_m, faces = np.flatnonzero(hits.body >= 0), 0.0, self._numbers(hits)
         rays = rays[starts_on_plane(faces[rays])]
         range_m, faces = hits.range_m[rays], faces[rays]
         for beyond in CONTACTS_BEYOND:
@@ -274,10 +265,10 @@ class RayCaster:
             travelled_m = travelled_m + range_m + beyond * self._faces.contact_m[faces]
             towards, left_m = directions.T[rays], np.maximum(limit_m[rays] - travelled_m, 0.0)
             starts_m = origin_m + travelled_m[:, None] * towards
-            answer = self._scene.run(starts_m.astype(np.float32), towards, dists=left_m.astype(np.float32), output=True)
-            hit, range_m, faces = answer["geomID"] >= 0, answer["tfar"], self._numbers(answer)
+            found = self.cast_from_each(starts_m.astype(np.float32), towards.T, left_m.astype(np.float32))
+            hit, range_m, faces = found.body >= 0, found.range_m, self._numbers(found)
             hits.range_m[rays] = np.where(hit, travelled_m + range_m, limit_m[rays])
-            hits.body[rays], hits.triangle[rays] = answer["geomID"], answer["primID"]
+            hits.body[rays], hits.triangle[rays] = found.body, found.triangle
             again = hit & starts_on_plane(faces)
             rays, travelled_m, range_m, faces = rays[again], travelled_m[again], range_m[again], faces[again]
 

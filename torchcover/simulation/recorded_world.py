@@ -122,7 +122,8 @@ def write_world(recording: Recording, folder: Path, *, steps: int | None = None)
         before = sum(frame <= gaps[0] for frame in recording.frames)
         raise ValueError(
             f"{recording.path}: nothing is recorded for {np.diff(times_s)[gaps[0]]:,.1f} s after "
-            f"{recording.names[gaps[0]]}; make a world of the frames before (--steps {before})"
+            f"{recording.names[gaps[0]]}, and a world needs a frame at least every {WINDOW_S:g} s; record more often, "
+            f"or make a world of the frames before (--steps {before})"
         )
     poses = np.array([reference.sweeps.local_T_vehicle(recording, instant) for instant in range(last + 1)])
     body = recording.body or USUAL_BODY

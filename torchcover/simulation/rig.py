@@ -1,6 +1,7 @@
 """A rig: the sensors of a vehicle, where they are mounted, and what carries them."""
 
 from collections.abc import Mapping
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
@@ -25,6 +26,12 @@ def read_sensor(content: Any, info: ValidationInfo) -> Sensor:  # noqa: ANN401  
     return TypeAdapter(SENSORS[kind]).validate_python(content, context=info.context)
 
 
+def _read_mounted(content: Any, info: ValidationInfo) -> Sensor:  # noqa: ANN401
+    if isinstance(content, dict) and not get_close_matches("mount", map(str, content)):
+        raise ValueError("mount: missing; metres from the ground under the vehicle's middle, as {x_m: 1.5, z_m: 1.7}")
+    return read_sensor(content, info)
+
+
 class Rig(BuiltIn):
     """The sensors of a vehicle.
 
@@ -47,7 +54,7 @@ class Rig(BuiltIn):
     description: str = ""
     vehicle: NameOrFile | None = None
     weather: Weather | None = None
-    sensors: tuple[Annotated[Sensor, PlainValidator(read_sensor)], ...] = Field(min_length=1)
+    sensors: tuple[Annotated[Sensor, PlainValidator(_read_mounted)], ...] = Field(min_length=1)
 
     @model_validator(mode="after")
     def _check_names(self) -> Self:
@@ -115,7 +122,7 @@ def _written(sensor: Sensor) -> dict[str, Any]:
     """The keys of a sensor, without those that its model stands for."""
     assert isinstance(sensor, Document)  # as all sensors of a rig
     keys = sensor.model_dump(mode="json", exclude_unset=True)
-    keys = {key: keys[key] for key in ("type", "name", "mount") if key in keys} | keys
+    keys = {key: keys[key] for key in ("type", "name") if key in keys} | {"mount": {}} | keys
     if isinstance(sensor, Lidar) and sensor.model is not None:
         if is_file_name(sensor.model):
             return {key: value for key, value in keys.items() if key != "model"}

@@ -80,12 +80,7 @@ def estimate_scan(scans: Sequence[Float64], lasers: Lasers = None) -> ScanEstima
     fov_deg, centre_deg = _field_of_view(azimuth_deg, step_deg)
     range_m = np.linalg.norm(points_m, axis=1)
     return ScanEstimate(
-        np.sort(found_deg)[::-1],
-        max(1, round(fov_deg / step_deg)),
-        fov_deg,
-        centre_deg,
-        float(range_m.max()),
-        origin_m,
+        np.sort(found_deg)[::-1], max(1, round(fov_deg / step_deg)), fov_deg, centre_deg, float(range_m.max()), origin_m
     )
 
 

@@ -108,12 +108,7 @@ class MountedSensor:
             tiles = tuple(tile.some(some) for tile, some in zip(tiles, met, strict=True))
             own_m, cast = tuple(ends_m[some] for ends_m, some in zip(own_m, met, strict=True)), np.concatenate(met)
         scan = instant.scan(
-            self.vehicle_T_sensor,
-            tiles,
-            max_range_m=self.reach_m,
-            own_m=own_m,
-            times=self._times,
-            threads=threads,
+            self.vehicle_T_sensor, tiles, max_range_m=self.reach_m, own_m=own_m, times=self._times, threads=threads
         )
         if cast is not None:
             ended = int((np.concatenate(self.own_m)[~cast] <= self.reach_m).sum())

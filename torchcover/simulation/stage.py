@@ -29,6 +29,8 @@ LOOKS = 8
 WITHIN_M = 100.0
 # A sensor on the ground is asked about a place this far above it: whether it is inside of something else.
 LIFT_M = np.array([0.0, 0.0, 0.01])
+# Farther from the vehicle nobody mounts a sensor on it: such a place is in millimetres, or of another frame.
+FARTHEST_MOUNT_M = 20.0
 # What all scenes that are kept may take: in a process, four cities of a minute or more of anything smaller; and of the
 # machine's memory in all workers of a DataLoader together. One scene is kept anyway, however large.
 KEPT_BYTES = 160e6
@@ -180,11 +182,19 @@ def mounted_on(scene: Scene, scenario: Scenario, name: str, rig: Rig) -> list[Mo
     """The sensors of a rig on the ego of a scene. ValueError: one is inside the ego's body."""
     for sensor in rig.sensors:
         place = sensor.mount.matrix()[:3, 3]
-        if scene.encloses(place):
-            other = f", or use its own vehicle (--vehicle {rig.vehicle})" if rig.vehicle else ""
+        where = f"rig {name!r}: sensor {sensor.name!r} at {place.round(3).tolist()} m lies"
+        off_m = np.linalg.norm(place - place.clip(scene.ego_box.lower_m, scene.ego_box.upper_m))
+        if off_m > FARTHEST_MOUNT_M:
             raise ValueError(
-                f"rig {name!r}: sensor {sensor.name!r} at {place.round(3).tolist()} m lies inside the ego of "
-                f"{scenario.name!r}, {scenario.ego_name}, so that all its rays start blocked; move its mount{other}"
+                f"{where} {off_m:.0f} m away from the ego of {scenario.name!r}, {scenario.ego_name}; mounts are in "
+                "metres, from the ground under the ego's middle: are these millimetres?"
+            )
+        if scene.encloses(place):
+            carried = rig.vehicle in (None, getattr(scenario.ego and scenario.ego.shape, "vehicle", None))
+            other = "" if carried else f", or use its own vehicle (--vehicle {rig.vehicle})"
+            raise ValueError(
+                f"{where} inside the ego of {scenario.name!r}, {scenario.ego_name}, so that all its rays start "
+                f"blocked; move its mount{other}"
             )
     return [
         MountedSensor(

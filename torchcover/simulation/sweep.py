@@ -79,12 +79,7 @@ class Sweep:
 
     @classmethod
     def of(
-        cls,
-        static: RayCaster,
-        now: Poses,
-        moving: Moving,
-        samples_s: Float64,
-        poses: Sequence[Poses],
+        cls, static: RayCaster, now: Poses, moving: Moving, samples_s: Float64, poses: Sequence[Poses]
     ) -> Self | None:
         """That of a scene; None if nothing moves meanwhile."""
         if all(np.array_equal(one, other) for each in poses for one, other in zip(each, now, strict=True)):

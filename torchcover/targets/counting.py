@@ -22,7 +22,7 @@ Float64 = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
 # Positions that are cast at together. A constant, so that nothing depends on threads.
-CHUNK = 256
+CHUNK = 128
 # More than any count.
 NEVER = np.iinfo(np.int64).max
 
@@ -178,12 +178,7 @@ class _OnGround(NamedTuple):
 
     @classmethod
     def of(
-        cls,
-        surface: Surface,
-        placed: Moving,
-        mounted: Sequence[MountedSensor],
-        met: Sequence[Met],
-        threshold_m: float,
+        cls, surface: Surface, placed: Moving, mounted: Sequence[MountedSensor], met: Sequence[Met], threshold_m: float
     ) -> Self:
         near = [
             surface.near(_in_target(sensor, one, placed.vehicle_T_part), threshold_m)

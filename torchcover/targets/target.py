@@ -10,13 +10,7 @@ from torchcover.simulation.moving import Solid
 from torchcover.simulation.shapes import Mesh
 
 # What people say -> the built-in body that is meant, whose name has its size.
-TARGETS = {
-    "child": "child_110cm",
-    "adult": "adult",
-    "dog": "dog_57cm",
-    "cyclist": "cyclist",
-    "pole": "pole_100cm",
-}
+TARGETS = {"child": "child_110cm", "adult": "adult", "dog": "dog_57cm", "cyclist": "cyclist", "pole": "pole_100cm"}
 
 
 @dataclass(frozen=True, eq=False)

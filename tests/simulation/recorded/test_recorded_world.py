@@ -138,7 +138,9 @@ def test_what_no_world_can_be_made_of_is_told():
         write_world(alone, alone.path)
     gap = Drive(steps=8)
     gap.times_s = gap.times_s + 60.0 * (np.arange(8) > 3)
-    with pytest.raises(ValueError, match=r"nothing is recorded for 60\.1 s after f3; .*\(--steps 4\)"):
+    with pytest.raises(
+        ValueError, match=r"nothing is recorded for 60\.1 s after f3, and a world needs .* 5 s; .*\(--steps 4\)"
+    ):
         write_world(gap, gap.path)
     jumping = Drive(steps=8)
     place = jumping.world_T_vehicle

@@ -2,17 +2,20 @@
 
 import numpy as np
 import pytest
+import shapely
 import trimesh
 
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic import Urban
 from torchcover.simulation.traffic.alignment import Alignment, Beside, Territory
+from torchcover.simulation.traffic.city import City
 from torchcover.simulation.traffic.course import APART_M, NEIGHBOURS_M, SMALLEST_RADIUS_M, course
+from torchcover.simulation.traffic.fleet import Fleet, load_bodies
 from torchcover.simulation.traffic.flow import LIMIT_EVERY_M
 from torchcover.simulation.traffic.hills import SQUARE_M, Hills
 from torchcover.simulation.traffic.scenery import slab
-from torchcover.simulation.traffic.streets import BRAKING_MPS2, COMFORTABLE_MPS2, Section, plan
+from torchcover.simulation.traffic.streets import BRAKING_MPS2, COMFORTABLE_MPS2, GUTTER_M, Section, plan
 
 RADIUS_M, REACH_M = 20.0, 1500.0
 STATIONS_M = np.arange(-300.0, 1200.0, 0.37)
@@ -167,6 +170,40 @@ def test_a_slab_over_a_bent_net_is_closed_and_looks_outwards():
     solid = trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False)
     assert solid.is_volume
     assert solid.volume == pytest.approx(0.15 * (30 * 8 - 0.04 * 25 * 8**2 / 2), rel=0.01)
+
+
+@pytest.mark.parametrize("built_share", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_beside_streets_there_is_pavement_and_between_pavements_no_bare_ground(seed, built_share):
+    generator, shapes = np.random.default_rng(seed), np.random.default_rng(seed)
+    seen_m, span_m = (-120.0, 700.0), (-440.0, 1020.0)
+    streets = plan(Section(2), 25.0, 0.5, span_m, 1200.0, generator, shapes)
+    territory, level, fleet = Territory(streets.main, span_m), Hills(0.0, shapes), Fleet(load_bodies(), None, generator)
+    _, pavement, *_ = City(streets, territory, level, fleet, 0.0, built_share, 0.0, generator, shapes).static(seen_m)[0]
+    triangles_m = pavement.vertices_m[pavement.faces]
+    up = np.cross(triangles_m[:, 1] - triangles_m[:, 0], triangles_m[:, 2] - triangles_m[:, 0])[:, 2] > 1e-6
+    paved = shapely.union_all(shapely.polygons(triangles_m[up][..., :2])).buffer(0.02)
+    lines = [(streets.main, np.arange(*span_m, 2.0), streets.kerb_m)]
+    for street, lanes in zip(streets.crossing, streets.cross_lanes_each_way, strict=True):
+        lines.append((street, np.arange(-150.0, 150.0, 2.0), lanes * streets.section.lane_m + GUTTER_M))
+    driven = shapely.union_all([
+        shapely.LineString(street.poses(along_m, 0.0)[:, :2]).buffer(half_m, cap_style="flat", quad_segs=32)
+        for street, along_m, half_m in lines
+    ])  # fmt: skip
+    assert (streets.course.turns[(streets.junctions_m > seen_m[0]) & (streets.junctions_m < seen_m[1])] != 0).any()
+    known = paved.union(driven.buffer(0.3))
+    along_m, left_m = np.meshgrid(np.arange(*seen_m), streets.kerb_m + np.array([0.5, 1.5, 2.8]))
+    for side in (1, -1):
+        assert shapely.contains_xy(known, streets.main.poses(along_m, side * left_m)[..., :2].reshape(-1, 2)).all()
+    # Along the streets that cross it, too.
+    for (street, _, half_m), station_m, turn in zip(lines[1:], streets.junctions_m, streets.course.turns, strict=True):
+        if not turn and seen_m[0] < station_m < seen_m[1]:
+            away_m, left_m = np.meshgrid(streets.kerb_m + np.arange(0.5, 17.0), half_m + np.array([0.5, 2.8]))
+            for way, side in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+                places_m = street.poses(way * away_m, side * left_m)[..., :2]
+                assert shapely.contains_xy(known, places_m.reshape(-1, 2)).all()
+    between = paved.buffer(9.0, join_style="mitre").buffer(-9.0, join_style="mitre").difference(known)
+    assert between.buffer(-1.5).is_empty
 
 
 @pytest.mark.parametrize("kind", ["hilly", "motorway"])

@@ -57,10 +57,7 @@ class RosBag(Layout):
     layout: ClassVar[str] = "metadata.yaml and *.db3 or *.mcap, *.bag, or such a file, with topics of PointCloud2"
 
     def __init__(
-        self,
-        path: str | os.PathLike[str],
-        vehicle_frame: str | None = None,
-        mounts: Mapping[str, Matrix] | None = None,
+        self, path: str | os.PathLike[str], vehicle_frame: str | None = None, mounts: Mapping[str, Matrix] | None = None
     ) -> None:
         self.path = Path(path)
         self.told = {

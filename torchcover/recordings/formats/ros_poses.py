@@ -40,7 +40,14 @@ class PoseSeries(NamedTuple):
         start_ns, gap_ns = self.times_ns[after - 1], np.diff(self.times_ns)[after - 1]
         since_s, gap_s = (times_ns - start_ns) * 1e-9, gap_ns * 1e-9
         beyond_s = np.maximum(-since_s, since_s - gap_s)
-        bad = (beyond_s > EDGE_S) | ((gap_s > LONGEST_GAP_S) & (since_s > 0) & (since_s < gap_s))
+        apart = (gap_s > LONGEST_GAP_S) & (since_s > 0) & (since_s < gap_s)
+        if apart.any():
+            raise ValueError(
+                f"{name}: the poses before and after the time {int(times_ns[apart][0])} ns are "
+                f"{gap_s[apart].max():.3g} s apart; where it was between is known of poses that are at most "
+                f"{LONGEST_GAP_S:g} s apart: record more often, or give poses of all times"
+            )
+        bad = beyond_s > EDGE_S
         if bad.any():
             off_s = np.minimum(np.abs(since_s), np.abs(since_s - gap_s))[bad].max()
             raise ValueError(
@@ -93,10 +100,7 @@ class VehiclePoses:
     def _around(self, logged_ns: int) -> Mapping[str, PoseSeries]:
         if self._last[0] != logged_ns:
             messages = self._bag.messages(self._topic, logged_ns - WINDOW_NS, logged_ns + WINDOW_NS)
-            self._last = (
-                logged_ns,
-                series_of(messages, self._bag.types[self._topic], self._topic),
-            )
+            self._last = (logged_ns, series_of(messages, self._bag.types[self._topic], self._topic))
         return self._last[1]
 
 

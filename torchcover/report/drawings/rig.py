@@ -155,10 +155,5 @@ def _entry(at: int, sensor: SensorView) -> Artist:
     reach = f"to {sensor.range_m:g} m" if np.isfinite(sensor.range_m) else "without a limit"
     words = f"{sensor.horizontal_fov_deg:.1f}° wide, {low:.1f}° to {high:.1f}° high, {reach}"
     return Line2D(
-        [],
-        [],
-        linestyle="none",
-        marker="o",
-        color=sensor_colour(at),
-        label=f"{at + 1}  {sensor.name}: {words}",
+        [], [], linestyle="none", marker="o", color=sensor_colour(at), label=f"{at + 1}  {sensor.name}: {words}"
     )

@@ -82,11 +82,7 @@ def _conditions(coverage: Coverage) -> str:
 
 
 def _subject(
-    quantity: Quantity,
-    values: Mapping[str, Tensor],
-    unknown: str,
-    conditions: str,
-    opacity: Tensor | None = None,
+    quantity: Quantity, values: Mapping[str, Tensor], unknown: str, conditions: str, opacity: Tensor | None = None
 ) -> Subject:
     """With the values in the unit that is shown, and one scale for all."""
     shown = {name: shown_unit(quantity.unit).factor * each for name, each in values.items()}

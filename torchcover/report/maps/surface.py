@@ -74,10 +74,7 @@ def as_drawn(coverage: Coverage) -> Coverage:
     rows, columns = (-(-count // side) for count in grid.shape[1:])
     cell_m = side * grid.cell
     coarse = replace(
-        grid,
-        x=(grid.x[0], grid.x[0] + columns * cell_m),
-        y=(grid.y[0], grid.y[0] + rows * cell_m),
-        cell=cell_m,
+        grid, x=(grid.x[0], grid.x[0] + columns * cell_m), y=(grid.y[0], grid.y[0] + rows * cell_m), cell=cell_m
     )
 
     def square(cell: Tensor) -> Tensor:

@@ -50,6 +50,7 @@ class PageMap:
         sides: (Y, X) how many cells wide the square is that each cell is drawn in; a power of 2.
         difference: Colours of the difference to the first rig; None for the first, and where nothing is compared.
         lines: What is drawn over it.
+        bits: Of each number and weight in the file, 16 or 8.
     """
 
     quantity: str
@@ -68,6 +69,7 @@ class PageMap:
     sides: Sides | None = None
     difference: ColourScale | None = None
     lines: Sequence[Line] = ()
+    bits: int = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +160,6 @@ class Page:
         outlines: Regions that the maps show, by name: (K, 2) corners x, y.
         facts: Heading -> name -> what holds, such as settings.
         more_tables: Below the facts, such as what was left out.
-        most_bytes: What the numbers of the maps may take, before they are packed.
     """
 
     title: str
@@ -174,4 +175,3 @@ class Page:
     outlines: Sequence[Line] = ()
     facts: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     more_tables: Sequence[PageTable] = ()
-    most_bytes: float = 3.8e6

@@ -11,9 +11,9 @@ from torchcover.report.maps.overlay import SensorView
 from torchcover.report.page.codes import CellBytes
 from torchcover.report.page.content import Array, Line, Page, PageMap
 
-VALUE_BITS, ERROR_BITS = 16, 8
 # The near field, in lengths of the ego to all sides.
 NEAR, NEAR_LENGTHS = "near the ego", 2.0
+BESIDE = "beside the ego"
 # JSON knows no infinity; beyond every map all ranges are alike.
 FARTHEST_M = 1e6
 
@@ -44,16 +44,20 @@ def _map(one: PageMap, raster: int, cells: CellBytes) -> dict[str, Any]:
         "rig": one.rig,
         "raster": raster,
         "unknown": one.unknown,
-        "values": cells.add(one.values, VALUE_BITS),
-        "errors": None if one.errors is None else cells.add(one.errors, ERROR_BITS),
-        "weights": None if one.weights is None else cells.add(one.weights, VALUE_BITS),
+        **arrays_of(one, cells),
         "weight_name": one.weight_name,
         "full": one.full_weight,
-        "sides": None if one.sides is None else cells.add(one.sides, ERROR_BITS),
         "scale": _scale(one.scale),
         "difference": None if one.difference is None else _scale(one.difference),
         "lines": _lines(one.lines),
     }
+
+
+def arrays_of(one: PageMap, cells: CellBytes) -> dict[str, int | None]:
+    """Its numbers, as places in the arrays of the cells."""
+    bits = {"values": one.bits, "errors": 8, "weights": one.bits, "sides": 8}
+    arrays = {name: getattr(one, name) for name in bits}
+    return {name: None if array is None else cells.add(array, bits[name]) for name, array in arrays.items()}
 
 
 def _raster(maps: Sequence[PageMap]) -> dict[str, Any]:
@@ -84,12 +88,15 @@ def _views(page: Page) -> list[dict[str, Any]]:
         low, high = page.ego_outline_m.min(axis=0), page.ego_outline_m.max(axis=0)
         reach = NEAR_LENGTHS * (high[0] - low[0])
         views.insert(0, (NEAR, np.array([low - reach, high + reach])))
+    if page.maps:  # which is what is told of, and may be of a part of what others show
+        views.insert(0, (BESIDE, np.array([page.maps[0].x, page.maps[0].y]).T))
     ends = np.array([[(one.x[0], one.y[0]), (one.x[1], one.y[1])] for one in page.maps])
     found = []
     for name, points_m in views if page.maps else ():
         low = np.maximum(points_m.min(axis=0), ends[:, 0].min(axis=0))
         high = np.minimum(points_m.max(axis=0), ends[:, 1].max(axis=0))
-        if (low < high).all():
+        whole = name == BESIDE and (low <= ends[:, 0].min(axis=0)).all() and (high >= ends[:, 1].max(axis=0)).all()
+        if (low < high).all() and not whole:
             found.append({"name": name, "x": [low[0], high[0]], "y": [low[1], high[1]]})
     return found
 

@@ -17,26 +17,13 @@ from torchcover.report.wording import shown_unit, span
 
 
 def maps_of(coverages: Mapping[str, Coverage]) -> Iterator[PageMap]:
-    """A map for each quantity, height band and rig; at last those of redundancy and of bodies, where there are any.
+    """A map for each quantity, height band and rig; first those of bodies, if there are any: the answer tells of them.
 
     Args:
         coverages: By the name of the rig; one, or several that are paired.
     """
     coverages = {name: as_drawn(coverage) for name, coverage in coverages.items()}
     first = next(iter(coverages.values()))
-    shown = quantities_shown(first)
-    surface = _weights(first) if first.measure == "area" else None
-    steps = Weights([_known(one) for one in first.probed_steps], "steps that probed it")
-    for quantity, by_surface in shown:
-        layers = {rig: coverage.layers[quantity.key] for rig, coverage in coverages.items()}
-        errors = {
-            rig: coverage.errors[quantity.key] for rig, coverage in coverages.items() if quantity.key in coverage.errors
-        }
-        yield from _of_quantity(layers, errors, (surface if by_surface else None) or steps, first.grid)
-    of_sensors = {rig: one.redundancy.layers for rig, one in coverages.items() if one.redundancy is not None}
-    for key in dict.fromkeys(key for layers in of_sensors.values() for key in layers):
-        having = {rig: layers[key] for rig, layers in of_sensors.items() if key in layers}
-        yield from _of_quantity(having, {}, surface or steps, first.grid)
     for rig, bodies in ((rig, coverage.bodies) for rig, coverage in coverages.items() if coverage.bodies):
         for body, cells in zip(bodies.bodies, bodies.cells, strict=True):
             free, share, quantity = _known(cells[..., 0]), cells[..., 1] / cells[..., 0], bodies.quantities[0]
@@ -53,6 +40,19 @@ def maps_of(coverages: Mapping[str, Coverage]) -> Iterator[PageMap]:
                 weights=free,
                 weight_name="free places",
             )
+    shown = quantities_shown(first)
+    surface = _weights(first) if first.measure == "area" else None
+    steps = Weights([_known(one) for one in first.probed_steps], "steps that probed it")
+    for quantity, by_surface in shown:
+        layers = {rig: coverage.layers[quantity.key] for rig, coverage in coverages.items()}
+        errors = {
+            rig: coverage.errors[quantity.key] for rig, coverage in coverages.items() if quantity.key in coverage.errors
+        }
+        yield from _of_quantity(layers, errors, (surface if by_surface else None) or steps, first.grid)
+    of_sensors = {rig: one.redundancy.layers for rig, one in coverages.items() if one.redundancy is not None}
+    for key in dict.fromkeys(key for layers in of_sensors.values() for key in layers):
+        having = {rig: layers[key] for rig, layers in of_sensors.items() if key in layers}
+        yield from _of_quantity(having, {}, surface or steps, first.grid)
 
 
 class Weights(NamedTuple):

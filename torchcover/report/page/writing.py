@@ -15,43 +15,44 @@ import numpy as np
 from torchcover.report.page.answer import plans_html, ranges_html, words_html
 from torchcover.report.page.codes import CellBytes
 from torchcover.report.page.content import Array, Page, PageMap, PagePicture, PageRig
-from torchcover.report.page.map_content import ERROR_BITS, VALUE_BITS, map_content
+from torchcover.report.page.map_content import arrays_of, map_content
 from torchcover.report.page.rig_drawing import rig_drawing, sensor_table
 from torchcover.report.renderers.layout import PageTable, Words
 
-# Of maps that are beside those with errors.
-MOST_HALVINGS = 2
-VALUE_BYTES, ERROR_BYTES = VALUE_BITS // 8, ERROR_BITS // 8
-NO_ERRORS = "Errors of single cells are left out, so that this file stays small: the .npz files have them."
+# What maps and pictures may take in a file that is sent by mail without a thought, and the maps in any case; and how
+# many times that they may take before they are packed.
+MOST_CHARS, LEAST_CHARS, MOST_PACKED = 440_000, 100_000, 8
+ROUNDED = "Numbers of single cells are rounded, those of a wide scale by up to 4 %"
+NO_ERRORS = "errors of single cells are left out"
 
 
-def fitted(maps: Sequence[PageMap], most_bytes: float = Page.most_bytes) -> tuple[list[PageMap], list[str]]:
-    """Take cells together where maps have no errors beside some that have; leave out errors; take all cells together.
+def fitted(maps: Sequence[PageMap], most_chars: int = MOST_CHARS) -> tuple[list[PageMap], list[str]]:
+    """Round numbers, then leave out errors, then take cells together where most are, until what is packed is small.
 
     Returns:
         The maps, and what was left out in words.
     """
-    kept, notes = list(maps), []
-    with_errors = [one.errors is not None for one in kept]
-    for _ in range(MOST_HALVINGS if any(with_errors) else 0):
-        if bytes_of(kept) > most_bytes:
-            kept = [one if has else coarser(one) for one, has in zip(kept, with_errors, strict=True)]
-    if bytes_of(kept) > most_bytes and any(with_errors):
-        kept, notes = [replace(one, errors=None) for one in kept], [NO_ERRORS]
-    while bytes_of(kept) > most_bytes:
-        kept = [coarser(one) for one in kept]
+    kept, left_out = list(maps), []
+    if _is_larger(kept, most_chars):
+        kept, left_out = [replace(one, bits=8) for one in kept], [ROUNDED]
+    if _is_larger(kept, most_chars) and any(one.errors is not None for one in kept):
+        kept, left_out = [replace(one, errors=None) for one in kept], [ROUNDED, NO_ERRORS]
+    while _is_larger(kept, most_chars):
+        most = max(one.values.size for one in kept)
+        kept = [coarser(one) if one.values.size > most / 4 else one for one in kept]
     sides = {round(one.cell_m / whole.cell_m) for one, whole in zip(kept, maps, strict=True)} - {1}
     if sides:
-        words = " or ".join(f"{side} x {side}" for side in sorted(sides))
-        notes.append(f"Some maps show {words} cells as one, so that this file stays small: the .npz files have each.")
-    return kept, notes
+        left_out.append(f"some maps show {' or '.join(f'{side} x {side}' for side in sorted(sides))} cells as one")
+    return kept, [f"{'; '.join(left_out)}, so that this file stays small: the .npz files have each."] * bool(left_out)
 
 
-def bytes_of(maps: Sequence[PageMap]) -> int:
-    """What their numbers take; weights that several share count once."""
-    values = sum(int((~np.isnan(one.values)).sum()) * _width(one) for one in maps)
-    weights = {id(one.weights): one.weights for one in maps if one.weights is not None}
-    return values + sum(VALUE_BYTES * int((~np.isnan(each)).sum()) for each in weights.values())
+def _is_larger(maps: Sequence[PageMap], most_chars: int) -> bool:
+    if sum(int((~np.isnan(one.values)).sum()) * one.bits // 8 for one in maps) > MOST_PACKED * most_chars:
+        return True
+    cells = CellBytes()
+    for one in maps:
+        arrays_of(one, cells)
+    return len(cells.text()) > most_chars
 
 
 def coarser(one: PageMap) -> PageMap:
@@ -82,10 +83,6 @@ def coarser(one: PageMap) -> PageMap:
     )
 
 
-def _width(one: PageMap) -> int:
-    return VALUE_BYTES + (ERROR_BYTES if one.errors is not None else 0)
-
-
 def _sums(values: Array) -> Array:
     rows, columns = values.shape
     even = np.pad(values, ((0, rows % 2), (0, columns % 2)))
@@ -99,10 +96,10 @@ SCRIPTS = ("cells.js", "map.js", "page.js", "controls.js")
 def page_html(page: Page) -> str:
     """The text of its file."""
     cells = CellBytes()
-    maps, notes = fitted(page.maps, page.most_bytes)
+    first = plans_html(page.plans) + "".join(map(_picture, page.pictures))
+    maps, notes = fitted(page.maps, max(MOST_CHARS - len(first), LEAST_CHARS))
     content = as_json(map_content(replace(page, maps=maps), cells))
     script = "\n".join(map(_file, SCRIPTS))
-    first = plans_html(page.plans) + "".join(map(_picture, page.pictures))
     more = "".join(f"<li>{words_html(words)}</li>" for words in page.verdict[1:])
     more = f'<ul class="more">{more}</ul>' if more else ""
     return Template(_file("page.html")).substitute(

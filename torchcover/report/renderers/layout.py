@@ -10,14 +10,7 @@ from torchcover.estimation import Quantity
 from torchcover.report.failures import decisive, failure_headings, failure_title, failure_words, sensors_of
 from torchcover.report.renderers.records import COLUMNS
 from torchcover.report.table import CoverageTable, Row
-from torchcover.report.wording import (
-    UNKNOWN,
-    capitalised,
-    difference_heading,
-    difference_words,
-    heading,
-    number_words,
-)
+from torchcover.report.wording import UNKNOWN, capitalised, difference_heading, difference_words, heading, number_words
 
 MAX_HEADING_CHARS = 16
 PLACE_HEADINGS = ("region", "height")

@@ -1,7 +1,7 @@
 """A table as text for a terminal."""
 
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import groupby
 from operator import itemgetter
@@ -23,6 +23,8 @@ from torchcover.report.table import CoverageTable
 SIGNS = {"best": "*", "significant": "!"}
 # More characters than any table has in a line.
 MAX_LINE_CHARS = 10_000
+# Words of headings that are longer may be cut, where there are too many columns.
+LEAST_HEADING_CHARS = 10
 
 
 class Terminal(Console):
@@ -81,22 +83,42 @@ def rich_tables(table: CoverageTable, width: int | None = None) -> list[Table]:
 
 
 def print_whole(tables: Sequence[PageTable]) -> None:
-    """Print tables as wide as they are: rather lines that are too long than numbers that are cut off."""
-    console, whole = Terminal(), [_in_words(table) for table in tables]
+    """Print tables, folded between words where the terminal is narrower, or 80 columns if that is not known.
+
+    Rather lines that are too long than words and numbers that are cut.
+    """
+    console = Terminal()
+    whole = [_in_words(table, console.width) for table in tables]
     console.width = max(console.width, narrowest_width(whole))
     for table in whole:
         console.print(table)
 
 
-def _in_words(table: PageTable) -> Table:
-    """The first column left, the others right; no words are markup."""
+def _in_words(table: PageTable, limit: int) -> Table:
+    """The first column left, the others right; no words are markup. The widest are folded until it is `limit` wide."""
+    columns = [(name, [row[at].text for row in table.rows]) for at, name in enumerate(table.headings)]
+    widths = [_longest([name, *cells], "\n") for name, cells in columns]
+    least = [max(min(_longest([name]), LEAST_HEADING_CHARS), _longest(cells)) for name, cells in columns]
+    beside = int(sum(least) + 3 * len(least) < limit)
+    room = max(limit - 1 - (1 + 2 * beside) * len(least), sum(least))
+    folded = sum(widths) > room
+    while sum(widths) > room:
+        widths[max((k for k in range(len(least)) if widths[k] > least[k]), key=widths.__getitem__)] -= 1
     title, caption = (Text(words) if words else None for words in (table.title, "\n".join(table.notes)))
-    shown = Table(title=title, caption=caption)
-    for at, heading in enumerate(table.headings):
-        shown.add_column(Text(heading), justify="right" if at else "left")
-    for row in table.rows:
-        shown.add_row(*(Text(cell.text) for cell in row))
+    shown = Table(title=title, caption=caption, padding=(0, beside))
+    for at, (heading, width) in enumerate(zip(table.headings, widths, strict=True)):
+        shown.add_column(Text(heading), justify="right" if at else "left", width=width, overflow="fold")
+    above = ""
+    for first, *others in table.rows:
+        again = folded and first.text == above  # whose many lines are not read twice
+        shown.add_row("" if again else Text(first.text), *(Text(cell.text) for cell in others))
+        above = first.text
     return shown
+
+
+def _longest(texts: Iterable[str], between: str | None = None) -> int:
+    """Of all words, or of what else is between."""
+    return max((cell_len(part) for text in texts for part in text.split(between)), default=0)
 
 
 def narrowest_width(tables: Sequence[Table], folded: Sequence[str] = ()) -> int:

@@ -29,12 +29,7 @@ CLASSES = {"truck": "truck", "bus": "bus", "motorcycle": "motorcycle", "cyclist"
 
 
 def write_routes(
-    path: Path,
-    network: Network,
-    streets: DrawnStreets,
-    fleet: Fleet,
-    duration_s: float,
-    generator: np.random.Generator,
+    path: Path, network: Network, streets: DrawnStreets, fleet: Fleet, duration_s: float, generator: np.random.Generator
 ) -> None:
     """Write vehicles and people, all of whom set off at 0.
 

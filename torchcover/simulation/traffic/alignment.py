@@ -119,15 +119,20 @@ class Beside:
         self.left_m = left_m
         self.way = way
         self._reach_m = reach_m
-        self._knots_m = street.lengths_m(street.stations_m, left_m)
-        steps_m, stations_m = np.diff(self._knots_m), np.diff(street.stations_m)
-        long = stations_m > 0
-        self._stations_per_m = np.append(np.divide(stations_m, steps_m, out=np.ones_like(steps_m), where=long), 1.0)
-        self._steps_m = np.where(long, steps_m, np.inf)
+
+    @cached_property
+    def _knots_m(self) -> Float64:
+        return self.street.lengths_m(self.street.stations_m, self.left_m)
 
     @cached_property
     def _cubics(self) -> Float64:
-        return _cubics(self.street.poses(self.street.stations_m, self.left_m), self._steps_m)
+        steps_m = np.where(np.diff(self.street.stations_m) > 0, np.diff(self._knots_m), np.inf)
+        return _cubics(self.street.poses(self.street.stations_m, self.left_m), steps_m)
+
+    @cached_property
+    def _stations_per_m(self) -> Float64:
+        steps_m, stations_m = np.diff(self._knots_m), np.diff(self.street.stations_m)
+        return np.append(np.divide(stations_m, steps_m, out=np.ones_like(steps_m), where=stations_m > 0), 1.0)
 
     @property
     def length_m(self) -> float:

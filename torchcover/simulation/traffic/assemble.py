@@ -1,6 +1,6 @@
 """From places on lanes to a world, and how the ego's body tilts: with braking and starting, curves, and the road."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -46,12 +46,12 @@ class Paths(NamedTuple):
         """And all that these bodies draw along, with headings in radians at first; straight behind if not given."""
         fronts = tuple(number for number, kind in enumerate(self.kinds) if kind in DRAWS)
         own = [np.column_stack([self.positions_m[:, k, :2], np.deg2rad(self.yaw_deg[:, k])]) for k in fronts]
-        positions_m, yaw_deg, kinds = [self.positions_m], [self.yaw_deg], self.kinds
-        for front, poses in zip(fronts, rears_of([kinds[front] for front in fronts], own, start), strict=True):
-            positions_m.append((poses * [1.0, 1.0, 0.0])[:, None])
-            yaw_deg.append(np.rad2deg(poses[:, 2:]))
-            kinds += (DRAWS[kinds[front]].rear,)
-        return Paths(np.concatenate(positions_m, axis=1), np.concatenate(yaw_deg, axis=1), kinds, fronts)
+        if not fronts:
+            return self
+        poses = np.stack(rears_of([self.kinds[front] for front in fronts], own, start), axis=1)
+        positions_m = np.concatenate([self.positions_m, poses * [1.0, 1.0, 0.0]], axis=1)
+        yaw_deg = np.concatenate([self.yaw_deg, np.rad2deg(poses[..., 2])], axis=1)
+        return Paths(positions_m, yaw_deg, (*self.kinds, *(DRAWS[self.kinds[front]].rear for front in fronts)), fronts)
 
 
 def paths(lanes: Sequence[Lane], agents: Sequence[Agent], place_m: Float64) -> Paths:
@@ -59,9 +59,7 @@ def paths(lanes: Sequence[Lane], agents: Sequence[Agent], place_m: Float64) -> P
     positions_m, yaw_deg = np.zeros((*place_m.shape, 3)), np.empty(place_m.shape)
     lane_of, kinds = np.array([agent.lane for agent in agents]), tuple(agent.kind for agent in agents)
     place_m = place_m + ahead_of(kinds)
-    for lane in np.unique(lane_of):
-        on_lane = np.flatnonzero(lane_of == lane)
-        poses = lanes[lane].line.poses(place_m[:, on_lane])
+    for on_lane, poses in _along(lanes, lane_of, place_m):
         positions_m[:, on_lane, :2], yaw_deg[:, on_lane] = poses[..., :2], poses[..., 2]
     start = []
     for number in [number for number, kind in enumerate(kinds) if kind in DRAWS]:
@@ -70,6 +68,15 @@ def paths(lanes: Sequence[Lane], agents: Sequence[Agent], place_m: Float64) -> P
         (axles_m,) = lanes[lane_of[number]].line.poses(place_m[:1, number] - back_m)[:, :2]
         start.append(float(np.arctan2(*(positions_m[0, number, :2] - axles_m)[::-1])))
     return Paths(positions_m, yaw_deg, kinds).with_rears(start)
+
+
+def _along(lanes: Sequence[Lane], lane_of: Int64, place_m: Float64) -> Iterator[tuple[slice | Int64, Float64]]:
+    """Those on the same lane, and their (T, N, 3) poses. Mostly they are numbered in turn, and taken without a copy."""
+    order = np.argsort(lane_of, kind="stable")
+    for on_lane in np.split(order, np.flatnonzero(np.diff(lane_of[order])) + 1):
+        first, last = int(on_lane[0]), int(on_lane[-1])
+        some = slice(first, last + 1) if last - first == len(on_lane) - 1 else on_lane
+        yield some, lanes[lane_of[first]].line.poses(place_m[:, some])
 
 
 def ahead_of(kinds: Sequence[str]) -> Float64:
@@ -81,7 +88,9 @@ def come_near(lanes: Sequence[Lane], agents: Sequence[Agent], place_m: Float64) 
     """Numbers of those who may come near the first one, who is among them; they are looked at now and then only."""
     looks = np.unique(np.append(np.arange(0, len(place_m), LOOKS_EVERY), len(place_m) - 1))
     seen_m = place_m[looks]
-    positions_m = paths(lanes, agents, seen_m).positions_m[:, : len(agents)]
+    positions_m, lane_of = np.empty((*seen_m.shape, 2)), np.array([agent.lane for agent in agents])
+    for on_lane, poses in _along(lanes, lane_of, seen_m + ahead_of([agent.kind for agent in agents])):
+        positions_m[:, on_lane] = poses[..., :2]
     distance_m = np.linalg.norm(positions_m - positions_m[:, :1], axis=2)
     # Nobody drives back: between two looks, the two come closer by the ways of both at most.
     ways_m = np.diff(seen_m, axis=0, append=seen_m[-1:])

@@ -15,7 +15,7 @@ from torchcover.simulation.traffic.frontage import Side, Times, Zone, stand
 from torchcover.simulation.traffic.hills import Hills
 from torchcover.simulation.traffic.scenery import Scenery, few, ground, plateau
 from torchcover.simulation.traffic.site import PIECE_M, Bounds, BuildingSite
-from torchcover.simulation.traffic.streets import GUTTER_M, Streets
+from torchcover.simulation.traffic.streets import LONGEST_HALF_M, Streets
 
 BLOCK_DEPTH_M = 95.0
 # Crossings and the sight of those who wait there stay free: of parked cars, and of furniture.
@@ -24,10 +24,10 @@ PARKED_GAP_M = 0.9
 LANE_SIDE_M = 2.2
 PARKED = {"suv": 3.0, "sedan": 3.0, "hatchback": 3.0, "pickup": 0.8, "van": 1.0}
 # The block between two streets that meet the main street where it turns.
-CORNER_M, CORNER_DEPTH_M = 100.0, 40.0
-# Half of the width that a gap inside a block has at most.
+CORNER_M, CORNER_DEPTH_M, LANES_M = 100.0, 70.0, 130.0
+# Half of the width that a gap between pavements has at most.
 WEDGE_M = 10.0
-SNAPPED_M = 1e-4
+APART_M, SNAPPED_M = 1e-3, 1e-4
 # Streets in plan: corners so far apart, and a little narrower than they are, for those are on their curves' chords.
 STREET_EVERY_M, WITHIN_M = 4.0, 0.2
 # Beyond a sensor's range the ground goes on a little.
@@ -81,52 +81,48 @@ class City:
             self._streets.main, self._territory, self._hills, self._streets.kerb_m + BLOCK_DEPTH_M + 10.0
         )
         fronts = [(main, front) for front in self._frontages(seen_m)]
-        turns = (self._streets.course.turns != 0) & self._territory.covers(self._streets.junctions_m)
+        turns = ~self._streets.has_lights & (np.abs(self._streets.junctions_m - np.mean(seen_m)) < np.ptp(seen_m) / 2)
         fronts += [self._corner(index) for index in np.flatnonzero(turns).tolist()]
-        blocks, outlines, floors, sides = [], [], [], list[Side]()
+        blocks, outlines, aprons, sides = [], [], list[shapely.Geometry](), list[Side]()
         for site, front in fronts:
             is_built = self._built_share == 1.0 or self._shapes.random() < self._built_share
             depth_m = BLOCK_DEPTH_M if front.junctions else CORNER_DEPTH_M
             depth_m = depth_m if is_built else self._section.sidewalk_m
             block, outline = site.block(front.x_m, front.side, front.kerb_m, depth_m)
             blocks.append(block)
+            outlines.append(outline)
             zone: Zone = "built" if is_built else "open"
             sides += self._sides(site.street, front, zone)
-            aprons = []
-            for index, corner_m, inwards in zip(front.junctions, front.x_m, (1, -1), strict=False):
-                deep_m = site.depth_m(np.array([corner_m]), front.side, front.kerb_m, BLOCK_DEPTH_M)[0]
-                y_m = front.side * (front.kerb_m + np.array([FREE_AT_CORNERS_M, max(deep_m, 2 * FREE_AT_CORNERS_M)]))
-                kerb_m = site.street.poses(corner_m, y_m)[:, :2]
-                if self._streets.course.turns[index]:
-                    face_m, kerb_m = kerb_m, self._far_kerb(index, kerb_m, inwards)
-                    aprons += [shapely.Polygon(np.concatenate([face_m, kerb_m[::-1]])).buffer(0)] * is_built
-                sides += _across(kerb_m if inwards == front.side else kerb_m[::-1], self._section.sidewalk_m, zone)
-            floors.append(shapely.union_all([outline, *aprons]) if aprons else outline)
-            if front.turns_m:
-                # Between the two wings of a block inside a turn, too.
-                floors[-1] = floors[-1].buffer(WEDGE_M, join_style="mitre").buffer(-WEDGE_M, join_style="mitre")
-            outlines.append(outline)
-        for floor, outline in zip(floors, outlines, strict=True):
-            if floor is not outline:
-                rest = floor.difference(shapely.union_all([one for one in outlines if one.intersects(floor)]))
-                parts = shapely.get_parts(shapely.set_precision(rest, SNAPPED_M))
-                parts = parts[(shapely.get_type_id(parts) == 3) & (shapely.area(parts) > WEDGE_M)]
-                blocks += [plateau(shapely.segmentize(part, PIECE_M), self._hills.heights_m) for part in parts]
-        self._park([(site, self._parked(front)) for site, front in fronts])
+            for end in range(len(front.junctions)):
+                edge_m, apron = self._end(site, front, end, is_built)
+                aprons += apron
+                sides += _across(edge_m if front.side == 1 - 2 * end else edge_m[::-1], self._section.sidewalk_m, zone)
         driven, walked = self._in_plan()
-        stood = stand(sides, driven, walked, floors, self._hills.heights_m, self._roadside, self._generator)
+        nets, whole = shapely.union_all(outlines), shapely.union_all([*outlines, *aprons], grid_size=SNAPPED_M)
+        if not self._streets.main.is_straight:
+            aprons.append(self._between(whole, shapely.union_all(driven)))
+            whole = shapely.union_all([whole, aprons[-1]], grid_size=SNAPPED_M)
+        # A little apart, so that no outline meets itself.
+        rest = shapely.union_all(aprons, grid_size=SNAPPED_M).difference(nets).buffer(-APART_M, join_style="bevel")
+        rest = shapely.get_parts(shapely.set_precision(rest, SNAPPED_M))
+        blocks.append(plateau(shapely.segmentize(rest, PIECE_M), self._hills.heights_m))
+        self._park([(site, self._parked(front)) for site, front in fronts])
+        stood = stand(
+            sides, driven, walked, shapely.get_parts(whole), self._hills.heights_m, self._roadside, self._generator
+        )
         pavements = few(blocks)
         return Scenery((self._ground(seen_m), *pavements, *few(*stood)), tuple(range(1 + len(pavements))))
 
     def _in_plan(self) -> tuple[list[shapely.Geometry], list[shapely.Geometry]]:
         """All streets, without and with the sidewalks along them."""
         stations_m = [self._territory.stations_m(STREET_EVERY_M)]
-        for street, ends_m in zip(self._streets.crossing, self._streets.cross_ends_m(), strict=True):
-            stations_m.append(ends_m if street.is_straight else np.arange(-CORNER_M, CORNER_M, STREET_EVERY_M))
+        bodies_m = self._streets.cross_ends_m + np.array([-LONGEST_HALF_M, LONGEST_HALF_M])
+        for street, ends_m in zip(self._streets.crossing, bodies_m, strict=True):
+            stations_m.append(ends_m if street.is_straight else np.arange(-LANES_M, LANES_M, STREET_EVERY_M))
         streets = zip([self._streets.main, *self._streets.crossing], stations_m, strict=True)
         lines = [shapely.LineString(street.poses(along_m, 0.0)[:, :2]) for street, along_m in streets]
-        half_m = [self._section.kerb_m]
-        half_m += (self._streets.cross_lanes_each_way * self._section.lane_m + GUTTER_M).tolist()
+        lines = shapely.simplify(lines, WITHIN_M / 4)
+        half_m = [self._section.kerb_m, *self._streets.carriageways_m.tolist()]
         driven, walked = (
             shapely.buffer(lines, np.array(half_m) - WITHIN_M + wider_m, cap_style="flat").tolist()
             for wider_m in (0.0, self._section.sidewalk_m)
@@ -145,18 +141,42 @@ class City:
                     "open" if number % 2 else zone, _beside(street, x_m, front.side * (front.kerb_m + sidewalk_m))
                 )
 
-    def _far_kerb(self, index: int, face_m: Float64, inwards: int) -> Float64:
-        """(K, 2) places at the kerb of a street that goes straight on where the main street turns away, at a junction.
+    def _end(
+        self, site: BuildingSite, front: Frontage, end: int, is_built: bool
+    ) -> tuple[Float64, list[shapely.Geometry]]:
+        """(2, 2) the kerb of the cross street at the beginning (0) or the end (1) of a block, and pavement along it.
 
-        People walk around the turn on the level, between what lies beside that street and the main street. They are as
-        far away from that as `face_m` (K, 2), at the end of the block beside it: `inwards` is 1 at its beginning, -1 at
-        its end.
+        Where the main street turns away, its sidewalk goes on around the turn, and the block as far as the street that
+        goes straight on.
         """
-        street, turn = self._streets.crossing[index], int(self._streets.course.turns[index])
-        kerb_m = float(self._streets.cross_lanes_each_way[index]) * self._section.lane_m + GUTTER_M
-        x, y, yaw_deg = street.poses(-inwards * float(self._streets.cross_kerbs_m[index]), -turn * kerb_m)
-        away = np.array([np.cos(np.deg2rad(yaw_deg)), np.sin(np.deg2rad(yaw_deg))])
-        return np.asarray(np.array([x, y]) + ((face_m - [x, y]) @ away)[:, None] * away)
+        index, corner_m, inwards = front.junctions[end], front.x_m[end], 1 - 2 * end
+        deep_m = float(site.depth_m(np.array([corner_m]), front.side, front.kerb_m, BLOCK_DEPTH_M)[0])
+        y_m = front.side * (front.kerb_m + np.array([0.0, FREE_AT_CORNERS_M, max(deep_m, 2 * FREE_AT_CORNERS_M)]))
+        face_m, sidewalk_m = site.street.poses(corner_m, y_m)[:, :2], self._section.sidewalk_m
+        inside_m = -inwards * front.side * sidewalk_m
+        if not self._streets.course.turns[index]:
+            return face_m[1:], [] if is_built else [_strip(face_m, inside_m)]
+        middle_m, half_m = float(self._streets.junctions_m[index]), float(self._streets.cross_kerbs_m[index])
+        around_m = site.street.poses(np.linspace(corner_m, middle_m, 17), front.side * front.kerb_m)[:, :2]
+        way_m, kerb_m = np.linspace(-half_m, half_m + CORNER_M, 97), float(self._streets.carriageways_m[index])
+        line_m = self._streets.crossing[index].poses(-inwards * way_m, 0.0)[:, :2]
+        ahead = (line_m[-1] - line_m[-2]) / np.linalg.norm(line_m[-1] - line_m[-2])
+        onto_m = line_m[-1] + ((face_m[1:] - line_m[-1]) @ ahead)[:, None] * ahead
+        opposite_m = line_m[(way_m >= 0.0) & ((line_m - onto_m[-1]) @ ahead < 0.0)]
+        area = shapely.Polygon(np.concatenate([face_m[::-1], around_m, opposite_m, onto_m[1:]])).buffer(0)
+        street = shapely.LineString(line_m)
+        area = area.difference(street.buffer(kerb_m, cap_style="flat"))
+        if not is_built:
+            area = area.intersection(street.buffer(kerb_m + sidewalk_m))
+        left_m = inwards * int(self._streets.course.turns[index]) * kerb_m
+        return onto_m + left_m * np.array([-ahead[1], ahead[0]]), [area, _strip(around_m, inside_m)]
+
+    def _between(self, whole: shapely.Geometry, streets: shapely.Geometry) -> shapely.Geometry:
+        """In plan, what is narrow between pavements but no street: wedges, and where the main street comes back."""
+        with np.errstate(all="ignore"):  # of what GEOS divides by zero in passing, nothing remains
+            closed = whole.buffer(WEDGE_M, join_style="mitre").buffer(-WEDGE_M, join_style="mitre")
+        between = closed.difference(streets.buffer(2 * WITHIN_M, join_style="bevel")).difference(whole)
+        return between.buffer(-WITHIN_M, join_style="bevel").buffer(WITHIN_M, join_style="bevel")
 
     def _ground(self, seen_m: Bounds) -> Mesh:
         """Under everything: as far as lanes go, or as far as it can be seen."""
@@ -183,7 +203,7 @@ class City:
     def _corner(self, index: int) -> tuple[BuildingSite, Frontage]:
         """The block between the two streets that meet the main street in a turn."""
         street, half_m = self._streets.crossing[index], float(self._streets.cross_kerbs_m[index])
-        kerb_m = float(self._streets.cross_lanes_each_way[index]) * self._section.lane_m + GUTTER_M
+        kerb_m = float(self._streets.carriageways_m[index])
         side, middle_m = int(self._streets.course.turns[index]), float(self._streets.junctions_m[index])
         span_m = (-half_m - CORNER_M, half_m + CORNER_M)
         site = BuildingSite(street, Territory(street, span_m), self._hills, kerb_m + CORNER_DEPTH_M + 10.0)
@@ -241,6 +261,11 @@ class City:
 
     def _uniform(self, low: float, high: float) -> float:
         return float(self._generator.uniform(low, high))
+
+
+def _strip(line_m: Float64, left_m: float) -> shapely.Geometry:
+    """What lies on the left of a line, up to so far."""
+    return shapely.buffer(shapely.LineString(line_m), left_m, single_sided=True, join_style="mitre")
 
 
 def _across(kerb_m: Float64, sidewalk_m: float, zone: Zone) -> Iterator[Side]:

@@ -3,6 +3,7 @@
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from functools import cache, lru_cache
+from operator import attrgetter
 
 import numpy as np
 
@@ -52,6 +53,7 @@ CATEGORIES = {name: BODIES[kind] for name, kind in sorted(KIND_OF.items())}
 EGO = "ego"
 HEAVY = ("truck", "lorry", "bus")
 REAR_OF = "rear of "
+_EXIT = attrgetter("exit_m")
 
 WALKING = Driver(
     desired_speed_mps=1.4, headway_s=0.4, standstill_gap_m=0.5, acceleration_mps2=1.0, deceleration_mps2=1.5
@@ -114,7 +116,9 @@ class Fleet:
 
     def draw_driver(self, typical: Driver, spread: float) -> Driver:
         """A driver whose desired speed differs from the typical one by up to `spread`, a share of it."""
-        desired_mps = float(typical.desired_speed_mps * self._generator.uniform(1 - spread, 1 + spread))
+        # As `uniform` would, which takes thrice as long.
+        share = 1 - spread + (1 + spread - (1 - spread)) * self._generator.random()
+        desired_mps = float(typical.desired_speed_mps * share)
         rest = typical.headway_s, typical.standstill_gap_m, typical.acceleration_mps2, typical.deceleration_mps2
         return Driver(desired_mps, *rest)  # by hand: there are thousands of them in a world
 
@@ -192,7 +196,9 @@ def _smallest_gap_m(driver: Driver) -> float:
 def _in_the_way(agent: Agent, gates: Sequence[Gate], gap_m: float, others: Sequence[Agent]) -> bool:
     rear, front = agent.place_m - agent.length_m / 2, agent.place_m + agent.length_m / 2
     # Gates follow each other: of those that are not behind, the first is the nearest.
-    gate = bisect_right(gates, rear, key=lambda gate: gate.exit_m)
+    gate = bisect_right(gates, rear, key=_EXIT)
     if gate < len(gates) and front > gates[gate].enter_m - gap_m:
         return True
-    return any(abs(agent.place_m - other.place_m) < (agent.length_m + other.length_m) / 2 + gap_m for other in others)
+    return bool(others) and any(
+        abs(agent.place_m - other.place_m) < (agent.length_m + other.length_m) / 2 + gap_m for other in others
+    )

@@ -72,14 +72,15 @@ def slab(corners_m: Float64, z_m: tuple[float, float]) -> Mesh:
     return Mesh(np.column_stack([places_m, np.repeat(z_m, up)]), np.concatenate([over[:, ::-1], over + up, sides]))
 
 
-def plateau(piece: shapely.Geometry, heights_m: Callable[[Float64], Float64]) -> Mesh:
-    """Pavement of any outline: a closed body from above the ground, whose heights are given, to below it."""
-    triangles = shapely.get_coordinates(shapely.get_parts(shapely.constrained_delaunay_triangles(piece)))
+def plateau(pieces: ArrayLike, heights_m: Callable[[Float64], Float64]) -> Mesh:
+    """Pavement of one or several outlines: closed, from above the ground, whose heights are given, to below it."""
+    triangles = shapely.get_coordinates(shapely.get_parts(shapely.constrained_delaunay_triangles(pieces)))
     corners_m = np.round(triangles.reshape(-1, 4, 2)[:, :3].reshape(-1, 2) / PLACES_ALIKE_M) * PLACES_ALIKE_M
-    places_m, faces = np.unique(corners_m, axis=0, return_inverse=True)
-    faces = faces.reshape(-1, 3)
-    first, second, third = places_m[faces].swapaxes(0, 1)
-    turns_left = np.cross(np.pad(second - first, ((0, 0), (0, 1))), np.pad(third - first, ((0, 0), (0, 1))))[:, 2] > 0
+    # Complex numbers are sorted in a fraction of the time that rows take.
+    places, faces = np.unique(corners_m.view(np.complex128)[:, 0], return_inverse=True)
+    places_m, faces = places.view(np.float64).reshape(-1, 2), faces.reshape(-1, 3)
+    first, second, third = places[faces].T
+    turns_left = ((second - first).conj() * (third - first)).imag > 0
     faces[~turns_left] = faces[~turns_left][:, ::-1]
     above_m, count = heights_m(places_m), len(places_m)
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)

@@ -60,9 +60,9 @@ class BuildingSite:
         outline = shapely.make_valid(shapely.Polygon(np.concatenate([net[:, 0], net[::-1, -1]])))
         mesh = slab(net if side == 1 else net[:, ::-1], (0.0, PAVEMENT_M))
         if not self._hills.are_flat:
-            above_m = mesh.vertices_m[:, 2] + self._hills.heights_m(mesh.vertices_m[:, :2])
-            above_m[mesh.vertices_m[:, 2] == 0.0] -= FOOT_M
-            mesh.vertices_m[:, 2] = above_m
+            below, above = mesh.vertices_m.reshape(2, -1, 3)
+            ground_m = self._hills.heights_m(above[:, :2])
+            below[:, 2], above[:, 2] = ground_m - FOOT_M, ground_m + PAVEMENT_M
         return mesh.made_of("pavement"), outline
 
     def depth_m(self, x_m: Float64, side: int, kerb_m: float, depth_m: float) -> Float64:

@@ -112,10 +112,10 @@ class Streets:
 
         They have station 0 on the junction, to which a straight one comes from the right of the main street.
         """
-        streets = []
-        for station, turn, half in zip(self.junctions_m, self.course.turns, self.course.halves_m, strict=True):
-            if turn == 0:
-                x, y, yaw_deg = self.main.poses(station, 0.0)
+        streets, middles = [], self.main.poses(self.junctions_m, 0.0)
+        for index, (station, half) in enumerate(zip(self.junctions_m, self.course.halves_m, strict=True)):
+            if self.course.turns[index] == 0:
+                x, y, yaw_deg = middles[index]
                 streets.append(Alignment([0.0], [0.0], (x, y, np.deg2rad(yaw_deg + 90.0))))
                 continue
             # The same turn, opposite of where the main street would go on to and come from.
@@ -128,6 +128,12 @@ class Streets:
             streets.append(Alignment(knots[of_turn] - station, self.main.curvatures_per_m[of_turn], start))
         return streets
 
+    @property
+    def carriageways_m(self) -> Float64:
+        """(J,) from the middle of each cross street to its kerb, of those that meet in a turn, too."""
+        return np.asarray(self.cross_lanes_each_way * self.section.lane_m + GUTTER_M)
+
+    @cached_property
     def cross_ends_m(self) -> Float64:
         """(J, 2) stations between which a cross street, in all its width, is far from all others of its kind."""
         whole = Territory(self.main, (-self.reach_m, self.reach_m))

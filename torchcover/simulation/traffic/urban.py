@@ -19,13 +19,7 @@ from torchcover.simulation.traffic.idm import Driver
 from torchcover.simulation.traffic.procedural import MostPeople, MostVehicles, Procedural
 from torchcover.simulation.traffic.scenery import Scenery
 from torchcover.simulation.traffic.signals import CROSS, MAIN
-from torchcover.simulation.traffic.streets import (
-    FOOTPATHS_M,
-    WAITING_BEHIND_KERB_M,
-    Section,
-    Streets,
-    plan,
-)
+from torchcover.simulation.traffic.streets import FOOTPATHS_M, WAITING_BEHIND_KERB_M, Section, Streets, plan
 from torchcover.simulation.world import Actor
 
 WARM_UP_S = 20.0
@@ -199,27 +193,29 @@ def _in_place(
     And let nobody be where their cross street ends, nor where the main street is not built.
     """
     junction = {id(street): index for index, street in enumerate(streets.crossing)}
-    ends_m = streets.cross_ends_m()
+    ends_m = streets.cross_ends_m
     if streets.main.is_straight:  # it never comes back
         built_m = (-2 * streets.reach_m, 2 * streets.reach_m)
     radius_m = np.array([fleet.length_m(agent.kind) / 2 for agent in agents])
     lane_of = np.array([agent.lane for agent in agents])
+    within_m = np.empty((2, len(agents)))
     for lane in np.unique(lane_of):
         line, on_lane = lanes[lane].line, np.flatnonzero(lane_of == lane)
-        places_m = place_m[:, on_lane]
         assert isinstance(line, Beside)
         of_main = line.street is streets.main
-        first_m, last_m = np.sort(line.places_at(built_m if of_main else ends_m[junction[id(line.street)]]))
-        step, agent = np.nonzero((places_m < first_m) | (places_m > last_m))
+        within_m[:, on_lane] = np.sort(line.places_at(built_m if of_main else ends_m[junction[id(line.street)]]))[
+            :, None
+        ]
         if of_main and CATEGORIES.get(agents[on_lane[0]].kind) == "pedestrian":
-            # On the inside of a turn the pavement goes on.
-            stop = streets.course.turns != np.sign(line.left_m)
+            # In a turn the pavement goes on.
+            stop = streets.has_lights
             middles_m, halves_m = streets.junctions_m[stop][:: line.way], streets.cross_kerbs_m[stop][:: line.way]
+            places_m = place_m[:, on_lane]
             first_m, last_m = np.sort(line.places_at(middles_m + np.array([[-1.0], [1.0]]) * halves_m), axis=0)
             next_one = np.minimum(np.searchsorted(last_m, np.ascontiguousarray(places_m.T)).T, len(last_m) - 1)
             beyond_kerb_m = np.minimum(places_m - first_m[next_one], last_m[next_one] - places_m)
             found.positions_m[:, on_lane, 2] = step_height(beyond_kerb_m, radius_m[on_lane])
-        found.positions_m[step, on_lane[agent]] = np.nan
+    found.positions_m[:, : len(agents)][(place_m < within_m[0]) | (place_m > within_m[1])] = np.nan
     rears = found.positions_m[:, len(agents) :]
     rears[np.isnan(found.positions_m[:, list(found.fronts), 0])] = np.nan
     return found
