@@ -3,6 +3,9 @@
 A drive is simulated with two LiDARs, 0.1 s apart, with poses and tracked boxes. The forward one is judged; the other
 spins. The truth is the measure by area against the surface reference at the same instants, over bands of local ground.
 
+`imperfect`: ranges of the recording have noise, and its poses errors. A second table says of how many that move the
+reference has found the velocity.
+
 With `--ground`, ranges have noise, and the question is how far the heights above the ground that these sweeps have seen
 are from those of the world, and how far that moves the numbers.
 """
@@ -11,6 +14,7 @@ import argparse
 import time
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -26,7 +30,9 @@ from torchcover.data import (
     SimulatedFrames,
     reference_called,
 )
-from torchcover.geometry import invert, transform
+from torchcover.detection import points_in_boxes
+from torchcover.geometry import invert, rigid, rotation_from_euler, transform
+from torchcover.recordings.movers import COMPARED_S, WITHIN_M, movers
 from torchcover.simulation import Lidar, PaperReference, Rig, Scenario
 
 EVERY_S = 0.1
@@ -45,10 +51,27 @@ OTHER = Lidar(
     max_range_m=200.0,
     mount={"x_m": -0.8, "z_m": 1.95},
 )
+# Errors of poses: of places, and of angles in degrees.
+POSE_ERROR_M, POSE_ERROR_DEG = 0.05, 0.1
+# Vehicles that move so fast and have so many points are to be found with a velocity that is off by no more.
+MOVES_MPS, POINTS, WITHIN_MPS, LEAST_LENGTH_M = 0.5, 50, 0.5, 3.0
 # With the ground: noise, how near to it points lie on it, and how far up they are lifted, lest noise takes them below.
 NOISE_M, ON_GROUND_M, LIFT_M = 0.03, 0.1, 0.3
 RANGES_M = (0.0, 40.0, 80.0, 160.0)
 MOUNTS = {"judged": JUDGED.mount.matrix(), "other": OTHER.mount.matrix()}
+
+
+class Case(NamedTuple):
+    """A reference that is looked at: the sensors that take part, its window, and what the recording is like."""
+
+    sensors: tuple[str, ...]
+    window_s: float
+    labelled: bool
+    imperfect: bool = False
+
+    def __str__(self):
+        labels = "labels" if self.labelled else "none"
+        return f"{', '.join(self.sensors)}, {self.window_s:g} s, {labels}{', imperfect' if self.imperfect else ''}"
 
 
 class SimulatedDrive:
@@ -69,19 +92,29 @@ class SimulatedDrive:
         self.names = [sweep.name for sweep in self._sweeps]
         self.frames = [reach]
         self.times_s = EVERY_S * np.arange(len(self.names))
-        self.labelled = labelled
+        self.labelled, self.imperfect = labelled, False
         self.body = sweeps.scenario.ego_box()
 
     def scan(self, sensor, index):
-        points_m = self._sweeps[index].clouds[sensor].numpy()
         mount = MOUNTS[sensor]
-        return Scan(transform(invert(mount), points_m.astype(np.float64)), mount, self.names[index])
+        points_m = transform(invert(mount), self._sweeps[index].clouds[sensor].numpy().astype(np.float64))
+        if self.imperfect:
+            range_m = np.linalg.norm(points_m, axis=1, keepdims=True)
+            points_m *= 1 + np.random.default_rng(index).normal(0, NOISE_M, range_m.shape) / range_m
+        return Scan(points_m, mount, self.names[index])
 
     def world_T_vehicle(self, index):
-        return self._poses[index]
+        if not self.imperfect:
+            return self._poses[index]
+        random = np.random.default_rng(index)
+        off = rigid(rotation_from_euler(*random.normal(0, POSE_ERROR_DEG, 3)), random.normal(0, POSE_ERROR_M, 3))
+        return self._poses[index] @ off
 
     def boxes(self, index):
-        return self._sweeps[index].boxes if self.labelled else None
+        return self.true_boxes(index) if self.labelled else None
+
+    def true_boxes(self, index):
+        return self._sweeps[index].boxes
 
 
 def main():
@@ -98,45 +131,100 @@ def main():
     if options.ground:
         heights(sweeps, options)
         return
+    cases = [
+        case
+        for window_s in options.windows
+        for case in (
+            Case(("judged",), window_s, True),
+            Case(("judged",), window_s, False),
+            Case(("judged",), window_s, False, imperfect=True),
+            Case(("other",), window_s, False),
+            Case(("judged", "other"), window_s, False),
+        )
+    ]
+    tables(cases, *measured(sweeps, cases, options.instants, max(options.windows)))
+
+
+def measured(sweeps, cases, many, longest_s):
+    """The true numbers of each rig; of each case those of its rigs, the processor time a frame, and `found_movers`."""
     surface = sweeps.with_reference_sensor(
         reference_called(rays=TRUTH_RAYS, asked=RegionsOfInterest().around(sweeps.ego_outline_m))
     )
-    cases = [
-        (f"{', '.join(sensors)}, {window_s:g} s, {'labels' if labelled else 'none'}", sensors, window_s, labelled)
-        for window_s in options.windows
-        for sensors in (("judged",), ("judged", "other"))
-        for labelled in (True, False)
-    ]
     truths = {rig: metric() for rig in MOUNTS}
-    metrics = {(name, rig): metric() for name, *_ in cases for rig in MOUNTS}
-    spent_s = dict.fromkeys((name for name, *_ in cases), 0.0)
-    for number in range(options.instants):
+    metrics = {case: {rig: metric() for rig in case.sensors} for case in cases}
+    spent_s, movers_of = dict.fromkeys(cases, 0.0), {case: [] for case in cases if not case.labelled}
+    for number in range(many):
         instant = round((number + 0.5) * sweeps.scenario.traffic.duration_s / EVERY_S)
         true = surface[instant]
         for rig, of in truths.items():
             added(of, true, rig)
-        recording = SimulatedDrive(sweeps, instant, max(options.windows))
-        for name, sensors, window_s, labelled in cases:
-            recording.labelled = labelled
-            recording.rigs = {rig: (rig,) for rig in sensors}
+        recording = SimulatedDrive(sweeps, instant, longest_s)
+        for case in cases:
+            recording.labelled, recording.imperfect = case.labelled, case.imperfect
+            recording.rigs = {rig: (rig,) for rig in case.sensors}
+            reference = AccumulatedReference(case.window_s, sensors=case.sensors)
             start_s = time.process_time()
-            (frame,) = RecordedFrames(recording, reference=AccumulatedReference(window_s, sensors=sensors))
-            spent_s[name] += (time.process_time() - start_s) / options.instants
-            for rig in sensors:
-                added(metrics[name, rig], frame, rig)
-    by_area = {rig: numbers(of.compute(), "area") for rig, of in truths.items()}
-    rows = [("the truth", "", "", "", *words(by_area["judged"]))]
-    for name, sensors, *_ in cases:
-        found = {rig: numbers(metrics[name, rig].compute(), "area") for rig in sensors}
-        between = ""
-        if len(sensors) == 2:
-            apart = [of["judged"] - of["other"] for of in (found, by_area)]
+            (frame,) = RecordedFrames(recording, reference=reference)
+            spent_s[case] += (time.process_time() - start_s) / many
+            for rig in case.sensors:
+                added(metrics[case][rig], frame, rig)
+            if not case.labelled:
+                movers_of[case] += found_movers(recording, reference, frame)
+    by_area = [{rig: numbers(of.compute(), "area") for rig, of in rigs.items()} for rigs in (truths, *metrics.values())]
+    return by_area[0], dict(zip(cases, by_area[1:], strict=True)), spent_s, movers_of
+
+
+def tables(cases, truths, found, spent_s, movers_of):
+    """Print what was measured."""
+    rows = [(f"the truth, {rig}", *5 * ("",), *words(of)) for rig, of in truths.items()]
+    for case in cases:
+        rig, between, from_labels = case.sensors[0], "", ""
+        if len(case.sensors) == 2:
+            apart = [of["judged"] - of["other"] for of in (found[case], truths)]
             between = f"{100 * np.sqrt(np.nanmean((apart[0] - apart[1])[:, 1] ** 2)):.1f}"
-        off = distance(found["judged"], by_area["judged"])
-        rows.append((name, *off, between, f"{spent_s[name]:.1f}", *words(found["judged"])))
-    rows[0] = (*rows[0][:4], "", *rows[0][4:])
+        labelled = case._replace(labelled=True)
+        if labelled in found and not case.labelled:
+            from_labels, _ = distance(found[case][rig], found[labelled][rig])
+        off = distance(found[case][rig], truths[rig])
+        rows.append((str(case), *off, from_labels, between, f"{spent_s[case]:.1f}", *words(found[case][rig])))
     strata = (f"{region.name} {height}" for region in REGIONS for height in GRID.heights)
-    table(("reference", "rms", "worst", "rms of the difference", "processor s", *strata), rows)
+    header = "reference", "rms", "worst", "rms from that with labels", "rms of the difference", "processor s"
+    table((*header, *strata), rows)
+    print()
+    rows = []
+    for case, off_mps in movers_of.items():
+        right = sum(off <= WITHIN_MPS for off in off_mps)
+        rows.append((str(case), len(off_mps), f"{right} ({right / max(len(off_mps), 1):.0%})", off_mps.count(np.inf)))
+    moving = f"vehicles that move, with {POINTS} points or more"
+    table(("reference", moving, f"found within {WITHIN_MPS:g} m/s", "not found at all"), rows)
+
+
+def found_movers(recording, reference, frame):
+    """How far off in m/s is each vehicle that moves and has enough points; inf for one that is not found."""
+    instant = recording.frames[0]
+    time_s, loose_m, apart_s = recording.times_s[instant], [], []
+    vehicle_T_local = invert(reference.sweeps.local_T_vehicle(recording, instant))
+    for (_, index), (points_m, told) in reference.told_apart(recording, instant).items():
+        own_m = transform(vehicle_T_local, points_m[told > 0])
+        since_s = recording.times_s[index] - time_s
+        if abs(since_s) <= COMPARED_S:
+            loose_m.append(own_m[np.linalg.norm(own_m[:, :2], axis=1) < WITHIN_M])
+            apart_s.append(since_s)
+    found = movers(loose_m, np.array(apart_s))
+    places_m = torch.from_numpy(np.concatenate([np.empty((0, 3)), *(of.points_m for of in found)])).float()
+    whose = np.repeat(np.arange(len(found)), [len(of.points_m) for of in found])
+    boxes = recording.true_boxes(instant)
+    cloud = torch.cat([frame.clouds[sensor] for sensor in reference.sensors])
+    count = torch.bincount(points_in_boxes(cloud, boxes).box, minlength=len(boxes))
+    inside, off_mps = points_in_boxes(places_m, boxes), []
+    for number in np.flatnonzero(count >= POINTS):
+        velocity_mps, far_m = boxes.velocity_mps[number].numpy(), np.linalg.norm(boxes.centre_m[number, :2])
+        moves = np.linalg.norm(velocity_mps) > MOVES_MPS and boxes.size_m[number, 0] > LEAST_LENGTH_M
+        if moves and far_m < WITHIN_M:
+            own = whose[inside.point[inside.box == number].numpy()]
+            of = found[np.bincount(own).argmax()].velocity_mps if len(own) else np.inf
+            off_mps.append(float(np.linalg.norm(of - velocity_mps)))
+    return off_mps
 
 
 def added(to, frame, rig):

@@ -23,10 +23,11 @@ RIGHT = {
     "as it is": "",
     "3 cm of noise on ranges": "",
     "poses off by 5 cm and 0.1 degrees": "",
-    "rain or dust, a tenth of the points": "",
-    "the first two sweeps": "",
 }
 WRONG = {
+    "rain or dust, a tenth of the points": "rain, snow or dust",
+    "the first two sweeps": "give a longer drive",
+    "a pose that jumps by 0.7 m": "give poses without jumps",
     "stands": "measure where it drives",
     "rotations x, y, z, w": "--quaternions xyzw",
     "poses are vehicle_T_world": "--poses inverse",
@@ -80,6 +81,8 @@ class Misread:
         earlier = {"poses a sweep late": max(index - 1, 0), "poses at half the rate": index // 2 * 2}
         number = {**earlier, "poses that stand": 0, "stands": 0}.get(self._fault, index)
         pose, random = self._recording.world_T_vehicle(number), np.random.default_rng(index)
+        if self._fault.startswith("a pose that jumps"):
+            return rigid(np.eye(3), np.array([0.5, 0.5, 0.0]) * (index >= len(self.names) // 2)) @ pose
         if self._fault.startswith("poses off"):
             return pose @ rigid(rotation_from_euler(*random.normal(0, 0.1, 3)), random.normal(0, 0.05, 3))
         if self._fault == "rotations x, y, z, w":

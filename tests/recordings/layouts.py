@@ -118,7 +118,8 @@ def nuscenes_tables(drive, root):
             tables["sample"].append({"token": f"k{index // 2}", "scene_token": "s", "timestamp": time_us})
             seen_there = {"sample_token": f"k{index // 2}", "instance_token": "i", "size": [2.0, 4.0, 1.5]}
             pose = {"rotation": quaternion(car), "translation": car[:3, 3].tolist()}
-            tables["sample_annotation"].append({"token": f"a{index}", **seen_there, **pose})
+            level = {"visibility_token": str(index % 4 + 1)}
+            tables["sample_annotation"].append({"token": f"a{index}", **seen_there, **pose, **level})
     (root / "v1.0-mini").mkdir()
     for name, rows in tables.items():
         (root / "v1.0-mini" / f"{name}.json").write_text(json.dumps(rows))

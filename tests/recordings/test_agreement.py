@@ -21,7 +21,7 @@ from torchcover.geometry import (
     rotation_from_quaternion,
     transform,
 )
-from torchcover.recordings.agreement import _late, disagreement
+from torchcover.recordings.agreement import _late, clocks_apart, disagreement, jumped
 from torchcover.recordings.corrected import corrected
 
 MOUNT = rigid(rotation_from_euler(2.0, 1.0, -1.0), [0.5, 0.1, 1.73])
@@ -166,6 +166,40 @@ def test_units_of_clouds(unit):
 def test_labels_of_which_none_fits():
     (doubt,) = RecordedFrames(Yard("unlabelled")).doubts()
     assert "labels, and none in 12 frames" in doubt
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.05, -0.1])
+def test_sensors_whose_clocks_are_apart(late_s):
+    class Two(Yard):
+        sensors = ("lidar", "other")
+
+        def true(self, step):
+            return super().true(step + 10 * late_s * (self.reading == "other"))
+
+        def scan(self, sensor, index):
+            self.reading = sensor
+            found = super().scan(sensor, index)
+            self.reading = ""
+            return found
+
+        reading = ""
+
+    found = clocks_apart(Two(), ("lidar", "other"), 12)
+    assert len(found) == (late_s != 0)
+    for doubt in found:
+        assert f"if it saw all {abs(late_s) * 1000:.0f} ms {'later' if late_s > 0 else 'earlier'}" in doubt
+
+
+def test_poses_that_jump_are_told_and_no_scans_are_compared_across():
+    class Jumping(Yard):
+        def world_T_vehicle(self, index):
+            jump_m = np.array([0.8, 0.4, 0.0]) * (index >= 6)
+            return rigid(np.eye(3), jump_m) @ super().world_T_vehicle(index)
+
+    assert "poses jump 1 times in 12 instants that were looked at, first at f6" in jumped(Jumping(), 12)
+    assert not doubts(Jumping())
+    assert jumped(Yard(pose_noise=0.05), 12) is None
+    assert jumped(Yard(speed_mps=0.0), 12) is None
 
 
 def test_lags_that_are_none():

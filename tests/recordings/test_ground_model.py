@@ -227,7 +227,8 @@ def test_without_times_the_ground_is_that_of_the_instant():
 
 
 def test_without_ground_bands_are_over_the_vehicle_and_the_result_says_so():
-    result = torchcover.evaluate(frames=RecordedFrames(Drive()), cell_m=8.0)
+    frames = RecordedFrames(Drive(), reference=AccumulatedReference(0.5))
+    result = torchcover.evaluate(frames=frames, cell_m=8.0)
     assert result.coverage.band_frame == "vehicle"
     assert "Ground: none was found near the vehicle" in " ".join(result.table.notes)
     assert RecordedFrames(Drive())[0].reference_heights_m.isnan().all()
@@ -235,6 +236,7 @@ def test_without_ground_bands_are_over_the_vehicle_and_the_result_says_so():
 
 
 def test_with_ground_bands_are_over_it():
-    result = torchcover.evaluate(frames=RecordedFrames(Road(steps=2)), cell_m=8.0)
+    frames = RecordedFrames(Road(steps=4), reference=AccumulatedReference(0.5))
+    result = torchcover.evaluate(frames=frames, cell_m=8.0)
     assert result.coverage.band_frame == "ground"
     assert "Ground: a height field through what all sensors saw of it" in " ".join(result.table.notes)

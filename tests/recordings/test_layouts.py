@@ -62,6 +62,9 @@ def test_poses_and_boxes_are_those_of_the_world(layout, written):
         between = layout == "nuscenes" and index % 2  # half-way between two headings
         torch.testing.assert_close(row, drive.boxes(index).rows[0], atol=1e-2 if between else 1e-4, rtol=0)
         assert recording.boxes(index).ids == recording.boxes(0).ids != ("",)
+        shares = {0: 0.2, 2: 0.7, 4: 0.2} if layout == "nuscenes" else {}  # between two, that of the first
+        share = shares.get(index // 2 * 2, np.nan)
+        assert recording.boxes(index).visibility.tolist() == pytest.approx([share], nan_ok=True)
         assert "car" in recording.boxes(index).categories[0] or "vehicle" in recording.boxes(index).categories[0]
 
 

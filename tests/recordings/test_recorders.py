@@ -10,6 +10,7 @@ import torch
 from tests.killing import operations_of
 from torchcover import Rig
 from torchcover.data import RecordedFrames, SimulatedFrames, open_recording, write_recording
+from torchcover.detection import box_visibility
 from torchcover.files import BadFileError, noted
 from torchcover.geometry import rotation_from_euler, rotation_from_quaternion
 from torchcover.geometry.rigid import quaternion_from_rotation
@@ -117,6 +118,13 @@ def test_kittis_layout_is_read_as_kittis(tmp_path):
     turned = read.boxes.yaw_rad - written.boxes.yaw_rad
     assert torch.sin(turned / 2).abs().max() < 1e-5
     assert read.boxes.categories == written.boxes.categories
+    weights = written.reference_weights
+    shares = box_visibility(written.sensor, written.reference, written.boxes, reference_weights=weights).share.numpy()
+    said = read.boxes.visibility.numpy()
+    assert (np.isnan(said) == np.isnan(shares)).all()
+    known = np.flatnonzero(~np.isnan(shares))
+    assert len(known) > 3
+    assert said[known] == pytest.approx(np.array([0.2, 0.6, 0.9])[np.digitize(shares[known], [0.4, 0.8])])
     calibration = read_calibration(tmp_path / "training" / "calib" / "000000.txt")
     assert {"P2", "R0_rect", "Tr_velo_to_cam", "Tr_imu_to_velo"} <= calibration.keys()
 

@@ -13,7 +13,7 @@ from tests.recordings.drives import Drive
 from torchcover.data import AccumulatedReference, RecordedFrames, Scan
 from torchcover.detection import Boxes
 from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_euler, transform
-from torchcover.recordings.suspicion import ground_height_m
+from torchcover.recordings.suspicion import ground_height_m, in_the_air
 
 MOUNT = rigid(rotation_from_euler(2.0, 1.0, -1.0), [0.5, 0.1, 1.73])
 SIZE_M = (4.0, 1.8, 1.5)
@@ -103,7 +103,7 @@ def test_nothing_is_wrong_with_what_is_right():
         Drive(labelled=False),
         Drive(origin_m=(5e5, 5e6, 100.0)),
     ):
-        assert doubts(drive, reference=AccumulatedReference(10.0)) == []
+        assert doubts(drive, reference=AccumulatedReference(0.8)) == []
 
 
 @pytest.mark.parametrize(
@@ -132,6 +132,38 @@ def test_each_mistake_is_named(mistake, says):
 def test_a_window_that_holds_one_instant():
     (doubt,) = doubts(Street(step_s=100.0), reference=AccumulatedReference(2.0))
     assert "instants are 100 s apart, and a window of 2 s" in doubt
+
+
+@pytest.mark.parametrize(("steps", "lasts"), [(1, "0 s, 1 instants"), (2, "0.1 s, 2 instants")])
+def test_a_drive_far_shorter_than_the_window(steps, lasts):
+    (doubt,) = doubts(Drive(steps=steps), reference=AccumulatedReference(2.0))
+    assert f"it lasts {lasts}, and its reference is to be of 2 s" in doubt
+    assert (
+        doubts(Drive(steps=steps), reference=AccumulatedReference(0.0, sensors=("left",)), rigs={"b": ("right",)}) == []
+    )
+
+
+def test_a_sensor_that_was_off_for_a_while():
+    street = Street()
+    scan = street.scan
+    off = Scan(np.empty((0, 3)), MOUNT, "off")
+    street.scan = lambda sensor, index: off if sensor == "lidar" and index >= 3 else scan(sensor, index)
+    (doubt,) = doubts(street)
+    assert "lidar has no point in 2 of 5 frames" in doubt
+
+
+def test_drops_hang_alone_in_the_air():
+    generator = np.random.default_rng(0)
+    x, y = generator.uniform(-12, 12, (2, 40_000))
+    ground_m = np.stack([x, y, np.zeros(40_000)], axis=1).astype(np.float32)
+    wall_m = np.stack([x, np.full(40_000, 8.0), generator.uniform(0, 4, 40_000)], axis=1)[:8000].astype(np.float32)
+    drops_m = generator.uniform([-8, -8, 0.5], [8, 8, 6], (1000, 3)).astype(np.float32)
+    dry, wet = (np.concatenate(of) for of in ((ground_m, wall_m), (ground_m, wall_m, drops_m)))
+    assert in_the_air({"lidar": [dry], "radar": [drops_m[:100]]}) is None
+    assert re.search(
+        r"within 15 m 1\d% \(lidar\) have no others near", in_the_air({"lidar": [wet, wet], "other": [dry]})
+    )
+    assert in_the_air({"lidar": [wet[::40]]}) is None  # where ground is as sparse, who is alone is no drop
 
 
 def test_ground_is_what_is_connected_below_the_vehicle():

@@ -1,4 +1,4 @@
-"""The ground of recordings far from the origin, and its sums, against twins in wider types."""
+"""Recordings, their ground and worlds made of them, far from the origin, against twins in wider types."""
 
 import math
 from functools import lru_cache
@@ -7,6 +7,8 @@ import numpy as np
 
 from torchcover.geometry import HeightField
 from torchcover.recordings.ground_model import GroundModel, low_surfaces
+from torchcover.recordings.sweeps import pose_jumps
+from torchcover.simulation.recorded_world import CELL_M, cell_mesh
 
 from .case import Case, most
 
@@ -66,6 +68,33 @@ def between_corners(dtype=None):
     return most(found_m - np.where(x >= y, low, high))
 
 
+@lru_cache
+def drive():
+    """Times and places of a bend, and one step that jumps by a metre; and after which place it does."""
+    times_s = 0.1 * np.arange(100)
+    way_m = np.stack([12.0 * times_s, 0.6 * times_s**2, 0.1 * times_s], axis=1)
+    way_m[41:] += [0.6, -0.8, 0.0]
+    return times_s, way_m, 40
+
+
+def wrong_jumps(dtype=np.float64):
+    times_s, way_m, jump = drive()
+    found = pose_jumps(times_s, (way_m + FAR_M).astype(dtype).astype(np.float64))
+    return float(len(set(found.tolist()) ^ {jump}))
+
+
+@lru_cache
+def cells():
+    generator = np.random.default_rng(6)
+    return generator.integers(0, 20, (2000, 3)), np.rint(FAR_M / CELL_M).astype(np.int64)
+
+
+def corners_m(dtype=np.float64):
+    here, away = cells()
+    found = cell_mesh(here + away).vertices_m.astype(dtype).astype(np.longdouble)
+    return most(found - np.longdouble(CELL_M) * away - cell_mesh(here).vertices_m)
+
+
 CASES = [
     Case("heights above ground, 8,000 km from the origin", "the same at the origin", "m", 1e-6, shifted,
          "float32 coordinates", lambda: shifted(np.float32)),
@@ -73,4 +102,8 @@ CASES = [
          "float32 mean", lambda: mean_m(lambda points_m: points_m.astype(np.float32).cumsum(axis=0)[-1] / 200_000)),
     Case("between the corners of a raster, 8,000 km from the origin", "longdouble", "m", 1e-8, between_corners,
          "float32", lambda: between_corners(np.float32)),
+    Case("a pose that jumps by 1 m, 8,000 km from the origin", "that step alone", "of 99 steps wrong", 0, wrong_jumps,
+         "float32 places", lambda: wrong_jumps(np.float32)),
+    Case("cells of a made world, 8,000 km from the origin", "the same at the origin, longdouble", "m", 1e-8, corners_m,
+         "float32", lambda: corners_m(np.float32)),
 ]  # fmt: skip

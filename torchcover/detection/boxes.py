@@ -16,6 +16,10 @@ from torchcover.geometry.arrays import Float64
 from torchcover.geometry.rigid import Matrix, transform
 from torchcover.neighbors import check_tensor
 
+# The middles of what labels of KITTI call fully visible, partly and largely occluded, which has no numbers for them: by
+# the borders of nuScenes, whose second and third level are one here.
+SHARE_OCCLUDED = {0.0: 0.9, 1.0: 0.6, 2.0: 0.2}
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Boxes:
@@ -34,8 +38,8 @@ class Boxes:
             where none were, as in recordings.
         bottom_heights_m: (K,) height of the bottom of each box above the local ground, that is the highest ground below
             its centre; NaN where unknown.
-        visibility: (K,) share of what can be seen of it that a rig shows, as `box_visibility` measures it; NaN where
-            unknown.
+        visibility: (K,) share of what can be seen of it that a rig shows, as `box_visibility` measures it, or the
+            middle of the level that a label says (`visibility_token`, `occluded`); NaN where unknown.
 
     Raises:
         ValueError: Shapes that do not fit, NaN or infinite places, a length, width or height that is not positive.
@@ -144,7 +148,8 @@ class Boxes:
         centre = np.column_stack([x, y - height / 2, z])  # the camera's y points down
         ahead = np.column_stack([np.cos(turn), np.zeros_like(turn), -np.sin(turn)])
         rows = upright_rows(centre, np.column_stack([length, width, height]), ahead, vehicle_T_camera)
-        return cls.from_rows(rows, **others)
+        shares = [SHARE_OCCLUDED.get(occluded, math.nan) for occluded in given[:, 1].tolist()]
+        return cls.from_rows(rows, visibility=torch.tensor(shares, dtype=torch.float32), **others)
 
     @property
     def rows(self) -> Tensor:

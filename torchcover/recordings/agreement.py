@@ -16,7 +16,7 @@ from torchcover.recordings.corrected import corrected_poses
 from torchcover.recordings.corrections import Corrections
 from torchcover.recordings.in_vehicle import in_vehicle
 from torchcover.recordings.recording import Recording
-from torchcover.recordings.sweeps import voxels
+from torchcover.recordings.sweeps import pose_jumps, voxels
 
 WITHIN_M, CELL_M, LEAST_POINTS, THICK_M, QUERIES = 40.0, 1.0, 6, 0.1, 1500
 # A surface lies flat if its normal is so upright, and it is so much thinner than wide.
@@ -27,8 +27,12 @@ STRETCHES, IN_A_ROW = 8, 25
 WAY_M, TURN_DEG, APART_S, LONGEST_S, PAIRS = 1.5, 3.0, 0.3, 1.5, 3
 # Poses are held if such a share of them is that of the instant before, for no more than so many instants.
 REPEATED, LONGEST_RUN = 0.2, 3
+# Poses of which a larger share jumps are wrong in another way.
+MOST_JUMPS = 0.1
 # What agrees so much better is right; noise of poses has many lags that are better, with worse ones in between.
 MORE, TIMES, MORE_BY_LAG, WELL, RAGGED = 0.15, 1.4, 0.06, 0.6, 0.03
+# Two sensors are not at one time if they agree so much better at another, farther off than halves of scans are.
+MORE_BY_CLOCK, OF_A_SCAN_S = 0.03, 0.03
 LAGS_S = [number * 0.025 for number in range(-12, 13)]
 # Where poses say that a vehicle stands: what it is moved by to see whether it does, with every so many points.
 STANDS_M, FASTEST_MPS, TURNS_DEG, FEWER = 0.1, 40.0, [half / 2 for half in range(-8, 9)], 3
@@ -82,6 +86,19 @@ class Surfaces:
         return float(np.exp(-squared / 2).sum() / len(points_m)) / self._own
 
 
+class TwoSensors:
+    """What two sensors see at the first of a pair of instants, between which the vehicle moves."""
+
+    def __init__(self, recording: Recording, sensors: Sequence[str], pair: "Pair") -> None:
+        scans = [in_vehicle(recording.scan(of, pair.first + pair.one), recording.body) for of in sensors]
+        self._surfaces, self._pair = [Surfaces(scan.points_m) for scan in scans], pair
+        self.enough = min(len(each.points_m) for each in self._surfaces) >= QUERIES // 10
+
+    def agreement(self, corrections: Corrections) -> float:
+        """How well the second fits the first, if it was later by the lag."""
+        return self._surfaces[0].agreement(transform(self._pair.later(corrections), self._surfaces[1].points_m))
+
+
 class Pair:
     """Two of the N instants in a row from `first` on, with (N,) times and (N, 4, 4) `world_T_vehicle`."""
 
@@ -95,6 +112,11 @@ class Pair:
         """(4, 4) from the vehicle frame of the other to that of the one."""
         poses = self._poses if corrections is GIVEN else corrected_poses(self._poses, self._times_s, corrections)
         return np.asarray(invert(poses[self.one]) @ poses[self.other])
+
+    def later(self, corrections: Corrections) -> Matrix:
+        """(4, 4) from the vehicle frame of the one, as it is with a lag, to that without."""
+        poses = corrected_poses(self._poses, self._times_s, corrections)
+        return np.asarray(invert(self._poses[self.one]) @ poses[self.one])
 
     def read(self, recording: Recording, sensor: str) -> bool:
         """Read what the sensor saw at both; whether enough stands there."""
@@ -134,18 +156,44 @@ def disagreement(recording: Recording, sensor: str, many: int) -> str | None:
     return mended and f"two scans of {sensor} agree to {given:.0%} once its poses move them, and to {mended}"
 
 
-def _mean(pairs: Sequence[Pair], corrections: Corrections) -> float:
+def _mean(pairs: Sequence[Pair | TwoSensors], corrections: Corrections) -> float:
     return float(np.mean([pair.agreement(corrections) for pair in pairs]))
 
 
 def _late(pairs: Sequence[Pair], given: float) -> str | None:
+    lag_s, agreed = _best_lag(pairs)
+    if agreed < max(given + MORE_BY_LAG, WELL):
+        return None
+    return f"{agreed:.0%} if they are late (early, if negative): --lag {lag_s:.2f}"
+
+
+def _best_lag(pairs: Sequence[Pair | TwoSensors]) -> tuple[float, float]:
+    """The lag with which they agree best, and how well; 0 where ragged noise has many that are better."""
     by_lag = np.array([_mean(pairs, Corrections(lag_s=lag_s)) for lag_s in LAGS_S])
     best = int(by_lag.argmax())
     # By how much it rises again on the way from the best.
     rises = max((side - np.minimum.accumulate(side)).max() for side in (by_lag[best::-1], by_lag[best:]))
-    if by_lag[best] < max(given + MORE_BY_LAG, WELL) or rises > RAGGED:
-        return None
-    return f"{by_lag[best]:.0%} if they are late (early, if negative): --lag {LAGS_S[best]:.2f}"
+    return (0.0, 0.0) if rises > RAGGED else (LAGS_S[best], float(by_lag[best]))
+
+
+def clocks_apart(recording: Recording, sensors: Sequence[str], many: int) -> list[str]:
+    """Sensors that see what the first of them does at another time than it, by the scans of the first `many` frames."""
+    pairs, found = [pair for pair in _chosen(list(_stretches(recording, many))) if pair.way_m > STANDS_M], []
+    for sensor in sensors[1:]:
+        try:
+            looks = [TwoSensors(recording, (sensors[0], sensor), pair) for pair in pairs]
+        except (OSError, ValueError):
+            continue  # whoever measures it will say so
+        looks = [look for look in looks if look.enough]
+        lag_s, agreed = _best_lag(looks) if looks else (0.0, 0.0)
+        given = _mean(looks, GIVEN) if lag_s else 1.0
+        if abs(lag_s) > OF_A_SCAN_S and agreed >= max(given + MORE_BY_CLOCK, WELL):
+            found.append(
+                f"{sensor} agrees with {sensors[0]} to {given:.0%} at the same instants, and to {agreed:.0%} if it saw "
+                f"all {abs(lag_s) * 1000:.0f} ms {'later' if lag_s > 0 else 'earlier'}: are their clocks apart? Mend "
+                "its times"
+            )
+    return found
 
 
 def _moved(pairs: Sequence[Pair], given: float) -> str | None:
@@ -166,6 +214,26 @@ def _moved(pairs: Sequence[Pair], given: float) -> str | None:
     if np.mean(agreed) < max(given + MORE, TIMES * given) or np.median(np.abs(ways_m)) < STANDS_M:
         return None
     return f"{np.mean(agreed):.0%} if it does not stand, but has moved {np.median(ways_m):+.1f} m: give the real poses"
+
+
+def jumped(recording: Recording, many: int) -> str | None:
+    """Whether poses jump."""
+    names, looked = [], 0
+    for times_s, poses, first in _stretches(recording, many):
+        looked += len(times_s)
+        names += [recording.names[first + at + 1] for at in _few_jumps(times_s, poses).tolist()]
+    if not names:
+        return None
+    return (
+        f"poses jump {len(names)} times in {looked} instants that were looked at, first at {names[0]}: no window "
+        "reaches over that, so that what is around it is judged by fewer sweeps: give poses without jumps"
+    )
+
+
+def _few_jumps(times_s: NDArray[np.float64], poses: Matrix) -> NDArray[np.intp]:
+    """Steps that are jumps; none where there are so many that it is no jump that is wrong."""
+    jumps = pose_jumps(times_s, poses[:, :3, 3])
+    return jumps[:0] if len(jumps) > max(2, MOST_JUMPS * len(times_s)) else jumps
 
 
 def _held(stretches: Sequence[Matrix]) -> str | None:
@@ -205,9 +273,10 @@ def _chosen(stretches: Sequence[tuple[NDArray[np.float64], Matrix, int]]) -> lis
     """Pairs of instants, spread over the recording; and those whose motion a lag would change most."""
     found = []
     for times_s, poses, first in stretches:
+        jumps = _few_jumps(times_s, poses)
         early, late = (corrected_poses(poses, times_s, Corrections(lag_s=lag_s)) for lag_s in (-0.1, 0.1))
         for one in range(len(times_s) - 1):
-            for other in range(one + 1, len(times_s)):
+            for other in range(one + 1, min(jumps[jumps >= one] + 1, default=len(times_s))):
                 pair = Pair(times_s, poses, first, one, other)
                 turned = np.rad2deg(np.arccos(np.clip((np.trace(pair.motion()[:3, :3]) - 1) / 2, -1, 1)))
                 far = pair.way_m > WAY_M or turned > TURN_DEG or pair.apart_s > APART_S - 1e-6

@@ -1,10 +1,12 @@
 """Objects as annotators saw them: each at some instants, and wanted at others or as a track."""
 
+import math
 from bisect import bisect_left
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import torch
 
 from torchcover.detection.boxes import Boxes, upright_rows
 from torchcover.geometry.rigid import Matrix, rigid, transform
@@ -14,13 +16,17 @@ SAME_TIME_S = 1e-3
 
 
 class Seen(NamedTuple):
-    """An object at an instant: `world_T_box` is its centre, x along its length; length, width, height are its size."""
+    """An object at an instant: `world_T_box` is its centre, x along its length; length, width, height are its size.
+
+    `visibility` as `Boxes` has it.
+    """
 
     name: str
     time_s: float
     world_T_box: Matrix
     size_m: tuple[float, float, float]
     category: str
+    visibility: float = math.nan
 
 
 def by_name(seen: Iterable[Seen]) -> dict[str, list[Seen]]:
@@ -56,7 +62,10 @@ class SeenObjects:
             None,
         )
         return Boxes.from_rows(
-            rows, ids=tuple(one.name for one in found), categories=tuple(one.category for one in found)
+            rows,
+            ids=tuple(one.name for one in found),
+            categories=tuple(one.category for one in found),
+            visibility=torch.tensor([one.visibility for one in found], dtype=torch.float32),
         )
 
     def _between(self, seen: Sequence[Seen], times_s: Sequence[float], time_s: float) -> Seen | None:

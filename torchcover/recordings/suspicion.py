@@ -12,7 +12,7 @@ from torchcover.files import RECORDING
 from torchcover.geometry import BoundingBox, invert
 from torchcover.neighbors import nearest
 from torchcover.recordings.accumulated_reference import USUAL_BODY, AccumulatedReference
-from torchcover.recordings.agreement import disagreement
+from torchcover.recordings.agreement import clocks_apart, disagreement, jumped
 from torchcover.recordings.ground_model import GroundModel, low_surfaces
 from torchcover.recordings.in_vehicle import in_vehicle, within
 from torchcover.recordings.recorded_reference import RecordedReference, Reference
@@ -38,6 +38,9 @@ FASTEST_MPS = 100.0
 FARTHEST_USUAL_M, FARTHEST_USUAL_CM = 300.0, 4000.0
 # Who moves less within a window stands.
 MOVES_M = 1.0
+# Drops are alone: the third of others is farther than this, and such a share of the range. So many times as many are of
+# those near and above ground as of those on it, and more than such a share.
+AIR_M, AIR_POINTS, NEIGHBOURS, ALONE_M, ALONE, TIMES_ALONE, MOST_ALONE = 15.0, 500, 4, 0.2, 0.03, 3.0, 0.04
 # So high above the ground, so many points are the vehicle's own.
 OWN_ABOVE_M, OWN_POINTS = 0.3, 20
 
@@ -84,10 +87,16 @@ def suspicions(recording: Recording, reference: Reference, rigs: Mapping[str, Se
             for rig, of in rigs.items()
         ),
         *(wrong_motion(recording) if disagreeing is None else [disagreeing]),
+        jumped(recording, many) if disagreeing is None else None,
+        *clocks_apart(recording, tuple(judged), many),
+        *(
+            doubt_of({sensor: [look.clouds[sensor] for look in looks] for sensor in sensors})
+            for doubt_of in (silent, in_the_air)
+        ),
         nothing_labelled(recording, many),
         unmarked(recording),
         *(
-            (alone_in_window(recording, reference), standing(recording, reference, judged, many))
+            (few_in_window(recording, reference), standing(recording, reference, judged, many))
             if isinstance(reference, AccumulatedReference)
             else ()
         ),
@@ -236,18 +245,65 @@ def wrong_motion(recording: Recording) -> list[str]:
     return found
 
 
-def alone_in_window(recording: Recording, reference: AccumulatedReference) -> str | None:
-    """Whether the time over which a reference is accumulated holds one instant only."""
-    times_s = recording.times_s
-    if times_s is None or len(times_s) < 2 or not reference.window_s:
+def few_in_window(recording: Recording, reference: AccumulatedReference) -> str | None:
+    """Whether the time over which a reference is accumulated holds one instant only, or the drive is far shorter."""
+    times_s, window_s = recording.times_s, reference.window_s
+    if times_s is None or not len(times_s) or not window_s:
         return None
-    apart_s = float(np.median(np.diff(times_s)))
-    if apart_s <= reference.window_s / 2:
+    lasts_s, apart_s = float(times_s[-1] - times_s[0]), float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0
+    if apart_s > window_s / 2:
+        return (
+            f"its instants are {apart_s:g} s apart, and a window of {window_s:g} s reaches none but its own: are "
+            "the times in seconds? Else ask for a longer window (--window-s)"
+        )
+    if lasts_s >= window_s / 2:
         return None
     return (
-        f"its instants are {apart_s:g} s apart, and a window of {reference.window_s:g} s reaches none but its own: are "
-        "the times in seconds? Else ask for a longer window (--window-s)"
+        f"it lasts {lasts_s:.3g} s, {len(times_s)} instants, and its reference is to be of {window_s:g} s: so short a "
+        "time shows little but what is seen at the instant, and numbers are far too good: give a longer drive"
     )
+
+
+def silent(clouds: Mapping[str, Sequence[NDArray[np.float32]]]) -> str | None:
+    """Whether sensors have nothing at some instants."""
+    empty = {sensor: sum(not len(cloud) for cloud in of) for sensor, of in clouds.items()}
+    if not any(empty.values()):
+        return None
+    told = ", ".join(
+        f"{sensor} has no point in {count} of {len(clouds[sensor])}" for sensor, count in empty.items() if count
+    )
+    return (
+        f"{told} frames that were looked at: it counts as blind there; if it was off, measure where it was on, or "
+        "leave it out (--sensors)"
+    )
+
+
+def in_the_air(clouds: Mapping[str, Sequence[NDArray[np.float32]]]) -> str | None:
+    """Whether many near points hang alone in the air, as drops do."""
+    shares = {sensor: share for sensor, of in clouds.items() if (share := share_alone(of)) > MOST_ALONE}
+    if not shares:
+        return None
+    told = ", ".join(f"{share:.0%} ({sensor})" for sensor, share in shares.items())
+    return (
+        f"of the points above ground within {AIR_M:g} m {told} have no others near them: rain, snow or dust? They "
+        "count as surface, hide what is behind them, and make a rig look better: leave them out"
+    )
+
+
+def share_alone(clouds: Sequence[NDArray[np.float32]]) -> float:
+    """How many of the near points above ground are alone; 0 where those on the ground are, too: it is sparse."""
+    from pykdtree.kdtree import KDTree
+
+    near_m = [cloud[np.linalg.norm(cloud, axis=1) < AIR_M] for cloud in clouds]
+    near_m = [near for near in near_m if len(near) >= AIR_POINTS]
+    if not near_m:
+        return 0.0
+    alone = [
+        KDTree(of).query(of, k=NEIGHBOURS)[0][:, -1] > ALONE_M + ALONE * np.linalg.norm(of, axis=1) for of in near_m
+    ]
+    above, which = np.concatenate(near_m)[:, 2] > GROUND_OFF_M, np.concatenate(alone)
+    share, on_ground = (float(which[of].mean()) if of.any() else 0.0 for of in (above, ~above))
+    return share if share > TIMES_ALONE * on_ground else 0.0
 
 
 def standing(recording: Recording, reference: AccumulatedReference, judged: Iterable[str], many: int) -> str | None:

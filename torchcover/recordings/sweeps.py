@@ -29,8 +29,8 @@ MARGIN_S, RAYS_EVERY_S = 1.0, 0.2
 SHORT = 20
 # Cells in which a thing that stands is seen again.
 CELL_M = 0.6
-# A vehicle that is so much faster or slower between two instants than between most has not moved: its pose has.
-JUMP_MPS = 15.0
+# A pose has jumped if a step is so far off those before and after, beside what tyres can do: the median of so many.
+JUMP_M, HARDEST_MPS2, STEPS = 0.3, 12.0, 5
 
 
 @dataclass(frozen=True)
@@ -106,9 +106,7 @@ class Sweeps:
             return [index]
         apart_s = np.abs(recording.times_s - recording.times_s[index])
         near = np.flatnonzero(apart_s <= (self.window_s / 2 + margin_s) * (1 + 1e-9))
-        places_m = np.array([_pose(recording, int(instant))[:3, 3] for instant in near])
-        speeds_mps = np.linalg.norm(np.diff(places_m, axis=0), axis=1) / np.diff(recording.times_s[near])
-        jumps = np.flatnonzero(np.abs(speeds_mps - np.median(speeds_mps)) > JUMP_MPS) if len(speeds_mps) else near[:0]
+        jumps = pose_jumps(recording.times_s[near], np.array([_pose(recording, int(one))[:3, 3] for one in near]))
         own = int(np.searchsorted(near, index))
         near = near[max(jumps[jumps < own] + 1, default=0) : min(jumps[jumps >= own] + 1, default=len(near))]
         return [int(instant) for instant in near[np.argsort(apart_s[near], kind="stable")]]
@@ -197,6 +195,19 @@ class Sweeps:
     def voxel(self, points_m: NDArray[np.float64]) -> NDArray[np.int64]:
         """(N,) number of the voxel of each point."""
         return voxels(points_m, self.voxel_m)
+
+
+def pose_jumps(times_s: NDArray[np.float64], places_m: NDArray[np.float64]) -> NDArray[np.intp]:
+    """After which of (N, 3) places the next lies elsewhere than those before and after say."""
+    if len(times_s) < 3:
+        return np.empty(0, np.intp)
+    step_s = np.diff(times_s)[:, None]
+    velocity_mps = np.diff(places_m, axis=0) / step_s
+    near = min(STEPS, len(step_s))
+    first = np.clip(np.arange(len(step_s)) - near // 2, 0, len(step_s) - near)
+    usual_mps = np.median(velocity_mps[first[:, None] + np.arange(near)], axis=1)
+    off_m = np.linalg.norm((velocity_mps - usual_mps) * step_s, axis=1)
+    return np.flatnonzero(off_m > JUMP_M + near // 2 * HARDEST_MPS2 * step_s[:, 0] ** 2)
 
 
 def voxels(points_m: NDArray[np.float64], side_m: float) -> NDArray[np.int64]:

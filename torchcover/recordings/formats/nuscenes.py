@@ -27,6 +27,8 @@ vehicle_T_ego = rigid(np.eye(3), [-1.385, 0.0, 0.0])
 # As in the body `renault_zoe`, where its source is.
 SIZE_M = (4.084, 1.730, 1.562)
 CHANNEL = "LIDAR_TOP"
+# The middle of each level of visibility, by its token.
+SHARES = {"1": 0.2, "2": 0.5, "3": 0.7, "4": 0.9}
 # Nothing but the car and what is mounted on it can be in its outline of 4.08 x 1.73 m up to a little above the LiDAR.
 BODY = BoundingBox((-2.042, -0.865, 0.05), (2.042, 0.865, 2.04))
 
@@ -185,7 +187,9 @@ def _seen(tables: Path, times_s: Mapping[str, float]) -> list[Seen]:
             name = row["instance_token"]
             category = str(categories.row(instances.row(name)["category_token"])["name"])
             world_T_box = rigid(rotation_from_quaternion(row["rotation"]), row["translation"])
-            seen.append(Seen(name, times_s[row["sample_token"]], world_T_box, (length, width, height), category))
+            visibility = SHARES.get(str(row.get("visibility_token")), np.nan)
+            size_m = (length, width, height)
+            seen.append(Seen(name, times_s[row["sample_token"]], world_T_box, size_m, category, visibility))
     return seen
 
 

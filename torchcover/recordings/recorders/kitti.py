@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from torchcover.detection.boxes import Boxes
+from torchcover.detection.visibility import box_visibility
 from torchcover.files import write_npz
 from torchcover.geometry import invert, transform
 from torchcover.recordings.formats.kitti_files import vehicle_T_velodyne
@@ -18,6 +19,8 @@ PROJECTION = "721.5377 0 609.5593 0 0 721.5377 172.854 0 0 0 1 0"  # of 2011_09_
 # What a file says in which there is no object: it must not be empty.
 NOTHING = "DontCare -1 -1 -10 -1 -1 -1 -1 -1 -1 -1 -1000 -1000 -1000 -10"
 UNKNOWN = "-1 -1 -1 -1"
+# `occluded` by the level of visibility: 3 is unknown, 2 largely, 1 partly, 0 not.
+OCCLUDED = (3, 2, 1, 1, 0)
 
 
 class KittiRecorder:
@@ -47,7 +50,8 @@ class KittiRecorder:
         frame, velodyne_T_vehicle = step.frame, invert(vehicle_T_velodyne)
         self._add_text(f"calib/{step.name}.txt", self._calibration)
         if frame.boxes is not None:
-            self._add_text(f"label_2/{step.name}.txt", _labels(frame.boxes))
+            seen = box_visibility(frame.sensor, frame.reference, frame.boxes, reference_weights=frame.reference_weights)
+            self._add_text(f"label_2/{step.name}.txt", _labels(frame.boxes, seen.level.tolist()))
         arrays = {"points": transform(velodyne_T_vehicle, frame.reference.numpy())}
         if frame.reference_weights is not None:
             arrays["weights"] = frame.reference_weights.numpy()
@@ -65,18 +69,20 @@ class KittiRecorder:
         self._add(name, lambda path: path.write_text(text, encoding="utf-8"))
 
 
-def _labels(boxes: Boxes) -> str:
-    """A line an object: what is not known of an image is -1."""
+def _labels(boxes: Boxes, levels: Sequence[int]) -> str:
+    """A line an object, by its level of visibility: what is not known of an image is -1."""
     rows = boxes.rows.double().numpy()
     camera_T_vehicle = camera_T_velodyne @ invert(vehicle_T_velodyne)
     centre_m = transform(camera_T_vehicle, rows[:, :3])
     lines = []
-    for (x, y, z), (_, _, _, length, width, height, yaw), category in zip(
-        centre_m, rows, boxes.categories, strict=True
+    for (x, y, z), (_, _, _, length, width, height, yaw), category, level in zip(
+        centre_m, rows, boxes.categories, levels, strict=True
     ):
         turn = np.arctan2(-np.cos(yaw), -np.sin(yaw))  # about the camera's y
         seen = np.angle(np.exp(1j * (turn - np.arctan2(x, z))))
         numbers = [height, width, length, x, y + height / 2, z, turn]
         name = "_".join(category.split()).capitalize() or "Misc"
-        lines.append(f"{name} -1 -1 {seen:.6f} {UNKNOWN} {' '.join(f'{number:.6f}' for number in numbers)}")
+        lines.append(
+            f"{name} -1 {OCCLUDED[level]} {seen:.6f} {UNKNOWN} {' '.join(f'{number:.6f}' for number in numbers)}"
+        )
     return "\n".join(lines or [NOTHING]) + "\n"
