@@ -281,7 +281,9 @@ class CommonInstants:
 
     def _numbers(self, rig: Rig, measures: Sequence[Measure]) -> RigNumbers:
         ego = self._worlds[0].ego_mesh() if self.questions.metrics else None
-        return self.questions.numbers_of(rig, ego, measures)
+        required = {name: one for name, one in self.objectives.items() if one.requires}
+        kept = {name: one.share_kept(rig, self._worlds[0], self.sensor_model) for name, one in required.items()}
+        return self.questions.numbers_of(rig, ego, measures, kept)
 
     def _measured(self, rig: Rig, numbers: Sequence[int], observed: RigNumbers) -> Iterator[MeasuredFrame]:
         """What is left of a rig's frames at some instants, in their order, each once it is added."""
