@@ -27,15 +27,9 @@ class Arm:
     """
 
     def __init__(
-        self,
-        name: str,
-        makes: MakesOptimiser,
-        cube: Cube,
-        seed: int,
-        start: Evaluation,
-        objectives: int,
+        self, name: str, makes: MakesOptimiser, cube: Cube, seed: int, start: Evaluation, objectives: int,
         floors: Float64,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.name, self._objectives, self._floors = name, objectives, floors
         self._lower = [quantity.lower_is_better for quantity in start.prefixes[-1].estimate.quantities]
         self._makes, self._cube, self._seed = makes, cube, seed

@@ -188,22 +188,15 @@ class Objective(Document):
             usual: Those that have names of their own.
 
         Raises:
-            ValueError: One is called by a name that none of these has.
+            ValueError: One is called by a name that none of these has; a band is none of the paper's, or there is none.
         """
+        if unknown := [band for _, band in self.places if band not in PAPER_HEIGHTS]:
+            raise ValueError(f"band {unknown[0]!r}: {' or '.join(map(repr, PAPER_HEIGHTS))} is needed")
+        if not self.places and self.metric is None:
+            raise ValueError("band: at least one is needed")
         if isinstance(self.region, dict):
             return tuple(region.called(name) for name, region in self.region.items())
         names = dict.fromkeys(region for region, _ in self.places)
         if unknown := [name for name in names if name not in usual]:
             raise ValueError(f"region {unknown[0]!r}: one of {', '.join(usual)} is needed, or {{name: {{x_m, y_m}}}}")
         return tuple(usual[name] for name in names)
-
-    def check_bands(self) -> None:
-        """Refuse a band that there is none of.
-
-        Raises:
-            ValueError: It is none of the paper's, or there is none at all.
-        """
-        if unknown := [band for _, band in self.places if band not in PAPER_HEIGHTS]:
-            raise ValueError(f"band {unknown[0]!r}: {' or '.join(map(repr, PAPER_HEIGHTS))} is needed")
-        if not self.places and self.metric is None:
-            raise ValueError("band: at least one is needed")

@@ -4,7 +4,7 @@ import math
 import re
 import warnings
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from typing import Any, NamedTuple, Self
 
@@ -64,7 +64,6 @@ class Questions(NamedTuple):
                 for region in objective.regions(usual):
                     if regions.setdefault(region.name, region) != region:
                         raise ValueError(f"region {region.name!r}: another objective calls another region so")
-                objective.check_bands()
             except ValueError as error:
                 raise ValueError(f"objective {name!r}: {error}") from error
         published = any(objective.metric for objective in objectives.values())
@@ -147,27 +146,15 @@ class Questions(NamedTuple):
         keys = {objective.key for objective in self.objectives.values()}
         return tuple(one for kind in AGGREGATIONS if (one := kind.of_keys(keys)))
 
-    def numbers_of(
-        self,
-        rig: Rig,
-        ego: Mesh | None = None,
-        measures: Sequence[Measure] = ("area",),
-        kept: Mapping[str, Estimate] | None = None,
-    ) -> "RigNumbers":
-        """What observes a rig on its ego, fed with nothing yet, for numbers by these measures; as of `RigNumbers`."""
+    def numbers_of(self, rig: Rig, ego: Mesh | None = None, measures: Sequence[Measure] = ("area",)) -> "RigNumbers":
+        """What observes a rig on its ego, fed with nothing yet, for numbers by these measures."""
         setup = Setup(
-            rig=rig.name,
-            sensors=rig.sensors,
-            ego=ego,
-            grid=self.grid,
-            regions=tuple(self.regions.values()),
-            square_metres=True,
-            threshold_m=max(self.thresholds_m, default=THRESHOLD_M),
-            sights=Sights(),
+            rig=rig.name, sensors=rig.sensors, ego=ego, grid=self.grid, regions=tuple(self.regions.values()),
+            threshold_m=max(self.thresholds_m, default=THRESHOLD_M), square_metres=True, sights=Sights(),
             sync_on_compute=False,
-        )
+        )  # fmt: skip
         others = {name: PUBLISHED[name].make(setup) for name in self.metrics}
-        return RigNumbers(self, rig, self.coverage_of(rig, measures), others, kept or {})
+        return RigNumbers(self, rig, self.coverage_of(rig, measures), others)
 
     def coverage_of(self, rig: Rig, measures: Sequence[Measure]) -> dict[Measure, CoverageObserver]:
         """What observes the coverage of a rig: the same for both measures where that knows both."""
@@ -180,16 +167,10 @@ class Questions(NamedTuple):
                 observers[measure] = observers["area"]
                 continue
             coverage = CoverageMetric(
-                self.grid,
-                self.thresholds_m,
-                max_radius=self.max_radius_m,
-                blocks=BLOCKS,
-                aggregations=self.aggregations,
-                regions=regions,
-                sensors=_names(rig) if failures else (),
-                square_metres=measure == "area",
-                sync_on_compute=False,
-            )
+                self.grid, self.thresholds_m, max_radius=self.max_radius_m, blocks=BLOCKS, regions=regions,
+                aggregations=self.aggregations, sensors=_names(rig) if failures else (),
+                square_metres=measure == "area", sync_on_compute=False,
+            )  # fmt: skip
             observers[measure] = CoverageObserver(coverage, rig.name)
         return observers
 
@@ -206,7 +187,7 @@ class RigNumbers:
     rig: Rig
     coverage: Mapping[Measure, CoverageObserver]
     others: Mapping[str, FrameMetric]
-    kept: Mapping[str, Estimate]
+    kept: Mapping[str, Estimate] = field(default_factory=dict)
 
     def add(self, seen: MeasuredFrame) -> None:
         """Add what is left of a frame where it was made and measured: its sums by measure."""
