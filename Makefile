@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lowest versions lint types doctest docs smoke bench measured paper clean
+.PHONY: demo test versions lint types doctest docs smoke bench measured paper clean
 
 demo: STEPS ?= 64
 demo: $(VENV)/.ready  ## evaluate a built-in rig in city traffic; writes to out/demo
@@ -16,18 +16,7 @@ unexport PYTHONDONTWRITEBYTECODE
 test: $(VENV)/.ready  ## every test
 	OMP_NUM_THREADS=1 OMP_WAIT_POLICY=passive $(BIN)/python -m pytest --numprocesses auto --dist worksteal
 
-# Of torch the version of constraints.txt: older ones come with gigabytes for CUDA. What old packages say of their own use
-# of newer ones is nobody's concern here.
-lowest: LOWEST := .venv-lowest
-lowest: $(VENV)/.ready  ## every test with the lowest versions that pyproject.toml promises, but for torch
-	$(PYTHON) .ci/make_venv.py $(LOWEST)
-	$(BIN)/python .ci/lowest.py torch > $(LOWEST)/constraints.txt
-	grep '^torch==' constraints.txt >> $(LOWEST)/constraints.txt
-	$(LOWEST)/bin/python -m pip install --quiet --constraint $(LOWEST)/constraints.txt --editable '.[dev]'
-	OMP_NUM_THREADS=1 OMP_WAIT_POLICY=passive $(LOWEST)/bin/python -m pytest --numprocesses auto --dist worksteal \
-	  -W ignore::DeprecationWarning
-
-versions: $(VENV)/.ready  ## docs/measured/versions.md: every test on each version of Python, in systems made for it
+versions: $(VENV)/.ready  ## docs/measured/versions.md: every test on each version of Python, and with the lowest versions
 	$(BIN)/python -m benchmarks.measured versions
 
 lint: $(VENV)/.ready

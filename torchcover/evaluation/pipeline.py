@@ -297,8 +297,7 @@ def _each(
         batch_sampler=tasks,
         collate_fn=list,
         num_workers=workers,
-        # What a server forks has that as its parent, which ends with this process.
-        worker_init_fn=None if method == "forkserver" else end_with_parent(),
+        worker_init_fn=end_with_parent(),
         multiprocessing_context=method if workers else None,
         prefetch_factor=1 if workers else None,  # what is made ahead waits in shared memory
     )

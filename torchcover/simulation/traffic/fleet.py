@@ -3,7 +3,6 @@
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from functools import cache, lru_cache
-from operator import attrgetter
 
 import numpy as np
 
@@ -53,7 +52,6 @@ CATEGORIES = {name: BODIES[kind] for name, kind in sorted(KIND_OF.items())}
 EGO = "ego"
 HEAVY = ("truck", "lorry", "bus")
 REAR_OF = "rear of "
-_EXIT = attrgetter("exit_m")
 
 WALKING = Driver(
     desired_speed_mps=1.4, headway_s=0.4, standstill_gap_m=0.5, acceleration_mps2=1.0, deceleration_mps2=1.5
@@ -196,9 +194,7 @@ def _smallest_gap_m(driver: Driver) -> float:
 def _in_the_way(agent: Agent, gates: Sequence[Gate], gap_m: float, others: Sequence[Agent]) -> bool:
     rear, front = agent.place_m - agent.length_m / 2, agent.place_m + agent.length_m / 2
     # Gates follow each other: of those that are not behind, the first is the nearest.
-    gate = bisect_right(gates, rear, key=_EXIT)
+    gate = bisect_right(gates, rear, key=lambda gate: gate.exit_m)
     if gate < len(gates) and front > gates[gate].enter_m - gap_m:
         return True
-    return bool(others) and any(
-        abs(agent.place_m - other.place_m) < (agent.length_m + other.length_m) / 2 + gap_m for other in others
-    )
+    return any(abs(agent.place_m - other.place_m) < (agent.length_m + other.length_m) / 2 + gap_m for other in others)
