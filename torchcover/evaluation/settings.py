@@ -170,10 +170,6 @@ def _probes(given: "str | Path | Iterable[str | Path] | None") -> "tuple[str | P
     return () if each == ("none",) else each
 
 
-def _device(given: "str | torch.device") -> str:
-    return str(given)
-
-
 @dataclass(frozen=True, eq=False)
 class Settings:
     """The arguments of `evaluate`; None where nothing was given.
@@ -339,7 +335,7 @@ class Settings:
     device: Annotated[
         Read["str | torch.device", str],
         Option("Where the search and the sums run, with Warp rays too: cpu, cuda, cuda:1, ...", str, in_study=True),
-    ] = Read(_device, "cpu")
+    ] = Read(str, "cpu")
     workers: Annotated[
         int | None,
         Option(

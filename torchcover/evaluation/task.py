@@ -14,7 +14,6 @@ import torch
 
 from torchcover import __version__
 from torchcover.coverage import Region
-from torchcover.coverage.grid import BandFrame
 from torchcover.evaluation.observers import AnyObserver
 from torchcover.evaluation.settings import DEFAULT_STEPS, OPTIONS, Settings
 from torchcover.frames import ChosenRigs, FrameSource
@@ -141,8 +140,9 @@ def simulation(settings: Settings, *, boxes: bool = False) -> Task[SimulatedFram
         carried, given = _in_weather(carried, given, settings.weather)
     loaded_world = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
     world = with_ego(loaded_world, carried, settings.vehicle)
+    band_frame = settings.band_frame or ("vehicle" if settings.reference == "paper" else DEFAULT_BAND_FRAME)
     asked = (settings.ask or RegionsOfInterest()).around(
-        world.ego_box().outline_m, settings.cell_m, _band_frame(settings), _within(world, carried)
+        world.ego_box().outline_m, settings.cell_m, band_frame, _within(world, carried)
     )
     frames = SimulatedFrames(
         world,
@@ -200,10 +200,6 @@ def _rays(settings: Settings) -> int | None:
     """Of the reference of a simulation; None for its own number."""
     few = settings.only_detection and settings.reference in (None, DEFAULT_REFERENCE)
     return FEW_RAYS if few and settings.rays is None else settings.rays
-
-
-def _band_frame(settings: Settings) -> BandFrame:
-    return settings.band_frame or ("vehicle" if settings.reference == "paper" else DEFAULT_BAND_FRAME)
 
 
 def _most_steps(frames: SimulatedFrames, settings: Settings) -> int | None:
