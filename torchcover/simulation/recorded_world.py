@@ -307,7 +307,9 @@ def cell_mesh(cells: Int64) -> Mesh:
 
 def _labelled(recording: Recording, last_s: float) -> Iterator[Row]:
     """Rows of `movers.csv` of labelled objects."""
-    first_m = _first_place_m(recording)
+    pose = recording.world_T_vehicle(0)
+    assert pose is not None  # as checked
+    first_m = pose[:3, 3]
     for track in objects_of(recording).tracks:
         for number, piece in enumerate(pieces(track.trajectory, GAP_S)):
             name = track.name if not number else f"{track.name} #{number + 1}"
@@ -317,12 +319,6 @@ def _labelled(recording: Recording, last_s: float) -> Iterator[Row]:
             yaw_deg = euler_from_rotation(placed[:, :3, :3])[:, :1]
             for row in np.column_stack([times_s, placed[:, :3, 3] - first_m, yaw_deg]).tolist():
                 yield (row[0], name, track.category, *row[1:4], *track.size_m, row[4])
-
-
-def _first_place_m(recording: Recording) -> Float64:
-    pose = recording.world_T_vehicle(0)
-    assert pose is not None  # as checked
-    return np.asarray(pose[:3, 3])
 
 
 def _found(seen: Surveyed, drive: Trajectory) -> Iterator[Row]:

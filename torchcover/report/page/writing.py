@@ -148,8 +148,9 @@ def table_html(table: PageTable) -> str:
     """A table, with its notes below."""
     caption = f"<caption>{escape(table.title)}</caption>" if table.title else ""
     kinds = ["" if at < table.words_first else "number" for at in range(len(table.headings))]
-    pairs = zip(kinds, table.headings, strict=True)
-    head = "".join(f'<th scope="col" class="{kind}">{_broken(heading)}</th>' for kind, heading in pairs)
+    headings = [escape(heading).replace("_", "_<wbr>").replace("\n", "<br>") for heading in table.headings]
+    pairs = zip(kinds, headings, strict=True)
+    head = "".join(f'<th scope="col" class="{kind}">{heading}</th>' for kind, heading in pairs)
     rows = "\n".join(f"<tr>{''.join(map(_cell, row, kinds))}</tr>" for row in table.rows)
     body = f"{caption}<thead><tr>{head}</tr></thead>\n<tbody>{rows}</tbody>"
     return f'<div class="wide"><table>{body}</table></div>{_notes(table.notes)}'
@@ -170,11 +171,6 @@ def _cell(cell: Words, kind: str) -> str:
     if not kind:
         return f'<th scope="row">{escape(cell.text)}</th>'
     return f'<td class="{kind} {escape(cell.mark)}">{escape(cell.text)}</td>'
-
-
-def _broken(heading: str) -> str:
-    lines = (escape(line).replace("_", "_<wbr>") for line in heading.split("\n"))
-    return "<br>".join(lines)
 
 
 def _rig(rig: PageRig, ego_outline_m: Array | None, number: int) -> str:

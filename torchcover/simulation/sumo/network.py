@@ -163,7 +163,9 @@ def _lane(edge: Attributes, item: Attributes) -> NetworkLane | None:
     line_m = _places(item.get("shape", ""))
     if not np.isfinite(line_m).all():
         raise ValueError(f"lane {name!r}: its shape has NaN or infinite numbers")
-    line_m = _without_repeats(line_m)
+    if len(line_m):
+        steps = np.linalg.norm(np.diff(line_m[:, :2], axis=0), axis=1)
+        line_m = line_m[np.concatenate([[True], steps > SAME_PLACE_M])]
     classes = frozenset(item.get("allow", "all").split())
     barred = frozenset(item.get("disallow", "").split())
     use = _use(edge.get("function", "normal"), item.get("type", ""), classes, barred)
@@ -196,13 +198,6 @@ def _places(shape: str) -> Float64:
     if any(len(row) not in (2, 3) for row in rows):
         raise ValueError(f"a shape of places x,y or x,y,z is needed; got {shape[:60]!r}")
     return np.array([row if len(row) == 3 else [*row, 0.0] for row in rows], dtype=np.float64).reshape(-1, 3)
-
-
-def _without_repeats(line_m: Float64) -> Float64:
-    if len(line_m) == 0:
-        return line_m
-    steps = np.linalg.norm(np.diff(line_m[:, :2], axis=0), axis=1)
-    return np.asarray(line_m[np.concatenate([[True], steps > SAME_PLACE_M])])
 
 
 def _number(item: Attributes, key: str, otherwise: float) -> float:

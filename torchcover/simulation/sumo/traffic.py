@@ -16,7 +16,7 @@ from torchcover.simulation.sumo.demand import EGO_TYPE, write_routes
 from torchcover.simulation.sumo.floating import Recorded, TimeWindow, read_floating, record
 from torchcover.simulation.sumo.ground import Pavement, decks, ground_of
 from torchcover.simulation.sumo.motion import motions, possible
-from torchcover.simulation.sumo.network import SAME_PLACE_M, Network, read_network
+from torchcover.simulation.sumo.network import SAME_PLACE_M, read_network
 from torchcover.simulation.sumo.placing import Placing, park
 from torchcover.simulation.sumo.simulating import from_opendrive, home, simulate
 from torchcover.simulation.sumo.streets import DrawnStreets
@@ -111,7 +111,10 @@ class Sumo(Procedural):
         with TemporaryDirectory() as folder:
             network_file = self._network_file(Path(folder), generator)
             network = read_network(network_file)
-            routes = self._routes(Path(folder), network, fleet, float(times_s[-1]), generator)
+            routes = self.routes
+            if self.random is not None:
+                routes = (Path(folder) / "drawn.rou.xml",)
+                write_routes(*routes, network, self.random, fleet, WARM_UP_S + float(times_s[-1]), generator)
             known = types_of(routes)
             recorded = self._recorded(network_file, routes, float(times_s[-1]), generator)
         ego_type = EGO_TYPE if self.random is not None else self.ego_type
@@ -161,15 +164,6 @@ class Sumo(Procedural):
         if self.net.suffix != ".xodr":
             return self.net
         return from_opendrive(self.net, folder, leave_out_links=self.leave_out_links)
-
-    def _routes(
-        self, folder: Path, network: Network, fleet: Fleet, duration_s: float, generator: np.random.Generator
-    ) -> tuple[Path, ...]:
-        if self.random is None:
-            return self.routes
-        drawn = folder / "drawn.rou.xml"
-        write_routes(drawn, network, self.random, fleet, WARM_UP_S + duration_s, generator)
-        return (drawn,)
 
     def _recorded(
         self, network_file: Path, routes: tuple[Path, ...], duration_s: float, generator: np.random.Generator

@@ -166,14 +166,11 @@ class Simulation:
     def _held_up(self, red: Bools, leader_m: Float64, leader_mps: Float64) -> Bools:
         """(N,) whether one may not cross the next stop line, and need not."""
         held = (red | self._occupied[self._gates.other_light])[self._gate]
-        held |= self._jammed_behind(leader_m, leader_mps)
+        # A queue behind the junction would force one to stop on it.
+        rear_m = leader_m - self._leaders_half_m
+        held |= (rear_m > self._enter_m) & (rear_m < self._clear_m) & (leader_mps < self._queue_mps)
         held &= ~self._committed
         return held
-
-    def _jammed_behind(self, leader_m: Float64, leader_mps: Float64) -> Bools:
-        """(N,) whether a queue behind the junction would force one to stop on it."""
-        rear_m = leader_m - self._leaders_half_m
-        return (rear_m > self._enter_m) & (rear_m < self._clear_m) & (leader_mps < self._queue_mps)
 
     def _first_speed(self) -> Float64:
         """(N,) fast, but slow enough to stop at the next line, and for the gap to the one ahead."""

@@ -71,7 +71,10 @@ class Highway(Procedural):
     ) -> tuple[Scenery, Actor, tuple[Actor, ...]]:
         (shapes,) = generator.spawn(1)
         hills = Hills(self.hills_m, shapes, HILLS_M, STEEPEST)
-        middle, sides = self._middle_line(shapes), [self._side_lane(shapes) for _ in range(2)]
+        middle, sides = self._middle_line(shapes), []
+        for _ in range(2):
+            begin_m = LEADER_MPS * (WARM_UP_S + shapes.uniform(0.0, 0.8) * self.duration_s)
+            sides.append(SideLane(begin_m, begin_m + float(shapes.uniform(*SIDE_LANE_M))))
         # Places of the other direction are stations with the sign turned.
         side_m = np.array([sides[0], (-sides[1].end_m, -sides[1].begin_m)])
         agents = self._traffic(side_m, fleet)
@@ -104,11 +107,6 @@ class Highway(Procedural):
         curvatures = amplitude * 2 * np.pi / wavelength * np.cos(waves)
         curvatures[[0, -1]] = 0.0
         return Alignment(stations, curvatures, (first, 0.0, float(amplitude * np.sin(waves[0]))))
-
-    def _side_lane(self, generator: np.random.Generator) -> SideLane:
-        """Somewhere on the ego's way."""
-        begin_m = LEADER_MPS * (WARM_UP_S + generator.uniform(0.0, 0.8) * self.duration_s)
-        return SideLane(begin_m, begin_m + float(generator.uniform(*SIDE_LANE_M)))
 
     def _traffic(self, side_m: Float64, fleet: Fleet) -> list[Agent]:
         """Everybody; the ego is the first, behind a leader in its lane."""

@@ -78,7 +78,9 @@ def _people(lot: Lot, driving: Paths, times_s: Float64, fleet: Fleet, generator:
     """People who cross the aisles between parked cars, and people on the walkways."""
     step_s = float(times_s[1] - times_s[0])
     positions, yaws, kinds = [], [], []
-    for path, crosses in [*((p, True) for p in _across_aisles(lot)), *((p, False) for p in _along_walkways())]:
+    half = STALLS_M / 2
+    along = [Footpath(np.array([-half, y]), np.array([half, y])) for y in WALKWAYS_M]
+    for path, crosses in [*((p, True) for p in _across_aisles(lot)), *((p, False) for p in along)]:
         kind = fleet.draw_kind({"adult": 4.0, "child": 1.0})
         takes_s = path.length_m / float(WALKING.desired_speed_mps * generator.uniform(0.8, 1.1))
         may_go = free_for(_car_near(driving, path), takes_s, step_s) if crosses else np.ones(len(times_s), dtype=bool)
@@ -96,11 +98,6 @@ def _across_aisles(lot: Lot) -> list[Footpath]:
         for side, x in lot.crossings
         for shift in (-PATHS_APART_M / 2, PATHS_APART_M / 2)
     ]
-
-
-def _along_walkways() -> list[Footpath]:
-    half = STALLS_M / 2
-    return [Footpath(np.array([-half, y]), np.array([half, y])) for y in WALKWAYS_M]
 
 
 def _car_near(driving: Paths, path: Footpath) -> Bools:
