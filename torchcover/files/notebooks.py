@@ -54,14 +54,7 @@ def _is_some(value: object) -> bool:
 
 
 def small_html(sentences: Iterable[str], figure: "Figure | None" = None) -> str:
-    """What a notebook shows of a result: sentences, and a picture below them.
-
-    Args:
-        sentences: Words, the first of which is a heading; names in them may hold anything.
-        figure: A figure of its own, outside pyplot.
-
-    Returns:
-        HTML that asks for no other file.
+    """What a notebook shows of a result, and no other file: sentences, the first as a heading, a picture below them.
 
     Example:
         >>> small_html(["<b>", "seen"])

@@ -215,12 +215,7 @@ def _scaled_norm(difference: Tensor) -> Tensor:
 
 
 def check_tensor(given: object, name: str, *, floating: bool = False) -> None:
-    """Raise unless what arrived is a tensor.
-
-    Args:
-        given: What arrived.
-        name: What the caller calls it, for the message.
-        floating: Whether it has to be of a floating-point type.
+    """Raise unless what arrived, which the caller calls so, is a tensor, of a floating-point type if it has to be.
 
     Raises:
         TypeError: It is none; of an array of NumPy's the message says how it becomes one.
@@ -255,10 +250,6 @@ def check_weights(weights: Tensor | None, points: int, name: str) -> None:
 
 def check_cloud(cloud: Tensor, name: str) -> None:
     """Raise unless `cloud` is a floating-point tensor of shape (N, 3) with finite coordinates.
-
-    Args:
-        cloud: What arrived.
-        name: What the caller calls it, for the message.
 
     Raises:
         TypeError: Not a tensor of a floating-point type.

@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 from torchcover.geometry.arrays import Bools, Float64
 from torchcover.simulation.documents import PathBeside
-from torchcover.simulation.sumo.crowd import crowd, types_of
+from torchcover.simulation.sumo.crowd import crowd, read_types
 from torchcover.simulation.sumo.demand import EGO_TYPE, write_routes
 from torchcover.simulation.sumo.floating import Recorded, TimeWindow, read_floating, record
 from torchcover.simulation.sumo.ground import Pavement, decks, ground_of
@@ -115,7 +115,7 @@ class Sumo(Procedural):
             if self.random is not None:
                 routes = (Path(folder) / "drawn.rou.xml",)
                 write_routes(*routes, network, self.random, fleet, WARM_UP_S + float(times_s[-1]), generator)
-            known = types_of(routes)
+            known = {name: found for path in routes for name, found in read_types(path).items()}
             recorded = self._recorded(network_file, routes, float(times_s[-1]), generator)
         ego_type = EGO_TYPE if self.random is not None else self.ego_type
         duration_s = float(times_s[-1])

@@ -135,14 +135,6 @@ def sides_around(
     return sides
 
 
-class _Pieces(NamedTuple):
-    """(N, 4, 2) outlines in plan, counter-clockwise from the far side on; (N,) heights, and which pieces are one."""
-
-    outlines_m: Float64
-    high_m: Float64
-    run: Int64
-
-
 def stand(
     sides: Sequence[Side],
     driven: Sequence[shapely.Geometry],
@@ -164,7 +156,7 @@ def stand(
     for name, kind in KINDS.items():
         factor = times.get(name, 1.0) if isinstance(times, Mapping) else 1.0 if name in HOUSES else times
         drawn.append(_drawn(kind, lines, factor, generator))
-    kinds = np.repeat(np.arange(len(KINDS)), [len(one.run) for one in drawn])
+    kinds = np.repeat(np.arange(len(KINDS)), [len(run) for _, _, run in drawn])
     outlines_m, high_m, run = (np.concatenate(column) for column in zip(*drawn, strict=True))
     kept, raised_m = _free(outlines_m, kinds, run, driven, walked, pavements)
     outlines_m, high_m, kinds, raised_m = outlines_m[kept], high_m[kept], kinds[kept], raised_m[kept]
@@ -217,13 +209,16 @@ class _Lines:
         return places_m, right
 
 
-def _drawn(kind: _Kind, lines: _Lines, times: float, generator: np.random.Generator) -> _Pieces:
-    """Runs of a kind along the sides that have it."""
+def _drawn(kind: _Kind, lines: _Lines, times: float, generator: np.random.Generator) -> tuple[Float64, Float64, Int64]:
+    """Runs of a kind along the sides that have it, in N pieces.
+
+    Returns (N, 4, 2) outlines in plan, counter-clockwise from the far side on; (N,) heights, and which pieces are one.
+    """
     has = np.array([zone in kind.zones for zone in lines.zones], dtype=bool)
     has[has] = generator.random(np.count_nonzero(has)) < kind.share
     numbers = np.flatnonzero(has)
     if not len(numbers) or times == 0:
-        return _Pieces(np.empty((0, 4, 2)), np.empty(0), np.empty(0, dtype=np.int64))
+        return np.empty((0, 4, 2)), np.empty(0), np.empty(0, dtype=np.int64)
     length_m, gap_m = lines.length_m[numbers], (kind.gap_m[0] / times, kind.gap_m[1] / times)
     shape = len(numbers), int(length_m.max() / (kind.run_m[0] + gap_m[0])) + 1
     run_m, between_m = generator.uniform(*kind.run_m, shape), generator.uniform(*gap_m, shape)
@@ -247,7 +242,7 @@ def _drawn(kind: _Kind, lines: _Lines, times: float, generator: np.random.Genera
     # Around a corner what is far out would be stretched, and on its inside squeezed.
     stretched = [np.linalg.norm(side[:, 1] - side[:, 0], axis=1) / piece_m for side in (near_m, far_m)]
     like = (np.abs(np.log(np.maximum(stretched, TINY_M))) < -np.log(TAPERED)).all(axis=0)
-    return _Pieces(np.concatenate([far_m, near_m[:, ::-1]], axis=1)[like], high_m[run][like], run[like])
+    return np.concatenate([far_m, near_m[:, ::-1]], axis=1)[like], high_m[run][like], run[like]
 
 
 def _free(

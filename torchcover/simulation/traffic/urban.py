@@ -89,7 +89,10 @@ class Urban(Procedural):
     ) -> tuple[Scenery, Actor, tuple[Actor, ...]]:
         # What the streets are like is drawn apart from what happens in them.
         (shapes,) = generator.spawn(1)
-        hills, section = Hills(self.hills_m, shapes), self._section(shapes)
+        hills, lanes_of_both = Hills(self.hills_m, shapes), self.lanes or int(shapes.choice([2, 4]))
+        bay_m = BAY_M if shapes.random() < WITH_BAYS else 0.0
+        widths_m = float(shapes.uniform(*LANE_M)), bay_m, float(shapes.uniform(*SIDEWALK_M))
+        section = Section(lanes_of_both // 2, *widths_m)
         longest_way = 1.25 * self.speed_mps * (self.duration_s + WARM_UP_S)
         span_m, reach_m = (-BEHIND_M, longest_way + AHEAD_M), longest_way + 2 * AHEAD_M
         for _ in range(DRAWS):
@@ -114,12 +117,6 @@ class Urban(Procedural):
         )
         static = city.static(seen)
         return static, driver, actors(times_s, [moving, crossing], driver, fleet, hills)
-
-    def _section(self, shapes: np.random.Generator) -> Section:
-        """The main street, as wide as is drawn."""
-        lanes = self.lanes or int(shapes.choice([2, 4]))
-        bay_m = BAY_M if shapes.random() < WITH_BAYS else 0.0
-        return Section(lanes // 2, float(shapes.uniform(*LANE_M)), bay_m, float(shapes.uniform(*SIDEWALK_M)))
 
     def _traffic(
         self, streets: Streets, fleet: Fleet, generator: np.random.Generator
