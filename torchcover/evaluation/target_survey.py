@@ -99,11 +99,7 @@ def survey_target(
 def in_world(
     rig: AnyRig, scenario: AnyScenario | None, vehicle: str | Path | None, sensor_model: Literal["ideal", "real"] | None
 ) -> tuple[Rig, Scenario, int]:
-    """The rig, the world whose ego carries it, and how many steps are usual; as `survey_target` is asked.
-
-    Raises:
-        FileNotFoundError, ValueError: As there.
-    """
+    """The rig, the world whose ego carries it, and how many steps are usual; as `survey_target` is asked."""
     rig = as_called(rig).sensing(sensor_model)
     world = free_space() if scenario is None else scenario
     world = with_ego(world if isinstance(world, Scenario) else Scenario.load(world), {rig.name: rig}, vehicle)
@@ -197,11 +193,7 @@ def plan_of(seen: TargetMap) -> PagePlan:
 
 
 def target_verdict(seen: Mapping[str, TargetMap]) -> tuple[str, ...]:
-    """Where rigs see a body, and which sensor most hangs on, in sentences; no words where nothing is free.
-
-    Args:
-        seen: By the name of the rig: the same body on the same places.
-    """
+    """Where rigs, by name, see the same body on the same places, and on which sensor most hangs, in sentences."""
     shares = {rig: one.share_seen(NEAR_M) for rig, one in seen.items()}
     known = sorted((rig for rig in shares if not math.isnan(shares[rig])), key=lambda rig: -shares[rig])
     if not known:

@@ -144,13 +144,15 @@ def simulation(settings: Settings, *, boxes: bool = False) -> Task[SimulatedFram
     asked = (settings.ask or RegionsOfInterest()).around(
         world.ego_box().outline_m, settings.cell_m, band_frame, _within(world, carried)
     )
+    few = settings.only_detection and settings.reference in (None, DEFAULT_REFERENCE)
+    rays = FEW_RAYS if few and settings.rays is None else settings.rays
     frames = SimulatedFrames(
         world,
         rigs=carried,
         steps=settings.simulated_steps,
         seed=settings.seed,
         every_s=spread_s(world, settings.every_s),
-        reference_sensor=reference_called(settings.reference, _rays(settings), asked),
+        reference_sensor=reference_called(settings.reference, rays, asked),
         boxes=boxes or settings.needs_boxes,
         within_m=max(settings.thresholds_m) if settings.only_detection else None,
         kept_bytes=0.0,  # steps come in order: no world is needed again
@@ -194,12 +196,6 @@ def _in_weather(
     each = {f"{name}, {one.name}": (name, one) for name in carried for one in weather}
     in_each = {both: carried[name].model_copy(update={"weather": one}) for both, (name, one) in each.items()}
     return in_each, {both: given[name] for both, (name, _) in each.items()}
-
-
-def _rays(settings: Settings) -> int | None:
-    """Of the reference of a simulation; None for its own number."""
-    few = settings.only_detection and settings.reference in (None, DEFAULT_REFERENCE)
-    return FEW_RAYS if few and settings.rays is None else settings.rays
 
 
 def _most_steps(frames: SimulatedFrames, settings: Settings) -> int | None:

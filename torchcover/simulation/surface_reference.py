@@ -107,7 +107,8 @@ class SurfaceReference:
 
     def scan(self, surroundings: Surroundings) -> ReferenceScan:
         """Draw points, and keep those that are seen; see `ReferenceSensor.scan`."""
-        boxes = self._boxes()
+        sides = np.array([(*area, band) for area in self.areas for band in self.bands_m], dtype=np.float64)
+        boxes = Bounds(*sides.transpose(2, 0, 1))
         instant = surroundings.instant
         # All places before the first point: they are the same for any number of rays.
         drawn = [surroundings.free_pose(self._pose) for _ in range(self.places)]
@@ -137,11 +138,6 @@ class SurfaceReference:
             looks.append((found, sight(instant, place_m, targets_m, threads=surroundings.threads)))
         objects = len(surroundings.scene.world.objects)
         return self._gathered(looks, objects, redrawn=sum(redrawn for _, redrawn in drawn))
-
-    def _boxes(self) -> Bounds:
-        sides = [(*area, band) for area in self.areas for band in self.bands_m]
-        lower_m, upper_m = np.array(sides, dtype=np.float64).transpose(2, 0, 1)
-        return Bounds(lower_m, upper_m)
 
     def _at_any_height(self, boxes: Bounds, ego: BoundingBox) -> Bounds:
         """The same areas, as far up and down in the vehicle frame as a point can be seen from a place."""

@@ -23,9 +23,8 @@ from torchcover.simulation.sumo.streets import DrawnStreets
 from torchcover.simulation.sumo.vicinity import OFF_STREET_M, Vicinity
 from torchcover.simulation.traffic.fleet import EGO, Fleet
 from torchcover.simulation.traffic.frontage import Side, Times, sides_around, stand
-from torchcover.simulation.traffic.procedural import Procedural
+from torchcover.simulation.traffic.procedural import Built, Procedural
 from torchcover.simulation.traffic.scenery import Scenery, few
-from torchcover.simulation.world import Actor
 
 # Nothing stands nearer to a lane than this; furniture and houses keep off by more, so that no crown hangs over it.
 CLEAR_M, KERB_M, BEHIND_M = 0.4, 1.0, 2.2
@@ -105,9 +104,7 @@ class Sumo(Procedural):
         if self.fcd is None or (self.net is not None and self.net.suffix == ".xodr"):
             home()  # or an ImportError
 
-    def _build(
-        self, fleet: Fleet, times_s: Float64, generator: np.random.Generator
-    ) -> tuple[Scenery, Actor, tuple[Actor, ...]]:
+    def _build(self, fleet: Fleet, times_s: Float64, generator: np.random.Generator) -> Built:
         with TemporaryDirectory() as folder:
             network_file = self._network_file(Path(folder), generator)
             network = read_network(network_file)

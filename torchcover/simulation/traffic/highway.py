@@ -13,10 +13,8 @@ from torchcover.simulation.traffic.flow import Agent, Flow, check_crowd
 from torchcover.simulation.traffic.hills import Hills
 from torchcover.simulation.traffic.idm import Driver
 from torchcover.simulation.traffic.overtaking import LANES, RAMP_MPS, SIDE_LANE, Overtaking
-from torchcover.simulation.traffic.procedural import MostVehicles, Procedural
+from torchcover.simulation.traffic.procedural import Built, MostVehicles, Procedural
 from torchcover.simulation.traffic.roadside import LANE_CENTRES_M, SideLane, roadside
-from torchcover.simulation.traffic.scenery import Scenery
-from torchcover.simulation.world import Actor
 
 # Platoons form behind the slower ones.
 WARM_UP_S = 30.0
@@ -66,9 +64,7 @@ class Highway(Procedural):
     ego_lane: int = Field(default=2, ge=1, le=3)
     hills_m: float = Field(default=3.0, ge=0.0, le=10.0)
 
-    def _build(
-        self, fleet: Fleet, times_s: Float64, generator: np.random.Generator
-    ) -> tuple[Scenery, Actor, tuple[Actor, ...]]:
+    def _build(self, fleet: Fleet, times_s: Float64, generator: np.random.Generator) -> Built:
         (shapes,) = generator.spawn(1)
         hills = Hills(self.hills_m, shapes, HILLS_M, STEEPEST)
         middle, sides = self._middle_line(shapes), []

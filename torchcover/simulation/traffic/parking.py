@@ -13,11 +13,9 @@ from torchcover.simulation.traffic.flow import Agent, Lane, Simulation
 from torchcover.simulation.traffic.frontage import Times
 from torchcover.simulation.traffic.idm import Driver
 from torchcover.simulation.traffic.lot import AISLE_M, ISLAND_M, STALLS_M, WALKWAYS_M, Lot
-from torchcover.simulation.traffic.procedural import Procedural
+from torchcover.simulation.traffic.procedural import Built, Procedural
 from torchcover.simulation.traffic.roads import loop
-from torchcover.simulation.traffic.scenery import Scenery
 from torchcover.simulation.traffic.signals import Signals
-from torchcover.simulation.world import Actor
 
 WARM_UP_S = 10.0
 ROUND_M, CORNER_RADIUS_M = 84.0, 6.0
@@ -49,9 +47,7 @@ class Parking(Procedural):
     built_share: float = Field(default=0.6, ge=0.0, le=1.0)
     roadside: Times = 1.0
 
-    def _build(
-        self, fleet: Fleet, times_s: Float64, generator: np.random.Generator
-    ) -> tuple[Scenery, Actor, tuple[Actor, ...]]:
+    def _build(self, fleet: Fleet, times_s: Float64, generator: np.random.Generator) -> Built:
         lanes = [Lane(loop(ROUND_M, 2 * AISLE_MIDDLE_M, CORNER_RADIUS_M))]
         agents = self._traffic(lanes[0].line.length_m, fleet, generator)
         flow = Simulation(lanes, agents, Signals.none()).run(times_s, WARM_UP_S)

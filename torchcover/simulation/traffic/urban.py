@@ -16,11 +16,9 @@ from torchcover.simulation.traffic.flow import Agent, Flow, Lane, Simulation, ch
 from torchcover.simulation.traffic.frontage import Times
 from torchcover.simulation.traffic.hills import Hills
 from torchcover.simulation.traffic.idm import Driver
-from torchcover.simulation.traffic.procedural import MostPeople, MostVehicles, Procedural
-from torchcover.simulation.traffic.scenery import Scenery
+from torchcover.simulation.traffic.procedural import Built, MostPeople, MostVehicles, Procedural
 from torchcover.simulation.traffic.signals import CROSS, MAIN
 from torchcover.simulation.traffic.streets import FOOTPATHS_M, WAITING_BEHIND_KERB_M, Section, Streets, plan
-from torchcover.simulation.world import Actor
 
 WARM_UP_S = 20.0
 # What is built up or has traffic, behind and ahead of all places the ego gets to.
@@ -84,9 +82,7 @@ class Urban(Procedural):
     turn_share: float = Field(default=0.25, ge=0.0, le=1.0)
     hills_m: float = Field(default=1.0, ge=0.0, le=2.0)
 
-    def _build(
-        self, fleet: Fleet, times_s: Float64, generator: np.random.Generator
-    ) -> tuple[Scenery, Actor, tuple[Actor, ...]]:
+    def _build(self, fleet: Fleet, times_s: Float64, generator: np.random.Generator) -> Built:
         # What the streets are like is drawn apart from what happens in them.
         (shapes,) = generator.spawn(1)
         hills, lanes_of_both = Hills(self.hills_m, shapes), self.lanes or int(shapes.choice([2, 4]))
