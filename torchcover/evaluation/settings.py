@@ -405,13 +405,6 @@ class Settings:
         return cast("AnyScenario", DEFAULT_SCENARIO if self.scenario is None else self.scenario)
 
     @property
-    def simulated_steps(self) -> int:
-        """Steps of a simulation, at most."""
-        if self.steps is not None:
-            return self.steps
-        return DEFAULT_STEPS if self.target_error is None else MAX_STEPS
-
-    @property
     def needs_boxes(self) -> bool:
         """Whether a metric is about objects, so that frames are to have them."""
         if not self.metrics:

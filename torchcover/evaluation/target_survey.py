@@ -256,16 +256,12 @@ def sides_table(seen: TargetMap) -> PageTable:
     rows = []
     for name in dict.fromkeys(side.side for side in sides):
         shares = ["-" if one.cells == 0 else percent(one.seen) for one in sides if one.side == name]
-        rows.append(tuple(map(Words, (name, *shares, _unseen(unseen_to_m[name])))))
+        to_m = unseen_to_m[name]
+        unseen = "-" if np.isnan(to_m) else f"{to_m:.2f}" if to_m else "nowhere"
+        rows.append(tuple(map(Words, (name, *shares, unseen))))
     of_steps = ", mean over the steps" if seen.step_count > 1 else ""
     headings = ("side", *(f"within {limit_m:g} m\n(%)" for limit_m in within), "unseen to\n(m)")
     return PageTable(f"Free places with {seen.hits} points or more{of_steps}", headings, rows)
-
-
-def _unseen(to_m: float) -> str:
-    if np.isnan(to_m):
-        return "-"
-    return f"{to_m:.2f}" if to_m else "nowhere"
 
 
 def places_table(places: Sequence[Place], title: str) -> PageTable:

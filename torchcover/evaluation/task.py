@@ -15,7 +15,7 @@ import torch
 from torchcover import __version__
 from torchcover.coverage import Region
 from torchcover.evaluation.observers import AnyObserver
-from torchcover.evaluation.settings import DEFAULT_STEPS, OPTIONS, Settings
+from torchcover.evaluation.settings import DEFAULT_STEPS, MAX_STEPS, OPTIONS, Settings
 from torchcover.frames import ChosenRigs, FrameSource
 from torchcover.recordings import RecordedFrames, open_recording
 from torchcover.simulation import (
@@ -146,10 +146,11 @@ def simulation(settings: Settings, *, boxes: bool = False) -> Task[SimulatedFram
     )
     few = settings.only_detection and settings.reference in (None, DEFAULT_REFERENCE)
     rays = FEW_RAYS if few and settings.rays is None else settings.rays
+    most = DEFAULT_STEPS if settings.target_error is None else MAX_STEPS
     frames = SimulatedFrames(
         world,
         rigs=carried,
-        steps=settings.simulated_steps,
+        steps=most if settings.steps is None else settings.steps,
         seed=settings.seed,
         every_s=spread_s(world, settings.every_s),
         reference_sensor=reference_called(settings.reference, rays, asked),

@@ -78,13 +78,10 @@ Row = tuple[float | str, ...]
 
 
 class Surveyed(NamedTuple):
-    """What a drive has seen, in the world from its first place.
+    """What a drive has seen, in the world from its first place: the ground, where it is known, and what is on it.
 
-    Args:
-        ground: Where it is known.
-        standing_m: (N, 3) a place in each cell in which something stands or lies.
-        loose: Of each scan when it was, (N, 3) what does not stand, and whether each is seen past.
-        images: How far some of them saw.
+    `standing_m` (N, 3) is a place in each cell in which something stands or lies; `loose` has of each scan when it was,
+    (N, 3) what does not stand, and whether each is seen past; `images` say how far some of them saw.
     """
 
     ground: Slopes

@@ -100,6 +100,7 @@ def page_html(page: Page) -> str:
     maps, notes = fitted(page.maps, max(MOST_CHARS - len(first), LEAST_CHARS))
     content = as_json(map_content(replace(page, maps=maps), cells))
     script = "\n".join(map(_file, SCRIPTS))
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     more = "".join(f"<li>{words_html(words)}</li>" for words in page.verdict[1:])
     more = f'<ul class="more">{more}</ul>' if more else ""
     return Template(_file("page.html")).substitute(
@@ -109,7 +110,7 @@ def page_html(page: Page) -> str:
         answer=first + more * bool(first or not maps) + ranges_html(page.ranges),
         more=more * bool(maps and not first),
         style=_file("page.css"),
-        script_hash=script_hash(script),
+        script_hash=f"sha256-{digest}",
         tables="\n".join(map(table_html, page.tables)),
         map_notes=_notes(notes),
         no_rigs="" if page.rigs else " hidden",
@@ -132,11 +133,6 @@ def as_json(content: object) -> str:
     """
     text = json.dumps(content, separators=(",", ":"), allow_nan=False)
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
-
-
-def script_hash(script: str) -> str:
-    """What the page's policy calls the only script that may run."""
-    return f"sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}"
 
 
 @cache

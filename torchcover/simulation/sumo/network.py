@@ -24,17 +24,11 @@ Use = Literal["road", "turn", "bay", "shoulder", "sidewalk", "crossing", "corner
 
 
 class NetworkLane(NamedTuple):
-    """A lane.
+    """A lane of a street in one direction, the `edge`: classes of vehicles may use it, or are barred, or "all".
 
-    Args:
-        edge: Name of the street, in one direction, that it is part of.
-        use: "road" and "turn" (on a junction) are for vehicles, a "bay" for those who park, a "shoulder" for nobody; a
-            "sidewalk", a "crossing" and a "corner", which joins these two, are for those on foot.
-        width_m: Its width.
-        line_m: (K, 3) its middle, in the direction of travel, K >= 2; of a corner its outline instead, K >= 3.
-        speed_mps: What is allowed.
-        classes: Of vehicles that may use it, or "all".
-        barred: Classes that may not, or "all".
+    "road" and "turn" (on a junction) are for vehicles, a "bay" for those who park, a "shoulder" for nobody; a
+    "sidewalk", a "crossing" and a "corner", which joins these two, are for those on foot. `line_m` (K, 3) is its
+    middle, in the direction of travel, K >= 2; of a corner its outline instead, K >= 3.
     """
 
     edge: str

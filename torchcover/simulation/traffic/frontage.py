@@ -34,20 +34,12 @@ TRUNK = 0.1
 
 
 class _Kind(NamedTuple):
-    """What stands beside streets; lengths are along the street, depths away from it.
+    """What stands beside streets, in runs of pieces; lengths are along the street, depths away from it.
 
-    Args:
-        form: Key of `FORMS`.
-        zones: Where: `kerb`, before the sidewalk, or behind it, along a side that is `built` or `open`.
-        share: Of the sides that have it.
-        at_m: From the line to a run of it; what is negative hangs over.
-        run_m: Length of a run.
-        gap_m: From one run to the next, at the usual density.
-        deep_m: Depth of a piece.
-        high_m: Its height.
-        piece_m: Its length; None: as long as the run. Walls and hedges consist of pieces without gaps.
-        air_m: Between the pieces of a run.
-        foot: How much of it must keep off streets, as a share of its size.
+    It is at the `kerb`, before the sidewalk, or behind it, along sides that are `built` or `open`, a share of which has
+    it: `at_m` from the line, where what is negative hangs over, with gaps from run to run at the usual density. Without
+    `piece_m` a piece is as long as its run; walls and hedges consist of pieces without gaps, others have `air_m` in
+    between. Of its size the share `foot` must keep off streets. `form` is a key of `FORMS`.
     """
 
     form: str

@@ -5,7 +5,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from torchcover.geometry.arrays import Bools, Float64
+from torchcover.geometry.arrays import Float64
 from torchcover.simulation.traffic.assemble import Paths, actors, ego_actor, paths
 from torchcover.simulation.traffic.crossing import Footpath, free_for, walk
 from torchcover.simulation.traffic.fleet import EGO, WALKING, Fleet
@@ -79,7 +79,10 @@ def _people(lot: Lot, driving: Paths, times_s: Float64, fleet: Fleet, generator:
     for path, crosses in [*((p, True) for p in _across_aisles(lot)), *((p, False) for p in along)]:
         kind = fleet.draw_kind({"adult": 4.0, "child": 1.0})
         takes_s = path.length_m / float(WALKING.desired_speed_mps * generator.uniform(0.8, 1.1))
-        may_go = free_for(_car_near(driving, path), takes_s, step_s) if crosses else np.ones(len(times_s), dtype=bool)
+        may_go = np.ones(len(times_s), dtype=bool)
+        if crosses:  # when no car is on the piece of the aisle that is crossed
+            distance = np.linalg.norm(driving.positions_m[..., :2] - (path.start_m + path.end_m) / 2, axis=2)
+            may_go = free_for((distance < KEEP_AWAY_M).any(axis=1), takes_s, step_s)
         position, yaw = walk(path, may_go, takes_s, times_s, fleet.length_m(kind) / 2, generator)
         positions.append(position)
         yaws.append(yaw)
@@ -94,10 +97,3 @@ def _across_aisles(lot: Lot) -> list[Footpath]:
         for side, x in lot.crossings
         for shift in (-PATHS_APART_M / 2, PATHS_APART_M / 2)
     ]
-
-
-def _car_near(driving: Paths, path: Footpath) -> Bools:
-    """(T,) whether a car is on the piece of the aisle that a path crosses."""
-    crossed = (path.start_m + path.end_m) / 2
-    distance = np.linalg.norm(driving.positions_m[..., :2] - crossed, axis=2)
-    return np.asarray((distance < KEEP_AWAY_M).any(axis=1))
