@@ -27,7 +27,8 @@ def read_sensor(content: Any, info: ValidationInfo) -> Sensor:  # noqa: ANN401  
 
 
 def _read_mounted(content: Any, info: ValidationInfo) -> Sensor:  # noqa: ANN401
-    if isinstance(content, dict) and not get_close_matches("mount", map(str, content)):
+    is_known = isinstance(content, dict) and str(content.get("type", "lidar")) in SENSORS
+    if is_known and not get_close_matches("mount", map(str, content)):
         raise ValueError("mount: missing; metres from the ground under the vehicle's middle, as {x_m: 1.5, z_m: 1.7}")
     return read_sensor(content, info)
 

@@ -215,10 +215,6 @@ class Territory:
         """(N,) stations of its street, at even distances."""
         return np.arange(*self._span_m, every_m)
 
-    def covers(self, stations_m: Float64) -> Bools:
-        """(N,) whether stations are among those that matter."""
-        return (stations_m > self._span_m[0]) & (stations_m < self._span_m[1])
-
     def owns(self, stations_m: Float64, left_m: Float64) -> Bools:
         """(N,) whether places beside the street are their own stretch's."""
         if self._street.is_straight:

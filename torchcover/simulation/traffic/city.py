@@ -49,45 +49,30 @@ class Frontage(NamedTuple):
     junctions: tuple[int, ...] = ()
 
 
-class City:
+class City(NamedTuple):
     """Builds the part of a city that the ego gets to see, and parks cars in it."""
 
-    def __init__(
-        self,
-        streets: Streets,
-        territory: Territory,
-        hills: Hills,
-        fleet: Fleet,
-        parked_share: float,
-        built_share: float,
-        roadside: Times,
-        generator: np.random.Generator,
-        shapes: np.random.Generator,
-    ) -> None:
-        self._streets = streets
-        self._section = streets.section
-        self._territory = territory
-        self._hills = hills
-        self._fleet = fleet
-        self._parked_share = parked_share
-        self._built_share = built_share
-        self._roadside = roadside
-        self._generator = generator
-        self._shapes = shapes
+    streets: Streets
+    territory: Territory
+    hills: Hills
+    fleet: Fleet
+    parked_share: float
+    built_share: float
+    roadside: Times
+    generator: np.random.Generator
+    shapes: np.random.Generator
 
     def static(self, seen_m: Bounds) -> Scenery:
         """The ground, the blocks, buildings and furniture; cars are parked among them."""
-        main = BuildingSite(
-            self._streets.main, self._territory, self._hills, self._streets.kerb_m + BLOCK_DEPTH_M + 10.0
-        )
+        main = BuildingSite(self.streets.main, self.territory, self.hills, self.streets.kerb_m + BLOCK_DEPTH_M + 10.0)
         fronts = [(main, front) for front in self._frontages(seen_m)]
-        turns = ~self._streets.has_lights & (np.abs(self._streets.junctions_m - np.mean(seen_m)) < np.ptp(seen_m) / 2)
+        turns = ~self.streets.has_lights & (np.abs(self.streets.junctions_m - np.mean(seen_m)) < np.ptp(seen_m) / 2)
         fronts += [self._corner(index) for index in np.flatnonzero(turns).tolist()]
         blocks, outlines, aprons, sides = [], [], list[shapely.Geometry](), list[Side]()
         for site, front in fronts:
-            is_built = self._built_share == 1.0 or self._shapes.random() < self._built_share
+            is_built = self.built_share == 1.0 or self.shapes.random() < self.built_share
             depth_m = BLOCK_DEPTH_M if front.junctions else CORNER_DEPTH_M
-            depth_m = depth_m if is_built else self._section.sidewalk_m
+            depth_m = depth_m if is_built else self.streets.section.sidewalk_m
             block, outline = site.block(front.x_m, front.side, front.kerb_m, depth_m)
             blocks.append(block)
             outlines.append(outline)
@@ -96,42 +81,44 @@ class City:
             for end in range(len(front.junctions)):
                 edge_m, apron = self._end(site, front, end, is_built)
                 aprons += apron
-                sides += _across(edge_m if front.side == 1 - 2 * end else edge_m[::-1], self._section.sidewalk_m, zone)
+                sides += _across(
+                    edge_m if front.side == 1 - 2 * end else edge_m[::-1], self.streets.section.sidewalk_m, zone
+                )
         driven, walked = self._in_plan()
         nets, whole = shapely.union_all(outlines), shapely.union_all([*outlines, *aprons], grid_size=SNAPPED_M)
-        if not self._streets.main.is_straight:
+        if not self.streets.main.is_straight:
             aprons.append(self._between(whole, shapely.union_all(driven)))
             whole = shapely.union_all([whole, aprons[-1]], grid_size=SNAPPED_M)
         # A little apart, so that no outline meets itself.
         rest = shapely.union_all(aprons, grid_size=SNAPPED_M).difference(nets).buffer(-APART_M, join_style="bevel")
         rest = shapely.get_parts(shapely.set_precision(rest, SNAPPED_M))
-        blocks.append(plateau(shapely.segmentize(rest, PIECE_M), self._hills.heights_m))
+        blocks.append(plateau(shapely.segmentize(rest, PIECE_M), self.hills.heights_m))
         self._park([(site, self._parked(front)) for site, front in fronts])
         stood = stand(
-            sides, driven, walked, shapely.get_parts(whole), self._hills.heights_m, self._roadside, self._generator
+            sides, driven, walked, shapely.get_parts(whole), self.hills.heights_m, self.roadside, self.generator
         )
         pavements = few(blocks)
         return Scenery((self._ground(seen_m), *pavements, *few(*stood)), tuple(range(1 + len(pavements))))
 
     def _in_plan(self) -> tuple[list[shapely.Geometry], list[shapely.Geometry]]:
         """All streets, without and with the sidewalks along them."""
-        stations_m = [self._territory.stations_m(STREET_EVERY_M)]
-        bodies_m = self._streets.cross_ends_m + np.array([-LONGEST_HALF_M, LONGEST_HALF_M])
-        for street, ends_m in zip(self._streets.crossing, bodies_m, strict=True):
+        stations_m = [self.territory.stations_m(STREET_EVERY_M)]
+        bodies_m = self.streets.cross_ends_m + np.array([-LONGEST_HALF_M, LONGEST_HALF_M])
+        for street, ends_m in zip(self.streets.crossing, bodies_m, strict=True):
             stations_m.append(ends_m if street.is_straight else np.arange(-LANES_M, LANES_M, STREET_EVERY_M))
-        streets = zip([self._streets.main, *self._streets.crossing], stations_m, strict=True)
+        streets = zip([self.streets.main, *self.streets.crossing], stations_m, strict=True)
         lines = [shapely.LineString(street.poses(along_m, 0.0)[:, :2]) for street, along_m in streets]
         lines = shapely.simplify(lines, WITHIN_M / 4)
-        half_m = [self._section.kerb_m, *self._streets.carriageways_m.tolist()]
+        half_m = [self.streets.section.kerb_m, *self.streets.carriageways_m.tolist()]
         driven, walked = (
             shapely.buffer(lines, np.array(half_m) - WITHIN_M + wider_m, cap_style="flat").tolist()
-            for wider_m in (0.0, self._section.sidewalk_m)
+            for wider_m in (0.0, self.streets.section.sidewalk_m)
         )
         return driven, walked
 
     def _sides(self, street: Alignment, front: Frontage, zone: Zone) -> Iterator[Side]:
         """Along its street: at the kerb, and behind the sidewalk."""
-        (first, last), sidewalk_m = front.x_m, self._section.sidewalk_m
+        (first, last), sidewalk_m = front.x_m, self.streets.section.sidewalk_m
         yield Side("kerb", _beside(street, (first + FREE_AT_ENDS_M, last - FREE_AT_ENDS_M), front.side * front.kerb_m))
         edges = [first + sidewalk_m, *(edge for turn_m in front.turns_m for edge in turn_m), last - sidewalk_m]
         for number, x_m in enumerate(pairwise(edges)):
@@ -152,14 +139,14 @@ class City:
         index, corner_m, inwards = front.junctions[end], front.x_m[end], 1 - 2 * end
         deep_m = float(site.depth_m(np.array([corner_m]), front.side, front.kerb_m, BLOCK_DEPTH_M)[0])
         y_m = front.side * (front.kerb_m + np.array([0.0, FREE_AT_CORNERS_M, max(deep_m, 2 * FREE_AT_CORNERS_M)]))
-        face_m, sidewalk_m = site.street.poses(corner_m, y_m)[:, :2], self._section.sidewalk_m
+        face_m, sidewalk_m = site.street.poses(corner_m, y_m)[:, :2], self.streets.section.sidewalk_m
         inside_m = -inwards * front.side * sidewalk_m
-        if not self._streets.course.turns[index]:
+        if not self.streets.course.turns[index]:
             return face_m[1:], [] if is_built else [_strip(face_m, inside_m)]
-        middle_m, half_m = float(self._streets.junctions_m[index]), float(self._streets.cross_kerbs_m[index])
+        middle_m, half_m = float(self.streets.junctions_m[index]), float(self.streets.cross_kerbs_m[index])
         around_m = site.street.poses(np.linspace(corner_m, middle_m, 17), front.side * front.kerb_m)[:, :2]
-        way_m, kerb_m = np.linspace(-half_m, half_m + CORNER_M, 97), float(self._streets.carriageways_m[index])
-        line_m = self._streets.crossing[index].poses(-inwards * way_m, 0.0)[:, :2]
+        way_m, kerb_m = np.linspace(-half_m, half_m + CORNER_M, 97), float(self.streets.carriageways_m[index])
+        line_m = self.streets.crossing[index].poses(-inwards * way_m, 0.0)[:, :2]
         ahead = (line_m[-1] - line_m[-2]) / np.linalg.norm(line_m[-1] - line_m[-2])
         onto_m = line_m[-1] + ((face_m[1:] - line_m[-1]) @ ahead)[:, None] * ahead
         opposite_m = line_m[(way_m >= 0.0) & ((line_m - onto_m[-1]) @ ahead < 0.0)]
@@ -168,7 +155,7 @@ class City:
         area = area.difference(street.buffer(kerb_m, cap_style="flat"))
         if not is_built:
             area = area.intersection(street.buffer(kerb_m + sidewalk_m))
-        left_m = inwards * int(self._streets.course.turns[index]) * kerb_m
+        left_m = inwards * int(self.streets.course.turns[index]) * kerb_m
         return onto_m + left_m * np.array([-ahead[1], ahead[0]]), [area, _strip(around_m, inside_m)]
 
     def _between(self, whole: shapely.Geometry, streets: shapely.Geometry) -> shapely.Geometry:
@@ -180,15 +167,15 @@ class City:
 
     def _ground(self, seen_m: Bounds) -> Mesh:
         """Under everything: as far as lanes go, or as far as it can be seen."""
-        if self._hills.are_flat:
-            reach = self._streets.reach_m + 200.0
+        if self.hills.are_flat:
+            reach = self.streets.reach_m + 200.0
             return ground((-reach, -reach), (reach, reach))
-        way_m = self._streets.main.poses(np.arange(*seen_m, WAY_EVERY_M), 0.0)[:, :2]
-        return self._hills.mesh(way_m, GROUND_M)
+        way_m = self.streets.main.poses(np.arange(*seen_m, WAY_EVERY_M), 0.0)[:, :2]
+        return self.hills.mesh(way_m, GROUND_M)
 
     def _frontages(self, seen_m: Bounds) -> Iterator[Frontage]:
         """Both sides of the main street from kerb to kerb."""
-        turns, middles, halves = self._streets.course.turns, self._streets.junctions_m, self._streets.cross_kerbs_m
+        turns, middles, halves = self.streets.course.turns, self.streets.junctions_m, self.streets.cross_kerbs_m
         starts, ends = (middles - halves).tolist(), (middles + halves).tolist()
         for west in range(len(turns) - 1):
             for side in (1, -1):
@@ -198,20 +185,20 @@ class City:
                     east += 1
                 if turns[west] != side and starts[east] > seen_m[0] and ends[west] < seen_m[1]:
                     turns_m = tuple((starts[k], ends[k]) for k in range(west + 1, east))
-                    yield Frontage((ends[west], starts[east]), side, self._streets.kerb_m, turns_m, (west, east))
+                    yield Frontage((ends[west], starts[east]), side, self.streets.kerb_m, turns_m, (west, east))
 
     def _corner(self, index: int) -> tuple[BuildingSite, Frontage]:
         """The block between the two streets that meet the main street in a turn."""
-        street, half_m = self._streets.crossing[index], float(self._streets.cross_kerbs_m[index])
-        kerb_m = float(self._streets.carriageways_m[index])
-        side, middle_m = int(self._streets.course.turns[index]), float(self._streets.junctions_m[index])
+        street, half_m = self.streets.crossing[index], float(self.streets.cross_kerbs_m[index])
+        kerb_m = float(self.streets.carriageways_m[index])
+        side, middle_m = int(self.streets.course.turns[index]), float(self.streets.junctions_m[index])
         span_m = (-half_m - CORNER_M, half_m + CORNER_M)
-        site = BuildingSite(street, Territory(street, span_m), self._hills, kerb_m + CORNER_DEPTH_M + 10.0)
+        site = BuildingSite(street, Territory(street, span_m), self.hills, kerb_m + CORNER_DEPTH_M + 10.0)
         # As far as it is opposite of the turn, and not of another one.
         x = np.arange(*span_m, 5.0)
         foreign = np.zeros(len(x), dtype=bool)
         for y in (kerb_m, kerb_m + CORNER_DEPTH_M):
-            nearest_m = self._territory.nearest(street.poses(x, side * y)[:, :2])
+            nearest_m = self.territory.nearest(street.poses(x, side * y)[:, :2])
             foreign |= np.abs(nearest_m - middle_m) > half_m + SAMPLE_EVERY_M
         foreign &= np.abs(x) > half_m
         before, behind = x[foreign & (x < 0.0)], x[foreign & (x > 0.0)]
@@ -224,16 +211,17 @@ class City:
         Nobody drives along the streets that meet the main street in a turn: there they are parked on the lanes.
         """
         cars: list[tuple[str, float, float, float]] = []
-        bay_m = self._section.bay_m if front.junctions else LANE_SIDE_M
+        uniform, free_m = self.generator.uniform, FREE_AT_CORNERS_M
+        bay_m = self.streets.section.bay_m if front.junctions else LANE_SIDE_M
         x, end = front.x_m[0] + FREE_AT_CORNERS_M, front.x_m[1] - FREE_AT_CORNERS_M
         while x < end and bay_m:
-            kind = self._fleet.draw_kind(PARKED)
-            length = self._fleet.length_m(kind) + PARKED_GAP_M + self._uniform(0.0, 0.5)
-            if self._generator.random() < self._parked_share and x + length < end:
-                slack = max((bay_m - self._fleet.width_m(kind)) / 2 - 0.08, 0.0)
-                y = front.side * (front.kerb_m - bay_m / 2 + self._uniform(0.0, slack))
-                yaw = (0.0 if front.side == -1 else 180.0) + self._uniform(-0.4, 0.4)
-                if self._is_free(front, (x, x + length)):
+            kind = self.fleet.draw_kind(PARKED)
+            length = self.fleet.length_m(kind) + PARKED_GAP_M + uniform(0.0, 0.5)
+            if self.generator.random() < self.parked_share and x + length < end:
+                slack = max((bay_m - self.fleet.width_m(kind)) / 2 - 0.08, 0.0)
+                y = front.side * (front.kerb_m - bay_m / 2 + uniform(0.0, slack))
+                yaw = (0.0 if front.side == -1 else 180.0) + uniform(-0.4, 0.4)
+                if all(x >= last + free_m or x + length <= first - free_m for first, last in front.turns_m):
                     cars.append((kind, x + length / 2, y, yaw))
             x += length
         return cars
@@ -249,18 +237,9 @@ class City:
         if not kinds:
             return
         poses = np.concatenate(found)
-        stances = self._hills.stances(poses[:, :2], poses[:, 2])
+        stances = self.hills.stances(poses[:, :2], poses[:, 2])
         for kind, (x, y, yaw), (height_m, *tilt_deg) in zip(kinds, poses.tolist(), stances.tolist(), strict=True):
-            self._fleet.park(kind, (x, y, yaw), height_m, (tilt_deg[0], tilt_deg[1]))
-
-    def _is_free(self, front: Frontage, x_m: Bounds) -> bool:
-        """Whether something may stand from one station to another."""
-        return not any(
-            x_m[0] < last + FREE_AT_CORNERS_M and x_m[1] > first - FREE_AT_CORNERS_M for first, last in front.turns_m
-        )
-
-    def _uniform(self, low: float, high: float) -> float:
-        return float(self._generator.uniform(low, high))
+            self.fleet.park(kind, (x, y, yaw), height_m, (tilt_deg[0], tilt_deg[1]))
 
 
 def _strip(line_m: Float64, left_m: float) -> shapely.Geometry:

@@ -3,7 +3,6 @@
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from functools import cache, lru_cache
-from operator import attrgetter
 
 import numpy as np
 
@@ -53,7 +52,6 @@ CATEGORIES = {name: BODIES[kind] for name, kind in sorted(KIND_OF.items())}
 EGO = "ego"
 HEAVY = ("truck", "lorry", "bus")
 REAR_OF = "rear of "
-_EXIT = attrgetter("exit_m")
 
 WALKING = Driver(
     desired_speed_mps=1.4, headway_s=0.4, standstill_gap_m=0.5, acceleration_mps2=1.0, deceleration_mps2=1.5
@@ -163,7 +161,9 @@ class Fleet:
         while per_km > 0:
             kind = self.draw_kind(mix)
             driver = self.draw_driver(drivers[KIND_OF[kind]][1], heavy_spread if KIND_OF[kind] in HEAVY else spread)
-            length, gap = self.length_m(kind), _smallest_gap_m(driver)
+            # What one keeps at full speed, so that nobody has to brake at first.
+            gap = float(driver.standstill_gap_m + driver.headway_s * driver.desired_speed_mps)
+            length = self.length_m(kind)
             rear += gap + self._generator.exponential(max(1000.0 / per_km - gap - length, 0.1))
             if rear + length > span_m[1]:
                 break
@@ -188,17 +188,10 @@ def _bodies_of(kinds: tuple[str, ...], weights: tuple[float, ...]) -> tuple[list
     return [name for names in sizes for name in names], (up_to / up_to[-1]).tolist()
 
 
-def _smallest_gap_m(driver: Driver) -> float:
-    """What a driver keeps at full speed, so that nobody has to brake at first."""
-    return float(driver.standstill_gap_m + driver.headway_s * driver.desired_speed_mps)
-
-
 def _in_the_way(agent: Agent, gates: Sequence[Gate], gap_m: float, others: Sequence[Agent]) -> bool:
     rear, front = agent.place_m - agent.length_m / 2, agent.place_m + agent.length_m / 2
     # Gates follow each other: of those that are not behind, the first is the nearest.
-    gate = bisect_right(gates, rear, key=_EXIT)
+    gate = bisect_right(gates, rear, key=lambda gate: gate.exit_m)
     if gate < len(gates) and front > gates[gate].enter_m - gap_m:
         return True
-    return bool(others) and any(
-        abs(agent.place_m - other.place_m) < (agent.length_m + other.length_m) / 2 + gap_m for other in others
-    )
+    return any(abs(agent.place_m - other.place_m) < (agent.length_m + other.length_m) / 2 + gap_m for other in others)
