@@ -144,7 +144,7 @@ def needing(pitch_deg, checked):
 def test_what_bodies_require_is_looked_at_where_it_decides_and_ends_the_choice_of_what_lacks_it(monkeypatch):
     """A child needs the nose at least 5 degrees down, as one would have it; so it costs near what it must."""
     checked = []
-    monkeypatch.setattr("torchcover.placement.search.check", needing(5.0, checked))
+    monkeypatch.setattr("torchcover.placement.objective.check", needing(5.0, checked))
     result = searched(of=space(requirements=required(points=5)), evaluations=30)
     assert result.search.evaluations[0].lacks == {"child_110cm, points_m [[5.0, 0.0]], points >= 5": 1}
     assert 5 <= result.best.evaluation.values["roof.pitch_deg"] < 9
@@ -155,7 +155,7 @@ def test_what_bodies_require_is_looked_at_where_it_decides_and_ends_the_choice_o
 def test_where_nobody_keeps_what_bodies_require_who_lacks_more_is_dropped_at_once(monkeypatch):
     """A child needs the nose farther down than it goes: the farthest down lacks the least, whatever it gains."""
     checked = []
-    monkeypatch.setattr("torchcover.placement.search.check", needing(50.0, checked))
+    monkeypatch.setattr("torchcover.placement.objective.check", needing(50.0, checked))
     search = searched(of=space(requirements=required(points=5)), evaluations=30).search
     assert len(checked) == len(search.evaluations) == 31
     for arm in search.arms.values():

@@ -132,11 +132,11 @@ class SensorTilt:
     tau_y: Scalar
 
     def apply(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Distorted plane -> sensor."""
+        """Distorted points -> tilted ones and a mask of those in front of the tilted plane."""
         return self._map(u, v, inverse=False)
 
     def undo(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Sensor -> distorted plane."""
+        """Tilted points -> distorted ones and a mask of those that come from the front."""
         return self._map(u, v, inverse=True)
 
     def _map(self, u: Tensor, v: Tensor, inverse: bool) -> tuple[Tensor, Tensor, Tensor]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from torchcover.cameras.lens import Distortion, Linear
+from torchcover.cameras.lens import Distortion
 from torchcover.cameras.start import StartTable, nearest_seeds
 from torchcover.cameras.valid_region import ValidRegion
 from torchcover.geometry.arrays import Bools, Float64
@@ -94,15 +94,10 @@ class _Search:
         at = self.distortion.linearise(a, b)
         du, dv = at.u - u, at.v - v
         determinant = at.determinant
-        step_a, step_b = _solve_linear(at, determinant, du, dv)
+        inverse = 1.0 / determinant
+        step_a, step_b = (at.v_b * du - at.u_b * dv) * inverse, (at.u_a * dv - at.v_a * du) * inverse
         du, dv = self.focal[0] * du, self.focal[1] * dv
         return step_a, step_b, np.sqrt(du * du + dv * dv), self.region.contains(a, b, determinant)
-
-
-def _solve_linear(at: Linear, determinant: Float64, du: Float64, dv: Float64) -> tuple[Float64, Float64]:
-    """The inverse Jacobian applied to (du, dv)."""
-    inverse = 1.0 / determinant
-    return (at.v_b * du - at.u_b * dv) * inverse, (at.u_a * dv - at.v_a * du) * inverse
 
 
 def solve(

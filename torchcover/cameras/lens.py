@@ -7,13 +7,16 @@ inverse of the lens is one problem, solved once (`inverse.py`), and the chart go
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchcover.geometry.arrays import Float64
+
+if TYPE_CHECKING:
+    from torchcover.cameras.brown_conrady import SensorTilt
 
 # A coefficient is a float where a lens is only evaluated, and a 0-d tensor where gradients flow into it.
 Scalar = float | Tensor
@@ -73,16 +76,6 @@ class Distortion(Protocol):
         """Every radius at which the radial part may stop being monotonic, in any order."""
 
 
-class Tilt(Protocol):
-    """A sensor that is not perpendicular to the optical axis: a projective map of the distorted plane."""
-
-    def apply(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Distorted points -> tilted ones and a mask of those in front of the tilted plane."""
-
-    def undo(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Tilted points -> distorted ones and a mask of those that come from the front."""
-
-
 @dataclass(frozen=True)
 class Lens:
     """A lens model with its coefficients.
@@ -93,7 +86,7 @@ class Lens:
 
     chart: Chart
     distortion: Distortion | None = None
-    tilt: Tilt | None = None
+    tilt: "SensorTilt | None" = None
 
 
 def as_vector(values: Sequence[Scalar], like: Tensor | None = None) -> Tensor:

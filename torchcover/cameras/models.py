@@ -32,21 +32,12 @@ def _build_brown_conrady(coefficients: Sequence[Scalar], trainable: bool) -> Len
     return Lens(PlaneChart(), _brown_conrady(coefficients[:12], trainable), tilt)
 
 
-def _build_kannala_brandt(coefficients: Sequence[Scalar], trainable: bool) -> Lens:
-    return Lens(AngleChart(), KannalaBrandt(coefficients) if trainable or any(coefficients) else None)
-
-
-def _build_mei(coefficients: Sequence[Scalar], trainable: bool) -> Lens:
-    distortion = _brown_conrady(coefficients[1:], trainable) if len(coefficients) > 1 else None
-    return Lens(SphereChart(coefficients[0]), distortion)
-
-
 _BUILD: dict[str, Callable[[Sequence[Scalar], bool], Lens]] = {
     "pinhole": lambda _, __: Lens(PlaneChart()),
     "brown_conrady": _build_brown_conrady,
-    "kannala_brandt": _build_kannala_brandt,
+    "kannala_brandt": lambda k, trainable: Lens(AngleChart(), KannalaBrandt(k) if trainable or any(k) else None),
     "theta_polynomial": lambda k, _: Lens(AngleChart(), ThetaPolynomial(k)),
-    "mei": _build_mei,
+    "mei": lambda k, trainable: Lens(SphereChart(k[0]), _brown_conrady(k[1:], trainable) if len(k) > 1 else None),
     "eucm": lambda k, _: Lens(ExtendedChart(k[0], k[1])),
     "double_sphere": lambda k, _: Lens(DoubleSphereChart(k[0], k[1])),
 }

@@ -32,7 +32,7 @@ def run(word: str | None) -> None:
         "scenarios": _traffic,
         "lidars": _rows,
         "vehicles": None,
-        "materials": _reflectivity,
+        "materials": lambda material: str(material["reflectivity"]),
         "weather": None,
         "encounters": None,
         "requirements": None,
@@ -85,10 +85,6 @@ def _traffic(scenario: Mapping[str, Any]) -> str:
 def _rows(lidar: Mapping[str, Any]) -> str:
     rows = lidar["channels"] if "channels" in lidar else len(lidar["elevations_deg"])
     return f"{rows} rows, {lidar['max_range_m']:g} m"
-
-
-def _reflectivity(material: Mapping[str, Any]) -> str:
-    return str(material["reflectivity"])
 
 
 def _first_sentence(text: str) -> str:

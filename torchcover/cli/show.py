@@ -113,7 +113,11 @@ def _steps_of_film(world: Scenario, first: int) -> range:
 
 def _kind(name: str) -> str:
     if Path(name).suffix in (".yaml", ".yml"):
-        return _kind_of_file(Path(name))
+        try:
+            keys = read_mapping(Path(name))
+        except BadFileError:
+            return "scenario"  # whatever loads it says what is wrong
+        return next((kind for kind, key in KINDS.items() if key in keys), "scenario")
     if Path(name).suffix:
         return "vehicle"  # a mesh
     of = {kind: builtin_names(f"{kind}s") for kind in KINDS}
@@ -123,14 +127,6 @@ def _kind(name: str) -> str:
         meant = nearest(name, sorted(set().union(*of.values())))
         raise ValueError(f"{name!r} is {both if kinds else f'neither a .yaml file nor built in; {meant}'}")
     return kinds[0]
-
-
-def _kind_of_file(path: Path) -> str:
-    try:
-        keys = read_mapping(path)
-    except BadFileError:
-        return "scenario"  # whatever loads it says what is wrong
-    return next((kind for kind, key in KINDS.items() if key in keys), "scenario")
 
 
 def _refuse(kind: str, options: dict[str, Any], reason: str) -> None:

@@ -1,7 +1,4 @@
-"""Grid, aggregations, metric, result, regions and paired differences: from clouds to coverage numbers.
-
-The public names are imported when first used: who only needs a region needs no torchmetrics.
-"""
+"""Grid, aggregations, metric, result, regions and paired differences: from clouds to coverage numbers."""
 
 import lazy_loader
 

@@ -8,6 +8,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +25,7 @@ from torchcover.coverage.redundancy import Redundancy, redundancy_quantities
 from torchcover.coverage.region_sums import PlaceNumbers, PlaceSums
 from torchcover.coverage.regions import Region
 from torchcover.estimation import Quantity
-from torchcover.files import NpyHeader, TooLargeError, check_memory, read_npz, reads, write_npz
+from torchcover.files import TooLargeError, check_kind, check_memory, read_npz, reads, write_npz
 from torchcover.metrics.blocks import FINER
 
 if TYPE_CHECKING:
@@ -85,7 +86,7 @@ def write_coverage(coverage: "Coverage", path: Path) -> None:
 def read_coverage(path: Path) -> dict[str, Any]:
     """Read what `write_coverage` wrote: the arguments of `Coverage`."""
     try:
-        arrays = read_npz(path, _check_kind)
+        arrays = read_npz(path, partial(check_kind, "fiuU"))  # numbers, and one text: the header
         header: dict[str, Any] = json.loads(str(arrays.pop("header")))
         version = header.pop("format")
         parts = _parts(header, arrays) if version == FORMAT_VERSION else None
@@ -99,12 +100,6 @@ def read_coverage(path: Path) -> dict[str, Any]:
         bands = "; height bands of older ones were over z of the vehicle: measure again" if older else ""
         raise ValueError(f"coverage format {version}; this torchcover reads format {FORMAT_VERSION}{bands}")
     return parts
-
-
-def _check_kind(header: NpyHeader) -> None:
-    """Numbers, and one text: the header."""
-    if header.dtype.kind not in "fiuU":
-        raise ValueError(f"an array of {header.dtype}")
 
 
 def _parts(header: dict[str, Any], arrays: Arrays) -> dict[str, Any]:

@@ -80,14 +80,14 @@ class BevGrid:
         for axis, bounds in (("x", self.x), ("y", self.y)):
             _check_bounds(axis, bounds)
             _check_multiple(axis, bounds, self.cell)
-        _check_heights(self.heights)
+        if not self.heights:
+            raise ValueError("heights: at least one height band is needed, for example {'ground': (-0.5, 0.5)}")
+        for name, band in self.heights.items():
+            _check_bounds(f"heights[{name!r}]", band)
         if self.band_frame not in get_args(BandFrame):
             raise ValueError(f"band_frame: ground or vehicle is needed; got {self.band_frame!r}")
         if math.prod(self.shape) > MAX_CELLS:
             raise ValueError(f"the grid has {math.prod(self.shape):,} cells, over {MAX_CELLS:,}: use larger cells")
-        self._normalise()
-
-    def _normalise(self) -> None:
         # Plain floats in copies: lists, whole numbers and a dict that its owner changes later make no difference.
         heights = {name: (float(low), float(high)) for name, (low, high) in self.heights.items()}
         own = {"x": tuple(map(float, self.x)), "y": tuple(map(float, self.y)), "cell": float(self.cell)}
@@ -292,13 +292,6 @@ def _check_multiple(name: str, bounds: tuple[float, float], cell: float) -> None
             f"{name}: its extent of {extent:.10g} m is not a multiple of the cell of {cell:.10g} m "
             f"({cells:.10g} cells); a cell of {fits:.10g} m would fit"
         )
-
-
-def _check_heights(heights: Mapping[str, tuple[float, float]]) -> None:
-    if not heights:
-        raise ValueError("heights: at least one height band is needed, for example {'ground': (-0.5, 0.5)}")
-    for name, band in heights.items():
-        _check_bounds(f"heights[{name!r}]", band)
 
 
 def _count(bounds: tuple[float, float], cell: float) -> int:

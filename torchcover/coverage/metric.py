@@ -15,7 +15,7 @@ from torchcover.coverage.measures import Measure
 from torchcover.coverage.plotting import draw_coverage
 from torchcover.coverage.quantity import MEASURED_WITHIN_M
 from torchcover.coverage.redundancy import Redundancy, SensorFailures
-from torchcover.coverage.region_sums import PlaceNumbers, PlaceSums, numbers_of_places
+from torchcover.coverage.region_sums import PlaceSums, numbers_of_places
 from torchcover.coverage.regions import Places, Region, check_regions, regions_within
 from torchcover.coverage.result import Coverage
 from torchcover.coverage.steps import (
@@ -288,7 +288,9 @@ class CoverageMetric(SumsInBlocks):
             counts={name: int(getattr(self, name)) for name in Coverage.COUNTS},
             regions=self.regions,
             places=self._by_area(),
-            aggregated=self._numbers(),
+            aggregated=numbers_of_places(self._in_places(fine=False), self._aggregated, self.max_radius)
+            if self._aggregated and self._places.count
+            else None,
             redundancy=Redundancy(self.sensors, known, {one.quantity.key: one for one in failures})
             if failures
             else None,
@@ -312,11 +314,6 @@ class CoverageMetric(SumsInBlocks):
         sums = self._in_places(fine=True).of
         own = [sums[kind.name]["sums"] for kind in (VisibleArea, SensorFailures) if kind.name in sums]
         return PlaceSums(self.fine_steps.clone(), sums[VisibleArea.name]["m2"], torch.cat(own).movedim(0, 1))
-
-    def _numbers(self) -> PlaceNumbers | None:
-        if not (self._aggregated and self._places.count):
-            return None
-        return numbers_of_places(self._in_places(fine=False), self._aggregated, self.max_radius)
 
     def estimates(self, places: Sequence[tuple[Region, str]], measure: Measure) -> list[Estimate]:
         """The numbers of regions in bands so far: those of `compute().estimate`, but no maps are made for them.

@@ -24,7 +24,9 @@ def draw_coverage(coverage: object, ax: "Axes", layer: str | None, height: str |
     if not isinstance(coverage, Coverage):
         raise TypeError(f"val: one Coverage, as compute() returns it, is needed; got {type(coverage).__name__}")
     bands = list(coverage.grid.heights)
-    key = _first_layer(coverage) if layer is None else layer
+    first = coverage.quantities[min(1, len(coverage.thresholds))]
+    first = first if coverage.measure == "known" else by_area(first)
+    key = first.key if layer is None else layer
     band = bands[0] if height is None else height
     for name, given, there in (("layer", key, list(coverage.layers)), ("height", band, bands)):
         if given not in there:
@@ -56,8 +58,3 @@ def draw_coverage(coverage: object, ax: "Axes", layer: str | None, height: str |
     )
     label = f"{quantity.title} (m)" if quantity.unit == "m" else quantity.title
     ax.figure.colorbar(mesh, ax=ax, label=label, shrink=0.7, extend="max" if (values > highest).any() else "neither")
-
-
-def _first_layer(coverage: Coverage) -> str:
-    quantity = coverage.quantities[min(1, len(coverage.thresholds))]
-    return quantity.key if coverage.measure == "known" else by_area(quantity).key

@@ -1,7 +1,4 @@
-"""Objects: their boxes, how much of each a rig could see, and which of them a detector found.
-
-The names are imported when first used: boxes need no torchmetrics.
-"""
+"""Objects: their boxes, how much of each a rig could see, and which of them a detector found."""
 
 import lazy_loader
 

@@ -69,7 +69,11 @@ class Boxes:
 
     def __post_init__(self) -> None:
         for name in ("centre_m", "size_m", "yaw_rad"):
-            _check_numbers(name, getattr(self, name))
+            tensor = getattr(self, name)
+            check_tensor(tensor, name, floating=True)
+            if not tensor.isfinite().all():
+                bad = int((~tensor.reshape(len(tensor), -1).isfinite()).any(dim=1).sum())
+                raise ValueError(f"{name}: {bad} of {len(tensor)} boxes have NaN or infinite numbers; leave them out")
         count = len(self.yaw_rad)
         fill = {
             "velocity_mps": self.centre_m.new_full((count, 2), math.nan),
@@ -199,13 +203,6 @@ def check_boxes(boxes: object) -> None:
             f"boxes: Boxes are needed, if only an empty list of them; got {type(boxes).__name__}; "
             "SimulatedFrames(..., boxes=True) makes them"
         )
-
-
-def _check_numbers(name: str, tensor: Tensor) -> None:
-    check_tensor(tensor, name, floating=True)
-    if not tensor.isfinite().all():
-        bad = int((~tensor.reshape(len(tensor), -1).isfinite()).any(dim=1).sum())
-        raise ValueError(f"{name}: {bad} of {len(tensor)} boxes have NaN or infinite numbers; leave them out")
 
 
 def upright_rows(centre_m: ArrayLike, size_m: ArrayLike, heading: ArrayLike, vehicle_T_source: Matrix | None) -> Tensor:

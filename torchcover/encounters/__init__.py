@@ -1,7 +1,4 @@
-"""In time or too late: when a rig detects what the vehicle is about to collide with.
-
-The public names are imported when first used: who asks for help needs no ray caster.
-"""
+"""In time or too late: when a rig detects what the vehicle is about to collide with."""
 
 import lazy_loader
 

@@ -1,7 +1,4 @@
-"""How sums over steps and worlds become numbers: quantities, estimates, standard errors, intervals, differences.
-
-The public names are imported when first used.
-"""
+"""How sums over steps and worlds become numbers: quantities, estimates, standard errors, intervals, differences."""
 
 import lazy_loader
 

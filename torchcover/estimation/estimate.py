@@ -238,12 +238,6 @@ class Estimate:
         return [int(each + 1e-9) for each in found.where(found.isfinite(), most.amin(dim=0)).tolist()]
 
     @property
-    def _varies(self) -> Tensor:
-        """(Q,) whether blocks, in a mixture those of each stratum, say different things: else they prove nothing."""
-        each = [one.error > ROUND_OFF for _, one in self.strata] or [self.error > ROUND_OFF]
-        return torch.stack(each).all(dim=0)
-
-    @property
     def has_intervals(self) -> list[bool]:
         """Whether 8 blocks or more are in effect, of each number."""
         enough: list[bool] = (self.effective > MIN_BLOCKS - ROUND_OFF).tolist()
@@ -256,7 +250,9 @@ class Estimate:
             count: How many they are over.
             count_of: What these are.
         """
-        found, varies = {}, self._varies.tolist()
+        # Blocks, in a mixture those of each stratum, that all say the same prove nothing.
+        each = [one.error > ROUND_OFF for _, one in self.strata] or [self.error > ROUND_OFF]
+        found, varies = {}, torch.stack(each).all(dim=0).tolist()
         errors = [error if known else math.nan for error, known in zip(self.error.tolist(), varies, strict=True)]
         numbers = self.quantities, self.value.tolist(), errors, self.has_intervals, self.freedom
         for quantity, value, error, has_interval, freedom in zip(*numbers, strict=True):

@@ -1,7 +1,4 @@
-"""The pipeline: frames in, observers fed from them, results out.
-
-The public names are imported when first used: who only feeds a metric needs no maps.
-"""
+"""The pipeline: frames in, observers fed from them, results out."""
 
 import lazy_loader
 

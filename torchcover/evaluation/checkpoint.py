@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.evaluation.observers import CoverageObserver, Stateful
-from torchcover.files import NpyHeader, check_memory, read_npz, reads, write_durably
+from torchcover.files import check_kind, check_memory, read_npz, reads, write_durably
 
 EVERY_S = 60.0
 # Writing takes at most this share of the time, though it may take seconds.
@@ -264,10 +264,4 @@ def _array(content: Mapping[str, Any], path: Path) -> Array:
 
 
 def _read(path: Path, name: str) -> Array:
-    return read_npz(path, _check_kind, lambda _: [name])[name]
-
-
-def _check_kind(header: NpyHeader) -> None:
-    """Bytes, and one text: the header."""
-    if header.dtype.kind not in "uU":
-        raise ValueError(f"an array of {header.dtype}")
+    return read_npz(path, partial(check_kind, "uU"), lambda _: [name])[name]  # bytes, and one text: the header

@@ -15,7 +15,7 @@ from torchcover.evaluation.evaluating import evaluate
 from torchcover.evaluation.task import AnyRig, loaded
 from torchcover.published import PUBLISHED, Ranking
 from torchcover.published.ranks import BASELINE, LEAST, OWN, rankings
-from torchcover.simulation import RegionsOfInterest, Rig, Scenario
+from torchcover.simulation import RegionsOfInterest, Scenario
 
 THRESHOLD_M = 0.4
 CELL_M = 1.0
@@ -110,13 +110,14 @@ def score_placements(
     if result.run is not None:
         result.run.raise_failure()  # ranks of a part of what was asked for would look like the whole
     assert result.metrics is not None  # some were asked for
+    heights_m = [sum(sensor.mount.z_m for sensor in rig.sensors) / len(rig.sensors) for rig in carried.values()]
     return PlacementScores(
         rigs=tuple(rigs),
         rankings=(
             *_own([result.coverages[rig] for rig in rigs], region, seed),
             *_of_others(result.metrics.rankings),
-            _of_rigs("mean mounting height", "m", map(_mean_height_m, carried.values())),
-            _of_rigs("rays", "rays", map(_rays, carried.values())),
+            _of_rigs("mean mounting height", "m", [round(height_m, 6) for height_m in heights_m]),
+            _of_rigs("rays", "rays", [float(sum(sensor.rays for sensor in rig.sensors)) for rig in carried.values()]),
         ),
         steps=steps,
         sensor_models={name: rig.sensor_model for name, rig in carried.items()},
@@ -157,11 +158,3 @@ def _of_others(published: Sequence[Ranking]) -> Iterator[Ranking]:
 
 def _of_rigs(words: str, unit: str, values: Iterable[float]) -> Ranking:
     return Ranking.of_values(Quantity(words, words, unit, lower_is_better=False), list(values))
-
-
-def _mean_height_m(rig: Rig) -> float:
-    return round(sum(sensor.mount.z_m for sensor in rig.sensors) / len(rig.sensors), 6)
-
-
-def _rays(rig: Rig) -> float:
-    return float(sum(sensor.rays for sensor in rig.sensors))

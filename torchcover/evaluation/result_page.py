@@ -129,14 +129,8 @@ def rig_document(name: str, sensors: Sequence[Sensor]) -> str:
 
 def region_line(region: Region) -> Line:
     """Its outline on the maps."""
-    return Line(region.name, _corners(region))
-
-
-def _corners(region: Region) -> np.ndarray[Any, np.dtype[np.float64]]:
-    if region.corners_m:
-        return np.array(region.corners_m)
     (left, right), (low, high) = region.x, region.y
-    return np.array([[left, low], [right, low], [right, high], [left, high]])
+    return Line(region.name, np.array(region.corners_m or [[left, low], [right, low], [right, high], [left, high]]))
 
 
 def facts_of(record: Mapping[str, Any], rigs: Mapping[str, str | None], steps: int) -> dict[str, dict[str, str]]:

@@ -13,7 +13,7 @@ from torchcover.report import ActorMark, SkinPatch, StandingFaces, draw_depths, 
 from torchcover.simulation import GRID_X_M, GRID_Y_M, CameraSensor, PaperReference, Rig, Scenario, SimulatedFrames
 from torchcover.simulation.bodies import Vehicle
 from torchcover.simulation.mount_regions import MountRegion, Skin
-from torchcover.simulation.world import Actor, World
+from torchcover.simulation.world import World
 
 PATCH_PLACES = 12  # along each side of a mount region
 FLAT = 0.9  # the least cosine between a face's normal and z
@@ -77,7 +77,7 @@ def scenario_pictures(
     for step in steps:
         frame = frames[step]
         scene, step_of_world = frames.simulator.scene_of(step)
-        time_s = step_of_world * scene.world.time_step_s
+        time_s, ego = step_of_world * scene.world.time_step_s, scene.world.ego.trajectory
         yield draw_scene(
             x_m,
             y_m,
@@ -88,7 +88,7 @@ def scenario_pictures(
             reference=frame.reference.numpy(),
             title=f"{scenario.name}, step {step}",
             subtitle=f"t = {time_s:g} s, seed {seed}; points of {rig.name} on {frames.scenario.ego_name}",
-            path_m=_path_m(scene.world, time_s),
+            path_m=transform(invert(ego.at(time_s)), ego.positions_m)[:, :2] if ego.moves else None,
         )
 
 
@@ -112,12 +112,6 @@ def _patch(name: str, region: MountRegion, skin: Skin) -> SkinPatch:
     except ValueError as error:
         raise ValueError(f"mount region {name!r}: {error}") from error
     return SkinPatch(name, region.seen_from, np.array(places_m))
-
-
-def _path_m(world: World, time_s: float) -> Matrix | None:
-    """(T, 2) where the ego is at all times, in the vehicle frame of one; None if it rests."""
-    ego = world.ego.trajectory
-    return transform(invert(ego.at(time_s)), ego.positions_m)[:, :2] if ego.moves else None
 
 
 def _frames(scenario: Scenario, rig: Rig, vehicle: str | None, step: int, seed: int) -> SimulatedFrames:
@@ -167,10 +161,10 @@ def _heights_m(corners_m: Matrix) -> Matrix:
 def _actor_marks(world: World, time_s: float) -> list[ActorMark]:
     vehicle_T_world = invert(world.ego.trajectory.at(time_s))
     there = [actor for actor in world.objects if np.isfinite(actor.trajectory.positions_at(np.array([time_s]))).all()]
-    return [ActorMark(actor.category, _footprint_m(actor, vehicle_T_world, time_s)) for actor in there]
-
-
-def _footprint_m(actor: Actor, vehicle_T_world: Matrix, time_s: float) -> Matrix:
-    corners = BoundingBox.around(actor.mesh.vertices_m).outline_m
-    on_ground = np.column_stack([corners, np.zeros(len(corners))])
-    return transform(vehicle_T_world @ actor.trajectory.at(time_s), on_ground)[:, :2]
+    marks = []
+    for actor in there:
+        corners = BoundingBox.around(actor.mesh.vertices_m).outline_m
+        vehicle_T_actor = vehicle_T_world @ actor.trajectory.at(time_s)
+        outline_m = transform(vehicle_T_actor, np.column_stack([corners, np.zeros(len(corners))]))[:, :2]
+        marks.append(ActorMark(actor.category, outline_m))
+    return marks

@@ -170,10 +170,6 @@ def _probes(given: "str | Path | Iterable[str | Path] | None") -> "tuple[str | P
     return () if each == ("none",) else each
 
 
-def _device(given: "str | torch.device") -> str:
-    return str(given)
-
-
 @dataclass(frozen=True, eq=False)
 class Settings:
     """The arguments of `evaluate`; None where nothing was given.
@@ -339,7 +335,7 @@ class Settings:
     device: Annotated[
         Read["str | torch.device", str],
         Option("Where the search and the sums run, with Warp rays too: cpu, cuda, cuda:1, ...", str, in_study=True),
-    ] = Read(_device, "cpu")
+    ] = Read(str, "cpu")
     workers: Annotated[
         int | None,
         Option(
@@ -407,13 +403,6 @@ class Settings:
         if self.mixture is not None:
             raise ValueError(f"scenario: one at a time here; got {', '.join(self.mixture)} (`evaluate` takes several)")
         return cast("AnyScenario", DEFAULT_SCENARIO if self.scenario is None else self.scenario)
-
-    @property
-    def simulated_steps(self) -> int:
-        """Steps of a simulation, at most."""
-        if self.steps is not None:
-            return self.steps
-        return DEFAULT_STEPS if self.target_error is None else MAX_STEPS
 
     @property
     def needs_boxes(self) -> bool:

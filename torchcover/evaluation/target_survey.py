@@ -99,11 +99,7 @@ def survey_target(
 def in_world(
     rig: AnyRig, scenario: AnyScenario | None, vehicle: str | Path | None, sensor_model: Literal["ideal", "real"] | None
 ) -> tuple[Rig, Scenario, int]:
-    """The rig, the world whose ego carries it, and how many steps are usual; as `survey_target` is asked.
-
-    Raises:
-        FileNotFoundError, ValueError: As there.
-    """
+    """The rig, the world whose ego carries it, and how many steps are usual; as `survey_target` is asked."""
     rig = as_called(rig).sensing(sensor_model)
     world = free_space() if scenario is None else scenario
     world = with_ego(world if isinstance(world, Scenario) else Scenario.load(world), {rig.name: rig}, vehicle)
@@ -197,11 +193,7 @@ def plan_of(seen: TargetMap) -> PagePlan:
 
 
 def target_verdict(seen: Mapping[str, TargetMap]) -> tuple[str, ...]:
-    """Where rigs see a body, and which sensor most hangs on, in sentences; no words where nothing is free.
-
-    Args:
-        seen: By the name of the rig: the same body on the same places.
-    """
+    """Where rigs, by name, see the same body on the same places, and on which sensor most hangs, in sentences."""
     shares = {rig: one.share_seen(NEAR_M) for rig, one in seen.items()}
     known = sorted((rig for rig in shares if not math.isnan(shares[rig])), key=lambda rig: -shares[rig])
     if not known:
@@ -264,16 +256,12 @@ def sides_table(seen: TargetMap) -> PageTable:
     rows = []
     for name in dict.fromkeys(side.side for side in sides):
         shares = ["-" if one.cells == 0 else percent(one.seen) for one in sides if one.side == name]
-        rows.append(tuple(map(Words, (name, *shares, _unseen(unseen_to_m[name])))))
+        to_m = unseen_to_m[name]
+        unseen = "-" if np.isnan(to_m) else f"{to_m:.2f}" if to_m else "nowhere"
+        rows.append(tuple(map(Words, (name, *shares, unseen))))
     of_steps = ", mean over the steps" if seen.step_count > 1 else ""
     headings = ("side", *(f"within {limit_m:g} m\n(%)" for limit_m in within), "unseen to\n(m)")
     return PageTable(f"Free places with {seen.hits} points or more{of_steps}", headings, rows)
-
-
-def _unseen(to_m: float) -> str:
-    if np.isnan(to_m):
-        return "-"
-    return f"{to_m:.2f}" if to_m else "nowhere"
 
 
 def places_table(places: Sequence[Place], title: str) -> PageTable:

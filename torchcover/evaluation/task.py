@@ -14,9 +14,8 @@ import torch
 
 from torchcover import __version__
 from torchcover.coverage import Region
-from torchcover.coverage.grid import BandFrame
 from torchcover.evaluation.observers import AnyObserver
-from torchcover.evaluation.settings import DEFAULT_STEPS, OPTIONS, Settings
+from torchcover.evaluation.settings import DEFAULT_STEPS, MAX_STEPS, OPTIONS, Settings
 from torchcover.frames import ChosenRigs, FrameSource
 from torchcover.recordings import RecordedFrames, open_recording
 from torchcover.simulation import (
@@ -141,16 +140,20 @@ def simulation(settings: Settings, *, boxes: bool = False) -> Task[SimulatedFram
         carried, given = _in_weather(carried, given, settings.weather)
     loaded_world = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
     world = with_ego(loaded_world, carried, settings.vehicle)
+    band_frame = settings.band_frame or ("vehicle" if settings.reference == "paper" else DEFAULT_BAND_FRAME)
     asked = (settings.ask or RegionsOfInterest()).around(
-        world.ego_box().outline_m, settings.cell_m, _band_frame(settings), _within(world, carried)
+        world.ego_box().outline_m, settings.cell_m, band_frame, _within(world, carried)
     )
+    few = settings.only_detection and settings.reference in (None, DEFAULT_REFERENCE)
+    rays = FEW_RAYS if few and settings.rays is None else settings.rays
+    most = DEFAULT_STEPS if settings.target_error is None else MAX_STEPS
     frames = SimulatedFrames(
         world,
         rigs=carried,
-        steps=settings.simulated_steps,
+        steps=most if settings.steps is None else settings.steps,
         seed=settings.seed,
         every_s=spread_s(world, settings.every_s),
-        reference_sensor=reference_called(settings.reference, _rays(settings), asked),
+        reference_sensor=reference_called(settings.reference, rays, asked),
         boxes=boxes or settings.needs_boxes,
         within_m=max(settings.thresholds_m) if settings.only_detection else None,
         kept_bytes=0.0,  # steps come in order: no world is needed again
@@ -194,16 +197,6 @@ def _in_weather(
     each = {f"{name}, {one.name}": (name, one) for name in carried for one in weather}
     in_each = {both: carried[name].model_copy(update={"weather": one}) for both, (name, one) in each.items()}
     return in_each, {both: given[name] for both, (name, _) in each.items()}
-
-
-def _rays(settings: Settings) -> int | None:
-    """Of the reference of a simulation; None for its own number."""
-    few = settings.only_detection and settings.reference in (None, DEFAULT_REFERENCE)
-    return FEW_RAYS if few and settings.rays is None else settings.rays
-
-
-def _band_frame(settings: Settings) -> BandFrame:
-    return settings.band_frame or ("vehicle" if settings.reference == "paper" else DEFAULT_BAND_FRAME)
 
 
 def _most_steps(frames: SimulatedFrames, settings: Settings) -> int | None:

@@ -22,6 +22,7 @@ from torchcover.files.notebooks import data_set as data_set
 from torchcover.files.notebooks import small_html as small_html
 from torchcover.files.numpy_files import DEFLATE_MAX_RATIO as DEFLATE_MAX_RATIO
 from torchcover.files.numpy_files import NpyHeader as NpyHeader
+from torchcover.files.numpy_files import check_kind as check_kind
 from torchcover.files.numpy_files import npz_headers as npz_headers
 from torchcover.files.numpy_files import read_npy as read_npy
 from torchcover.files.numpy_files import read_npz as read_npz

@@ -102,7 +102,7 @@ def naming(path: Path, content: str) -> Iterator[None]:
     except MemoryError as error:
         raise BadFileError(f"{path}: there is not enough memory to read {content} of this size") from error
     except Exception as error:
-        reason = _one_line(error)
+        reason = " ".join(str(error).split())[:MAX_REASON_CHARS] or type(error).__name__
         if not isinstance(error, ValueError) or isinstance(error, UnicodeError):
             reason = f"not readable as {content} ({type(error).__name__}: {reason}); is it damaged, or another format?"
         raise BadFileError(f"{path}: {reason}") from error
@@ -119,10 +119,6 @@ def check_regular(path: Path, content: str) -> None:
         raise ValueError(f"a pipe, a socket or a device; {content} has to be a regular file")
     if status.st_size == 0:
         raise ValueError(f"an empty file (0 bytes); {content} is needed")
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:MAX_REASON_CHARS] or type(error).__name__
 
 
 class TooLargeError(ValueError):

@@ -54,14 +54,7 @@ def _is_some(value: object) -> bool:
 
 
 def small_html(sentences: Iterable[str], figure: "Figure | None" = None) -> str:
-    """What a notebook shows of a result: sentences, and a picture below them.
-
-    Args:
-        sentences: Words, the first of which is a heading; names in them may hold anything.
-        figure: A figure of its own, outside pyplot.
-
-    Returns:
-        HTML that asks for no other file.
+    """What a notebook shows of a result, and no other file: sentences, the first as a heading, a picture below them.
 
     Example:
         >>> small_html(["<b>", "seen"])
@@ -78,27 +71,12 @@ def small_html(sentences: Iterable[str], figure: "Figure | None" = None) -> str:
 
 
 def data_set(maps: Mapping[str, "NDArray[Any]"], axes: Mapping[str, "NDArray[Any] | list[str]"]) -> "xarray.Dataset":
-    """Maps over the same axes as a labelled data set.
-
-    Args:
-        maps: By name, arrays over all axes.
-        axes: Name of each axis, the outermost first -> where its entries are.
-
-    Raises:
-        ModuleNotFoundError: xarray is not there.
-    """
+    """Maps, by name, over the same axes, the outermost first, as a data set; ModuleNotFoundError without xarray."""
     return _extra("xarray").Dataset({name: (list(axes), values) for name, values in maps.items()}, coords=dict(axes))
 
 
 def data_frame(rows: Iterable[Mapping[str, object] | Any]) -> "pandas.DataFrame":
-    """Rows as a frame of data.
-
-    Args:
-        rows: Mappings, all with the same keys, or named tuples.
-
-    Raises:
-        ModuleNotFoundError: pandas is not there.
-    """
+    """Rows, mappings with the same keys or named tuples, as a frame of data; ModuleNotFoundError without pandas."""
     return _extra("pandas").DataFrame([row if isinstance(row, Mapping) else row._asdict() for row in rows])
 
 

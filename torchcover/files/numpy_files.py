@@ -32,6 +32,12 @@ class NpyHeader(NamedTuple):
     dtype: np.dtype[Any]
 
 
+def check_kind(kinds: str, header: NpyHeader) -> None:
+    """Raise unless an array is of one of these kinds, by their letters in `numpy.dtype.kind`."""
+    if header.dtype.kind not in kinds:
+        raise ValueError(f"an array of {header.dtype}")
+
+
 def read_npy(path: Path, check: Callable[[NpyHeader], None]) -> NDArray[Any]:
     """Read a `.npy`.
 

@@ -43,14 +43,10 @@ def write_durably(path: Path, write: Callable[[Path], object]) -> None:
     """Write a file aside, see it onto the disk, and put it in the place of the one that is there.
 
     Whatever happens meanwhile, `path` is what it was before, or all of what it is to be. A process that is killed
-    leaves the file aside, which the next one writes over.
+    leaves the file aside, which the next one writes over. No other process may be writing it.
 
-    Args:
-        path: The file, in a folder that is made if it does not exist; no other process may be writing it.
-        write: Writes it to the path that it is given.
-
-    Raises:
-        OSError: It cannot be written, for want of room for example; the file aside is taken away.
+    `write` writes it to the path that it is given. OSError: it cannot be written, for want of room for example; the
+    file aside is taken away.
 
     Example:
         >>> import tempfile

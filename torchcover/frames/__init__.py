@@ -1,7 +1,4 @@
-"""What the metrics are fed with: frames, batches of them, their augmentation, and what a source of them is.
-
-The public names are imported when first used.
-"""
+"""What the metrics are fed with: frames, batches of them, their augmentation, and what a source of them is."""
 
 import lazy_loader
 

@@ -56,11 +56,9 @@ class TouchedSums:
 
 
 def added_up(rows: Tensor, maxima: int = 0) -> Tensor:
-    """One row for each key, in their order.
+    """One row for each key, in their order, of (N, 1 + C) float64 keys and what is added up in the order of the rows.
 
-    Args:
-        rows: (N, 1 + C) float64 keys, then what is added up in the order of the rows.
-        maxima: How many of the last columns keep the largest instead.
+    So many of the last columns as `maxima` says keep the largest instead.
 
     Example:
         >>> added_up(torch.tensor([[7.0, 1.0, 3.0], [2.0, 5.0, 4.0], [7.0, 2.0, 9.0]]).double(), maxima=1).tolist()

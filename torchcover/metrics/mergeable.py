@@ -70,13 +70,11 @@ class MergeableMetric(Metric):
         super().__init__(**kwargs)
         self.meaning = dict(meaning)
         self._tables: dict[str, Reduction] = {}
-        self.add_state("fingerprint", self._fingerprint(), dist_reduce_fx="max", persistent=True)
+        # (32,) int64 numbers in [0, 256), equal for two metrics exactly if their sums mean the same.
+        words = repr((type(self).__name__, sorted(self.meaning.items())))
+        fingerprint = torch.tensor(list(hashlib.sha256(words.encode()).digest()))
+        self.add_state("fingerprint", fingerprint, dist_reduce_fx="max", persistent=True)
         self.add_sum("steps", (), torch.int64)
-
-    def _fingerprint(self) -> Tensor:
-        """(32,) int64 numbers in [0, 256), equal for two metrics exactly if their sums mean the same."""
-        meaning = repr((type(self).__name__, sorted(self.meaning.items())))
-        return torch.tensor(list(hashlib.sha256(meaning.encode()).digest()))
 
     @torch.inference_mode(False)  # here and below: a tensor made under it could not be added to outside of it
     def add_state(self, name: str, default: Tensor | list[Any], *args: Any, **kwargs: Any) -> None:  # noqa: ANN401

@@ -126,7 +126,10 @@ def _nearest(query: Tensor, points: Tensor, max_distance: float, backend: str, m
             # Autocast is for networks: no coordinate may be rounded to bfloat16.
             with torch.no_grad(), torch.autocast(query.device.type, enabled=False):
                 scaled, among, bound = _rescale(query, points, max_distance)
-                index = search(scaled, among, _reach(bound, scaled.dtype), memory_mb)
+                # A little more than the bound, for a search compares squares in its own type, and `_distance_to` the
+                # differences; not so little that its square vanishes: 0 still finds a point at distance 0.
+                reach = max(bound * (1 + 1e-5), 2 * math.sqrt(torch.finfo(scaled.dtype).tiny))
+                index = search(scaled, among, reach, memory_mb)
         return _distance_to(query, points, index, max_distance)
 
     return _in_parts_that_fit(found, query, points, memory_mb)
@@ -179,14 +182,6 @@ def _rescale(query: Tensor, points: Tensor, max_distance: float) -> tuple[Tensor
     return query.detach() * half * rest, points.detach() * half * rest, max_distance * half * rest
 
 
-def _reach(max_distance: float, dtype: torch.dtype) -> float:
-    """A little more than the bound: a search compares squares in its own type, and `_distance_to` the differences.
-
-    Its square does not vanish: a bound of 0 still finds a point at distance 0.
-    """
-    return max(max_distance * (1 + 1e-5), 2 * math.sqrt(torch.finfo(dtype).tiny))
-
-
 def _distance_to(query: Tensor, points: Tensor, index: Tensor, max_distance: float) -> Nearest:
     """Measure from the differences, in float64; mask what is out of reach."""
     if len(points) == 0:
@@ -220,12 +215,7 @@ def _scaled_norm(difference: Tensor) -> Tensor:
 
 
 def check_tensor(given: object, name: str, *, floating: bool = False) -> None:
-    """Raise unless what arrived is a tensor.
-
-    Args:
-        given: What arrived.
-        name: What the caller calls it, for the message.
-        floating: Whether it has to be of a floating-point type.
+    """Raise unless what arrived, which the caller calls so, is a tensor, of a floating-point type if it has to be.
 
     Raises:
         TypeError: It is none; of an array of NumPy's the message says how it becomes one.
@@ -260,10 +250,6 @@ def check_weights(weights: Tensor | None, points: int, name: str) -> None:
 
 def check_cloud(cloud: Tensor, name: str) -> None:
     """Raise unless `cloud` is a floating-point tensor of shape (N, 3) with finite coordinates.
-
-    Args:
-        cloud: What arrived.
-        name: What the caller calls it, for the message.
 
     Raises:
         TypeError: Not a tensor of a floating-point type.

@@ -1,9 +1,8 @@
 """Search on a GPU, or on the CPU from the same source: each query walks a tree of boxes, compiled by Warp.
 
 The walk keeps no stack. Of two children it takes the nearer one and notes in a bit whether the other may matter; a node
-and the bits of its ancestors say where to go on. The squared distance to a box is never above that to a point in it,
-because rounding keeps order, so nothing nearer is passed over. Of several points at the same squared distance, in the
-type of the clouds, the one with the smallest index is named: the result is the same for any order and division.
+and the bits of its ancestors say where to go on. Nothing nearer is passed over, and of several points at the same
+squared distance, here in the type of the clouds, the one with the smallest index is named, as in `packets`.
 """
 
 # The types of Warp's functions are Warp's own.

@@ -11,8 +11,8 @@ from torchcover.placement.optimisers import Cube, MakesOptimiser, Optimiser
 from torchcover.placement.pareto import chebyshev, non_dominated
 from torchcover.placement.racing import Prefix, gains
 
-# Of an objective's value at the start, for each such share that a number which must not be worse has lost: so much more
-# than could be gained by it that an optimiser turns away, and no more than it can learn from.
+# Of an objective's value at the start, of 1 if that is 0, for each such share that a number which must not be worse has
+# lost: so much more than could be gained by it that an optimiser turns away, and no more than it can learn from.
 PENALTY = 3.0
 # What rounding makes of a difference.
 ROUNDING = 1e-9
@@ -27,20 +27,15 @@ class Arm:
     """
 
     def __init__(
-        self,
-        name: str,
-        makes: MakesOptimiser,
-        cube: Cube,
-        seed: int,
-        start: Evaluation,
-        objectives: int,
+        self, name: str, makes: MakesOptimiser, cube: Cube, seed: int, start: Evaluation, objectives: int,
         floors: Float64,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.name, self._objectives, self._floors = name, objectives, floors
         self._lower = [quantity.lower_is_better for quantity in start.prefixes[-1].estimate.quantities]
         self._makes, self._cube, self._seed = makes, cube, seed
         self._optimiser: Optimiser = makes(cube, seed)
-        self._scale = np.abs(start.prefixes[-1].estimate.value.numpy()).clip(ROUNDING)
+        scale = np.abs(start.prefixes[-1].estimate.value.numpy())
+        self._scale = np.where(scale > ROUNDING, scale, 1.0)
         nothing = np.zeros(objectives)
         self._gains, self._lefts, self._lacks = [nothing], [nothing], [self._lacking(start)]
         self.evaluations: list[Evaluation] = [start]

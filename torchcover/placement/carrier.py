@@ -71,20 +71,7 @@ class Carrier(NamedTuple):
 
 
 class VehicleSpace(Readable):
-    """What a search and a choice have in common: the worlds, the vehicle in them, and what a good rig is.
-
-    Args:
-        name: What files and pages call it.
-        description: What it is.
-        scenario: One or several, by name or file: they count alike.
-        vehicle: What carries the sensors, by name or file; if not given, that of the rig that the space begins with, or
-            the scenario's own.
-        objectives: One to three, by name. One is made as large as it gets; of several, what one gains is weighed
-            against what the others lose.
-        not_worse: What must not be worse than with the rig that is there today: names of usual regions, of which
-            detection within 0.4 m in both bands counts, or objectives.
-        requirements: What must be kept, by name or file, as of `torchcover check`.
-    """
+    """What a search and a choice have in common: the worlds, the vehicle in them, and what a good rig is."""
 
     name: str
     description: str = ""

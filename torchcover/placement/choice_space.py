@@ -153,6 +153,7 @@ class ChoiceSpace(VehicleSpace):
         objectives: One to three detections, by name. One is made as large as it gets; of several there is the best of
             each, and one between.
         not_worse: Detections of which `now` has no more: names of usual regions, or objectives.
+        requirements: What must be kept of regions, by name or file, as of `torchcover check`.
 
     Raises:
         ValueError: Nothing in it can be chosen, for a reason that the message tells.

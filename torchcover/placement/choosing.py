@@ -257,12 +257,8 @@ def choose(
     scored = instants.estimates(rig)[instants.estimate].numbers()
     model = rig.sensing(instants.sensor_model).sensor_model
     choice = tuple(found), scored, tuple(drawn), now
-    return _tested(
-        SensorChoice(space, instants.estimate, model, sensors, refused, candidates, limits, *choice),
-        instants,
-        test_seed,
-        fresh_worlds,
-    )
+    chosen = SensorChoice(space, instants.estimate, model, sensors, refused, candidates, limits, *choice)
+    return _tested(chosen, instants, test_seed, fresh_worlds)
 
 
 def seen_by(rig: Rig, instants: CommonInstants) -> tuple[Bools, float]:

@@ -82,9 +82,8 @@ class HeldWorlds(Dataset[Frame | MeasuredFrame]):
         instant = self._instants[number]
         if number not in self._held:
             built, within_m = self._built(instant, number), self._questions.within_m
-            points = (
-                built.reference.numpy().copy()
-            )  # the memory of a tensor that travels to another process is given up
+            # The memory of a tensor that travels to another process is given up.
+            points = built.reference.numpy().copy()
             self._held[number] = built, None if within_m is None else Balls.around(points, within_m)
         held, within = self._held[number]
         if rig is None:
@@ -194,19 +193,9 @@ class CommonInstants:
         self._vehicles: set[str | None] = {None}  # that were found to be that of these worlds
         self._worlds = [with_ego(one, {}, vehicle) for one in self.scenarios]
         self.questions = Questions.around(Carrier.of(self._worlds).outline_m, objectives)
-        simulations = [
-            SimulatedFrames(
-                one,
-                rigs={},
-                steps=MANY,
-                seed=seed,
-                every_s=every_s,
-                reference_sensor=self.questions.reference_sensor(rays),
-                boxes=self.questions.boxes,
-                kept_bytes=float("inf"),
-            )
-            for one in self._worlds
-        ]
+        shown: dict[str, Any] = {"steps": MANY, "seed": seed, "every_s": every_s, "kept_bytes": float("inf")}
+        shown |= {"reference_sensor": self.questions.reference_sensor(rays), "boxes": self.questions.boxes}
+        simulations = [SimulatedFrames(one, rigs={}, **shown) for one in self._worlds]
         self.instants = _instants_of([one.simulator for one in simulations], worlds, per_world)
         self.order = racing_order([instant.world for instant in self.instants], seed)
         self._batches: list[list[AskedInstant]] = []
@@ -281,7 +270,9 @@ class CommonInstants:
 
     def _numbers(self, rig: Rig, measures: Sequence[Measure]) -> RigNumbers:
         ego = self._worlds[0].ego_mesh() if self.questions.metrics else None
-        return self.questions.numbers_of(rig, ego, measures)
+        required = {name: one for name, one in self.objectives.items() if one.requires}
+        kept = {name: one.share_kept(rig, self._worlds[0], self.sensor_model) for name, one in required.items()}
+        return replace(self.questions.numbers_of(rig, ego, measures), kept=kept)
 
     def _measured(self, rig: Rig, numbers: Sequence[int], observed: RigNumbers) -> Iterator[MeasuredFrame]:
         """What is left of a rig's frames at some instants, in their order, each once it is added."""

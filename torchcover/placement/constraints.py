@@ -91,10 +91,7 @@ def price_eur(cost: Mapping[str, float], sensor: str, model: str | None) -> floa
 
 
 def check_prices(
-    cost: Mapping[str, float],
-    max_cost_eur: float | None,
-    sensors: Sequence[Sensor],
-    free: Mapping[str, FreeSensor],
+    cost: Mapping[str, float], max_cost_eur: float | None, sensors: Sequence[Sensor], free: Mapping[str, FreeSensor]
 ) -> None:
     """ValueError: a price is missing, is one of nothing, or the limit, if there is one, is below the cheapest rig."""
     if not cost:

@@ -201,9 +201,8 @@ def numbers_of(pose: Pose) -> dict[str, float]:
 
 def pose_of(x_m: float, y_m: float, z_m: float, yaw_deg: float, pitch_deg: float, roll_deg: float) -> Pose:
     """A pose of which a file keeps every digit."""
-    x, y, z, yaw, pitch, roll = (
-        round(number, DECIMALS) + 0.0 for number in (x_m, y_m, z_m, yaw_deg, pitch_deg, roll_deg)
-    )
+    given = x_m, y_m, z_m, yaw_deg, pitch_deg, roll_deg
+    x, y, z, yaw, pitch, roll = (round(number, DECIMALS) + 0.0 for number in given)
     return Pose(x_m=x, y_m=y, z_m=z, yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll)
 
 

@@ -11,6 +11,7 @@ import torch
 from torchcover.coverage.grid import PAPER_HEIGHTS
 from torchcover.coverage.quantity import detection
 from torchcover.estimation import Difference, Estimate, Quantity
+from torchcover.estimation.jackknife import ROUND_OFF
 from torchcover.evaluation.target_survey import free_space
 from torchcover.placement.carrier import NOT_WORSE
 from torchcover.placement.common_instants import CommonInstants
@@ -165,10 +166,12 @@ def fresh_test(
             FreshGain(objective, own[objective] or estimate, test, in_search[objective].gain)
             for estimate in sorted(start_by_search, key=lambda one: one != searched.estimate)
             for in_search in [by_search[estimate].differences(start_by_search[estimate])]
-            for objective, test in by_test[name][estimate].differences(start_by_test[estimate]).items()
+            for objective, test in _differences(
+                by_test[name][estimate], start_by_test[estimate], searched.objectives
+            ).items()
             if objective in own and (estimate == searched.estimate or not own[objective])
         )
-    found = by_test[first][searched.estimate].differences(start_by_test[searched.estimate])
+    found = _differences(by_test[first][searched.estimate], start_by_test[searched.estimate], searched.objectives)
     tests = {name: test for name, test in found.items() if name in others or name.startswith(NOT_WORSE)}
     tests |= _of_targets(winners[first], start, searched)
     shares: dict[str, dict[str, float]] = {name: {} for name in tests}
@@ -182,6 +185,17 @@ def fresh_test(
     ]
     changes.sort(key=lambda one: (not one.is_worse, math.isnan(one.p), one.p, one.test.gain))
     return FreshTest(gains, tuple(changes))
+
+
+def _differences(one: Estimate, other: Estimate, asked: Mapping[str, Objective]) -> dict[str, Difference]:
+    """Of two rigs. What is required is looked at once and not in worlds, so that chance has no part in it."""
+    found = one.differences(other)
+    for name in (name for name, each in asked.items() if each.requires):
+        value = found[name].value
+        differs = abs(value) > ROUND_OFF
+        p = 0.0 if differs else 1.0
+        found[name] = found[name]._replace(error=0.0, low=value, high=value, significant=differs, p=p)
+    return found
 
 
 def holm(p: Sequence[float]) -> list[float]:
@@ -266,7 +280,8 @@ def told(gain: FreshGain, *, optimism: bool = False) -> str:
     if math.isnan(test.value):
         return "unknown in the fresh worlds"
     t = "t unknown" if math.isnan(gain.t) else f"t {gain.t:.1f}"
-    rest = f"{gain.words} {unit_words(unit)} on {test.blocks} fresh worlds ({t}, better in {test.better})"
+    where = f"on {test.blocks} fresh worlds ({t}, better in {test.better})"
+    rest = f"{gain.words} {unit_words(unit)} {'in any world' if test.low == test.high else where}"
     if optimism and not math.isnan(gain.optimism):
         rest += f", optimism {amount(gain.optimism, unit)}"
     if test.significant:

@@ -1,18 +1,24 @@
 """A number of a result that a search makes better, as a space writes it."""
 
+import math
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from functools import cache
-from typing import Annotated, Self
+from typing import Annotated, Any, Literal, Self
 
+import torch
 from pydantic import Field, NonNegativeFloat, model_validator
 
 from torchcover.coverage import Region
 from torchcover.coverage.grid import PAPER_HEIGHTS
+from torchcover.estimation import Estimate, Quantity
+from torchcover.evaluation.checking import check
+from torchcover.evaluation.requirements import AnyRequirement, RegionRequirement, Requirements, Verdict
+from torchcover.evaluation.target_survey import free_space
 from torchcover.published import PUBLISHED, Setup
-from torchcover.simulation import Document, Rig
+from torchcover.simulation import Document, Rig, Scenario
 from torchcover.simulation.regions_of_interest import RegionOfInterest
 
 Name = Annotated[str, Field(min_length=1)]
@@ -31,6 +37,17 @@ def published_numbers() -> tuple[str, ...]:
     return tuple(one.key for name, each in numbers.items() for one in each if one.key.startswith(name))
 
 
+def looked_for(
+    rig: Rig, asked: Requirements, world: Scenario, sensor_model: Literal["ideal", "real"] | None
+) -> Sequence[Verdict]:
+    """Whether a rig on a world's ego keeps what bodies and encounters require, in free space or where that says."""
+    ego: Any = world.ego
+    where = asked.scenario or free_space().model_copy(update={"ego": ego})
+    vehicle = getattr(ego.shape, "vehicle", None)
+    (found,) = check(rig, asked, where, vehicle=vehicle, sensor_model=sensor_model).verdicts.values()
+    return found
+
+
 class Objective(Document):
     """A number of a rig that is made better: a mean over some regions and height bands, each weighing the same.
 
@@ -45,6 +62,9 @@ class Objective(Document):
         region: Name of a region, or several, as tables of `torchcover.evaluate` call them: "20m", "80m", "160m" ahead,
             "front_3m", "rear_3m", "left_3m", "right_3m" around the vehicle; or regions of one's own by name, written as
             those in a YAML file of `RegionsOfInterest`. Not of published metrics, whose names say what they are about.
+        requires: Instead of all these one number that is required of a body at places, written out, or in encounters,
+            as in `Requirements`: made better is the share of the places, or encounters, that keep it. It is measured
+            there, the same in all worlds; what is not checked is not kept.
 
     Example:
         >>> far = Objective(detection=0.4, band=["ground", "obstacle"], region="80m")
@@ -52,6 +72,8 @@ class Objective(Document):
         ('detection_0.4m', (('80m', 'ground'), ('80m', 'obstacle')))
         >>> Objective(number="radius_m", region={"behind": {"x_m": [-10.0, -3.0], "y_m": [-2.0, 2.0]}}).places[0][0]
         'behind'
+        >>> Objective(requires={"target": "child", "at": {"within_m": 3.0, "sides": ["front"]}, "points": 5}).words
+        "child_110cm, within_m 3.0 sides ['front'], points >= 5"
     """
 
     number: Name | None = None
@@ -63,9 +85,12 @@ class Objective(Document):
         | Annotated[dict[Name, RegionOfInterest], Field(min_length=1)]
         | None
     ) = None
+    requires: AnyRequirement | None = None
 
     @model_validator(mode="after")
     def _check_one_of(self) -> Self:
+        if self.requires is not None:
+            return self._check_requires()
         if self.number is not None and self.detection is not None:
             raise ValueError(f"number, detection: one of the two is possible; got {self.number!r} and a threshold")
         if self.region is None and self.metric is None:
@@ -78,9 +103,30 @@ class Objective(Document):
             raise ValueError(f"band: {self.number!r} has none")
         return self
 
+    def _check_requires(self) -> Self:
+        one = self.requires
+        if others := sorted(self.model_fields_set - {"requires"}):
+            raise ValueError(f"requires: it makes an objective alone; leave out {', '.join(others)}")
+        if isinstance(one, RegionRequirement):
+            raise ValueError("requires: of a region give its number, band and region instead")
+        if one is not None and len(one.bounds) > 1:
+            raise ValueError(f"requires: one number is needed; got {', '.join(each.words for each in one.bounds)}")
+        if isinstance(at := getattr(one, "at", None), str):
+            raise ValueError(f"requires.at: write the place out, as in within_m: 3; got the name {at!r}")
+        return self
+
+    def share_kept(self, rig: Rig, world: Scenario, sensor_model: Literal["ideal", "real"] | None) -> Estimate:
+        """Of what `requires` asks about, in no blocks; NaN if it is nowhere, as no body has room."""
+        (one,) = looked_for(rig, Requirements.model_validate({"requirements": [self.requires]}), world, sensor_model)
+        share = (one.count - one.failed - one.unknown) / one.count if one.count else math.nan
+        quantity = Quantity(self.key, self.words, "share", lower_is_better=False)
+        return Estimate.of([quantity], torch.tensor([share], dtype=torch.float64))
+
     @property
     def key(self) -> str:
         """Of its number."""
+        if self.requires is not None:
+            return "requires"
         return self.number or f"detection_{THRESHOLD_M if self.detection is None else self.detection:g}m"
 
     @property
@@ -91,6 +137,8 @@ class Objective(Document):
             >>> Objective(region="80m").words, Objective(number="radius_m", region="20m", band="ground").words
             ('80m', 'radius_m, 20m, ground')
         """
+        if self.requires is not None:
+            return f"{self.requires.words}, {self.requires.bounds[0].words}"
         plain = self.key == f"detection_{THRESHOLD_M:g}m"
         bands = (self.band,) if isinstance(self.band, str) else self.band or ()
         regions = (self.region,) if isinstance(self.region, str) else self.region or ()
@@ -115,8 +163,8 @@ class Objective(Document):
         """What its number is a mean over where that is no choice.
 
         Returns:
-            "known" of a number over known cells, "-" of a published metric or an aggregation; else empty: "area" or
-            "known", as a search is asked.
+            "known" of a number over known cells, "-" of a published metric, an aggregation or what is required; else
+            empty: "area" or "known", as a search is asked.
 
         Example:
             >>> [Objective(number=key, region="20m").own_estimate for key in ("known_radius_m", "radius_maximum_m")]
@@ -128,7 +176,7 @@ class Objective(Document):
 
     @property
     def places(self) -> tuple[tuple[str, str], ...]:
-        """The regions and bands that it is the mean over; none of a published metric."""
+        """The regions and bands that it is the mean over; none of a published metric, nor of what is required."""
         bands = (self.band,) if isinstance(self.band, str) else tuple(PAPER_HEIGHTS) if self.band is None else self.band
         regions = (self.region,) if isinstance(self.region, str) else tuple(self.region or ())
         return tuple((region, band) for region in regions for band in bands)
@@ -140,22 +188,15 @@ class Objective(Document):
             usual: Those that have names of their own.
 
         Raises:
-            ValueError: One is called by a name that none of these has.
+            ValueError: One is called by a name that none of these has; a band is none of the paper's, or there is none.
         """
+        if unknown := [band for _, band in self.places if band not in PAPER_HEIGHTS]:
+            raise ValueError(f"band {unknown[0]!r}: {' or '.join(map(repr, PAPER_HEIGHTS))} is needed")
+        if not self.places and self.metric is None:
+            raise ValueError("band: at least one is needed")
         if isinstance(self.region, dict):
             return tuple(region.called(name) for name, region in self.region.items())
         names = dict.fromkeys(region for region, _ in self.places)
         if unknown := [name for name in names if name not in usual]:
             raise ValueError(f"region {unknown[0]!r}: one of {', '.join(usual)} is needed, or {{name: {{x_m, y_m}}}}")
         return tuple(usual[name] for name in names)
-
-    def check_bands(self) -> None:
-        """Refuse a band that there is none of.
-
-        Raises:
-            ValueError: It is none of the paper's, or there is none at all.
-        """
-        if unknown := [band for _, band in self.places if band not in PAPER_HEIGHTS]:
-            raise ValueError(f"band {unknown[0]!r}: {' or '.join(map(repr, PAPER_HEIGHTS))} is needed")
-        if not self.places and self.metric is None:
-            raise ValueError("band: at least one is needed")

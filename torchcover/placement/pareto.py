@@ -33,14 +33,8 @@ def hypervolume(values: Float64, reference: Float64) -> float:
         return float((above - reference).max())
     above = above[np.argsort(-above[:, -1], kind="stable")]
     heights = np.append(above[:, -1], reference[-1])
-    slices = heights[:-1] - heights[1:]
-    return float(
-        sum(
-            height * hypervolume(above[: count + 1, :-1], reference[:-1])
-            for count, height in enumerate(slices)
-            if height > 0
-        )
-    )
+    slices = enumerate((heights[:-1] - heights[1:]).tolist(), start=1)
+    return float(sum(each * hypervolume(above[:some, :-1], reference[:-1]) for some, each in slices if each > 0))
 
 
 def chebyshev(values: Float64, weights: Float64) -> Float64:

@@ -23,18 +23,9 @@ MakesInstants = Callable[[SearchSpace, "SearchPlan", int, int], CommonInstants]
 
 def common_instants(space: SearchSpace | ChoiceSpace, plan: "SearchPlan", seed: int, worlds: int) -> CommonInstants:
     """Instants of the worlds of a seed."""
-    return CommonInstants(
-        space.scenarios,
-        space.asked,
-        worlds=worlds,
-        per_world=plan.per_world,
-        every_s=plan.every_s,
-        seed=seed,
-        rays=plan.rays,
-        estimate=plan.estimate,
-        sensor_model=plan.sensor_model,
-        workers=plan.workers,
-    )
+    of_plan = ("per_world", "every_s", "rays", "estimate", "sensor_model", "workers")
+    settings: dict[str, Any] = {name: getattr(plan, name) for name in of_plan}
+    return CommonInstants(space.scenarios, space.asked, worlds=worlds, seed=seed, **settings)
 
 
 @dataclass(frozen=True)
@@ -119,11 +110,7 @@ class SearchPlan:
             "estimate": self.estimate,
             "sensor_model": space.start.sensing(self.sensor_model).sensor_model,
             "band_frame": DEFAULT_BAND_FRAME,
-            "seed": self.seed,
-            "worlds": self.worlds,
-            "per_world": self.per_world,
-            "every_s": self.every_s,
-            "rays": self.rays,
+            **{name: getattr(self, name) for name in ("seed", "worlds", "per_world", "every_s", "rays")},
         }
 
 

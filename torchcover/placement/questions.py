@@ -4,7 +4,7 @@ import math
 import re
 import warnings
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from typing import Any, NamedTuple, Self
 
@@ -30,12 +30,15 @@ CELL_M = 0.5
 # What stands in a key for the sensor without which the number is worst.
 ANY = "any"
 SEEN_WITHIN = re.compile(r"(?:detection|sensors|seen_by_two)_(\d+(?:\.\d+)?)m")
+# What is asked where nothing else is, for the steps.
+FOR_STEPS = {"": Objective(region="20m", band="ground")}
 FAILURE = re.compile(r"(.+)_without_(.+)")
 
 
 class Questions(NamedTuple):
-    """What objectives ask around one vehicle, by name, and all regions that are asked about.
+    """What objectives ask of frames around one vehicle, by name, and all regions that are asked about.
 
+    What is required of bodies and in encounters is not among them; `names` are those of all, in order.
     The `grid` has cells of 0.5 m around these, or is that of `evaluate` where a published metric is asked for. Radii
     saturate at `max_radius_m`: as in `evaluate`, or at the largest threshold if no radius is asked for.
     """
@@ -45,6 +48,7 @@ class Questions(NamedTuple):
     grid: BevGrid
     max_radius_m: float
     thresholds_m: tuple[float, ...]
+    names: tuple[str, ...]
 
     @classmethod
     def around(cls, ego_outline_m: Float64, objectives: Mapping[str, Objective]) -> Self:
@@ -53,13 +57,13 @@ class Questions(NamedTuple):
         ValueError: a region or a band that is none; two regions of one name; one that holds no cell centre.
         """
         usual = {region.name: region for region in RegionsOfInterest().around(ego_outline_m).regions}
-        regions: dict[str, Region] = {}
+        regions, names = dict[str, Region](), tuple(objectives)
+        objectives = {name: one for name, one in objectives.items() if not one.requires} or FOR_STEPS
         for name, objective in objectives.items():
             try:
                 for region in objective.regions(usual):
                     if regions.setdefault(region.name, region) != region:
                         raise ValueError(f"region {region.name!r}: another objective calls another region so")
-                objective.check_bands()
             except ValueError as error:
                 raise ValueError(f"objective {name!r}: {error}") from error
         published = any(objective.metric for objective in objectives.values())
@@ -72,9 +76,8 @@ class Questions(NamedTuple):
         thresholds = sorted({float(each) for key in keys for each in SEEN_WITHIN.findall(key)})
         within = all(SEEN_WITHIN.match(key) for key in keys) and max(thresholds) > 0
         max_radius_m = max(thresholds) if within else grid.diagonal_m
-        return cls(
-            objectives, regions, grid if published else _around(grid, regions.values()), max_radius_m, tuple(thresholds)
-        )
+        grid = grid if published else _around(grid, regions.values())
+        return cls(objectives, regions, grid, max_radius_m, tuple(thresholds), names)
 
     @property
     def metrics(self) -> tuple[str, ...]:
@@ -146,16 +149,10 @@ class Questions(NamedTuple):
     def numbers_of(self, rig: Rig, ego: Mesh | None = None, measures: Sequence[Measure] = ("area",)) -> "RigNumbers":
         """What observes a rig on its ego, fed with nothing yet, for numbers by these measures."""
         setup = Setup(
-            rig=rig.name,
-            sensors=rig.sensors,
-            ego=ego,
-            grid=self.grid,
-            regions=tuple(self.regions.values()),
-            square_metres=True,
-            threshold_m=max(self.thresholds_m, default=THRESHOLD_M),
-            sights=Sights(),
+            rig=rig.name, sensors=rig.sensors, ego=ego, grid=self.grid, regions=tuple(self.regions.values()),
+            threshold_m=max(self.thresholds_m, default=THRESHOLD_M), square_metres=True, sights=Sights(),
             sync_on_compute=False,
-        )
+        )  # fmt: skip
         others = {name: PUBLISHED[name].make(setup) for name in self.metrics}
         return RigNumbers(self, rig, self.coverage_of(rig, measures), others)
 
@@ -170,16 +167,10 @@ class Questions(NamedTuple):
                 observers[measure] = observers["area"]
                 continue
             coverage = CoverageMetric(
-                self.grid,
-                self.thresholds_m,
-                max_radius=self.max_radius_m,
-                blocks=BLOCKS,
-                aggregations=self.aggregations,
-                regions=regions,
-                sensors=_names(rig) if failures else (),
-                square_metres=measure == "area",
-                sync_on_compute=False,
-            )
+                self.grid, self.thresholds_m, max_radius=self.max_radius_m, blocks=BLOCKS, regions=regions,
+                aggregations=self.aggregations, sensors=_names(rig) if failures else (),
+                square_metres=measure == "area", sync_on_compute=False,
+            )  # fmt: skip
             observers[measure] = CoverageObserver(coverage, rig.name)
         return observers
 
@@ -189,13 +180,14 @@ class RigNumbers:
     """What observes a rig for its objectives: those who observe it in `evaluate`.
 
     `coverage` is by what its numbers are means over; one for both where that knows both. `others` are published
-    metrics.
+    metrics, `kept` what it keeps of what is required, which is so in every block.
     """
 
     questions: Questions
     rig: Rig
     coverage: Mapping[Measure, CoverageObserver]
     others: Mapping[str, FrameMetric]
+    kept: Mapping[str, Estimate] = field(default_factory=dict)
 
     def add(self, seen: MeasuredFrame) -> None:
         """Add what is left of a frame where it was made and measured: its sums by measure."""
@@ -210,12 +202,14 @@ class RigNumbers:
         answers = self._answers(measure)
         steps = max((one.steps for each in answers.values() for one in each), key=len)
         quantities, values, left_out = [], [], []
-        for name, each in answers.items():
+        for name in self.questions.names:
+            each = answers.get(name) or [self.kept[name]]
             quantities.append(each[0].quantities[0]._replace(key=name))
             values.append(torch.cat([one.value for one in each]).mean())
             whole = all(len(one.left_out) == len(steps) for one in each)
             unknown = torch.full((len(steps),), math.nan, dtype=torch.float64)
-            left_out.append(torch.cat([one.left_out for one in each], dim=1).mean(dim=1) if whole else unknown)
+            known = torch.cat([one.left_out for one in each], dim=1).mean(dim=1) if whole else unknown
+            left_out.append(values[-1].expand(len(steps)) if name in self.kept else known)
         return Estimate(tuple(quantities), torch.stack(values), torch.stack(left_out, dim=1), steps)
 
     def _answers(self, measure: Measure) -> dict[str, list[Estimate]]:

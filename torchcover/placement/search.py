@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from torchcover.evaluation.checking import check
-from torchcover.evaluation.target_survey import free_space
 from torchcover.geometry.arrays import Float64
 from torchcover.placement.arm import Arm
 from torchcover.placement.common_instants import CommonInstants
 from torchcover.placement.evaluation import OPTIMISER, RANDOM, START, Evaluation
+from torchcover.placement.objective import looked_for
 from torchcover.placement.optimisers import Cube, RandomSearch
 from torchcover.placement.optimisers.optimiser import Unit
 from torchcover.placement.plan import SearchPlan, levels_of
@@ -177,9 +176,7 @@ class PlacementSearch:
         lacks, required = dict[str, float](), self.space.to_check
         if required is None:
             return lacks
-        world = required.scenario or free_space().model_copy(update={"ego": self.space.scenarios[0].ego})
-        (found,) = check(rig, required, world, sensor_model=self.plan.sensor_model).verdicts.values()
-        for one in found:
+        for one in looked_for(rig, required, self.space.scenarios[0], self.plan.sensor_model):
             worst = 1.0 if math.isnan(one.margin) else max(-one.margin / (abs(one.bound.value) or 1.0), 0.0)
             if one.state != "kept":
                 share = (one.failed + one.unknown) / max(one.count, 1)
@@ -232,6 +229,8 @@ class PlacementSearch:
                 why = "one of its regions and bands is never seen; take larger ones, more worlds or more rays"
                 if metric := self.space.asked[name].metric:
                     why = f"what {metric} is about is never there; take another scenario, or more worlds"
+                if self.space.asked[name].requires:
+                    why = "nowhere is room for the body; take another place"
                 raise ValueError(f"objectives.{name}: unknown at all {start.instants} instants: {why}")
         makes = {OPTIMISER: self.plan.makes_optimiser, RANDOM: RandomSearch}
         for name, each in makes.items():

@@ -37,6 +37,7 @@ class SearchSpace(VehicleSpace):
             against what the others lose.
         not_worse: What must not be worse than with `start`: names of usual regions, of which detection within 0.4 m in
             both bands counts, or objectives.
+        requirements: What must be kept, by name or file, as of `torchcover check`.
 
     Raises:
         ValueError: Nothing in it can be searched, for a reason that the message tells.

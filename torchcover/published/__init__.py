@@ -1,7 +1,4 @@
-"""Coverage metrics that others published, on the same frames: `PUBLISHED` has them by name.
-
-The public names are imported when first used.
-"""
+"""Coverage metrics that others published, on the same frames: `PUBLISHED` has them by name."""
 
 import lazy_loader
 

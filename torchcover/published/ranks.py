@@ -135,7 +135,9 @@ def kendall_tau_b(first: ArrayLike, second: ArrayLike) -> Float64:
     the two broadcast. Returns (...); NaN for fewer than three that are known, or if all of one are equal.
     """
     one, other = _known_in_both(first, second)
-    signs = [_signs(each[..., :, None], each[..., None, :]) for each in (one, other)]
+    # No difference: of two that are infinite there is none, and what is unknown is neither more nor less.
+    pairs = [(each[..., :, None], each[..., None, :]) for each in (one, other)]
+    signs = [(first > second).astype(np.float64) - (first < second) for first, second in pairs]
     agreement = (signs[0] * signs[1]).sum(axis=(-2, -1))
     apart = [np.abs(sign).sum(axis=(-2, -1)) for sign in signs]
     return _ratio(agreement, np.sqrt(apart[0] * apart[1]), one)
@@ -197,11 +199,6 @@ def _spearman_of_orders(one: Float64, target: Float64, numbers: Int64) -> Float6
     own, other = (ranks - ranks.mean() for ranks in (midranks(one), midranks(target)))
     spread = np.sqrt((own**2).sum() * (other**2).sum())
     return _ratio(other[numbers] @ own, np.full(len(numbers), spread), np.broadcast_to(one, numbers.shape))
-
-
-def _signs(one: Float64, other: Float64) -> Float64:
-    # No difference: of two that are infinite there is none, and what is unknown is neither more nor less.
-    return (one > other).astype(np.float64) - (one < other)
 
 
 def _known_in_both(first: ArrayLike, second: ArrayLike) -> tuple[Float64, Float64]:

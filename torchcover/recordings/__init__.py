@@ -1,7 +1,4 @@
-"""Recordings: their scans, poses and objects as frames, the layouts that they are read from and written in.
-
-The public names are imported when first used.
-"""
+"""Recordings: their scans, poses and objects as frames, the layouts that they are read from and written in."""
 
 import lazy_loader
 

@@ -6,9 +6,7 @@ from collections.abc import Collection, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.detection import Boxes
 from torchcover.geometry import BoundingBox, invert, transform
-from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.in_vehicle import InVehicle, within
 from torchcover.recordings.movers import COMPARED_S, WITHIN_M, Moved, movers
 from torchcover.recordings.recording import Recording
@@ -107,7 +105,8 @@ class AccumulatedReference:
         votes = sweeps.votes(recording, sensors, index)
         scans = {key: sweeps.thinned(recording, *key) for key in votes if key[1] != index or key[0] not in judged}
         within = set(sweeps.instants(recording, index))
-        boxes, dropped = _by_name(recording.boxes(index)), Counter[str]()
+        labelled, dropped = recording.boxes(index), Counter[str]()
+        boxes = {name: pose_of(labelled, number) for number, name in enumerate(labelled.ids)} if labelled else {}
         used = [key for key in scans if key[1] in within]
         dropped["sweeps"] = sum(not scans[key].dropped["sweeps_skipped"] for key in used)
         if skipped := sweeps.skipped(recording, index):
@@ -253,11 +252,6 @@ class AccumulatedReference:
 
     def _taking_part(self, recording: Recording) -> tuple[str, ...]:
         return tuple(recording.sensors) if self.sensors is None else self.sensors
-
-
-def _by_name(boxes: Boxes | None) -> dict[str, Matrix]:
-    """Name of each object -> vehicle_T_box."""
-    return {} if boxes is None else {name: pose_of(boxes, number) for number, name in enumerate(boxes.ids)}
 
 
 def _beneath_or_in(points_m: NDArray[np.float64], body: BoundingBox | None) -> NDArray[np.intp]:

@@ -16,9 +16,6 @@ more; then, with squares of 1.25 m, all columns there: kerbs stay.
 
 *What is unknown.* Farther than `REACH` from all such squares there is no height, and no band. Of surfaces above each
 other it is the one that is connected with the vehicle's; stairs lead nowhere.
-
-Others: Patchwork++ (Lee et al., 2022) fits planes to the lowest points of sectors of rings around one scan, and accepts
-them by tilt, height and flatness; its patches know nothing of each other, and it gives no heights in between.
 """
 
 from collections.abc import Sequence
@@ -56,12 +53,10 @@ SIDE = int(2 * AROUND_M / NODE_M) + 2 * REACH + 1
 
 
 class GroundModel(NamedTuple):
-    """The ground around a place, made as this module says.
+    """The ground around a place, made as this module says: a `field` of heights from `lower_m` (2,) on.
 
-    Args:
-        lower_m: (2,) where it may begin, in the frame of the points that it was made of.
-        field: The heights, from there.
-        known: (SIDE^2,) squares, row after row along y, in which there is a height; they begin `REACH` before that.
+    In the frame of the points that it was made of. In the `known` (SIDE^2,) squares, row after row along y, there is a
+    height; they begin `REACH` before that.
     """
 
     lower_m: Float64
@@ -115,15 +110,10 @@ class GroundModel(NamedTuple):
 
 
 def low_surfaces(points_m: Float64, place_m: Float64) -> Float64:
-    """What a sweep says about the ground: much less than all of its points.
+    """What a sweep says about the ground: much less than all of its points, (N, 3) of nothing that moves.
 
-    Args:
-        points_m: (N, 3) points that belong to nothing that moves.
-        place_m: (3,) where the vehicle was, in the same frame, whose z points up.
-
-    Returns:
-        (K, 4) places of the low surfaces of columns with the number of their points, and the lowest of what stands or
-        hangs above each, as one point.
+    The vehicle was at `place_m` (3,) in the same frame, whose z points up. Returns (K, 4) places of the low surfaces of
+    columns with the number of their points, and the lowest of what stands or hangs above each, as one point.
     """
     low, above_m = _columns(np.column_stack([points_m, np.ones(len(points_m))]), place_m)
     below = np.isfinite(above_m)

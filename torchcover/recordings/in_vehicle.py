@@ -17,14 +17,10 @@ MAX_COORDINATE_M = 1e5
 
 
 class InVehicle(NamedTuple):
-    """A cloud in the vehicle frame.
+    """A cloud of N points in the vehicle frame: what each counts for, and its height above the local ground, if known.
 
-    Args:
-        points_m: (N, 3) float32.
-        dropped: How many points were left out: `nonfinite`, `no_return`, `own_vehicle`; of an accumulated reference
-            also `gone`, those of objects that are not labelled at the instant.
-        weights: (N,) float32 what each point counts for; None if all count the same.
-        heights_m: (N,) float32 above the local ground, NaN where there is none at or below; None if that is unknown.
+    A height is NaN where there is no ground at or below. `dropped` says how many points were left out: `nonfinite`,
+    `no_return`, `own_vehicle`; of an accumulated reference also `gone`, those of objects that are not labelled then.
     """
 
     points_m: NDArray[np.float32]

@@ -16,14 +16,10 @@ from torchcover.recordings.seen import Seen, by_name
 
 
 class Track(NamedTuple):
-    """A box over time.
+    """A box over time, by its id and by what the recording calls its category; its class is by SUMO's names.
 
-    Args:
-        name: Its id.
-        category: What the recording calls it.
-        vehicle_class: Its class by SUMO's names, such as "passenger" or "pedestrian"; None if it is no road user.
-        size_m: Length, width, height; NaN for a height that was not recorded.
-        trajectory: Of the middle of its bottom; transient, unless it is there all the time.
+    That is "passenger" or "pedestrian" for example, None if it is no road user. Of length, width and height the last is
+    NaN if it was not recorded. The trajectory, of the middle of its bottom, is transient unless it is there always.
     """
 
     name: str
@@ -34,14 +30,9 @@ class Track(NamedTuple):
 
 
 class Ego(NamedTuple):
-    """A recording's own ego.
+    """A recording's own ego: its id, where it was, (K, 4, 4), and when; the size of its body, as published, if known.
 
-    Args:
-        name: Its id.
-        times_s: (K,) when.
-        world_T_ego: (K, 4, 4) where.
-        ego_T_vehicle: (4, 4) the vehicle frame in that of these poses: on the ground under the middle of its body.
-        size_m: Of its body, as published; None if it is unknown.
+    `ego_T_vehicle` (4, 4) is the vehicle frame in that of these poses: on the ground under the middle of its body.
     """
 
     name: str
@@ -74,15 +65,10 @@ class RecordedObjects(NamedTuple):
 
 
 def track_of(seen: Sequence[Seen], vehicle_class: str | None, world_T_source: Matrix | None = None) -> Track:
-    """A track from boxes about their middles.
+    """A track from boxes about their middles, in the order of time; of the sizes the median counts.
 
-    Args:
-        seen: An object, in the order of time; of its sizes the median counts.
-        vehicle_class: See `Track`.
-        world_T_source: (K, 4, 4) the frame in which it was seen each time; None: the world.
-
-    Raises:
-        ValueError: No size, times that do not ascend, numbers that are none; the message names the id.
+    `world_T_source` (K, 4, 4) is the frame in which it was seen each time; None: the world. ValueError: no size, times
+    that do not ascend, numbers that are none; the message names the id.
     """
     name = seen[0].name
     sizes_m = np.array([one.size_m for one in seen], dtype=np.float64)

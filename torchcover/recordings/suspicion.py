@@ -76,7 +76,8 @@ def suspicions(recording: Recording, reference: Reference, rigs: Mapping[str, Se
     ]
     widest = max(judged, key=lambda sensor: sum(len(look.clouds[sensor]) for look in looks))
     disagreeing = disagreement(recording, widest, many)
-    elsewhere = ground_is_elsewhere({sensor: [look.clouds[sensor] for look in looks] for sensor in sensors})
+    clouds = {sensor: [look.clouds[sensor] for look in looks] for sensor in sensors}
+    elsewhere = ground_is_elsewhere(clouds)
     known = elsewhere is not None or recording.body is not None
     doubts = [
         elsewhere,
@@ -89,10 +90,8 @@ def suspicions(recording: Recording, reference: Reference, rigs: Mapping[str, Se
         *(wrong_motion(recording) if disagreeing is None else [disagreeing]),
         jumped(recording, many) if disagreeing is None else None,
         *clocks_apart(recording, tuple(judged), many),
-        *(
-            doubt_of({sensor: [look.clouds[sensor] for look in looks] for sensor in sensors})
-            for doubt_of in (silent, in_the_air)
-        ),
+        silent(clouds),
+        in_the_air(clouds),
         nothing_labelled(recording, many),
         unmarked(recording),
         *(

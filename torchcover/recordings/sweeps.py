@@ -169,7 +169,9 @@ class Sweeps:
         in_box = np.zeros(len(points_m), dtype=bool)
         of_box, unnamed = {}, 0
         if boxes is not None:
-            inside = points_in_boxes(torch.from_numpy(scan.points_m), _grown(boxes))
+            beside_m = boxes.size_m.new_tensor([2 * BESIDE_BOX_M, 2 * BESIDE_BOX_M, 0.0])
+            grown = replace(boxes, size_m=boxes.size_m + beside_m)
+            inside = points_in_boxes(torch.from_numpy(scan.points_m), grown)
             in_box[inside.point.numpy()] = True
             for number, name in enumerate(boxes.ids):
                 own_m = points_m[inside.point[inside.box == number].numpy()]
@@ -241,7 +243,3 @@ def _pose(recording: Recording, index: int) -> Matrix:
     """Where the vehicle was; it has not moved where that is unknown."""
     pose = recording.world_T_vehicle(index)
     return np.eye(4) if pose is None else pose
-
-
-def _grown(boxes: Boxes) -> Boxes:
-    return replace(boxes, size_m=boxes.size_m + boxes.size_m.new_tensor([2 * BESIDE_BOX_M, 2 * BESIDE_BOX_M, 0.0]))

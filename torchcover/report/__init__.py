@@ -1,7 +1,4 @@
-"""What a run shows: a table and its renderers, maps, drawings, a page.
-
-The public names are imported when first used: a table needs no maps.
-"""
+"""What a run shows: a table and its renderers, maps, drawings, a page."""
 
 import lazy_loader
 

@@ -64,10 +64,17 @@ def rounded(number: float, error: float, unit: Unit) -> Rounded:
     if math.isinf(value):
         return Rounded(value, 0)
     if error > ROUND_OFF:
-        return _to_error(value, shown.factor * error, shown)
+        error *= shown.factor
+        rounded_value = _round(value, decimals_of(error, shown.max_decimals))
+        if rounded_error(error, shown.max_decimals).relation == "<":
+            return _not_to_an_end(rounded_value, value, shown, shown.max_decimals)
+        return rounded_value
     if value in (0.0, shown.highest) and math.isfinite(shown.highest):
         return Rounded(value, 0)
-    return _to_decimals(value, shown)
+    decimals = _decimals(value, shown)
+    rounded_value = _round(value, decimals)
+    # A share is told from none; a length below half a centimetre is none.
+    return _not_to_an_end(rounded_value, value, shown, decimals) if math.isfinite(shown.highest) else rounded_value
 
 
 def rounded_error(error: float, max_decimals: int) -> Rounded:
@@ -92,20 +99,6 @@ def decimals_of(error: float, most: int) -> int:
     # Rounding to two digits may add one in front: 0.0996 is 0.10.
     exponent = int(f"{error:.1e}".split("e")[1])
     return min(most, max(0, 1 - exponent))
-
-
-def _to_error(value: float, error: float, shown: ShownUnit) -> Rounded:
-    number = _round(value, decimals_of(error, shown.max_decimals))
-    if rounded_error(error, shown.max_decimals).relation == "<":
-        return _not_to_an_end(number, value, shown, shown.max_decimals)
-    return number
-
-
-def _to_decimals(value: float, shown: ShownUnit) -> Rounded:
-    decimals = _decimals(value, shown)
-    number = _round(value, decimals)
-    # A share is told from none; a length below half a centimetre is none.
-    return _not_to_an_end(number, value, shown, decimals) if math.isfinite(shown.highest) else number
 
 
 def _decimals(value: float, shown: ShownUnit) -> int:

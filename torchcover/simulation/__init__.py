@@ -1,7 +1,4 @@
-"""Simulated worlds: what a rig and a reference sensor see of a scenario.
-
-The public names are imported when first used: who lists the built-in documents needs no torch.
-"""
+"""Simulated worlds: what a rig and a reference sensor see of a scenario."""
 
 import lazy_loader
 

@@ -56,13 +56,6 @@ def warn_of_mover(owner: str, mesh: Mesh, category: str) -> None:
         _warn(owner, (x, y, z), f"{'wider' if y > z else 'higher'} than long; {TURN}")
 
 
-def warn_of_scenery(owner: str, mesh: Mesh) -> None:
-    """Warn if what never moves, which may be a whole city, is larger than any in all three extents."""
-    x, y, z = np.ptp(mesh.vertices_m, axis=0).tolist()
-    if min(x, y, z) > TALLEST_SCENERY_M:
-        _warn(owner, (x, y, z), f"far too large; {UNITS}")
-
-
 def _warn(owner: str, size_m: tuple[float, float, float], what: str) -> None:
     x, y, z = (f"{extent_m:,.0f}" if extent_m >= 1000 else f"{extent_m:.3g}" for extent_m in size_m)
     warnings.warn(f"{owner}: its body is {x} x {y} x {z} m, {what}", stacklevel=4)
@@ -142,7 +135,9 @@ class Body(Document):
         mesh = sound_mesh(self.shape, f"body {self.name!r}")
         if self.material is not None or self.ground:
             mesh = mesh.made_of(self.material or "road")
-        warn_of_scenery(f"body {self.name!r}", mesh)
+        x, y, z = np.ptp(mesh.vertices_m, axis=0).tolist()
+        if min(x, y, z) > TALLEST_SCENERY_M:  # of what may be a whole city
+            _warn(f"body {self.name!r}", (x, y, z), f"far too large; {UNITS}")
         return [mesh.moved(pose.matrix()) for pose in self.poses]
 
 

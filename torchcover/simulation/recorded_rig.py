@@ -19,7 +19,7 @@ from torchcover.simulation.bodies import body_called, mover_mesh
 from torchcover.simulation.camera_sensor import MOUNT_T_CAMERA
 from torchcover.simulation.lidar import LidarModel
 from torchcover.simulation.rig import Rig
-from torchcover.simulation.scan_estimate import ScanEstimate, estimate_scan
+from torchcover.simulation.scan_estimate import estimate_scan
 
 # What is on a roof reaches so far above the highest LiDAR.
 ABOVE_SENSOR_M = 0.2
@@ -119,19 +119,16 @@ def _lidar(recording: Recording, name: str, known: SensorCalibrations, model: st
         )
     mount = mount @ rigid(rotation_from_euler(found.centre_deg, 0.0, 0.0), [0.0, 0.0, found.origin_m])
     mounted += f", its rays' origin {found.origin_m:+.2f} m higher" if found.origin_m else ""
-    return {"type": "lidar", "name": name, "mount": _pose(mount), **_pattern(found)}, (
-        f"{mounted}; estimated from {count} scan{'s' * (count > 1)}: {len(found.elevations_deg)} rows (those that "
-        f"returned anything), {found.columns:,} columns, the range of the farthest return" + (undone and f"; {undone}")
-    )
-
-
-def _pattern(found: ScanEstimate) -> dict[str, Any]:
-    return {
+    pattern = {
         "elevations_deg": [round(float(elevation), 3) + 0.0 for elevation in found.elevations_deg],
         "horizontal_fov_deg": round(found.horizontal_fov_deg, 3),
         "columns": found.columns,
         "max_range_m": math.ceil(found.max_range_m * 10) / 10,
     }
+    return {"type": "lidar", "name": name, "mount": _pose(mount), **pattern}, (
+        f"{mounted}; estimated from {count} scan{'s' * (count > 1)}: {len(found.elevations_deg)} rows (those that "
+        f"returned anything), {found.columns:,} columns, the range of the farthest return" + (undone and f"; {undone}")
+    )
 
 
 def _camera(camera: Calibration) -> dict[str, Any]:

@@ -78,13 +78,10 @@ Row = tuple[float | str, ...]
 
 
 class Surveyed(NamedTuple):
-    """What a drive has seen, in the world from its first place.
+    """What a drive has seen, in the world from its first place: the ground, where it is known, and what is on it.
 
-    Args:
-        ground: Where it is known.
-        standing_m: (N, 3) a place in each cell in which something stands or lies.
-        loose: Of each scan when it was, (N, 3) what does not stand, and whether each is seen past.
-        images: How far some of them saw.
+    `standing_m` (N, 3) is a place in each cell in which something stands or lies; `loose` has of each scan when it was,
+    (N, 3) what does not stand, and whether each is seen past; `images` say how far some of them saw.
     """
 
     ground: Slopes
@@ -307,7 +304,9 @@ def cell_mesh(cells: Int64) -> Mesh:
 
 def _labelled(recording: Recording, last_s: float) -> Iterator[Row]:
     """Rows of `movers.csv` of labelled objects."""
-    first_m = _first_place_m(recording)
+    pose = recording.world_T_vehicle(0)
+    assert pose is not None  # as checked
+    first_m = pose[:3, 3]
     for track in objects_of(recording).tracks:
         for number, piece in enumerate(pieces(track.trajectory, GAP_S)):
             name = track.name if not number else f"{track.name} #{number + 1}"
@@ -317,12 +316,6 @@ def _labelled(recording: Recording, last_s: float) -> Iterator[Row]:
             yaw_deg = euler_from_rotation(placed[:, :3, :3])[:, :1]
             for row in np.column_stack([times_s, placed[:, :3, 3] - first_m, yaw_deg]).tolist():
                 yield (row[0], name, track.category, *row[1:4], *track.size_m, row[4])
-
-
-def _first_place_m(recording: Recording) -> Float64:
-    pose = recording.world_T_vehicle(0)
-    assert pose is not None  # as checked
-    return np.asarray(pose[:3, 3])
 
 
 def _found(seen: Surveyed, drive: Trajectory) -> Iterator[Row]:

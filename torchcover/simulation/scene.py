@@ -168,7 +168,8 @@ class Scene:
         self._check_overlap(time_s, vehicle_T_world, distance_m)
         resting, first = len(self._resting), self._first_moving
         near = np.flatnonzero(distance_m[resting:] < within_m)
-        moving = self._placed(near, vehicle_T_world, time_s)
+        solids = [self._solids.of(self._moving[k].mesh) for k in near.tolist()]
+        moving = Moving.placed(solids, self._parts(near, vehicle_T_world, time_s), first + near)
         # Either list of bodies begins with the ego.
         if self.world.ego.trajectory.moves:
             static_T_vehicle, ego = invert(self._world_T_local) @ world_T_vehicle, first
@@ -248,10 +249,6 @@ class Scene:
                     f"actor {bodies[k].name!r} overlaps the ego at t = {time_s:g} s (their bounding boxes do); "
                     "change one of the trajectories"
                 )
-
-    def _placed(self, numbers: NDArray[np.intp], vehicle_T_world: Matrix, time_s: float) -> Moving:
-        solids = [self._solids.of(self._moving[k].mesh) for k in numbers.tolist()]
-        return Moving.placed(solids, self._parts(numbers, vehicle_T_world, time_s), self._first_moving + numbers)
 
     def _parts(self, numbers: NDArray[np.intp], vehicle_T_world: Matrix, time_s: float) -> Matrix:
         """(P, 4, 4) where some of the bodies that move are at a time."""

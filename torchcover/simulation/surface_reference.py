@@ -107,7 +107,8 @@ class SurfaceReference:
 
     def scan(self, surroundings: Surroundings) -> ReferenceScan:
         """Draw points, and keep those that are seen; see `ReferenceSensor.scan`."""
-        boxes = self._boxes()
+        sides = np.array([(*area, band) for area in self.areas for band in self.bands_m], dtype=np.float64)
+        boxes = Bounds(*sides.transpose(2, 0, 1))
         instant = surroundings.instant
         # All places before the first point: they are the same for any number of rays.
         drawn = [surroundings.free_pose(self._pose) for _ in range(self.places)]
@@ -120,22 +121,23 @@ class SurfaceReference:
             surface = surroundings.scene.surface(
                 around.lower_m.min(axis=0), around.upper_m.max(axis=0), (float(lower_m[2]), float(upper_m[2]))
             )
-        patches = surface.near(instant, around, self._objects_within_m(places_m))
+        # How near an object must come to the vehicle's origin to get points of its own.
+        farthest_m = max(float(np.linalg.norm(place_m)) for place_m in places_m)
+        within_m = self.max_range_m + farthest_m if self.object_points else -math.inf
+        patches = surface.near(instant, around, within_m)
         strata = SurfaceStrata(patches, boxes, heights_m)
         above_m = max(ABOVE_M, ABOVE_SHARE * float(np.abs(instant.static_T_vehicle[:3, 3]).max()))
         on_objects, looks = math.ceil(self.object_points / self.places), []
+        each = self.rays / (self.places * len(self.areas) * len(self.bands_m))
         for place_m in places_m:
-            found = strata.draw(place_m, self._rays_each, surroundings.generator, on_objects=on_objects)
-            found = self._in_range(_uncovered(found, surroundings), place_m)
+            found = strata.draw(place_m, each, surroundings.generator, on_objects=on_objects)
+            found = _uncovered(found, surroundings)
+            near = np.linalg.norm(found.points_m - place_m, axis=1) <= self.max_range_m
+            found = found if near.all() else found.some(near)
             targets_m = found.points_m + np.float32(above_m) * found.normals
             looks.append((found, sight(instant, place_m, targets_m, threads=surroundings.threads)))
         objects = len(surroundings.scene.world.objects)
         return self._gathered(looks, objects, redrawn=sum(redrawn for _, redrawn in drawn))
-
-    def _boxes(self) -> Bounds:
-        sides = [(*area, band) for area in self.areas for band in self.bands_m]
-        lower_m, upper_m = np.array(sides, dtype=np.float64).transpose(2, 0, 1)
-        return Bounds(lower_m, upper_m)
 
     def _at_any_height(self, boxes: Bounds, ego: BoundingBox) -> Bounds:
         """The same areas, as far up and down in the vehicle frame as a point can be seen from a place."""
@@ -144,23 +146,8 @@ class SurfaceReference:
         ends_m = np.broadcast_to(np.array([[[-reach_m], [reach_m]]]), (len(areas), 2, 1))
         return Bounds(*np.concatenate([areas, ends_m], axis=2).swapaxes(0, 1))
 
-    @property
-    def _rays_each(self) -> float:
-        """Rays from one place to one stratum."""
-        return self.rays / (self.places * len(self.areas) * len(self.bands_m))
-
-    def _objects_within_m(self, places_m: list[Float64]) -> float:
-        """How near an object must come to the vehicle's origin to get points of its own."""
-        if self.object_points == 0:
-            return -math.inf
-        return self.max_range_m + max(float(np.linalg.norm(place_m)) for place_m in places_m)
-
     def _pose(self, ego: BoundingBox, generator: np.random.Generator) -> Float64:
         return rigid(np.eye(3), position_in_shell(ego, self.shell_m, generator))
-
-    def _in_range(self, drawn: SurfacePoints, place_m: Float64) -> SurfacePoints:
-        near = np.linalg.norm(drawn.points_m - place_m, axis=1) <= self.max_range_m
-        return drawn if near.all() else drawn.some(near)
 
     def _gathered(self, looks: list[tuple[SurfacePoints, Sight]], objects: int, redrawn: int) -> ReferenceScan:
         # One place stands for one of so many: every place's points are a surface of their own.

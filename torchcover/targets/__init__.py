@@ -1,7 +1,4 @@
-"""What a rig sees of a body, for every place around the vehicle.
-
-The public names are imported when first used: who asks for help needs no ray caster.
-"""
+"""What a rig sees of a body, for every place around the vehicle."""
 
 import lazy_loader
 

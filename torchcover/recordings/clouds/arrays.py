@@ -1,6 +1,6 @@
 """Clouds that are bare arrays: KITTI and nuScenes records, `.npy`, `.npz`."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -52,8 +52,8 @@ def read_weighted_cloud(path: Path) -> tuple[Points, NDArray[np.float64]]:
     """
     if path.suffix.lower() != ".npz":
         raise ValueError("weights are read from a .npz with the arrays points and weights only")
-    (points,) = read_npz(path, _check, _only("points")).values()
-    (weights,) = read_npz(path, partial(_check_values, "weights"), _only("weights")).values()
+    (points,) = read_npz(path, _check, partial(_only, "points")).values()
+    (weights,) = read_npz(path, partial(_check_values, "weights"), partial(_only, "weights")).values()
     if len(points) != len(weights):
         raise ValueError(f"one weight for each point is needed; got {len(weights)} for {len(points)}")
     bad = int((~(np.isfinite(weights) & (weights > 0))).sum())
@@ -71,7 +71,7 @@ def read_heights(path: Path, count: int) -> NDArray[np.float32] | None:
     """
     if path.suffix.lower() != ".npz" or "heights_m" not in npz_headers(path):
         return None
-    (heights_m,) = read_npz(path, partial(_check_values, "heights_m"), _only("heights_m")).values()
+    (heights_m,) = read_npz(path, partial(_check_values, "heights_m"), partial(_only, "heights_m")).values()
     if len(heights_m) != count:
         raise ValueError(f"one of heights_m for each point is needed; got {len(heights_m)} for {count}")
     bad = int(np.isinf(heights_m).sum())
@@ -85,13 +85,10 @@ def _coordinates(points: NDArray[np.floating]) -> Points:
     return xyz.astype(np.float32) if xyz.dtype.itemsize < np.dtype(np.float32).itemsize else xyz
 
 
-def _only(wanted: str) -> Callable[[Collection[str]], Collection[str]]:
-    def choose(names: Collection[str]) -> Collection[str]:
-        if wanted not in names:
-            raise ValueError(f"the arrays points and weights are needed; got {_listed(names)}")
-        return (wanted,)
-
-    return choose
+def _only(wanted: str, names: Collection[str]) -> Collection[str]:
+    if wanted not in names:
+        raise ValueError(f"the arrays points and weights are needed; got {_listed(names)}")
+    return (wanted,)
 
 
 def _choose(path: Path, names: Collection[str]) -> Collection[str]:

@@ -87,15 +87,11 @@ def _parse_header(data: bytes) -> tuple[_Header, bytes]:
     unknown = set(header.types) - set(TYPES)
     if unknown:
         raise ValueError(f"TYPE of the PCD header is one of {', '.join(TYPES)}; got {', '.join(sorted(unknown))[:40]}")
-    _check_image(entries, header.points)
-    return header, data[end:]
-
-
-def _check_image(entries: dict[str, list[str]], points: int) -> None:
-    """WIDTH and HEIGHT, which early files lack, say the same as POINTS."""
+    # WIDTH and HEIGHT, which early files lack, say the same as POINTS.
     sides = [_whole(entries[key][0], key) for key in ("WIDTH", "HEIGHT") if entries.get(key)]
-    if len(sides) == 2 and math.prod(sides) != points:
-        raise ValueError(f"WIDTH {sides[0]} times HEIGHT {sides[1]} of the PCD header is not POINTS {points}")
+    if len(sides) == 2 and math.prod(sides) != header.points:
+        raise ValueError(f"WIDTH {sides[0]} times HEIGHT {sides[1]} of the PCD header is not POINTS {header.points}")
+    return header, data[end:]
 
 
 def _parse_ascii(header: _Header, axes: Sequence[int], body: bytes) -> Points:

@@ -49,7 +49,8 @@ class KittiRaw(Layout):
         self.rigs = {"kitti": self.sensors}
         times = self.path / "velodyne_points" / "timestamps.txt"
         self.times_s = check_times(read_timestamps(times), len(self.names), str(times))
-        self._imu_T_vehicle = self._calibrated()
+        velodyne_T_imu = read_rigid(self.path.parent / "calib_imu_to_velo.txt")
+        self._imu_T_vehicle = invert(velodyne_T_imu) @ invert(vehicle_T_velodyne)
         self._tracklets = self.path / "tracklet_labels.xml"
 
     @classmethod
@@ -93,9 +94,6 @@ class KittiRaw(Layout):
     @cached_property
     def _tracked(self) -> dict[int, Boxes]:
         return read_tracklets(self._tracklets, vehicle_T_velodyne)
-
-    def _calibrated(self) -> Matrix:
-        return invert(read_rigid(self.path.parent / "calib_imu_to_velo.txt")) @ invert(vehicle_T_velodyne)
 
 
 @reads("KITTI tracklets")

@@ -112,7 +112,7 @@ class NuScenes:
         data = [
             row
             for row in read_json_table(tables / "sample_data.json").rows
-            if _is_lidar(row) and row["sample_token"] in samples
+            if f"/{CHANNEL}/" in str(row["filename"]) and row["sample_token"] in samples
         ]
         data.sort(key=lambda row: row["timestamp"])
         self.names = tuple(row["filename"].rpartition("/")[2].removesuffix(".pcd.bin") for row in data)
@@ -228,10 +228,6 @@ def _check_poses(rotations: NDArray[np.float64], places_m: NDArray[np.float64]) 
         raise ValueError(f"{np.count_nonzero(bad)} of {len(rotations)} poses have numbers that are not finite")
     if not rotations.any(axis=1).all():
         raise ValueError("a quaternion of norm 0 is no rotation; the identity is [1, 0, 0, 0] (w, x, y, z)")
-
-
-def _is_lidar(row: dict[str, Any]) -> bool:
-    return f"/{CHANNEL}/" in str(row["filename"])
 
 
 def _tables(path: Path) -> Path:

@@ -74,7 +74,10 @@ class RosBag(Layout):
             self.rigs = {"ros": self.sensors}
             found = vehicle_poses(self._bag, tree, self.vehicle_frame)
             self._poses = found[0] if found else None
-            self._logged_ns = self._together()
+            # Sensor -> when its scan of each instant was recorded.
+            times = {sensor: self._bag.times_ns(self._topic(sensor)) for sensor in self.sensors}
+            first_ns = times[self.sensors[0]]
+            self._logged_ns = {sensor: times_ns[nearest_of(times_ns, first_ns)] for sensor, times_ns in times.items()}
             self._stamps_ns: dict[int, int] = {}
             self._leave_out_ends()
             if vehicle_frame is None and {*VEHICLE_FRAMES} <= tree.frames:
@@ -165,12 +168,6 @@ class RosBag(Layout):
         if lost:
             self._warn(f"left out, for {told}")
         return {topic.removeprefix("/"): mount for topic, mount in found.items() if mount is not None}
-
-    def _together(self) -> dict[str, NDArray[np.int64]]:
-        """Sensor -> when its scan of each instant was recorded."""
-        times = {sensor: self._bag.times_ns(self._topic(sensor)) for sensor in self.sensors}
-        first_ns = times[self.sensors[0]]
-        return {sensor: times_ns[nearest_of(times_ns, first_ns)] for sensor, times_ns in times.items()}
 
     def _leave_out_ends(self) -> None:
         """Keep the instants between the first pose and the last."""

@@ -4,17 +4,18 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.coverage import BevGrid
 from torchcover.report.maps.colours import (
     NEVER_PROBED,
+    PALER,
     ColourScale,
     cell_entries,
     draw_cells,
     draw_colour_bar,
-    paler_entry,
 )
 from torchcover.report.maps.overlay import SensorView, draw_ego, draw_places, draw_sensors
 from torchcover.report.maps.sheet import (
@@ -87,7 +88,7 @@ def draw_side_by_side(
     draw_colour_bar(sheets[0], images[0], together, scale)
     entries = cell_entries(together, unknown)
     if opacity:
-        entries.append(paler_entry())
+        entries.append(Line2D([], [], linestyle="none", label=PALER))  # words only, as it is about every colour
     for sheet, name in zip(sheets, values, strict=True):
         if name:
             write_heading(sheet.axes, name)

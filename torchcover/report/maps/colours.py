@@ -13,7 +13,6 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap, LogNorm, Normalize
 from matplotlib.image import AxesImage
-from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -147,11 +146,6 @@ def cell_entries(array: NDArray[np.float64], unknown: str = NEVER_PROBED) -> lis
         label = f"infinite: a step saw nothing ({percent(float(infinite.mean()))} % of the cells)"
         entries.append(Patch(facecolor=INFINITE, label=label))
     return entries
-
-
-def paler_entry() -> Artist:
-    """The legend entry for cells that are not opaque: words only, as it is about every colour."""
-    return Line2D([], [], linestyle="none", label=PALER)
 
 
 def draw_colour_bar(sheet: Sheet, image: AxesImage, array: NDArray[np.float64], scale: ColourScale) -> None:

@@ -153,7 +153,11 @@ class _Band:
 
 def _figures(coverages: Mapping[str, Coverage], setting: _Setting, layer: str | None) -> Iterator[Named]:
     first, ego = next(iter(coverages.values())), setting.ego_outline_m
-    bands, shown = _bands(first.grid), asked_and_known(first, ego)
+    named, shown = (
+        zip(first.grid.heights, file_stems(list(first.grid.heights)), strict=True),
+        asked_and_known(first, ego),
+    )
+    bands = [_Band(at, name, stem, span(first.grid, name)) for at, (name, stem) in enumerate(named)]
     near = None if ego is None else near_field(first.grid, ego)
     for whole in map(setting.told, subjects_of(coverages)):
         if layer not in (None, whole.quantity.key):
@@ -170,11 +174,6 @@ def _figures(coverages: Mapping[str, Coverage], setting: _Setting, layer: str | 
 def _within(subject: Subject, shown: Window) -> Subject:
     values = {rig: shown.of(each) for rig, each in subject.values.items()}
     return replace(subject, values=values, opacity=None if subject.opacity is None else shown.of(subject.opacity))
-
-
-def _bands(grid: BevGrid) -> list[_Band]:
-    named = zip(grid.heights, file_stems(list(grid.heights)), strict=True)
-    return [_Band(at, name, stem, span(grid, name)) for at, (name, stem) in enumerate(named)]
 
 
 def _draw_rigs(subject: Subject, grid: BevGrid, bands: Sequence[_Band], setting: _Setting) -> Iterator[Named]:

@@ -75,7 +75,9 @@ def lay_out(grid: BevGrid, maps: int = 1) -> list[Sheet]:
     for at in range(maps):
         left_in, top_in = (step_in * [at % across, at // across]).tolist()
         views.append(figure.add_axes(place(left_in, top_in, map_in), xlim=grid.x, ylim=grid.y))
-        _label(views[-1], left=at % across == 0, lowest=at + across >= maps)
+        left, lowest = at % across == 0, at + across >= maps
+        views[-1].set(xlabel="x forward (m)" if lowest else "", ylabel="y left (m)" if left else "")
+        views[-1].tick_params(labelbottom=lowest, labelleft=left)
     bar_in = np.array([COLOUR_BAR_IN, max(paper_in[1], MIN_COLOUR_BAR_IN)])
     gap_in = GAP_IN if maps == 1 else BESIDE_IN  # the axis of a map above the last row has labels beside the bar
     bar = figure.add_axes(place(paper_in[0] + gap_in, 0.0, bar_in))
@@ -94,12 +96,6 @@ def _arrange(grid: BevGrid, maps: int) -> tuple[int, float]:
 
     across = max(range(1, maps + 1), key=inches_per_cell)
     return across, inches_per_cell(across)
-
-
-def _label(axes: Axes, *, left: bool, lowest: bool) -> None:
-    axes.set_xlabel("x forward (m)" if lowest else "")
-    axes.set_ylabel("y left (m)" if left else "")
-    axes.tick_params(labelbottom=lowest, labelleft=left)
 
 
 def stack_views(views: Sequence[tuple[Bounds, Bounds]], *, width_in: float) -> tuple[Figure, list[Axes]]:

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage import Coverage
-from torchcover.coverage.blocks import BlockSums
 from torchcover.coverage.quantity import by_area
 from torchcover.estimation import Quantity
 from torchcover.report.maps.colours import NEVER_PROBED, ColourScale, scale_of
@@ -63,7 +62,8 @@ def difference(values: Tensor, expected: Tensor) -> Tensor:
 
 
 def _of_surface(coverages: Mapping[str, Coverage]) -> Iterator[Subject]:
-    first, areas = next(iter(coverages.values())), _areas(coverages)
+    first = next(iter(coverages.values()))
+    areas = {name: coverage.area for name, coverage in coverages.items() if coverage.area is not None}
     sides = square_sides(first.points, first.grid.cell)
     # The rigs share the reference points, and so the square metres.
     opacity = opacity_of(next(iter(areas.values())), first.counts["steps"], sides, first.grid.cell)
@@ -71,10 +71,6 @@ def _of_surface(coverages: Mapping[str, Coverage]) -> Iterator[Subject]:
     for at, quantity in enumerate(map(by_area, first.quantities)):
         values = {name: values[at] for name, values in each.items()}
         yield _subject(quantity, values, NOTHING_FOUND, _conditions(first) + LARGER, opacity)
-
-
-def _areas(coverages: Mapping[str, Coverage]) -> dict[str, BlockSums]:
-    return {name: coverage.area for name, coverage in coverages.items() if coverage.area is not None}
 
 
 def _conditions(coverage: Coverage) -> str:

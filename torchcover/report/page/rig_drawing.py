@@ -42,15 +42,13 @@ def rig_drawing(sensors: Sequence[SensorView], ego_outline_m: Array | None, numb
 def sensor_table(sensors: Sequence[SensorView]) -> PageTable:
     """Where each sensor is, whereto it looks, and how far."""
     headings = ("sensor", "x, y, z (m)", "yaw (°)", "wide (°)", "high (°)", "range (m)")
-    rows = [tuple(map(Words, _sensor_words(at, view))) for at, view in enumerate(sensors)]
+    rows = []
+    for at, view in enumerate(sensors):
+        place = ", ".join(f"{value:.2f}" for value in view.position_m)
+        low, high = view.vertical_fov_deg
+        each = f"{view.yaw_deg:.1f}", f"{view.horizontal_fov_deg:.1f}", f"{low:.1f} to {high:.1f}", f"{view.range_m:g}"
+        rows.append(tuple(map(Words, (f"{at + 1}  {view.name}", place, *each))))
     return PageTable("", headings, rows)
-
-
-def _sensor_words(at: int, view: SensorView) -> Sequence[str]:
-    low, high = view.vertical_fov_deg
-    place = ", ".join(f"{value:.2f}" for value in view.position_m)
-    each = f"{view.yaw_deg:.1f}", f"{view.horizontal_fov_deg:.1f}", f"{low:.1f} to {high:.1f}", f"{view.range_m:g}"
-    return f"{at + 1}  {view.name}", place, *each
 
 
 def _span(values: Array) -> tuple[float, float]:

@@ -100,6 +100,7 @@ def page_html(page: Page) -> str:
     maps, notes = fitted(page.maps, max(MOST_CHARS - len(first), LEAST_CHARS))
     content = as_json(map_content(replace(page, maps=maps), cells))
     script = "\n".join(map(_file, SCRIPTS))
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     more = "".join(f"<li>{words_html(words)}</li>" for words in page.verdict[1:])
     more = f'<ul class="more">{more}</ul>' if more else ""
     return Template(_file("page.html")).substitute(
@@ -109,7 +110,7 @@ def page_html(page: Page) -> str:
         answer=first + more * bool(first or not maps) + ranges_html(page.ranges),
         more=more * bool(maps and not first),
         style=_file("page.css"),
-        script_hash=script_hash(script),
+        script_hash=f"sha256-{digest}",
         tables="\n".join(map(table_html, page.tables)),
         map_notes=_notes(notes),
         no_rigs="" if page.rigs else " hidden",
@@ -134,11 +135,6 @@ def as_json(content: object) -> str:
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
-def script_hash(script: str) -> str:
-    """What the page's policy calls the only script that may run."""
-    return f"sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}"
-
-
 @cache
 def _file(name: str) -> str:
     return files("torchcover.report.page").joinpath(name).read_text(encoding="utf-8")
@@ -148,8 +144,9 @@ def table_html(table: PageTable) -> str:
     """A table, with its notes below."""
     caption = f"<caption>{escape(table.title)}</caption>" if table.title else ""
     kinds = ["" if at < table.words_first else "number" for at in range(len(table.headings))]
-    pairs = zip(kinds, table.headings, strict=True)
-    head = "".join(f'<th scope="col" class="{kind}">{_broken(heading)}</th>' for kind, heading in pairs)
+    headings = [escape(heading).replace("_", "_<wbr>").replace("\n", "<br>") for heading in table.headings]
+    pairs = zip(kinds, headings, strict=True)
+    head = "".join(f'<th scope="col" class="{kind}">{heading}</th>' for kind, heading in pairs)
     rows = "\n".join(f"<tr>{''.join(map(_cell, row, kinds))}</tr>" for row in table.rows)
     body = f"{caption}<thead><tr>{head}</tr></thead>\n<tbody>{rows}</tbody>"
     return f'<div class="wide"><table>{body}</table></div>{_notes(table.notes)}'
@@ -170,11 +167,6 @@ def _cell(cell: Words, kind: str) -> str:
     if not kind:
         return f'<th scope="row">{escape(cell.text)}</th>'
     return f'<td class="{kind} {escape(cell.mark)}">{escape(cell.text)}</td>'
-
-
-def _broken(heading: str) -> str:
-    lines = (escape(line).replace("_", "_<wbr>") for line in heading.split("\n"))
-    return "<br>".join(lines)
 
 
 def _rig(rig: PageRig, ego_outline_m: Array | None, number: int) -> str:

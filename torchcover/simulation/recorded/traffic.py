@@ -17,7 +17,6 @@ from torchcover.recordings.formats.track_tables import read_trajectory
 from torchcover.recordings.objects import Ego, RecordedObjects
 from torchcover.simulation.bodies import sound_mesh
 from torchcover.simulation.documents import PathBeside, Pose, builtin_hashes
-from torchcover.simulation.height_field import Plain, Slopes
 from torchcover.simulation.recorded.bodies import Bodies
 from torchcover.simulation.recorded.ground import ground_below, stood_on, tilted
 from torchcover.simulation.recorded.run import Excerpt, cast_of, excerpt_of, pieces, poses_at_all
@@ -122,7 +121,8 @@ class RecordedTraffic(Traffic):
         left_out = len(others) - len(shown)
         stood: tuple[Mesh, ...] = ()
         if self.ground is None:
-            below = self._fitted(driver)
+            standing = [track.trajectory.positions_m for track in run.others if track.vehicle_class is not None]
+            below = ground_below(stood_on(standing), stood_on([driver.trajectory.positions_at(self._times_s)]))
             if self.built_share is not None:
                 generator = np.random.default_rng(seed)
                 sides, driven, walked = sides_of(driver, shown, self.built_share, generator)
@@ -200,7 +200,3 @@ class RecordedTraffic(Traffic):
     @staticmethod
     def _read(ground: Path) -> Mesh:
         return sound_mesh(MeshFile(type="mesh", path=ground), str(ground))
-
-    def _fitted(self, ego: Actor) -> Plain | Slopes:
-        standing = [track.trajectory.positions_m for track in self._run.others if track.vehicle_class is not None]
-        return ground_below(stood_on(standing), stood_on([ego.trajectory.positions_at(self._times_s)]))

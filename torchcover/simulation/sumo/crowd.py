@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -62,18 +61,6 @@ def read_types(path: Path) -> dict[str, VehicleType]:
     return found
 
 
-def types_of(paths: Sequence[Path]) -> dict[str, VehicleType]:
-    """The types that several files declare together."""
-    return {name: found for path in paths for name, found in read_types(path).items()}
-
-
-class Crowd(NamedTuple):
-    """The ego, and who comes near to it."""
-
-    ego: RoadUser
-    others: list[RoadUser]
-
-
 def crowd(
     recorded: Recorded,
     known: Mapping[str, VehicleType],
@@ -82,8 +69,8 @@ def crowd(
     ego_type: str | None,
     duration_s: float,
     generator: np.random.Generator,
-) -> Crowd:
-    """Choose the ego, and leave out whoever never comes near.
+) -> tuple[RoadUser, list[RoadUser]]:
+    """Choose the ego, and those of the others who come near to it.
 
     The ego is the one of a name; else it is drawn in proportion to the ways that vehicles drive, of one type or of all
     cars.
@@ -102,7 +89,7 @@ def crowd(
             users.append(RoadUser(track, kind, found.length_m, fleet.sizes_m(kind)))
     ego = _ego(users, recorded, ego_name, ego_type, duration_s, generator)
     others = [other for other in users if other is not ego and _comes_near(other.track, ego.track)]
-    return Crowd(ego._replace(kind=EGO, sizes_m=fleet.sizes_m(EGO)), others)
+    return ego._replace(kind=EGO, sizes_m=fleet.sizes_m(EGO)), others
 
 
 def _ego(

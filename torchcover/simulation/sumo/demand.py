@@ -1,6 +1,5 @@
 """Traffic on the streets of a network, drawn: ways without an aim that never end within a run."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
@@ -69,7 +68,12 @@ def write_routes(
             way = ways.draw(speed_mps * duration_s, generator)
             if on_foot and generator.random() < 0.5:
                 way = way[::-1]
-            rows.append(_person(kind, k, way) if on_foot else _vehicle(kind, k, way))
+            who, edges = f'id="{kind}.{k}" type="{kind}" depart="0"', quoteattr(" ".join(way))
+            rows.append(
+                f'<person {who} departPos="random"><walk edges={edges}/></person>'
+                if on_foot
+                else f'<vehicle {who} departPos="random_free" departLane="best"><route edges={edges}/></vehicle>'
+            )
     path.write_text(f"<routes>{''.join(rows)}</routes>", encoding="utf-8")
 
 
@@ -108,17 +112,3 @@ class _Ways:
             # A way is never so long as the number of its edges could get where they have no length.
             gone_m += max(float(self._long_m[self._number[way[-1]]]), 1.0)
         return way
-
-
-def _vehicle(kind: str, number: int, way: Sequence[str]) -> str:
-    return (
-        f'<vehicle id="{kind}.{number}" type="{kind}" depart="0" departPos="random_free" departLane="best">'
-        f"<route edges={quoteattr(' '.join(way))}/></vehicle>"
-    )
-
-
-def _person(kind: str, number: int, way: Sequence[str]) -> str:
-    return (
-        f'<person id="{kind}.{number}" type="{kind}" depart="0" departPos="random">'
-        f"<walk edges={quoteattr(' '.join(way))}/></person>"
-    )

@@ -24,17 +24,11 @@ Use = Literal["road", "turn", "bay", "shoulder", "sidewalk", "crossing", "corner
 
 
 class NetworkLane(NamedTuple):
-    """A lane.
+    """A lane of a street in one direction, the `edge`: classes of vehicles may use it, or are barred, or "all".
 
-    Args:
-        edge: Name of the street, in one direction, that it is part of.
-        use: "road" and "turn" (on a junction) are for vehicles, a "bay" for those who park, a "shoulder" for nobody; a
-            "sidewalk", a "crossing" and a "corner", which joins these two, are for those on foot.
-        width_m: Its width.
-        line_m: (K, 3) its middle, in the direction of travel, K >= 2; of a corner its outline instead, K >= 3.
-        speed_mps: What is allowed.
-        classes: Of vehicles that may use it, or "all".
-        barred: Classes that may not, or "all".
+    "road" and "turn" (on a junction) are for vehicles, a "bay" for those who park, a "shoulder" for nobody; a
+    "sidewalk", a "crossing" and a "corner", which joins these two, are for those on foot. `line_m` (K, 3) is its
+    middle, in the direction of travel, K >= 2; of a corner its outline instead, K >= 3.
     """
 
     edge: str
@@ -163,7 +157,9 @@ def _lane(edge: Attributes, item: Attributes) -> NetworkLane | None:
     line_m = _places(item.get("shape", ""))
     if not np.isfinite(line_m).all():
         raise ValueError(f"lane {name!r}: its shape has NaN or infinite numbers")
-    line_m = _without_repeats(line_m)
+    if len(line_m):
+        steps = np.linalg.norm(np.diff(line_m[:, :2], axis=0), axis=1)
+        line_m = line_m[np.concatenate([[True], steps > SAME_PLACE_M])]
     classes = frozenset(item.get("allow", "all").split())
     barred = frozenset(item.get("disallow", "").split())
     use = _use(edge.get("function", "normal"), item.get("type", ""), classes, barred)
@@ -196,13 +192,6 @@ def _places(shape: str) -> Float64:
     if any(len(row) not in (2, 3) for row in rows):
         raise ValueError(f"a shape of places x,y or x,y,z is needed; got {shape[:60]!r}")
     return np.array([row if len(row) == 3 else [*row, 0.0] for row in rows], dtype=np.float64).reshape(-1, 3)
-
-
-def _without_repeats(line_m: Float64) -> Float64:
-    if len(line_m) == 0:
-        return line_m
-    steps = np.linalg.norm(np.diff(line_m[:, :2], axis=0), axis=1)
-    return np.asarray(line_m[np.concatenate([[True], steps > SAME_PLACE_M])])
 
 
 def _number(item: Attributes, key: str, otherwise: float) -> float:

@@ -49,7 +49,7 @@ def output_of(program: str, *options: str | Path, cpu_s: float = math.inf) -> It
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=said,
-            env=_environment(folder),
+            env={**os.environ, "SUMO_HOME": str(folder)},
             preexec_fn=end_with_parent(most_gb(), cpu_s),  # noqa: PLW1509  (one call of the system, no lock)
         )
         assert process.stdout is not None  # as asked for
@@ -91,10 +91,6 @@ def home() -> Path:
     if program is None:
         raise ImportError("traffic of type 'sumo' needs SUMO: pip install 'torchcover[sumo]'")
     return Path(program).resolve().parent.parent
-
-
-def _environment(folder: Path) -> dict[str, str]:
-    return {**os.environ, "SUMO_HOME": str(folder)}
 
 
 def simulate(

@@ -11,21 +11,20 @@ from pydantic import Field, model_validator
 
 from torchcover.geometry.arrays import Bools, Float64
 from torchcover.simulation.documents import PathBeside
-from torchcover.simulation.sumo.crowd import crowd, types_of
+from torchcover.simulation.sumo.crowd import crowd, read_types
 from torchcover.simulation.sumo.demand import EGO_TYPE, write_routes
 from torchcover.simulation.sumo.floating import Recorded, TimeWindow, read_floating, record
 from torchcover.simulation.sumo.ground import Pavement, decks, ground_of
 from torchcover.simulation.sumo.motion import motions, possible
-from torchcover.simulation.sumo.network import SAME_PLACE_M, Network, read_network
+from torchcover.simulation.sumo.network import SAME_PLACE_M, read_network
 from torchcover.simulation.sumo.placing import Placing, park
 from torchcover.simulation.sumo.simulating import from_opendrive, home, simulate
 from torchcover.simulation.sumo.streets import DrawnStreets
 from torchcover.simulation.sumo.vicinity import OFF_STREET_M, Vicinity
 from torchcover.simulation.traffic.fleet import EGO, Fleet
 from torchcover.simulation.traffic.frontage import Side, Times, sides_around, stand
-from torchcover.simulation.traffic.procedural import Procedural
+from torchcover.simulation.traffic.procedural import Built, Procedural
 from torchcover.simulation.traffic.scenery import Scenery, few
-from torchcover.simulation.world import Actor
 
 # Nothing stands nearer to a lane than this; furniture and houses keep off by more, so that no crown hangs over it.
 CLEAR_M, KERB_M, BEHIND_M = 0.4, 1.0, 2.2
@@ -105,14 +104,15 @@ class Sumo(Procedural):
         if self.fcd is None or (self.net is not None and self.net.suffix == ".xodr"):
             home()  # or an ImportError
 
-    def _build(
-        self, fleet: Fleet, times_s: Float64, generator: np.random.Generator
-    ) -> tuple[Scenery, Actor, tuple[Actor, ...]]:
+    def _build(self, fleet: Fleet, times_s: Float64, generator: np.random.Generator) -> Built:
         with TemporaryDirectory() as folder:
             network_file = self._network_file(Path(folder), generator)
             network = read_network(network_file)
-            routes = self._routes(Path(folder), network, fleet, float(times_s[-1]), generator)
-            known = types_of(routes)
+            routes = self.routes
+            if self.random is not None:
+                routes = (Path(folder) / "drawn.rou.xml",)
+                write_routes(*routes, network, self.random, fleet, WARM_UP_S + float(times_s[-1]), generator)
+            known = {name: found for path in routes for name, found in read_types(path).items()}
             recorded = self._recorded(network_file, routes, float(times_s[-1]), generator)
         ego_type = EGO_TYPE if self.random is not None else self.ego_type
         duration_s = float(times_s[-1])
@@ -161,15 +161,6 @@ class Sumo(Procedural):
         if self.net.suffix != ".xodr":
             return self.net
         return from_opendrive(self.net, folder, leave_out_links=self.leave_out_links)
-
-    def _routes(
-        self, folder: Path, network: Network, fleet: Fleet, duration_s: float, generator: np.random.Generator
-    ) -> tuple[Path, ...]:
-        if self.random is None:
-            return self.routes
-        drawn = folder / "drawn.rou.xml"
-        write_routes(drawn, network, self.random, fleet, WARM_UP_S + duration_s, generator)
-        return (drawn,)
 
     def _recorded(
         self, network_file: Path, routes: tuple[Path, ...], duration_s: float, generator: np.random.Generator

@@ -161,7 +161,9 @@ class Fleet:
         while per_km > 0:
             kind = self.draw_kind(mix)
             driver = self.draw_driver(drivers[KIND_OF[kind]][1], heavy_spread if KIND_OF[kind] in HEAVY else spread)
-            length, gap = self.length_m(kind), _smallest_gap_m(driver)
+            # What one keeps at full speed, so that nobody has to brake at first.
+            gap = float(driver.standstill_gap_m + driver.headway_s * driver.desired_speed_mps)
+            length = self.length_m(kind)
             rear += gap + self._generator.exponential(max(1000.0 / per_km - gap - length, 0.1))
             if rear + length > span_m[1]:
                 break
@@ -184,11 +186,6 @@ def _bodies_of(kinds: tuple[str, ...], weights: tuple[float, ...]) -> tuple[list
     shares = np.repeat(np.array(weights) / np.sum(weights), [len(names) for names in sizes])
     up_to = (shares / np.repeat([len(names) for names in sizes], [len(names) for names in sizes])).cumsum()
     return [name for names in sizes for name in names], (up_to / up_to[-1]).tolist()
-
-
-def _smallest_gap_m(driver: Driver) -> float:
-    """What a driver keeps at full speed, so that nobody has to brake at first."""
-    return float(driver.standstill_gap_m + driver.headway_s * driver.desired_speed_mps)
 
 
 def _in_the_way(agent: Agent, gates: Sequence[Gate], gap_m: float, others: Sequence[Agent]) -> bool:

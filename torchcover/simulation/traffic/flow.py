@@ -118,8 +118,13 @@ class Simulation:
         driver, speed_mps = self._driver, self.speed_mps
         leader_m, leader_mps = self._leader_m(), speed_mps.take(self._leader)
         gap_m = self._gap_m(leader_m)
+        held = (red | self._occupied[self._gates.other_light])[self._gate]
+        # A queue behind the junction would force one to stop on it.
+        rear_m = leader_m - self._leaders_half_m
+        held |= (rear_m > self._enter_m) & (rear_m < self._clear_m) & (leader_mps < self._queue_mps)
+        held &= ~self._committed
         # Lines that may be crossed are as far away as can be.
-        line_m = np.where(self._held_up(red, leader_m, leader_mps), self._to_line_m, np.inf)
+        line_m = np.where(held, self._to_line_m, np.inf)
         stop_m = line_m + driver.standstill_gap_m
         stop_m -= STOP_BEFORE_LINE_M
         tight = tightness(driver, speed_mps, gap_m, speed_mps - leader_mps)
@@ -162,18 +167,6 @@ class Simulation:
         self._committed = self.speed_mps**2 > 2 * BRAKING_FOR_A_LIGHT_MPS2 * self._to_line_m
         self._occupied = np.zeros(2 * len(self._signals.offset_s), dtype=bool)
         self._occupied[self._gates.light[self._gate[self._committed]]] = True
-
-    def _held_up(self, red: Bools, leader_m: Float64, leader_mps: Float64) -> Bools:
-        """(N,) whether one may not cross the next stop line, and need not."""
-        held = (red | self._occupied[self._gates.other_light])[self._gate]
-        held |= self._jammed_behind(leader_m, leader_mps)
-        held &= ~self._committed
-        return held
-
-    def _jammed_behind(self, leader_m: Float64, leader_mps: Float64) -> Bools:
-        """(N,) whether a queue behind the junction would force one to stop on it."""
-        rear_m = leader_m - self._leaders_half_m
-        return (rear_m > self._enter_m) & (rear_m < self._clear_m) & (leader_mps < self._queue_mps)
 
     def _first_speed(self) -> Float64:
         """(N,) fast, but slow enough to stop at the next line, and for the gap to the one ahead."""

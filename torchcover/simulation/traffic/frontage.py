@@ -34,20 +34,12 @@ TRUNK = 0.1
 
 
 class _Kind(NamedTuple):
-    """What stands beside streets; lengths are along the street, depths away from it.
+    """What stands beside streets, in runs of pieces; lengths are along the street, depths away from it.
 
-    Args:
-        form: Key of `FORMS`.
-        zones: Where: `kerb`, before the sidewalk, or behind it, along a side that is `built` or `open`.
-        share: Of the sides that have it.
-        at_m: From the line to a run of it; what is negative hangs over.
-        run_m: Length of a run.
-        gap_m: From one run to the next, at the usual density.
-        deep_m: Depth of a piece.
-        high_m: Its height.
-        piece_m: Its length; None: as long as the run. Walls and hedges consist of pieces without gaps.
-        air_m: Between the pieces of a run.
-        foot: How much of it must keep off streets, as a share of its size.
+    It is at the `kerb`, before the sidewalk, or behind it, along sides that are `built` or `open`, a share of which has
+    it: `at_m` from the line, where what is negative hangs over, with gaps from run to run at the usual density. Without
+    `piece_m` a piece is as long as its run; walls and hedges consist of pieces without gaps, others have `air_m` in
+    between. Of its size the share `foot` must keep off streets. `form` is a key of `FORMS`.
     """
 
     form: str
@@ -135,14 +127,6 @@ def sides_around(
     return sides
 
 
-class _Pieces(NamedTuple):
-    """(N, 4, 2) outlines in plan, counter-clockwise from the far side on; (N,) heights, and which pieces are one."""
-
-    outlines_m: Float64
-    high_m: Float64
-    run: Int64
-
-
 def stand(
     sides: Sequence[Side],
     driven: Sequence[shapely.Geometry],
@@ -164,7 +148,7 @@ def stand(
     for name, kind in KINDS.items():
         factor = times.get(name, 1.0) if isinstance(times, Mapping) else 1.0 if name in HOUSES else times
         drawn.append(_drawn(kind, lines, factor, generator))
-    kinds = np.repeat(np.arange(len(KINDS)), [len(one.run) for one in drawn])
+    kinds = np.repeat(np.arange(len(KINDS)), [len(run) for _, _, run in drawn])
     outlines_m, high_m, run = (np.concatenate(column) for column in zip(*drawn, strict=True))
     kept, raised_m = _free(outlines_m, kinds, run, driven, walked, pavements)
     outlines_m, high_m, kinds, raised_m = outlines_m[kept], high_m[kept], kinds[kept], raised_m[kept]
@@ -217,13 +201,16 @@ class _Lines:
         return places_m, right
 
 
-def _drawn(kind: _Kind, lines: _Lines, times: float, generator: np.random.Generator) -> _Pieces:
-    """Runs of a kind along the sides that have it."""
+def _drawn(kind: _Kind, lines: _Lines, times: float, generator: np.random.Generator) -> tuple[Float64, Float64, Int64]:
+    """Runs of a kind along the sides that have it, in N pieces.
+
+    Returns (N, 4, 2) outlines in plan, counter-clockwise from the far side on; (N,) heights, and which pieces are one.
+    """
     has = np.array([zone in kind.zones for zone in lines.zones], dtype=bool)
     has[has] = generator.random(np.count_nonzero(has)) < kind.share
     numbers = np.flatnonzero(has)
     if not len(numbers) or times == 0:
-        return _Pieces(np.empty((0, 4, 2)), np.empty(0), np.empty(0, dtype=np.int64))
+        return np.empty((0, 4, 2)), np.empty(0), np.empty(0, dtype=np.int64)
     length_m, gap_m = lines.length_m[numbers], (kind.gap_m[0] / times, kind.gap_m[1] / times)
     shape = len(numbers), int(length_m.max() / (kind.run_m[0] + gap_m[0])) + 1
     run_m, between_m = generator.uniform(*kind.run_m, shape), generator.uniform(*gap_m, shape)
@@ -247,7 +234,7 @@ def _drawn(kind: _Kind, lines: _Lines, times: float, generator: np.random.Genera
     # Around a corner what is far out would be stretched, and on its inside squeezed.
     stretched = [np.linalg.norm(side[:, 1] - side[:, 0], axis=1) / piece_m for side in (near_m, far_m)]
     like = (np.abs(np.log(np.maximum(stretched, TINY_M))) < -np.log(TAPERED)).all(axis=0)
-    return _Pieces(np.concatenate([far_m, near_m[:, ::-1]], axis=1)[like], high_m[run][like], run[like])
+    return np.concatenate([far_m, near_m[:, ::-1]], axis=1)[like], high_m[run][like], run[like]
 
 
 def _free(

@@ -13,10 +13,8 @@ from torchcover.simulation.traffic.flow import Agent, Flow, check_crowd
 from torchcover.simulation.traffic.hills import Hills
 from torchcover.simulation.traffic.idm import Driver
 from torchcover.simulation.traffic.overtaking import LANES, RAMP_MPS, SIDE_LANE, Overtaking
-from torchcover.simulation.traffic.procedural import MostVehicles, Procedural
+from torchcover.simulation.traffic.procedural import Built, MostVehicles, Procedural
 from torchcover.simulation.traffic.roadside import LANE_CENTRES_M, SideLane, roadside
-from torchcover.simulation.traffic.scenery import Scenery
-from torchcover.simulation.world import Actor
 
 # Platoons form behind the slower ones.
 WARM_UP_S = 30.0
@@ -66,12 +64,13 @@ class Highway(Procedural):
     ego_lane: int = Field(default=2, ge=1, le=3)
     hills_m: float = Field(default=3.0, ge=0.0, le=10.0)
 
-    def _build(
-        self, fleet: Fleet, times_s: Float64, generator: np.random.Generator
-    ) -> tuple[Scenery, Actor, tuple[Actor, ...]]:
+    def _build(self, fleet: Fleet, times_s: Float64, generator: np.random.Generator) -> Built:
         (shapes,) = generator.spawn(1)
         hills = Hills(self.hills_m, shapes, HILLS_M, STEEPEST)
-        middle, sides = self._middle_line(shapes), [self._side_lane(shapes) for _ in range(2)]
+        middle, sides = self._middle_line(shapes), []
+        for _ in range(2):
+            begin_m = LEADER_MPS * (WARM_UP_S + shapes.uniform(0.0, 0.8) * self.duration_s)
+            sides.append(SideLane(begin_m, begin_m + float(shapes.uniform(*SIDE_LANE_M))))
         # Places of the other direction are stations with the sign turned.
         side_m = np.array([sides[0], (-sides[1].end_m, -sides[1].begin_m)])
         agents = self._traffic(side_m, fleet)
@@ -104,11 +103,6 @@ class Highway(Procedural):
         curvatures = amplitude * 2 * np.pi / wavelength * np.cos(waves)
         curvatures[[0, -1]] = 0.0
         return Alignment(stations, curvatures, (first, 0.0, float(amplitude * np.sin(waves[0]))))
-
-    def _side_lane(self, generator: np.random.Generator) -> SideLane:
-        """Somewhere on the ego's way."""
-        begin_m = LEADER_MPS * (WARM_UP_S + generator.uniform(0.0, 0.8) * self.duration_s)
-        return SideLane(begin_m, begin_m + float(generator.uniform(*SIDE_LANE_M)))
 
     def _traffic(self, side_m: Float64, fleet: Fleet) -> list[Agent]:
         """Everybody; the ego is the first, behind a leader in its lane."""

@@ -69,7 +69,8 @@ class Lot:
         for side in (1, -1):
             for head, inwards in ((MIDDLE_WALKWAY_M / 2, 1), (OUTER_HEAD_M, -1)):
                 for column in range(STALLS):
-                    low.append(self._wheel_stop(_stall_x(column), side * (head + inwards * 0.12)))
+                    wheel_stop = box((_stall_x(column), side * (head + inwards * 0.12)), (1.8, 0.15, 0.1))
+                    low.append(wheel_stop)
                     if column not in self._empty[side]:
                         place = (_stall_x(column), side * head, side * inwards)
                         low += self._occupant(*place)
@@ -84,9 +85,6 @@ class Lot:
         taken = [LOT_M, market.buffer(CROWN_M)]
         stood = stand(sides, taken, taken, (), level_m, self._roadside, self._generator)
         return Scenery((level, *few(low, self._bollards()), *kerbs, *few(trees, around, *stood)), (0, 3))
-
-    def _wheel_stop(self, x: float, y: float) -> Mesh:
-        return box((x, y), (1.8, 0.15, 0.1))
 
     def _occupant(self, x: float, head_y: float, inwards: int) -> list[Mesh]:
         """Park a car in a stall, nose or tail first; or return a trolley that somebody left there; or nothing."""

@@ -5,7 +5,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from torchcover.geometry.arrays import Bools, Float64
+from torchcover.geometry.arrays import Float64
 from torchcover.simulation.traffic.assemble import Paths, actors, ego_actor, paths
 from torchcover.simulation.traffic.crossing import Footpath, free_for, walk
 from torchcover.simulation.traffic.fleet import EGO, WALKING, Fleet
@@ -13,11 +13,9 @@ from torchcover.simulation.traffic.flow import Agent, Lane, Simulation
 from torchcover.simulation.traffic.frontage import Times
 from torchcover.simulation.traffic.idm import Driver
 from torchcover.simulation.traffic.lot import AISLE_M, ISLAND_M, STALLS_M, WALKWAYS_M, Lot
-from torchcover.simulation.traffic.procedural import Procedural
+from torchcover.simulation.traffic.procedural import Built, Procedural
 from torchcover.simulation.traffic.roads import loop
-from torchcover.simulation.traffic.scenery import Scenery
 from torchcover.simulation.traffic.signals import Signals
-from torchcover.simulation.world import Actor
 
 WARM_UP_S = 10.0
 ROUND_M, CORNER_RADIUS_M = 84.0, 6.0
@@ -49,9 +47,7 @@ class Parking(Procedural):
     built_share: float = Field(default=0.6, ge=0.0, le=1.0)
     roadside: Times = 1.0
 
-    def _build(
-        self, fleet: Fleet, times_s: Float64, generator: np.random.Generator
-    ) -> tuple[Scenery, Actor, tuple[Actor, ...]]:
+    def _build(self, fleet: Fleet, times_s: Float64, generator: np.random.Generator) -> Built:
         lanes = [Lane(loop(ROUND_M, 2 * AISLE_MIDDLE_M, CORNER_RADIUS_M))]
         agents = self._traffic(lanes[0].line.length_m, fleet, generator)
         flow = Simulation(lanes, agents, Signals.none()).run(times_s, WARM_UP_S)
@@ -78,10 +74,15 @@ def _people(lot: Lot, driving: Paths, times_s: Float64, fleet: Fleet, generator:
     """People who cross the aisles between parked cars, and people on the walkways."""
     step_s = float(times_s[1] - times_s[0])
     positions, yaws, kinds = [], [], []
-    for path, crosses in [*((p, True) for p in _across_aisles(lot)), *((p, False) for p in _along_walkways())]:
+    half = STALLS_M / 2
+    along = [Footpath(np.array([-half, y]), np.array([half, y])) for y in WALKWAYS_M]
+    for path, crosses in [*((p, True) for p in _across_aisles(lot)), *((p, False) for p in along)]:
         kind = fleet.draw_kind({"adult": 4.0, "child": 1.0})
         takes_s = path.length_m / float(WALKING.desired_speed_mps * generator.uniform(0.8, 1.1))
-        may_go = free_for(_car_near(driving, path), takes_s, step_s) if crosses else np.ones(len(times_s), dtype=bool)
+        may_go = np.ones(len(times_s), dtype=bool)
+        if crosses:  # when no car is on the piece of the aisle that is crossed
+            distance = np.linalg.norm(driving.positions_m[..., :2] - (path.start_m + path.end_m) / 2, axis=2)
+            may_go = free_for((distance < KEEP_AWAY_M).any(axis=1), takes_s, step_s)
         position, yaw = walk(path, may_go, takes_s, times_s, fleet.length_m(kind) / 2, generator)
         positions.append(position)
         yaws.append(yaw)
@@ -96,15 +97,3 @@ def _across_aisles(lot: Lot) -> list[Footpath]:
         for side, x in lot.crossings
         for shift in (-PATHS_APART_M / 2, PATHS_APART_M / 2)
     ]
-
-
-def _along_walkways() -> list[Footpath]:
-    half = STALLS_M / 2
-    return [Footpath(np.array([-half, y]), np.array([half, y])) for y in WALKWAYS_M]
-
-
-def _car_near(driving: Paths, path: Footpath) -> Bools:
-    """(T,) whether a car is on the piece of the aisle that a path crosses."""
-    crossed = (path.start_m + path.end_m) / 2
-    distance = np.linalg.norm(driving.positions_m[..., :2] - crossed, axis=2)
-    return np.asarray((distance < KEEP_AWAY_M).any(axis=1))

@@ -20,6 +20,8 @@ MAX_DURATION_S = 3600.0
 # To a kilometre of a lane; more have no room.
 MostVehicles = Annotated[float, Field(ge=0.0, le=200.0)]
 MostPeople = Annotated[float, Field(ge=0.0, le=1000.0)]
+# What rests, the ego, and who else moves.
+Built = tuple[Scenery, Actor, tuple[Actor, ...]]
 
 
 class Procedural(Traffic):
@@ -66,7 +68,5 @@ class Procedural(Traffic):
         return steps_of(self.duration_s, self.time_step_s)
 
     @abstractmethod
-    def _build(
-        self, fleet: Fleet, times_s: Float64, generator: np.random.Generator
-    ) -> tuple[Scenery, Actor, tuple[Actor, ...]]:
+    def _build(self, fleet: Fleet, times_s: Float64, generator: np.random.Generator) -> Built:
         """What rests, the ego, and who else moves, at (T,) times from 0 to the end, T >= 2."""

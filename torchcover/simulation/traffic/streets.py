@@ -50,11 +50,6 @@ class Section:
     sidewalk_m: float = 3.2
 
     @property
-    def bicycle_lane_m(self) -> float:
-        """From the middle of the street to that of its bicycle lane."""
-        return self.lanes_each_way * self.lane_m + BICYCLE_LANE_M / 2
-
-    @property
     def bays_m(self) -> float:
         """From the middle of the street to that of its parking bays."""
         return self.lanes_each_way * self.lane_m + BICYCLE_LANE_M + self.bay_m / 2
@@ -151,7 +146,8 @@ class Streets:
 
     def bicycle_lanes(self) -> list[Lane]:
         """One eastbound, one westbound."""
-        return [self._main_lane(self.section.bicycle_lane_m, way, STOP_LINE_M) for way in (1, -1)]
+        left_m = self.section.lanes_each_way * self.section.lane_m + BICYCLE_LANE_M / 2
+        return [self._main_lane(left_m, way, STOP_LINE_M) for way in (1, -1)]
 
     def sidewalks(self) -> list[Lane]:
         """Tracks of the people who walk along the main street: each way on both sides."""

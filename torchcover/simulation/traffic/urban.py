@@ -16,11 +16,9 @@ from torchcover.simulation.traffic.flow import Agent, Flow, Lane, Simulation, ch
 from torchcover.simulation.traffic.frontage import Times
 from torchcover.simulation.traffic.hills import Hills
 from torchcover.simulation.traffic.idm import Driver
-from torchcover.simulation.traffic.procedural import MostPeople, MostVehicles, Procedural
-from torchcover.simulation.traffic.scenery import Scenery
+from torchcover.simulation.traffic.procedural import Built, MostPeople, MostVehicles, Procedural
 from torchcover.simulation.traffic.signals import CROSS, MAIN
 from torchcover.simulation.traffic.streets import FOOTPATHS_M, WAITING_BEHIND_KERB_M, Section, Streets, plan
-from torchcover.simulation.world import Actor
 
 WARM_UP_S = 20.0
 # What is built up or has traffic, behind and ahead of all places the ego gets to.
@@ -84,12 +82,13 @@ class Urban(Procedural):
     turn_share: float = Field(default=0.25, ge=0.0, le=1.0)
     hills_m: float = Field(default=1.0, ge=0.0, le=2.0)
 
-    def _build(
-        self, fleet: Fleet, times_s: Float64, generator: np.random.Generator
-    ) -> tuple[Scenery, Actor, tuple[Actor, ...]]:
+    def _build(self, fleet: Fleet, times_s: Float64, generator: np.random.Generator) -> Built:
         # What the streets are like is drawn apart from what happens in them.
         (shapes,) = generator.spawn(1)
-        hills, section = Hills(self.hills_m, shapes), self._section(shapes)
+        hills, lanes_of_both = Hills(self.hills_m, shapes), self.lanes or int(shapes.choice([2, 4]))
+        bay_m = BAY_M if shapes.random() < WITH_BAYS else 0.0
+        widths_m = float(shapes.uniform(*LANE_M)), bay_m, float(shapes.uniform(*SIDEWALK_M))
+        section = Section(lanes_of_both // 2, *widths_m)
         longest_way = 1.25 * self.speed_mps * (self.duration_s + WARM_UP_S)
         span_m, reach_m = (-BEHIND_M, longest_way + AHEAD_M), longest_way + 2 * AHEAD_M
         for _ in range(DRAWS):
@@ -114,12 +113,6 @@ class Urban(Procedural):
         )
         static = city.static(seen)
         return static, driver, actors(times_s, [moving, crossing], driver, fleet, hills)
-
-    def _section(self, shapes: np.random.Generator) -> Section:
-        """The main street, as wide as is drawn."""
-        lanes = self.lanes or int(shapes.choice([2, 4]))
-        bay_m = BAY_M if shapes.random() < WITH_BAYS else 0.0
-        return Section(lanes // 2, float(shapes.uniform(*LANE_M)), bay_m, float(shapes.uniform(*SIDEWALK_M)))
 
     def _traffic(
         self, streets: Streets, fleet: Fleet, generator: np.random.Generator

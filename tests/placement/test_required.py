@@ -1,0 +1,147 @@
+"""What is required of bodies and in encounters, as an objective: the share that is kept, the same in all worlds."""
+
+import json
+
+import numpy as np
+import pytest
+
+from tests.placement.worlds import EGO, LOT, held, lidar, rig
+from torchcover.evaluation.checking import check
+from torchcover.evaluation.requirements import Requirements
+from torchcover.evaluation.target_survey import free_space
+from torchcover.placement import Objective, PlacementSearch, SearchPlan, SearchSpace, run_search
+from torchcover.targets import Target, survey_places
+
+# Ahead of an ego that is 4 m long; the last is within it, so that it has no room and is not checked.
+PLACES = [[4.5, 0.0], [6.5, 0.0], [9.0, 0.0], [0.0, 0.0]]
+CHILD = {"target": "child", "at": {"points_m": PLACES}, "points": 1}
+CROSSING = {"name": "a", "ego": {"speed_kmh": 30}, "other": {"body": "adult", "speed_kmh": 5, "from_m": 2}}
+ENCOUNTERS = {"name": "some", "encounters": [CROSSING, {**CROSSING, "name": "b", "ego": {"speed_kmh": 70}}]}
+SPAN = {"channels": 4, "vertical_fov_deg": [-4, 4], "columns": 361}
+LEVEL = rig(lidar(**SPAN), name="level")
+DOWN = rig(lidar(**SPAN, mount={"z_m": 1.9, "pitch_deg": 15.0}), name="down")
+
+
+def child(**changes):
+    return Objective.model_validate({"requires": {**CHILD, **changes}})
+
+
+@pytest.fixture(scope="module")
+def lot(tmp_path_factory):
+    """Its file: a space names its worlds."""
+    path = tmp_path_factory.mktemp("worlds") / "lot.yaml"
+    traffic = {"type": "parking", "duration_s": 1.0, "time_step_s": 0.2, "crossings": 0, "parked_share": 0.3}
+    path.write_text(json.dumps({"name": "lot", "ego": EGO, "traffic": traffic}))
+    return str(path)
+
+
+def searched(lot, out=None, *, objectives=None, resume=False, evaluations=8, **changes):
+    content = {
+        "name": "nose", "start": LEVEL, "scenario": lot,
+        "free": {"top": {"pitch_deg": (0.0, 30.0)}}, "objectives": objectives or {"child": child()}, **changes,
+    }  # fmt: skip
+    plan = SearchPlan(evaluations=evaluations, worlds=3, per_world=2, every_s=0.4, fresh_worlds=2, rays=512)
+    return run_search(PlacementSearch(SearchSpace.model_validate(content), plan), out, resume=resume)
+
+
+def test_the_number_is_the_share_of_the_places_that_are_seen_well_enough_and_has_no_error():
+    some = held(objectives={"near": Objective(region="20m"), "child": child(), "far": Objective(region="80m")})
+    without = held(objectives={"near": Objective(region="20m"), "far": Objective(region="80m")})
+    empty, shares = free_space().model_copy(update={"ego": some._worlds[0].ego}), []
+    for each in (LEVEL, DOWN):
+        *_, last = some.prefixes(each)
+        both = some.estimates(each)
+        points = survey_places(each, empty, Target.load("child"), np.array(PLACES)).least_points
+        assert np.isnan(points[3])
+        for estimate in (last.estimate, *both.values()):
+            assert estimate.value[1] == np.mean(points >= 1)
+            assert (estimate.left_out[:, 1] == estimate.value[1]).all()
+            assert estimate.quantities[1][0] == "child"
+            assert estimate.quantities[1][2:] == ("share", False)
+        # The others are what they are without it.
+        assert both["area"].value[[0, 2]].tolist() == without.estimates(each)["area"].value.tolist()
+        shares.append(float(both["area"].value[1]))
+    assert shares[0] < shares[1] <= 0.75
+
+
+def test_of_encounters_those_count_that_are_kept_in_all_phases_on_the_vehicle_of_the_search():
+    asked = {"requires": {"encounters": ENCOUNTERS, "in_time": {}}}
+    some = held(
+        [LOT.model_copy(update={"ego": None})],
+        objectives={"crossings": Objective.model_validate(asked)},
+        vehicle="van",
+        worlds=1,
+    )
+    of_rig = rig(lidar(channels=32, mount={"z_m": 3.2}), vehicle="suv")  # which is not what carries it there
+    required = Requirements.model_validate({"requirements": [asked["requires"]]})
+    (verdict,) = check(of_rig, required, vehicle="van").verdicts["small"]
+    assert verdict.count == 2
+    assert some.estimates(of_rig)["area"].value.tolist() == [(2 - verdict.failed - verdict.unknown) / 2]
+
+
+def test_a_search_finds_where_the_child_is_seen_and_resumed_it_finds_the_same(lot, tmp_path):
+    searched(lot, tmp_path, evaluations=2)
+    resumed, found = (searched(lot, out, resume=out is not None) for out in (tmp_path, None))
+    told = [[(one.values, one.instants) for one in of.search.evaluations] for of in (resumed, found)]
+    assert told[0] == told[1]
+    start, best = (one.prefixes[-1].estimate.value[0] for one in (found.search.evaluations[0], found.best.evaluation))
+    assert (start, best) == (0.0, 0.75)
+    assert found.sentence.startswith("child: gained +75.0 points in any world, optimism +0.00. ")
+    (gain,) = found.best.gains
+    assert (gain.estimate, gain.test.p, gain.test.error, gain.test.significant) == ("-", 0.0, 0.0, True)
+    assert gain.test.value == gain.search_gain == best - start
+    # What is below the best is dropped at the first look, and nothing else.
+    for arm in found.search.arms.values():
+        for at, one in enumerate(arm.evaluations[1:], start=1):
+            assert (one.instants == 3) == (arm.gains[at, 0] < arm.gains[:at, 0].max())
+    resumed.save(tmp_path)
+    record = json.loads((tmp_path / "search.json").read_text())["found"][0]
+    assert record["gains"]["child"]["-"]["p"] == 0.0
+
+
+def test_what_must_not_be_worse_for_a_child_is_kept_and_changes_by_no_chance(lot):
+    """Of the ground ahead more is seen with the nose down, and of an adult far ahead with the nose up."""
+    level = {"requires": {"target": "adult", "at": {"points_m": [[20.0, 0.0]]}, "points": 1}}
+    objectives = {"near": {"region": "front_3m", "band": "ground"}}
+    free, kept = (searched(lot, objectives=objectives, not_worse=worse) for worse in ((), (level,)))
+    (name,) = kept.search.space.asked.keys() - {"near"}
+    assert kept.search.evaluations[0].prefixes[-1].estimate.value.tolist()[1] == 1.0
+    assert free.best.evaluation.values["top.pitch_deg"] > 8 > kept.best.evaluation.values["top.pitch_deg"]
+    (row,) = (one for one in kept.test.changes if one.what == name)
+    assert (row.p, row.test.value, row.test.error) == (1.0, 0.0, 0.0)
+
+
+def test_where_nothing_is_ever_seen_nothing_is_unknown(lot, tmp_path):
+    never = child(points=10**6)
+    found = searched(lot, objectives={"near": {"region": "20m"}, "never": never}, evaluations=6)
+    arm = found.search.arms["optimiser"]
+    assert not np.isnan(arm.gains).any()
+    assert (arm.gains[:, 1] == 0).all()
+    assert "never: no gain is shown: 0 points in any world" in found.sentence
+    alone = searched(lot, objectives={"never": never}, evaluations=6)
+    assert alone.best.is_start
+    alone.save(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"requires": CHILD, "region": "20m", "band": "ground"}, "it makes an objective alone; leave out band, region"),
+        (
+            {"requires": {"region": "20m", "height": "ground", "number": "radius_m", "most": 0.3}},
+            "requires: of a region give its number, band and region instead",
+        ),
+        ({"requires": {**CHILD, "share": 0.3}}, "requires: one number is needed; got points >= 1, share >= 0.3"),
+        ({"requires": {**CHILD, "at": "kerb"}}, "requires.at: write the place out, .* got the name 'kerb'"),
+        ({"requires": {"points": 5}}, "give target, region or encounters"),
+    ],
+)
+def test_what_cannot_be_an_objective_is_refused(given, message):
+    with pytest.raises(ValueError, match=message):
+        Objective.model_validate(given)
+
+
+def test_a_place_without_room_is_refused_with_the_start(lot):
+    inside = child(at={"x_m": [-0.5, 0.5], "y_m": [-0.3, 0.3]})
+    with pytest.raises(ValueError, match=r"objectives.child: .* nowhere is room for the body; take another place"):
+        searched(lot, objectives={"child": inside})
