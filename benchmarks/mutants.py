@@ -59,6 +59,7 @@ RENAMED = {"min": "max", "max": "min", "all": "any", "any": "all", "minimum": "m
            "floor": "ceil", "ceil": "floor", "cos": "sin", "sin": "cos"}  # fmt: skip
 # Whose arguments may come in any order.
 COMMUTATIVE = ("min", "max", "minimum", "maximum", "equal", "promote_types")
+ORDER = "only decides which of two boxes is looked into first"
 # Looked at, and the same as what they were made of: file, line, what became of it; and why.
 EQUAL = {
     ("ranks.py", "data = data if self.rank == 0 else torch.empty(int(length), dtype=torch.uint8)",
@@ -78,7 +79,17 @@ EQUAL = {
      "4"): "a ray to begin with, whose answer nobody looks at",
     ("rigid.py", "np.matmul(points_m[rows].astype(np.float64, copy=False) + shift, rotation.T, out=moved[rows])",
      "points_m[rows].astype(np.float64)"): "a copy more, of the same numbers",
-    ("kdtree.py", "SAMPLE = 1024", "1025"): "a larger sample only decides about the speed",
+    ("choice.py", "FLAT_SHARE = 1e-3", "0.002"): "only decides about the speed",
+    ("cdist.py", "closer = distance < best", "(distance <= best)"): "of points as near any is right",
+    ("warp.py", "dz = wp.max(zero, wp.max(boxes[node, 2] - z, z - boxes[node, 5]))",
+     "wp.min(boxes[node, 2] - z, z - boxes[node, 5])"): "more boxes are looked into for the same answers",
+    ("packets.py", "x = abs(boxes[node, 0] + boxes[node, 3] - around[0] - around[3])",
+     "(boxes[node, 0] + boxes[node, 3] - around[0] + around[3])"): ORDER,
+    ("packets.py", "x = abs(boxes[node, 0] + boxes[node, 3] - around[0] - around[3])", "2"): ORDER,
+    ("packets.py", "z = abs(boxes[node, 2] + boxes[node, 5] - around[2] - around[5])", "4"): ORDER,
+    ("packets.py", "if near_gap == ZERO and far_gap == ZERO:", "(far_gap != ZERO)"): ORDER,
+    ("recall.py", "for (name, given), highest in zip(borders.items(), (1.0, math.inf), strict=True):",
+     "zip(borders.items(), (1.0, math.inf))"): "there are always two",
 }  # fmt: skip
 # Of unions of types, which fail where they are made.
 OF_TYPES = re.compile(r"\|.*\b(None|str|int|float|bool|[A-Z]\w*)\b|\b(None|str|int|float|bool|[A-Z]\w*)\b.*\|")
