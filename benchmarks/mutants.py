@@ -92,6 +92,8 @@ EQUAL = {
      "5"): "sides of a box are only weighed against each other",
     ("packets.py", "around[3:] = -HUGE", "HUGE"): "more boxes are looked into for the same answers",
     ("packets.py", "y = abs(boxes[node, 1] + boxes[node, 4] - around[1] - around[4])", "5"): ORDER,
+    ("packets.py", "y = abs(boxes[node, 1] + boxes[node, 4] - around[1] - around[4])",
+     "(boxes[node, 1] + boxes[node, 4] + around[1])"): ORDER,
     ("cdist.py", "closer = distance < best", "(distance <= best)"): "of points as near any is right",
     ("warp.py", "dz = wp.max(zero, wp.max(boxes[node, 2] - z, z - boxes[node, 5]))",
      "wp.min(boxes[node, 2] - z, z - boxes[node, 5])"): "more boxes are looked into for the same answers",
