@@ -79,6 +79,8 @@ EQUAL = {
      "4"): "a ray to begin with, whose answer nobody looks at",
     ("rigid.py", "np.matmul(points_m[rows].astype(np.float64, copy=False) + shift, rotation.T, out=moved[rows])",
      "points_m[rows].astype(np.float64)"): "a copy more, of the same numbers",
+    ("box_tree.py", "scale = (AXIS_CELLS / extent).nan_to_num(0.0, posinf=0.0)",
+     "1.0"): "points that are all at one place may come in any order",
     ("choice.py", "FLAT_SHARE = 1e-3", "0.002"): "only decides about the speed",
     ("choice.py", "NEAR_S = 6e-11", "1.2e-10"): "only decides about the speed",
     ("query.py", "memory_mb: float = 256.0,", "512.0"): "only decides about the memory",
