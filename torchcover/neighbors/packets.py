@@ -261,7 +261,7 @@ def _visit(packet: Array, found: Array, leaves: Array, indices: Array, leaf: int
     "void(float32[:, ::1], int64[::1], "
     "float32[:, :, ::1], int32[:, ::1], float32[:, ::1], int32[::1], float32, int64[::1])"
 )
-def _search_part(  # noqa: C901
+def _search_part(
     queries: Array,
     part: Array,
     leaves: Array,
@@ -294,18 +294,14 @@ def _search_part(  # noqa: C901
             while node < first and near_gap <= most:
                 near, far = 2 * node, 2 * node + 1
                 near_gap, far_gap = _gap(boxes, near, around), _gap(boxes, far, around)
-                swap = far_gap < near_gap
-                if near_gap == far_gap:
-                    swap = _centre_gap(boxes, far, around) < _centre_gap(boxes, near, around)
-                if swap:
+                as_near = far_gap == near_gap and _centre_gap(boxes, far, around) < _centre_gap(boxes, near, around)
+                if as_near or far_gap < near_gap:
                     near, far, near_gap, far_gap = far, near, far_gap, near_gap
                 if far_gap <= most:
                     stack[height], gaps[height] = far, far_gap
                     height += 1
                 node = near
-            if near_gap > most or node - first == seed:
-                continue
-            if _may_improve(packet, found, boxes, smallest, node):
+            if near_gap <= most and node - first != seed and _may_improve(packet, found, boxes, smallest, node):
                 last = node - first
                 most = _visit(packet, found, leaves, indices, last)
         for i in range(len(members)):
