@@ -261,7 +261,7 @@ def _visit(packet: Array, found: Array, leaves: Array, indices: Array, leaf: int
     "void(float32[:, ::1], int64[::1], "
     "float32[:, :, ::1], int32[:, ::1], float32[:, ::1], int32[::1], float32, int64[::1])"
 )
-def _search_part(
+def _search_part(  # noqa: C901
     queries: Array,
     part: Array,
     leaves: Array,
@@ -301,7 +301,9 @@ def _search_part(
                     stack[height], gaps[height] = far, far_gap
                     height += 1
                 node = near
-            if near_gap <= most and node - first != seed and _may_improve(packet, found, boxes, smallest, node):
+            if near_gap > most or node - first == seed:
+                continue
+            if _may_improve(packet, found, boxes, smallest, node):
                 last = node - first
                 most = _visit(packet, found, leaves, indices, last)
         for i in range(len(members)):
