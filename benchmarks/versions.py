@@ -48,7 +48,7 @@ def tried(name):
     run(["bash", "-euc", LOWEST if name == "lowest" else NEWEST], source)
     words = run(["bash", "-euc", f"{VERSIONS} && .venv/bin/python -V"], source)
     # Old packages say of their own use of newer ones what is nobody's concern here.
-    old = " -W ignore::DeprecationWarning" * (name == "lowest")
+    old = " -W ignore::DeprecationWarning -W ignore::FutureWarning" * (name == "lowest")
     tests = run(["bash", "-uc", TESTS + old], source, may_fail=True)
     (FOLDER / f"{name}.txt").write_text(tests, encoding="utf-8")
     numpy, torch, _, version = words.split()

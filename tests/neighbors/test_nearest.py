@@ -350,12 +350,48 @@ def test_packets_that_do_not_pay_in_one_cloud_do_in_many(monkeypatch):
     assert choice.backend_of_several(query, [points] * 20) == "packets"
 
 
+def test_packets_lose_nothing_to_the_tree_where_queries_and_points_are_in_one_plane():
+    query, points = (random_cloud(10_000, seed) * torch.tensor([1.0, 1.0, 0.0]) for seed in (28, 29))
+    assert choice._lost_s(query, points) == 0.0
+
+
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
 def test_what_packets_lose_around_points_in_a_plane_does_not_hang_on_the_unit_of_length(scale):
     query, points = random_cloud(10_000, 26), random_cloud(10_000, 27) * torch.tensor([1.0, 1.0, 0.0])
     lost_s = choice._lost_s(query, points)
     assert lost_s > 0.0
     assert choice._lost_s(query * scale, points * scale) == pytest.approx(lost_s, rel=1e-5)
+
+
+def box_of(extent, count, low=(5.0, -20.0, 300.0)):
+    """Half of the points at each end of a box: all that its extent is told by."""
+    ends = torch.tensor([low, low]) + torch.tensor([[0.0, 0.0, 0.0], extent])
+    return ends.repeat_interleave(count // 2, dim=0)
+
+
+@pytest.mark.parametrize(
+    ("asked", "at", "extent", "share"),
+    [
+        ((160.0, 62.5, 100.0), (0.0, 0.0, 10.0), (80.0, 160.0, 0.0), 0.5 * 0.25),
+        ((160.0, 62.5, 100.0), (0.0, 0.0, 90.0), (80.0, 20.0, 0.0), 0.5),
+        ((160.0, 62.5, 100.0), (0.0, 54.0, 28.0), (400.0, 0.0, 0.0), 0.1),
+        ((1000.0, 100.0, 0.0), (0.0, 90.0, 0.0), (80.0, 0.0, 0.0), 0.5),
+        ((20.0, 50.0, 1000.0), (0.0, 0.0, 100.0), (20.0, 20.0, 1.0), 1.0),  # as thick as a thousandth: in a plane
+        ((20.0, 50.0, 1000.0), (0.0, 0.0, 100.0), (20.0, 20.0, 1.0625), 0.0),
+    ],
+)
+def test_what_packets_lose_around_points_in_a_plane_or_on_a_line_by_hand(asked, at, extent, share):
+    """64 of 64,000 queries are 10 m wide, the farthest points 90 m away: the next 10 + sqrt(2 * 45 * 10) m are near."""
+    query = box_of(asked, 64_000)
+    points = box_of(extent, 10_000, tuple(float(c) for c in query[0] + torch.tensor(at)))
+    assert choice._lost_s(query, points) == pytest.approx(choice.NEAR_S * 64_000 * 10_000 * share, rel=1e-5)
+
+
+@pytest.mark.parametrize(("count", "chosen"), [(28_000, "packets"), (30_000, "auto")])
+def test_packets_are_taken_until_they_lose_more_than_they_gain(count, chosen, monkeypatch):
+    monkeypatch.setattr(choice, "_works", lambda *_: True)
+    query, points = box_of((160.0, 62.5, 100.0), 64_000), box_of((80.0, 160.0, 0.0), count, (5.0, -20.0, 310.0))
+    assert choice.backend_of_several(query, [points]) == chosen
 
 
 @pytest.fixture

@@ -102,6 +102,15 @@ def threads():
     torch.set_num_threads(before)
 
 
+@pytest.fixture
+def as_python(threads, monkeypatch):
+    """The loops of packets are run by Python, on one thread: others do not know what errors are ignored."""
+    threads(1)
+    for function, compiled in vars(packets).copy().items():
+        if hasattr(compiled, "py_func"):
+            monkeypatch.setattr(packets, function, compiled.py_func)
+
+
 @clouds
 @backends
 def test_the_index_is_the_slow_twins(name, backend):
@@ -111,16 +120,64 @@ def test_the_index_is_the_slow_twins(name, backend):
 
 @if_installed
 @pytest.mark.parametrize("name", ["random", "ties", "every point 8 times", "all equal", "17 points", "one point"])
-def test_the_loops_as_python_runs_them_find_the_same_and_stay_within_arrays(name, installed, threads, monkeypatch):
+def test_the_loops_as_python_runs_them_find_the_same_and_stay_within_arrays(name, installed, as_python, monkeypatch):
     """Compiled ones do not look where they write."""
-    threads(1)  # others do not know what errors are ignored
-    for function, compiled in vars(packets).copy().items():
-        if hasattr(compiled, "py_func"):
-            monkeypatch.setattr(packets, function, compiled.py_func)
     monkeypatch.setattr(packets, "CROWD", 20)
     query, points = (cloud[:count] for cloud, count in zip(CLOUDS[name], (70, 90), strict=True))
     with np.errstate(over="ignore"):
         np.testing.assert_array_equal(search(query, points, "packets"), slow_twin(query, points))
+
+
+def boxes_around(count, seed):
+    """(count, 6) boxes around two random points each, and around one of them."""
+    ends = np.stack([uniform(count, seed), uniform(count, seed + 1)])
+    ends[1, ::4] = ends[0, ::4]
+    return np.concatenate([ends.min(axis=0), ends.max(axis=0)], axis=1)
+
+
+@if_installed
+def test_gaps_between_boxes_are_those_along_each_axis_in_closed_form(installed):
+    one, other = boxes_around(60, 33), boxes_around(60, 35)
+    (low, high), (least, most) = ((boxes[:, :3], boxes[:, 3:]) for boxes in (one, other))
+    apart = np.maximum(np.maximum(low - most, least - high), 0)
+    between_centres = np.abs((low + high) - (least + most)).sum(axis=1)
+    for name, expected in (("_gap", (apart**2).sum(axis=1)), ("_centre_gap", between_centres)):
+        gap = getattr(packets, name).py_func
+        found = [gap(one, node, around) for node, around in enumerate(other)]
+        np.testing.assert_allclose(found, expected, rtol=1e-4, err_msg=name)
+
+
+@pytest.mark.parametrize("backend", [name for name in BACKENDS if name == "warp"])
+def test_the_gap_to_a_box_is_that_to_the_nearest_place_in_it(backend):
+    """As Python runs it: a smaller one would be found out by nothing but the time that a search takes."""
+    boxes, points = boxes_around(60, 37), uniform(60, 39)
+    gap = import_module("torchcover.neighbors.warp")._gap.func
+    found = [gap(boxes, node, *map(float, point)) for node, point in enumerate(points)]
+    expected = ((np.clip(points, boxes[:, :3], boxes[:, 3:]) - points) ** 2).sum(axis=1)
+    np.testing.assert_allclose(found, expected, rtol=1e-4)
+
+
+@if_installed
+def test_a_packet_looks_into_fewer_leaves_if_it_begins_with_those_around_its_middle(installed, as_python, monkeypatch):
+    """Of the many whose boxes meet its own, as where points are asked for their neighbours."""
+    points = generator(41).normal(0, 9, (600, 3)).astype(np.float32)
+    query = points + np.float32(0.1)
+    looked = []
+
+    def noted(*given, visit=packets._visit):
+        looked.append(given[-1])
+        return visit(*given)
+
+    def leaves_looked_into():
+        looked.clear()
+        with np.errstate(over="ignore"):
+            np.testing.assert_array_equal(search(query, points, "packets"), slow_twin(query, points))
+        return len(looked)
+
+    monkeypatch.setattr(packets, "_visit", noted)
+    from_the_middle = leaves_looked_into()
+    monkeypatch.setattr(packets, "_centre_gap", lambda *_: 0.0)
+    assert from_the_middle < 0.8 * leaves_looked_into()
 
 
 @clouds
