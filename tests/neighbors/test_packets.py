@@ -6,6 +6,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from itertools import permutations
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -155,6 +156,33 @@ def test_the_gap_to_a_box_is_that_to_the_nearest_place_in_it(backend):
     found = [gap(boxes, node, *map(float, point)) for node, point in enumerate(points)]
     expected = ((np.clip(points, boxes[:, :3], boxes[:, 3:]) - points) ** 2).sum(axis=1)
     np.testing.assert_allclose(found, expected, rtol=1e-4)
+
+
+@pytest.mark.parametrize("backend", [name for name in BACKENDS if name == "warp"])
+def test_a_walk_looks_into_at_most_twice_the_boxes_that_any_search_has_to(backend, monkeypatch):
+    """As Python runs it: those beneath a box that is nearer than the nearest point, which nobody knows beforehand."""
+    warp = import_module("torchcover.neighbors.warp")
+    points = generator(43).normal(0, 9, (600, 3)).astype(np.float32)
+    query = points[:100] + np.float32(0.1)
+    tree = [part.numpy() for part in warp.box_tree(torch.from_numpy(points))]
+    looked = []
+
+    def noted(*given, gap=warp._gap.func):
+        looked.append(given[1])
+        return gap(*given)
+
+    monkeypatch.setattr(warp, "_gap", noted)
+    monkeypatch.setattr(warp, "_better", warp._better.func)
+    stand_in = {"max": max, "int32": int, "where": lambda truth, one, other: one if truth else other}
+    found = np.full(len(query), warp.NONE)
+    for number in range(len(query)):
+        monkeypatch.setattr(warp, "wp", SimpleNamespace(tid=lambda number=number: number, **stand_in))
+        warp._walk.func(query, *tree, np.float32(np.inf), found)
+    nearest_of_all = slow_twin(query, points)
+    np.testing.assert_array_equal(found, nearest_of_all)
+    inner = tree[2][1 : len(tree[2]) // 2, None]
+    gaps = ((np.clip(query, inner[..., :3], inner[..., 3:]) - query) ** 2).sum(axis=2)
+    assert len(looked) < 2 * 2 * (gaps <= ((points[nearest_of_all] - query) ** 2).sum(axis=1)).sum()
 
 
 @if_installed
