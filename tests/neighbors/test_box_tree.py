@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from torchcover.neighbors.box_tree import LEAF, NONE, along_the_curve, box_tree
+from torchcover.neighbors.box_tree import AXIS_CELLS, LEAF, NONE, SPREAD, along_the_curve, box_tree
 
 
 def random_cloud(count, seed, dtype=torch.float32):
@@ -45,6 +45,20 @@ def test_points_far_away_do_not_coarsen_the_order(far_m):
     alone = leaf_sizes(cloud).median()
     assert leaf_sizes(torch.cat([cloud, far_m * random_cloud(100, 2)])).median() < 1.2 * alone
     assert alone < 1.5 * (LEAF / len(cloud)) ** (1 / 3) * 3**0.5 * 100
+
+
+def test_what_lies_beyond_the_last_cell_counts_to_it():
+    far = torch.tensor([[1e9], [-1e9]]).expand(2, 3)
+    order = along_the_curve(torch.cat([random_cloud(20_000, 5), far])).tolist()
+    assert (order[-1], order[0]) == (20_000, 20_001)
+
+
+def test_cells_are_spread_to_every_third_bit():
+    cell = torch.randint(AXIS_CELLS, (500,), generator=torch.Generator().manual_seed(6))
+    spread = cell
+    for bits, mask in SPREAD:
+        spread = (spread | (spread << bits)) & mask
+    assert torch.equal(spread, sum(((cell >> bit) & 1) << (3 * bit) for bit in range(21)))
 
 
 def test_many_equal_points_do_not_coarsen_the_order_of_the_others():

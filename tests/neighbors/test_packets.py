@@ -270,6 +270,78 @@ def test_a_point_far_away_does_not_coarsen_the_order(installed):
 
 
 @if_installed
+def test_keys_are_the_bits_of_the_cells_along_the_axes_in_turn_and_then_the_index(installed):
+    cells = generator(44).integers(0, packets.AXIS_CELLS, (500, 3))
+    cells[:2] = [[0] * 3, [packets.AXIS_CELLS - 1] * 3]
+    keys = packets._morton_keys(cells.astype(np.float32) - 7)
+    in_turn = sum(((cells[:, axis] >> bit) & 1) << (3 * bit + axis) for axis in range(3) for bit in range(11))
+    np.testing.assert_array_equal(keys, (in_turn.astype(np.uint64) << np.uint64(31)) + np.arange(500, dtype=np.uint64))
+    assert keys[1] >> np.uint64(31) == 2**33 - 1
+    np.testing.assert_array_equal(packets._sorted(keys.copy()), np.sort(keys))
+
+
+@if_installed
+def test_crowds_are_the_runs_of_more_equal_cells_than_are_left_alone(installed):
+    counts = [3, packets.CROWD, packets.CROWD + 1, 1, 5000, packets.CROWD - 1, 2 * packets.CROWD]
+    cells, ends = np.repeat(np.arange(len(counts), dtype=np.uint64), counts), np.cumsum(counts)
+    keys = (cells << np.uint64(31)) + np.arange(len(cells), dtype=np.uint64)[::-1]
+    runs = [[end - count, end] for count, end in zip(counts, ends, strict=True) if count > 1024]
+    np.testing.assert_array_equal(packets._crowds(keys), runs)
+
+
+@if_installed
+@pytest.mark.parametrize("count", [1, 16, 17, 100, 1000])
+def test_boxes_and_smallest_indices_are_of_all_that_is_beneath(installed, count):
+    points, order = uniform(count, 46), generator(47).permutation(count)
+    leaves, indices, boxes, smallest = packets._build(points, order)
+    filled = np.concatenate([order, np.repeat(order[-1:], -count % 16)]).reshape(-1, 16)
+    np.testing.assert_array_equal(indices, filled)
+    np.testing.assert_array_equal(leaves.transpose(0, 2, 1), points[filled])
+    first = len(boxes) // 2
+    assert first / 2 < len(filled) <= first
+    for node in range(1, 2 * first):
+        below = first.bit_length() - node.bit_length()
+        beneath = filled[(node << below) - first : ((node + 1) << below) - first].ravel()
+        ends = np.concatenate([points[beneath].min(axis=0, initial=3e38), points[beneath].max(axis=0, initial=-3e38)])
+        np.testing.assert_array_equal(boxes[node], ends)
+        assert smallest[node] == beneath.min(initial=2**31 - 1)
+
+
+@if_installed
+@pytest.mark.parametrize("count", [64, 40])
+def test_a_packet_knows_its_box_and_its_least_distances_and_whether_a_box_may_lessen_them(installed, as_python, count):
+    query, points, part = uniform(100, 48), uniform(64, 50), generator(49).permutation(100)[:count]
+    leaves, indices, boxes, smallest = packets._build(points, np.arange(64))
+    packet, found, around = np.zeros(packets.MOST + 1, np.float32), np.zeros(64, np.int32), np.zeros(6, np.float32)
+    packets._load(query, part, packet, found, np.float32(3e38), around)
+    members = query[np.concatenate([part, np.repeat(part[-1:], 64 - count)])]
+    np.testing.assert_array_equal(packet[:192].reshape(3, 64), members.T)
+    np.testing.assert_array_equal(around, np.concatenate([members.min(axis=0), members.max(axis=0)]))
+    squared = ((members[:, None] - points) ** 2).sum(axis=2)
+    for leaf in range(4):
+        most = packets._visit(packet, found, leaves, indices, leaf)
+        least = squared[:, : 16 * leaf + 16].min(axis=1)
+        np.testing.assert_allclose(packet[packets.LEAST : packets.TO_BOX], least, rtol=1e-5)
+        np.testing.assert_array_equal(found, squared[:, : 16 * leaf + 16].argmin(axis=1))
+        assert most == packet[packets.LEAST : packets.TO_BOX].max()
+    for node, (low, high) in enumerate(boxes[1:].reshape(-1, 2, 3), 1):
+        x, y, z = (np.clip(members, low, high) - members).T
+        to_box = x * x + y * y + z * z
+        for bound in (0.0, to_box.min(), to_box.min() * 1.001, to_box.max()):
+            packet[packets.LEAST : packets.TO_BOX], found[:] = bound, smallest[node]
+            assert packets._may_improve(packet, found, boxes, smallest, node) == (to_box < bound).any()
+            found[to_box.argmin()] += 1
+            assert packets._may_improve(packet, found, boxes, smallest, node) == (to_box.min() <= bound)
+
+
+@if_installed
+@pytest.mark.parametrize("axis", range(3))
+def test_the_order_is_as_fine_along_whichever_axis_a_cloud_is_long(installed, axis):
+    cloud = uniform(20_000, 45) * np.float32([100, 1, 0.01])
+    assert np.median(leaf_sizes(np.roll(cloud, axis, axis=1))) < 1.1 * np.median(leaf_sizes(cloud)) < 60
+
+
+@if_installed
 @pytest.mark.parametrize("count", [1, 2, 5000])
 @pytest.mark.parametrize("extent", [0.0, 1e-45, 1e-38, 1e-3, 1e9])
 def test_the_order_is_a_permutation(installed, count, extent):
