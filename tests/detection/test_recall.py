@@ -328,6 +328,9 @@ def test_intervals_are_wilson_s_and_unknown_without_trials():
         assert ratio.low[k].item() == pytest.approx(exact.low, abs=1e-12)
         assert ratio.high[k].item() == pytest.approx(exact.high, abs=1e-12)
     assert torch.stack([ratio.value[5], ratio.low[5], ratio.high[5]]).isnan().all()
+    counts = torch.arange(1, 1000)
+    assert (Ratio.of(counts, counts).high <= 1.0).all()
+    assert (Ratio.of(counts - counts, counts).low >= 0.0).all()
     # Tensors cannot say whether they are equal: each is what it is.
     assert len({ratio, replace(ratio)}) == 2
     assert ratio != replace(ratio)
