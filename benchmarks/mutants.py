@@ -81,6 +81,8 @@ EQUAL = {
     ("query.py", "memory_mb: float = 256.0,", "512.0"): "only decides about the memory",
     ("query.py", "return parts[0] if len(parts) == 1 else Nearest(*map(torch.cat, zip(*parts, strict=True)))",
      "-1"): "the only one is the last one",
+    ("query.py", "return parts[0] if len(parts) == 1 else Nearest(*map(torch.cat, zip(*parts, strict=True)))",
+     "False"): "each has a distance and an index",
     ("visibility.py", "steps = (torch.arange(SIDE_POINTS, device=number.device).double() + 0.5) * 2 / SIDE_POINTS - 1",
      "torch.arange(SIDE_POINTS)"): "the same on a CPU; tests that need a GPU notice",
     ("warp.py", "wp.overload(_walk, [_floats, _floats, _integers, _floats, _integers, _scalar, _integers])",

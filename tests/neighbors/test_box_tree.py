@@ -55,8 +55,10 @@ def test_cells_are_spread_to_every_third_bit():
     assert torch.equal(spread, sum(((cell >> bit) & 1) << (3 * bit) for bit in range(21)))
 
 
-def test_many_equal_points_do_not_coarsen_the_order_of_the_others():
-    sizes = leaf_sizes(torch.cat([random_cloud(3000, 3), torch.zeros(250_000, 3)]))
+@pytest.mark.parametrize("height_m", [0.0, 1e5])
+def test_many_equal_points_do_not_coarsen_the_order_of_the_others(height_m):
+    above = torch.tensor([0.0, 0.0, height_m])
+    sizes = leaf_sizes(torch.cat([random_cloud(3000, 3), torch.zeros(250_000, 3)]) + above)
     assert sizes[sizes > 0].mean() < 50
 
 

@@ -240,6 +240,24 @@ def test_the_order_of_the_queries_their_parts_and_the_threads_change_nothing(nam
     np.testing.assert_array_equal(np.concatenate(parts), expected)
 
 
+@if_installed
+@pytest.mark.parametrize(("count", "asked"), [(1, 0), (2, 2)])
+def test_the_sort_and_the_search_are_on_several_threads_where_there_are_some(
+    installed, threads, monkeypatch, count, asked
+):
+    threads(count)
+    calls = []
+
+    class Noted(packets.ThreadPoolExecutor):
+        def map(self, *given):
+            calls.append(given)
+            return super().map(*given)
+
+    monkeypatch.setattr(packets, "ThreadPoolExecutor", Noted)
+    search(*CLOUDS["random"], "packets")
+    assert len(calls) == asked
+
+
 @clouds
 @backends
 @pytest.mark.parametrize("quantile", [0.0, 0.5, 1.0])
