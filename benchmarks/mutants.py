@@ -71,6 +71,15 @@ EQUAL = {
      "(index <= found[i])"): "at equal indices nothing changes",
     ("packets.py", "boxes[node, axis + 3] = max(boxes[left, axis + 3], boxes[right, axis + 3])",
      "(axis - 3)"): "of six columns the third from the end is the fourth",
+    ("packets.py", "around[axis + 3] = max(around[axis + 3], value)",
+     "(axis - 3)"): "of six numbers the third from the end is the fourth",
+    ("kdtree.py", "_, index = KDTree(coordinates, leafsize=leaf).query(np.ascontiguousarray(query.numpy()), "
+     "distance_upper_bound=bound)", "KDTree(coordinates)"): "only decides about the speed",
+    ("warp.py", "least = bound + (x - x)", "(bound - (x - x))"): "nothing is added",
+    ("warp.py", "node = 0", "-1"): "the walk ends at either",
+    ("choice.py", "_search_of(backend)(point, point, 1.0, 1.0)", "2.0"): "a point that is asked for itself",
+    ("compiled.py", "return numba.njit(signature, cache=True, **options)(function)  # type: ignore[no-any-return]",
+     "numba.njit(signature, **options)"): "compiled anew by each process",
     ("packets.py", "nearer, as_near = np.int32(0), np.int32(0)", "1"): "more boxes are looked into for one answer",
     ("valid_region.py", "_PLANE_RADII = np.concatenate([np.tan(np.linspace(0.0, np.pi / 2, 512, endpoint=False)), "
      "np.geomspace(400.0, 1e8, 32)])", "513"): "one radius more is looked at",

@@ -328,7 +328,8 @@ def test_boxes_and_smallest_indices_are_of_all_that_is_beneath(installed, count)
 @if_installed
 @pytest.mark.parametrize("count", [64, 40])
 def test_a_packet_knows_its_box_and_its_least_distances_and_whether_a_box_may_lessen_them(installed, as_python, count):
-    query, points, part = uniform(100, 48), uniform(64, 50), generator(49).permutation(100)[:count]
+    query, part = uniform(100, 48), generator(49).permutation(100)[:count]
+    points = np.sort(uniform(64, 50), axis=0) + np.float32([60, 0, 0])  # some boxes beside all queries
     leaves, indices, boxes, smallest = packets._build(points, np.arange(64))
     packet, found, around = np.zeros(packets.MOST + 1, np.float32), np.zeros(64, np.int32), np.zeros(6, np.float32)
     packets._load(query, part, packet, found, np.float32(3e38), around)
