@@ -47,7 +47,7 @@ candidates:
     places: {front: {x_m: 2.1, z_m: 1.0}, rear: {x_m: -2.1, z_m: 1.0, yaw_deg: 180}, roof: {z_m: 2.0}}
 choose: {at_most: 2}
 cost: {small: 1}
-objective: {detection: 1.0, band: ground, region: 20m}
+objectives: {near: {detection: 1.0, band: ground, region: 20m}}
 """
 WORLD = ("--scenario", "yard.yaml")
 SMALL = (*WORLD, "--rays", "64", "--cell-m", "8", "--steps", "2")

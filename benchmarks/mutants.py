@@ -35,7 +35,7 @@ ROOMS = {
     "neighbors": (("neighbors",), ("neighbors",)),
     "geometry": (("geometry",), ("geometry",)),
     "cameras": (("cameras",), ("cameras",)),
-    "detection": (("detection",), ("detection",)),
+    "detection": (("detection",), ("detection", "frames/test_visible_targets.py")),
     "simulation": (
         ("simulation/surface.py", "simulation/surface_points.py", "simulation/local_ground.py",
          "simulation/recorded_returns.py", "simulation/sweep.py", "simulation/raycaster.py"),
@@ -59,6 +59,7 @@ RENAMED = {"min": "max", "max": "min", "all": "any", "any": "all", "minimum": "m
            "floor": "ceil", "ceil": "floor", "cos": "sin", "sin": "cos"}  # fmt: skip
 # Whose arguments may come in any order.
 COMMUTATIVE = ("min", "max", "minimum", "maximum", "equal", "promote_types")
+ORDER = "only decides which of two boxes is looked into first"
 # Looked at, and the same as what they were made of: file, line, what became of it; and why.
 EQUAL = {
     ("ranks.py", "data = data if self.rank == 0 else torch.empty(int(length), dtype=torch.uint8)",
@@ -78,7 +79,25 @@ EQUAL = {
      "4"): "a ray to begin with, whose answer nobody looks at",
     ("rigid.py", "np.matmul(points_m[rows].astype(np.float64, copy=False) + shift, rotation.T, out=moved[rows])",
      "points_m[rows].astype(np.float64)"): "a copy more, of the same numbers",
-    ("kdtree.py", "SAMPLE = 1024", "1025"): "a larger sample only decides about the speed",
+    ("choice.py", "FLAT_SHARE = 1e-3", "0.002"): "only decides about the speed",
+    ("choice.py", "NEAR_S = 6e-11", "1.2e-10"): "only decides about the speed",
+    ("query.py", "memory_mb: float = 256.0,", "512.0"): "only decides about the memory",
+    ("query.py", "return parts[0] if len(parts) == 1 else Nearest(*map(torch.cat, zip(*parts, strict=True)))",
+     "-1"): "the only one is the last one",
+    ("visibility.py", "side_m2 = 4 * half_m[facing, one] * half_m[facing, other]",
+     "5"): "sides of a box are only weighed against each other",
+    ("packets.py", "around[3:] = -HUGE", "HUGE"): "more boxes are looked into for the same answers",
+    ("packets.py", "y = abs(boxes[node, 1] + boxes[node, 4] - around[1] - around[4])", "5"): ORDER,
+    ("cdist.py", "closer = distance < best", "(distance <= best)"): "of points as near any is right",
+    ("warp.py", "dz = wp.max(zero, wp.max(boxes[node, 2] - z, z - boxes[node, 5]))",
+     "wp.min(boxes[node, 2] - z, z - boxes[node, 5])"): "more boxes are looked into for the same answers",
+    ("packets.py", "x = abs(boxes[node, 0] + boxes[node, 3] - around[0] - around[3])",
+     "(boxes[node, 0] + boxes[node, 3] - around[0] + around[3])"): ORDER,
+    ("packets.py", "x = abs(boxes[node, 0] + boxes[node, 3] - around[0] - around[3])", "2"): ORDER,
+    ("packets.py", "z = abs(boxes[node, 2] + boxes[node, 5] - around[2] - around[5])", "4"): ORDER,
+    ("packets.py", "if near_gap == ZERO and far_gap == ZERO:", "(far_gap != ZERO)"): ORDER,
+    ("recall.py", "for (name, given), highest in zip(borders.items(), (1.0, math.inf), strict=True):",
+     "zip(borders.items(), (1.0, math.inf))"): "there are always two",
 }  # fmt: skip
 # Of unions of types, which fail where they are made.
 OF_TYPES = re.compile(r"\|.*\b(None|str|int|float|bool|[A-Z]\w*)\b|\b(None|str|int|float|bool|[A-Z]\w*)\b.*\|")

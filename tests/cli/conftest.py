@@ -16,7 +16,8 @@ opened = []
 def _told(event, arguments):
     if event == "open" and isinstance(arguments[0], str | os.PathLike):
         path, mode, flags = arguments
-        if any(letter in (mode or "") for letter in "wax+") or flags & (os.O_WRONLY | os.O_RDWR):
+        writes = any(letter in (mode or "") for letter in "wax+") or flags & (os.O_WRONLY | os.O_RDWR)
+        if writes and not Path(path).is_dir():  # where only a file without a name is written
             opened.append(Path(path).absolute())
 
 

@@ -1,5 +1,7 @@
 """Boxes as others write them down, against corners in closed form."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -54,6 +56,13 @@ def test_a_label_of_kitti_is_a_box_that_stands_on_its_bottom():
     (row,) = Boxes.from_kitti_label([turned], rigid(axes, np.zeros(3))).rows
     assert row[6].item() == pytest.approx(0.0, abs=1e-6)
     assert torch.equal(Boxes.from_rows(row[None]).rows[0], row)
+
+
+def test_levels_of_occlusion_in_labels_of_kitti_are_shares_that_are_seen():
+    labels = np.ones((5, 14))
+    labels[:, 1] = 0, 1, 2, 3, -1  # fully visible, partly and largely occluded, unknown
+    visibility = Boxes.from_kitti_label(labels).visibility
+    torch.testing.assert_close(visibility, torch.tensor([0.9, 0.6, 0.2, math.nan, math.nan]), equal_nan=True)
 
 
 def test_labels_at_once_are_those_one_by_one():

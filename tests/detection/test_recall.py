@@ -129,6 +129,14 @@ def test_the_higher_score_chooses_first_even_if_the_other_is_nearer():
     assert match(detections, torch.tensor([0.9, 0.5]), truth, "distance", 2.01).tolist() == [0, 1]
 
 
+def test_of_all_overlaps_only_that_of_the_box_itself_is_one():
+    truth = torch.tensor([row(0.0, 0.0), row(20.0, 0.0)])
+    metric = RecallByVisibility(by="iou", threshold=1.0)
+    moved = truth + torch.tensor([0, 0, 0, 0, 0, 0, 0.01]) * torch.tensor([[0.0], [1.0]])
+    metric.update(moved, Boxes.from_rows(truth), torch.ones(2))
+    assert metric.compute().overall().recall.value.item() == 0.5
+
+
 def test_a_distance_of_exactly_the_threshold_is_too_far_and_an_overlap_of_exactly_it_is_enough():
     truth = torch.tensor([row(0.0, 0.0)])
     assert match(torch.tensor([row(2.0, 0.0)]), torch.ones(1), truth, "distance", 2.0).tolist() == [-1]
@@ -401,6 +409,7 @@ def test_a_plot_of_recall_has_a_point_and_its_wilson_interval_for_every_bin_with
         ends = np.array([segment[:, 1] for segment in bars.get_segments()])
         expected = torch.stack([curve.recall.low[at], curve.recall.high[at]], dim=1)[[0, 1, 3]]
         np.testing.assert_allclose(ends, expected, atol=1e-12)
+        assert [len(caps.get_xdata()) for caps in axes.lines[1:]] == [3, 3]  # both ends of each interval are marked
         assert [label.get_text().split("\n")[1] for label in axes.get_xticklabels()] == ["1", "1", "0", "1"]
         assert axes.get_xlabel() == "visibility of the object; below, objects"
         plt.close(figure)

@@ -343,6 +343,26 @@ def test_packets_do_not_pay_around_points_on_a_line_or_in_a_plane(scale, chosen,
     assert choice.backend_of_several(points, [points]) == "packets"  # queries among them are near few
 
 
+def test_packets_that_do_not_pay_in_one_cloud_do_in_many(monkeypatch):
+    monkeypatch.setattr(choice, "_works", lambda *_: True)
+    query, points = random_cloud(2_000, 24), random_cloud(100, 25)
+    assert choice.backend_of_several(query, [points]) != "packets"
+    assert choice.backend_of_several(query, [points] * 20) == "packets"
+
+
+def test_packets_lose_nothing_to_the_tree_where_queries_and_points_are_in_one_plane():
+    query, points = (random_cloud(10_000, seed) * torch.tensor([1.0, 1.0, 0.0]) for seed in (28, 29))
+    assert choice._lost_s(query, points) == 0.0
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+def test_what_packets_lose_around_points_in_a_plane_does_not_hang_on_the_unit_of_length(scale):
+    query, points = random_cloud(10_000, 26), random_cloud(10_000, 27) * torch.tensor([1.0, 1.0, 0.0])
+    lost_s = choice._lost_s(query, points)
+    assert lost_s > 0.0
+    assert choice._lost_s(query * scale, points * scale) == pytest.approx(lost_s, rel=1e-5)
+
+
 @pytest.fixture
 def untried():
     """Whether numba and Warp work is asked anew, and afterwards again."""

@@ -190,11 +190,14 @@ def test_sensors_whose_clocks_are_apart(late_s):
         assert f"if it saw all {abs(late_s) * 1000:.0f} ms {'later' if late_s > 0 else 'earlier'}" in doubt
 
 
-def test_poses_that_jump_are_told_and_no_scans_are_compared_across():
+@pytest.mark.parametrize(("jump_m", "turn_deg"), [((0.8, 0.4, 0.0), 0.0), ((0.0, 0.0, 0.0), 4.0)])
+def test_poses_that_jump_are_told_and_no_scans_are_compared_across(jump_m, turn_deg):
     class Jumping(Yard):
         def world_T_vehicle(self, index):
-            jump_m = np.array([0.8, 0.4, 0.0]) * (index >= 6)
-            return rigid(np.eye(3), jump_m) @ super().world_T_vehicle(index)
+            pose = super().world_T_vehicle(index)
+            if index < 6:
+                return pose
+            return rigid(np.eye(3), jump_m) @ pose @ rigid(rotation_from_euler(turn_deg, 0.0, 0.0), np.zeros(3))
 
     assert "poses jump 1 times in 12 instants that were looked at, first at f6" in jumped(Jumping(), 12)
     assert not doubts(Jumping())

@@ -70,16 +70,18 @@ def between_corners(dtype=None):
 
 @lru_cache
 def drive():
-    """Times and places of a bend, and one step that jumps by a metre; and after which place it does."""
+    """Times and poses of a bend, and one step that jumps by a metre; and after which place it does."""
     times_s = 0.1 * np.arange(100)
     way_m = np.stack([12.0 * times_s, 0.6 * times_s**2, 0.1 * times_s], axis=1)
     way_m[41:] += [0.6, -0.8, 0.0]
-    return times_s, way_m, 40
+    poses = np.tile(np.eye(4), (len(times_s), 1, 1))
+    poses[:, :3, 3] = way_m + FAR_M
+    return times_s, poses, 40
 
 
 def wrong_jumps(dtype=np.float64):
-    times_s, way_m, jump = drive()
-    found = pose_jumps(times_s, (way_m + FAR_M).astype(dtype).astype(np.float64))
+    times_s, poses, jump = drive()
+    found = pose_jumps(times_s, poses.astype(dtype).astype(np.float64))
     return float(len(set(found.tolist()) ^ {jump}))
 
 

@@ -153,7 +153,7 @@ class Boxes:
         ahead = np.column_stack([np.cos(turn), np.zeros_like(turn), -np.sin(turn)])
         rows = upright_rows(centre, np.column_stack([length, width, height]), ahead, vehicle_T_camera)
         shares = [SHARE_OCCLUDED.get(occluded, math.nan) for occluded in given[:, 1].tolist()]
-        return cls.from_rows(rows, visibility=torch.tensor(shares, dtype=torch.float32), **others)
+        return cls.from_rows(rows, visibility=rows.new_tensor(shares), **others)
 
     @property
     def rows(self) -> Tensor:

@@ -127,7 +127,7 @@ def box_visibility(
     sensor_points = torch.bincount(points_in_boxes(sensor, boxes).box, minlength=len(boxes))
     if only := ((reference_points == 0) & (sensor_points > 0)).nonzero().squeeze(1).tolist():
         sides, side_of, square_metres = _facing_sides(boxes, only)
-        weights = torch.ones_like(asked[:, 0]) if weights is None else weights
+        weights = asked.new_ones(len(asked)) if weights is None else weights
         asked, box = torch.cat([asked, sides.to(asked)]), torch.cat([box, side_of])
         weights = torch.cat([weights.double(), square_metres])
     # Only the reference may be cropped to the boxes.

@@ -232,7 +232,7 @@ def jumped(recording: Recording, many: int) -> str | None:
 
 def _few_jumps(times_s: NDArray[np.float64], poses: Matrix) -> NDArray[np.intp]:
     """Steps that are jumps; none where there are so many that it is no jump that is wrong."""
-    jumps = pose_jumps(times_s, poses[:, :3, 3])
+    jumps = pose_jumps(times_s, poses)
     return jumps[:0] if len(jumps) > max(2, MOST_JUMPS * len(times_s)) else jumps
 
 

@@ -29,8 +29,9 @@ MARGIN_S, RAYS_EVERY_S = 1.0, 0.2
 SHORT = 20
 # Cells in which a thing that stands is seen again.
 CELL_M = 0.6
-# A pose has jumped if a step is so far off those before and after, beside what tyres can do: the median of so many.
-JUMP_M, HARDEST_MPS2, STEPS = 0.3, 12.0, 5
+# A pose has jumped if a step is so far off those before and after, beside what tyres can do: the median of so many. A
+# turn counts as what it moves so far ahead.
+JUMP_M, HARDEST_MPS2, STEPS, AHEAD_M = 0.3, 12.0, 5, 10.0
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,7 @@ class Sweeps:
             return [index]
         apart_s = np.abs(recording.times_s - recording.times_s[index])
         near = np.flatnonzero(apart_s <= (self.window_s / 2 + margin_s) * (1 + 1e-9))
-        jumps = pose_jumps(recording.times_s[near], np.array([_pose(recording, int(one))[:3, 3] for one in near]))
+        jumps = pose_jumps(recording.times_s[near], np.array([_pose(recording, int(one)) for one in near]))
         own = int(np.searchsorted(near, index))
         near = near[max(jumps[jumps < own] + 1, default=0) : min(jumps[jumps >= own] + 1, default=len(near))]
         return [int(instant) for instant in near[np.argsort(apart_s[near], kind="stable")]]
@@ -199,12 +200,14 @@ class Sweeps:
         return voxels(points_m, self.voxel_m)
 
 
-def pose_jumps(times_s: NDArray[np.float64], places_m: NDArray[np.float64]) -> NDArray[np.intp]:
-    """After which of (N, 3) places the next lies elsewhere than those before and after say."""
+def pose_jumps(times_s: NDArray[np.float64], world_T_vehicle: Matrix) -> NDArray[np.intp]:
+    """After which of (N, 4, 4) poses the next lies, or points, elsewhere than those before and after say."""
     if len(times_s) < 3:
         return np.empty(0, np.intp)
     step_s = np.diff(times_s)[:, None]
-    velocity_mps = np.diff(places_m, axis=0) / step_s
+    turned = world_T_vehicle[:-1, :3, :3].swapaxes(1, 2) @ world_T_vehicle[1:, :3, :3]
+    ahead_m = AHEAD_M * np.arctan2(turned[:, 1, 0], turned[:, 0, 0])
+    velocity_mps = np.column_stack([np.diff(world_T_vehicle[:, :3, 3], axis=0), ahead_m]) / step_s
     near = min(STEPS, len(step_s))
     first = np.clip(np.arange(len(step_s)) - near // 2, 0, len(step_s) - near)
     usual_mps = np.median(velocity_mps[first[:, None] + np.arange(near)], axis=1)

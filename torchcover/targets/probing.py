@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.coverage import NEAR_FIELD_M, BevGrid, BodySums, Region
-from torchcover.coverage.bodies import COLUMNS, FREE, SEEN
+from torchcover.coverage.bodies import COLUMNS, FREE, SEEN, TRIED
 from torchcover.frames import Frame
 from torchcover.geometry import BoundingBox, overlapping
 from torchcover.metrics import SumsInBlocks
@@ -129,17 +129,18 @@ class Probes(SumsInBlocks):
             some, box = probe.some(self.places, generator), probe.body.solid.box
             vehicle_T_body = probe.vehicle_T_body[some]
             z_m, free = free_places(instant, probe.body, probe.surface, vehicle_T_body)
+            np.add.at(sums[:, number, :, TRIED].T, probe.region[some], 1.0)
+            some = some[room := free & probe.room[some]]
+            vehicle_T_body, z_m = vehicle_T_body[room], z_m[room]
             visible = probe.surface.seen_from(place_m, probe.body, standing(vehicle_T_body, z_m), instant)
             for rig, mounted in enumerate(stage.mounted.values()):
                 held = np.any([holding(box, vehicle_T_body, one.vehicle_T_sensor[:3, 3]) for one in mounted], axis=0)
-                step = Step(
-                    SensorStep.of_rig(ends[rig], seed, index), z_m, free & probe.room[some] & ~held, visible[None]
-                )
+                step = Step(SensorStep.of_rig(ends[rig], seed, index), z_m, ~held, visible[None])
                 seen = count(
                     probe.body, probe.surface, vehicle_T_body, mounted, [step], hits=HITS, threshold_m=THRESHOLD_M
                 )
                 m2 = np.multiply(probe.surface.m2_each, (seen.visible, seen.near))
-                each = np.stack([np.ones(len(some)), seen.steps, seen.seen, *m2], axis=1)
+                each = np.stack([np.zeros(len(some)), seen.steps, seen.seen, *m2], axis=1)
                 np.add.at(sums[rig, number], probe.region[some], each)
                 np.add.at(cells[rig, number], probe.cell[some], each[:, [FREE, SEEN]])
         return StepProbes(simulator.place_in_time(index), torch.from_numpy(sums), torch.from_numpy(cells))
