@@ -17,7 +17,7 @@ from torchcover.data import AccumulatedReference, RecordedFrames, open_recording
 from torchcover.recordings.formats.kitti_files import vehicle_T_velodyne
 from torchcover.recordings.in_vehicle import in_vehicle
 
-POINTS, SWEEPS, LONG = 120_000, 20, 100_000
+POINTS, SWEEPS, LONG = 120_000, 50, 100_000
 LINKS = 50_000  # files that may be one file
 
 

@@ -396,6 +396,13 @@ def test_a_frame_in_which_nobody_looked_for_objects_is_refused():
         RecallByVisibility().update(torch.empty(0, 7), None, torch.empty(0))
 
 
+def test_intervals_of_all_and_of_none_end_at_one_and_at_zero_however_they_are_rounded():
+    trials = torch.arange(1, 20_000)
+    every, none = (Ratio.of(successes, trials) for successes in (trials, torch.zeros_like(trials)))
+    assert every.high.max() == 1.0
+    assert none.low.min() == 0.0
+
+
 def test_a_plot_of_recall_has_a_point_and_its_wilson_interval_for_every_bin_with_objects():
     metric = RecallByVisibility(visibility_borders=(0.5,), score_thresholds=(0.0, 0.5))
     rows = torch.tensor([row(10 * k, 0) for k in range(1, 4)])

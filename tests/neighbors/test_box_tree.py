@@ -61,3 +61,10 @@ def test_the_order_is_a_permutation(count, extent):
 
 def test_equal_points_keep_their_order():
     assert along_the_curve(torch.ones(5000, 3)).tolist() == list(range(5000))
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_what_lies_far_beyond_a_crowd_is_at_that_end_of_the_curve(sign):
+    cloud = torch.cat([sign * torch.full((1, 3), 1e6), random_cloud(2000, 5)])
+    order = along_the_curve(cloud)
+    assert order[-1 if sign > 0 else 0] == 0

@@ -8,7 +8,7 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from torchcover.neighbors import nearest
+from torchcover.neighbors import cdist, nearest
 
 MEGABYTES = [2.0, 24.0, 256.0]  # in many chunks, in few, at once
 
@@ -80,7 +80,9 @@ class PeakMemory(TorchDispatchMode):
 
 @clouds
 @pytest.mark.parametrize("memory_mb", MEGABYTES)
-def test_memory_stays_inside_the_budget(clouds, memory_mb):
+@pytest.mark.parametrize("between", [cdist._distances, cdist._squared_distances])  # of the CPU, and of other devices
+def test_memory_stays_inside_the_budget(clouds, memory_mb, between, monkeypatch):
+    monkeypatch.setattr(cdist, "_distances", between)
     query, points = clouds
     with PeakMemory(query, points) as memory:
         nearest(query, points, backend="cdist", memory_mb=memory_mb)

@@ -69,6 +69,7 @@ def test_every_built_in_document_is_valid_and_carries_its_file_name(kind):
         ("columns: 8", "columns: many", r"sensors\.0\.columns: .*integer.*got 'many'"),
         ("x_m: 1.0", "x: 1.0", r"sensors\.0\.mount\.x: Extra inputs"),
         ("    mount:", "    mounts:", r"sensors\.0\.mounts: Extra inputs .*; is mount meant\?$"),
+        ("x_m: 1.0", "xyz: [1, 0, 1]", r"sensors\.0\.mount\.xyz: Extra inputs .*; is x_m, y_m, z_m meant\?$"),
         ("    mount:", "    place:", r"sensors\.0: mount: missing; metres from the ground"),
         ("x_m: 1.0", "x_m: .nan", r"sensors\.0\.mount\.x_m: .*finite"),
         ("x_m: 1.0", "x_m: .inf", r"sensors\.0\.mount\.x_m: .*finite"),

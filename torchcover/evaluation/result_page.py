@@ -20,7 +20,7 @@ from torchcover.simulation import CameraSensor, Sensor, vertical_fov_deg
 # What decides about the numbers, with this package.
 PACKAGES = ("torch", "numpy", "embreex", "trimesh", "pykdtree", "kornia")
 OF_THE_RUN = ("torchcover", "seconds", "complete", "device", "skipped_frames")
-ELSEWHERE = ("rows", "worlds", "metrics", "counts", "frame_counts", "left_out", "rig", "rigs")
+ELSEWHERE = ("verdict", "rows", "worlds", "metrics", "counts", "frame_counts", "left_out", "rig", "rigs")
 # What it is, how often it was left out, and of how many; the counts are those of the frames, added up.
 COUNTED = (
     ("moving bodies out of every sensor's range: not placed", "moving_bodies_out_of_range", "moving_bodies"),
@@ -157,12 +157,12 @@ def _versions() -> dict[str, str]:
 
 def words_of(facts: Mapping[str, Any]) -> dict[str, str]:
     """Facts of a record as a page says them; without those that are unknown."""
-    return {name.replace("_", " "): _value(value) for name, value in facts.items() if value not in (None, [], {})}
+    return {name.replace("_", " "): words for name, value in facts.items() if (words := _value(value))}
 
 
 def _value(value: object) -> str:
     if isinstance(value, Mapping):
-        return ", ".join(f"{name} {_value(one)}" for name, one in value.items())
+        return ", ".join(f"{name} {words}" for name, one in value.items() if (words := _value(one)))
     if isinstance(value, list | tuple):
         return (
             "; ".join(map(_value, value))
@@ -171,6 +171,8 @@ def _value(value: object) -> str:
         )
     if isinstance(value, bool):
         return "yes" if value else "no"
+    if value is None:
+        return ""
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 

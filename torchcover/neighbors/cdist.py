@@ -38,7 +38,8 @@ def _distances(query: Tensor, points: Tensor) -> Tensor:
 def _squared_distances(query: Tensor, points: Tensor) -> Tensor:
     """On an H200 in a seventieth of the time of `cdist`, which has a block of threads for each pair there."""
     squared = (query[:, 0, None] - points[:, 0]).square_()
+    difference = torch.empty_like(squared)  # once, for there is memory for two
     for axis in (1, 2):
-        difference = query[:, axis, None] - points[:, axis]
+        torch.sub(query[:, axis, None], points[:, axis], out=difference)
         squared.addcmul_(difference, difference)
     return squared

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Collection, Mapping
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -137,6 +138,9 @@ class AccumulatedReference:
         local_m = np.concatenate(
             [np.empty((0, 3)), *(scans[key].still_m[~loose[key]] for key in used), *(mover.points_m for mover in found)]
         )
+        local_m = local_m[
+            np.sort(first_of_each(sweeps.voxel(local_m)))
+        ]  # still those first that were seen nearest in time
         # Noise, and errors of poses, make the ground a thick layer that would count for more and hide what is behind.
         level_m = self._on_ground(recording, index, local_m)
         first = first_of_each(sweeps.voxel(level_m))
@@ -182,20 +186,26 @@ class AccumulatedReference:
     def _passing(self, recording: Recording, index: int, scans: Mapping[Key, Thinned]) -> dict[Key, NDArray[np.bool_]]:
         """Of the points of each scan, those above ground where nothing is seen for long."""
         times_s = np.zeros(len(recording.names)) if recording.times_s is None else recording.times_s
-        lengths = [len(scan.cells[0]) for scan in scans.values()]
-        cells = np.concatenate([np.empty(0, np.int64), *(scan.cells[0] for scan in scans.values())])
-        instants, rank = np.unique(np.array([instant for _, instant in scans], dtype=np.int64), return_inverse=True)
-        number, of_cell = np.unique(cells, return_inverse=True)
-        seen = np.unique(of_cell * len(instants) + np.repeat(rank, lengths))
-        start = np.searchsorted(seen, np.arange(len(number)) * len(instants))
-        count = np.diff(np.append(start, len(seen)))
-        first, last = seen[start] % len(instants), seen[start + count - 1] % len(instants)
+        in_time = sorted(scans, key=itemgetter(1))
+        lengths = [len(scans[key].cells[0]) for key in in_time]
+        cells = np.concatenate([np.empty(0, np.int64), *(scans[key].cells[0] for key in in_time)])
+        instants, rank = np.unique(np.array([instant for _, instant in in_time], np.int64), return_inverse=True)
+        order = np.argsort(cells, kind="stable")
+        seen, another = np.repeat(rank, lengths)[order], np.diff(cells[order], prepend=-1) != 0
+        start = np.flatnonzero(another)
+        length = np.diff(np.append(start, len(seen)))
+        end = start + length - 1
+        first, last = seen[start], seen[end]
+        changes = np.cumsum(another | (np.diff(seen, prepend=0) != 0))
+        count = changes[end] - changes[start] + 1
         least_s = min(STANDS_S, np.ptp(times_s[instants]) / 2) if len(instants) else 0.0
         shortly = times_s[instants[last]] - times_s[instants[first]] < least_s - 1e-6
         shortly |= count < SEEN_AGAIN * (last - first + 1)
-        short = np.split(shortly[of_cell], np.cumsum(lengths))
+        short = np.empty(len(cells), np.bool_)
+        short[order] = np.repeat(shortly, length)
         ground, found = self._sweeps.ground(recording, index), {}
-        for (key, scan), of_scan in zip(scans.items(), short, strict=False):
+        for key, of_scan in zip(in_time, np.split(short, np.cumsum(lengths)), strict=False):
+            scan = scans[key]
             passing = of_scan[scan.cells[1]]
             if ground is not None:
                 rows = np.flatnonzero(passing)

@@ -30,6 +30,17 @@ from torchcover.simulation.builtin import builtin_folder, builtin_names
 
 # Mistakes of one document that a message tells, and characters of what arrived.
 MAX_TOLD = 5
+# Keys of other formats, and what they are here.
+OF_OTHERS = {
+    **dict.fromkeys(("xyz", "position", "translation", "location"), "x_m, y_m, z_m"),
+    **dict.fromkeys(("rpy", "euler"), "roll_deg, pitch_deg, yaw_deg"),
+    **dict.fromkeys(("rotation", "orientation", "quaternion"), "quaternion_wxyz, or roll_deg, pitch_deg, yaw_deg,"),
+    **dict.fromkeys(("rows", "beams", "lines", "layers"), "channels"),
+    **dict.fromkeys(("lidars", "cameras", "radars"), "sensors"),
+    "fov": "horizontal_fov_deg, vertical_fov_deg or, of a camera, fov_deg",
+    "resolution": "width, height",
+    "range": "max_range_m",
+}
 MAX_QUOTED = 60
 # Keys and numbers, from the document on.
 Place = tuple[int | str, ...]
@@ -217,7 +228,9 @@ def _told(detail: ErrorDetails, meant: Place | None = None) -> str:
 
 
 def _alike(key: str) -> str:
-    """The key of some document that is this one with a unit behind it, or nearly this one; empty if there is none."""
+    """What others call like that, or the key of some document that is it but for a unit, or nearly; else empty."""
+    if key in OF_OTHERS:
+        return OF_OTHERS[key]
     known = sorted(_keys(Document))
     with_unit = [name for name in known if name.rpartition("_")[0] == key]
     return next(iter(with_unit or get_close_matches(key, known, n=1, cutoff=0.8)), "")
