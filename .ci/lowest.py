@@ -8,7 +8,7 @@ import sys
 import tomllib
 from pathlib import Path
 
-EXTRAS = ("exr", "lightning", "tensorboard")
+EXTRAS = ("av2", "exr", "lightning", "tensorboard")
 
 
 def main(left_out: list[str]) -> None:

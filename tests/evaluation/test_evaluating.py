@@ -423,7 +423,7 @@ def test_hills_do_not_change_what_is_seen_of_far_obstacles():
         for result in (hilly, level)
     ]
     for region in ("80m", "160m"):
-        assert abs(far[0][region] - far[1][region]) < 0.06  # of eight instants
+        assert abs(far[0][region] - far[1][region]) < 0.07  # of eight instants
 
 
 def test_an_ego_that_leans_finds_the_same_numbers():

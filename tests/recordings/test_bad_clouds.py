@@ -152,6 +152,14 @@ def test_archives_of_every_compression_grow_as_far_as_their_memory_is_granted(tm
     assert "claims 900000000 bytes out of" in refused(tmp_path, "a.npz", npz(compression, 900_000_000))
 
 
+@pytest.mark.parametrize("before", ["", "x,y,z\n1,2,3\n", "# x,y,z\n", "// "])
+def test_a_line_of_megabytes_is_refused_before_it_is_taken_apart(tmp_path, before):
+    """Millions of words take fifty times as much as the file."""
+    (path := tmp_path / "a.csv").write_text(before + "1," * 600_000 + "1\n")
+    with pytest.raises(BadFileError, match=r"a line of 12000[0-9]{2} characters; at most 1000000 are read of one"):
+        read_cloud(path)
+
+
 def test_text_takes_no_more_than_is_granted(tmp_path, monkeypatch):
     data = b"1 2 3\n" * 10_000
     (tmp_path / "a.xyz").write_bytes(data)

@@ -103,5 +103,7 @@ def test_tables_that_do_not_hold_together_are_bad_files(tmp_path, table, change,
 
 def test_a_time_zone_is_no_time_of_kitti(tmp_path):
     (tmp_path / "timestamps.txt").write_text("2011-09-26 13:02:25+02\n")
-    with pytest.raises(BadFileError, match="lines of date and time are needed"):
+    with pytest.raises(
+        BadFileError, match=r"lines of date and time are needed|parsing timezone aware"
+    ):  # as NumPy says
         read_timestamps(tmp_path / "timestamps.txt")

@@ -19,7 +19,7 @@ warnings.simplefilter("error")
 warnings.filterwarnings("ignore", ".*isinstance.treespec, LeafSpec.. is deprecated", FutureWarning)
 warnings.filterwarnings("ignore", "The '.*dataloader' does not have many workers")
 folder = Path(sys.argv[1])
-job = torch.load(folder / "frames.pt")
+job = torch.load(folder / "frames.pt", weights_only=False)
 frames = [Frame({"rig": sensor}, reference, k, "saved") for k, (sensor, reference) in enumerate(job["frames"])]
 
 

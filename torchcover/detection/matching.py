@@ -78,12 +78,11 @@ def match(detections: Tensor, scores: Tensor, truth: Tensor, by: MatchBy, thresh
     else:
         cost = -bev_iou(detections, truth)
         allowed = cost <= -threshold
-    order = scores.argsort(descending=True, stable=True).tolist()
     # A choice depends on those before it, so this is a loop; only detections near an object take part.
     costs = cost.where(allowed, torch.inf).cpu().numpy()
     taken_by = np.full(len(detections), -1, dtype=np.int64)
     has_choice = np.isfinite(costs).any(axis=1)
-    for number in order:
+    for number in scores.argsort(descending=True, stable=True).tolist():
         if has_choice[number]:
             chosen = int(costs[number].argmin())
             if np.isfinite(costs[number, chosen]):

@@ -164,11 +164,7 @@ def _value(value: object) -> str:
     if isinstance(value, Mapping):
         return ", ".join(f"{name} {words}" for name, one in value.items() if (words := _value(one)))
     if isinstance(value, list | tuple):
-        return (
-            "; ".join(map(_value, value))
-            if any(isinstance(one, str) for one in value)
-            else " to ".join(map(_value, value))
-        )
+        return ("; " if any(isinstance(one, str) for one in value) else " to ").join(map(_value, value))
     if isinstance(value, bool):
         return "yes" if value else "no"
     if value is None:

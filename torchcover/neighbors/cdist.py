@@ -21,7 +21,7 @@ def search(query: Tensor, points: Tensor, max_distance: float, memory_mb: float)
 
 
 def _nearest_in_chunks(query: Tensor, points: Tensor, columns: int) -> Tensor:
-    best = torch.full_like(query[:, 0], torch.inf)
+    best = query.new_full((len(query),), torch.inf)
     index = torch.zeros(len(query), dtype=torch.int64, device=query.device)
     between = _distances if query.device.type == "cpu" else _squared_distances
     for start in range(0, len(points), columns):

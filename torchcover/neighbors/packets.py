@@ -208,7 +208,7 @@ def _gap(boxes: Array, node: int, around: Array) -> Array:
 
 @inlined
 def _centre_gap(boxes: Array, node: int, around: Array) -> Array:
-    """How far apart the centres of the two boxes are: the order of nodes that both meet the packet's box."""
+    """How far apart the centres of the two boxes are, by sums along the axes: the order of nodes that are as near."""
     x = abs(boxes[node, 0] + boxes[node, 3] - around[0] - around[3])
     y = abs(boxes[node, 1] + boxes[node, 4] - around[1] - around[4])
     z = abs(boxes[node, 2] + boxes[node, 5] - around[2] - around[5])
@@ -284,7 +284,7 @@ def _search_part(  # noqa: C901
         seed, most = last, bound
         if seed >= 0:
             most = _visit(packet, found, leaves, indices, seed)
-        stack[0], gaps[0], height = 1, _gap(boxes, 1, around), 1
+        stack[0], gaps[0], height = 1, ZERO, 1
         while height > 0:
             height -= 1
             node = stack[height]
@@ -294,10 +294,8 @@ def _search_part(  # noqa: C901
             while node < first and near_gap <= most:
                 near, far = 2 * node, 2 * node + 1
                 near_gap, far_gap = _gap(boxes, near, around), _gap(boxes, far, around)
-                swap = far_gap < near_gap
-                if near_gap == ZERO and far_gap == ZERO:
-                    swap = _centre_gap(boxes, far, around) < _centre_gap(boxes, near, around)
-                if swap:
+                as_near = far_gap == near_gap and _centre_gap(boxes, far, around) < _centre_gap(boxes, near, around)
+                if as_near or far_gap < near_gap:
                     near, far, near_gap, far_gap = far, near, far_gap, near_gap
                 if far_gap <= most:
                     stack[height], gaps[height] = far, far_gap

@@ -14,6 +14,7 @@ COMMENT_MARKS = ("#", "//")
 AXES = ("x", "y", "z")
 # Of three float64, and once more while the array grows.
 ROW_BYTES = 48
+MAX_LINE = 1_000_000  # characters: a word takes 50 times as much, until it is known how many there should be
 
 
 def read_text(path: Path) -> NDArray[np.float64]:
@@ -70,7 +71,11 @@ def read_lines(data: bytes) -> Iterator[str]:
 def _lines(data: bytes) -> Iterator[str]:
     stream = io.TextIOWrapper(io.BytesIO(data), encoding="utf-8-sig")
     try:
-        yield from filter(None, map(str.strip, stream))
+        for line in stream:
+            if len(line) > MAX_LINE:
+                raise ValueError(f"a line of {len(line)} characters; at most {MAX_LINE} are read of one")
+            if row := line.strip():
+                yield row
     except UnicodeDecodeError as error:
         raise ValueError(f"not text in UTF-8: there is a byte 0x{error.object[error.start]:02x}") from error
 
