@@ -276,7 +276,7 @@ def _share_of_one_city(estimate, other):
     """(N,) the largest share that a city has of the variance."""
     parts = (estimate.left_out - (0.0 if other is None else other.left_out)).numpy()
     squares = np.square(parts - parts.mean(axis=0))
-    return squares.max(axis=0) / squares.sum(axis=0)
+    return squares.max(axis=0) / np.maximum(squares.sum(axis=0), np.finfo(float).tiny)
 
 
 def _covered(each, truth):

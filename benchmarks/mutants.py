@@ -59,7 +59,6 @@ RENAMED = {"min": "max", "max": "min", "all": "any", "any": "all", "minimum": "m
            "floor": "ceil", "ceil": "floor", "cos": "sin", "sin": "cos"}  # fmt: skip
 # Whose arguments may come in any order.
 COMMUTATIVE = ("min", "max", "minimum", "maximum", "equal", "promote_types")
-ORDER = "only decides which of two boxes is looked into first"
 # Looked at, and the same as what they were made of: file, line, what became of it; and why.
 EQUAL = {
     ("ranks.py", "data = data if self.rank == 0 else torch.empty(int(length), dtype=torch.uint8)",
@@ -72,6 +71,15 @@ EQUAL = {
      "(index <= found[i])"): "at equal indices nothing changes",
     ("packets.py", "boxes[node, axis + 3] = max(boxes[left, axis + 3], boxes[right, axis + 3])",
      "(axis - 3)"): "of six columns the third from the end is the fourth",
+    ("packets.py", "around[axis + 3] = max(around[axis + 3], value)",
+     "(axis - 3)"): "of six numbers the third from the end is the fourth",
+    ("kdtree.py", "_, index = KDTree(coordinates, leafsize=leaf).query(np.ascontiguousarray(query.numpy()), "
+     "distance_upper_bound=bound)", "KDTree(coordinates)"): "only decides about the speed",
+    ("warp.py", "least = bound + (x - x)", "(bound - (x - x))"): "nothing is added",
+    ("warp.py", "node = 0", "-1"): "the walk ends at either",
+    ("choice.py", "_search_of(backend)(point, point, 1.0, 1.0)", "2.0"): "a point that is asked for itself",
+    ("compiled.py", "return numba.njit(signature, cache=True, **options)(function)  # type: ignore[no-any-return]",
+     "numba.njit(signature, **options)"): "compiled anew by each process",
     ("packets.py", "nearer, as_near = np.int32(0), np.int32(0)", "1"): "more boxes are looked into for one answer",
     ("valid_region.py", "_PLANE_RADII = np.concatenate([np.tan(np.linspace(0.0, np.pi / 2, 512, endpoint=False)), "
      "np.geomspace(400.0, 1e8, 32)])", "513"): "one radius more is looked at",
@@ -79,31 +87,22 @@ EQUAL = {
      "4"): "a ray to begin with, whose answer nobody looks at",
     ("rigid.py", "np.matmul(points_m[rows].astype(np.float64, copy=False) + shift, rotation.T, out=moved[rows])",
      "points_m[rows].astype(np.float64)"): "a copy more, of the same numbers",
-    ("box_tree.py", "scale = (AXIS_CELLS / extent).nan_to_num(0.0, posinf=0.0)",
-     "1.0"): "points that are all at one place may come in any order",
-    ("choice.py", "FLAT_SHARE = 1e-3", "0.002"): "only decides about the speed",
-    ("choice.py", "NEAR_S = 6e-11", "1.2e-10"): "only decides about the speed",
     ("query.py", "memory_mb: float = 256.0,", "512.0"): "only decides about the memory",
     ("query.py", "return parts[0] if len(parts) == 1 else Nearest(*map(torch.cat, zip(*parts, strict=True)))",
      "-1"): "the only one is the last one",
+    ("query.py", "return parts[0] if len(parts) == 1 else Nearest(*map(torch.cat, zip(*parts, strict=True)))",
+     "False"): "each has a distance and an index",
     ("visibility.py", "steps = (torch.arange(SIDE_POINTS, device=number.device).double() + 0.5) * 2 / SIDE_POINTS - 1",
      "torch.arange(SIDE_POINTS)"): "the same on a CPU; tests that need a GPU notice",
     ("warp.py", "wp.overload(_walk, [_floats, _floats, _integers, _floats, _integers, _scalar, _integers])",
      "pass"): "compiled when it is used first, in two modules",
     ("visibility.py", "side_m2 = 4 * half_m[facing, one] * half_m[facing, other]",
      "5"): "sides of a box are only weighed against each other",
-    ("packets.py", "around[3:] = -HUGE", "HUGE"): "more boxes are looked into for the same answers",
-    ("packets.py", "y = abs(boxes[node, 1] + boxes[node, 4] - around[1] - around[4])", "5"): ORDER,
-    ("packets.py", "y = abs(boxes[node, 1] + boxes[node, 4] - around[1] - around[4])",
-     "(boxes[node, 1] + boxes[node, 4] + around[1])"): ORDER,
     ("cdist.py", "closer = distance < best", "(distance <= best)"): "of points as near any is right",
-    ("warp.py", "dz = wp.max(zero, wp.max(boxes[node, 2] - z, z - boxes[node, 5]))",
-     "wp.min(boxes[node, 2] - z, z - boxes[node, 5])"): "more boxes are looked into for the same answers",
-    ("packets.py", "x = abs(boxes[node, 0] + boxes[node, 3] - around[0] - around[3])",
-     "(boxes[node, 0] + boxes[node, 3] - around[0] + around[3])"): ORDER,
-    ("packets.py", "x = abs(boxes[node, 0] + boxes[node, 3] - around[0] - around[3])", "2"): ORDER,
-    ("packets.py", "z = abs(boxes[node, 2] + boxes[node, 5] - around[2] - around[5])", "4"): ORDER,
-    ("packets.py", "if near_gap == ZERO and far_gap == ZERO:", "(far_gap != ZERO)"): ORDER,
+    ("warp.py", "wp.config.quiet = True", "False"): "asked by older Warps alone",
+    ("box_tree.py", "scale = (AXIS_CELLS / extent).nan_to_num(0.0, posinf=0.0)",
+     "1.0"): "points that are all one are in the first cell by any scale, and no quotient is NaN",
+    ("packets.py", "last = -1", "0"): "the first packet begins with the first leaf, once all the same",
     ("recall.py", "for (name, given), highest in zip(borders.items(), (1.0, math.inf), strict=True):",
      "zip(borders.items(), (1.0, math.inf))"): "there are always two",
 }  # fmt: skip

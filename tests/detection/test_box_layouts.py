@@ -27,6 +27,12 @@ def test_upright_boxes_keep_their_places_and_headings_in_another_frame():
     assert np.cos(turned[:, 6] - yaw - np.pi / 2) == pytest.approx(1.0)
 
 
+def test_numbers_of_few_bits_turn_into_a_heading_as_exact_as_they_are():
+    heading = np.array([[0.6, 0.8, 0.0]], dtype=np.float16)
+    (row,) = upright_rows(np.ones((1, 3), np.float16), np.ones((1, 3), np.float16), heading, None)
+    assert row[6].item() == pytest.approx(math.atan2(*map(float, heading[0, 1::-1])), abs=1e-6)
+
+
 def test_no_boxes_are_none():
     assert upright_rows([], [], [], None).shape == (0, 7)
     assert len(Boxes.from_kitti_label([])) == 0

@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy.stats import binomtest
 
-from torchcover.detection import Boxes, BoxVisibility, RecallByVisibility, bev_iou, match
+from torchcover.detection import Boxes, BoxVisibility, RecallByVisibility, bev_iou, match, matching
 from torchcover.detection.recall_curve import Ratio
 
 VISIBILITY, DISTANCE = (0.2, 0.4, 0.6, 0.8), (20.0, 40.0, 60.0)
@@ -44,6 +44,14 @@ def test_overlap_of_boxes_along_the_axes_in_closed_form():
     quarter = rows[1][:, [0, 1, 2, 4, 3, 5, 6]].clone()
     quarter[:, 6] += math.pi / 2
     np.testing.assert_allclose(bev_iou(rows[0], quarter).numpy(), expected, atol=1e-12)
+
+
+def test_boxes_whose_circles_do_not_meet_are_not_compared_any_further(monkeypatch):
+    asked = []
+    monkeypatch.setattr(matching, "_intersection", lambda a, b: asked.append(len(a)) or torch.zeros(len(a)).double())
+    diagonal = math.hypot(4.0, 2.0)
+    bev_iou(torch.tensor([row(0.0, 0.0)]), torch.tensor([row(1.01 * diagonal, 0.0), row(0.0, 0.99 * diagonal)]))
+    assert asked == [1]
 
 
 def test_overlap_of_turned_boxes_against_a_fine_raster():

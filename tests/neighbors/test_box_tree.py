@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from torchcover.neighbors.box_tree import LEAF, NONE, along_the_curve, box_tree
+from torchcover.neighbors.box_tree import AXIS_CELLS, LEAF, NONE, SPREAD, along_the_curve, box_tree
 
 
 def random_cloud(count, seed, dtype=torch.float32):
@@ -47,8 +47,18 @@ def test_points_far_away_do_not_coarsen_the_order(far_m):
     assert alone < 1.5 * (LEAF / len(cloud)) ** (1 / 3) * 3**0.5 * 100
 
 
-def test_many_equal_points_do_not_coarsen_the_order_of_the_others():
-    sizes = leaf_sizes(torch.cat([random_cloud(3000, 3), torch.zeros(250_000, 3)]))
+def test_cells_are_spread_to_every_third_bit():
+    cell = torch.randint(AXIS_CELLS, (500,), generator=torch.Generator().manual_seed(6))
+    spread = cell
+    for bits, mask in SPREAD:
+        spread = (spread | (spread << bits)) & mask
+    assert torch.equal(spread, sum(((cell >> bit) & 1) << (3 * bit) for bit in range(21)))
+
+
+@pytest.mark.parametrize("height_m", [0.0, 1e5])
+def test_many_equal_points_do_not_coarsen_the_order_of_the_others(height_m):
+    above = torch.tensor([0.0, 0.0, height_m])
+    sizes = leaf_sizes(torch.cat([random_cloud(3000, 3), torch.zeros(250_000, 3)]) + above)
     assert sizes[sizes > 0].mean() < 50
 
 

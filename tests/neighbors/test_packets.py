@@ -6,6 +6,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from itertools import permutations
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -157,6 +158,33 @@ def test_the_gap_to_a_box_is_that_to_the_nearest_place_in_it(backend):
     np.testing.assert_allclose(found, expected, rtol=1e-4)
 
 
+@pytest.mark.parametrize("backend", [name for name in BACKENDS if name == "warp"])
+def test_a_walk_looks_into_at_most_twice_the_boxes_that_any_search_has_to(backend, monkeypatch):
+    """As Python runs it: those beneath a box that is nearer than the nearest point, which nobody knows beforehand."""
+    warp = import_module("torchcover.neighbors.warp")
+    points = generator(43).normal(0, 9, (600, 3)).astype(np.float32)
+    query = points[:100] + np.float32(0.1)
+    tree = [part.numpy() for part in warp.box_tree(torch.from_numpy(points))]
+    looked = []
+
+    def noted(*given, gap=warp._gap.func):
+        looked.append(given[1])
+        return gap(*given)
+
+    monkeypatch.setattr(warp, "_gap", noted)
+    monkeypatch.setattr(warp, "_better", warp._better.func)
+    stand_in = {"max": max, "int32": int, "where": lambda truth, one, other: one if truth else other}
+    found = np.full(len(query), warp.NONE)
+    for number in range(len(query)):
+        monkeypatch.setattr(warp, "wp", SimpleNamespace(tid=lambda number=number: number, **stand_in))
+        warp._walk.func(query, *tree, np.float32(np.inf), found)
+    nearest_of_all = slow_twin(query, points)
+    np.testing.assert_array_equal(found, nearest_of_all)
+    inner = tree[2][1 : len(tree[2]) // 2, None]
+    gaps = ((np.clip(query, inner[..., :3], inner[..., 3:]) - query) ** 2).sum(axis=2)
+    assert len(looked) < 2 * 2 * (gaps <= ((points[nearest_of_all] - query) ** 2).sum(axis=1)).sum()
+
+
 @if_installed
 def test_a_packet_looks_into_fewer_leaves_if_it_begins_with_those_around_its_middle(installed, as_python, monkeypatch):
     """Of the many whose boxes meet its own, as where points are asked for their neighbours."""
@@ -212,6 +240,24 @@ def test_the_order_of_the_queries_their_parts_and_the_threads_change_nothing(nam
     np.testing.assert_array_equal(np.concatenate(parts), expected)
 
 
+@if_installed
+@pytest.mark.parametrize(("count", "asked"), [(1, 0), (2, 2)])
+def test_the_sort_and_the_search_are_on_several_threads_where_there_are_some(
+    installed, threads, monkeypatch, count, asked
+):
+    threads(count)
+    calls = []
+
+    class Noted(packets.ThreadPoolExecutor):
+        def map(self, *given):
+            calls.append(given)
+            return super().map(*given)
+
+    monkeypatch.setattr(packets, "ThreadPoolExecutor", Noted)
+    search(*CLOUDS["random"], "packets")
+    assert len(calls) == asked
+
+
 @clouds
 @backends
 @pytest.mark.parametrize("quantile", [0.0, 0.5, 1.0])
@@ -239,6 +285,79 @@ def test_a_point_far_away_does_not_coarsen_the_order(installed):
     alone = np.median(leaf_sizes(cloud))
     assert np.median(leaf_sizes(np.concatenate([cloud, far]))) < 1.2 * alone
     assert alone < 0.2 * np.median(np.linalg.norm(np.ptp(cloud.reshape(-1, 16, 3), axis=1), axis=1))
+
+
+@if_installed
+def test_keys_are_the_bits_of_the_cells_along_the_axes_in_turn_and_then_the_index(installed):
+    cells = generator(44).integers(0, packets.AXIS_CELLS, (500, 3))
+    cells[:2] = [[0] * 3, [packets.AXIS_CELLS - 1] * 3]
+    keys = packets._morton_keys(cells.astype(np.float32) - 7)
+    in_turn = sum(((cells[:, axis] >> bit) & 1) << (3 * bit + axis) for axis in range(3) for bit in range(11))
+    np.testing.assert_array_equal(keys, (in_turn.astype(np.uint64) << np.uint64(31)) + np.arange(500, dtype=np.uint64))
+    assert keys[1] >> np.uint64(31) == 2**33 - 1
+    np.testing.assert_array_equal(packets._sorted(keys.copy()), np.sort(keys))
+
+
+@if_installed
+def test_crowds_are_the_runs_of_more_equal_cells_than_are_left_alone(installed):
+    counts = [3, packets.CROWD, packets.CROWD + 1, 1, 5000, packets.CROWD - 1, 2 * packets.CROWD]
+    cells, ends = np.repeat(np.arange(len(counts), dtype=np.uint64), counts), np.cumsum(counts)
+    keys = (cells << np.uint64(31)) + np.arange(len(cells), dtype=np.uint64)[::-1]
+    runs = [[end - count, end] for count, end in zip(counts, ends, strict=True) if count > 1024]
+    np.testing.assert_array_equal(packets._crowds(keys), runs)
+
+
+@if_installed
+@pytest.mark.parametrize("count", [1, 16, 17, 100, 1000])
+def test_boxes_and_smallest_indices_are_of_all_that_is_beneath(installed, count):
+    points, order = uniform(count, 46), generator(47).permutation(count)
+    leaves, indices, boxes, smallest = packets._build(points, order)
+    filled = np.concatenate([order, np.repeat(order[-1:], -count % 16)]).reshape(-1, 16)
+    np.testing.assert_array_equal(indices, filled)
+    np.testing.assert_array_equal(leaves.transpose(0, 2, 1), points[filled])
+    first = len(boxes) // 2
+    assert first / 2 < len(filled) <= first
+    for node in range(1, 2 * first):
+        below = first.bit_length() - node.bit_length()
+        beneath = filled[(node << below) - first : ((node + 1) << below) - first].ravel()
+        ends = np.concatenate([points[beneath].min(axis=0, initial=3e38), points[beneath].max(axis=0, initial=-3e38)])
+        np.testing.assert_array_equal(boxes[node], ends)
+        assert smallest[node] == beneath.min(initial=2**31 - 1)
+
+
+@if_installed
+@pytest.mark.parametrize("count", [64, 40])
+def test_a_packet_knows_its_box_and_its_least_distances_and_whether_a_box_may_lessen_them(installed, as_python, count):
+    query, part = uniform(100, 48), generator(49).permutation(100)[:count]
+    points = np.sort(uniform(64, 50), axis=0) + np.float32([60, 0, 0])  # some boxes beside all queries
+    leaves, indices, boxes, smallest = packets._build(points, np.arange(64))
+    packet, found, around = np.zeros(packets.MOST + 1, np.float32), np.zeros(64, np.int32), np.zeros(6, np.float32)
+    packets._load(query, part, packet, found, np.float32(3e38), around)
+    members = query[np.concatenate([part, np.repeat(part[-1:], 64 - count)])]
+    np.testing.assert_array_equal(packet[:192].reshape(3, 64), members.T)
+    np.testing.assert_array_equal(around, np.concatenate([members.min(axis=0), members.max(axis=0)]))
+    squared = ((members[:, None] - points) ** 2).sum(axis=2)
+    for leaf in range(4):
+        most = packets._visit(packet, found, leaves, indices, leaf)
+        least = squared[:, : 16 * leaf + 16].min(axis=1)
+        np.testing.assert_allclose(packet[packets.LEAST : packets.TO_BOX], least, rtol=1e-5)
+        np.testing.assert_array_equal(found, squared[:, : 16 * leaf + 16].argmin(axis=1))
+        assert most == packet[packets.LEAST : packets.TO_BOX].max()
+    for node, (low, high) in enumerate(boxes[1:].reshape(-1, 2, 3), 1):
+        x, y, z = (np.clip(members, low, high) - members).T
+        to_box = x * x + y * y + z * z
+        for bound in (0.0, to_box.min(), to_box.min() * 1.001, to_box.max()):
+            packet[packets.LEAST : packets.TO_BOX], found[:] = bound, smallest[node]
+            assert packets._may_improve(packet, found, boxes, smallest, node) == (to_box < bound).any()
+            found[to_box.argmin()] += 1
+            assert packets._may_improve(packet, found, boxes, smallest, node) == (to_box.min() <= bound)
+
+
+@if_installed
+@pytest.mark.parametrize("axis", range(3))
+def test_the_order_is_as_fine_along_whichever_axis_a_cloud_is_long(installed, axis):
+    cloud = uniform(20_000, 45) * np.float32([100, 1, 0.01])
+    assert np.median(leaf_sizes(np.roll(cloud, axis, axis=1))) < 1.1 * np.median(leaf_sizes(cloud)) < 60
 
 
 @if_installed
