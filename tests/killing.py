@@ -36,11 +36,13 @@ def operations_of(act, at=None, number=signal.SIGKILL, *, copied=None):
         with open(there, "rb") as told:
             count = len(told.read())
         return count, os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-    counting = itertools.count()
+    counting, killed_pid = itertools.count(), os.getpid()
     is_copying = False
 
     def touched(event, arguments):
         nonlocal is_copying
+        if os.getpid() != killed_pid:  # a child of it
+            return
         # Where a file is opened for reading nothing can break.
         if event in OPERATIONS and (event != "open" or arguments[1] not in ("r", "rb")) and not is_copying:
             index = next(counting)

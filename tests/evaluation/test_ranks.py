@@ -9,7 +9,6 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
-from queue import SimpleQueue
 
 import pytest
 import torch
@@ -120,50 +119,71 @@ def test_all_get_the_result_of_a_single_process(frame_of, tmp_path, length, work
         check_equal(found, single)
 
 
-class Wired(Ranks):
-    """One of several ranks in a process, each in a thread; counts what it merges."""
-
-    def __init__(self, wires, rank, size):
-        super().__init__(None, rank, size)
-        self.wires, self.received = wires, 0
-
-    def _send(self, value, rank):
-        self.wires[self.rank, rank].put(value)
-
-    def _receive(self, rank):
-        self.received += 1
-        return self.wires[rank, self.rank].get(timeout=LONGEST_S)
-
-
-@pytest.mark.parametrize("size", [2, 3, 8, 11, 64])
-def test_ranks_merge_in_order_and_none_of_them_many(size):
-    wires = {(rank, other): SimpleQueue() for rank in range(size) for other in range(rank)}
-    ranks = [Wired(wires, rank, size) for rank in range(size)]
-
-    def merged(rank):
-        observer = Names()
-        observer.names = [f"{rank.rank}", f"{rank.rank} too"]
-        return rank._merged(observer)
-
-    with ThreadPoolExecutor(size) as pool:
-        first = next(pool.map(merged, ranks))
-    assert first.names == [name for rank in range(size) for name in (f"{rank}", f"{rank} too")]
-    assert max(rank.received for rank in ranks) == math.ceil(math.log2(size))
-
-
-def in_threads(work, size=3):
+def in_threads(work, size=3, kind=Ranks):
     """What `work(ranks)` gives or raises in ranks that have no more in common than a store."""
     store = HashStore()
     store.set_timeout(timedelta(seconds=LONGEST_S / 3))
 
     def outcome(rank):
         try:
-            return work(Ranks(store, rank, size))
+            return work(kind(store, rank, size))
         except Exception as error:
             return error
 
     with ThreadPoolExecutor(size) as pool:
         return list(pool.map(outcome, range(size)))
+
+
+class Counting(Ranks):
+    """Counts what it merges."""
+
+    received = 0
+
+    def _receive(self, rank, to=None):
+        self.received += to is None
+        return super()._receive(rank, to)
+
+
+@pytest.mark.parametrize("size", [2, 3, 8, 11, 64])
+def test_ranks_merge_in_order_and_none_of_them_many(size):
+    def merged(rank):
+        observer = Names()
+        observer.names = [f"{rank.rank}", f"{rank.rank} too"]
+        (whole,) = rank.merge([observer])
+        return whole.names, rank.received
+
+    found = in_threads(merged, size, Counting)
+    assert [names for names, _ in found] == [
+        [name for rank in range(size) for name in (f"{rank}", f"{rank} too")]
+    ] * size
+    assert max(received for _, received in found) == math.ceil(math.log2(size))
+
+
+@pytest.mark.parametrize("part_bytes", [7, 64, 2**22])
+def test_ranks_get_what_others_have_in_order_and_in_parts(monkeypatch, part_bytes):
+    monkeypatch.setattr("torchcover.evaluation.ranks.PART_BYTES", part_bytes)
+    stores = []
+
+    def work(rank):
+        stores.append(rank.store)
+        first = rank.gather(torch.full((rank.rank,), float(rank.rank)))
+        return first, rank.gather(f"then {rank.rank}")
+
+    for first, then in in_threads(work):
+        torch.testing.assert_close(first, [torch.full((rank,), float(rank)) for rank in range(3)], rtol=0, atol=0)
+        assert then == ["then 0", "then 1", "then 2"]
+    # What everybody has read from everybody is not kept.
+    assert not stores[0].check(["1 to 0: 1 0"])
+
+
+def test_who_waits_for_what_others_have_seen_learns_that_one_has_ended():
+    def work(rank):
+        if rank.rank == 1:
+            rank.tell(MemoryError(), ABORTED)
+        else:
+            rank.gather("x")
+
+    assert list(map(repr, in_threads(work)))[::2] == ["ChildProcessError('rank 1: MemoryError')"] * 2
 
 
 @pytest.mark.parametrize("late", range(3))

@@ -153,7 +153,7 @@ def test_the_gap_to_a_box_is_that_to_the_nearest_place_in_it(backend):
     """As Python runs it: a smaller one would be found out by nothing but the time that a search takes."""
     boxes, points = boxes_around(60, 37), uniform(60, 39)
     gap = import_module("torchcover.neighbors.warp")._gap.func
-    found = [gap(boxes, node, *map(float, point)) for node, point in enumerate(points)]
+    found = [gap(boxes, node, *point) for node, point in enumerate(points)]
     expected = ((np.clip(points, boxes[:, :3], boxes[:, 3:]) - points) ** 2).sum(axis=1)
     np.testing.assert_allclose(found, expected, rtol=1e-4)
 

@@ -154,9 +154,8 @@ def _whole(run: Run, observers: Sequence[AnyObserver], ranks: Ranks) -> tuple[Ru
         raise run.failure  # whoever ends one rank ends all, and does not wait for them
     if run.failure:
         ranks.tell(run.failure)
-    with ranks.connected():
-        parts = ranks.gather((run.steps, run.counts, run.skipped, run.seconds))
-        observers = ranks.merge(observers)
+    parts = ranks.gather((run.steps, run.counts, run.skipped, run.seconds))
+    observers = ranks.merge(observers)
     words, counts = ranks.failure, Counter[str]()
     for part in parts:
         counts.update(part[1])  # + would forget what was never counted

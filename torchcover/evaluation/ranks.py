@@ -5,15 +5,15 @@ import json
 import os
 import pickle
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import timedelta
 from itertools import groupby
 from typing import Any, TypeVar
 
-import torch
-from torch import Tensor, distributed
-from torch.distributed.distributed_c10d import PrefixStore, Store
+from torch import Tensor
+from torch.distributed.distributed_c10d import Store
 from torch.distributed.rendezvous import rendezvous
 
 from torchcover.evaluation.checkpoint import differences
@@ -21,20 +21,23 @@ from torchcover.evaluation.observers import AnyObserver
 
 Payload = TypeVar("Payload")
 
-# A rank may wait for another as long as a run takes; that one of them is gone shows at once.
-LONGEST_WAIT = timedelta(days=30)
+# A rank may wait for another as long as a run takes.
+LONGEST_WAIT_S = 30 * 24 * 3600.0
 LOOK_EVERY_S = 0.05
 # How long rank 0 lets the others read its last word.
 PARTING_S = 5.0
 # What ranks tell each other, beside what they have measured.
 FAILED, ABORTED, IDENTITY, PARTED = "failed", "aborted", "identity", "parted"
+# What they have measured travels through the store, too, which takes at most 8 MiB at once.
+PART_BYTES = 4 * 2**20
+EVERYBODY = -1
 
 
 class Ranks:
     """The processes that share a run, as `torchrun` starts them: every one of them calls the same.
 
     Args:
-        store: Where they tell each other short words.
+        store: Through which they tell each other everything.
         rank: Which one this is.
         size: How many there are.
     """
@@ -43,6 +46,7 @@ class Ranks:
         self.store = store
         self.rank = rank
         self.size = size
+        self._letters = Counter[tuple[int, int]]()
 
     def share(self, indices: Sequence[int], world_of: Callable[[int], int]) -> Iterator[int]:
         """The frames that are this rank's: those of whole worlds, dealt in turns, so that more steps change no share.
@@ -102,23 +106,6 @@ class Ranks:
             self.tell(error, ABORTED)
             raise
 
-    @contextmanager
-    def connected(self) -> Iterator[None]:
-        """Where ranks `gather` and `merge`; elsewhere other code, such as a metric that adds up, does not know of them.
-
-        Raises:
-            ChildProcessError: Another rank cannot go on.
-        """
-        self.store.set(f"here {self.rank}", "")
-        # In a way that a signal can end, unlike what waits for data.
-        self._wait_for([f"here {rank}" for rank in range(self.size)])
-        sums = PrefixStore("sums", self.store)
-        distributed.init_process_group("gloo", store=sums, rank=self.rank, world_size=self.size, timeout=LONGEST_WAIT)
-        try:
-            yield
-        finally:
-            distributed.destroy_process_group()
-
     def merge(self, observers: Sequence[AnyObserver]) -> list[AnyObserver]:
         """Add up what all ranks have seen, in their order; every rank gets all of it.
 
@@ -158,7 +145,7 @@ class Ranks:
             self._send(observer, self.rank - apart)
         return observer
 
-    def _wait_for(self, keys: list[str], at_most_s: float = LONGEST_WAIT.total_seconds()) -> None:
+    def _wait_for(self, keys: list[str], at_most_s: float = LONGEST_WAIT_S) -> None:
         end_s = time.monotonic() + at_most_s
         while not self.store.check(keys) and time.monotonic() < end_s:
             if self.store.check([ABORTED]) and PARTED not in keys[0]:
@@ -166,32 +153,39 @@ class Ranks:
             time.sleep(LOOK_EVERY_S)
 
     def _from_first(self, value: Payload) -> Payload:
-        data = packed(value) if self.rank == 0 else torch.empty(0, dtype=torch.uint8)
-        length = torch.tensor([len(data)])
-        distributed.broadcast(length, 0)
-        data = data if self.rank == 0 else torch.empty(int(length), dtype=torch.uint8)
-        distributed.broadcast(data, 0)
-        received: Payload = value if self.rank == 0 else pickle.loads(data.numpy().data)
+        if self.rank == 0:
+            self._send(value, EVERYBODY)
+            return value
+        received: Payload = self._receive(0, EVERYBODY)
         return received
 
-    def _send(self, value: object, rank: int) -> None:
-        data = packed(value)
-        distributed.send(torch.tensor([len(data)]), rank)
-        distributed.send(data, rank)
+    def _send(self, value: object, to: int) -> None:
+        letter, data = self._letter(self.rank, to), packed(value)
+        for start in range(0, len(data), PART_BYTES):
+            part = data[start : start + PART_BYTES]
+            self.store.set(f"{letter} {start}", part)  # type: ignore[arg-type]  # it takes bytes, too
+        self.store.set(letter, f"{len(data)}")
 
-    def _receive(self, rank: int) -> Any:  # noqa: ANN401  (what another rank has sent)
-        length = torch.zeros(1, dtype=torch.int64)
-        distributed.recv(length, rank)
-        data = torch.empty(int(length), dtype=torch.uint8)
-        distributed.recv(data, rank)
-        return pickle.loads(data.numpy().data)  # as a process of the same run has packed it; nobody else's
+    def _receive(self, rank: int, to: int | None = None) -> Any:  # noqa: ANN401  (what another rank has sent)
+        letter = self._letter(rank, self.rank if to is None else to)
+        self._wait_for([letter])
+        parts = [f"{letter} {start}" for start in range(0, int(self.store.get(letter)), PART_BYTES)]
+        data = b"".join(map(self.store.get, parts))
+        for part in parts if to is None else ():
+            self.store.delete_key(part)
+        return pickle.loads(data)  # as a process of the same run has packed it; nobody else's
+
+    def _letter(self, rank: int, to: int) -> str:
+        """Its key, of the next one from one rank to another."""
+        self._letters[rank, to] += 1
+        return f"{rank} to {to}: {self._letters[rank, to]}"
 
 
-def packed(value: object) -> Tensor:
-    """(N,) uint8: any object that can be pickled, its tensors on the CPU."""
+def packed(value: object) -> bytes:
+    """Any object that can be pickled, its tensors on the CPU."""
     stream = io.BytesIO()
     _OnTheCpu(stream, protocol=pickle.HIGHEST_PROTOCOL).dump(value)
-    return torch.frombuffer(stream.getbuffer(), dtype=torch.uint8)
+    return stream.getvalue()
 
 
 class _OnTheCpu(pickle.Pickler):
