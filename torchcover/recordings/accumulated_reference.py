@@ -135,12 +135,10 @@ class AccumulatedReference:
             len(mover.points_m) >= KNOWN_POINTS and bool(np.linalg.norm(mover.velocity_mps) > MOVES_MPS)
             for mover in found
         )
-        local_m = np.concatenate(
-            [np.empty((0, 3)), *(scans[key].still_m[~loose[key]] for key in used), *(mover.points_m for mover in found)]
-        )
-        local_m = local_m[
-            np.sort(first_of_each(sweeps.voxel(local_m)))
-        ]  # still those first that were seen nearest in time
+        moved_m = np.concatenate([np.empty((0, 3)), *(mover.points_m for mover in found)])
+        local_m = np.concatenate([*(scans[key].still_m[~loose[key]] for key in used), moved_m])
+        voxel = np.concatenate([*(scans[key].voxel[~loose[key]] for key in used), sweeps.voxel(moved_m)])
+        local_m = local_m[np.sort(first_of_each(voxel))]  # still those first that were seen nearest in time
         # Noise, and errors of poses, make the ground a thick layer that would count for more and hide what is behind.
         level_m = self._on_ground(recording, index, local_m)
         first = first_of_each(sweeps.voxel(level_m))

@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 
-from torchcover.neighbors.compiled import Array, compiled
+from torchcover.neighbors.compiled import Array, compiled, inlined
 from torchcover.recordings.seen_past import COLUMNS, ROWS
-from torchcover.recordings.visible import BEHIND, BEHIND_M, OVER_M
+from torchcover.recordings.visible import A1, A3, A5, A7, A9, BEHIND, BEHIND_M, OVER_M, TINY
 
 
 @compiled("void(f8[:, ::1], f4[:, ::1], i8, f8[:, ::1], f8, i2[::1], i8)")
@@ -14,7 +14,9 @@ def vote_by_loop(
     points_m: Array, free_m: Array, first_row: int, sensor_T_local: Array, farthest_m: float, votes: Array, vote: int
 ) -> None:
     """Count the places that lie in free space: `vote_by_arrays`."""
-    T, rows, times = sensor_T_local, free_m.shape[0], COLUMNS // free_m.shape[1]
+    T, rows, halved = sensor_T_local, free_m.shape[0], 0
+    while COLUMNS >> halved > free_m.shape[1]:
+        halved += 1
     for i in range(points_m.shape[0]):
         px, py, pz = points_m[i, 0], points_m[i, 1], points_m[i, 2]
         x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
@@ -23,7 +25,7 @@ def vote_by_loop(
         range_m = math.sqrt(x * x + y * y + z * z)
         if range_m >= farthest_m:
             continue
-        row = min(int((1 + z / max(range_m, 1e-9)) * (ROWS / 2)), ROWS - 1) // times - first_row
+        row = (min(int((1 + z / max(range_m, 1e-9)) * (ROWS / 2)), ROWS - 1) >> halved) - first_row
         if row < 0 or row >= rows:
             continue
         low, high = min(abs(x), abs(y)), max(abs(x), abs(y), 1e-9)
@@ -34,8 +36,22 @@ def vote_by_loop(
             turn = 2 - turn
         if y < 0:
             turn = 4 - turn
-        if range_m < free_m[row, int(turn * (COLUMNS / 4)) % COLUMNS // times]:
+        column = int(turn * (COLUMNS / 4))
+        if range_m < free_m[row, (0 if column == COLUMNS else column) >> halved]:
             votes[i] += vote
+
+
+@inlined
+def _angle_rad(y: Array, x: Array) -> Array:
+    low, high = min(abs(x), abs(y)), max(abs(x), abs(y), TINY)
+    share = low / high
+    square = share * share
+    angle = share * (A1 + square * (A3 + square * (A5 + square * (A7 + square * A9))))
+    if abs(y) > abs(x):
+        angle = math.pi / 2 - angle
+    if x < 0:
+        angle = math.pi - angle
+    return -angle if y < 0 else angle
 
 
 @compiled("void(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], b1[::1])")
@@ -49,8 +65,8 @@ def hide_by_loop(
         x, y, z = points_m[i, 0] - place_m[0], points_m[i, 1] - place_m[1], points_m[i, 2] - place_m[2]
         flat_m = math.sqrt(x * x + y * y)
         range_m[i] = math.sqrt(flat_m * flat_m + z * z)
-        up[i], across[i] = math.atan2(z, flat_m) + math.pi / 2, math.atan2(y, x) + math.pi
-        over[i] = math.atan2(z + OVER_M, flat_m) + math.pi / 2
+        up[i], across[i] = _angle_rad(z, flat_m) + math.pi / 2, _angle_rad(y, x) + math.pi
+        over[i] = _angle_rad(z + OVER_M, flat_m) + math.pi / 2
         enters, leaves = -math.inf, math.inf
         for axis in range(3):
             way_m = points_m[i, axis] - place_m[axis]
