@@ -12,7 +12,7 @@ from torchcover.recordings.in_vehicle import InVehicle, within
 from torchcover.recordings.movers import COMPARED_S, WITHIN_M, Moved, movers
 from torchcover.recordings.recording import Recording
 from torchcover.recordings.seen_past import Key
-from torchcover.recordings.sweeps import Sweeps, Thinned, first_of_each, pose_of
+from torchcover.recordings.sweeps import Sweeps, Thinned, first_of_each, pose_of, voxels
 from torchcover.recordings.visible import seen_share, square_metres
 
 # So many scans have to see past a point.
@@ -20,6 +20,8 @@ VOTES = 2
 # What stands is seen for at least so long, or half of the time that was looked at; what is no higher is the ground.
 STANDS_S, ON_GROUND_M = 1.0, 0.3
 SEEN_AGAIN = 0.2
+# Points that are near each other are beside each other in memory, which is searched in half the time.
+BLOCK_M = 1.6
 # What is slower stands; of fewer points, its velocity is a guess.
 MOVES_MPS, KNOWN_POINTS = 0.5, 50
 # Where a recording does not say how large its vehicle is.
@@ -142,6 +144,7 @@ class AccumulatedReference:
         # Noise, and errors of poses, make the ground a thick layer that would count for more and hide what is behind.
         level_m = self._on_ground(recording, index, local_m)
         first = first_of_each(sweeps.voxel(level_m))
+        first = first[np.argsort(voxels(level_m[first], BLOCK_M), kind="stable")]
         vehicle_T_local = invert(local_T_vehicle)
         points_m, level_m = (
             np.concatenate([transform(vehicle_T_local, of[first]), *parts]) for of in (local_m, level_m)

@@ -52,6 +52,7 @@ class KittiRaw(Layout):
         velodyne_T_imu = read_rigid(self.path.parent / "calib_imu_to_velo.txt")
         self._imu_T_vehicle = invert(velodyne_T_imu) @ invert(vehicle_T_velodyne)
         self._tracklets = self.path / "tracklet_labels.xml"
+        self._poses: dict[int, Matrix] = {}
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -64,8 +65,10 @@ class KittiRaw(Layout):
         return Scan(read_cloud(path), vehicle_T_velodyne, str(path))
 
     def world_T_vehicle(self, index: int) -> Matrix:
-        """Where the vehicle was, by the GPS and IMU."""
-        return world_T_imu(self._oxts(index), self._latitude_deg) @ self._imu_T_vehicle
+        """Where the vehicle was, by the GPS and IMU; a file each, which is read once."""
+        if index not in self._poses:
+            self._poses[index] = world_T_imu(self._oxts(index), self._latitude_deg) @ self._imu_T_vehicle
+        return self._poses[index]
 
     def calibrations(self) -> SensorCalibrations:
         """The rectified cameras of the day, where its `calib_cam_to_cam.txt` is there."""
