@@ -21,7 +21,7 @@ CELL_M, GAP = 0.3, 3
 FEWEST, MOST = 5, 60
 # Scans that a cluster is compared with; velocities that are tried, first by coarse steps; of several that fit as well
 # the slower one: so much overlap is worth a metre a second. With less overlap nothing is found.
-COMPARED, FASTEST_MPS, STEPS_MPS, SLOWER, OVERLAP = 6, 45.0, (1.5, 0.5, 0.25), 2e-3, 0.5
+COMPARED, FASTEST_MPS, STEPS_MPS, SLOWER, OVERLAP = 8, 45.0, (1.5, 0.5, 0.25), 2e-3, 0.5
 # What scans within this time have of it is put together; those within the longer one are compared.
 TOGETHER_S, COMPARED_S = 0.31, 0.61
 # Nothing is looked for farther away.
@@ -42,9 +42,14 @@ def movers(scans_m: Sequence[Float64], apart_s: Float64) -> list[Moved]:
     """What moves, or has stood for a moment only.
 
     `scans_m`: (N, 3) points of each scan that belong to nothing that stands; `apart_s`: (S,) when each scan was, from
-    the instant on.
+    the instant on; those of one time are one.
     """
     found: list[Moved] = []
+    # What one of several sensors sees is in no scan of the others.
+    apart_s, turn = np.unique(apart_s, return_inverse=True)
+    scans_m = [
+        np.concatenate([scans_m[one] for one in np.flatnonzero(turn == number)]) for number in range(len(apart_s))
+    ]
     if sum(map(len, scans_m)) < FEWEST or len(scans_m) < 2:
         return found
     lower_m = np.min([points_m[:, :2].min(axis=0) for points_m in scans_m if len(points_m)], axis=0) - 2 * CELL_M
@@ -54,9 +59,7 @@ def movers(scans_m: Sequence[Float64], apart_s: Float64) -> list[Moved]:
     left = [np.ones(len(points_m), np.bool_) for points_m in scans_m]
     together = sorted(map(int, np.flatnonzero(np.abs(apart_s) <= TOGETHER_S)), key=lambda one: abs(apart_s[one]))
     for scan in together:
-        times_s = np.unique(apart_s[apart_s != apart_s[scan]])
-        compared_s = times_s[np.argsort(np.abs(times_s - apart_s[scan]), kind="stable")[:COMPARED]]
-        others = np.flatnonzero(np.isin(apart_s, compared_s))
+        others = np.sort(np.argsort(np.abs(apart_s - apart_s[scan]), kind="stable")[1 : COMPARED + 1])
         since_s = np.ascontiguousarray(apart_s[others] - apart_s[scan])
         rows = np.flatnonzero(left[scan])
         for cluster in _clusters(cells[scan][rows], shape):
