@@ -159,6 +159,14 @@ def test_a_mover_is_put_back_where_it_is(velocity_mps):
     assert np.median(apart_m) < 0.1
     assert apart_m.max() < 1.0
     assert len(found.points_m) > 0.6 * 6 * len(box_m)
+    # Of two sensors, each of which sees a half of the places, or of three, one of which sees nothing.
+    for halves in ([scan_m[:, 1] < 8.0 for scan_m in scans_m], [scan_m[:, 1] < 99.0 for scan_m in scans_m]):
+        parts = [
+            scan_m[half == one] for one in (True, False, None) for scan_m, half in zip(scans_m, halves, strict=True)
+        ]
+        same = max(movers(parts, np.tile(times_s, 3)), key=lambda one: len(one.points_m))
+        np.testing.assert_array_equal(same.velocity_mps, found.velocity_mps)
+        assert len(same.points_m) == len(found.points_m)
 
 
 def test_nothing_moves_where_there_is_nothing():
