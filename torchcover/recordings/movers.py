@@ -47,9 +47,10 @@ def movers(scans_m: Sequence[Float64], apart_s: Float64) -> list[Moved]:
     found: list[Moved] = []
     # What one of several sensors sees is in no scan of the others.
     apart_s, turn = np.unique(apart_s, return_inverse=True)
-    scans_m = [
-        np.concatenate([scans_m[one] for one in np.flatnonzero(turn == number)]) for number in range(len(apart_s))
-    ]
+    of_times = (
+        [each for each, of in zip(scans_m, turn, strict=True) if of == number] for number in range(len(apart_s))
+    )
+    scans_m = [np.concatenate(of_time) for of_time in of_times]
     if sum(map(len, scans_m)) < FEWEST or len(scans_m) < 2:
         return found
     lower_m = np.min([points_m[:, :2].min(axis=0) for points_m in scans_m if len(points_m)], axis=0) - 2 * CELL_M
