@@ -20,7 +20,7 @@ VOTES = 2
 # What stands is seen for at least so long, or half of the time that was looked at; what is no higher is the ground.
 STANDS_S, ON_GROUND_M = 1.0, 0.3
 SEEN_AGAIN = 0.2
-# Points that are near each other are beside each other in memory, which is searched in half the time.
+# Points that are near each other are beside each other in memory, which is searched in two thirds of the time.
 BLOCK_M = 1.6
 # What is slower stands; of fewer points, its velocity is a guess.
 MOVES_MPS, KNOWN_POINTS = 0.5, 50
