@@ -336,10 +336,10 @@ def test_codes_keep_what_a_reader_can_read(values, bits):
 def test_the_same_is_kept_once():
     cells, values = CellBytes(), np.arange(200.0).reshape(10, 20)
     first = cells.add(values, 16)
-    alone = len(cells.text())
+    alone = len(cells.text)
     assert cells.add(values, 16) == first
     cells.add(values.copy(), 16)
-    assert len(cells.text()) == alone
+    assert len(cells.text) == alone
 
 
 def noisy(rigs: int) -> list[PageMap]:
@@ -377,14 +377,14 @@ def test_no_page_has_more_than_half_a_megabyte(rigs):
 def test_cells_taken_together_have_their_mean_by_weight_and_the_page_says_so():
     whole = noisy(1)[0]
     known = replace(whole, values=np.where(np.arange(800) < 700, whole.values, np.nan))
-    (same,), silence = fitted([known], most_chars=10**7)
+    (same,), _, silence = fitted([known], most_chars=10**7)
     assert same is known
     assert silence == []
-    (rounded,), notes = fitted([known], most_chars=950_000)
+    (rounded,), _, notes = fitted([known], most_chars=950_000)
     assert rounded.values is known.values
     assert (rounded.bits, rounded.errors is known.errors, notes[0][:7]) == (8, True, "Numbers")
     few = replace(known, values=known.values[:8, :12], errors=None, weights=None, sides=None, cell_m=1.0)
-    (coarse, still_few), notes = fitted([known, few], most_chars=200_000)
+    (coarse, still_few), _, notes = fitted([known, few], most_chars=200_000)
     assert still_few.cell_m == 1.0  # it takes next to nothing, and would have nothing left
     assert coarse.errors is None
     assert coarse.cell_m == 0.5

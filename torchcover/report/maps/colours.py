@@ -96,7 +96,8 @@ def difference_scale(quantity: Quantity, differences: Tensor) -> ColourScale:
 
 
 def _robust_end(values: Tensor) -> float:
-    known = values[values.isfinite()].cpu().numpy()
+    each = values.cpu().numpy()
+    known = each[np.isfinite(each)]
     high = float(np.percentile(known, ROBUST_PERCENTILE) or known.max()) if len(known) else 0.0
     return _round_up(high) or 1.0
 

@@ -106,19 +106,19 @@ class Controls {
   }
 }
 
-// Every map, small: to choose one, and on paper. Each is drawn when it comes into sight; returned is what draws the rest.
+// Every map, small: to choose one, and on paper. Each is drawn when it comes into sight; returned is what draws the rest
+// at once, and what has all drawn again in other colours.
 function fillGallery(page, controls) {
   const all = page.choices.flatMap((quantity, q) => quantity.bands.flatMap((band, b) => band.rigs.map((rig, r) => ({ quantity, band, rig, at: { quantity: q, band: b, rig: r } }))));
-  const todo = new Map();
-  const drawn = (canvas) => { todo.get(canvas)?.(); todo.delete(canvas); sight.unobserve(canvas); };
+  const draws = new Map(), todo = new Set();
+  const drawn = (canvas) => { if (todo.delete(canvas)) draws.get(canvas)(); sight.unobserve(canvas); };
   const sight = new IntersectionObserver((entries) => {
     for (const one of entries) if (one.isIntersecting) drawn(one.target);
   }, { rootMargin: "300px" });
   part("gallery").replaceChildren(...all.map(({ quantity, band, rig, at }) => {
     const button = made("button", "", { type: "button" }), figure = made("figure"), canvas = made("canvas");
     const draw = cropped(canvas, page.content.rasters[rig.map.raster], page.content.ego);
-    todo.set(canvas, () => draw(page.shown(rig, false).image));
-    sight.observe(canvas);
+    draws.set(canvas, () => draw(page.shown(rig, false).image));
     button.append(canvas, made("figcaption", `${quantity.name}, ${band.name}: ${rig.name}`));
     button.addEventListener("click", () => {
       Object.assign(page.state, at);
@@ -129,7 +129,9 @@ function fillGallery(page, controls) {
     figure.append(button, barOf(rig.against ? rig.map.difference : rig.map.scale, page.content.luts));
     return figure;
   }));
-  return () => [...todo.keys()].forEach(drawn);
+  const again = () => { for (const canvas of draws.keys()) { todo.add(canvas); sight.observe(canvas); } };
+  again();
+  return { again, rest: () => [...todo].forEach(drawn) };
 }
 
 // A canvas as large as what is known of a raster, and what draws an image of all of it there, on hatching.
@@ -154,16 +156,24 @@ function cropped(canvas, raster, ego) {
   };
 }
 
-// On paper nothing can be opened.
-function printAll(page, drawGallery) {
+// What is drawn has the colours of the page, dark or light. On paper nothing can be opened, and it is white.
+function drawIn(page, gallery) {
   let closed = [];
+  const redraw = () => { gallery.again(); page.draw(); };
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
   window.addEventListener("beforeprint", () => {
-    drawGallery();
+    document.documentElement.classList.add("on-paper");
+    gallery.again();
+    gallery.rest();
     closed = [...document.querySelectorAll("details:not([open])")];
     for (const one of closed) one.open = true;
     page.draw();
   });
-  window.addEventListener("afterprint", () => { for (const one of closed) one.open = false; page.draw(); });
+  window.addEventListener("afterprint", () => {
+    document.documentElement.classList.remove("on-paper");
+    for (const one of closed) one.open = false;
+    redraw();
+  });
 }
 
 async function start() {
@@ -172,7 +182,7 @@ async function start() {
   const bytes = await inflated(part("cells").textContent);
   part("maps").hidden = false;
   const page = new MapPage(content, bytes);
-  printAll(page, fillGallery(page, new Controls(page)));
+  drawIn(page, fillGallery(page, new Controls(page)));
   return page;
 }
 

@@ -142,7 +142,7 @@ class MapView {
     const [left, top] = this.toMetres(MARGIN.left, MARGIN.top);
     const [right, bottom] = this.toMetres(MARGIN.left + width, MARGIN.top + height);
     const words = (value) => String(+value.toPrecision(6)).replace("-", "−");
-    pen.strokeStyle = pen.fillStyle = "#1b1b1b"; pen.lineWidth = 1; pen.font = "12px sans-serif";
+    pen.strokeStyle = pen.fillStyle = getComputedStyle(this.canvas).color; pen.lineWidth = 1; pen.font = "12px sans-serif";
     pen.strokeRect(MARGIN.left, MARGIN.top, width, height);
     pen.textAlign = "center"; pen.textBaseline = "top";
     for (const value of ticks(left, right, width / 80)) {
@@ -166,11 +166,11 @@ class MapView {
 
 // What is unknown is hatched grey: no colour of any scale.
 function hatching(pen) {
-  const tile = document.createElement("canvas");
+  const tile = document.createElement("canvas"), style = getComputedStyle(pen.canvas);
   tile.width = tile.height = 8;
   const own = tile.getContext("2d");
-  own.fillStyle = "#d2d2d2"; own.fillRect(0, 0, 8, 8);
-  own.strokeStyle = "#bcbcbc"; own.lineWidth = 1;
+  own.fillStyle = style.getPropertyValue("--unknown"); own.fillRect(0, 0, 8, 8);
+  own.strokeStyle = style.getPropertyValue("--hatch"); own.lineWidth = 1;
   own.beginPath();
   for (const shift of [-8, 0, 8]) { own.moveTo(shift, 8); own.lineTo(shift + 8, 0); }
   own.stroke();

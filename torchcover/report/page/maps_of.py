@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchcover.coverage import BevGrid, Coverage, Layer
+from torchcover.coverage import Coverage, Layer
 from torchcover.report.maps.arrays import as_array
 from torchcover.report.maps.colours import NEVER_PROBED, difference_scale, scale_of
 from torchcover.report.maps.subjects import NOTHING_FOUND, difference, quantities_shown
@@ -44,15 +44,13 @@ def maps_of(coverages: Mapping[str, Coverage]) -> Iterator[PageMap]:
     surface = _weights(first) if first.measure == "area" else None
     steps = Weights([_known(one) for one in first.probed_steps], "steps that probed it")
     for quantity, by_surface in shown:
-        layers = {rig: coverage.layers[quantity.key] for rig, coverage in coverages.items()}
-        errors = {
-            rig: coverage.errors[quantity.key] for rig, coverage in coverages.items() if quantity.key in coverage.errors
-        }
-        yield from _of_quantity(layers, errors, (surface if by_surface else None) or steps, first.grid)
-    of_sensors = {rig: one.redundancy.layers for rig, one in coverages.items() if one.redundancy is not None}
+        layers = {rig: coverage.listed[quantity.key] for rig, coverage in coverages.items()}
+        errors = {rig: one.listed_errors.get(quantity.key) for rig, one in coverages.items()}
+        yield from _of_quantity(layers, errors, (surface if by_surface else None) or steps, first)
+    of_sensors = {rig: one.redundancy.listed for rig, one in coverages.items() if one.redundancy is not None}
     for key in dict.fromkeys(key for layers in of_sensors.values() for key in layers):
         having = {rig: layers[key] for rig, layers in of_sensors.items() if key in layers}
-        yield from _of_quantity(having, {}, surface or steps, first.grid)
+        yield from _of_quantity(having, dict.fromkeys(having), surface or steps, first)
 
 
 class Weights(NamedTuple):
@@ -65,17 +63,23 @@ class Weights(NamedTuple):
 
 
 def _of_quantity(
-    layers: Mapping[str, Layer], errors: Mapping[str, Tensor], weights: Weights, grid: BevGrid
+    layers: Mapping[str, Layer], errors: Mapping[str, Tensor | None], weights: Weights, first: Coverage
 ) -> Iterator[PageMap]:
-    quantity = next(iter(layers.values())).quantity
+    """Maps from numbers of the known cells, which are the same of all rigs; so are those of `first`."""
+    grid, quantity = first.grid, next(iter(layers.values())).quantity
     factor = shown_unit(quantity.unit).factor
     values = {rig: factor * layer.values for rig, layer in layers.items()}
     scale = scale_of(quantity, torch.stack(list(values.values())))
     expected, *others = values.values()
     differences = [difference(one, expected) for one in others]
     against = difference_scale(quantity, torch.stack(differences)) if differences else None
+    spread = {rig: as_array(first.known.spread(one)) for rig, one in values.items()}
+    of_errors = {
+        rig: None if one is None else factor * as_array(first.known.spread(one)) for rig, one in errors.items()
+    }
     for band, height in enumerate(grid.heights):
         for at, rig in enumerate(values):
+            error = of_errors[rig]
             yield PageMap(
                 quantity=quantity.title,
                 band=f"{height}, {span(grid, height)}",
@@ -83,10 +87,10 @@ def _of_quantity(
                 x=grid.x,
                 y=grid.y,
                 cell_m=grid.cell,
-                values=as_array(values[rig][band]),
+                values=spread[rig][band],
                 scale=scale,
                 unknown=NEVER_PROBED if weights.sides is None else NOTHING_FOUND,
-                errors=factor * as_array(errors[rig][band]) if rig in errors else None,
+                errors=None if error is None else error[band],
                 weights=weights.values[band],
                 weight_name=weights.name,
                 full_weight=weights.full,

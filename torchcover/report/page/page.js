@@ -150,7 +150,7 @@ class MapPage {
     if (shown.scale.log && shown.values.includes(0)) entries.push("orange: none");
     if (against) entries.push(`blue: ${this.choice.map.rig} is better; red: ${against.rig} is better`);
     if (shown.squares) entries.push(`squares are larger where points are few`);
-    if (shown.full) entries.push("paler: less visible surface in a step than open ground has");
+    if (shown.full) entries.push("fainter: less visible surface in a step than open ground has");
     if (this.content.outlines.length) entries.push(`dotted: ${this.content.outlines.map((line) => line.name).join(", ")}`);
     for (const [at, line] of map.lines.entries()) entries.push(`${at ? "dashed" : "thick"} line: ${line.name}`);
     part("legend").replaceChildren(...entries.map((words) => made("li", words)));

@@ -31,7 +31,7 @@ def rig_drawing(sensors: Sequence[SensorView], ego_outline_m: Array | None, numb
     parts = []
     if ego_outline_m is not None:
         corners = " ".join(f"{x:.3f},{-y:.3f}" for x, y in ego_outline_m)
-        parts.append(f'<polygon points="{corners}" fill="white" stroke="black" stroke-width="0.05"/>')
+        parts.append(f'<polygon points="{corners}" fill="none" stroke="currentColor" stroke-width="0.05"/>')
     parts += [_field(f"fade-{number}-{at}", sensor_colour(at), view, reach) for at, view in enumerate(sensors)]
     parts += [_disc(at, x, y) for at, (x, y) in enumerate(_apart(places))]
     parts.append(_scale_bar(left, -top))
@@ -93,5 +93,6 @@ def _disc(at: int, x: float, y: float) -> str:
 def _scale_bar(left: float, bottom: float) -> str:
     x, y = left + 0.3, bottom - 0.3
     line = f"M{x:.3f} {y - 0.1:.3f}V{y:.3f}H{x + 1:.3f}V{y - 0.1:.3f}"
-    words = f'<text x="{x + 1.15:.3f}" y="{y:.3f}" font-size="0.32" font-family="sans-serif">1 m</text>'
-    return f'<path d="{line}" fill="none" stroke="black" stroke-width="0.04"/>{words}'
+    font = 'font-size="0.32" font-family="sans-serif" fill="currentColor"'
+    words = f'<text x="{x + 1.15:.3f}" y="{y:.3f}" {font}>1 m</text>'
+    return f'<path d="{line}" fill="none" stroke="currentColor" stroke-width="0.04"/>{words}'

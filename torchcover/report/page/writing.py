@@ -13,7 +13,7 @@ from string import Template
 import numpy as np
 
 from torchcover.report.page.answer import plans_html, ranges_html, words_html
-from torchcover.report.page.codes import CellBytes
+from torchcover.report.page.codes import CellBytes, Codes
 from torchcover.report.page.content import Array, Page, PageMap, PagePicture, PageRig
 from torchcover.report.page.map_content import arrays_of, map_content
 from torchcover.report.page.rig_drawing import rig_drawing, sensor_table
@@ -26,33 +26,40 @@ ROUNDED = "Numbers of single cells are rounded, those of a wide scale by up to 4
 NO_ERRORS = "errors of single cells are left out"
 
 
-def fitted(maps: Sequence[PageMap], most_chars: int = MOST_CHARS) -> tuple[list[PageMap], list[str]]:
+def fitted(maps: Sequence[PageMap], most_chars: int = MOST_CHARS) -> tuple[list[PageMap], CellBytes, list[str]]:
     """Round numbers, then leave out errors, then take cells together where most are, until what is packed is small.
 
     Returns:
-        The maps, and what was left out in words.
+        The maps, what is packed, and what was left out in words.
     """
+    codes: Codes = {}
     kept, left_out = list(maps), []
-    if _is_larger(kept, most_chars):
+    cells = _packed(kept, most_chars, codes)
+    if cells is None:
         kept, left_out = [replace(one, bits=8) for one in kept], [ROUNDED]
-    if _is_larger(kept, most_chars) and any(one.errors is not None for one in kept):
+        cells = _packed(kept, most_chars, codes)
+    if cells is None and any(one.errors is not None for one in kept):
         kept, left_out = [replace(one, errors=None) for one in kept], [ROUNDED, NO_ERRORS]
-    while _is_larger(kept, most_chars):
+        cells = _packed(kept, most_chars, codes)
+    while cells is None:
         most = max(one.values.size for one in kept)
         kept = [coarser(one) if one.values.size > most / 4 else one for one in kept]
+        cells = _packed(kept, most_chars, codes)
     sides = {round(one.cell_m / whole.cell_m) for one, whole in zip(kept, maps, strict=True)} - {1}
     if sides:
         left_out.append(f"some maps show {' or '.join(f'{side} x {side}' for side in sorted(sides))} cells as one")
-    return kept, [f"{'; '.join(left_out)}, so that this file stays small: the .npz files have each."] * bool(left_out)
+    notes = [f"{'; '.join(left_out)}, so that this file stays small: the .npz files have each."] * bool(left_out)
+    return kept, cells, notes
 
 
-def _is_larger(maps: Sequence[PageMap], most_chars: int) -> bool:
+def _packed(maps: Sequence[PageMap], most_chars: int, codes: Codes) -> CellBytes | None:
+    """Their cells; None if they are too many."""
     if sum(int((~np.isnan(one.values)).sum()) * one.bits // 8 for one in maps) > MOST_PACKED * most_chars:
-        return True
-    cells = CellBytes()
+        return None
+    cells = CellBytes(codes)
     for one in maps:
         arrays_of(one, cells)
-    return len(cells.text()) > most_chars
+    return cells if len(cells.text) <= most_chars else None
 
 
 def coarser(one: PageMap) -> PageMap:
@@ -95,9 +102,8 @@ SCRIPTS = ("cells.js", "map.js", "page.js", "controls.js")
 
 def page_html(page: Page) -> str:
     """The text of its file."""
-    cells = CellBytes()
     first = plans_html(page.plans) + "".join(map(_picture, page.pictures))
-    maps, notes = fitted(page.maps, max(MOST_CHARS - len(first), LEAST_CHARS))
+    maps, cells, notes = fitted(page.maps, max(MOST_CHARS - len(first), LEAST_CHARS))
     content = as_json(map_content(replace(page, maps=maps), cells))
     script = "\n".join(map(_file, SCRIPTS))
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
@@ -119,7 +125,7 @@ def page_html(page: Page) -> str:
         facts="\n".join(_facts(heading, facts) for heading, facts in page.facts.items()),
         more_tables="\n".join(map(table_html, page.more_tables)),
         content=content,
-        cells=cells.text(),
+        cells=cells.text,
         script=script,
     )
 
