@@ -535,7 +535,11 @@ def test_memory_does_not_grow_over_epochs(tmp_path, blank_maps):
     callback = CoverageCallback(make_metric(), stage="train")
     logger = TensorBoardLogger(tmp_path, name="", version="run")
     trainer = make_trainer(tmp_path, callback, Count(), logger=logger, max_epochs=3)
-    trainer.fit(Model(), loader(6))
+    gc.freeze()  # what other tests left is not counted; with torch 2.4 there are tensors among it that are none
+    try:
+        trainer.fit(Model(), loader(6))
+    finally:
+        gc.unfreeze()
     assert counts[1:] == [counts[1]] * 2
     assert counted == [2, 4, 6] * 3
 
