@@ -54,6 +54,48 @@ def test_what_sticks_out_of_its_box_moves_with_it():
     assert distances_m(reference, np.concatenate([standing(drive, 2), moving(drive, 2)])).max() < 1e-4
 
 
+class Parked(Drive):
+    """A part of the wall is labelled, too."""
+
+    def boxes(self, index):
+        moving, size_m = super().boxes(index), (6.0, 1.0, 3.2)
+        vehicle_T_parked = invert(self.world_T_vehicle(index)) @ rigid(np.eye(3), [10.0, 5.0, 1.5])
+        yaw = np.arctan2(vehicle_T_parked[1, 0], vehicle_T_parked[0, 0])
+        row = torch.tensor([[*vehicle_T_parked[:3, 3], *size_m, yaw]], dtype=torch.float32)
+        return Boxes.from_rows(torch.cat([moving.rows, row]), ids=("car", "parked"))
+
+
+def test_a_box_that_stands_changes_nothing():
+    labelled, other = (
+        RecordedFrames(drive, reference=AccumulatedReference(10.0, voxel_m=0.05))[6]
+        for drive in (Parked(steps=12), Drive(steps=12))
+    )
+    assert labelled.reference.equal(other.reference)
+    assert labelled.reference_weights.equal(other.reference_weights)
+    assert labelled.counts == other.counts
+
+
+class Slim(Drive):
+    """What moves is no wider than somebody on foot, and is hit three times."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        self.back_m = np.array([[-0.22, 0.12, 0.22], [-0.22, -0.12, 0.32], [-0.22, 0.02, 0.62]])
+
+    def boxes(self, index):
+        rows = super().boxes(index).rows
+        rows[:, 3:6] = torch.tensor([0.5, 0.6, 1.5])
+        return Boxes.from_rows(rows, ids=("walker",))
+
+
+def test_few_points_of_a_box_stand_for_no_more_than_its_sides():
+    drive = Slim()
+    frame = RecordedFrames(drive, reference=AccumulatedReference(10.0, voxel_m=0.05))[2]
+    own = distances_m(frame.reference, moving(drive, 2)) < 1e-3
+    assert int(own.sum()) == 3
+    assert 0.5 < float(frame.reference_weights[own].sum()) <= 1.1 * 1.5 + 0.5 * 0.6  # by how many places see it
+
+
 def test_objects_without_a_name_are_left_out_and_counted():
     drive = Drive(named=False)
     frame = RecordedFrames(drive, reference=AccumulatedReference(10.0, voxel_m=0.05))[2]

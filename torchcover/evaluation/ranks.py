@@ -24,8 +24,8 @@ Payload = TypeVar("Payload")
 # A rank may wait for another as long as a run takes.
 LONGEST_WAIT_S = 30 * 24 * 3600.0
 LOOK_EVERY_S = 0.05
-# How long rank 0 lets the others read its last word.
-PARTING_S = 5.0
+# How long rank 0, which keeps the store, lets the others read what it has sent; whoever has, says so.
+PARTING_S = 60.0
 # What ranks tell each other, beside what they have measured.
 FAILED, ABORTED, IDENTITY, PARTED = "failed", "aborted", "identity", "parted"
 # What they have measured travels through the store, too, which takes at most 8 MiB at once.

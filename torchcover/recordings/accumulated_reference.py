@@ -12,7 +12,7 @@ from torchcover.recordings.in_vehicle import InVehicle, within
 from torchcover.recordings.movers import COMPARED_S, WITHIN_M, Moved, movers
 from torchcover.recordings.recording import Recording
 from torchcover.recordings.seen_past import Key
-from torchcover.recordings.sweeps import Sweeps, Thinned, first_of_each, pose_of, voxels
+from torchcover.recordings.sweeps import MOVES_MPS, Sweeps, Thinned, first_of_each, pose_of, voxels
 from torchcover.recordings.visible import seen_share, square_metres
 
 # So many scans have to see past a point.
@@ -22,8 +22,8 @@ STANDS_S, ON_GROUND_M = 1.0, 0.3
 SEEN_AGAIN = 0.2
 # Points that are near each other are beside each other in memory, which is searched in two thirds of the time.
 BLOCK_M = 1.6
-# What is slower stands; of fewer points, its velocity is a guess.
-MOVES_MPS, KNOWN_POINTS = 0.5, 50
+# Of fewer points, a velocity is a guess.
+KNOWN_POINTS = 50
 # Where a recording does not say how large its vehicle is.
 USUAL_BODY = BoundingBox((-2.4, -0.95, 0.0), (2.4, 0.95, 1.7))
 
@@ -37,10 +37,10 @@ DIFFERENCE_OFF = 4
 class AccumulatedReference:
     """What all sensors of a recording saw around an instant, moved to where it is at that instant.
 
-    Scans are moved by the poses of the vehicle, and points in labelled boxes, or within 0.1 m of their sides, with
-    their boxes. Points of an object that has no box at the instant are left out. Of the others, those go that rays of
-    two scans see past, and those above ground where nothing is seen for long; what moved is put where it is at the
-    instant. One point a voxel is kept, if it is seen from beside the vehicle, and counts by square metres.
+    Scans are moved by the poses of the vehicle, and points in labelled boxes that move, or within 0.1 m of their sides,
+    with their boxes. Points of such an object that has no box at the instant are left out. Of the others, those go that
+    rays of two scans see past, and those above ground where nothing is seen for long; what moved is put where it is at
+    the instant. One point a voxel is kept, if it is seen from beside the vehicle, and counts by square metres.
 
     A sensor that is judged takes no part at the instant itself, for its points would be 0 m from themselves. At other
     instants it does: what it never sees, this reference does not know either.
@@ -109,7 +109,7 @@ class AccumulatedReference:
         scans = {key: sweeps.thinned(recording, *key) for key in votes if key[1] != index or key[0] not in judged}
         within = set(sweeps.instants(recording, index))
         labelled, dropped = recording.boxes(index), Counter[str]()
-        boxes = {name: pose_of(labelled, number) for number, name in enumerate(labelled.ids)} if labelled else {}
+        boxes = dict(zip(labelled.ids, range(len(labelled)), strict=True)) if labelled else {}
         used = [key for key in scans if key[1] in within]
         dropped["sweeps"] = sum(not scans[key].dropped["sweeps_skipped"] for key in used)
         if skipped := sweeps.skipped(recording, index):
@@ -120,11 +120,13 @@ class AccumulatedReference:
             dropped["gone"] += scans[key].unnamed
             for name, points_m in scans[key].of_box.items():
                 of_box.setdefault(name, []).append(points_m)
-        parts = []
+        parts, most_m2 = [], [np.inf]
         for name, boxed in of_box.items():
             points_m = np.concatenate(boxed)
-            if name in boxes:
-                parts.append(transform(boxes[name], points_m[first_of_each(sweeps.voxel(points_m))]))
+            if labelled and name in boxes:
+                vehicle_T_box = pose_of(labelled, boxes[name])
+                parts.append(transform(vehicle_T_box, points_m[first_of_each(sweeps.voxel(points_m))]))
+                most_m2.append(_sides_m2(*labelled.size_m[boxes[name]].tolist()))
             else:
                 dropped["gone"] += len(points_m)
         passing = self._passing(recording, index, scans)
@@ -149,19 +151,24 @@ class AccumulatedReference:
         points_m, level_m = (
             np.concatenate([transform(vehicle_T_local, of[first]), *parts]) for of in (local_m, level_m)
         )
+        part = np.repeat(np.arange(len(most_m2)), [len(first), *map(len, parts)])
         own = _beneath_or_in(points_m, recording.body)
         dropped["own_vehicle"] += len(own)
         points_m, level_m = (np.ascontiguousarray(np.delete(of, own, axis=0)) for of in (points_m, level_m))
+        part = np.delete(part, own)
         share = seen_share(level_m, recording.body or USUAL_BODY, self.voxel_m, index)
         dropped["hidden"] = int((share == 0).sum())
-        points_m, level_m, share = points_m[share > 0], level_m[share > 0], share[share > 0]
+        points_m, level_m, part, share = points_m[share > 0], level_m[share > 0], part[share > 0], share[share > 0]
         if not len(points_m):
             raise ValueError(
                 f"no reference point is left of the scans within {self.window_s / 2:g} s of this instant, of which "
                 f"{dropped['sweeps']} were used and {dropped['sweeps_skipped']} not, as where poses jump; "
                 "--skip-bad-frames leaves it out"
             )
-        weights = (square_metres(level_m) * share).astype(np.float32)
+        m2 = square_metres(level_m)
+        # Of few points in a box, the eighth neighbour is beside it.
+        m2 *= np.minimum(1.0, np.array(most_m2)[part] / np.bincount(part, m2)[part])
+        weights = (m2 * share).astype(np.float32)
         return InVehicle(points_m.astype(np.float32), dropped, weights)
 
     def told_apart(self, recording: Recording, index: int) -> dict[Key, tuple[NDArray[np.float64], NDArray[np.int8]]]:
@@ -270,3 +277,8 @@ def _beneath_or_in(points_m: NDArray[np.float64], body: BoundingBox | None) -> N
     if body is None:
         return np.empty(0, np.intp)
     return within(points_m, BoundingBox((*body.lower_m[:2], -np.inf), body.upper_m))
+
+
+def _sides_m2(length_m: float, width_m: float, height_m: float) -> float:
+    """How much of a box can be seen from a place: two of its sides and its top."""
+    return (length_m + width_m) * height_m + length_m * width_m

@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from operator import itemgetter
 
 import numpy as np
 import torch
@@ -18,6 +19,8 @@ from torchcover.recordings.in_vehicle import in_vehicle
 from torchcover.recordings.recording import Recording, Scan
 from torchcover.recordings.seen_past import Key, RangeImage, Votes
 
+# What is slower stands: between a time before and one after.
+MOVES_MPS, MOVED_S = 0.5, 0.5
 # Voxels are numbered with so many bits an axis: 200 km at 0.1 m.
 VOXEL_BITS = 21
 # Boxes that were drawn by hand leave out mirrors and corners: what is so near to the sides belongs to the object, as in
@@ -39,10 +42,10 @@ class Thinned:
     """A scan, one point a voxel.
 
     Args:
-        still_m: (N, 3) float64 points that belong to no box, in the world, from the recording's first place.
+        still_m: (N, 3) float64 points of what stands, or has no box, in the world, from the recording's first place.
         voxel: (N,) int64 number of the voxel of each, ascending.
-        of_box: Name of each object -> (M, 3) float64 points in the frame of its box: x along its heading, its centre in
-            the middle.
+        of_box: Name of each object that moves -> (M, 3) float64 points in the frame of its box: x along its heading,
+            its centre in the middle.
         unnamed: Points in boxes without a name, which cannot be found again.
         dropped: As `InVehicle.dropped`.
         place_m: (3,) where the vehicle was, likewise.
@@ -88,6 +91,7 @@ class Sweeps:
     def _forget(self) -> None:
         self._kept: dict[Key, Thinned] = {}
         self._kept_of: Recording | None = None
+        self._places: dict[int, dict[str, NDArray[np.float64]]] = {}
         self._votes = Votes()
         self._ground: tuple[int, GroundModel | None] | None = None
 
@@ -125,6 +129,7 @@ class Sweeps:
             self._forget()
         near = set(instants)
         self._kept_of, self._kept = recording, {key: scan for key, scan in self._kept.items() if key[1] in near}
+        self._places = {instant: places for instant, places in self._places.items() if instant in near}
 
     def votes(self, recording: Recording, sensors: Sequence[str], index: int) -> dict[Key, NDArray[np.int16]]:
         """How many scans see past each point, of the scans of the window and its margins."""
@@ -159,7 +164,7 @@ class Sweeps:
             return self._kept[key]
         try:
             stored = recording.scan(sensor, index)
-            scan, boxes = in_vehicle(stored, recording.body), recording.boxes(index)
+            scan, boxes = in_vehicle(stored, recording.body), self._moving(recording, index)
         except (OSError, ValueError) as error:
             if not self.skip_bad:
                 raise BadFrameError(f"{recording.names[index]}: {error}") from error
@@ -194,6 +199,30 @@ class Sweeps:
         thinned = Thinned(still_m[first], voxel[first], of_box, unnamed, scan.dropped, place_m, image)
         self._kept[key] = thinned
         return thinned
+
+    def _moving(self, recording: Recording, index: int) -> Boxes | None:
+        """The boxes that move, or have no name, or are seen at no other time."""
+        boxes, times_s = recording.boxes(index), recording.times_s
+        if boxes is None or times_s is None or not self.window_s:
+            return boxes
+        ends = np.searchsorted(times_s, times_s[index] + np.array([-MOVED_S, MOVED_S])).clip(0, len(times_s) - 1)
+        instants = [index, *map(int, ends)]
+        places_m = [self._places_m(recording, instant) for instant in instants]
+        moving = []
+        for name in boxes.ids:
+            known = [(times_s[at], of[name]) for at, of in zip(instants, places_m, strict=True) if name in of]
+            (first_s, first_m), (last_s, last_m) = min(known, key=itemgetter(0)), max(known, key=itemgetter(0))
+            is_known = name and last_s > first_s
+            moving.append(not is_known or np.linalg.norm(last_m - first_m) > MOVES_MPS * (last_s - first_s))
+        return boxes.select(torch.tensor(moving, dtype=torch.bool))
+
+    def _places_m(self, recording: Recording, index: int) -> dict[str, NDArray[np.float64]]:
+        """Where the boxes of an instant are in the world, by their names."""
+        if index not in self._places:
+            boxes = recording.boxes(index)
+            centres_m = transform(_pose(recording, index), boxes.centre_m.double().numpy()) if boxes else ()
+            self._places[index] = dict(zip(boxes.ids, centres_m, strict=True)) if boxes else {}
+        return self._places[index]
 
     def voxel(self, points_m: NDArray[np.float64]) -> NDArray[np.int64]:
         """(N,) number of the voxel of each point."""

@@ -23,7 +23,6 @@ from torchcover.geometry.rigid import Matrix
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings.accumulated_reference import (
     KNOWN_POINTS,
-    MOVES_MPS,
     ON_GROUND_M,
     USUAL_BODY,
     VOTES,
@@ -35,7 +34,7 @@ from torchcover.recordings.movers import COMPARED_S, WITHIN_M, Moved, movers
 from torchcover.recordings.objects import objects_of
 from torchcover.recordings.recording import Recording
 from torchcover.recordings.seen_past import RangeImage
-from torchcover.recordings.sweeps import first_of_each, voxels
+from torchcover.recordings.sweeps import MOVES_MPS, first_of_each, voxels
 from torchcover.simulation.height_field import Slopes
 from torchcover.simulation.recorded.run import pieces
 from torchcover.simulation.shapes import Mesh
@@ -94,8 +93,8 @@ def write_world(recording: Recording, folder: Path, *, steps: int | None = None)
     """Make a scenario of a drive: `scenario.yaml` in a folder, and the files that it names.
 
     The ground is a height field through what was seen of it. What stands is what no two scans have seen past, as cells
-    of 0.2 m. What moves has the tracks of its labels; without labels those that are found by rays. What nobody saw is
-    not there.
+    of 0.2 m. What is labelled has the tracks of its labels; without labels, what moves has those that are found by
+    rays. What nobody saw is not there.
 
     Args:
         recording: With times and poses.
@@ -130,7 +129,7 @@ def write_world(recording: Recording, folder: Path, *, steps: int | None = None)
     drive = Trajectory.from_poses(times_s, poses)
     labelled = recording.boxes(recording.frames[0]) is not None
     rows = list(_labelled(recording, float(times_s[-1])) if labelled else _found(seen, drive))
-    driven = [(pose, body) for pose in poses] + [_around(row) for row in rows if not labelled]
+    driven = [(pose, body) for pose in poses] + [_around(row) for row in rows]
     cells = _cells(seen, driven)
     instants_s: Float64 = STEP_S * np.arange(int(times_s[-1] / STEP_S + 1e-6) + 1.0)
     placed = drive.at_each(instants_s)
