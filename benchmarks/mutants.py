@@ -61,10 +61,6 @@ RENAMED = {"min": "max", "max": "min", "all": "any", "any": "all", "minimum": "m
 COMMUTATIVE = ("min", "max", "minimum", "maximum", "equal", "promote_types")
 # Looked at, and the same as what they were made of: file, line, what became of it; and why.
 EQUAL = {
-    ("ranks.py", "data = data if self.rank == 0 else torch.empty(int(length), dtype=torch.uint8)",
-     "torch.empty(int(length))"): "gloo fills as many bytes as were sent, and an unpickler stops where its object ends",
-    ("ranks.py", "data = torch.empty(int(length), dtype=torch.uint8)",
-     "torch.empty(int(length))"): "gloo fills as many bytes as were sent, and an unpickler stops where its object ends",
     ("redundancy.py", "for radius, *others in zip(*map(_without_each, of_sensors), strict=True):",
      "zip(*map(_without_each, of_sensors))"): "each has a row a sensor",
     ("packets.py", "better = (squared < least) | ((squared == least) & (index < found[i]))",
