@@ -156,33 +156,36 @@ function cropped(canvas, raster, ego) {
   };
 }
 
-// What is drawn has the colours of the page, dark or light. On paper nothing can be opened, and it is white.
-function drawIn(page, gallery) {
-  let closed = [];
+// What is drawn has the colours of the page, dark or light, and those of paper.
+function drawAgain(page, gallery) {
   const redraw = () => { gallery.again(); page.draw(); };
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
+  window.addEventListener("beforeprint", () => { redraw(); gallery.rest(); });
+  window.addEventListener("afterprint", redraw);
+}
+
+// Paper is white, and on it nothing can be opened.
+function printWhole() {
+  let closed = [];
   window.addEventListener("beforeprint", () => {
     document.documentElement.classList.add("on-paper");
-    gallery.again();
-    gallery.rest();
     closed = [...document.querySelectorAll("details:not([open])")];
     for (const one of closed) one.open = true;
-    page.draw();
   });
   window.addEventListener("afterprint", () => {
     document.documentElement.classList.remove("on-paper");
     for (const one of closed) one.open = false;
-    redraw();
   });
 }
 
 async function start() {
+  printWhole();
   const content = JSON.parse(part("content").textContent);
   if (!content.maps.length) return null;
   const bytes = await inflated(part("cells").textContent);
   part("maps").hidden = false;
   const page = new MapPage(content, bytes);
-  drawIn(page, fillGallery(page, new Controls(page)));
+  drawAgain(page, fillGallery(page, new Controls(page)));
   return page;
 }
 
