@@ -20,6 +20,8 @@ VOTES = 2
 # What stands is seen for at least so long, or half of the time that was looked at; what is no higher is the ground.
 STANDS_S, ON_GROUND_M = 1.0, 0.3
 SEEN_AGAIN = 0.2
+# Farther away, what angles of poses are off by lifts the ground higher.
+TILTED = 0.005
 # Points that are near each other are beside each other in memory, which is searched in two thirds of the time.
 BLOCK_M = 1.6
 # Of fewer points, a velocity is a guess.
@@ -188,7 +190,8 @@ class AccumulatedReference:
         if ground is None:
             return points_m
         heights_m = ground.heights_m(points_m)
-        down_m = np.where(np.abs(heights_m) <= ON_GROUND_M, heights_m, 0.0)
+        away_m = np.linalg.norm(points_m[:, :2] - self._sweeps.local_T_vehicle(recording, index)[:2, 3], axis=1)
+        down_m = np.where(np.abs(heights_m) <= ON_GROUND_M + TILTED * away_m, heights_m, 0.0)
         return np.asarray(points_m - down_m[:, None] * np.array([0.0, 0.0, 1.0]))
 
     def _passing(self, recording: Recording, index: int, scans: Mapping[Key, Thinned]) -> dict[Key, NDArray[np.bool_]]:
