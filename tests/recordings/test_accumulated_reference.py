@@ -75,6 +75,23 @@ def test_a_box_that_stands_changes_nothing():
     assert labelled.counts == other.counts
 
 
+class OnARoad(Drive):
+    """Nothing but a flat road."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        x, y = np.meshgrid(np.arange(3.0, 110.0, 0.5), np.arange(-6.0, 6.5, 0.5))
+        self.wall_m, self.back_m = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1), np.empty((0, 3))
+
+
+def test_the_farther_away_the_higher_may_the_ground_be_by_errors_of_poses():
+    drive = OnARoad(labelled=False)
+    points_m = np.array([[10.0, 0.0, 0.34], [10.0, 0.0, 0.36], [100.0, 0.0, -0.78], [100.0, 0.0, 0.82]])
+    level_m = AccumulatedReference(10.0)._on_ground(drive, 0, points_m)
+    assert level_m[:, 2] == pytest.approx([0.0, 0.36, 0.0, 0.82], abs=1e-6)
+    assert level_m[:, :2] == pytest.approx(points_m[:, :2])
+
+
 class Slim(Drive):
     """What moves is no wider than somebody on foot, and is hit three times."""
 
