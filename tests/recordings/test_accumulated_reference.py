@@ -261,3 +261,18 @@ def test_one_bad_sweep_costs_its_own_frame():
     assert frames[0].counts["reference_sweeps_skipped"] == 2  # both sensors
     whole = RecordedFrames(Drive(steps=6), reference=AccumulatedReference(1.0))[0]
     assert frames[0].counts["reference_sweeps"] == whole.counts["reference_sweeps"] - 2
+
+
+def test_labels_that_cannot_be_read_cost_their_own_sweep():
+    def gone(index):
+        if index == 6:
+            raise ValueError("f6.csv: truncated")
+        return boxes(index)
+
+    drive = Drive(steps=12)
+    boxes, drive.boxes = drive.boxes, gone
+    frames = RecordedFrames(drive, reference=AccumulatedReference(0.2))
+    frames.leave_out_bad_sweeps()
+    for index in (0, 1, 11):  # whose boxes half a second before or after are not to be had
+        assert frames[index].counts.get("reference_sweeps_skipped", 0) == 0
+    assert frames[5].counts["reference_sweeps_skipped"] == 2

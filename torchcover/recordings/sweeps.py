@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import itemgetter
@@ -207,7 +208,8 @@ class Sweeps:
             return boxes
         ends = np.searchsorted(times_s, times_s[index] + np.array([-MOVED_S, MOVED_S])).clip(0, len(times_s) - 1)
         instants = [index, *map(int, ends)]
-        places_m = [self._places_m(recording, instant) for instant in instants]
+        self._places[index] = _places_m(recording, index, boxes)
+        places_m = [self._places_of(recording, instant) for instant in instants]
         moving = []
         for name in boxes.ids:
             known = [(times_s[at], of[name]) for at, of in zip(instants, places_m, strict=True) if name in of]
@@ -216,12 +218,12 @@ class Sweeps:
             moving.append(not is_known or np.linalg.norm(last_m - first_m) > MOVES_MPS * (last_s - first_s))
         return boxes.select(torch.tensor(moving, dtype=torch.bool))
 
-    def _places_m(self, recording: Recording, index: int) -> dict[str, NDArray[np.float64]]:
-        """Where the boxes of an instant are in the world, by their names."""
+    def _places_of(self, recording: Recording, index: int) -> dict[str, NDArray[np.float64]]:
+        """As `_places_m`; nothing where labels cannot be read, which is the fault of that instant alone."""
         if index not in self._places:
-            boxes = recording.boxes(index)
-            centres_m = transform(_pose(recording, index), boxes.centre_m.double().numpy()) if boxes else ()
-            self._places[index] = dict(zip(boxes.ids, centres_m, strict=True)) if boxes else {}
+            self._places[index] = {}
+            with suppress(OSError, ValueError):
+                self._places[index] = _places_m(recording, index, recording.boxes(index))
         return self._places[index]
 
     def voxel(self, points_m: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -261,6 +263,13 @@ def pose_of(boxes: Boxes, number: int) -> Matrix:
     """`vehicle_T_box` of one of them."""
     yaw_deg = float(np.rad2deg(boxes.yaw_rad[number].item()))
     return rigid(rotation_from_euler(yaw_deg, 0.0, 0.0), boxes.centre_m[number].double().numpy())
+
+
+def _places_m(recording: Recording, index: int, boxes: Boxes | None) -> dict[str, NDArray[np.float64]]:
+    """Where the boxes of an instant are in the world, by their names."""
+    if boxes is None:
+        return {}
+    return dict(zip(boxes.ids, transform(_pose(recording, index), boxes.centre_m.double().numpy()), strict=True))
 
 
 def _casts_rays(recording: Recording, index: int) -> bool:
