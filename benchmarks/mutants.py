@@ -99,6 +99,7 @@ EQUAL = {
     ("box_tree.py", "scale = (AXIS_CELLS / extent).nan_to_num(0.0, posinf=0.0)",
      "1.0"): "points that are all one are in the first cell by any scale, and no quotient is NaN",
     ("packets.py", "last = -1", "0"): "the first packet begins with the first leaf, once all the same",
+    ("ranks.py", "EVERYBODY = -1", "1"): "rank 0, which writes to everybody, writes to no single rank",
     ("recall.py", "for (name, given), highest in zip(borders.items(), (1.0, math.inf), strict=True):",
      "zip(borders.items(), (1.0, math.inf))"): "there are always two",
 }  # fmt: skip

@@ -12,7 +12,7 @@ from datetime import timedelta
 
 import pytest
 import torch
-from torch.distributed import FileStore, HashStore
+from torch.distributed import FileStore, HashStore, TCPStore
 
 import torchcover
 from torchcover.data import BadFrameError, FrameDataset, SimulatedFrames
@@ -119,9 +119,9 @@ def test_all_get_the_result_of_a_single_process(frame_of, tmp_path, length, work
         check_equal(found, single)
 
 
-def in_threads(work, size=3, kind=Ranks):
+def in_threads(work, size=3, kind=Ranks, store=None):
     """What `work(ranks)` gives or raises in ranks that have no more in common than a store."""
-    store = HashStore()
+    store = store or HashStore()
     store.set_timeout(timedelta(seconds=LONGEST_S / 3))
 
     def outcome(rank):
@@ -174,6 +174,22 @@ def test_ranks_get_what_others_have_in_order_and_in_parts(monkeypatch, part_byte
         assert then == ["then 0", "then 1", "then 2"]
     # What everybody has read from everybody is not kept.
     assert not stores[0].check(["1 to 0: 1 0"])
+
+
+def test_more_than_the_store_of_torchrun_takes_at_once_gets_through():
+    store, value = TCPStore("127.0.0.1", 0, is_master=True), torch.arange(2**21, dtype=torch.float64)
+    for found in in_threads(lambda rank: rank.gather(value[rank.rank :])[1], 2, store=store):
+        torch.testing.assert_close(found, value[1:], rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("local", "name", "device"), [("3", "cuda", "cuda:3"), (None, "cuda", "cuda:0"), ("3", "cpu", "cpu")]
+)
+def test_each_rank_of_a_machine_has_a_gpu_of_its_own(monkeypatch, local, name, device):
+    monkeypatch.delenv("LOCAL_RANK", raising=False)
+    if local:
+        monkeypatch.setenv("LOCAL_RANK", local)
+    assert Ranks(HashStore(), 0, 2).device(name) == device
 
 
 def test_who_waits_for_what_others_have_seen_learns_that_one_has_ended():
