@@ -322,6 +322,8 @@ def test_of_detections_alone_the_same_is_known_and_of_radii_nothing():
     every, some = (torchcover.evaluate(rigs, "parking", **given, only_detection=only) for only in (False, True))
     for name, coverage in every.coverages.items():
         other = some.coverages[name]
+        assert coverage.bodies
+        assert not other.bodies  # nobody has asked for them
         np.testing.assert_array_equal(other.detection, coverage.detection)
         assert other.radius.isnan().all()
         for region, height in ((region, height) for region in every.regions for height in coverage.grid.heights):

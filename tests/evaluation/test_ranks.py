@@ -17,7 +17,7 @@ from torch.distributed import FileStore, HashStore, TCPStore
 import torchcover
 from torchcover.data import BadFrameError, FrameDataset, SimulatedFrames
 from torchcover.evaluation import Ranks, joined_ranks
-from torchcover.evaluation.ranks import ABORTED
+from torchcover.evaluation.ranks import ABORTED, packed
 
 LONGEST_S = 30.0
 
@@ -190,6 +190,12 @@ def test_each_rank_of_a_machine_has_a_gpu_of_its_own(monkeypatch, local, name, d
     if local:
         monkeypatch.setenv("LOCAL_RANK", local)
     assert Ranks(HashStore(), 0, 2).device(name) == device
+
+
+def test_what_travels_is_on_the_cpu():
+    assert pickle.loads(packed({"x": torch.arange(3)}))["x"].tolist() == [0, 1, 2]
+    with pytest.raises(NotImplementedError, match="no data"):  # a device that nothing can be copied from
+        packed({"x": torch.empty(3, device="meta")})
 
 
 def test_who_waits_for_what_others_have_seen_learns_that_one_has_ended():

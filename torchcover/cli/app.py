@@ -1,5 +1,6 @@
 """The command line as a program: its commands, and how they end."""
 
+import gc
 import io
 import os
 import signal
@@ -31,6 +32,9 @@ ENDED_BY = {"SIGINT": "interrupted", "SIGTERM": "terminated", "SIGHUP": "hung up
 # What is raised for any mistake in options and arguments. Typer names only descendants of it.
 USAGE_ERROR: type[Exception] = typer.BadParameter.__bases__[0]
 
+# A run holds hardly anything in circles: looking for these as often as Python does takes a fortieth of it.
+OBJECTS_BETWEEN_LOOKS = 100_000
+
 # Of what a mistake is told in: whoever gave a name of thousands does not want it back.
 MAX_LINE_CHARS = 2000
 
@@ -41,6 +45,7 @@ def main() -> None:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # where there is no –, a result with ? is better than none
     set_threads()
+    gc.set_threshold(OBJECTS_BETWEEN_LOOKS)
     try:
         with warnings.catch_warnings(), terminable(_on_signals()) as signals:
             warnings.showwarning = _warn

@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import IO, Any, Protocol, Self
 
@@ -199,7 +200,7 @@ def write_states(file: Path | IO[bytes], header: Mapping[str, Any], states: Mapp
     """The content of the file."""
     # One array after the other: together they would take as much memory again as the states.
     with zipfile.ZipFile(file, "w") as archive:
-        numbers = iter(range(10**9))
+        numbers = count()
         packed = {name: _packed(state, archive, numbers) for name, state in states.items()}
         _add(archive, HEADER, np.array(json.dumps({"format": FORMAT_VERSION, **header, "states": packed})))
         archive.comment = _seal(archive)

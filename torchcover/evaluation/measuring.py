@@ -91,7 +91,7 @@ def _workers(task: Task[FrameSource], settings: Settings) -> int:
 
 def _probes(task: Task[FrameSource], settings: Settings) -> dict[str, Probes]:
     """Who puts bodies beside the vehicle; nobody where there is no scene to put them into."""
-    usual = () if settings.ask and settings.ask.regions else PROBES
+    usual = () if settings.only_detection or (settings.ask and settings.ask.regions) else PROBES
     names = usual if settings.probe is None else settings.probe
     if not (names and isinstance(task.frames, SimulatedFrames)):
         return {}

@@ -316,8 +316,9 @@ class Settings:
     only_detection: Annotated[
         bool,
         Option(
-            "Only the detections of regions: no radii, and rough maps. Few reference points (2048 rays), and of the "
-            "rig only those rays are cast that can change their detection: for target errors, with more steps.",
+            "Only the detections of regions: no radii, rough maps, and no bodies unless given. Few reference points "
+            "(2048 rays), and of the rig only those rays are cast that can change their detection: for target errors, "
+            "with more steps.",
             in_study=True,
         ),
     ] = False

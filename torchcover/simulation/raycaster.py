@@ -34,6 +34,8 @@ CONTACTS_BEYOND = 2.0 ** np.arange(1, 13)
 CONTACT_ROUNDINGS = 4
 # Origins are rounded too, before they come here: in float64, as a share of the largest coordinate.
 MIN_CONTACT = 1e-12
+# More faces than so many are no lists: they would take some hundred bytes each.
+MOST_LISTS = 2**18
 # So far beside a place the line upwards starts if it would run through an edge.
 BESIDE_M = ((0.0, 0.0), (1.1e-7, 2.3e-7), (-3.7e-7, 1.9e-7))
 
@@ -58,10 +60,17 @@ def _embree(bodies: Sequence[Mesh]) -> EmbreeScene:
     # Robust: a ray through a shared edge hits one of the two faces instead of slipping between them.
     scene = EmbreeScene(robust=True)
     for body in bodies:
-        TriangleMesh(scene, body.vertices_m.astype(np.float32), body.faces.astype(np.int32))
+        TriangleMesh(scene, body.vertices_m.astype(np.float32), _as_read(body.faces))
     # embreex commits the scene when it is first used; do it before several threads do.
     scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
     return scene
+
+
+def _as_read(faces: NDArray[np.integer]) -> NDArray[Any]:
+    """(F, 3) faces as embreex, which asks for one number after the other, has them soonest: lists, but of very many."""
+    if len(faces) > MOST_LISTS:
+        return faces.astype(np.int32)
+    return np.fromiter(faces.tolist(), dtype=object, count=len(faces))
 
 
 def _warp(bodies: Sequence[Mesh], device: str) -> Any:  # noqa: ANN401  (answers as Embree's scene)
