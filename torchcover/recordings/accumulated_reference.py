@@ -1,12 +1,14 @@
 """A reference made of a recording itself: what all sensors saw within some time."""
 
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from operator import itemgetter
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.detection.boxes import Boxes
 from torchcover.geometry import BoundingBox, invert, transform
 from torchcover.recordings.in_vehicle import InVehicle, within
 from torchcover.recordings.movers import COMPARED_S, WITHIN_M, Moved, movers
@@ -34,6 +36,13 @@ USUAL_BODY = BoundingBox((-2.4, -0.95, 0.0), (2.4, 0.95, 1.7))
 # differences of rigs were off. From docs/measured/recordings.md.
 OFF = {2.0: {"towns": (11, 52), "highways": (6, 20)}, 5.0: {"towns": (10, 41), "highways": (6, 17)}}
 DIFFERENCE_OFF = 4
+
+
+class _Body(NamedTuple):
+    """Points of an object that moves, (M, 3) in the vehicle frame, and how many square metres a place sees at most."""
+
+    points_m: NDArray[np.float64]
+    most_m2: float
 
 
 class AccumulatedReference:
@@ -105,32 +114,75 @@ class AccumulatedReference:
         Raises:
             OSError, ValueError: A scan cannot be read, or no point is left.
         """
-        sweeps, local_T_vehicle = self._sweeps, self._sweeps.local_T_vehicle(recording, index)
-        sensors = self._taking_part(recording)
+        sweeps, sensors = self._sweeps, self._taking_part(recording)
         votes = sweeps.votes(recording, sensors, index)
         scans = {key: sweeps.thinned(recording, *key) for key in votes if key[1] != index or key[0] not in judged}
         within = set(sweeps.instants(recording, index))
-        labelled, dropped = recording.boxes(index), Counter[str]()
-        boxes = dict(zip(labelled.ids, range(len(labelled)), strict=True)) if labelled else {}
-        used = [key for key in scans if key[1] in within]
-        dropped["sweeps"] = sum(not scans[key].dropped["sweeps_skipped"] for key in used)
+        used = {key: scan for key, scan in scans.items() if key[1] in within}
+        dropped = Counter[str](sweeps=sum(not scan.dropped["sweeps_skipped"] for scan in used.values()))
         if skipped := sweeps.skipped(recording, index):
             dropped["sweeps_skipped"] = len(sensors) * skipped
+        for scan in used.values():
+            dropped += scan.dropped
+            dropped["gone"] += scan.unnamed
+        bodies = self._bodies(recording.boxes(index), used.values(), dropped)
+        local_m = self._standing(recording, index, scans, used, votes, dropped)
+        # Noise, and errors of poses, make the ground a thick layer that would count for more and hide what is behind.
+        level_m = self._on_ground(recording, index, local_m)
+        first = first_of_each(sweeps.voxel(level_m))
+        first = first[np.argsort(voxels(level_m[first], BLOCK_M), kind="stable")]
+        vehicle_T_local = invert(sweeps.local_T_vehicle(recording, index))
+        points_m, level_m = (
+            np.concatenate([transform(vehicle_T_local, of[first]), *(body.points_m for body in bodies)])
+            for of in (local_m, level_m)
+        )
+        part = np.repeat(np.arange(1 + len(bodies)), [len(first), *(len(body.points_m) for body in bodies)])
+        own = _beneath_or_in(points_m, recording.body)
+        dropped["own_vehicle"] += len(own)
+        points_m, level_m, part = (np.ascontiguousarray(np.delete(of, own, axis=0)) for of in (points_m, level_m, part))
+        share = seen_share(level_m, recording.body or USUAL_BODY, self.voxel_m, index)
+        seen = share > 0
+        dropped["hidden"] = int((~seen).sum())
+        points_m, level_m, part, share = points_m[seen], level_m[seen], part[seen], share[seen]
+        if not len(points_m):
+            raise ValueError(
+                f"no reference point is left of the scans within {self.window_s / 2:g} s of this instant, of which "
+                f"{dropped['sweeps']} were used and {dropped['sweeps_skipped']} not, as where poses jump; "
+                "--skip-bad-frames leaves it out"
+            )
+        m2 = square_metres(level_m)
+        # Of few points in a box, the eighth neighbour is beside it.
+        most_m2 = np.array([np.inf, *(body.most_m2 for body in bodies)])
+        m2 *= np.minimum(1.0, most_m2[part] / np.bincount(part, m2)[part])
+        return InVehicle(points_m.astype(np.float32), dropped, (m2 * share).astype(np.float32))
+
+    def _bodies(self, labelled: Boxes | None, scans: Iterable[Thinned], dropped: Counter[str]) -> list["_Body"]:
+        """What was seen of the objects that move, with their boxes to where these are at the instant."""
         of_box: dict[str, list[NDArray[np.float64]]] = {}
-        for key in used:
-            dropped += scans[key].dropped
-            dropped["gone"] += scans[key].unnamed
-            for name, points_m in scans[key].of_box.items():
+        for scan in scans:
+            for name, points_m in scan.of_box.items():
                 of_box.setdefault(name, []).append(points_m)
-        parts, most_m2 = [], [np.inf]
+        boxes, found = {name: number for number, name in enumerate(labelled.ids)} if labelled else {}, []
         for name, boxed in of_box.items():
             points_m = np.concatenate(boxed)
-            if labelled and name in boxes:
-                vehicle_T_box = pose_of(labelled, boxes[name])
-                parts.append(transform(vehicle_T_box, points_m[first_of_each(sweeps.voxel(points_m))]))
-                most_m2.append(_sides_m2(*labelled.size_m[boxes[name]].tolist()))
-            else:
+            if labelled is None or name not in boxes:
                 dropped["gone"] += len(points_m)
+                continue
+            first = first_of_each(self._sweeps.voxel(points_m))
+            placed_m = transform(pose_of(labelled, boxes[name]), points_m[first])
+            found.append(_Body(placed_m, _sides_m2(*labelled.size_m[boxes[name]].tolist())))
+        return found
+
+    def _standing(
+        self,
+        recording: Recording,
+        index: int,
+        scans: Mapping[Key, Thinned],
+        used: Mapping[Key, Thinned],
+        votes: Mapping[Key, NDArray[np.int16]],
+        dropped: Counter[str],
+    ) -> NDArray[np.float64]:
+        """(N, 3) places where something stands, and of what moves where it is at the instant, one a voxel."""
         passing = self._passing(recording, index, scans)
         loose = {key: (votes[key] >= VOTES) | passing[key] for key in scans}
         dropped["rays"] = sum(len(scan.still_m) for scan in scans.values() if scan.image is not None)
@@ -142,36 +194,10 @@ class AccumulatedReference:
             for mover in found
         )
         moved_m = np.concatenate([np.empty((0, 3)), *(mover.points_m for mover in found)])
-        local_m = np.concatenate([*(scans[key].still_m[~loose[key]] for key in used), moved_m])
-        voxel = np.concatenate([*(scans[key].voxel[~loose[key]] for key in used), sweeps.voxel(moved_m)])
-        local_m = local_m[np.sort(first_of_each(voxel))]  # still those first that were seen nearest in time
-        # Noise, and errors of poses, make the ground a thick layer that would count for more and hide what is behind.
-        level_m = self._on_ground(recording, index, local_m)
-        first = first_of_each(sweeps.voxel(level_m))
-        first = first[np.argsort(voxels(level_m[first], BLOCK_M), kind="stable")]
-        vehicle_T_local = invert(local_T_vehicle)
-        points_m, level_m = (
-            np.concatenate([transform(vehicle_T_local, of[first]), *parts]) for of in (local_m, level_m)
-        )
-        part = np.repeat(np.arange(len(most_m2)), [len(first), *map(len, parts)])
-        own = _beneath_or_in(points_m, recording.body)
-        dropped["own_vehicle"] += len(own)
-        points_m, level_m = (np.ascontiguousarray(np.delete(of, own, axis=0)) for of in (points_m, level_m))
-        part = np.delete(part, own)
-        share = seen_share(level_m, recording.body or USUAL_BODY, self.voxel_m, index)
-        dropped["hidden"] = int((share == 0).sum())
-        points_m, level_m, part, share = points_m[share > 0], level_m[share > 0], part[share > 0], share[share > 0]
-        if not len(points_m):
-            raise ValueError(
-                f"no reference point is left of the scans within {self.window_s / 2:g} s of this instant, of which "
-                f"{dropped['sweeps']} were used and {dropped['sweeps_skipped']} not, as where poses jump; "
-                "--skip-bad-frames leaves it out"
-            )
-        m2 = square_metres(level_m)
-        # Of few points in a box, the eighth neighbour is beside it.
-        m2 *= np.minimum(1.0, np.array(most_m2)[part] / np.bincount(part, m2)[part])
-        weights = (m2 * share).astype(np.float32)
-        return InVehicle(points_m.astype(np.float32), dropped, weights)
+        local_m = np.concatenate([*(scan.still_m[~loose[key]] for key, scan in used.items()), moved_m])
+        voxel = np.concatenate([*(scan.voxel[~loose[key]] for key, scan in used.items()), self._sweeps.voxel(moved_m)])
+        # Still those first that were seen nearest in time.
+        return np.asarray(local_m[np.sort(first_of_each(voxel))])
 
     def told_apart(self, recording: Recording, index: int) -> dict[Key, tuple[NDArray[np.float64], NDArray[np.int8]]]:
         """Of each scan of the window `Thinned.still_m`, and (N,) 0 if it stands, 1 if it passes, 2 if seen past."""
