@@ -24,14 +24,16 @@ from torchcover.geometry.arrays import Bools, Float32, Float64, Int32, Int64
 from torchcover.geometry.rigid import Matrix
 from torchcover.simulation.patches import outward_faces
 from torchcover.simulation.rays import rotate
-from torchcover.simulation.shapes import Mesh, corners_of, normals_of, parts_of
+from torchcover.simulation.shapes import PART, Mesh, corners_of, normals_of, parts_of
 
 # Farther from the origin float32 resolves no better than 64 m, and at 2e18 Embree drops faces without a word.
 MAX_M = 1e9
 # How far beyond a face that it leaves a ray goes on, in contact distances; farther each time that it hits one again.
 CONTACTS_BEYOND = 2.0 ** np.arange(1, 13)
 # An origin lies on a face if it is no farther from its plane than this many times what rounding makes of that.
-CONTACT_ROUNDINGS = 4
+CONTACT = 4 * float(np.finfo(np.float32).eps)
+# Twice that, of the largest coordinate of a face, and what rounding its box to float32 adds.
+MOST_CONTACT = 3 * CONTACT
 # Origins are rounded too, before they come here: in float64, as a share of the largest coordinate.
 MIN_CONTACT = 1e-12
 # More faces than so many are no lists: they would take some hundred bytes each.
@@ -82,22 +84,27 @@ def _warp(bodies: Sequence[Mesh], device: str) -> Any:  # noqa: ANN401  (answers
 class Faces:
     """The faces of all bodies, one after the other, and how far from each a place counts as on it.
 
-    `contact_m` (F,) bounds the distance from its plane at which float32 may find a place that lies on it, unless it is
-    a sliver; `normals` (3, F) are of length one, or 0 where a face has no area. Both are float32, for there may be ten
-    million; what a question needs in float64 is computed again for the few faces that it is about.
+    `normals` (3, F) are of length one, or 0 where a face has no area. What is kept of all is float32, for there may be
+    ten million; what a question needs in float64 is computed for the few faces that it is about.
     """
 
     def __init__(self, bodies: Sequence[Mesh], reach_m: float) -> None:
         self._bodies = bodies
-        count = sum(len(body.faces) for body in bodies)
-        self.contact_m = np.empty(count, dtype=np.float32)
-        self._lower_m, self._upper_m = (np.empty((3, count), dtype=np.float32) for _ in range(2))
-        for faces, corners_m in parts_of(bodies):
-            self.contact_m[faces] = contact_m = np.maximum(_contact_m(corners_m), MIN_CONTACT * reach_m)
-            # Rounded outwards.
-            lower_m, upper_m = corners_m.min(axis=0) - 2 * contact_m, corners_m.max(axis=0) + 2 * contact_m
-            self._lower_m[:, faces] = np.nextafter(lower_m.astype(np.float32), np.float32(-np.inf))
-            self._upper_m[:, faces] = np.nextafter(upper_m.astype(np.float32), np.float32(np.inf))
+        self._least_contact_m = MIN_CONTACT * reach_m
+        self._count = sum(len(body.faces) for body in bodies)
+        # Of the boxes of places that may lie on a face: no contact distance is more than a share of its coordinates.
+        self._lower_m, self._upper_m = (np.empty((3, self._count), dtype=np.float32) for _ in range(2))
+        first = 0
+        for body in bodies:
+            vertices_m = np.ascontiguousarray(body.vertices_m.T, dtype=np.float32)
+            for start in range(0, len(body.faces), PART):
+                corners_m = vertices_m.take(body.faces[start : start + PART].T, axis=1)
+                lower_m, upper_m = corners_m.min(axis=1), corners_m.max(axis=1)
+                largest_m = np.maximum(np.abs(lower_m).max(axis=0), np.abs(upper_m).max(axis=0))
+                beside_m = np.float32(MOST_CONTACT) * largest_m + np.float32(2 * self._least_contact_m)
+                faces = slice(first, first + corners_m.shape[2])
+                first = faces.stop
+                self._lower_m[:, faces], self._upper_m[:, faces] = lower_m - beside_m, upper_m + beside_m
         self._least_m, self._most_m = (
             self._lower_m.min(axis=1, initial=np.inf),
             self._upper_m.max(axis=1, initial=-np.inf),
@@ -106,7 +113,7 @@ class Faces:
     @cached_property
     def normals(self) -> Float32:
         """Asked where light returns."""
-        normals = np.empty((3, len(self.contact_m)), dtype=np.float32)
+        normals = np.empty((3, self._count), dtype=np.float32)
         for faces, corners_m in parts_of(self._bodies):
             normals[:, faces] = normals_of(corners_m)
         return normals
@@ -122,7 +129,9 @@ class Faces:
             near = near[(self._lower_m[axis, near] <= coordinate_m) & (coordinate_m <= self._upper_m[axis, near])]
         if len(near) == 0:
             return near
-        return np.asarray(near[self.from_plane_m(place_m, near) <= 2 * self.contact_m[near]])
+        corners_m, within_m = corners_of(self._bodies, near), 2 * self.contact_m(near)
+        apart_m = np.maximum(corners_m.min(axis=0) - place_m[:, None], place_m[:, None] - corners_m.max(axis=0))
+        return np.asarray(near[(apart_m <= within_m).all(axis=0) & (self.from_plane_m(place_m, near) <= within_m)])
 
     def above(self, place_m: NDArray[np.floating]) -> Int64:
         """Numbers of those that a line upwards from a (3,) place may meet."""
@@ -130,6 +139,10 @@ class Faces:
         near = np.flatnonzero((self._lower_m[0] <= x) & (x <= self._upper_m[0]))
         near = near[(self._lower_m[1, near] <= y) & (y <= self._upper_m[1, near])]
         return np.asarray(near[z <= self._upper_m[2, near]])
+
+    def contact_m(self, faces: Int64) -> Float64:
+        """(N,) from the planes of some of them, as far as float32 may find a place that lies on it, but of slivers."""
+        return np.maximum(_contact_m(corners_of(self._bodies, faces)), self._least_contact_m)
 
     def from_plane_m(self, place_m: NDArray[np.floating], faces: Int64) -> Float64:
         """Distance of a (3,) place from the planes of some of them."""
@@ -147,7 +160,7 @@ def _contact_m(corners_m: Matrix) -> Matrix:
     largest = np.abs(corners_m).max(axis=0)
     rounding_m = (products * largest).sum(axis=0) / np.where(length == 0, np.inf, length)
     # The plane of a sliver is anybody's guess, but the sliver is not far from where it is.
-    return np.asarray(np.minimum(rounding_m, largest.max(axis=0)) * (CONTACT_ROUNDINGS * np.finfo(np.float32).eps))
+    return np.asarray(np.minimum(rounding_m, largest.max(axis=0)) * CONTACT)
 
 
 class Hits(NamedTuple):
@@ -262,7 +275,7 @@ class RayCaster:
         """Let the rays go on that hit a face whose plane they start on: by rounding alone, as they leave it."""
 
         def starts_on_plane(faces: Int64) -> Bools:
-            return np.asarray(self._faces.from_plane_m(origin_m, faces) <= self._faces.contact_m[faces])
+            return np.asarray(self._faces.from_plane_m(origin_m, faces) <= self._faces.contact_m(faces))
 
         rays, travelled_m, faces = np.flatnonzero(hits.body >= 0), 0.0, self._numbers(hits)
         rays = rays[starts_on_plane(faces[rays])]
@@ -271,7 +284,7 @@ class RayCaster:
             if len(rays) == 0:
                 return
             # The hit is the nearest one, so nothing lies before it.
-            travelled_m = travelled_m + range_m + beyond * self._faces.contact_m[faces]
+            travelled_m = travelled_m + range_m + beyond * self._faces.contact_m(faces)
             towards, left_m = directions.T[rays], np.maximum(limit_m[rays] - travelled_m, 0.0)
             starts_m = origin_m + travelled_m[:, None] * towards
             found = self.cast_from_each(starts_m.astype(np.float32), towards.T, left_m.astype(np.float32))
@@ -304,7 +317,7 @@ class RayCaster:
             if not ((areas == 0).any(axis=0) & (whole != 0)).any():
                 break
         with np.errstate(divide="ignore", invalid="ignore"):
-            is_above = (areas * corners_m[:, 2]).sum(axis=0) / whole > self._faces.contact_m[faces]
+            is_above = (areas * corners_m[:, 2]).sum(axis=0) / whole > self._faces.contact_m(faces)
         way = (areas > 0).all(axis=0).astype(np.int64) - (areas < 0).all(axis=0)
         return bodies[np.bincount(of, way * (is_above & is_closed), len(bodies)) > 0]
 
