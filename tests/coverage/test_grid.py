@@ -223,6 +223,7 @@ def test_a_cell_without_a_length_is_refused(cell):
         ((0.0, 1.2), "its extent of 1.2 m is not a multiple of the cell of 0.5 m .2.4 cells.; a cell of 0.6 m would"),
         ((0.0, 0.2), "its extent of 0.2 m is not a multiple of the cell of 0.5 m .0.4 cells.; a cell of 0.2 m would"),
         ((0.0, 1e-7), "its extent of 1e-07 m is not a multiple of the cell of 0.5 m .2e-07 cells."),
+        ((0.0, 0.5 + 0.8e-6), "its extent of 0.5000008 m is not a multiple of the cell of 0.5 m"),
         ((0.0, 500_000.25), "its extent of 500000.25 m is not a multiple of the cell of 0.5 m"),
     ],
 )

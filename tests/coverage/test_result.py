@@ -144,6 +144,13 @@ def test_without_a_block_of_one_step_a_pooled_mean_is_that_of_the_others():
     assert found.steps.tolist() == [1] * 8
 
 
+def test_what_was_not_aggregated_has_no_numbers():
+    grid = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)})
+    result = a_coverage(grid=grid, frames=torch.tensor([[[1]]]))
+    found = result.estimate_aggregated(Region("one", grid.x, grid.y), "all")
+    assert (found.quantities, len(found.value)) == ((), 0)
+
+
 def test_the_share_of_known_cells_is_in_the_repr():
     grid = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=0.5, heights={"all": (0.0, 1.0)})
     result = a_coverage(grid=grid, frames=torch.tensor([[[1, 0], [0, 0]]]))

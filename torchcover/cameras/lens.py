@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+import torchcover.geometry.first_calls  # noqa: F401
 from torchcover.geometry.arrays import Float64
 
 if TYPE_CHECKING:

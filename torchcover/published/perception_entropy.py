@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+import torchcover.geometry.first_calls  # noqa: F401
 from torchcover.coverage.quantity import MEASURED_WITHIN_M
 from torchcover.frames import Frame
 from torchcover.published.frame_metric import WorldRatios, said

@@ -7,6 +7,8 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
+import torchcover.geometry.first_calls  # noqa: F401
+
 TINY = 1e-30
 # Hyperparameters are learnt from so many values, which costs their third power at every step.
 MOST_LEARNT_FROM = 150
