@@ -99,7 +99,8 @@ EQUAL = {
     ("box_tree.py", "scale = (AXIS_CELLS / extent).nan_to_num(0.0, posinf=0.0)",
      "1.0"): "points that are all one are in the first cell by any scale, and no quotient is NaN",
     ("packets.py", "last = -1", "0"): "the first packet begins with the first leaf, once all the same",
-    ("trajectory.py", "return max(after - 1, 0), max(after - 1, 0), 0.0", "1.0"): "between a pose and itself lies no other",
+    ("trajectory.py", "return max(after - 1, 0), max(after - 1, 0), 0.0",
+     "1.0"): "between a pose and itself lies no other",
     ("lens.py", "near_real = np.abs(roots.imag) < 1e-6 * (1.0 + np.abs(roots.real))",
      "2.0"): "a radius more is looked at",
     ("mixture.py", "known_cells = round(sum(weight * row.known_cells for weight, row in zip(weights, rows, "
