@@ -67,11 +67,16 @@ def parts_of(meshes: Sequence[Mesh]) -> Iterator[tuple[slice, Float64]]:
     """As `Mesh.parts`, of faces that are counted through all meshes: of small ones several together."""
     first, held = 0, list[Float64]()
     for number, mesh in enumerate(meshes, 1):
+        # The first index is the coordinate: three rows that are read one after the other.
+        coordinates_m = np.ascontiguousarray(mesh.vertices_m.T)
         for start in range(0, max(len(mesh.faces), 1), PART):
-            held.append(mesh.vertices_m[mesh.faces[start : start + PART]])
-            count, is_last = sum(map(len, held)), number == len(meshes) and start + PART >= len(mesh.faces)
+            held.append(coordinates_m.take(mesh.faces[start : start + PART].T, axis=1))
+            count, is_last = (
+                sum(part.shape[2] for part in held),
+                number == len(meshes) and start + PART >= len(mesh.faces),
+            )
             if count and (count >= PART or is_last):
-                yield slice(first, first + count), np.ascontiguousarray(np.concatenate(held).transpose(1, 2, 0))
+                yield slice(first, first + count), np.concatenate(held, axis=2).swapaxes(0, 1)
                 first, held = first + count, []
 
 
