@@ -101,6 +101,10 @@ EQUAL = {
     ("packets.py", "last = -1", "0"): "the first packet begins with the first leaf, once all the same",
     ("trajectory.py", "return max(after - 1, 0), max(after - 1, 0), 0.0",
      "1.0"): "between a pose and itself lies no other",
+    ("height_field.py", "left_m, layers = heights_m - base(across_m), HeightField(np.zeros(2), np.zeros((2, 2)), 1.0)",
+     "2.0"): "0 everywhere, whatever its squares",
+    ("voxel_walk.py", "way = np.asarray(directions, dtype=np.float64)",
+     "np.asarray(directions)"): "all that they are combined with is float64",
     ("lens.py", "near_real = np.abs(roots.imag) < 1e-6 * (1.0 + np.abs(roots.real))",
      "2.0"): "a radius more is looked at",
     ("mixture.py", "known_cells = round(sum(weight * row.known_cells for weight, row in zip(weights, rows, "

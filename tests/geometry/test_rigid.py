@@ -12,6 +12,7 @@ from torchcover.geometry import (
     rigid,
     rotation_from_euler,
     rotation_from_quaternion,
+    slerp,
     transform,
 )
 
@@ -115,6 +116,20 @@ def test_many_quaternions_are_turned_at_once_as_each_alone():
 def test_a_quaternion_of_fewer_digits_is_turned_with_all_of_a_double(dtype):
     few = np.array([[3, 1, -2, 5], [0, 1, 1, 1]], dtype=dtype)
     np.testing.assert_array_equal(rotation_from_quaternion(few), rotation_from_quaternion(few.astype(np.float64)))
+
+
+def test_between_two_rotations_the_way_is_the_shorter_one_whatever_the_signs_of_their_quaternions():
+    random = np.random.default_rng(0)
+    first, second = (of / np.linalg.norm(of, axis=1, keepdims=True) for of in random.normal(size=(2, 50, 4)))
+    share = random.random((50, 1))
+    between = rotation_from_quaternion(slerp(first, second, share))
+    for other in (slerp(-first, second, share), slerp(first, -second, share), slerp(second, first, 1 - share)):
+        np.testing.assert_allclose(rotation_from_quaternion(other), between, rtol=0, atol=1e-12)
+    turned = [
+        np.linalg.norm(of - rotation_from_quaternion(first), axis=(1, 2))
+        for of in (between, rotation_from_quaternion(second))
+    ]
+    assert (turned[0] <= turned[1] + 1e-12).all()
 
 
 def test_a_quaternion_of_norm_zero_is_refused():
