@@ -1,9 +1,8 @@
 """Importing this makes torch's functions as exact in the first call of a process as in any other.
 
 On CPUs torch leaves them to Intel's MKL, which looks for the right one of its variants at the first call. If several
-threads make that call together, some may get one with twelve digits instead of sixteen, in float32 with four
-(github.com/pytorch/pytorch/issues/188792): the first table of a camera was so in one process of 200. So one thread
-makes the first calls.
+threads make that call together, some may get a much less exact one (github.com/pytorch/pytorch/issues/188792), and the
+first rays of a camera differ from process to process. So one thread makes the first calls.
 """
 
 import torch

@@ -156,7 +156,7 @@ class AccumulatedReference:
         m2 *= np.minimum(1.0, most_m2[part] / np.bincount(part, m2)[part])
         return InVehicle(points_m.astype(np.float32), dropped, (m2 * share).astype(np.float32))
 
-    def _bodies(self, labelled: Boxes | None, scans: Iterable[Thinned], dropped: Counter[str]) -> list["_Body"]:
+    def _bodies(self, labelled: Boxes | None, scans: Iterable[Thinned], dropped: Counter[str]) -> list[_Body]:
         """What was seen of the objects that move, with their boxes to where these are at the instant."""
         of_box: dict[str, list[NDArray[np.float64]]] = {}
         for scan in scans:

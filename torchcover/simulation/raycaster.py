@@ -30,7 +30,7 @@ from torchcover.simulation.shapes import PART, Mesh, corners_of, normals_of, par
 MAX_M = 1e9
 # How far beyond a face that it leaves a ray goes on, in contact distances; farther each time that it hits one again.
 CONTACTS_BEYOND = 2.0 ** np.arange(1, 13)
-# An origin lies on a face if it is no farther from its plane than this many times what rounding makes of that.
+# An origin lies on a face if it is no farther from its plane than four times what rounding makes of that; as a share.
 CONTACT = 4 * float(np.finfo(np.float32).eps)
 # Twice that, of the largest coordinate of a face, and what rounding its box to float32 adds.
 MOST_CONTACT = 3 * CONTACT
@@ -69,7 +69,7 @@ def _embree(bodies: Sequence[Mesh]) -> EmbreeScene:
 
 
 def _as_read(faces: NDArray[np.integer]) -> NDArray[Any]:
-    """(F, 3) faces as embreex, which asks for one number after the other, has them soonest: lists, but of very many."""
+    """Of (F, 3) faces what embreex, which asks for one number after the other, reads soonest: lists, but of very many."""
     if len(faces) > MOST_LISTS:
         return faces.astype(np.int32)
     return np.fromiter(faces.tolist(), dtype=object, count=len(faces))
