@@ -69,7 +69,7 @@ def _embree(bodies: Sequence[Mesh]) -> EmbreeScene:
 
 
 def _as_read(faces: NDArray[np.integer]) -> NDArray[Any]:
-    """Of (F, 3) faces what embreex, which asks for one number after the other, reads soonest: lists, but of very many."""
+    """Of (F, 3) faces what embreex, which asks for one number after another, reads soonest: lists, but of very many."""
     if len(faces) > MOST_LISTS:
         return faces.astype(np.int32)
     return np.fromiter(faces.tolist(), dtype=object, count=len(faces))
