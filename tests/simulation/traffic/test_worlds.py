@@ -78,9 +78,10 @@ def test_the_ego_stays_on_the_road_and_tilts_a_little(kind, world):
     assert np.abs(np.diff(ego.angles_deg[:, 1:], axis=0)).max() < 0.4
 
 
-def test_what_is_known_of_faces_is_what_would_be_found(world):
-    static = [mesh for mesh in world("winding", 0).static if mesh.outward is not None]
-    assert len(static) == 2  # houses, and what is smaller
+@pytest.mark.parametrize(("kind", "known"), [("straight", 4), ("winding", 4), ("parking", 3)])
+def test_what_is_known_of_faces_is_what_would_be_found(kind, known, world):
+    static = [mesh for mesh in world(kind, 0).static if mesh.outward is not None]
+    assert len(static) == known  # the ground, pavements, houses, and what is smaller
     for mesh in static:
         np.testing.assert_array_equal(mesh.outward, outward_faces(mesh._replace(outward=None)))
 

@@ -85,4 +85,5 @@ class Hills:
         wanted[faces] = True
         used, number = np.flatnonzero(wanted), np.cumsum(wanted) - 1
         places_m = square_m * (lower + np.stack([used % (columns + 1), used // (columns + 1)], axis=1))
-        return Mesh(np.column_stack([places_m, self.heights_m(places_m)]), number[faces]).made_of("road")
+        vertices_m, outward = np.column_stack([places_m, self.heights_m(places_m)]), np.zeros(len(faces), dtype=bool)
+        return Mesh(vertices_m, number[faces], outward=outward).made_of("road")

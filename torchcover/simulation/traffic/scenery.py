@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from torchcover.geometry import rigid, rotation_from_euler
 from torchcover.geometry.arrays import Float64
 from torchcover.simulation.bodies import merge
+from torchcover.simulation.patches import outward_faces
 from torchcover.simulation.shapes import Mesh, band, circle, prism_faces
 
 PAVEMENT_M = 0.15
@@ -31,7 +32,7 @@ def ground(lower_m: ArrayLike, upper_m: ArrayLike) -> Mesh:
     """The one plane at z = 0 under everything: two triangles, so there is no seam for a ray to slip through."""
     (x0, y0), (x1, y1) = np.asarray(lower_m, dtype=np.float64), np.asarray(upper_m, dtype=np.float64)
     corners = np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0]])
-    return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]])).made_of("road")
+    return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), outward=np.zeros(2, dtype=bool)).made_of("road")
 
 
 def prism(outlines_m: Sequence[ArrayLike], heights_m: Sequence[float]) -> Mesh:
@@ -69,7 +70,8 @@ def slab(corners_m: Float64, z_m: tuple[float, float]) -> Mesh:
     around = np.concatenate([number[:-1, 0], number[-1, :-1], number[:0:-1, -1], number[0, :0:-1]])
     sides, up = band(around, np.roll(around, -1), rows * columns), rows * columns
     places_m = np.tile(corners_m.reshape(-1, 2), (2, 1))
-    return Mesh(np.column_stack([places_m, np.repeat(z_m, up)]), np.concatenate([over[:, ::-1], over + up, sides]))
+    faces = np.concatenate([over[:, ::-1], over + up, sides])
+    return Mesh(np.column_stack([places_m, np.repeat(z_m, up)]), faces, outward=np.ones(len(faces), dtype=bool))
 
 
 def plateau(pieces: ArrayLike, heights_m: Callable[[Float64], Float64]) -> Mesh:
@@ -87,12 +89,11 @@ def plateau(pieces: ArrayLike, heights_m: Callable[[Float64], Float64]) -> Mesh:
     # Around the outline an edge has a triangle on one side only.
     key, back = edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0]
     here, following = edges[~np.isin(key, back)].T
-    return Mesh(
-        np.concatenate([
-            np.column_stack([places_m, above_m + PAVEMENT_M]), np.column_stack([places_m, above_m - SUNK_M])
-        ]),
-        np.concatenate([faces, faces[:, ::-1] + count, band(here + count, following + count, -count)]),
-    ).made_of("pavement")  # fmt: skip
+    vertices_m = [np.column_stack([places_m, above_m + up_m]) for up_m in (PAVEMENT_M, -SUNK_M)]
+    faces = np.concatenate([faces, faces[:, ::-1] + count, band(here + count, following + count, -count)])
+    mesh = Mesh(np.concatenate(vertices_m), faces).made_of("pavement")
+    # Where places that are alike have become one, it may be open.
+    return mesh._replace(outward=outward_faces(mesh))
 
 
 def box(centre_m: ArrayLike, size_m: ArrayLike, bottom_m: float = 0.0, yaw_deg: float = 0.0) -> Mesh:
