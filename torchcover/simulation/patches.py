@@ -33,6 +33,8 @@ def outward_faces(mesh: Mesh) -> Bools:
     """
     if mesh.outward is not None:
         return mesh.outward
+    if len(mesh.faces) == 0:
+        return np.empty(0, dtype=bool)
     edge, way = edges_of(mesh)
     return outward_by(mesh, edge, way, surfaces_of(edge))
 
