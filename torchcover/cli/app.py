@@ -6,8 +6,11 @@ import os
 import signal
 import sys
 import time
+import traceback
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
+from enum import IntEnum
 from typing import Annotated, Any
 
 import typer
@@ -17,16 +20,31 @@ from torchcover.cli.evaluate import compare, evaluate
 from torchcover.evaluation.cores import set_threads
 from torchcover.evaluation.progress import terminable
 
+
+class ExitCode(IntEnum):
+    """Exit codes of every command; a signal ends a command with 128 + its number."""
+
+    SUCCESS = 0
+    REQUIREMENT_NOT_MET = 1
+    USER_ERROR = 2
+    INTERNAL_ERROR = 70  # EX_SOFTWARE of sysexits.h
+    BROKEN_PIPE = 128 + 13  # SIGPIPE, as of programs that this signal ends
+
+
+EXIT_CODE_HELP = (
+    "Exit codes: 0 success, or all requirements met; 1 a requirement is not met (`check`); 2 user error; "
+    "70 internal error; 141 the reader of the output is gone; 128 + n ended by signal n."
+)
+
 app = typer.Typer(
     name="torchcover",
     help="Blind spots and coverage of a vehicle's sensor rig, measured against a random reference sensor.",
+    epilog=EXIT_CODE_HELP,
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
 )
 
-# Exit codes; those of signals are 128 and their number.
-MISTAKE, INTERRUPTED = 2, 130
 ENDED_BY = {"SIGINT": "interrupted", "SIGTERM": "terminated", "SIGHUP": "hung up"}
 
 # What is raised for any mistake in options and arguments. Typer names only descendants of it.
@@ -40,27 +58,88 @@ MAX_LINE_CHARS = 2000
 
 
 def main() -> None:
-    """Run the command line; a user's mistake ends in one line on stderr and exit code 2, a warning is one line too."""
+    """Run the command line and end with an `ExitCode`; a user error or a warning is one line on stderr."""
+    open_closed_streams()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # where there is no –, a result with ? is better than none
     set_threads()
     gc.set_threshold(OBJECTS_BETWEEN_LOOKS)
+    signals: Sequence[int] = ()
     try:
         with warnings.catch_warnings(), terminable(_on_signals()) as signals:
             warnings.showwarning = _warn
             warnings.filterwarnings("ignore", "The run was cut short", RuntimeWarning)  # the last line says it
-            code = typer.main.get_command(app).main(standalone_mode=False)
-        sys.stdout.flush()
-    except Exception as error:
-        message = _mistake(error)
-        if message is None:
-            raise
-        _fail(message)
-    if code == INTERRUPTED:  # what typer makes of KeyboardInterrupt
+            code = run_command(sys.argv[1:])
+            sys.stdout.flush()
+    except (Exception, KeyboardInterrupt) as error:
+        code, message = judge_error(error, signals)
+        if code == ExitCode.INTERNAL_ERROR:
+            traceback.print_exc()
+        print_error(message)
+    for stream in (sys.stdout, sys.stderr):
+        flush_or_discard(stream)
+    sys.exit(code)
+
+
+def run_command(arguments: Sequence[str]) -> int:
+    """Run the command of a command line; typer's own `main` would end a broken pipe with the code of a verdict.
+
+    Returns:
+        The exit code that the command asks for.
+    """
+    command = typer.main.get_command(app)
+    try:
+        with command.make_context("torchcover", list(arguments)) as context:
+            command.invoke(context)
+    except typer.Exit as end:
+        return int(end.exit_code)
+    return ExitCode.SUCCESS
+
+
+def judge_error(error: BaseException, signals: Sequence[int] = ()) -> tuple[int, str]:
+    """Decide how the program ends after an error.
+
+    Args:
+        error: The exception that ended the command.
+        signals: Numbers of the signals that arrived.
+
+    Returns:
+        The exit code, and the line for stderr; empty if there is nothing to say.
+    """
+    if isinstance(error, KeyboardInterrupt):
         first = signals[0] if signals else signal.SIGINT
-        _fail(ENDED_BY[signal.Signals(first).name], 128 + first)
-    sys.exit(code if isinstance(code, int) else 0)
+        return 128 + first, ENDED_BY[signal.Signals(first).name]
+    if isinstance(error, BrokenPipeError):
+        return ExitCode.BROKEN_PIPE, ""
+    message = _mistake(error)
+    if message is not None:
+        return ExitCode.USER_ERROR, message
+    return ExitCode.INTERNAL_ERROR, f"internal error ({type(error).__name__}: {error}); please report the lines above"
+
+
+def open_closed_streams() -> None:
+    """Connect closed standard streams to the null device; a file that is opened later would take their place."""
+    for number, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
+        try:
+            os.fstat(number)
+        except OSError:
+            null = os.open(os.devnull, os.O_RDWR)
+            if null != number:
+                os.dup2(null, number)
+                os.close(null)
+            os.set_inheritable(number, True)
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: SIM115  (for the whole process)
+
+
+def flush_or_discard(stream: io.TextIOBase) -> None:
+    """Write what a stream holds, or drop it if nobody can take it: Python would fail with code 120 at exit."""
+    try:
+        stream.flush()
+    except OSError:
+        with suppress(OSError), open(os.devnull, "wb") as null:
+            os.dup2(null.fileno(), stream.fileno())
 
 
 def _on_signals() -> Callable[[Sequence[int]], None]:
@@ -80,12 +159,12 @@ def _on_signals() -> Callable[[Sequence[int]], None]:
             kept = f"kept is {', '.join(map(str, files))}" if files else "nothing of this run is kept"
             cursor = "\x1b[?25h" * (2 in terminals)  # a bar hides it
             os.write(2, f"{cursor}\ntorchcover: ended at once: {kept}\n".encode())
-            os._exit(INTERRUPTED)
+            os._exit(128 + signal.SIGINT)
 
     return told
 
 
-def _mistake(error: Exception) -> str | None:
+def _mistake(error: BaseException) -> str | None:
     """What a user did wrong, or lacks; None if it is a mistake of ours."""
     if isinstance(error, USAGE_ERROR):
         # The typed name is private; of a choice it tells the kind of the exception, too.
@@ -116,19 +195,22 @@ def version(show: Annotated[bool, typer.Option("--version", help="Print the vers
 for command in (commands.report, evaluate, compare, commands.study, commands.record, commands.rig, commands.robot,
                 commands.calibrate, commands.world, commands.show, commands.targets, commands.check, commands.encounter,
                 commands.search):  # fmt: skip
-    app.command()(command)
-app.command("list")(commands.list_builtin)
+    app.command(epilog=EXIT_CODE_HELP)(command)
+app.command("list", epilog=EXIT_CODE_HELP)(commands.list_builtin)
 
 
 def _warn(message: Warning | str, *_: Any, **__: Any) -> None:  # noqa: ANN401  (where in our code: of no use to a user)
     typer.echo(f"torchcover: warning: {_one_line(str(message))}", err=True)
 
 
-def _fail(message: str, code: int = MISTAKE) -> None:
+def print_error(message: str) -> None:
+    """Print one line on stderr: none where no command was given, for which the help was printed."""
     line = _one_line(message)
-    if line:  # none where no command was given: the help has been printed
-        typer.echo(f"torchcover: {line if len(line) <= MAX_LINE_CHARS else line[:MAX_LINE_CHARS] + ' ...'}", err=True)
-    sys.exit(code)
+    if line:
+        with suppress(OSError):  # a terminal that is gone
+            typer.echo(
+                f"torchcover: {line if len(line) <= MAX_LINE_CHARS else line[:MAX_LINE_CHARS] + ' ...'}", err=True
+            )
 
 
 def _one_line(words: str) -> str:

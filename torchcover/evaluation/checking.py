@@ -61,10 +61,9 @@ class Checked:
     settings: Mapping[str, Any]
 
     @property
-    def exit_code(self) -> int:
-        """0: all is checked and kept; 1: something is not kept; 3: something is not checked."""
-        states = {one.state for each in self.verdicts.values() for one in each}
-        return 1 if "not kept" in states else 3 if "not checked" in states else 0
+    def is_met(self) -> bool:
+        """Whether every rig meets every requirement; one that was not checked is not met."""
+        return all(one.state == "kept" for each in self.verdicts.values() for one in each)
 
     @property
     def verdict(self) -> tuple[str, ...]:
@@ -88,7 +87,7 @@ class Checked:
         """All of it, for JSON."""
         rigs = {rig: [json_record(_record(one)) for one in each] for rig, each in self.verdicts.items()}
         about = {"requirements": self.requirements.name, "torchcover": __version__, **self.settings}
-        return {**about, "exit_code": self.exit_code, "rigs": rigs}
+        return {**about, "met": self.is_met, "rigs": rigs}
 
     @property
     def junit(self) -> str:
@@ -161,8 +160,8 @@ def check(
     Example:
         >>> child = {"target": "child", "at": {"points_m": [[5.0, 0.0]]}, "points": 5}
         >>> found = check("front_roof_128", Requirements.model_validate({"requirements": [child]}))
-        >>> [one.state for one in found.verdicts["front_roof_128"]], found.exit_code
-        (['kept'], 0)
+        >>> [one.state for one in found.verdicts["front_roof_128"]], found.is_met
+        (['kept'], True)
     """
     asked = requirements if isinstance(requirements, Requirements) else Requirements.load(requirements)
     given = [rigs] if isinstance(rigs, str | Path | Rig) else rigs

@@ -1,0 +1,74 @@
+"""Every end of a command has one exit code, with closed streams too."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from torchcover.cli import app, listing
+
+PROGRAM = [sys.executable, "-m", "torchcover"]
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "lines"),
+    [
+        (ValueError("such a value"), 2, 1),
+        (FileNotFoundError("no such file"), 2, 1),
+        (MemoryError(), 2, 1),
+        (RuntimeError("a defect"), 70, 3),
+        (KeyError("name"), 70, 3),
+        (AssertionError(), 70, 3),
+        (BrokenPipeError(32, "Broken pipe"), 141, 0),
+        (KeyboardInterrupt(), 130, 1),
+        (app.typer.Exit(1), 1, 0),
+        (app.typer.Exit(), 0, 0),
+    ],
+)
+def test_each_kind_of_end_has_its_exit_code(torchcover, monkeypatch, error, code, lines):
+    def run(word):
+        raise error
+
+    monkeypatch.setattr(listing, "run", run)
+    ended, _, complaints = torchcover("list")
+    assert (ended, ("Traceback" in complaints)) == (code, code == 70)
+    assert len(complaints.splitlines()) >= lines if code == 70 else len(complaints.splitlines()) == lines
+    assert code != 70 or complaints.splitlines()[-1].startswith("torchcover: internal error (")
+
+
+@pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
+@pytest.mark.parametrize(("arguments", "code"), [("list", 0), ("--help", 0), ("list nothing-such", 2), ("", 2)])
+def test_every_command_works_with_closed_streams(closed, arguments, code):
+    command = f"exec {' '.join(PROGRAM)} {arguments} {closed}"
+    done = subprocess.run(["sh", "-c", command], check=False, capture_output=True, text=True)
+    assert (done.returncode, "Traceback" in done.stderr) == (code, False)
+
+
+def test_a_run_with_closed_streams_writes_its_results_and_nothing_into_them(worlds):
+    settings = f"--scenario {worlds}/yard.yaml --cell-m 4 --rays 1024 --steps 2 --workers 1"
+    command = f"exec {' '.join(PROGRAM)} evaluate {worlds}/low.yaml {settings} --files numbers <&- >&- 2>&-"
+    assert subprocess.run(["sh", "-c", command], check=False, cwd=worlds).returncode == 0
+    assert {path.name for path in (worlds / "out").iterdir()} >= {"summary.json", "coverage.npz", "summary.csv"}
+    assert b"\x1b" not in (worlds / "out" / "summary.csv").read_bytes()
+
+
+def test_a_reader_that_is_gone_ends_it_with_141_without_a_word():
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run([*PROGRAM, "list"], check=False, stdout=writer, stderr=subprocess.PIPE, text=True)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, "")
+
+
+def test_a_full_disk_behind_the_output_is_one_line():
+    with open("/dev/full", "w", encoding="utf-8") as full:
+        done = subprocess.run([*PROGRAM, "list"], check=False, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert (done.returncode, done.stderr) == (2, "torchcover: [Errno 28] No space left on device\n")
+
+
+def test_help_names_the_exit_codes(torchcover):
+    for arguments in (["--help"], ["check", "--help"]):
+        printed = " ".join(torchcover(*arguments)[1].split())
+        assert all(f"{code} " in printed for code in (0, 1, 2, 70, 141)), printed
