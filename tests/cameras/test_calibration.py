@@ -57,9 +57,43 @@ def test_ros_message(tmp_path):
     assert camera.coefficients.tolist() == [-0.2, 0.1, 0.0, 0.001, 0.02]
 
 
+def ros_region(x_offset, y_offset, width, height, binning):
+    roi = f"roi: {{x_offset: {x_offset}, y_offset: {y_offset}, width: {width}, height: {height}, do_rectify: false}}\n"
+    return f"binning_x: {binning}\nbinning_y: {binning}\n{roi}"
+
+
+# A message as `ros2 topic echo` ends it, and several that differ in their stamps.
+@pytest.mark.parametrize("messages", [1, 2])
+@pytest.mark.parametrize(
+    ("said", "region", "intrinsics", "size"),
+    [
+        ((640, 480), (0, 0, 0, 0, 0), (520, 510, 318, 242), (640, 480)),
+        ((640, 480), (0, 0, 0, 0, 2), (260, 255, 159, 121), (320, 240)),
+        ((640, 480), (100, 80, 320, 200, 1), (520, 510, 218, 162), (320, 200)),
+        ((640, 480), (100, 80, 320, 200, 2), (260, 255, 109, 81), (160, 100)),
+        # Drivers that give the size of the region for that of the sensor.
+        ((320, 200), (100, 80, 320, 200, 1), (520, 510, 218, 162), (320, 200)),
+    ],
+)
+def test_a_camera_info_describes_the_image_that_is_published(tmp_path, messages, said, region, intrinsics, size):
+    text = ROS_MESSAGE.replace("640", str(said[0])).replace("480", str(said[1])) + ros_region(*region)
+    echoed = [text.replace("head}", f"head, seq: {number}}}") + "---\n" for number in range(messages)]
+    (tmp_path / "info.yaml").write_text("".join(echoed))
+    camera = Camera.from_ros(tmp_path / "info.yaml")
+    assert (camera.width, camera.height) == size
+    assert camera.intrinsics.tolist() == list(intrinsics)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        (
+            ROS_MESSAGE + "---\n" + ROS_MESSAGE.replace("318", "319"),
+            "2 messages of different content; keep one of them",
+        ),
+        (ROS_MESSAGE + ros_region(400, 0, 320, 200, 1), "roi: .* width of 640 pixels is needed; got 320 from 400 on"),
+        (ROS_MESSAGE + ros_region(400, 0, 0, 0, 1), "roi: .* got 0 from 400 on; give the region that was read"),
+        (ROS_MESSAGE + "roi: 3", "roi: x_offset, y_offset, width and height are needed; got 3"),
         (ROS_MESSAGE.replace("height", "hight"), "image_height or height is missing"),
         (ROS_MESSAGE.replace("plumb_bob", "wide"), "'wide' is unknown; allowed: plumb_bob"),
         (ROS_MESSAGE.replace("plumb_bob", "[a, b]"), "distortion_model a list is unknown"),

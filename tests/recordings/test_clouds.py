@@ -194,6 +194,21 @@ def test_text_keeps_non_finite_points(tmp_path):
     np.testing.assert_array_equal(cloud, [[np.nan, 0, 0], [1, 2, 3], [0, -np.inf, 0]])
 
 
+@pytest.mark.parametrize("word", ["-nan", "NaN", "-nan(ind)", "nan(snan)", "-1.#IND", "1.#QNAN0", "-1.#INF", "1.#R"])
+def test_nan_may_be_spelled_as_windows_does(tmp_path, word):
+    lines = f"4 5 6\n{word} 0 1\n1 2 3\n"
+    pcd = read_cloud(store(tmp_path, ".pcd", pcd_header(3, "ascii") + lines.encode()))
+    text = read_cloud(store(tmp_path, ".csv", lines.replace(" ", ",").encode()))
+    for cloud in (pcd, text):
+        np.testing.assert_array_equal(cloud, [[4, 5, 6], [np.nan, 0, 1], [1, 2, 3]])
+
+
+def test_the_viewpoint_of_a_pcd_is_said_to_be_left_aside(tmp_path):
+    header = pcd_header(3, "ascii").replace(b"VIEWPOINT 0 0 0", b"VIEWPOINT 1 2 0")
+    with pytest.warns(UserWarning, match="VIEWPOINT 1 2 0 1 0 0 0 of PCD files is not applied"):
+        np.testing.assert_array_equal(read_cloud(store(tmp_path, ".pcd", header + rows(CLOUD))), CLOUD)
+
+
 MIXED = np.array(
     [(2.0, 7, (8, 9), 1.0, 3, 3.0), (5.0, 7, (8, 9), 4.0, 3, 6.0)],
     dtype=[("y", "<f8"), ("rgb", "<u4"), ("pair", "<i2", 2), ("x", "<f4"), ("_", "u1"), ("z", "<f4")],
@@ -228,8 +243,21 @@ def test_pcd_finds_x_y_z_among_other_fields_of_any_type_and_count(tmp_path, enco
         pcd_header(3, "binary") + CLOUD.tobytes() + bytes(4096),
         pcd_header(3, "binary_compressed") + pcd_block(CLOUD.T) + bytes(4096),
         (pcd_header(3, "binary").replace(b"\n", b"\r\n")) + CLOUD.tobytes(),
+        pcd_header(3, "ascii", "x y z _", "4 4 4 1", "F F F U", "1 1 1 0") + rows(CLOUD),
+        pcd_header(3, "binary", "x y z _", "4 4 4 1", "F F F U", "1 1 1 0") + CLOUD.tobytes(),
+        pcd_header(3, "ascii").replace(b"FIELDS", b"COLUMNS").replace(b"POINTS 3\n", b"") + rows(CLOUD),
     ],
-    ids=["crlf_and_spaces", "no_count", "old_version", "padded", "padded_compressed", "crlf_binary"],
+    ids=[
+        "crlf_and_spaces",
+        "no_count",
+        "old_version",
+        "padded",
+        "padded_compressed",
+        "crlf_binary",
+        "ascii_count_0",
+        "binary_count_0",
+        "columns_without_points",
+    ],  # fmt: skip
 )
 def test_pcd_variants_found_in_the_wild(tmp_path, data):
     np.testing.assert_array_equal(read_cloud(store(tmp_path, ".pcd", data)), CLOUD)
@@ -339,8 +367,8 @@ def mislabelled_member():
         (".pcd", pcd_header(2, "ascii", types="F F I"), r"field z is TYPE I SIZE 4 COUNT 1; TYPE F"),
         (".pcd", pcd_header(2, "ascii", counts="2 1 1"), r"field x is TYPE F SIZE 4 COUNT 2"),
         (".pcd", pcd_header(2, "ascii", counts="1 1"), r"COUNT of the PCD header differ in length"),
-        (".pcd", pcd_header(2, "ascii", counts="1 1 0"), r"COUNT .* has to be positive; got 1 1 0"),
-        (".pcd", pcd_header(-1, "ascii"), r"POINTS of the PCD header has to be a whole number; got '-1'"),
+        (".pcd", pcd_header(2, "ascii", counts="1 1 0"), r"field z is TYPE F SIZE 4 COUNT 0; .* COUNT 1 is needed"),
+        (".pcd", pcd_header(-1, "ascii"), r"WIDTH of the PCD header has to be a whole number; got '-1'"),
         (".pcd", pcd_header(1, "zstd"), r"DATA is 'zstd'; allowed are ascii, binary, binary_compressed"),
         (".pcd", pcd_header(3, "ascii") + rows(CLOUD[:2]), r"claims 3 points; 2 rows follow it"),
         (".pcd", pcd_header(2, "ascii") + rows(CLOUD), r"claims 2 points; 3 rows follow it"),

@@ -67,6 +67,25 @@ def test_a_cloud_may_have_gaps_rows_and_big_ends(tmp_path, kind, order):
     np.testing.assert_allclose(seen.points_m, transform(mount, stored_m[[0, 1, 2, 4]]), atol=1e-6)
 
 
+@pytest.mark.parametrize(("height", "row_step"), [(1, 0), (1, 36), (1, 10**6), (2, 12)])
+def test_a_cloud_without_gaps_needs_no_row_step(tmp_path, height, row_step):
+    path = other(tmp_path / "a", height=height, width=4 // height, row_step=row_step)
+    np.testing.assert_array_equal(RosBag(path).scan("lidar", 1).points_m, CORNERS_M.astype("f4"))
+
+
+@pytest.mark.parametrize("ending", ["-wal", "-journal"])
+def test_messages_beside_a_database_are_not_lost(tmp_path, ending):
+    path = bag(tmp_path / "a", MOUNTED + clouds(), "sqlite3")
+    (path / f"a.db3{ending}").touch()
+    assert len(RosBag(path).names) == 2
+    (path / f"a.db3{ending}").write_bytes(b"more")
+    for opened in (path, path / "a.db3"):
+        with pytest.raises(
+            BadFileError, match=rf"a.db3: .* in a.db3{ending} only, .* `sqlite3 a.db3 'PRAGMA quick_check'`"
+        ):
+            open_recording(opened)
+
+
 @pytest.mark.parametrize(
     ("field", "stored"),
     [

@@ -10,12 +10,14 @@ from numpy.typing import ArrayLike
 
 from torchcover.cameras.lens import as_vector
 from torchcover.cameras.models import check_image, check_model
-from torchcover.files import naming, parse_yaml, read_json_table, read_short_text, reads
+from torchcover.files import naming, parse_yaml, parse_yaml_stream, read_json_table, read_short_text, reads
 from torchcover.geometry import check_rigid, invert, rigid, rotation_from_euler, rotation_from_quaternion
 from torchcover.geometry.rigid import Matrix
 
 # Beyond, squares of float64 overflow.
 MAX_NUMBER = 1e150
+# A side of an image is shorter.
+MAX_PIXELS = 1_000_000
 # Camera axes (x right, y down, z forward) of a camera that looks along the vehicle's x (forward; y left, z up).
 LOOKING_FORWARD = rigid([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], [0.0, 0.0, 0.0])
 
@@ -158,17 +160,20 @@ def read_ros(path: Path) -> Calibration:
 
     Args:
         path: A YAML file with size, matrix K, distortion model and coefficients. The unrectified image is described;
-            the matrices R and P of the rectified one are not read.
+            the matrices R and P of the rectified one are not read. The region of interest and the binning are applied,
+            as image_geometry does. Of several messages all but their headers has to be equal.
 
     Returns:
-        The calibration; a file without coefficients is a pinhole.
+        The calibration of the image as it is published; a file without coefficients is a pinhole.
 
     Raises:
         FileNotFoundError: There is no such file.
-        BadFileError: An entry is missing or makes no camera, or the distortion model is none of `plumb_bob`,
-            `rational_polynomial`, `equidistant` and `fisheye`.
+        BadFileError: An entry is missing or makes no camera, messages differ, or the distortion model is none of
+            `plumb_bob`, `rational_polynomial`, `equidistant` and `fisheye`.
     """
-    content = _read_yaml(path)
+    content, *others = map(_check_mapping, parse_yaml_stream(read_short_text(path)) or [None])
+    if any({**other, "header": None} != {**content, "header": None} for other in others):
+        raise ValueError(f"{1 + len(others)} messages of different content; keep one of them")
     size = whole(content, "image_width", "width"), whole(content, "image_height", "height")
     matrix = numbers(content, "camera_matrix", "k", "K")
     if matrix.size != 9:
@@ -179,7 +184,8 @@ def read_ros(path: Path) -> Calibration:
         raise ValueError(f"distortion_model {told(model)} is unknown; allowed: {', '.join(_MODEL_NAMES)}")
     name = content.get("camera_name")
     name = name if isinstance(name, str) else path.stem
-    return _distorted(name, size, matrix.reshape(3, 3), _MODEL_NAMES[model], distortion.ravel())
+    size, K = _cut_and_binned(content, size, matrix.reshape(3, 3))
+    return _distorted(name, size, K, _MODEL_NAMES[model], distortion.ravel())
 
 
 @reads("an OpenCV calibration")
@@ -288,8 +294,36 @@ def read_nuscenes(
         return _checked(Calibration(width, height, *intrinsics, vehicle_T_camera=pose, name=channel))
 
 
+def _cut_and_binned(content: Mapping[str, Any], size: tuple[int, int], K: Matrix) -> tuple[tuple[int, int], Matrix]:
+    """The size and the matrix of the published image: a region of the whole sensor, then binned.
+
+    Some drivers give the size of the region where the size of the whole sensor belongs.
+    """
+    roi = content.get("roi") or {}
+    if not isinstance(roi, dict):
+        raise ValueError(f"roi: x_offset, y_offset, width and height are needed; got {told(roi)}")
+    sides, K = list[int](), K.copy()
+    for axis, (name, length) in enumerate(zip(("width", "height"), size, strict=True)):
+        offset, cut = (whole({key: 0, **roi}, key) for key in (f"{'xy'[axis]}_offset", name))
+        key = f"binning_{'xy'[axis]}"
+        binning = max(whole({key: 0, **content}, key), 1)
+        is_part = 0 <= offset <= offset + cut <= length or (offset >= 0 and cut == length)
+        if not is_part or (offset and not cut) or offset > MAX_PIXELS:
+            raise ValueError(
+                f"roi: a part of the image's {name} of {length} pixels is needed; got {cut} from {offset} on; give the "
+                "region that was read, or 0 for all"
+            )
+        K[axis, 2] -= offset
+        K[axis] /= binning
+        sides.append((cut or length) // binning)
+    return (sides[0], sides[1]), K
+
+
 def _read_yaml(path: Path) -> dict[str, Any]:
-    content = parse_yaml(read_short_text(path))
+    return _check_mapping(parse_yaml(read_short_text(path)))
+
+
+def _check_mapping(content: object) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise ValueError(f"a mapping of names to values is needed; got {type(content).__name__}")
     return content

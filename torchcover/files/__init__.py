@@ -43,4 +43,5 @@ from torchcover.files.xml_text import parse_xml as parse_xml
 from torchcover.files.yaml_text import as_yaml as as_yaml
 from torchcover.files.yaml_text import builtin_folder as builtin_folder
 from torchcover.files.yaml_text import parse_yaml as parse_yaml
+from torchcover.files.yaml_text import parse_yaml_stream as parse_yaml_stream
 from torchcover.files.yaml_text import road_user_classes as road_user_classes

@@ -1,7 +1,7 @@
 """YAML without its traps: every key once, numbers that look like numbers, and an end."""
 
 import re
-from collections.abc import Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar
@@ -43,15 +43,36 @@ def parse_yaml(text: str) -> Any:  # noqa: ANN401  (YAML knows no types)
         >>> parse_yaml("mount: {x_m: 1, z_m: 1e-1}\nname: on")
         {'mount': {'x_m': 1, 'z_m': 0.1}, 'name': 'on'}
     """
+    return _parse(text, yaml.load)
+
+
+def _parse(text: str, load: Callable[[str, type["_Loader"]], Any]) -> Any:  # noqa: ANN401
     if len(text) > MAX_CHARACTERS:
         raise ValueError(f"not a YAML file of {MAX_CHARACTERS:,} characters at most; it has {len(text):,}")
     if text.startswith("%YAML:"):  # OpenCV's directive has a colon that YAML does not allow
         text = "#" + text
     try:
-        return yaml.load(text, _Loader)  # a SafeLoader with fewer traps
+        return load(text, _Loader)  # a SafeLoader with fewer traps
     except (yaml.YAMLError, ValueError) as error:
         reason = " ".join(str(error).replace('in "<unicode string>", ', "").split())
         raise ValueError(f"not a YAML file: {reason}") from error
+
+
+def parse_yaml_stream(text: str) -> list[Any]:
+    """Read all documents of a YAML text, each as `parse_yaml` does; empty ones are left out.
+
+    Raises:
+        ValueError: As `parse_yaml`.
+    """
+    return [document for document in _parse(text, _load_all) if document is not None]
+
+
+def _load_all(text: str, loader_class: type["_Loader"]) -> list[Any]:
+    loader, documents = loader_class(text), []
+    while loader.check_data():
+        documents.append(loader.get_data())
+        loader.forget_sizes()
+    return documents
 
 
 def builtin_folder(kind: str) -> Path:
@@ -102,6 +123,10 @@ class _Loader(yaml.SafeLoader):
         self._depth = 0
         self._nodes = 0
         self._sizes: dict[int, int] = {}
+
+    def forget_sizes(self) -> None:
+        """Forget the nodes of a document that was read, whose places others may take."""
+        self._sizes.clear()
 
     def compose_node(self, parent: Node | None, index: Any) -> Node | None:  # noqa: ANN401
         """A node; none that is too deep, and none that makes the document too large."""

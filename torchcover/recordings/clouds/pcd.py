@@ -2,6 +2,7 @@
 
 import math
 import struct
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
@@ -21,6 +22,8 @@ LZF_MAX_RATIO = 88
 MAX_DIGITS = 18
 ENCODINGS = ("ascii", "binary", "binary_compressed")
 TYPES = ("F", "U", "I")
+# The origin, without a rotation: x y z qw qx qy qz.
+NO_VIEWPOINT = "0 0 0 1 0 0 0".split()
 
 
 @dataclass(frozen=True)
@@ -67,15 +70,21 @@ def _parse_header(data: bytes) -> tuple[_Header, bytes]:
             raise ValueError(f"the PCD header has two lines {words[0][:40]}")
         if words:
             entries[words[0]] = words[1:]
+    if "COLUMNS" in entries:  # early versions of the format
+        entries.setdefault("FIELDS", entries["COLUMNS"])
+    sides = [_whole(entries[key][0], key) for key in ("WIDTH", "HEIGHT") if entries.get(key)]
+    if sides:
+        entries.setdefault("POINTS", [str(math.prod(sides))])
     missing = [key for key in ("FIELDS", "SIZE", "TYPE", "POINTS") if not entries.get(key)]
     if missing:
         raise ValueError(f"the PCD header lacks {', '.join(missing)}; it has {', '.join(entries)}")
+    _warn_of_viewpoint(entries.get("VIEWPOINT", []))
     fields = tuple(entries["FIELDS"])
     header = _Header(
         fields=fields,
         sizes=_positive(entries["SIZE"], "SIZE"),
         types=tuple(entries["TYPE"]),
-        counts=_positive(entries.get("COUNT", ["1"] * len(fields)), "COUNT"),
+        counts=tuple(_whole(word, "COUNT") for word in entries.get("COUNT", ["1"] * len(fields))),
         points=_whole(entries["POINTS"][0], "POINTS"),
         encoding=" ".join(entries["DATA"]),
     )
@@ -87,8 +96,6 @@ def _parse_header(data: bytes) -> tuple[_Header, bytes]:
     unknown = set(header.types) - set(TYPES)
     if unknown:
         raise ValueError(f"TYPE of the PCD header is one of {', '.join(TYPES)}; got {', '.join(sorted(unknown))[:40]}")
-    # WIDTH and HEIGHT, which early files lack, say the same as POINTS.
-    sides = [_whole(entries[key][0], key) for key in ("WIDTH", "HEIGHT") if entries.get(key)]
     if len(sides) == 2 and math.prod(sides) != header.points:
         raise ValueError(f"WIDTH {sides[0]} times HEIGHT {sides[1]} of the PCD header is not POINTS {header.points}")
     return header, data[end:]
@@ -101,6 +108,16 @@ def _parse_ascii(header: _Header, axes: Sequence[int], body: bytes) -> Points:
     if rows == 0:
         return np.empty((0, 3))
     return parse_rows(read_lines(body), [sum(header.counts[:axis]) for axis in axes], sum(header.counts))
+
+
+def _warn_of_viewpoint(words: Sequence[str]) -> None:
+    """Warn about a pose of the sensor, which other programs apply to the points or ignore."""
+    if words and words != NO_VIEWPOINT and [float(word) for word in words] != [float(word) for word in NO_VIEWPOINT]:
+        warnings.warn(
+            f"VIEWPOINT {' '.join(words)[:80]} of PCD files is not applied: points are taken in the frame in which they "
+            "are stored",
+            stacklevel=2,
+        )
 
 
 def _whole(word: str, key: str) -> int:

@@ -1,6 +1,7 @@
 """Clouds as text: `.csv`, `.xyz`, and the rows of the ascii variants of other formats."""
 
 import io
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
@@ -14,6 +15,8 @@ COMMENT_MARKS = ("#", "//")
 AXES = ("x", "y", "z")
 # Of three float64, and once more while the array grows.
 ROW_BYTES = 48
+# NaN and infinity as C libraries of Windows print them: -1.#IND, 1.#QNAN0, 1.#INF, -nan(ind).
+NOT_FINITE = re.compile(r"(?<![\w.])[-+]?(?:1\.[#$][A-Za-z]*\d*|nan\([a-z]*\))", re.IGNORECASE)
 MAX_LINE = 1_000_000  # characters: a word takes 50 times as much, until it is known how many there should be
 
 
@@ -75,7 +78,7 @@ def _lines(data: bytes) -> Iterator[str]:
             if len(line) > MAX_LINE:
                 raise ValueError(f"a line of {len(line)} characters; at most {MAX_LINE} are read of one")
             if row := line.strip():
-                yield row
+                yield NOT_FINITE.sub("nan", row) if "#" in row or "(" in row else row
     except UnicodeDecodeError as error:
         raise ValueError(f"not text in UTF-8: there is a byte 0x{error.object[error.start]:02x}") from error
 

@@ -43,6 +43,8 @@ class Bag:
             check_metadata(path / METADATA)
         elif not self._files:
             check_suffix(path)
+        for database in path.glob(f"*{SUFFIXES['sqlite3']}") if path.is_dir() else [path]:
+            check_journal(database)
         self._opened: tuple[int, list[Any], Callable[..., Any]] | None = None
         with naming(path, "a bag"):
             readers, _ = self._readers()
@@ -116,6 +118,18 @@ def check_suffix(path: Path) -> None:
     """Whether a file is called as bags are."""
     if path.suffix not in SUFFIXES.values():
         raise ValueError(f"a folder with {METADATA}, or a file of {', '.join((*SUFFIXES.values(), ROS1))} is needed")
+
+
+@reads("a bag")
+def check_journal(path: Path) -> None:
+    """Refuse a database with changes in a file beside it, where its recorder was killed or still runs."""
+    for ending in ("-wal", "-journal"):
+        journal = path.with_name(path.name + ending)
+        if journal.exists() and journal.stat().st_size:
+            raise ValueError(
+                f"some of its messages are in {journal.name} only, since its recorder did not end: copy the files "
+                f"beside each other to where you may write, and run `sqlite3 {path.name} 'PRAGMA quick_check'`"
+            )
 
 
 @reads("the metadata of a bag")

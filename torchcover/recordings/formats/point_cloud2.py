@@ -61,6 +61,8 @@ def _table(message: Any, fields: list[Any]) -> NDArray[Any]:  # noqa: ANN401
     """(N,) the points with these fields, without what lies between points and rows."""
     width, height, step, row = (int(getattr(message, name)) for name in ("width", "height", "point_step", "row_step"))
     data = np.asarray(message.data)
+    if len(data) == width * height * step:  # without gaps; some senders leave row_step 0, or stale
+        row = width * step
     if row * height != len(data) or width * step > row:
         raise ValueError(
             f"{height} rows of {row} bytes ({width} points of {step}) do not fit the {len(data)} bytes of the cloud"
