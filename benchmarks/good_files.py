@@ -258,7 +258,7 @@ def recording_files(folder):
     for path, read in (
         (kitti.parent / "calib_imu_to_velo.txt", kitti_files.read_calibration),
         (kitti / "oxts" / "data" / "0000000000.txt", kitti_files.read_oxts),
-        (kitti / "velodyne_points" / "timestamps.txt", kitti_files.read_timestamps),
+        (kitti / "velodyne_points" / "timestamps.txt", lambda path: kitti_files.read_timestamps(path, [0])),
         (kitti / "tracklet_labels.xml", boxes),
         (nuscenes / "v1.0-mini" / "sample_data.json", read_json_table),
         (argoverse2 / "annotations.feather", cuboids),

@@ -106,4 +106,34 @@ def test_a_time_zone_is_no_time_of_kitti(tmp_path):
     with pytest.raises(
         BadFileError, match=r"lines of date and time are needed|parsing timezone aware"
     ):  # as NumPy says
-        read_timestamps(tmp_path / "timestamps.txt")
+        read_timestamps(tmp_path / "timestamps.txt", [0])
+
+
+@pytest.mark.parametrize("stamps", ["a line for each frame", "blank lines", "a line for each scan"])
+@pytest.mark.parametrize("gone", [(1, 2), (0, 3)])
+def test_frame_numbers_of_kitti_identify_tracklets_and_times(tmp_path, stamps, gone):
+    path = LAYOUTS["kitti_raw"](Drive(steps=6), tmp_path)
+    whole = open_recording(path)
+    times = path / "velodyne_points" / "timestamps.txt"
+    lines = times.read_text().splitlines(keepends=True)
+    for number in gone:
+        for folder, suffix in (("velodyne_points", "bin"), ("oxts", "txt")):
+            (path / folder / "data" / f"{number:010d}.{suffix}").unlink()
+    if stamps != "a line for each frame":
+        blank = "\n" if stamps == "blank lines" else ""
+        times.write_text("".join(blank if number in gone else line for number, line in enumerate(lines)))
+    left = [number for number in range(6) if number not in gone]
+    partial = open_recording(path)
+    np.testing.assert_allclose(partial.times_s, whole.times_s[left] - whole.times_s[left[0]], atol=1e-6)
+    for index, number in enumerate(left):
+        torch.testing.assert_close(partial.boxes(index).rows, whole.boxes(number).rows)
+
+
+def test_kitti_scans_and_poses_of_other_times_are_refused(tmp_path):
+    path = LAYOUTS["kitti_raw"](Drive(steps=3), tmp_path)
+    stamps = (path / "velodyne_points" / "timestamps.txt").read_text()
+    (path / "oxts" / "timestamps.txt").write_text(stamps)
+    open_recording(path)
+    (path / "oxts" / "timestamps.txt").write_text(stamps.replace("2018", "2017"))
+    with pytest.raises(ValueError, match=r"apart; take the drive's synced\+rectified"):
+        open_recording(path)

@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -140,15 +141,32 @@ def world_T_imu(oxts: NDArray[np.float64], latitude_deg: float) -> Matrix:
 
 
 @reads("time stamps")
-def read_timestamps(path: Path) -> NDArray[np.float64]:
-    """Read lines such as `2011-09-26 13:02:25.964389445`: seconds since the first."""
+def read_timestamps(path: Path, numbers: Sequence[int]) -> NDArray[np.datetime64]:
+    """Read lines such as `2011-09-26 13:02:25.964389445`: one for each frame number.
+
+    Line n is frame n, blank where there is no scan. A file that does not reach the last frame (part of a drive) has one
+    line for each scan instead.
+
+    Args:
+        path: A `timestamps.txt`.
+        numbers: The frame numbers that have a scan, ascending.
+
+    Returns:
+        (F,) datetime64[ns].
+
+    Raises:
+        BadFileError: A line that is no date and time, or neither a line for each frame nor one for each scan.
+    """
     check_memory(BYTES_PER_BYTE * path.stat().st_size)
-    lines = decode(path.read_bytes()).split("\n")
+    lines = [line.strip().replace(" ", "T") for line in decode(path.read_bytes()).rstrip().split("\n")]
+    stamps = [line for line in lines if line]
+    if len(lines) > numbers[-1]:
+        stamps = [lines[number] for number in numbers]
+        if "" in stamps:
+            raise ValueError(f"line {numbers[stamps.index('')] + 1} is blank, but there is a scan of this frame")
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error")  # of time zones, which NumPy would leave out with a warning
-            words = [line.strip().replace(" ", "T") for line in lines if line.strip()]
-            times = np.array(words, dtype="datetime64[ns]")
+            warnings.simplefilter("error")  # NumPy would leave out time zones with a warning
+            return np.array(stamps, dtype="datetime64[ns]")
     except (ValueError, UserWarning) as error:
         raise ValueError(f"lines of date and time are needed: {error}") from error
-    return np.asarray((times - times[0]) / np.timedelta64(1, "s"))

@@ -1,6 +1,7 @@
 """A drive of KITTI's raw data: scans with the poses of the GPS and IMU, and tracklets."""
 
 import os
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import ClassVar
@@ -15,7 +16,7 @@ from torchcover.files import parse_xml, reads
 from torchcover.geometry import BoundingBox
 from torchcover.geometry.rigid import Matrix, euler_from_rotation, invert, rotation_from_euler, transform
 from torchcover.recordings.clouds.readers import read_cloud
-from torchcover.recordings.formats.file_names import check_same_names, frame_files
+from torchcover.recordings.formats.file_names import check_same_names, frame_files, some_of
 from torchcover.recordings.formats.kitti_files import (
     BODY,
     read_oxts,
@@ -26,6 +27,9 @@ from torchcover.recordings.formats.kitti_files import (
     world_T_imu,
 )
 from torchcover.recordings.recording import Layout, Scan, SensorCalibrations, check_times
+
+# In synchronized drives, the GPS and IMU's record of a frame and its scan are some milliseconds apart.
+MAX_CLOCK_GAP_S = 0.1
 
 
 class KittiRaw(Layout):
@@ -47,8 +51,8 @@ class KittiRaw(Layout):
         check_same_names(self.path, {"velodyne_points/data": self._clouds})
         self.names = tuple(self._clouds)
         self.rigs = {"kitti": self.sensors}
-        times = self.path / "velodyne_points" / "timestamps.txt"
-        self.times_s = check_times(read_timestamps(times), len(self.names), str(times))
+        self._numbers = frame_numbers(self.path, self.names)
+        self.times_s = self._read_times()
         velodyne_T_imu = read_rigid(self.path.parent / "calib_imu_to_velo.txt")
         self._imu_T_vehicle = invert(velodyne_T_imu) @ invert(vehicle_T_velodyne)
         self._tracklets = self.path / "tracklet_labels.xml"
@@ -82,10 +86,25 @@ class KittiRaw(Layout):
         return SensorCalibrations(f"the LiDAR where KITTI's is, {cameras.name}", mounts, placed)
 
     def boxes(self, index: int) -> Boxes | None:
-        """The tracklets of that instant; None without the file."""
+        """Return the tracklets of the frame number of a scan; None without the file."""
         if not self._tracklets.exists():
             return None
-        return self._tracked.get(index, Boxes.from_rows(torch.empty(0, 7)))
+        return self._tracked.get(self._numbers[index], Boxes.from_rows(torch.empty(0, 7)))
+
+    def _read_times(self) -> NDArray[np.float64]:
+        """Return the times of the scans in seconds after the first."""
+        stamps = self.path / "velodyne_points" / "timestamps.txt"
+        times, second = read_timestamps(stamps, self._numbers), np.timedelta64(1, "s")
+        poses = self.path / "oxts" / "timestamps.txt"
+        if poses.exists():
+            oxts = read_timestamps(poses, self._numbers)
+            apart_s = np.abs((oxts - times) / second) if len(oxts) == len(times) else np.array([np.inf])
+            if apart_s.max() > MAX_CLOCK_GAP_S:
+                raise ValueError(
+                    f"{poses}: records of the GPS and IMU and scans of the same frame number are up to "
+                    f"{apart_s.max():g} s apart; take the drive's synced+rectified data (_sync), not _extract"
+                )
+        return check_times(np.asarray((times - times[0]) / second), len(self.names), str(stamps))
 
     def _oxts(self, index: int) -> NDArray[np.float64]:
         return read_oxts(self.path / "oxts" / "data" / f"{self.names[index]}.txt")
@@ -99,9 +118,21 @@ class KittiRaw(Layout):
         return read_tracklets(self._tracklets, vehicle_T_velodyne)
 
 
+def frame_numbers(folder: Path, names: Sequence[str]) -> list[int]:
+    """Return the frame numbers that scans are named by; tracklets and time stamps count frames without a scan, too.
+
+    Raises:
+        ValueError: A name that is not a number.
+    """
+    other = [name for name in names if not name.isdecimal()]
+    if other:
+        raise ValueError(f"{folder}: scans of KITTI raw are named by frame numbers; got {some_of(other)}")
+    return [int(name) for name in names]
+
+
 @reads("KITTI tracklets")
 def read_tracklets(path: Path, vehicle_T_velodyne: Matrix) -> dict[int, Boxes]:
-    """Read the boxes of every frame that has any.
+    """Read the boxes of every frame that has any, by frame number.
 
     The origin of a tracklet is the middle of the bottom of its box, in the frame of the LiDAR. Its name is its number
     in the file.
