@@ -129,6 +129,35 @@ def test_frame_numbers_of_kitti_identify_tracklets_and_times(tmp_path, stamps, g
         torch.testing.assert_close(partial.boxes(index).rows, whole.boxes(number).rows)
 
 
+def remove_second_pose(layout, path):
+    if layout == "kitti_raw":
+        (path / "oxts" / "data" / "0000000001.txt").unlink()
+        return
+    from pyarrow import feather
+
+    table = feather.read_table(path / "city_SE3_egovehicle.feather")
+    kept = np.arange(len(table)) != np.argsort(table["timestamp_ns"].to_numpy())[1]
+    feather.write_feather(table.filter(kept), str(path / "city_SE3_egovehicle.feather"))
+
+
+@pytest.mark.parametrize("layout", ["kitti_raw", "argoverse2"])
+def test_a_missing_pose_costs_its_sweep_only(layout, tmp_path):
+    drive = Drive(steps=4)
+    path = LAYOUTS[layout](drive, tmp_path)
+    whole = open_recording(path)
+    remove_second_pose(layout, path)
+    with pytest.warns(UserWarning, match=r"1 of 4 sweeps are left out, for there is no pose .* first is "):
+        partial = open_recording(path)
+    assert list(partial.names) == [whole.names[index] for index in (0, 2, 3)]
+    np.testing.assert_allclose(partial.times_s, whole.times_s[[0, 2, 3]], atol=1e-6)
+    for index, number in enumerate((0, 2, 3)):
+        np.testing.assert_allclose(partial.world_T_vehicle(index), whole.world_T_vehicle(number))
+        np.testing.assert_array_equal(
+            partial.scan(whole.sensors[0], index).points_m, whole.scan(whole.sensors[0], number).points_m
+        )
+        torch.testing.assert_close(partial.boxes(index).rows, whole.boxes(number).rows)
+
+
 def test_kitti_scans_and_poses_of_other_times_are_refused(tmp_path):
     path = LAYOUTS["kitti_raw"](Drive(steps=3), tmp_path)
     stamps = (path / "velodyne_points" / "timestamps.txt").read_text()

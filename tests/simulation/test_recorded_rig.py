@@ -204,10 +204,10 @@ def argoverse2_with_camera(drive, root):
         str(path / "calibration" / "intrinsics.feather"),
     )
 
-    def pixels(points_m):
+    def pixels(points_m, raw=False):
         x, y, z = transform(invert(argoverse2.vehicle_T_ego @ ego_T_camera), points_m).T
         x, y = x / z, y / z
-        r2 = x * x + y * y
+        r2 = raw * (x * x + y * y)
         radial = 1 + r2 * (lens["k1"] + r2 * (lens["k2"] + r2 * lens["k3"]))
         return np.stack([1031.0 + 1687.0 * x * radial, 768.0 + 1680.0 * y * radial], axis=1)
 
@@ -221,9 +221,23 @@ camera0_T_velodyne = np.vstack(
 R0 = rotation_from_euler(0.3, 0.4, -0.5)
 
 
-def by_kitti(points_m):
-    """Pixels of the left colour camera, by the formula of the development kit."""
+K2 = np.array([[959.7, 0.0, 696.0], [0.0, 956.9, 224.2], [0.0, 0.0, 1.0]])
+D2 = [-0.37, 0.19, 1.1e-3, 1.8e-3, -0.06]
+camera2_T_camera0 = rigid(rotation_from_euler(0.3, 0.2, -0.4), [0.06, 0.0, 0.004])
+
+
+def by_kitti(points_m, raw=False):
+    """Pixels of the left color camera, by the formula of the development kit, or by OpenCV's of the raw image."""
     velodyne_m = transform(invert(kitti_files.vehicle_T_velodyne), points_m)
+    if raw:
+        x, y, z = transform(camera2_T_camera0 @ camera0_T_velodyne, velodyne_m).T
+        x, y = x / z, y / z
+        k1, k2, p1, p2, k3 = D2
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        bent_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+        bent_y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+        return np.stack([696.0 + 959.7 * bent_x, 224.2 + 956.9 * bent_y], axis=1)
     rectified = np.c_[transform(camera0_T_velodyne, velodyne_m) @ R0.T, np.ones(len(points_m))]
     seen = rectified @ P2.T
     return seen[:, :2] / seen[:, 2:]
@@ -242,6 +256,11 @@ def kitti_raw_with_cameras(drive, root):
         lines += [
             f"S_rect_{name}: 1242 375",
             f"P_rect_{name}: {numbers(P2)}",
+            f"S_{name}: 1392 512",
+            f"K_{name}: {numbers(K2)}",
+            f"D_{name}: {numbers(D2)}",
+            f"R_{name}: {numbers(camera2_T_camera0[:3, :3])}",
+            f"T_{name}: {numbers(camera2_T_camera0[:3, 3])}",
             f"R_rect_{name.replace('00', '9')}: {numbers(R0)}",
         ]
     (path.parent / "calib_cam_to_cam.txt").write_text("\n".join(lines))
@@ -267,13 +286,20 @@ CAMERAS = {
 }
 
 
+@pytest.mark.parametrize("raw", [False, True])
 @pytest.mark.parametrize("layout", CAMERAS)
-def test_cameras_show_points_where_their_data_set_says(layout, tmp_path):
+def test_cameras_show_points_where_their_data_set_says(layout, raw, tmp_path):
+    """Images are released undistorted or rectified; the raw ones are those of the lenses."""
     path, name, size, pixels = CAMERAS[layout](Drive(steps=3), tmp_path)
     recording = open_recording(path, layout)
-    rig = Rig.model_validate(rig_document(recording, models=dict.fromkeys(recording.sensors, "velodyne_vlp16")))
+    models = dict.fromkeys(recording.sensors, "velodyne_vlp16")
+    if raw and layout in ("nuscenes", "kitti_object"):
+        with pytest.raises(ValueError, match="leave out --raw-images"):
+            rig_document(recording, models=models, raw_images=True)
+        return
+    rig = Rig.model_validate(rig_document(recording, models=models, raw_images=raw))
     sensor = next(one for one in rig.sensors if one.name == name)
-    assert (sensor.width, sensor.height) == size
+    assert (sensor.width, sensor.height) == ((1392, 512) if raw and layout == "kitti_raw" else size)
     ahead_m = (
         sensor.mount.matrix() @ np.c_[np.random.default_rng(0).uniform([5, -2, -1], [30, 2, 1], (50, 3)), np.ones(50)].T
     )
@@ -282,7 +308,7 @@ def test_cameras_show_points_where_their_data_set_says(layout, tmp_path):
     found, shown = sensor.camera().project(torch.from_numpy(in_camera_m))
     assert shown.sum() > 30
     np.testing.assert_allclose(
-        found[shown].numpy(), pixels(vehicle_m)[shown.numpy()], atol=0.01
+        found[shown].numpy(), pixels(vehicle_m, **{"raw": True} if raw else {})[shown.numpy()], atol=0.01
     )  # mounts have 6 decimals
     assert name in rig.description
     assert "as calibrated" in rig.description

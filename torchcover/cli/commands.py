@@ -91,6 +91,12 @@ def rig(
         list[str] | None,
         typer.Option(help="SENSOR=MODEL: a LiDAR scans as this model (see `list`), and is not estimated."),
     ] = None,
+    raw_images: Annotated[
+        bool,
+        typer.Option(
+            "--raw-images", help="Cameras with the distortion of their lenses, which released images no longer have."
+        ),
+    ] = False,
 ) -> None:
     """Print the sensors of a recording as a rig: mounts, LiDARs and cameras for `show` and `evaluate`."""
     from torchcover.files import as_yaml
@@ -99,7 +105,7 @@ def rig(
     models = dict(_pair(text) for text in lidar or ())
     names = [name for of in sensors or () for name in of.split(",")]
     recording = options.opened(frames, recording_format, None, vehicle_frame, mount)
-    document = rig_document(recording, sensors=names or None, models=models)
+    document = rig_document(recording, sensors=names or None, models=models, raw_images=raw_images)
     typer.echo(as_yaml(document), nl=False)
 
 

@@ -1,6 +1,7 @@
 """What every reader of recordings gives: scans of named sensors at instants, and where the vehicle was."""
 
 import json
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -172,8 +173,48 @@ class CalibratedRecording(Protocol):
     """A recording that knows more of its sensors."""
 
     def calibrations(self) -> SensorCalibrations:
-        """Read them. OSError: they are not there. ValueError: they are not what they are meant to be."""
+        """Read them; cameras are those of the images as the data set ships them.
+
+        Raises:
+            OSError: They are not there.
+            ValueError: They are not what they are meant to be.
+        """
         ...
+
+
+@runtime_checkable
+class UndistortedRecording(Protocol):
+    """A recording that ships undistorted or rectified images, and knows the distortion of the lenses, too."""
+
+    def raw_cameras(self) -> tuple[Calibration, ...]:
+        """Read the cameras with their lenses as calibrated, before images were undistorted.
+
+        Raises:
+            OSError: They are not there.
+            ValueError: They are not what they are meant to be.
+        """
+        ...
+
+
+def warn_of_missing_poses(path: Path, missing: Sequence[str], count: int) -> None:
+    """Warn of the sweeps that are left out because the vehicle's pose at their time is not known.
+
+    Args:
+        path: The file or folder of poses.
+        missing: Names of these sweeps.
+        count: Number of all sweeps.
+
+    Raises:
+        ValueError: No sweep has a pose.
+    """
+    if len(missing) == count:
+        raise ValueError(f"{path}: none of {count:,} sweeps has a pose, the first is {missing[0]}; is it one log?")
+    if missing:
+        warnings.warn(
+            f"{path}: {len(missing):,} of {count:,} sweeps are left out, for there is no pose at their time; the first "
+            f"is {missing[0]}",
+            stacklevel=3,
+        )
 
 
 def whole_recording(folder: Path) -> dict[str, Any] | None:

@@ -13,7 +13,7 @@ from torchcover.geometry import BoundingBox, euler_from_rotation, invert, rigid,
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.formats.ros import RosBag
 from torchcover.recordings.recorders.folder import CLEARANCE_M
-from torchcover.recordings.recording import CalibratedRecording, Recording, SensorCalibrations
+from torchcover.recordings.recording import CalibratedRecording, Recording, SensorCalibrations, UndistortedRecording
 from torchcover.simulation.as_cast import as_cast
 from torchcover.simulation.bodies import body_called, mover_mesh
 from torchcover.simulation.camera_sensor import MOUNT_T_CAMERA
@@ -31,7 +31,11 @@ ASSUMED = "assumed: depth from 0.1 to 200 m in every fourth pixel"
 
 
 def rig_document(
-    recording: Recording, *, sensors: Sequence[str] | None = None, models: Mapping[str, str] | None = None
+    recording: Recording,
+    *,
+    sensors: Sequence[str] | None = None,
+    models: Mapping[str, str] | None = None,
+    raw_images: bool = False,
 ) -> dict[str, Any]:
     """Make a rig of what a recording knows of its sensors, and of what these saw.
 
@@ -41,13 +45,16 @@ def rig_document(
         recording: The recording.
         sensors: LiDARs that are wanted; all if not given.
         models: Name of a LiDAR -> a built-in `LidarModel`, or the path of one.
+        raw_images: Whether cameras have the distortion of their lenses where the data set ships undistorted images;
+            by default they are the cameras of the released images.
 
     Returns:
         The keys of a valid rig; its description says where each number is from.
 
     Raises:
         OSError: A file is missing.
-        ValueError: An unknown sensor or model, a LiDAR whose place is not known or whose points do not lie in rows.
+        ValueError: An unknown sensor or model, a LiDAR whose place is not known or whose points do not lie in rows, or
+            raw images of a recording that knows no other lenses than those of its images.
     """
     models = models or {}
     wanted = tuple(recording.sensors) if sensors is None else tuple(sensors)
@@ -57,14 +64,17 @@ def rig_document(
             f"{recording.path}: no LiDAR {', '.join(unknown)}; the recording has {', '.join(recording.sensors)}"
         )
     known = recording.calibrations() if isinstance(recording, CalibratedRecording) else SensorCalibrations("", {})
+    cameras = _raw_cameras(recording) if raw_images else known.cameras
     told, documents = [], []
     for name in wanted:
         document, said = _lidar(recording, name, known, models.get(name))
         documents.append(document)
         told.append(f"{name}: {said}.")
-    documents += [_camera(camera) for camera in known.cameras]
-    if known.cameras:
-        told.append(f"{', '.join(one.name for one in known.cameras)}: lenses and mounts as calibrated; {ASSUMED}.")
+    documents += [_camera(camera) for camera in cameras]
+    if cameras:
+        images = "raw" if raw_images else "released"
+        names = ", ".join(camera.name for camera in cameras)
+        told.append(f"{names}: lenses and mounts as calibrated, of the {images} images; {ASSUMED}.")
     source = f" Calibrations: {known.source}." if known.source else ""
     rig = {
         "name": re.sub(r"\W+", "_", recording.path.resolve().stem).strip("_") or "recording",
@@ -73,6 +83,14 @@ def rig_document(
     }
     Rig.model_validate(rig)
     return rig
+
+
+def _raw_cameras(recording: Recording) -> tuple[Calibration, ...]:
+    if not isinstance(recording, UndistortedRecording):
+        raise ValueError(
+            f"{recording.path}: this recording knows one model of each lens, that of its images; leave out --raw-images"
+        )
+    return recording.raw_cameras()
 
 
 def recorded_body(recording: Recording, vehicle: str | Path) -> BoundingBox:

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -16,7 +17,7 @@ from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_quater
 from torchcover.geometry.rigid import Matrix
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings.objects import Ego, RecordedObjects, track_of
-from torchcover.recordings.recording import Layout, Scan, SensorCalibrations, check_times
+from torchcover.recordings.recording import Layout, Scan, SensorCalibrations, check_times, warn_of_missing_poses
 from torchcover.recordings.seen import Seen, SeenObjects, by_name
 
 # The ego frame lies in the rear axle, 0.30 m above the ground; the centre of a Ford Fusion is 1.339 m before it, as in
@@ -45,8 +46,13 @@ class Argoverse2(Layout):
 
     The clouds are in the frame of the ego and corrected for its motion within a turn. Needs `torchcover[av2]`.
 
-    FileNotFoundError: no sweeps, or no poses. ValueError: a table with other columns, a sweep without a pose within 10
-    ms. ImportError: pyarrow is not installed.
+    Raises:
+        FileNotFoundError: No sweeps, or no poses.
+        ValueError: A table with other columns, or no sweep has a pose within 10 ms.
+        ImportError: pyarrow is not installed.
+
+    Warns:
+        UserWarning: Sweeps without a pose within 10 ms are left out.
     """
 
     layout: ClassVar[str] = "sensors/lidar/TIME.feather, city_SE3_egovehicle.feather"
@@ -58,10 +64,13 @@ class Argoverse2(Layout):
         self._files = sorted(self.path.joinpath(*SWEEPS).glob("*.feather"), key=_time_ns)
         if not self._files:
             raise FileNotFoundError(f"{self.path.joinpath(*SWEEPS)}: no sweeps TIME.feather in it")
-        self.names = tuple(file.stem for file in self._files)
         self.rigs = {"argoverse2": self.sensors}
+        self._poses, has_pose = self._read_poses(np.array([_time_ns(file) for file in self._files]))
+        missing = [file.stem for file, posed in zip(self._files, has_pose, strict=True) if not posed]
+        warn_of_missing_poses(self.path / POSES, missing, len(self._files))
+        self._files = [file for file, posed in zip(self._files, has_pose, strict=True) if posed]
         self._times_ns = np.array([_time_ns(file) for file in self._files])
-        self._poses = self._read_poses()
+        self.names = tuple(file.stem for file in self._files)
         self.times_s = check_times(self._times_ns * 1e-9, len(self.names), str(self.path.joinpath(*SWEEPS)))
 
     @property
@@ -95,7 +104,16 @@ class Argoverse2(Layout):
         return self._tracks.at(float(self._times_ns[index] - self._times_ns[0]) * 1e-9, vehicle_T_ego)
 
     def calibrations(self) -> SensorCalibrations:
-        """The mounts of both LiDARs, and the cameras with the distortion of their lenses."""
+        """Read the mounts of both LiDARs, and the cameras: pinholes, for released images are undistorted."""
+        mounts, cameras = self._calibrations()
+        return SensorCalibrations("calibration/", mounts, tuple(replace(one, **_PINHOLE) for one in cameras))
+
+    def raw_cameras(self) -> tuple[Calibration, ...]:
+        """Read the cameras with the distortion of their lenses, which the released images no longer have."""
+        return self._calibrations()[1]
+
+    def _calibrations(self) -> tuple[dict[str, Matrix], tuple[Calibration, ...]]:
+        """Return the mounts of the LiDARs, and the cameras with distortion."""
         folder = self.path / "calibration"
         poses = read_feather(folder / "egovehicle_SE3_sensor.feather", ("sensor_name", *POSE))
         lenses = read_feather(folder / "intrinsics.feather", ("sensor_name", *_LENS))
@@ -106,7 +124,7 @@ class Argoverse2(Layout):
                 raise ValueError(f"egovehicle_SE3_sensor.feather has no {', '.join(sorted(missing))}")
             rows = [dict(zip(lenses, row, strict=True)) for row in zip(*lenses.values(), strict=True)]
             cameras = tuple(_camera(row, vehicle_T_ego @ ego_T[str(row["sensor_name"])]) for row in rows)
-        return SensorCalibrations("calibration/", {name: vehicle_T_ego @ ego_T[name] for name in LASERS}, cameras)
+        return {name: vehicle_T_ego @ ego_T[name] for name in LASERS}, cameras
 
     @cached_property
     def _tracks(self) -> SeenObjects | None:
@@ -116,21 +134,16 @@ class Argoverse2(Layout):
             return None
         return SeenObjects(_seen(read_feather(path, CUBOIDS), int(self._times_ns[0])), longest_gap_s=0.0)
 
-    def _read_poses(self) -> Matrix:
-        path = self.path / POSES
-        columns = read_feather(path, ("timestamp_ns", *POSE))
+    def _read_poses(self, sweeps_ns: NDArray[np.int64]) -> tuple[Matrix, NDArray[np.bool_]]:
+        """Return (M, 4, 4) poses of the sweeps that have one near their (N,) times, and the (N,) mask of these."""
+        columns = read_feather(self.path / POSES, ("timestamp_ns", *POSE))
         times_ns = columns["timestamp_ns"].astype(np.int64)
         order = np.argsort(times_ns, kind="stable")
-        after = np.searchsorted(times_ns[order], self._times_ns).clip(1, len(order) - 1)
-        before_is_nearer = self._times_ns - times_ns[order[after - 1]] < times_ns[order[after]] - self._times_ns
+        after = np.searchsorted(times_ns[order], sweeps_ns).clip(1, len(order) - 1)
+        before_is_nearer = sweeps_ns - times_ns[order[after - 1]] < times_ns[order[after]] - sweeps_ns
         nearest = order[after - before_is_nearer]
-        gaps = np.abs(times_ns[nearest] - self._times_ns)
-        if (gaps > MAX_CLOCK_GAP_NS).any():
-            worst = int(gaps.argmax())
-            raise ValueError(
-                f"{path}: the pose nearest to the sweep {self.names[worst]} is {gaps[worst] * 1e-9:.3f} s off"
-            )
-        return poses_of({name: column[nearest] for name, column in columns.items()})
+        has_pose = np.abs(times_ns[nearest] - sweeps_ns) <= MAX_CLOCK_GAP_NS
+        return poses_of({name: column[nearest[has_pose]] for name, column in columns.items()}), has_pose
 
 
 def has_objects(path: Path) -> bool:
@@ -193,6 +206,7 @@ def poses_of(columns: Mapping[str, NDArray[Any]]) -> Matrix:
     return rigid(rotation_from_quaternion(rotations), places)
 
 
+_PINHOLE: dict[str, Any] = {"model": "pinhole", "coefficients": ()}
 _LENS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "height_px", "width_px")
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.cameras.calibration import Calibration, split_projection
+from torchcover.cameras.calibration import Calibration, split_matrix, split_projection
 from torchcover.files import BadFileError, check_memory, decode, naming, read_short_text, reads
 from torchcover.geometry import BoundingBox, check_rigid, invert, rigid, rotation_from_euler
 from torchcover.geometry.rigid import Matrix
@@ -85,6 +85,43 @@ def read_rectified(path: Path, vehicle_T_camera0: Matrix) -> tuple[Calibration, 
         pose = vehicle_T_rectified @ invert(camera_T_rectified)
         found.append(Calibration(int(size[0]), int(size[1]), *intrinsics, vehicle_T_camera=pose, name=f"image_{name}"))
     return tuple(found)
+
+
+def read_distorted(path: Path, vehicle_T_camera0: Matrix) -> tuple[Calibration, ...]:
+    """Read the cameras of `calib_cam_to_cam.txt` before rectification.
+
+    Args:
+        path: The file, with `S_NN`, `K_NN`, `D_NN` (k1, k2, p1, p2, k3), `R_NN` and `T_NN` of each camera.
+        vehicle_T_camera0: (4, 4) pose of camera 0.
+
+    Returns:
+        One Brown-Conrady camera each.
+
+    Raises:
+        BadFileError: An entry is missing or makes no camera.
+    """
+    numbers = read_calibration(path)
+    cameras = []
+    for name in (f"{number:02d}" for number in range(4)):
+        size, matrix, lens, place_m = (numbers.get(f"{key}_{name}", np.empty(0)) for key in "SKDT")
+        if (size.size, matrix.size, lens.size, place_m.size) != (2, 9, 5, 3):
+            arrived = f"{size.size}, {matrix.size}, {lens.size} and {place_m.size}"
+            raise BadFileError(f"{path}: 2, 9, 5 and 3 numbers of S, K, D and T_{name} are needed; got {arrived}")
+        with naming(path, "a KITTI calibration"):
+            intrinsics = split_matrix(matrix.reshape(3, 3), f"K_{name}")
+        camera_T_camera0 = rigid(transform_of(numbers, f"R_{name}", path)[:3, :3], place_m)
+        cameras.append(
+            Calibration(
+                int(size[0]),
+                int(size[1]),
+                *intrinsics,
+                model="brown_conrady",
+                coefficients=tuple(lens.tolist()),
+                vehicle_T_camera=vehicle_T_camera0 @ invert(camera_T_camera0),
+                name=f"image_{name}",
+            )
+        )
+    return tuple(cameras)
 
 
 @reads("a PNG image")
@@ -164,6 +201,11 @@ def read_timestamps(path: Path, numbers: Sequence[int]) -> NDArray[np.datetime64
         stamps = [lines[number] for number in numbers]
         if "" in stamps:
             raise ValueError(f"line {numbers[stamps.index('')] + 1} is blank, but there is a scan of this frame")
+    if len(stamps) != len(numbers):
+        raise ValueError(
+            f"a line for each frame up to {numbers[-1]} or one for each of {len(numbers)} scans is needed; got "
+            f"{len(lines)}"
+        )
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # NumPy would leave out time zones with a warning

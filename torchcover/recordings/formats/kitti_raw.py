@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torchcover.cameras.calibration import Calibration
 from torchcover.detection.boxes import Boxes
 from torchcover.files import parse_xml, reads
 from torchcover.geometry import BoundingBox
@@ -19,6 +20,7 @@ from torchcover.recordings.clouds.readers import read_cloud
 from torchcover.recordings.formats.file_names import check_same_names, frame_files, some_of
 from torchcover.recordings.formats.kitti_files import (
     BODY,
+    read_distorted,
     read_oxts,
     read_rectified,
     read_rigid,
@@ -26,7 +28,7 @@ from torchcover.recordings.formats.kitti_files import (
     vehicle_T_velodyne,
     world_T_imu,
 )
-from torchcover.recordings.recording import Layout, Scan, SensorCalibrations, check_times
+from torchcover.recordings.recording import Layout, Scan, SensorCalibrations, check_times, warn_of_missing_poses
 
 # In synchronized drives, the GPS and IMU's record of a frame and its scan are some milliseconds apart.
 MAX_CLOCK_GAP_S = 0.1
@@ -37,8 +39,12 @@ class KittiRaw(Layout):
 
     Boxes are those of `tracklet_labels.xml`, if it is there.
 
-    FileNotFoundError: a part is missing. ValueError: no frames, another number of times than of scans, times out of
-    order, a bad calibration.
+    Raises:
+        FileNotFoundError: A part is missing.
+        ValueError: No frames, another number of times than of frames or scans, times out of order, a bad calibration.
+
+    Warns:
+        UserWarning: Scans without a record of the GPS and IMU are left out.
     """
 
     layout: ClassVar[str] = "DATE/DRIVE/velodyne_points/data/FRAME.bin, oxts/data/FRAME.txt"
@@ -49,10 +55,13 @@ class KittiRaw(Layout):
         self.path = Path(path)
         self._clouds = frame_files(self.path / "velodyne_points" / "data")
         check_same_names(self.path, {"velodyne_points/data": self._clouds})
-        self.names = tuple(self._clouds)
+        missing = [name for name in self._clouds if not self._oxts_path(name).exists()]
+        warn_of_missing_poses(self.path / "oxts" / "data", missing, len(self._clouds))
         self.rigs = {"kitti": self.sensors}
+        scanned = frame_numbers(self.path, tuple(self._clouds))
+        self.names = tuple(name for name in self._clouds if name not in set(missing))
         self._numbers = frame_numbers(self.path, self.names)
-        self.times_s = self._read_times()
+        self.times_s = self._read_times(scanned)
         velodyne_T_imu = read_rigid(self.path.parent / "calib_imu_to_velo.txt")
         self._imu_T_vehicle = invert(velodyne_T_imu) @ invert(vehicle_T_velodyne)
         self._tracklets = self.path / "tracklet_labels.xml"
@@ -81,9 +90,16 @@ class KittiRaw(Layout):
         mounts = {"velodyne": vehicle_T_velodyne}
         if not cameras.exists():
             return SensorCalibrations(f"the LiDAR where KITTI's is; no cameras, for there is no {cameras.name}", mounts)
-        camera_T_velodyne = read_rigid(day / "calib_velo_to_cam.txt")
-        placed = read_rectified(cameras, vehicle_T_velodyne @ invert(camera_T_velodyne))
+        placed = read_rectified(cameras, self._vehicle_T_camera0())
         return SensorCalibrations(f"the LiDAR where KITTI's is, {cameras.name}", mounts, placed)
+
+    def raw_cameras(self) -> tuple[Calibration, ...]:
+        """Read the cameras before rectification, with the distortion of their lenses."""
+        return read_distorted(self.path.parent / "calib_cam_to_cam.txt", self._vehicle_T_camera0())
+
+    def _vehicle_T_camera0(self) -> Matrix:
+        camera_T_velodyne = read_rigid(self.path.parent / "calib_velo_to_cam.txt")
+        return np.asarray(vehicle_T_velodyne @ invert(camera_T_velodyne))
 
     def boxes(self, index: int) -> Boxes | None:
         """Return the tracklets of the frame number of a scan; None without the file."""
@@ -91,23 +107,25 @@ class KittiRaw(Layout):
             return None
         return self._tracked.get(self._numbers[index], Boxes.from_rows(torch.empty(0, 7)))
 
-    def _read_times(self) -> NDArray[np.float64]:
-        """Return the times of the scans in seconds after the first."""
-        stamps = self.path / "velodyne_points" / "timestamps.txt"
-        times, second = read_timestamps(stamps, self._numbers), np.timedelta64(1, "s")
-        poses = self.path / "oxts" / "timestamps.txt"
+    def _read_times(self, scanned: Sequence[int]) -> NDArray[np.float64]:
+        """Return the times of the scans with a pose in seconds after the first; `scanned`: frame numbers of all."""
+        stamps, poses = self.path / "velodyne_points" / "timestamps.txt", self.path / "oxts" / "timestamps.txt"
+        times = read_timestamps(stamps, scanned)[np.isin(scanned, self._numbers)]
+        second = np.timedelta64(1, "s")
         if poses.exists():
-            oxts = read_timestamps(poses, self._numbers)
-            apart_s = np.abs((oxts - times) / second) if len(oxts) == len(times) else np.array([np.inf])
-            if apart_s.max() > MAX_CLOCK_GAP_S:
+            gap_s = float(np.abs((read_timestamps(poses, self._numbers) - times) / second).max())
+            if gap_s > MAX_CLOCK_GAP_S:
                 raise ValueError(
-                    f"{poses}: records of the GPS and IMU and scans of the same frame number are up to "
-                    f"{apart_s.max():g} s apart; take the drive's synced+rectified data (_sync), not _extract"
+                    f"{poses}: records of the GPS and IMU and scans of the same frame number are up to {gap_s:g} s "
+                    "apart; take the drive's synced+rectified data (_sync), not _extract"
                 )
         return check_times(np.asarray((times - times[0]) / second), len(self.names), str(stamps))
 
     def _oxts(self, index: int) -> NDArray[np.float64]:
-        return read_oxts(self.path / "oxts" / "data" / f"{self.names[index]}.txt")
+        return read_oxts(self._oxts_path(self.names[index]))
+
+    def _oxts_path(self, name: str) -> Path:
+        return self.path / "oxts" / "data" / f"{name}.txt"
 
     @cached_property
     def _latitude_deg(self) -> float:
