@@ -1,6 +1,7 @@
 """Robots of URDF: places of links and sensors in closed form, meshes wherever they lie, and what is no robot."""
 
 import math
+import time
 
 import numpy as np
 import pytest
@@ -22,9 +23,9 @@ CAMERA = """<camera{}><horizontal_fov>1.5</horizontal_fov><image><width>640</wid
 <clip><near>0.2</near><far>9</far></clip></camera>"""
 
 
-def joint(parent, child, xyz="0 0 0", rpy="0 0 0", name="j"):
-    ends = f"<parent link='{parent}'/><child link='{child}'/>"
-    return f"<joint name='{name}' type='revolute'>{ends}<origin xyz='{xyz}' rpy='{rpy}'/></joint>"
+def joint(parent, child, xyz="0 0 0", rpy="0 0 0", inside="", kind="revolute"):
+    ends = f"<parent link='{parent}'/><child link='{child}'/><origin xyz='{xyz}' rpy='{rpy}'/>"
+    return f"<joint name='{parent}_{child}' type='{kind}'>{ends}{inside}</joint>"
 
 
 def on(link, *sensors):
@@ -49,7 +50,7 @@ def test_a_link_and_its_sensor_are_where_all_joints_before_them_are_at_0(robot_o
     pose = "<pose>0.01 0.02 0.03 0 0 0.2</pose>"
     robot = robot_of(
         CHASSIS, "<link name='arm'/><link name='head'/>", joint("base", "arm", turns[0][0], words[0]),
-        joint("arm", "head", turns[1][0], words[1], "k"), on("head", LIDAR.format("l", pose, 0.0).replace("181", "1")),
+        joint("arm", "head", turns[1][0], words[1]), on("head", LIDAR.format("l", pose, 0.0).replace("181", "1")),
     )  # fmt: skip
     expected = places[0] @ places[1] @ places[2]
     expected[2, 3] += 0.2  # the middle of the chassis is so far above the ground
@@ -84,7 +85,7 @@ def test_cameras_have_their_own_poses_and_names_and_the_range_of_their_depth(rob
     assert (named["d"]["min_range_m"], named["d"]["max_range_m"], named["m_l"]["max_range_m"]) == (0.3, 5.0, 9.0)
     assert named["m_r"]["mount"] == {"x_m": 0.5, "y_m": -0.1, "z_m": 0.2}
     assert named["d"]["fov_deg"] == pytest.approx(math.degrees(1.5), abs=1e-4)
-    assert robot.notes == ["Left out: i, of type imu.", "m: a camera, which counts as if it measured depth."]
+    assert robot.notes[:2] == ["Left out: i, of type imu.", "m: a camera, which counts as if it measured depth."]
 
 
 @pytest.mark.parametrize("scale", [1.0, -0.5])
@@ -94,6 +95,7 @@ def test_cameras_have_their_own_poses_and_names_and_the_range_of_their_depth(rob
         ("<box size='0.4 0.2 0.6'/>", (0.4, 0.2, 0.6)),
         ("<cylinder radius='0.2' length='0.6'/>", (0.4, 0.4, 0.6)),
         ("<sphere radius='0.3'/>", (0.6, 0.6, 0.6)),
+        ("<capsule radius='0.2' length='0.2'/>", (0.4, 0.4, 0.6)),
         ("<mesh filename='m.stl' scale='{0} 1 1'/>", (0.4, 0.2, 0.6)),
         ("<mesh filename='file://m.dae' scale='{0} 1 1'/>", (0.4, 0.2, 0.6)),
     ],
@@ -134,12 +136,100 @@ def test_what_a_sensor_is_built_into_is_left_out_and_the_largest_body_stays(robo
     links = (
         "<link name='l'>" + BOX.format("0.1 0.1 0.1") + "</link><link name='m'>" + BOX.format("0.1 0.1 0.2") + "</link>"
     )
-    joints = joint("base", "l", "0 0 0.5") + joint("base", "m", "0.3 0 0.5", name="k")
+    joints = joint("base", "l", "0 0 0.5") + joint("base", "m", "0.3 0 0.5")
     robot = robot_of(
         CHASSIS, links, joints, on("l", LIDAR.format("l", "", 1.0)), on("base", LIDAR.format("b", "", 1.0))
     )
     assert len(robot.body.vertices_m) == 16
-    assert robot.notes == ["Left out: what sensors are built into, 1 of 3 bodies."]
+    assert robot.notes == [
+        "Left out: what sensors are built into, 1 of 3 bodies.",
+        "l: 108 of 543 rays (19.9%) end on its own vehicle.",
+        "b: 543 of 543 rays (100.0%) end on its own vehicle.",
+    ]
+
+
+def test_a_guard_of_posts_around_a_lidar_stays_and_takes_its_rays(robot_of):
+    """Its bounding box holds the sensor, but it is not built into it: posts are 2 cm wide, 6 cm away."""
+    corners = [f"{x} {y} 0" for x in (-0.06, 0.06) for y in (-0.06, 0.06)]
+    posts = "".join(BOX.format("0.02 0.02 0.2").replace("<geo", f"<origin xyz='{xyz}'/><geo") for xyz in corners)
+    full_turn = LIDAR.format("l", "", 2 * math.pi).replace("181", "3600")
+    robot = robot_of(CHASSIS, f"<link name='l'>{posts}</link>", joint("base", "l", "0 0 0.5"), on("l", full_turn))
+    assert len(robot.body.vertices_m) == 5 * 8
+    # Seen from the middle, a post spans from one of its corners to the opposite one.
+    span_rad = 4 * 2 * (math.atan2(0.07, 0.05) - math.pi / 4)
+    (note,) = robot.notes
+    share = float(note.split("(")[1].split("%")[0])
+    assert share == pytest.approx(100 * span_rad / (2 * math.pi), abs=0.1)
+
+
+@pytest.mark.parametrize("pose", [
+    "<pose degrees='true'>0.1 0 0 0 10 90</pose>",
+    "<pose rotation_format='quat_xyzw'>0.1 0 0 -0.061628417 0.061628417 0.704416026 0.704416026</pose>",
+    "<pose relative_to='base_l' degrees='1'>-0.1 0 -0.3 0 10 90</pose>",
+    "<pose relative_to='l'>-0.1 0 -0.3 0 0.174532925 1.570796327</pose>",
+    "<pose frame='__model__' degrees='true'>0.1 0 0 0 10 90</pose>",
+])  # fmt: skip
+def test_attributes_of_a_pose_are_applied(robot_of, pose):
+    links = "<link name='l'/>" + joint("base", "l", "0.2 0 0.3")
+    mount = robot_of(CHASSIS, links, on("base", f"<sensor name='c' type='depth'>{pose}{CAMERA.format('')}</sensor>"))
+    assert mount.sensors[0]["mount"] == {"x_m": 0.1, "z_m": 0.2, "yaw_deg": 90.0, "pitch_deg": 10.0}
+
+
+def test_lens_distortion_and_noise_of_a_camera_are_applied(robot_of):
+    """Gazebo counts the principal point from the corner of the image, torchcover from the center of the first pixel."""
+    inside = (
+        "<lens><intrinsics><fx>{}</fx><fy>320</fy><cx>320</cx><cy>{}</cy><s>0</s></intrinsics></lens>"
+        "<distortion><k1>{}</k1></distortion><noise><stddev>0.02</stddev><mean>0.1</mean></noise></camera>"
+    )
+    cases = [("320", "240", "0"), ("310", "200", "0"), ("320", "240", "-0.1")]
+    sensors = [f"<sensor name='c' type='depth'>{CAMERA.format('').replace('</camera>', inside.format(*case))}</sensor>"
+               for case in cases]  # fmt: skip
+    robot = robot_of(CHASSIS, on("base", *sensors))
+    plain, shifted, distorted = robot.sensors
+    assert (plain["fov_deg"], plain["range_noise_m"]) == (90.0, 0.02)
+    assert [shifted[key] for key in ("fx", "fy", "cx", "cy")] == [310.0, 320.0, 319.5, 199.5]
+    assert (distorted["lens"], distorted["coefficients"]) == ("brown_conrady", [-0.1, 0.0, 0.0, 0.0, 0.0])
+    assert "c: <noise><mean> 0.1 is not applied; noise has a mean of 0." in robot.notes
+    assert "c: cy is counted from the top of the image; Gazebo Classic 10 counts from below." in robot.notes
+
+
+def test_settings_that_are_not_applied_are_named(robot_of):
+    plugin = "<plugin><min_range>0.9</min_range><updateRate>20.0</updateRate><topic>x</topic></plugin>"
+    lens = "<lens><type>equidistant</type></lens><visibility_mask>7</visibility_mask></camera>"
+    camera = CAMERA.format("").replace("</camera>", lens)
+    lidar = LIDAR.format("l", "", 1.0).replace("</sensor>", f"{plugin}</sensor>")
+    notes = robot_of(CHASSIS, on("base", lidar, f"<sensor name='c' type='depth'>{camera}</sensor>")).notes
+    assert "l: settings of its plugin are not applied: <min_range> 0.9; set them in rig.yaml." in notes
+    assert any(note.startswith("c: <lens><type> equidistant is not applied, a pinhole is taken") for note in notes)
+    assert "c: <visibility_mask> 7 is not applied; it sees all bodies." in notes
+
+
+def test_joints_that_mimic_others_are_at_their_offset_and_limits_without_0_are_noted(robot_of):
+    """b slides by 0.1 m; c follows b with 2 * 0.1 + 0.05 m along y; d, which excludes 0, stays there."""
+    links = "".join(f"<link name='{name}'>{BOX.format('0.1 0.1 0.1')}</link>" for name in "bcd")
+    limit = "<limit lower='0.2' upper='0.6'/>"
+    mimics = [f"<axis xyz='0 2 0'/><mimic joint='{of}' multiplier='2' offset='{offset}'/>"
+              for of, offset in (("base_d", 0.1), ("base_b", 0.05))]  # fmt: skip
+    robot = robot_of(
+        CHASSIS, links, joint("base", "d", "0 0 1", inside=limit),
+        joint("base", "c", "0 0 2", "0 0 1", mimics[1], "prismatic"),
+        joint("base", "b", "0 0 3", "", mimics[0], "prismatic").replace("rpy=''", ""),
+    )  # fmt: skip
+    center_m = robot.body.vertices_m.reshape(4, 8, 3).mean(axis=1)
+    np.testing.assert_allclose(center_m[1], [0.0, 0.1, 3.2], atol=1e-9)
+    np.testing.assert_allclose(center_m[2], [-0.25 * math.sin(1), 0.25 * math.cos(1), 2.2], atol=1e-9)
+    (note,) = robot.notes
+    assert note.startswith("Joints outside of their limits: 'base_d' at 0 rad (0.2 to 0.6)")
+
+
+def test_the_time_for_a_robot_is_linear_in_its_links(robot_of):
+    """A chain and a star of 20,000 links took minutes, for each link looked at all others."""
+    names = [f"l{k}" for k in range(20_000)]
+    links = "".join(f"<link name='{name}'/>" for name in names)
+    joints = "".join(joint(names[k - 1] if k % 2 else names[0], names[k], "0 0 0.001") for k in range(1, len(names)))
+    start_s = time.process_time()
+    robot_of(CHASSIS, links, joints, joint("base", "l0"))
+    assert time.process_time() - start_s < 20.0
 
 
 def test_what_is_written_can_be_simulated_and_names_stay_names(robot_of, tmp_path):
@@ -163,6 +253,9 @@ def test_without_sensors_there_is_no_rig(robot_of, tmp_path):
     }
 
 
+SKEWED = CAMERA.format("").replace(
+    "</camera>", "<lens><intrinsics><fx>9</fx><fy>9</fy><s>2</s></intrinsics></lens></camera>"
+)
 TWO = "<link name='b'/><link name='c'/>"
 MESH = "<link name='base'><visual><geometry><mesh filename='package://p/{}.stl'/></geometry></visual></link>"
 
@@ -176,6 +269,14 @@ MESH = "<link name='base'><visual><geometry><mesh filename='package://p/{}.stl'/
         ([CHASSIS, TWO, joint("b", "c")], "'base', 'b' hang on no other"),
         ([CHASSIS, joint("base", "nowhere")], "about 'nowhere', which is no link"),
         ([CHASSIS, CHASSIS], "several of <link> are called 'base'"),
+        ([CHASSIS, joint("base", "b"), joint("base", "b"), TWO], "several of <joint> are called 'base_b'"),
+        ([CHASSIS, "<link name='b'/>", joint("base", "b", inside="<mimic joint='x'/>")], "mimics 'x', which is no"),
+        ([CHASSIS, "<link name='b'/>", joint("base", "b", inside="<mimic joint='base_b'/>")], "mimics itself"),
+        (["<link name='b'><visual><geometry><heightmap/></geometry></visual></link>"], "<heightmap> cannot be applied"),
+        ([CHASSIS, on("base", LIDAR.format("l", "<pose relative_to='x'/>", 1.0))], "sensor 'l' is on 'x'"),
+        ([CHASSIS, on("base", LIDAR.format("l", "<pose rotation_format='axis'/>", 1.0))], "rotation_format 'axis'"),
+        ([CHASSIS, on("base", LIDAR.format("l", "", -1.0))], "horizontal_fov_deg"),
+        ([CHASSIS, on("base", f"<sensor name='c' type='depth'>{SKEWED}</sensor>")], "s 2 cannot be applied"),
         ([CHASSIS, on("nowhere", LIDAR.format("l", "", 1.0))], "sensor 'l' is on 'nowhere'"),
         (["<link name='base'/>"], "no link has a visual"),
         ([MESH.format("one")], "1 of 1 meshes are missing: package://p/one.stl. Name the folder"),

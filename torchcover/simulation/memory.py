@@ -8,6 +8,8 @@ from pathlib import Path
 CGROUP_LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
 # Where no system call tells.
 USUAL_BYTES = 16e9
+# Of a step at its largest: 73 to 246 were measured, for a LiDAR, a camera and the reference sensors.
+BYTES_PER_RAY = 300
 
 
 @lru_cache

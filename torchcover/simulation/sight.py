@@ -8,10 +8,12 @@ import numpy as np
 from torchcover.geometry import rigid
 from torchcover.geometry.arrays import Bools, Float32, Float64, Int32, Int64
 from torchcover.simulation.instant import Instant, SensorScan, in_threads
+from torchcover.simulation.memory import BYTES_PER_RAY, check_fits
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.rays import BLOCK, Balls, Tile, into_tiles, pixels_in_tiles, rotate
 from torchcover.simulation.scene import Scene, ends_at
 from torchcover.simulation.sensor import Draws, RayHits, ScanTimes, Sensor
+from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.sweep import RayTimes
 from torchcover.simulation.weather import CLEAR, Weather
 
@@ -160,6 +162,39 @@ def ray_times(sensor: Sensor, tiles: Sequence[Tile], pixel_of_ray: Int64) -> lis
     ends = np.cumsum([tile.directions.shape[1] for tile in tiles])
     of_tiles = np.split(times_s.ravel()[pixel_of_ray], ends[:-1])
     return [RayTimes(*np.unique(of_tile, return_inverse=True)) for of_tile in of_tiles]
+
+
+def count_self_hits(sensor: Sensor, body: Mesh) -> tuple[int, int]:
+    """Count the rays of a sensor that end on the body of its own vehicle.
+
+    Args:
+        sensor: The sensor; only its own rays and range count, whatever the weather.
+        body: The body in the vehicle frame.
+
+    Returns:
+        How many rays end on it, and how many rays the sensor has.
+    """
+    check_fits(f"{sensor.rays:,} rays of sensor {sensor.name!r}", BYTES_PER_RAY * sensor.rays, "use fewer rays")
+    caster, vehicle_T_sensor, tiles = RayCaster([body]), sensor.mount.matrix(), into_tiles(sensor.directions())
+    ends_m = [ends_at(caster, vehicle_T_sensor, tile, sensor.max_range_m) for tile in tiles]
+    return sum(int(np.isfinite(end_m).sum()) for end_m in ends_m), sum(len(end_m) for end_m in ends_m)
+
+
+def describe_self_hits(sensors: Sequence[Sensor], body: Mesh) -> list[str]:
+    """Say of each sensor with rays that end on its own vehicle, how many these are.
+
+    Example:
+        >>> from torchcover.simulation import Rig, Scenario
+        >>> describe_self_hits(Rig.load("front_roof_128").sensors, Scenario.load("courtyard").ego_mesh())
+        []
+    """
+    sentences = []
+    for sensor in sensors:
+        self_hits, rays = count_self_hits(sensor, body)
+        if self_hits:
+            share = f"{self_hits:,} of {rays:,} rays ({self_hits / rays:.1%})"
+            sentences.append(f"{sensor.name}: {share} end on its own vehicle.")
+    return sentences
 
 
 class Sight(NamedTuple):

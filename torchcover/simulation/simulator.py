@@ -13,7 +13,7 @@ import torch
 from torchcover.geometry import BoundingBox
 from torchcover.geometry.arrays import Float32, Int64
 from torchcover.simulation.instant import Instant, SensorScan
-from torchcover.simulation.memory import check_fits
+from torchcover.simulation.memory import BYTES_PER_RAY, check_fits
 from torchcover.simulation.rays import Balls
 from torchcover.simulation.reference_sensor import ReferenceScan, ReferenceSensor, Surroundings
 from torchcover.simulation.rig import Rig, with_ego
@@ -22,9 +22,6 @@ from torchcover.simulation.scene import Scene
 from torchcover.simulation.sensor import Draws
 from torchcover.simulation.stage import Scenes, Stage, Stages, warn_of_floating
 from torchcover.simulation.world import Label, labels
-
-# What a step takes at its largest: 73 to 246 were measured, for a LiDAR, a camera and the reference sensors.
-BYTES_PER_RAY = 300
 
 
 @dataclass(frozen=True, eq=False)

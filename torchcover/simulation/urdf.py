@@ -1,7 +1,7 @@
 """Robots described in URDF: their bodies, and the sensors that Gazebo would simulate on them."""
 
-import math
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -9,20 +9,28 @@ from typing import Any, NamedTuple
 from xml.etree.ElementTree import Element
 
 import numpy as np
+from pydantic import ValidationError
+from scipy.spatial import cKDTree
 
 from torchcover.files import Publication, as_yaml, parse_xml, reads
-from torchcover.geometry import BoundingBox, euler_from_rotation, rigid, rotation_from_euler
+from torchcover.geometry import BoundingBox, rigid, rotation_from_quaternion
 from torchcover.geometry.arrays import Float64
 from torchcover.simulation.bodies import merge
+from torchcover.simulation.documents import explain
+from torchcover.simulation.gazebo_sensors import PlacedSensor, read_numbers, read_pose, read_sensors
+from torchcover.simulation.instant import encloses
+from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.rig import Rig
+from torchcover.simulation.sensor import Sensor
 from torchcover.simulation.shapes import Box, Cylinder, Ellipsoid, Mesh, MeshFile
+from torchcover.simulation.sight import count_self_hits, describe_self_hits
 
-LIDARS = ("ray", "gpu_ray", "lidar", "gpu_lidar")
-CAMERAS = ("camera", "depth", "depth_camera", "rgbd", "rgbd_camera", "multicamera")
 # Larger bodies hold a sensor, but are not its housing.
 LARGEST_HOUSING_M = 0.5
-# As in the built-in rigs of cameras.
-STRIDE = 4
+# A housing that is not closed takes at least this share of the rays of a sensor inside of it; a guard of posts less.
+HOUSING_SHARE = 0.99
+# Joints and meshes that a message names.
+MAX_NAMED = 3
 BODY, VEHICLE, RIG = "body.ply", "vehicle.yaml", "rig.yaml"
 
 
@@ -47,8 +55,6 @@ class Robot(NamedTuple):
         Args:
             folder: Where to write; made if it does not exist.
 
-        Raises:
-            ValueError: A sensor that no rig can have, such as one with a range of 0.
         """
         size = " x ".join(f"{length:.2f}" for length in np.ptp(self.body.vertices_m, axis=0))
         told = " ".join([f"{size} m, of a URDF.", *self.notes])
@@ -57,7 +63,6 @@ class Robot(NamedTuple):
             written.add(BODY, partial(_write_ply, mesh=self.body))
             written.add_text(VEHICLE, as_yaml({"name": self.name, "description": told, "parts": [part]}))
             if self.sensors:
-                Rig.model_validate({"name": self.name, "sensors": self.sensors})
                 keys = {"name": self.name, "description": told, "vehicle": VEHICLE, "sensors": self.sensors}
                 written.add_text(RIG, as_yaml(keys))
             written.publish({"robot": self.name, "notes": self.notes})
@@ -78,10 +83,11 @@ def _write_ply(path: Path, mesh: Mesh) -> None:
 
 @reads("a URDF")
 def read_robot(path: Path, packages: Mapping[str, str | Path] | None = None) -> Robot:
-    """Read a robot from a URDF file, with every joint at 0.
+    """Read a robot from a URDF file, with every joint at 0 except those that mimic another one with an offset.
 
     Its body is what links show (`visual`), or where they show nothing, what they collide with. Sensors are those of
-    Gazebo's tags: LiDARs, cameras and depth cameras. A small body around a sensor, which it is built into, is left out.
+    Gazebo's tags: LiDARs, cameras and depth cameras. A small body that a sensor is built into is left out: one that
+    encloses the sensor, or that ends nearly all of its rays.
 
     Args:
         path: The file; one of xacro has to be expanded first.
@@ -89,11 +95,11 @@ def read_robot(path: Path, packages: Mapping[str, str | Path] | None = None) -> 
             one that has the rest of the path.
 
     Returns:
-        The robot: its body in the vehicle frame, in metres, and the keys of its sensors as in YAML.
+        The robot: its body in the vehicle frame, in meters, and the keys of its sensors as in YAML.
 
     Raises:
         BadFileError: Not a URDF; links that are no tree; meshes that are missing, all of them named; a sensor without
-            what it needs; numbers that are none.
+            what it needs; numbers that are none; an attribute that changes values and cannot be applied.
 
     Example:
         >>> import tempfile
@@ -108,258 +114,260 @@ def read_robot(path: Path, packages: Mapping[str, str | Path] | None = None) -> 
     if any("xacro" in element.tag for element in root.iter()):
         raise ValueError(f"it is xacro, which has to be expanded first: xacro {path.name} > {path.stem}_expanded.urdf")
     if root.tag != "robot" or root.find("link") is None:
-        raise ValueError(f"a <robot> with links is needed; got <{root.tag}>")
-    base_T_link = _places(root)
-    _check_meshes(root, path, packages or {})
-    links = _by_name(root, "link")
-    pieces = [
-        mesh.moved(base_T_link[name]) for name, link in links.items() for mesh in _meshes(link, path, packages or {})
-    ]
+        remedy = "; use the URDF that the SDF was made from, or convert it, as by sdformat_urdf" * (root.tag == "sdf")
+        raise ValueError(f"a <robot> with links is needed; got <{root.tag}>{remedy}")
+    links, joints = _by_name(root, "link"), _by_name(root, "joint")
+    positions = _joint_positions(joints)
+    base_T_link = _link_poses(links, joints, positions)
+    meshes = _read_meshes(links, path, packages or {})
+    pieces = [mesh.moved(base_T_link[name]) for name, link in links.items() for mesh in _link_meshes(link, meshes)]
     if not pieces:
         raise ValueError("no link has a visual or collision geometry, so there is no body")
     box = BoundingBox.around(merge(pieces).vertices_m)
     middle_m = np.add(box.lower_m, box.upper_m) / 2
     vehicle_T_base = rigid(np.eye(3), (-middle_m[0], -middle_m[1], -box.lower_m[2]))
     pieces = [piece.moved(vehicle_T_base) for piece in pieces]
-    sensors, notes = _sensors(root, {name: vehicle_T_base @ place for name, place in base_T_link.items()})
-    body = _without_housings(pieces, [pose[:3, 3] for _, pose in sensors])
-    if left_out := len(pieces) - len(body):
+    vehicle_T_frame = {"__model__": vehicle_T_base}
+    for name, joint in joints.items():
+        vehicle_T_frame[name] = vehicle_T_base @ base_T_link[_end(joint, "child")]
+    vehicle_T_frame |= {name: vehicle_T_base @ pose for name, pose in base_T_link.items()}
+    sensors, notes = read_sensors(root, vehicle_T_frame)
+    kept = _without_housings(pieces, sensors)
+    if left_out := len(pieces) - len(kept):
         notes.append(f"Left out: what sensors are built into, {left_out} of {len(pieces)} bodies.")
-    return Robot(root.get("name", path.stem), merge(body), [keys for keys, _ in sensors], notes)
+    notes += _note_limits(joints, positions)
+    body = merge(kept)
+    if sensors:
+        notes += describe_self_hits(_mounted(sensors), body)
+    return Robot(root.get("name", path.stem), body, [sensor.keys for sensor in sensors], notes)
 
 
 def _by_name(root: Element, tag: str) -> dict[str, Element]:
-    named = [(element.get("name", ""), element) for element in root.findall(tag)]
-    twice = {name for name, _ in named if [other for other, _ in named].count(name) > 1}
-    if twice:
-        raise ValueError(f"several of <{tag}> are called {', '.join(map(repr, sorted(twice)))}")
-    return dict(named)
+    elements = root.findall(tag)
+    counts = Counter(element.get("name", "") for element in elements)
+    if repeated := sorted(name for name, count in counts.items() if count > 1):
+        raise ValueError(f"several of <{tag}> are called {', '.join(map(repr, repeated))}")
+    return {element.get("name", ""): element for element in elements}
 
 
-def _places(root: Element) -> dict[str, Float64]:
-    """Name of each link -> its pose in the frame of the root, with every joint at 0."""
-    links, above = _by_name(root, "link"), dict[str, tuple[str, Element]]()
-    for joint in root.findall("joint"):
-        ends = [end.get("link", "") if (end := joint.find(tag)) is not None else "" for tag in ("parent", "child")]
-        name = joint.get("name", "")
-        if unknown := [end for end in ends if end not in links]:
+def _end(joint: Element, tag: str) -> str:
+    """Name of the link at the end of a joint, its `parent` or `child`."""
+    end = joint.find(tag)
+    return "" if end is None else end.get("link", "")
+
+
+def _joint_positions(joints: Mapping[str, Element]) -> dict[str, float]:
+    """Position of each joint in radians or meters: 0, or of one that mimics another, `multiplier * other + offset`."""
+    positions: dict[str, float] = {}
+    for name in joints:
+        followers: dict[str, Element] = {}
+        while name not in positions and (mimic := joints[name].find("mimic")) is not None:
+            followers[name] = mimic
+            name = mimic.get("joint", "")  # noqa: PLW2901  (along the chain of joints that mimic each other)
+            if name not in joints:
+                raise ValueError(f"joint {next(reversed(followers))!r} mimics {name!r}, which is no joint")
+            if name in followers:
+                raise ValueError(f"joint {name!r} mimics itself, through others")
+        positions.setdefault(name, 0.0)
+        for follower, mimic in reversed(followers.items()):
+            what = f"joint {follower!r}: mimic"
+            (multiplier,), (offset,) = (
+                read_numbers(mimic.get(key, usual), 1, f"{what} {key}")
+                for key, usual in (("multiplier", "1"), ("offset", "0"))
+            )
+            positions[follower] = multiplier * positions[name] + offset
+            name = follower  # noqa: PLW2901
+    return positions
+
+
+def _joint_motion(joint: Element, position: float) -> Float64:
+    """(4, 4) transform by which a joint moves its child link; `position` is in radians or meters."""
+    kind = joint.get("type", "")
+    if position == 0.0 or kind not in ("revolute", "continuous", "prismatic"):
+        return np.eye(4)
+    axis = joint.find("axis")
+    direction = np.array(read_numbers("1 0 0" if axis is None else axis.get("xyz", "1 0 0"), 3, "axis xyz"))
+    direction /= np.linalg.norm(direction) or 1.0
+    if kind == "prismatic":
+        return rigid(np.eye(3), position * direction)
+    quaternion = [np.cos(position / 2), *np.sin(position / 2) * direction]
+    return rigid(rotation_from_quaternion(quaternion), np.zeros(3))
+
+
+def _link_poses(
+    links: Mapping[str, Element], joints: Mapping[str, Element], positions: Mapping[str, float]
+) -> dict[str, Float64]:
+    """Name of each link -> its (4, 4) pose in the frame of the root."""
+    above: dict[str, tuple[str, str]] = {}
+    children: dict[str, list[str]] = {name: [] for name in links}
+    for name, joint in joints.items():
+        parent, child = _end(joint, "parent"), _end(joint, "child")
+        if unknown := [end for end in (parent, child) if end not in links]:
             raise ValueError(f"joint {name!r} is about {unknown[0]!r}, which is no link")
-        if ends[1] in above:
-            raise ValueError(f"link {ends[1]!r} hangs on {above[ends[1]][0]!r} and on {ends[0]!r}: a tree is needed")
-        above[ends[1]] = ends[0], joint
+        if child in above:
+            raise ValueError(f"link {child!r} hangs on {above[child][0]!r} and on {parent!r}: a tree is needed")
+        above[child] = parent, name
+        children[parent].append(child)
     roots = [name for name in links if name not in above]
     if len(roots) > 1:
-        raise ValueError(f"links {', '.join(map(repr, roots))} hang on no other: one is needed that all others hang on")
-    places: dict[str, Float64] = {}
+        raise ValueError(f"links {_named(roots)} hang on no other: one is needed that all others hang on")
+    poses: dict[str, Float64] = {}
     waiting = roots
     while waiting:
         name = waiting.pop()
-        at = _pose(above[name][1].find("origin")) if name in above else np.eye(4)
-        places[name] = places[above[name][0]] @ at if name in above else at
-        waiting += [child for child, (parent, _) in above.items() if parent == name]
-    if ring := [name for name in links if name not in places]:
-        raise ValueError(f"links {', '.join(map(repr, ring))} hang on each other in a ring: a tree is needed")
-    return places
+        if name in above:
+            parent, joint_name = above[name]
+            joint = joints[joint_name]
+            poses[name] = poses[parent] @ read_pose(joint.find("origin")) @ _joint_motion(joint, positions[joint_name])
+        else:
+            poses[name] = np.eye(4)
+        waiting += children[name]
+    if ring := [name for name in links if name not in poses]:
+        raise ValueError(f"links {_named(ring)} hang on each other in a ring: a tree is needed")
+    return poses
 
 
-def _numbers(text: str | None, count: int, what: str) -> list[float]:
-    words = (text or "").split()
-    try:
-        numbers = [float(word) for word in words]
-    except ValueError:
-        numbers = []
-    if len(numbers) != count or not all(map(math.isfinite, numbers)):
-        raise ValueError(f"{what}: {count} number{'s' * (count > 1)} needed; got {text!r}")
-    return numbers
+def _named(names: Sequence[str]) -> str:
+    return ", ".join(map(repr, names[:MAX_NAMED])) + f" and {len(names) - MAX_NAMED} more" * (len(names) > MAX_NAMED)
 
 
-def _pose(origin: Element | None) -> Float64:
-    """Of `<origin xyz rpy>`, or of Gazebo's `<pose>`, which is the same in one row."""
-    if origin is None:
-        return np.eye(4)
-    if origin.tag == "pose":
-        *place_m, roll, pitch, yaw = _numbers(origin.text, 6, "pose")
-    else:
-        place_m = _numbers(origin.get("xyz", "0 0 0"), 3, "origin xyz")
-        roll, pitch, yaw = _numbers(origin.get("rpy", "0 0 0"), 3, "origin rpy")
-    return rigid(rotation_from_euler(*np.rad2deg([yaw, pitch, roll])), place_m)
+def _note_limits(joints: Mapping[str, Element], positions: Mapping[str, float]) -> list[str]:
+    """Note the joints whose position lies outside of their limits."""
+    outside = []
+    for name, joint in joints.items():
+        limit = joint.find("limit")
+        if limit is None or joint.get("type") not in ("revolute", "prismatic"):
+            continue
+        lower, upper = (
+            read_numbers(limit.get(key, "0"), 1, f"joint {name!r}: limit {key}")[0] for key in ("lower", "upper")
+        )
+        if not lower <= positions[name] <= upper:
+            unit = "m" if joint.get("type") == "prismatic" else "rad"
+            outside.append(f"{name!r} at {positions[name]:g} {unit} ({lower:g} to {upper:g})")
+    if not outside:
+        return []
+    more = f" and {len(outside) - MAX_NAMED} more" * (len(outside) > MAX_NAMED)
+    return [
+        f"Joints outside of their limits: {', '.join(outside[:MAX_NAMED])}{more}; the body is drawn as if they could."
+    ]
 
 
-def _shown(link: Element) -> list[Element]:
+def _visuals(link: Element) -> list[Element]:
     return link.findall("visual") or link.findall("collision")
 
 
-def _check_meshes(root: Element, path: Path, packages: Mapping[str, str | Path]) -> None:
-    shown = [mesh for link in root.findall("link") for body in _shown(link) for mesh in body.iterfind("geometry/mesh")]
-    files = dict.fromkeys(mesh.get("filename", "") for mesh in shown)
-    if missing := [name for name in files if _found(name, path, packages) is None]:
-        told = ", ".join(missing[:3]) + f" and {len(missing) - 3} more" * (len(missing) > 3)
+def _read_meshes(
+    links: Mapping[str, Element], path: Path, packages: Mapping[str, str | Path]
+) -> dict[str, tuple[Mesh, float]]:
+    """Name of each mesh file -> the mesh and the meters of its unit.
+
+    Raises:
+        ValueError: Files are missing.
+    """
+    elements = [mesh for link in links.values() for body in _visuals(link) for mesh in body.iterfind("geometry/mesh")]
+    files = {name: _find_mesh(name, path, packages) for name in {mesh.get("filename", ""): None for mesh in elements}}
+    if missing := [name for name, file in files.items() if file is None]:
+        listed = ", ".join(missing[:MAX_NAMED]) + f" and {len(missing) - MAX_NAMED} more" * (len(missing) > MAX_NAMED)
         raise ValueError(
-            f"{len(missing)} of {len(files)} meshes are missing: {told}. Name the folder of a ROS package: "
+            f"{len(missing)} of {len(files)} meshes are missing: {listed}. Name the folder of a ROS package: "
             "--package NAME=FOLDER"
         )
+    return {
+        name: (MeshFile(type="mesh", path=file).mesh(), _unit(file)) for name, file in files.items() if file is not None
+    }
 
 
-def _found(name: str, path: Path, packages: Mapping[str, str | Path]) -> Path | None:
-    """The file of a mesh; None if there is none."""
+def _find_mesh(name: str, path: Path, packages: Mapping[str, str | Path]) -> Path | None:
+    """Find the file of a mesh; None if there is none."""
     scheme, _, rest = name.rpartition("://")
     package, _, within = rest.partition("/")
     if scheme in ("package", "model"):
         around = [parent / part for parent in path.resolve().parents for part in (rest, within)]
-        places = [Path(packages[package], within)] if package in packages else around
+        candidates = [Path(packages[package], within)] if package in packages else around
     else:
-        places = [path.parent / rest]
-    return next((place for place in places if within + rest and place.is_file()), None)
+        candidates = [path.parent / rest]
+    return next((candidate for candidate in candidates if within + rest and candidate.is_file()), None)
 
 
-def _meshes(link: Element, path: Path, packages: Mapping[str, str | Path]) -> list[Mesh]:
-    """What a link shows, in its frame."""
-    meshes = []
-    for body in _shown(link):
-        for shape in body.iterfind("geometry/*"):
-            mesh = _mesh(shape, path, packages)
-            if mesh is not None:
-                meshes.append(mesh.moved(_pose(body.find("origin"))))
-    return meshes
+def _link_meshes(link: Element, meshes: Mapping[str, tuple[Mesh, float]]) -> list[Mesh]:
+    """The meshes that a link shows, in its frame."""
+    return [
+        _shape_mesh(shape, link.get("name", ""), meshes).moved(read_pose(body.find("origin")))
+        for body in _visuals(link)
+        for shape in body.iterfind("geometry/*")
+    ]
 
 
-def _mesh(shape: Element, path: Path, packages: Mapping[str, str | Path]) -> Mesh | None:
-    """A geometry with its origin in its middle; None of a kind that has no surface."""
+def _shape_mesh(shape: Element, link: str, meshes: Mapping[str, tuple[Mesh, float]]) -> Mesh:
+    """The mesh of a geometry, with its origin in its middle."""
     if shape.tag == "mesh":
-        file = _found(shape.get("filename", ""), path, packages)
-        assert file is not None  # as _check_meshes has seen
-        scale = np.array(_numbers(shape.get("scale", "1 1 1"), 3, "mesh scale")) * _unit(file)
-        mesh = MeshFile(type="mesh", path=file).mesh()
+        mesh, unit_m = meshes[shape.get("filename", "")]
+        scale = np.array(read_numbers(shape.get("scale", "1 1 1"), 3, "mesh scale")) * unit_m
         faces = mesh.faces[:, ::-1] if np.prod(scale) < 0 else mesh.faces  # mirrored, they would face inwards
         return mesh._replace(vertices_m=mesh.vertices_m * scale, faces=faces)
     if shape.tag == "box":
-        x, y, height_m = _numbers(shape.get("size"), 3, "box size")
-        mesh = Box(type="box", size_m=(x, y, height_m)).mesh()
-    elif shape.tag == "cylinder":
-        (radius_m,), (height_m,) = (_numbers(shape.get(key), 1, f"cylinder {key}") for key in ("radius", "length"))
-        mesh = Cylinder(type="cylinder", radius_m=radius_m, height_m=height_m).mesh()
-    elif shape.tag == "sphere":
-        height_m = 2 * _numbers(shape.get("radius"), 1, "sphere radius")[0]
-        mesh = Ellipsoid(type="ellipsoid", size_m=(height_m, height_m, height_m)).mesh()
-    else:
-        return None
+        x, y, height_m = read_numbers(shape.get("size"), 3, "box size")
+        return _centered(Box(type="box", size_m=(x, y, height_m)).mesh(), height_m)
+    if shape.tag not in ("cylinder", "capsule", "sphere"):
+        raise ValueError(
+            f"link {link!r}: geometry <{shape.tag}> cannot be applied; use box, cylinder, capsule, sphere or mesh"
+        )
+    (radius_m,) = read_numbers(shape.get("radius"), 1, f"{shape.tag} radius")
+    ball = _centered(Ellipsoid(type="ellipsoid", size_m=(2 * radius_m,) * 3).mesh(), 2 * radius_m)
+    if shape.tag == "sphere":
+        return ball
+    (length_m,) = read_numbers(shape.get("length"), 1, f"{shape.tag} length")
+    tube = _centered(Cylinder(type="cylinder", radius_m=radius_m, height_m=length_m).mesh(), length_m)
+    if shape.tag == "cylinder":
+        return tube
+    ends_m = (-length_m / 2, length_m / 2)
+    return merge([tube, *(ball.moved(rigid(np.eye(3), (0.0, 0.0, end_m))) for end_m in ends_m)])
+
+
+def _centered(mesh: Mesh, height_m: float) -> Mesh:
     return mesh.moved(rigid(np.eye(3), (0.0, 0.0, -height_m / 2)))
 
 
 def _unit(file: Path) -> float:
-    """Metres of a unit of a COLLADA file, which says it; other formats are in metres."""
+    """Meters of a unit of a COLLADA file, which says it; other formats are in meters."""
     if file.suffix.lower() != ".dae":
         return 1.0
     with file.open("rb") as opened:
         said = re.search(rb"<unit\b[^>]*\bmeter\s*=\s*[\"']([^\"']+)", opened.read(100_000))
-    return _numbers(said[1].decode(), 1, f"{file.name}: unit")[0] if said else 1.0
+    return read_numbers(said[1].decode(), 1, f"{file.name}: unit")[0] if said else 1.0
 
 
-Placed = tuple[dict[str, Any], Float64]
+def _mounted(sensors: Sequence[PlacedSensor]) -> Sequence[Sensor]:
+    """The sensors as those of a rig. ValueError: one that no rig can have, such as one with a range of 0."""
+    try:
+        return Rig.model_validate({"name": "robot", "sensors": [sensor.keys for sensor in sensors]}).sensors
+    except ValidationError as error:
+        raise ValueError(explain(error)) from error
 
 
-def _sensors(root: Element, vehicle_T_link: Mapping[str, Float64]) -> tuple[list[Placed], list[str]]:
-    """Keys and pose of each sensor, and what was left out or assumed."""
-    found: list[Placed] = []
-    notes: list[str] = []
-    for gazebo in root.findall("gazebo"):
-        for sensor in gazebo.findall("sensor"):
-            name, kind = sensor.get("name", "sensor"), sensor.get("type", "")
-            if kind not in (*LIDARS, *CAMERAS):
-                notes.append(f"Left out: {name}, of type {kind or 'none'}.")
-                continue
-            link = gazebo.get("reference", "")
-            if link not in vehicle_T_link:
-                raise ValueError(f"sensor {name!r} is on {link!r}, which is no link")
-            vehicle_T_sensor = vehicle_T_link[link] @ _pose(sensor.find("pose"))
-            each = [_lidar(sensor, name)] if kind in LIDARS else list(_cameras(sensor, name, kind, notes))
-            for keys, sensor_T_own in each:
-                taken = [other["name"] for other, _ in found]
-                keys["name"] += f"_{len(found)}" * (keys["name"] in taken)
-                if rate_hz := _asked(sensor, "update_rate", f"sensor {name!r}", 0.0):
-                    keys["rate_hz"] = rate_hz
-                found.append(_mounted(keys, vehicle_T_sensor @ sensor_T_own))
-    return found, notes
-
-
-def _mounted(keys: dict[str, Any], pose: Float64) -> Placed:
-    """With its mount, to the tenth of a millimetre and the hundredth of a degree."""
-    angles = dict(zip(("yaw_deg", "pitch_deg", "roll_deg"), euler_from_rotation(pose[:3, :3]).round(2), strict=True))
-    values = dict(zip(("x_m", "y_m", "z_m"), pose[:3, 3].round(4), strict=True)) | angles
-    mount = {key: float(value) for key, value in values.items() if value}
-    first = {key: keys.pop(key) for key in ("type", "name")}
-    return {**first, "mount": mount, **keys}, pose
-
-
-def _asked(parent: Element, place: str, what: str, usual: float | None = None) -> float:
-    text = parent.findtext(place)
-    if text is None and usual is not None:
-        return usual
-    return _numbers(text, 1, f"{what}: {place}")[0]
-
-
-def _lidar(sensor: Element, name: str) -> Placed:
-    """Its columns are those that Gazebo samples, ends included; what looks to one side is turned there."""
-    what = f"sensor {name!r}"
-    block = next((found for tag in ("lidar", "ray") if (found := sensor.find(tag)) is not None), None)
-    if block is None:
-        raise ValueError(f"{what}: <lidar> or <ray> is missing")
-    columns, rows = (
-        round(_asked(block, f"scan/{axis}/samples", what, usual) * _asked(block, f"scan/{axis}/resolution", what, 1.0))
-        for axis, usual in (("horizontal", None), ("vertical", 1.0))
-    )
-    left, right = (_asked(block, f"scan/horizontal/{end}_angle", what) for end in ("min", "max"))
-    low, high = (_asked(block, f"scan/vertical/{end}_angle", what, 0.0) for end in ("min", "max"))
-    spread_deg = math.degrees(right - left) * columns / max(columns - 1, 1)
-    keys: dict[str, Any] = {
-        "type": "lidar",
-        "name": name,
-        "channels": rows,
-        "vertical_fov_deg": [round(math.degrees(low), 4), round(math.degrees(high), 4)],
-        "horizontal_fov_deg": round(min(spread_deg, 360.0), 4) or 1.0,  # of a single column
-        "columns": columns,
-        **_ranges(block, "range/min", "range/max", what),
-    }
-    if noise := _asked(block, "noise/stddev", what, 0.0):
-        keys["range_noise_m"] = noise
-    return keys, rigid(rotation_from_euler(math.degrees((left + right) / 2), 0.0, 0.0), np.zeros(3))
-
-
-def _cameras(sensor: Element, name: str, kind: str, notes: list[str]) -> Sequence[Placed]:
-    cameras = sensor.findall("camera")
-    if not cameras:
-        raise ValueError(f"sensor {name!r}: <camera> is missing")
-    if kind in ("camera", "multicamera"):
-        notes.append(f"{name}: a camera, which counts as if it measured depth.")
-    found = []
-    for number, camera in enumerate(cameras):
-        what = f"sensor {name!r}"
-        own = camera.get("name", str(number)) if len(cameras) > 1 else ""
-        clip = "depth_camera/clip" if camera.find("depth_camera/clip/far") is not None else "clip"
-        keys: dict[str, Any] = {
-            "type": "camera",
-            "name": f"{name}_{own}" if own else name,
-            "width": round(_asked(camera, "image/width", what)),
-            "height": round(_asked(camera, "image/height", what)),
-            "fov_deg": round(math.degrees(_asked(camera, "horizontal_fov", what)), 4),
-            "stride": STRIDE,
-            **_ranges(camera, f"{clip}/near", f"{clip}/far", what),
-        }
-        found.append((keys, _pose(camera.find("pose"))))
-    return found
-
-
-def _ranges(parent: Element, least: str, most: str, what: str) -> dict[str, float]:
-    return {"min_range_m": _asked(parent, least, what, 0.0), "max_range_m": _asked(parent, most, what)}
-
-
-def _without_housings(pieces: Sequence[Mesh], places_m: Sequence[Float64]) -> list[Mesh]:
-    """Those whose box holds no sensor, those that are no housing, and whatever happens the largest."""
-    kept = []
+def _without_housings(pieces: Sequence[Mesh], sensors: Sequence[PlacedSensor]) -> list[Mesh]:
+    """All pieces of the body except the housings of sensors; the largest piece stays in any case."""
+    if not sensors:
+        return list(pieces)
+    tree = cKDTree([sensor.vehicle_T_sensor[:3, 3] for sensor in sensors])
     longest_m = [float(np.linalg.norm(np.ptp(piece.vertices_m, axis=0))) for piece in pieces]
+    kept = []
     for piece, length_m in zip(pieces, longest_m, strict=True):
-        low_m, high_m = piece.vertices_m.min(axis=0), piece.vertices_m.max(axis=0)
-        held = any((low_m <= at_m).all() and (at_m <= high_m).all() for at_m in places_m)
-        if not held or length_m >= min(LARGEST_HOUSING_M, max(longest_m)):
+        middle_m = (piece.vertices_m.min(axis=0) + piece.vertices_m.max(axis=0)) / 2
+        is_small = length_m < min(LARGEST_HOUSING_M, max(longest_m))
+        near = tree.query_ball_point(middle_m, length_m / 2) if is_small else []
+        if not any(_is_housing(piece, sensors[k]) for k in near):
             kept.append(piece)
     return kept
+
+
+def _is_housing(piece: Mesh, sensor: PlacedSensor) -> bool:
+    """Whether a sensor is inside a piece of the body: closed around it, or across nearly all of its rays."""
+    position_m = sensor.vehicle_T_sensor[:3, 3]
+    lower_m, upper_m = piece.vertices_m.min(axis=0), piece.vertices_m.max(axis=0)
+    if not ((lower_m <= position_m) & (position_m <= upper_m)).all():
+        return False
+    if encloses(RayCaster([piece]), position_m):
+        return True
+    self_hits, rays = count_self_hits(_mounted([sensor])[0], piece)
+    return self_hits >= HOUSING_SHARE * rays
