@@ -46,6 +46,15 @@ def greedy(path: Path, gb: float):
     return {"bytes": np.ones(int(gb * 1e9), np.uint8)[:1]}
 
 
+KEPT = []
+
+
+@apart
+def keeping(path: Path, gb: float):
+    KEPT.append(np.ones(int(gb * 1e9), np.uint8))
+    return {"kept": np.array([len(KEPT), os.getpid()])}
+
+
 @apart
 def writing(path: Path):
     path.with_suffix(".new").write_text("x")

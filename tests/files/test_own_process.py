@@ -67,6 +67,14 @@ def test_memory_is_what_files_may_take(path, monkeypatch):
     assert path.with_suffix(".new").stat().st_size == 0
 
 
+def test_what_libraries_keep_of_one_file_does_not_add_to_the_next(path):
+    (first, process), (second, other) = (apart_readers.keeping(path, 1.1)["kept"] for _ in range(2))
+    assert (first, second) == (1, 1)
+    assert process == other  # which has begun anew
+    apart_readers.keeping(path, 0.0)
+    assert apart_readers.keeping(path, 0.0)["kept"][0] == 2
+
+
 def test_threads_and_forks_read_too(path):
     found = []
     threads = [threading.Thread(target=lambda: found.append(apart_readers.good(path, 3.0)["one"])) for _ in range(4)]

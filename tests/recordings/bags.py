@@ -4,7 +4,7 @@ from dataclasses import fields, is_dataclass
 
 import numpy as np
 from rosbags import rosbag1
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from torchcover.geometry import invert, quaternion_from_rotation, rigid, rotation_from_euler
@@ -84,10 +84,13 @@ def posed(matrix, time_ns):
     return made("geometry_msgs/msg/PoseStamped", header(time_ns, "map"), place(matrix, "Pose"))
 
 
-def bag(path, messages, storage="mcap"):
-    """Write (topic, time of recording, message) in this order."""
+def bag(path, messages, storage="mcap", compression=None):
+    """Write (topic, time of recording, message) in this order; `compression` is "MESSAGE" or "STORAGE"."""
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
-    with Writer(path, version=9, storage_plugin=plugin) as writer:
+    writer = Writer(path, version=9, storage_plugin=plugin)
+    if compression is not None:
+        writer.set_compression(CompressionMode[compression], CompressionFormat.ZSTD)
+    with writer:
         connections = {}
         for topic, time_ns, message in messages:
             kind = message.__msgtype__
@@ -97,9 +100,12 @@ def bag(path, messages, storage="mcap"):
     return path
 
 
-def bag1(path, messages):
-    """The same as a file of ROS 1."""
-    with rosbag1.Writer(path) as writer:
+def bag1(path, messages, compression=None):
+    """The same as a file of ROS 1; `compression` is "BZ2" or "LZ4"."""
+    writer = rosbag1.Writer(path)
+    if compression is not None:
+        writer.set_compression(rosbag1.Writer.CompressionFormat[compression])
+    with writer:
         connections = {}
         for topic, time_ns, message in messages:
             kind = message.__msgtype__

@@ -1,7 +1,12 @@
 """Bags of ROS: clouds of all shapes, times of single points, trees of frames, and bags that do not hold together."""
 
+import os
+
+import lz4.frame
 import numpy as np
 import pytest
+from rosbags import rosbag1
+from rosbags.rosbag2.writer import zstd
 
 from tests.recordings import bags
 from tests.recordings.bags import T0_NS, bag, cloud, link, made, odometry, points, posed, tree
@@ -412,6 +417,54 @@ def test_a_bag_that_was_cut_off_or_is_gone(tmp_path, storage):
     file.unlink()
     with pytest.raises(FileNotFoundError, match=f"{file.name}: no such file; .*metadata.yaml names it"):
         RosBag(path)
+
+
+GROWN_BYTES = 1_300_000_000
+
+
+def compress_zeros(compressor):
+    """Compress far more zeros than a file may grow to, piece by piece."""
+    piece = bytes(10_000_000)
+    pieces = [compressor.begin()] if hasattr(compressor, "begin") else []
+    pieces += [compressor.compress(piece) for _ in range(GROWN_BYTES // len(piece))]
+    return b"".join([*pieces, compressor.flush()])
+
+
+@pytest.mark.parametrize(
+    ("storage", "compression"),
+    [("ros1", "BZ2"), ("ros1", "LZ4"), ("mcap", "MESSAGE"), ("mcap", "STORAGE"), ("sqlite3", "MESSAGE")],
+)
+def test_bags_stay_compressed_and_bounded(tmp_path, monkeypatch, storage, compression):
+    def write(name):
+        if storage == "ros1":
+            return bags.bag1(tmp_path / f"{name}.bag", MOUNTED + clouds(), compression)
+        return bag(tmp_path / name, MOUNTED + clouds(), storage, compression)
+
+    assert len(RosBag(write("good")).scan("lidar", 1).points_m) == 4
+    if compression == "BZ2":  # which takes long to grow
+        return
+    bomb = compress_zeros(lz4.frame.LZ4FrameCompressor() if storage == "ros1" else zstd.ZstdCompressor())
+    assert len(bomb) < GROWN_BYTES / 200
+    monkeypatch.setattr(rosbag1.writer, "lz4_compress", lambda *_: bomb)
+    monkeypatch.setattr(zstd, "compress", lambda _: bomb)
+    path = write("bomb")
+    monkeypatch.setenv("TORCHCOVER_MAX_FILE_GB", "0.1")
+    told = "Failed to resize buffer" if storage == "ros1" else r"not enough memory .* TORCHCOVER_MAX_FILE_GB above 0.1"
+    with pytest.raises(BadFileError, match=rf"bomb.*: .*{told}"):
+        RosBag(path)
+
+
+def test_messages_are_bounded_by_what_they_become(tmp_path, monkeypatch):
+    recording = RosBag(bag(tmp_path / "a", MOUNTED + clouds(lambda t: cloud(points(np.zeros((9000, 3))), t, "lidar"))))
+    monkeypatch.setenv("TORCHCOVER_MAX_FILE_GB", "0.002")
+    with pytest.raises(BadFileError, match=r"reading it takes 0.00216 GB of memory, more than the 0.002 GB"):
+        recording.scan("lidar", 0)
+
+
+def test_pipes_are_no_bags(tmp_path):
+    os.mkfifo(tmp_path / "a.bag")
+    with pytest.raises(BadFileError, match="a pipe, a socket or a device; a bag has to be a regular file"):
+        RosBag(tmp_path / "a.bag")
 
 
 def test_an_index_that_lies_is_found_out(tmp_path):

@@ -100,7 +100,10 @@ def naming(path: Path, content: str) -> Iterator[None]:
     except (BadFileError, FileNotFoundError, IsADirectoryError, ImportError):
         raise
     except MemoryError as error:
-        raise BadFileError(f"{path}: there is not enough memory to read {content} of this size") from error
+        raise BadFileError(
+            f"{path}: there is not enough memory to read {content} of this size: use a smaller one, or set the "
+            f"environment variable {VARIABLE} above {said_gb(VARIABLE, DEFAULT_GB):g}"
+        ) from error
     except Exception as error:
         reason = " ".join(str(error).split())[:MAX_REASON_CHARS] or type(error).__name__
         if not isinstance(error, ValueError) or isinstance(error, UnicodeError):

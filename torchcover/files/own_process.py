@@ -22,8 +22,8 @@ from typing import IO, Any, Concatenate, ParamSpec
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.files.bad_file import VARIABLE, most_gb
-from torchcover.files.processes import end_with_parent, limit
+from torchcover.files.bad_file import LIBRARIES_GB, VARIABLE, BadFileError, most_gb
+from torchcover.files.processes import end_with_parent, limit, used_bytes
 
 Arguments = ParamSpec("Arguments")
 Arrays = dict[str, NDArray[Any]]
@@ -32,7 +32,7 @@ Reader = Callable[Concatenate[Path, Arguments], Arrays]
 # A file may take so long, and a second more for each megabyte.
 MOST_S = 60.0
 BYTES_PER_S = 1e6
-KNOWN_ERRORS = {kind.__name__: kind for kind in (ValueError, MemoryError, ImportError, FileNotFoundError)}
+KNOWN_ERRORS = {kind.__name__: kind for kind in (BadFileError, ValueError, MemoryError, ImportError, FileNotFoundError)}
 # As much as a scan has: or both wait for each other, again and again.
 PIPE_BYTES = 1 << 20
 # The same modules as here, whatever folder this one was started in.
@@ -54,7 +54,8 @@ def apart(read: Reader[Arguments]) -> Reader[Arguments]:
     @wraps(read)
     def asked(path: Path, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Arrays:
         assert not kwargs
-        limit_s = MOST_S + path.stat().st_size / BYTES_PER_S
+        files = path.iterdir() if path.is_dir() else [path]
+        limit_s = MOST_S + sum(file.stat().st_size for file in files) / BYTES_PER_S
         request = [os.environ.get(VARIABLE), read.__module__, read.__name__, str(path.absolute()), *args]
         return _own_process().ask(request, limit_s)
 
@@ -145,6 +146,10 @@ def serve() -> None:
                 for array in arrays.values():
                     answers.write(array.reshape(-1).view(np.uint8).data)
                 answers.flush()
+                del arrays
+            if used_bytes() > LIBRARIES_GB * 1e9:  # or what is kept of one file would add to the next one's
+                os.dup2(answers.fileno(), 1)
+                os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
 
 
 def _plain(array: NDArray[Any]) -> NDArray[Any]:

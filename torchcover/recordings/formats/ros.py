@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from torchcover.files import naming
 from torchcover.geometry import invert
 from torchcover.geometry.rigid import Matrix
-from torchcover.recordings.formats.bag import METADATA, SUFFIXES, Bag, ros1_files
+from torchcover.recordings.bag_files import METADATA, find_ros1_files
+from torchcover.recordings.formats.bag import SUFFIXES, Bag
 from torchcover.recordings.formats.frame_tree import FrameTree, frame_name
 from torchcover.recordings.formats.point_cloud2 import CloudMessage, cloud_of
 from torchcover.recordings.formats.ros_poses import WINDOW_NS, VehiclePoses, mounted_transforms, vehicle_poses
@@ -94,7 +95,7 @@ class RosBag(Layout):
     @classmethod
     def recognises(cls, path: Path) -> bool:
         """Whether it is such a folder or file."""
-        if ros1_files(path):
+        if find_ros1_files(path):
             return True
         if path.is_dir():
             return (path / METADATA).exists() and any(any(path.glob(f"*{suffix}*")) for suffix in SUFFIXES.values())

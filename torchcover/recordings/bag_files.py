@@ -1,0 +1,166 @@
+"""Bags of ROS 1 and 2 read by rosbags, in a process of their own: nothing that loads torch may be imported here."""
+
+from collections import Counter
+from collections.abc import Callable
+from functools import lru_cache
+from operator import itemgetter
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.files import apart, check_memory, check_regular, naming
+
+ROS1_SUFFIX = ".bag"
+METADATA = "metadata.yaml"
+# A message of small fields takes up to 20 times its bytes as Python objects.
+OBJECT_BYTES_PER_BYTE = 20
+# Bags that stay open, so that a mixture of recordings does not read their indices again and again.
+MAX_OPEN_BAGS = 4
+# A message index of MCAP: a code, a size, the channel, the size of the entries.
+MCAP_INDEX_CODE = 0x07
+MCAP_INDEX_HEAD_BYTES = 15
+MCAP_INDEX_ENTRY = np.dtype([("time_ns", "<u8"), ("offset", "<u8")])
+
+Times = dict[str, NDArray[np.int64]]
+# Path, size in bytes and time of the last change of each file of a bag.
+Version = tuple[tuple[str, int, int], ...]
+
+
+class _OpenBag(NamedTuple):
+    readers: list[Any]
+    is_ros1: bool
+
+
+def find_ros1_files(path: Path) -> list[Path]:
+    """Return the files of ROS 1 at a path: the file itself, or those in a folder that is no bag of ROS 2."""
+    if path.is_dir():
+        return [] if (path / METADATA).exists() else sorted(path.glob(f"*{ROS1_SUFFIX}"))
+    return [path] if path.suffix == ROS1_SUFFIX else []
+
+
+@apart
+def read_bag_index(path: Path) -> dict[str, NDArray[Any]]:
+    """Read which messages a bag has, without the messages themselves.
+
+    Args:
+        path: The folder or the file.
+
+    Returns:
+        `topics` and `types` (T,) text, `counts` (T,) messages of each, `times_ns` (sum of counts,) int64 times of
+        recording, topic by topic, ascending.
+
+    Raises:
+        BadFileError: A damaged bag, or one that takes too much memory.
+        ImportError: rosbags is not installed.
+    """
+    with naming(path, "a bag"):
+        bag = _open(path)
+        types = {connection.topic: str(connection.msgtype) for one in bag.readers for connection in one.connections}
+        parts = [_times_of_ros1(one) if bag.is_ros1 else _times_of_ros2(one) for one in bag.readers]
+        none = np.empty(0, np.int64)
+        times_ns = [np.sort(np.concatenate([none, *(part.get(topic, none) for part in parts)])) for topic in types]
+        return {
+            "topics": np.array(list(types), dtype=str),
+            "types": np.array(list(types.values()), dtype=str),
+            "counts": np.array([len(times) for times in times_ns], dtype=np.int64),
+            "times_ns": np.concatenate([none, *times_ns]),
+        }
+
+
+@apart
+def read_bag_messages(path: Path, topic: str, start_ns: int | None, stop_ns: int | None) -> dict[str, NDArray[Any]]:
+    """Read the serialized messages of a topic that were recorded within [start_ns, stop_ns).
+
+    Returns:
+        `data` uint8 bytes of all messages in the order of their recording, `ends` (M,) where each ends, `types` (M,).
+
+    Raises:
+        BadFileError: A damaged bag, or messages that take too much memory.
+    """
+    with naming(path, f"a bag, in {topic}"):
+        messages: list[tuple[int, str, bytes]] = []
+        total_bytes = 0
+        for reader in _open(path).readers:
+            connections = [one for one in reader.connections if one.topic == topic]
+            for connection, time_ns, raw in reader.messages(connections, start_ns, stop_ns) if connections else ():
+                total_bytes += len(raw)
+                check_memory(OBJECT_BYTES_PER_BYTE * total_bytes)
+                messages.append((time_ns, str(connection.msgtype), bytes(raw)))
+        messages.sort(key=itemgetter(0))
+        return {
+            "data": np.frombuffer(b"".join(raw for *_, raw in messages), np.uint8),
+            "ends": np.cumsum([len(raw) for *_, raw in messages], dtype=np.int64),
+            "types": np.array([kind for _, kind, _ in messages], dtype=str),
+        }
+
+
+def _open(path: Path) -> _OpenBag:
+    files = find_ros1_files(path) or (sorted(path.iterdir()) if path.is_dir() else [path])
+    status = [(str(file), file.stat()) for file in files]
+    return _open_version(path, tuple((name, one.st_size, one.st_mtime_ns) for name, one in status))
+
+
+@lru_cache(MAX_OPEN_BAGS)
+def _open_version(path: Path, _: Version) -> _OpenBag:
+    try:
+        from rosbags import rosbag1, rosbag2
+    except ImportError as error:
+        raise ImportError(f"{path}: bags need rosbags: pip install 'torchcover[ros]'") from error
+    files = find_ros1_files(path)
+    for file in files:
+        check_regular(file, "a bag")
+    readers = [rosbag1.Reader(file) for file in files] or [rosbag2.Reader(path)]
+    for reader in readers:
+        reader.open()
+    return _OpenBag(readers, bool(files))
+
+
+def _times_of_ros1(reader: Any) -> Times:  # noqa: ANN401  (rosbags has no types)
+    times: dict[str, list[int]] = {}
+    for connection in reader.connections:
+        times.setdefault(connection.topic, []).extend(entry.time for entry in reader.indexes[connection.id])
+    return {topic: np.array(times_ns, dtype=np.int64) for topic, times_ns in times.items()}
+
+
+def _times_of_ros2(reader: Any) -> Times:  # noqa: ANN401
+    parts: dict[str, list[NDArray[np.int64]]] = {}
+    for storage in getattr(reader.storage, "storages", [reader.storage]):
+        read: Callable[[Any], Times] = _times_of_database if storage.path.suffix == ".db3" else _times_of_mcap
+        for topic, times_ns in read(storage).items():
+            parts.setdefault(topic, []).append(times_ns)
+    return {topic: np.concatenate(times_ns) for topic, times_ns in parts.items()}
+
+
+def _times_of_database(storage: Any) -> Times:  # noqa: ANN401
+    topics = storage.dbconn.execute("SELECT id, name FROM topics").fetchall()
+    rows = storage.dbconn.execute("SELECT topic_id, timestamp FROM messages").fetchall()
+    table = np.array(rows, dtype=np.int64).reshape(-1, 2)
+    return {str(name): table[table[:, 0] == number, 1] for number, name in topics}
+
+
+def _times_of_mcap(storage: Any) -> Times:  # noqa: ANN401
+    topics = {one.id: one.topic for one in storage.connections}
+    parts: dict[str, list[NDArray[np.int64]]] = {}
+    for chunk in storage.chunks:
+        check_memory(chunk.compressed_size + chunk.uncompressed_size)
+        for channel, offset in chunk.message_index_offsets.items():
+            parts.setdefault(topics[channel], []).append(_read_mcap_index(storage.bio, channel, offset))
+    times_ns = {topic: np.concatenate(of_topic) for topic, of_topic in parts.items()}
+    counts: Counter[str] = Counter()
+    for connection in storage.connections:
+        counts[connection.topic] += connection.msgcount
+    if any(count != len(times_ns.get(topic, ())) for topic, count in counts.items()):
+        raise ValueError("there is no index of its messages, or only of some; `mcap recover` makes one")
+    return times_ns
+
+
+def _read_mcap_index(file: Any, channel: int, offset: int) -> NDArray[np.int64]:  # noqa: ANN401
+    file.seek(offset)
+    head = file.read(MCAP_INDEX_HEAD_BYTES)
+    size_bytes = int.from_bytes(head[11:], "little")
+    if head[:1] != bytes([MCAP_INDEX_CODE]) or int.from_bytes(head[9:11], "little") != channel:
+        raise ValueError(f"the index of its messages leads to something else at byte {offset}")
+    check_memory(size_bytes)
+    return np.frombuffer(file.read(size_bytes), MCAP_INDEX_ENTRY)["time_ns"].astype(np.int64)
