@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test versions lint types doctest docs smoke bench measured paper clean
+.PHONY: demo test lint types doctest docs smoke bench measured paper clean
 
 demo: STEPS ?= 64
 demo: $(VENV)/.ready  ## evaluate a built-in rig in city traffic; writes to out/demo
@@ -15,9 +15,6 @@ unexport PYTHONDONTWRITEBYTECODE
 # One thread in each process: the tests are dealt out to as many processes as there are cores.
 test: $(VENV)/.ready  ## every test
 	OMP_NUM_THREADS=1 OMP_WAIT_POLICY=passive $(BIN)/python -m pytest --numprocesses auto --dist worksteal
-
-versions: $(VENV)/.ready  ## docs/measured/versions.md: every test on each version of Python, and with the lowest versions
-	$(BIN)/python -m benchmarks.measured versions
 
 lint: $(VENV)/.ready
 	$(BIN)/ruff check .
@@ -37,11 +34,11 @@ docs: $(VENV)/.ready  ## the pages, with those made from the code, in out/site
 smoke: $(VENV)/.ready  ## the built wheel, in an empty environment outside the repository
 	TORCHCOVER_CACHE_GB=0 PYTHON="$(PYTHON)" bash .ci/smoke $(BIN)/python
 
-bench: $(VENV)/.ready  ## docs/measured/performance.md: speed and memory
-	$(BIN)/python -m benchmarks.measured performance
+bench: $(VENV)/.ready  ## docs/measured/speed.md: speed and memory
+	$(BIN)/python -m benchmarks speed
 
 measured: $(VENV)/.ready  ## the tables and pictures of docs/measured that are older than the code, cheapest first
-	$(BIN)/python -m benchmarks.measured
+	$(BIN)/python -m benchmarks
 
 paper: STEPS ?= 128
 paper: $(VENV)/.ready  ## the paper's experiments, with the assumed LiDARs and both fits (docs/measured/paper.md)

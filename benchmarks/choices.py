@@ -4,7 +4,7 @@ import time
 
 import numpy as np
 
-from benchmarks.timing import table
+from benchmarks import table
 from torchcover.placement import ChoiceSpace, CommonInstants, subsets
 from torchcover.placement.choosing import seen_by, worth_of
 from torchcover.placement.subsets import Candidates, Limits, best

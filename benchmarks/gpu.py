@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 import torch
 
-from benchmarks.timing import table
+from benchmarks import table
 from torchcover import nearest
 from torchcover.data import RegionsOfInterest, SimulatedFrames, reference_called
 from torchcover.evaluation import CoverageObserver, Settings

@@ -23,7 +23,7 @@ from pathlib import Path
 import torch
 from matplotlib.figure import Figure
 
-from benchmarks.timing import table
+from benchmarks import table
 from tests.cli.hostile import RIG, YARD
 from tests.killing import operations_of
 from tests.placement.surfaces import Surface

@@ -5,8 +5,8 @@ import time
 
 import torch
 
+from benchmarks import table
 from benchmarks.placement import SPACE
-from benchmarks.timing import table
 from torchcover.placement import PlacementSearch, SearchSpace, run_search
 
 # A full turn looks the same whichever way it begins, but for what its rays happen to hit.

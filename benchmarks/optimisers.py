@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import torch
 
-from benchmarks.timing import table
+from benchmarks import table
 from torchcover.placement import OPTIMISERS, CommonInstants, Cube, SearchSpace
 from torchcover.placement.racing import gains, race
 

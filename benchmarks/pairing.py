@@ -4,7 +4,7 @@ import time
 
 import numpy as np
 
-from benchmarks.timing import table
+from benchmarks import table
 from torchcover.placement import CommonInstants, Objective
 from torchcover.placement.racing import MIN_WORLDS, TOGETHER, Prefix, gains, race
 from torchcover.simulation import Rig

@@ -6,7 +6,7 @@ import time
 import numpy as np
 import torch
 
-from benchmarks.timing import table
+from benchmarks import table
 from torchcover.placement import OPTIMISERS, Cube, PlacementSearch, SearchSpace, run_search
 from torchcover.placement.optimisers.gp_model import GaussianProcess
 

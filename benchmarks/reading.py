@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from benchmarks.timing import compare, table
+from benchmarks import compare, table
 from torchcover.data import AccumulatedReference, RecordedFrames, open_recording
 from torchcover.recordings.formats.kitti_files import vehicle_T_velodyne
 from torchcover.recordings.in_vehicle import in_vehicle

@@ -1,4 +1,4 @@
-"""Where the processor time of the default run goes, beside what nobody can do without: `python -m benchmarks run`.
+"""Where the processor time of the default run goes, beside what nobody can do without: `python -m benchmarks.run`.
 
 `python -m benchmarks.run OTHER` measures another checkout beside it, in turns. Each part counts for itself only: the
 search within an update is the search's. The floor is the same rays through bare Embree, those for heights too, the bare
@@ -14,8 +14,6 @@ import time
 from collections import Counter
 from importlib import import_module
 from pathlib import Path
-
-from benchmarks.timing import table
 
 ROOT = Path(__file__).parents[1]
 COMMAND = ["evaluate", "front_roof_128", "--scenario", "urban", "--steps", "64"]
@@ -43,6 +41,8 @@ WATCHED = {
 
 def main():
     """Print the table."""
+    from benchmarks import table  # the measured process runs this file with the package of another checkout
+
     checkouts = [Path(name).resolve() for name in sys.argv[1:] if Path(name).is_dir()] + [ROOT]
     found = {checkout: [] for checkout in checkouts}
     with tempfile.TemporaryDirectory() as folder:

@@ -3,7 +3,7 @@
 import subprocess
 import sys
 
-from benchmarks.timing import table
+from benchmarks import table
 from tests.stability import choosing, faces, ground, lenses, metric, motion, poses, rays, returns, search, sums
 from tests.stability.case import CPU_SEARCHES
 

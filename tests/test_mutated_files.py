@@ -1,11 +1,11 @@
-"""Damaged files of every format are read, or end in one error; in full: `python -m benchmarks mutated_files`."""
+"""Damaged files of every format are read, or end in one error; in full: `python -m benchmarks.faults`."""
 
 import os
 
 import pytest
 
-from benchmarks.good_files import kinds
-from benchmarks.mutated_files import attempt, mutated
+from tests.damaged.good_files import kinds
+from tests.damaged.mutated_files import attempt, mutated
 
 PARTS, FILES = 4, 270
 

@@ -169,7 +169,7 @@ def test_a_small_run_is_a_page_with_boards_among_the_metrics(example, tmp_path, 
     assert page in capsys.readouterr().out
     for words in ("## car mAP", "## mIoU", "agree with each other by 0.85", "as the best of so many", "| points *"):
         assert words in page
-    # Boards depend on no world: these are the ranks of docs/measured/agreement.md, other signs at 10 m and at 50 m.
+    # Boards depend on no world: these are the ranks that the example prints, other signs at 10 m and at 50 m.
     assert "| lob_10m * | -0.64 [" in page
     assert "| lob_50m * | +0.90 [" in page
     assert [path.name for path in tmp_path.iterdir()] == ["agreement.md"]

@@ -10,7 +10,7 @@ NORMAL_QUANTILE = 1.959963984540054
 # Of Student's distribution with 1 to 6 degrees of freedom, likewise; there the expansion below is off.
 FEW = 12.7062047362, 4.3026527297, 3.1824463053, 2.7764451052, 2.5705818356, 2.4469118511
 # Scenes in which a rig is all but blind are rare and missing from most short runs, so that the true mean of a length
-# lies on that side more often than on the other (docs/measured/error_bars.md).
+# lies on that side more often than on the other (docs/measured/accuracy.md).
 BLIND_SIDE = 1.25
 # exp of more is no float64.
 MOST = 700.0

@@ -39,7 +39,7 @@ AnyRig = Rig | str | Path
 AnyScenario = Scenario | str | Path
 SourceT = TypeVar("SourceT", bound=FrameSource, covariant=True)
 
-# Steps that follow each other are alike (docs/measured/spacing.md), and every minute is another city.
+# Steps that follow each other are alike, and every minute is another city.
 EVERY_S_IN_TRAFFIC = 10.0
 # Of the reference where only detections are asked for. Fewer save rays, but take more steps, and worlds, to an error.
 FEW_RAYS = 2048

@@ -20,7 +20,7 @@ BACKENDS = {
 DEVICES = {"kdtree": ("cpu",), "packets": ("cpu",), "warp": ("cpu", "cuda")}
 
 # Once loaded, packets are faster than the KD-tree for nearly any clouds, by at least so much
-# (docs/measured/performance.md, search). Loading numba takes each process half a second, which a hundred calls should
+# (docs/measured/speed.md). Loading numba takes each process half a second, which a hundred calls should
 # earn. By the clouds alone: a choice by what was searched before would change the last bits of a run with its workers.
 GAINED_PER_QUERY_S = 3e-7
 GAINED_PER_POINT_S = 8e-9

@@ -7,6 +7,7 @@ with a target error end, and studies say that they would.
 """
 
 import argparse
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,14 +15,16 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 
-from benchmarks.timing import table
-from torchcover import forward_regions, nearest
+from benchmarks import table
+from torchcover import BevGrid, CoverageMetric, forward_regions, nearest
 from torchcover.coverage.quantity import RADIUS, detection, seen_by_two, sensors_seeing
+from torchcover.data import SimulatedFrames
 from torchcover.estimation import ErrorModel, Estimate
-from torchcover.evaluation import Settings, TargetError, TargetWatch
+from torchcover.evaluation import CoverageObserver, Settings, TargetError, TargetWatch
 from torchcover.evaluation.task import simulation
+from torchcover.simulation import PaperReference, Rig, SurfaceReference
 
-SCENARIOS = {"urban": 110, "highway": 70, "sumo_random": 66, "parking": 70}
+SCENARIOS = {"urban": 50, "highway": 35}
 RIGS = ("front_roof_128", "front_grille_128")
 THRESHOLD_M, STEPS_OF_A_CITY, LENGTHS = 0.4, 6, (64, 256)
 # What is summed up of each point, each as one rig has it, or both as one.
@@ -34,12 +37,26 @@ ONE_CITY = 1 / 3
 TARGET = 0.01
 
 
+RIG = "front_roof_128"
+REGIONS = forward_regions()
+AREAS = tuple((region.x, region.y) for region in REGIONS)
+HEIGHTS = ("ground", "obstacle")
+EVERY_S = 10.0
+RAYS = (1024, 4096, 16_384, 65_536, 262_144, 1_048_576)
+BUDGET_CITIES = 3
+# Name of a row, estimator and band frame.
+ESTIMATORS = (("paper's pattern, mean over cells", "known", "vehicle"), ("surface points, by area", "area", "ground"))
+BUDGET_SCENARIOS = ("urban", "highway")
+FEW, MANY, DRAWS, INSTANTS = 4096, 262_144, 10, 6
+FAR_M = 180.0
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=77, help="of the cities")
     parser.add_argument("--draw", type=int, default=5, help="seed of the runs")
-    parser.add_argument("--runs", type=int, default=1000)
-    options = parser.parse_args([] if __name__ != "__main__" else None)
+    parser.add_argument("--runs", type=int, default=400)
+    options = parser.parse_args()
     pools = {name: Cities.of(name, cities, options.seed) for name, cities in SCENARIOS.items()}
     apart = []
     for steps in LENGTHS:
@@ -70,6 +87,7 @@ def main():
          "within 1.3 of their median"),
         [(name, *pool.stopped(np.random.default_rng(options.draw))) for name, pool in pools.items()],
     )  # fmt: skip
+    show_ray_budget()
 
 
 def _summary(name, kind, judged):
@@ -291,6 +309,111 @@ def _covered(each, truth):
 
 def _ends(numbers):
     return " / ".join(f"{number:.0f}" for number in np.quantile(numbers, (0.05, 0.5, 0.95)))
+
+
+def show_ray_budget():
+    """Print how numbers depend on the number of rays."""
+    print(f"\n### {STEPS_OF_A_CITY * BUDGET_CITIES} frames of `urban`\n")
+    rows = in_two_processes(of_estimator, ESTIMATORS)
+    table(("estimator", *(f"{rays:,}" for rays in RAYS[:-1])), rows)
+    print(f"\n### {DRAWS} samples of {FEW:,} points against as many of {MANY:,}, {INSTANTS} frames of as many cities\n")
+    header = ("scenario", "bias", "standard error", "largest bias", "rms of one sample")
+    table(header, in_two_processes(of_draws, BUDGET_SCENARIOS))
+
+
+def of_estimator(row):
+    """The distances of an estimator with few rays to its own value with a million."""
+    name, measure, band_frame = row
+    frames = frames_of("urban", cities=BUDGET_CITIES)
+    grid = BevGrid(x=(0.0, 160.0), y=(-40.0, 40.0), cell=0.25 if measure == "known" else 1.0, band_frame=band_frame)
+    looks, observers = {}, {}
+    for rays in RAYS:
+        of_paper = PaperReference(rows=int(rays**0.5), columns=int(rays**0.5))
+        of_surface = SurfaceReference(AREAS, rays=rays, band_frame=band_frame)
+        looks[rays] = frames.with_reference_sensor(of_paper if measure == "known" else of_surface)
+        metric = CoverageMetric(grid, max_radius=grid.diagonal_m, square_metres=measure == "area")
+        observers[rays] = CoverageObserver(metric)
+    for index, cloud in enumerate(rig_clouds(frames)):
+        for rays, look in looks.items():
+            observers[rays].update(replace(look[index], clouds={RIG: cloud}, sensor_points={}))
+    coverages = {rays: observer.compute() for rays, observer in observers.items()}
+    places = [(region, height) for region in REGIONS for height in HEIGHTS]
+    values = {
+        rays: np.stack([coverage.estimate(*place, measure).value.numpy() for place in places])
+        for rays, coverage in coverages.items()
+    }
+    return name, *(shown(rms(moves(values[rays], values[RAYS[-1]]), axis=0)) for rays in RAYS[:-1])
+
+
+def of_draws(scenario):
+    """How far draws of few points are from those of many points that the same places see."""
+    frames = frames_of(scenario, cities=1, every_s=60.0)
+    sums = np.zeros((2, DRAWS, len(REGIONS) * len(HEIGHTS), 3))
+    for index, cloud in enumerate(rig_clouds(frames)):
+        for draw in range(DRAWS):
+            for at, rays in enumerate((FEW, MANY)):
+                look = frames.with_reference_sensor(SurfaceReference(AREAS, rays=rays, band_frame="ground"))
+                look.simulator.seed = draw  # of places and points; what stands there is drawn already
+                sums[at, draw] += sums_of(look[index], cloud)
+    few, many = sums[..., 1:] / sums[..., :1]
+    apart = moves(few, many)
+    bias, error = apart.mean(axis=0), apart.std(axis=0, ddof=1) / DRAWS**0.5
+    return (
+        f"`{scenario}`",
+        shown(rms(bias, 0)),
+        shown(rms(error, 0)),
+        shown(np.abs(bias).max(0)),
+        shown(rms(apart, (0, 1))),
+    )
+
+
+def sums_of(frame, cloud):
+    """(places, 3) square metres, and those times radius and detection."""
+    radius_m = nearest(frame.reference, cloud, max_distance=FAR_M).distance.clamp(max=FAR_M).double()
+    each = torch.stack([torch.ones_like(radius_m), radius_m, (radius_m <= 0.4).double()], dim=1)
+    each *= frame.reference_weights.double()[:, None]
+    x_m, y_m = frame.reference[:, 0], frame.reference[:, 1]
+    found = []
+    for region in REGIONS:
+        inside = (x_m >= region.x[0]) & (x_m < region.x[1]) & (y_m >= region.y[0]) & (y_m < region.y[1])
+        for low_m, high_m in ((-0.5, 0.5), (0.5, 2.0)):
+            height_m = frame.reference_heights_m
+            found.append(each[inside & (height_m >= low_m) & (height_m < high_m)].sum(dim=0))
+    return torch.stack(found).numpy()
+
+
+def moves(values, others):
+    """(..., 2) radius, detection -> points of detection, per cent of the radius."""
+    return np.stack([100 * (values[..., 1] - others[..., 1]), 100 * (values[..., 0] / others[..., 0] - 1)], axis=-1)
+
+
+def rms(values, axis):
+    return np.sqrt(np.nanmean(values**2, axis=axis))
+
+
+def shown(pair):
+    return "{:.2f} / {:.1f}".format(*pair)
+
+
+def frames_of(scenario, *, cities=BUDGET_CITIES, seed=0, vehicle=None, every_s=EVERY_S):
+    """All instants of whole cities, or of a scenario that repeats itself; no rig is in them."""
+    few = SimulatedFrames(scenario, rigs={}, steps=1, seed=seed, every_s=every_s, vehicle=vehicle)
+    steps = few.simulator.distinct_steps or STEPS_OF_A_CITY * cities
+    return SimulatedFrames(scenario, rigs={}, steps=steps, seed=seed, every_s=every_s, vehicle=vehicle)
+
+
+def rig_clouds(frames, rig=RIG):
+    """The points of a rig, instant by instant."""
+    torch.set_num_threads(1)
+    simulator = frames.simulator.with_rigs({rig: Rig.load(rig)})
+    for index in range(len(frames)):
+        yield torch.cat([torch.from_numpy(scan.points) for scan in simulator.scans(index)[rig]])
+
+
+def in_two_processes(function, rows):
+    """[function(row) for row in rows], two at a time."""
+    with ProcessPoolExecutor(2) as pool:
+        return list(pool.map(function, rows))
 
 
 if __name__ == "__main__":

@@ -19,8 +19,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from benchmarks.recorded_measure import distance
-from benchmarks.timing import table
+from benchmarks import table
 from torchcover import BevGrid, CoverageMetric, forward_regions
 from torchcover.data import (
     AccumulatedReference,
@@ -125,7 +124,7 @@ def main():
     parser.add_argument("--ground", action="store_true")
     parser.add_argument("--hills-m", type=float, help="of a city")
     parser.add_argument("--windows", type=float, nargs="+", default=[2.0, 5.0])
-    options = parser.parse_args([] if __name__ != "__main__" else None)
+    options = parser.parse_args()
     torch.set_num_threads(1)
     sweeps = drive(options)
     if options.ground:
@@ -225,6 +224,14 @@ def found_movers(recording, reference, frame):
             of = found[np.bincount(own).argmax()].velocity_mps if len(own) else np.inf
             off_mps.append(float(np.linalg.norm(of - velocity_mps)))
     return off_mps
+
+
+def distance(value, other):
+    """The root mean square over regions and bands, and the worst: points of detection / per cent of the radius."""
+    apart = np.stack([100 * (value[:, 1] - other[:, 1]), 100 * (value[:, 0] / other[:, 0] - 1)])
+    worst = np.take_along_axis(apart, np.nanargmax(np.abs(apart), axis=1)[:, None], axis=1)[:, 0]
+    rms = np.sqrt(np.nanmean(apart**2, axis=1))
+    return f"{rms[0]:.1f} / {rms[1]:.0f}", f"{worst[0]:+.1f} / {worst[1]:+.0f}"
 
 
 def added(to, frame, rig):

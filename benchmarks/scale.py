@@ -8,19 +8,23 @@ each of which is measured, and the whole beside a run that none of them was meas
 """
 
 import argparse
+import json
 import os
 import pickle
+import random
+import signal
 import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from benchmarks.timing import table
+from benchmarks import table
 from torchcover.data import RegionsOfInterest, SimulatedFrames, reference_called
 from torchcover.evaluation import CoverageObserver, Settings
 from torchcover.evaluation.checkpoint import write_checkpoint
@@ -37,13 +41,27 @@ RANKS = (4, 16, 64)
 # The run that is extrapolated to: as in the documentation.
 MANY_RIGS, MANY_SCENARIOS, STEPS = 1000, 100, 64
 RIGS_TOGETHER = 8
+RESUMED_STEPS = 150
+COMMAND = ("evaluate", "front_roof_32", "--rays", "256", "--cell-m", "8", "--resume", "--steps", str(RESUMED_STEPS))
+OFTEN = """
+import sys
+from torchcover.evaluation import checkpoint
+checkpoint.EVERY_S, checkpoint.MOST_TIME = 0.05, 1.0
+from torchcover.cli.app import main
+main()
+"""
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--worlds", type=int, default=2, help="worlds of six steps each, for every row")
     parser.add_argument("--ranks", action="store_true", help="wall times of ranks and workers too: on a quiet machine")
-    options = parser.parse_args([] if __name__ != "__main__" else None)
+    parser.add_argument("--kills", type=int, help="kill and resume runs this often instead")
+    parser.add_argument("--seed", type=int, default=0, help="of the times of the kills")
+    options = parser.parse_args()
+    if options.kills:
+        show_resumes(options.kills, options.seed)
+        return
     torch.set_num_threads(1)
     times(1)  # what is imported and compiled at the first step is a part of the start
     steps = STEPS_A_WORLD * options.worlds
@@ -224,6 +242,56 @@ def by_processes(steps=48):
     for name, command in runs.items():
         with tempfile.TemporaryDirectory() as out:
             yield name, *ended([*command, "--out", out])
+
+
+def show_resumes(kills_wanted, seed):
+    """Kill runs at random and resume them until complete; print whether their numbers are those of an unbroken run."""
+    chance, found, kills, runs = random.Random(seed), Counter(), 0, 0
+    with tempfile.TemporaryDirectory() as place:
+        whole = Path(place) / "whole"
+        begin_s = time.monotonic()
+        started(whole).wait()
+        unbroken_s = time.monotonic() - begin_s
+        while kills < kills_wanted:
+            out, code, of_run, runs = Path(place) / f"out{runs}", None, 0, runs + 1
+            while code != 0:
+                process = started(out)
+                if kills < kills_wanted:
+                    kill_after(process, chance.uniform(0.5, 1.0) * unbroken_s)
+                code = process.wait()
+                if code == -signal.SIGKILL:
+                    kills, of_run = kills + 1, of_run + 1
+                    found[
+                        "killed", "with a checkpoint" if (out / "checkpoint.npz").exists() else "before its first"
+                    ] += 1
+                elif code:
+                    found["ended with an error", f"exit code {code}"] += 1
+                    break
+            same = code == 0 and numbers(out) == numbers(whole)
+            found["complete", "the same bits" if same else "OTHER BITS"] += 1
+    print(f"{kills} kills in {runs} runs of {RESUMED_STEPS} steps\n")
+    table(("runs", "what is there", "how often"), [(*what, count) for what, count in sorted(found.items())])
+
+
+def started(out):
+    """A run of the command line."""
+    command = [sys.executable, "-c", OFTEN, *COMMAND, "--out", str(out)]
+    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def kill_after(process, seconds):
+    """Kill it then, unless it has ended before."""
+    try:
+        process.wait(seconds)
+    except subprocess.TimeoutExpired:
+        process.kill()
+
+
+def numbers(out):
+    """All that was measured; the time that it took is another one each time."""
+    summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    summary.pop("seconds")
+    return summary, (out / "coverage.npz").read_bytes(), (out / "summary.csv").read_bytes()
 
 
 if __name__ == "__main__":

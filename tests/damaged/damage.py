@@ -8,7 +8,7 @@ import zlib
 
 import numpy as np
 
-from benchmarks.good_files import archive
+from tests.damaged.good_files import archive
 
 NUMBERS = (b"0", b"-1", b"1e999", b"nan", b"2.5", b"7", b"1000000000", b"9" * 18, b"9" * 30, b"9" * 5000, b"1e-320")
 WORDS = (

@@ -1,6 +1,5 @@
-"""Mutated files through every reader: what comes out, how long it takes, and how much memory."""
+"""Read damaged files with every reader: the outcome, the time and the memory that it takes."""
 
-import argparse
 import contextlib
 import os
 import random
@@ -11,70 +10,18 @@ import tempfile
 import time
 import warnings
 import zlib
-from collections import Counter
-from itertools import product
 from pathlib import Path
 
-from benchmarks.damage import damaged
-from benchmarks.good_files import Kind, archive, kinds, ply
-from benchmarks.timing import table
-from torchcover.files import BadFileError, own_process
+from tests.damaged.damage import damaged
+from tests.damaged.good_files import Kind, archive, ply
+from torchcover.files import BadFileError
 
-MAX_SECONDS, MAX_MB = 5.0, 500
 # A reader that never ends.
 STOP_SECONDS = 30
 
 
 class Endless(BaseException):
     """A reader was stopped; nothing that catches errors catches this."""
-
-
-def main():
-    """Print a table of readers, and one of bombs."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--files", type=int, default=20_000, help="of each seed")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--show", action="store_true", help="print a message of every sort")
-    arguments, _ = parser.parse_known_args()
-    with tempfile.TemporaryDirectory() as folder, _silent_libraries():
-        every = kinds(folder)
-        found = {kind.name: Counter() for kind in every}
-        messages = {}
-        for number, seed in product(range(arguments.files), arguments.seeds):
-            kind = every[number % len(every)]
-            data = mutated(every, number, seed)
-            outcome = attempt(kind, data, Path(folder), messages)
-            _add(found[kind.name], outcome)
-        bombs = [(name, *attempt(kind, kind.data, Path(folder), messages)) for name, kind in _bombs(every)]
-        pipes = [(f"a FIFO called {kind.name}", *_attempt_pipe(kind, Path(folder))) for kind in every]
-    columns = ("read", "bad", "foreign", "unnamed", "slow", "large", "seconds", "MB")
-    total = Counter()
-    for counts in found.values():
-        total = Counter(
-            {
-                key: max(total[key], counts[key]) if key in ("seconds", "MB") else total[key] + counts[key]
-                for key in columns
-            }
-        )
-    for reading in own_process._processes.values():
-        reading.end()
-    children_mb = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
-    print(
-        f"{arguments.files:,} files of each seed: {arguments.seeds}. The largest size of this process was "
-        f"{_largest_mb():.0f} MB, of one that reads for it {children_mb:.0f} MB.\n"
-    )
-    table(
-        ("file", *columns),
-        [(name, *(counts[key] for key in columns)) for name, counts in {**found, "all": total}.items()],
-    )
-    print()
-    ended = Counter(outcome for _, outcome, _, _ in pipes)
-    table(
-        ("bomb", "outcome", "seconds", "MB"),
-        [*bombs, ("a FIFO, for each", dict(ended), max(row[2] for row in pipes), max(row[3] for row in pipes))],
-    )
-    if arguments.show:
-        print("\n".join(sorted(messages.values())))
 
 
 def mutated(every, number, seed=0):
@@ -96,7 +43,7 @@ def attempt(kind, data, folder, messages=None):
 
 
 def _attempt(kind, path, messages=None):
-    before, start = _largest_mb(), time.perf_counter()
+    before, start = largest_mb(), time.perf_counter()
     signal.signal(signal.SIGALRM, _stop)
     signal.alarm(STOP_SECONDS)
     try:
@@ -119,10 +66,10 @@ def _attempt(kind, path, messages=None):
         outcome = f"foreign: {type(error).__name__}: {error}"
     finally:
         signal.alarm(0)
-    return outcome, time.perf_counter() - start, _largest_mb() - before
+    return outcome, time.perf_counter() - start, largest_mb() - before
 
 
-def _attempt_pipe(kind, folder):
+def attempt_pipe(kind, folder):
     with tempfile.TemporaryDirectory(dir=folder) as own:
         for name, beside in kind.beside:
             Path(own, name).write_bytes(beside)
@@ -131,17 +78,7 @@ def _attempt_pipe(kind, folder):
         return _attempt(kind, path)
 
 
-def _add(counts, outcome):
-    what, seconds, grown_mb = outcome
-    counts[what.partition(":")[0]] += 1
-    counts["slow"] += seconds > MAX_SECONDS
-    counts["large"] += grown_mb > MAX_MB
-    counts["seconds"], counts["MB"] = max(counts["seconds"], seconds), max(counts["MB"], grown_mb)
-    if what not in ("read", "bad"):
-        print(what[:300])
-
-
-def _bombs(every):
+def bombs(every):
     """Small files that claim, or really become, gigabytes."""
     clouds = {kind.name: kind for kind in every}
 
@@ -223,7 +160,7 @@ def _png_of(image, side, deflated):
     return image[:8] + chunk(b"IHDR", header) + chunk(b"IDAT", b"\x78\x9c" + deflated) + chunk(b"IEND", b"")
 
 
-def _largest_mb():
+def largest_mb():
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
@@ -232,7 +169,7 @@ def _stop(*_):
 
 
 @contextlib.contextmanager
-def _silent_libraries():
+def silence_libraries():
     """OpenEXR prints what it finds."""
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 2)
@@ -242,7 +179,3 @@ def _silent_libraries():
         os.dup2(kept, 2)
         os.close(kept)
         os.close(nowhere)
-
-
-if __name__ == "__main__":
-    main()

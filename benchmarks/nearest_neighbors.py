@@ -15,7 +15,7 @@ import torch
 from pykdtree.kdtree import KDTree
 from scipy.spatial import cKDTree
 
-from benchmarks.timing import compare, table
+from benchmarks import compare, table
 from torchcover import nearest
 from torchcover.data import SimulatedFrames
 from torchcover.neighbors.choice import choose_search
@@ -32,7 +32,7 @@ RESULT = Path("out/benchmarks/search.json")
 
 def main():
     """Print the table from a process in which every library has one thread; the figures go to `RESULT`, too."""
-    command = [sys.executable, "-m", "benchmarks.search"]
+    command = [sys.executable, "-m", "benchmarks.nearest_neighbors", "measure"]
     subprocess.run(command, env=os.environ | {"OMP_NUM_THREADS": "1"}, check=True)
 
 
@@ -181,4 +181,4 @@ def on_cuda():
 
 
 if __name__ == "__main__":
-    measure()
+    measure() if sys.argv[1:] == ["measure"] else main()

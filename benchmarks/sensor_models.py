@@ -1,6 +1,8 @@
-"""Real sweeps beside the same sensors simulated: returns from the road and from vehicles, blind cones, blocked sectors.
+"""Compare the sensor models with real sweeps, and the coverage of imperfect sensors with that of ideal ones.
 
-`python -m benchmarks.real_sweeps RIG=RECORDING ...`, such as `argoverse2=LOG`. Only curves and figures are printed.
+`python -m benchmarks.sensor_models` prints the coverage of imperfect sensors; with `RIG=RECORDING ...`, such as
+`argoverse2=LOG`, it compares returns from the road and from vehicles, blind cones and blocked sectors of recordings
+with the same sensors simulated.
 """
 
 import argparse
@@ -9,9 +11,11 @@ from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
+import torch
 
-from benchmarks.timing import table
-from torchcover.data import open_recording
+from benchmarks import table
+from torchcover import BevGrid, CoverageMetric
+from torchcover.data import SimulatedFrames, open_recording
 from torchcover.geometry import invert, transform
 from torchcover.recordings.in_vehicle import in_vehicle
 from torchcover.simulation import Lidar, Material, PaperReference, Rig, Scenario, Simulator
@@ -40,6 +44,14 @@ PLAIN = {
     "name": "plain",
     "ego": {"pose": {}},
     "bodies": [{"name": "plain", "ground": True, "shape": {"type": "plane", "size_m": [400.0, 400.0]}}],
+}
+NUM_FRAMES = 12
+EVERY_S = 15.0
+GRID = BevGrid(x=(0.0, 80.0), y=(-20.0, 20.0), band_frame="ground")
+LIDAR, CAMERAS = "front_roof_128", "three_cameras"
+IMPERFECT = {
+    LIDAR: [{}, *({"range_noise_m": sigma_m} for sigma_m in (0.03, 0.1, 0.5, 3.0)), {"dropout": 0.3}],
+    CAMERAS: [{}, {"range_noise_share": 0.05}, {"stereo": {"baseline_m": 0.3, "subpixel_px": 0.25}}],
 }
 
 
@@ -217,9 +229,12 @@ def at_sides(points_m, boxes, lidar):
 def main():
     """Print the tables of each recording, and draw P(return)."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("recordings", nargs="+", help="RIG=RECORDING")
+    parser.add_argument("recordings", nargs="*", help="RIG=RECORDING")
     parser.add_argument("--picture", type=Path, help="where to draw P(return) by range")
     given, road = parser.parse_args(), Material.load("road")
+    if not given.recordings:
+        show_imperfections()
+        return
     returns, misfits, cones, vehicles, curves = [], [], [], [], {}
     for pair in given.recordings:
         name, _, folder = pair.partition("=")
@@ -286,6 +301,40 @@ def draw(curves, path):
     np.atleast_1d(axes)[0].set_ylabel("P(return) from road")
     np.atleast_1d(axes)[0].legend(fontsize=7, loc="lower left")
     figure.savefig(path, dpi=130)
+
+
+def show_imperfections():
+    """Print detection within 80 m, by area, of sensors with noise and drop-out."""
+    torch.set_num_threads(1)
+    rigs = {f"{name}: {words(keys)}": imperfect(name, keys) for name, each in IMPERFECT.items() for keys in each}
+    frames = SimulatedFrames("urban", rigs=rigs, steps=NUM_FRAMES, every_s=EVERY_S, seed=0)
+    metrics = {(rig, landed): CoverageMetric(GRID, square_metres=True) for rig in rigs for landed in (False, True)}
+    for frame in frames:
+        for (rig, landed), metric in metrics.items():
+            points, error = (frame.landed(rig), None) if landed else (frame.cloud_of(rig), frame.error_of(rig))
+            surface = {"weights": frame.reference_weights, "height": frame.reference_heights_m}
+            metric.update(points, frame.reference, error=error, **surface)
+    percent = {key: [f"{100 * value:.1f}" for value in detection(metric)] for key, metric in metrics.items()}
+    rows = [(*rig.split(": ", 1), *percent[rig, False], *percent[rig, True]) for rig in rigs]
+    table(
+        ("rig", "what is imperfect", "ground (%)", "obstacle (%)", "ground, landed (%)", "obstacle, landed (%)"), rows
+    )
+
+
+def words(keys):
+    return ", ".join(f"{key} {value}" for key, value in keys.items()).replace("'", "") or "nothing"
+
+
+def imperfect(name, keys):
+    """A built-in rig whose sensors all have some more keys."""
+    document = Rig.load(name).model_dump(exclude_unset=True)
+    return Rig.model_validate({**document, "sensors": [{**sensor, **keys} for sensor in document["sensors"]]})
+
+
+def detection(metric):
+    """Of the ground, and of obstacles."""
+    rows = {(row.region, row.height): row for row in metric.compute().summary()}
+    return [rows["80m", height].numbers["detection_0.4m"].value for height in ("ground", "obstacle")]
 
 
 if __name__ == "__main__":
