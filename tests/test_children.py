@@ -1,19 +1,26 @@
-"""No process outlives the one that has started it, though that is killed."""
+"""No process outlives the one that has started it, though that is killed; one that is stopped is reported."""
 
+import gc
 import math
 import os
+import re
 import select
 import signal
 import subprocess
 import sys
 import time
+from functools import partial
+from multiprocessing import active_children
 
 import pytest
 import torch
+from torch.distributed import HashStore
 
+from tests.files import apart_readers
 from torchcover.data import Frame
 from torchcover.evaluation import observe
-from torchcover.files import end_with_parent
+from torchcover.evaluation.heartbeat import Heartbeat, HeartbeatParams, reporting_silent_ranks
+from torchcover.files import end_with_parent, own_process, reporting_stopped
 from torchcover.simulation.sumo import simulating
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs Linux, which ends processes with their parent")
@@ -120,3 +127,78 @@ def test_what_makes_traffic_ends(alive, tmp_path, monkeypatch):
     monkeypatch.setattr(simulating, "home", lambda: tmp_path)
     is_killed(lambda: simulating.run("sumo"), alive)
     assert alive.has_ended(within_s=LIVES_S / 3)
+
+
+@pytest.fixture
+def stopped(monkeypatch):
+    """Look often for stopped processes; returns a list of the warnings, each of which lets its process go on."""
+    reported = []
+
+    def warn(message, *_, **__):
+        reported.append(message)
+        os.kill(int(re.search(r"kill -CONT (\d+)", message)[1]), signal.SIGCONT)
+
+    monkeypatch.setattr("torchcover.files.processes.warnings.warn", warn)
+    for place in ("evaluation.pipeline", "files.own_process", "simulation.sumo.simulating"):
+        monkeypatch.setattr(f"torchcover.{place}.reporting_stopped", partial(reporting_stopped, look_every_s=0.1))
+    return reported
+
+
+class StoppingDrive:
+    """Four frames, the second of which stops the worker that makes it."""
+
+    world_of = int
+
+    def __len__(self):
+        return 4
+
+    def __getitem__(self, index):
+        if index == 1:
+            os.kill(os.getpid(), signal.SIGSTOP)
+        return Frame({"a": torch.zeros(1, 3)}, torch.zeros(1, 3), index, "f")
+
+
+def test_a_stopped_worker_is_reported_and_the_run_goes_on_with_it(stopped):
+    assert observe(StoppingDrive(), [], workers=2).steps == 4
+    assert [message.split(" (process ")[0] for message in stopped] == ["a worker"]
+
+
+def test_a_run_with_a_stopped_worker_can_be_ended(stopped, monkeypatch):
+    end = lambda message, *_, **__: (stopped.append(message), os.kill(os.getpid(), signal.SIGINT))  # noqa: E731
+    monkeypatch.setattr("torchcover.files.processes.warnings.warn", end)
+    with pytest.raises(KeyboardInterrupt):
+        observe(StoppingDrive(), [], workers=2)
+    gc.collect()
+    assert len(stopped) == 1
+    assert active_children() == []
+
+
+def test_a_stopped_sumo_is_reported(stopped, tmp_path, monkeypatch):
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "bin" / "sumo").write_text("#!/bin/sh\nkill -STOP $$\necho more\n")
+    (tmp_path / "bin" / "sumo").chmod(0o755)
+    monkeypatch.setattr(simulating, "home", lambda: tmp_path)
+    assert list(simulating.output_of("sumo")) == [b"more\n"]
+    assert [message.split(" (process ")[0] for message in stopped] == ["SUMO's sumo"]
+
+
+def test_a_stopped_reader_is_reported_and_ends_after_its_time(stopped, tmp_path, monkeypatch):
+    (tmp_path / "file.x").write_text("content")
+    assert apart_readers.stopping(tmp_path / "file.x")["one"] == 1
+    assert [message.split(" (process ")[0] for message in stopped] == ["the process that reads files"]
+    monkeypatch.setattr("torchcover.files.processes.warnings.warn", lambda *_, **__: None)
+    monkeypatch.setattr(own_process, "MOST_S", 0.5)
+    with pytest.raises(ValueError, match="the process that reads it was stopped"):
+        apart_readers.stopping(tmp_path / "file.x")
+
+
+@pytest.mark.parametrize("pause_s", [0.0, 1.0])
+def test_a_rank_without_signs_of_life_is_reported_once(monkeypatch, pause_s):
+    reported, params, store = [], HeartbeatParams(every_s=0.05, silent_s=0.5), HashStore()
+    monkeypatch.setattr("torchcover.evaluation.heartbeat.warnings.warn", lambda words, *_, **__: reported.append(words))
+    silent = Heartbeat(store, 1, 3, params)  # sends nothing
+    with reporting_silent_ranks(store, 0, 3, params), reporting_silent_ranks(store, 2, 3, params):
+        time.sleep(0.2 + pause_s)
+    assert sorted(words[:6] for words in reported) == ["rank 1"] * (2 if pause_s else 0)
+    assert silent.find_silent(time.monotonic() + 9.0) == [0]  # the store, which rank 0 keeps, has not answered
+    assert store.get("alive 0") == b"left"

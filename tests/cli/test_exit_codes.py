@@ -38,9 +38,17 @@ def test_each_kind_of_end_has_its_exit_code(torchcover, monkeypatch, error, code
     assert code != 70 or complaints.splitlines()[-1].startswith("torchcover: internal error (")
 
 
-@pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
-@pytest.mark.parametrize(("arguments", "code"), [("list", 0), ("--help", 0), ("list nothing-such", 2), ("", 2)])
-def test_every_command_works_with_closed_streams(closed, arguments, code):
+@pytest.mark.parametrize(
+    ("arguments", "code", "closed"),
+    [
+        ("list", 0, "<&-"),
+        ("list", 0, ">&-"),
+        ("list nothing-such", 2, "2>&-"),
+        ("--help", 0, "<&- >&- 2>&-"),
+        ("", 2, ">&- 2>&-"),
+    ],
+)
+def test_every_command_works_with_closed_streams(arguments, code, closed):
     command = f"exec {' '.join(PROGRAM)} {arguments} {closed}"
     done = subprocess.run(["sh", "-c", command], check=False, capture_output=True, text=True)
     assert (done.returncode, "Traceback" in done.stderr) == (code, False)

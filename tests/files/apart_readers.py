@@ -2,6 +2,7 @@
 
 import ctypes
 import os
+import signal
 import sys
 import time
 from pathlib import Path
@@ -59,3 +60,9 @@ def keeping(path: Path, gb: float):
 def writing(path: Path):
     path.with_suffix(".new").write_text("x")
     return {}
+
+
+@apart
+def stopping(path: Path):
+    os.kill(os.getpid(), signal.SIGSTOP)
+    return {"one": np.array(1)}

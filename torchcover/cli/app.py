@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from enum import IntEnum
-from typing import Annotated, Any
+from typing import Annotated, Any, TextIO
 
 import typer
 
@@ -133,7 +133,7 @@ def open_closed_streams() -> None:
             setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: SIM115  (for the whole process)
 
 
-def flush_or_discard(stream: io.TextIOBase) -> None:
+def flush_or_discard(stream: TextIO) -> None:
     """Write what a stream holds, or drop it if nobody can take it: Python would fail with code 120 at exit."""
     try:
         stream.flush()

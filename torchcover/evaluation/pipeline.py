@@ -1,11 +1,14 @@
 """The one loop: frames in order, and every observer is fed with each of them."""
 
+import os
+import signal
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import groupby, islice
+from multiprocessing import active_children
 from traceback import clear_frames, format_exc
 from typing import Any, NamedTuple, Protocol
 
@@ -17,7 +20,7 @@ from torchcover.evaluation.cores import cores, start_method, warn_of_spinning
 from torchcover.evaluation.observers import AnyObserver, CoverageObserver
 from torchcover.evaluation.progress import ENDS, Progress, held_back
 from torchcover.evaluation.ranks import Ranks
-from torchcover.files import end_with_parent
+from torchcover.files import end_with_parent, is_stopped, reporting_stopped
 from torchcover.frames import BadFrameError, Frame, FrameSource, worlds_of
 
 Frames = FrameSource | Dataset[Frame] | Sequence[Frame]
@@ -301,7 +304,7 @@ def _each(
         multiprocessing_context=method if workers else None,
         prefetch_factor=1 if workers else None,  # what is made ahead waits in shared memory
     )
-    for batch in loader:
+    for batch in batches_of(loader):
         for made in batch:
             if isinstance(made, MeasuredFrame):
                 yield made
@@ -309,3 +312,23 @@ def _each(
                 run.skipped.append(str(made))
             else:
                 raise made
+
+
+def batches_of(loader: DataLoader[Any]) -> Iterator[Any]:
+    """Iterate over the batches of a loader, with a warning about each of its workers that is stopped.
+
+    Whatever ends the loop early kills workers that are stopped, for which the end of the program would wait.
+    """
+    batches = iter(loader)
+    workers = [worker.pid or 0 for worker in active_children()] if loader.num_workers else []
+    try:
+        while True:
+            with reporting_stopped(workers, "a worker"):
+                batch = next(batches, None)
+            if batch is None:
+                return
+            yield batch
+    except BaseException:
+        for pid in filter(is_stopped, workers):
+            os.kill(pid, signal.SIGKILL)
+        raise

@@ -17,6 +17,7 @@ from torch.distributed.distributed_c10d import Store
 from torch.distributed.rendezvous import rendezvous
 
 from torchcover.evaluation.checkpoint import differences
+from torchcover.evaluation.heartbeat import reporting_silent_ranks
 from torchcover.evaluation.observers import AnyObserver
 
 Payload = TypeVar("Payload")
@@ -216,7 +217,8 @@ def joined_ranks() -> Iterator[Ranks | None]:
         return
     store, rank, size = next(iter(rendezvous("env://", timeout=timedelta(minutes=5))))
     ranks = Ranks(store, rank, size)
-    try:
-        yield ranks
-    finally:
-        ranks.part()
+    with reporting_silent_ranks(store, rank, size):
+        try:
+            yield ranks
+        finally:
+            ranks.part()

@@ -23,7 +23,7 @@ from torchcover.evaluation.measuring import measured
 from torchcover.evaluation.settings import OPTIONS, Settings
 from torchcover.evaluation.target_error import MIN_STEPS, rounded_up
 from torchcover.evaluation.task import simulation
-from torchcover.files import Publication, end_with_parent
+from torchcover.files import Publication, end_with_parent, reporting_stopped
 from torchcover.report import (
     PageTable,
     Words,
@@ -378,7 +378,15 @@ def command_s(plan: StudyPlan) -> float:
     start = time.perf_counter()
     with TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "torchcover", *words, f"--out={folder}"]
-        done = subprocess.run(command, check=False, capture_output=True, text=True, preexec_fn=end_with_parent())
-    if done.returncode:
-        raise ValueError(f"torchcover {' '.join(words)} ended with {done.returncode}: {done.stderr.strip()}")
+        process = subprocess.Popen(
+            command,
+            text=True,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            preexec_fn=end_with_parent(),  # noqa: PLW1509  (one call of the system, no lock)
+        )
+        with process, reporting_stopped([process.pid], "the command that is measured"):
+            complaints = process.communicate()[1]
+    if process.returncode:
+        raise ValueError(f"torchcover {' '.join(words)} ended with {process.returncode}: {complaints.strip()}")
     return time.perf_counter() - start

@@ -29,6 +29,8 @@ from torchcover.files.numpy_files import read_npz as read_npz
 from torchcover.files.numpy_files import write_npz as write_npz
 from torchcover.files.own_process import apart as apart
 from torchcover.files.processes import end_with_parent as end_with_parent
+from torchcover.files.processes import is_stopped as is_stopped
+from torchcover.files.processes import reporting_stopped as reporting_stopped
 from torchcover.files.publishing import RECORDING as RECORDING
 from torchcover.files.publishing import SUMMARY as SUMMARY
 from torchcover.files.publishing import Publication as Publication

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.files.bad_file import LIBRARIES_GB, VARIABLE, BadFileError, most_gb
-from torchcover.files.processes import end_with_parent, limit, used_bytes
+from torchcover.files.processes import end_with_parent, is_stopped, limit, reporting_stopped, used_bytes
 
 Arguments = ParamSpec("Arguments")
 Arrays = dict[str, NDArray[Any]]
@@ -84,13 +84,17 @@ class _Process:
         requests, answers = self._popen.stdin, self._popen.stdout
         assert requests is not None
         assert answers is not None
-        with self.lock:
+        with self.lock, reporting_stopped([self._popen.pid], "the process that reads files"):
             try:
                 _send(requests, request)
                 answer, arrays = _received(answers, limit_s)
             except (BrokenPipeError, EOFError, TimeoutError) as error:
-                late = isinstance(error, TimeoutError)
+                late, stopped = isinstance(error, TimeoutError), is_stopped(self._popen.pid)
                 self.end()
+                if stopped:
+                    raise ValueError(
+                        f"the process that reads it was stopped for {limit_s:.0f} s; read it again"
+                    ) from error
                 ended = f"it took more than {limit_s:.0f} s" if late else "the library that reads it crashed"
                 raise ValueError(f"{ended}; the file is damaged, or not what its name says") from error
             except BaseException:  # such as Ctrl-C: an answer that nobody waits for must not be the next one's

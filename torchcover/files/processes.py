@@ -1,16 +1,18 @@
-"""Processes that do not outlive the one that has started them."""
+"""Processes that do not outlive the one that has started them, and that are reported while they are stopped."""
 
 import ctypes
 import math
 import os
 import signal
 import sys
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
 from functools import partial
 from multiprocessing import parent_process
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from threading import Thread
+from threading import Event, Thread
 
 if sys.platform == "linux":
     import resource
@@ -36,6 +38,57 @@ def end_with_parent(memory_gb: float = math.inf, cpu_s: float = math.inf) -> Cal
         0
     """
     return partial(_end_with, os.getpid(), memory_gb, cpu_s) if _prctl else None
+
+
+def is_stopped(pid: int) -> bool:
+    """Whether a process is stopped by a signal, as by SIGSTOP; False where the system, any but Linux, does not tell.
+
+    Example:
+        >>> is_stopped(os.getpid())
+        False
+    """
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+    except OSError:  # it has ended
+        return False
+    return state.rpartition(")")[2].split()[0] == "T"
+
+
+@contextmanager
+def reporting_stopped(pids: Collection[int], role: str, look_every_s: float = 5.0) -> Iterator[None]:
+    """Warn about processes that this one waits for, and that someone has stopped: nothing else would end the silence.
+
+    Args:
+        pids: Process numbers.
+        role: What they are, for the warning: "a worker".
+        look_every_s: Seconds between two looks; a process that is stopped at two of them in a row is reported, so that
+            Ctrl-Z and `fg`, which stop and continue all processes of a command, are not.
+    """
+    if not pids:
+        yield
+        return
+    ended = Event()
+
+    def watch() -> None:
+        looks = dict.fromkeys(pids, 0)
+        while not ended.wait(look_every_s):
+            for pid in pids:
+                looks[pid] = looks[pid] + 1 if is_stopped(pid) else 0
+                if looks[pid] == 2:
+                    warnings.warn(
+                        f"{role} (process {pid}) is stopped, and the run waits for it: continue it with "
+                        f"`kill -CONT {pid}`, or end the run with Ctrl-C",
+                        RuntimeWarning,
+                        stacklevel=2,
+                    )
+
+    watcher = Thread(target=watch, daemon=True)
+    watcher.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        watcher.join()
 
 
 def limit(memory_gb: float) -> None:

@@ -11,7 +11,7 @@ from torchcover.coverage import Measure
 from torchcover.estimation import Estimate
 from torchcover.evaluation import CoverageObserver
 from torchcover.evaluation.cores import start_method
-from torchcover.evaluation.pipeline import FramesOrErrors, MeasuredFrame, killed_worker
+from torchcover.evaluation.pipeline import FramesOrErrors, MeasuredFrame, batches_of, killed_worker
 from torchcover.frames import Frame
 from torchcover.placement.carrier import Carrier
 from torchcover.placement.objective import Objective
@@ -306,7 +306,7 @@ class CommonInstants:
         self._batches[:] = [[AskedInstant(rig, number, measures) for number in share] for share in shares]
         made: dict[int, Frame | MeasuredFrame | ValueError] = {}
         try:
-            for share, batch in zip(shares, self._loader, strict=True):
+            for share, batch in zip(shares, batches_of(self._loader), strict=True):
                 made |= zip(share, batch, strict=True)
         except Exception as error:
             if killed := killed_worker(error, self._processes, steps=len(made)):

@@ -12,7 +12,7 @@ from shutil import which
 from tempfile import TemporaryFile
 from xml.etree import ElementTree
 
-from torchcover.files import end_with_parent, most_gb, parse_xml, reads
+from torchcover.files import end_with_parent, most_gb, parse_xml, reads, reporting_stopped
 from torchcover.files.bad_file import VARIABLE
 from torchcover.simulation.sumo.floating import ATTRIBUTES
 from torchcover.simulation.traffic.assemble import HORIZON_M
@@ -55,7 +55,7 @@ def output_of(program: str, *options: str | Path, cpu_s: float = math.inf) -> It
         assert process.stdout is not None  # as asked for
         try:
             with closing(process.stdout):
-                while piece := process.stdout.read(PIECE_BYTES):
+                while piece := _read_piece(process, program):
                     yield piece
             ended = process.wait()
         finally:
@@ -69,6 +69,12 @@ def output_of(program: str, *options: str | Path, cpu_s: float = math.inf) -> It
             if "bad_alloc" in told:
                 told += f"; it may take {most_gb():g} GB: take a piece of the network, or set {VARIABLE} to more"
             raise ValueError(f"SUMO's {program} fails: {told}")
+
+
+def _read_piece(process: subprocess.Popen[bytes], program: str) -> bytes:
+    assert process.stdout is not None  # as asked for
+    with reporting_stopped([process.pid], f"SUMO's {program}"):
+        return process.stdout.read(PIECE_BYTES)
 
 
 def _errors(lines: Sequence[str]) -> str:
