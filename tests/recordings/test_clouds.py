@@ -257,7 +257,7 @@ def test_pcd_finds_x_y_z_among_other_fields_of_any_type_and_count(tmp_path, enco
         "ascii_count_0",
         "binary_count_0",
         "columns_without_points",
-    ],  # fmt: skip
+    ],
 )
 def test_pcd_variants_found_in_the_wild(tmp_path, data):
     np.testing.assert_array_equal(read_cloud(store(tmp_path, ".pcd", data)), CLOUD)

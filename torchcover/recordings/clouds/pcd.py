@@ -23,7 +23,7 @@ MAX_DIGITS = 18
 ENCODINGS = ("ascii", "binary", "binary_compressed")
 TYPES = ("F", "U", "I")
 # The origin, without a rotation: x y z qw qx qy qz.
-NO_VIEWPOINT = "0 0 0 1 0 0 0".split()
+NO_VIEWPOINT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -59,17 +59,7 @@ def read_pcd(path: Path) -> Points:
 
 
 def _parse_header(data: bytes) -> tuple[_Header, bytes]:
-    entries: dict[str, list[str]] = {}
-    end = 0
-    while "DATA" not in entries:
-        start, end = end, data.find(b"\n", end, MAX_HEADER_BYTES) + 1
-        if end == 0:
-            raise ValueError(f"not a PCD file: no line DATA ends the header; it starts with {data[:12]!r}")
-        words = data[start:end].decode("ascii", "replace").split("#")[0].split()
-        if words and words[0] in entries:
-            raise ValueError(f"the PCD header has two lines {words[0][:40]}")
-        if words:
-            entries[words[0]] = words[1:]
+    entries, end = _read_entries(data)
     if "COLUMNS" in entries:  # early versions of the format
         entries.setdefault("FIELDS", entries["COLUMNS"])
     sides = [_whole(entries[key][0], key) for key in ("WIDTH", "HEIGHT") if entries.get(key)]
@@ -101,6 +91,22 @@ def _parse_header(data: bytes) -> tuple[_Header, bytes]:
     return header, data[end:]
 
 
+def _read_entries(data: bytes) -> tuple[dict[str, list[str]], int]:
+    """The words behind each key of the header, and where it ends."""
+    entries: dict[str, list[str]] = {}
+    end = 0
+    while "DATA" not in entries:
+        start, end = end, data.find(b"\n", end, MAX_HEADER_BYTES) + 1
+        if end == 0:
+            raise ValueError(f"not a PCD file: no line DATA ends the header; it starts with {data[:12]!r}")
+        words = data[start:end].decode("ascii", "replace").split("#")[0].split()
+        if words and words[0] in entries:
+            raise ValueError(f"the PCD header has two lines {words[0][:40]}")
+        if words:
+            entries[words[0]] = words[1:]
+    return entries, end
+
+
 def _parse_ascii(header: _Header, axes: Sequence[int], body: bytes) -> Points:
     rows = sum(1 for _ in read_lines(body))
     if rows != header.points:
@@ -112,9 +118,9 @@ def _parse_ascii(header: _Header, axes: Sequence[int], body: bytes) -> Points:
 
 def _warn_of_viewpoint(words: Sequence[str]) -> None:
     """Warn about a pose of the sensor, which other programs apply to the points or ignore."""
-    if words and words != NO_VIEWPOINT and [float(word) for word in words] != [float(word) for word in NO_VIEWPOINT]:
+    if words and tuple(map(float, words)) != NO_VIEWPOINT:
         warnings.warn(
-            f"VIEWPOINT {' '.join(words)[:80]} of PCD files is not applied: points are taken in the frame in which they "
+            f"VIEWPOINT {' '.join(words)[:80]} of PCD files is not applied: points are in the frame in which they "
             "are stored",
             stacklevel=2,
         )
