@@ -169,6 +169,9 @@ def test_a_camera_that_does_not_fit_its_image_is_told(tmp_path):
     photographed(tmp_path / "other", np.ones((3, 4), int), fov=None)
     with pytest.raises(ValueError, match=r"sensors\.json: .*a camera needs width .* and fov, in degrees"):
         open_recording(tmp_path / "other")
+    photographed(tmp_path / "bent", np.ones((3, 4), int), lens_kcube="0.2", lens_k="-1.0")
+    with pytest.raises(ValueError, match=r"sensors\.json: .*lens_kcube: distorted depth images are not read"):
+        open_recording(tmp_path / "bent")
     photographed(tmp_path / "cloud", np.ones((3, 4), int))
     np.save(tmp_path / "cloud" / "head" / "001.npy", np.zeros((1, 3)))
     with pytest.raises(ValueError, match=r"001\.npy: not a depth image; allowed are files ending in \.png"):
@@ -189,9 +192,24 @@ def test_objects_are_where_they_are_seen_from_the_vehicle(tmp_path):
         open_recording(tmp_path)
 
 
+def test_an_object_without_a_size_costs_no_other(tmp_path):
+    turning(tmp_path, 20.0)
+    rows = [
+        [name, "bike", 4.0, 10.0, 1.0, 0.0, 0.0, 90.0, 0.3, width, 0.9] for name, width in (("17", 0.0), ("18", 0.2))
+    ]
+    for tick in range(5):
+        table(tmp_path / "boxes" / f"{tick}.csv", CARLA_BOX, rows)
+    with pytest.warns(UserWarning, match=r"without a size are left out: 1 of 2 .* 17 \(bike\): .* extent_y 0"):
+        assert open_recording(tmp_path).boxes(1).ids == ("18",)
+
+
 @pytest.mark.parametrize(
     ("box", "message"),
     [
+        (
+            "{location: {x: 0, y: 0, z: 1}, extent: {x: 2, y: 1, z: 1}, rotation: {pitch: 0, yaw: 90, roll: 0}}",
+            "rotation: a box along the vehicle's axes is needed",
+        ),
         ("{extent: {x: 1, y: 1, z: 1}}", "location: Field required"),
         ("[]", "location and extent, each with x, y, z"),
         ("{location: {x: 0, y: 0, z: 0}, extent: {x: 0, y: 1, z: 1}}", "lower < upper on every axis"),

@@ -85,9 +85,7 @@ def test_messages_beside_a_database_are_not_lost(tmp_path, ending):
     assert len(RosBag(path).names) == 2
     (path / f"a.db3{ending}").write_bytes(b"more")
     for opened in (path, path / "a.db3"):
-        with pytest.raises(
-            BadFileError, match=rf"in a.db3{ending} only, .* `sqlite3 a.db3 'PRAGMA quick_check'`"
-        ):
+        with pytest.raises(BadFileError, match=rf"in a.db3{ending} only, .* `sqlite3 a.db3 'PRAGMA quick_check'`"):
             open_recording(opened)
 
 
@@ -262,7 +260,7 @@ def test_files_of_ros_1_are_parts_of_one_bag(tmp_path):
     np.testing.assert_allclose(recording.world_T_vehicle(2), pose_at(0.2), atol=1e-9)
     whole = (tmp_path / "drive" / "lidar.bag").read_bytes()
     (tmp_path / "drive" / "lidar.bag").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(BadFileError, match="`rosbag reindex lidar.bag"):
+    with pytest.raises(BadFileError, match=r"rosbag reindex lidar\.bag"):
         open_recording(tmp_path / "drive")
 
 
@@ -420,7 +418,7 @@ def test_a_bag_that_was_cut_off_or_is_gone(tmp_path, storage, share):
         (file,) = path.glob("a.*")
     file.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
     for opened in {path, file}:
-        with pytest.raises(BadFileError, match=f"a bag .*damaged or cut off.* `{REMEDIES[storage]}"):
+        with pytest.raises(BadFileError, match=f"damaged or cut off, `{REMEDIES[storage]}"):
             open_recording(opened)
     file.unlink()
     if storage == "ros1":

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from torchcover.simulation import builtin_names
+from torchcover.simulation import bodies, builtin_names
 from torchcover.simulation.bodies import Body, Vehicle, VehicleShape, in_vehicle_frame
 from torchcover.simulation.documents import Pose
 from torchcover.simulation.scenario import Mover
@@ -199,14 +199,29 @@ def test_a_body_in_millimetres_is_named_though_scenery_may_be_large(tmp_path):
     ("size_m", "message"),
     [
         ((25.3, 2.55, 4.0), "a: its body is 25.3 x 2.55 x 4 m, far too large for a vehicle on a road"),
-        ((1.94, 4.9, 1.63), r"a: .* wider than long; .* x axis points forward .*yaw_deg: 90"),
-        ((1.94, 1.63, 4.9), r"a: .* higher than long; .* z up"),
+        ((1.94, 4.9, 1.63), r"a: .* wider than long; .* x axis points forward .*{yaw_deg: -90}"),
+        ((1.94, 1.63, 4.9), r"a: .* higher than long; .* z up: .*{yaw_deg: 90, roll_deg: 90}.*glTF"),
         ((0.049, 0.0194, 0.0163), r"a: its body is 0.049 x 0.0194 x 0.0163 m, too small .*metres_per_unit"),
     ],
 )
 def test_a_vehicle_as_none_looks_is_named_with_the_remedy(category, size_m, message):
     with pytest.warns(UserWarning, match=message):
         Mover(shape=Box(type="box", size_m=size_m)).actor("a", category)
+
+
+@pytest.mark.parametrize(
+    ("pose", "forward", "up"),
+    [
+        ({"yaw_deg": 90, "roll_deg": 90}, [0, 0, 1], [0, 1, 0]),  # glTF 2.0: y up, z forward
+        ({"roll_deg": 90}, [1, 0, 0], [0, 1, 0]),
+        ({"yaw_deg": -90}, [0, 1, 0], [0, 0, 1]),
+        ({"yaw_deg": 90}, [0, -1, 0], [0, 0, 1]),
+    ],
+)
+def test_the_turns_that_are_proposed_lead_to_x_forward_and_z_up(pose, forward, up):
+    assert str(pose).replace("'", "") in bodies.WIDE + bodies.HIGH
+    turned = Pose(**pose).matrix()[:3, :3] @ np.array([forward, up]).T
+    np.testing.assert_allclose(turned.T, [[1, 0, 0], [0, 0, 1]], atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -307,8 +307,8 @@ def _cut_and_binned(content: Mapping[str, Any], size: tuple[int, int], K: Matrix
         offset, cut = (whole({key: 0, **roi}, key) for key in (f"{'xy'[axis]}_offset", name))
         key = f"binning_{'xy'[axis]}"
         binning = max(whole({key: 0, **content}, key), 1)
-        is_part = 0 <= offset <= offset + cut <= length or (offset >= 0 and cut == length)
-        if not is_part or (offset and not cut) or offset > MAX_PIXELS:
+        is_part = 0 <= offset < offset + cut <= length or (0 <= offset < MAX_PIXELS and cut == length)
+        if (offset or cut) and not is_part:
             raise ValueError(
                 f"roi: a part of the image's {name} of {length} pixels is needed; got {cut} from {offset} on; give the "
                 "region that was read, or 0 for all"

@@ -64,15 +64,11 @@ def parse_yaml_stream(text: str) -> list[Any]:
     Raises:
         ValueError: As `parse_yaml`.
     """
-    return [document for document in _parse(text, _load_all) if document is not None]
+    return [document for document in _parse(text, _documents) if document is not None]
 
 
-def _load_all(text: str, loader_class: type["_Loader"]) -> list[Any]:
-    loader, documents = loader_class(text), []
-    while loader.check_data():
-        documents.append(loader.get_data())
-        loader.forget_sizes()
-    return documents
+def _documents(text: str, loader_class: type["_Loader"]) -> list[Any]:
+    return list(yaml.load_all(text, loader_class))
 
 
 def builtin_folder(kind: str) -> Path:
@@ -124,9 +120,10 @@ class _Loader(yaml.SafeLoader):
         self._nodes = 0
         self._sizes: dict[int, int] = {}
 
-    def forget_sizes(self) -> None:
-        """Forget the nodes of a document that was read, whose places others may take."""
+    def compose_document(self) -> Node | None:
+        """A document; nodes of the one before, whose places in memory others may take, are forgotten."""
         self._sizes.clear()
+        return super().compose_document()
 
     def compose_node(self, parent: Node | None, index: Any) -> Node | None:  # noqa: ANN401
         """A node; none that is too deep, and none that makes the document too large."""

@@ -1,7 +1,8 @@
 """Bags of ROS 1 and 2 read by rosbags, in a process of their own: nothing that loads torch may be imported here."""
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from operator import itemgetter
 from pathlib import Path
@@ -11,9 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.files import apart, check_memory, check_regular, naming
+from torchcover.files.bad_file import MAX_REASON_CHARS
 
 ROS1_SUFFIX = ".bag"
 METADATA = "metadata.yaml"
+# The command that saves the messages of a file that was cut off, as when its recorder was killed.
+REMEDIES = {
+    ".mcap": "mcap recover {name} -o recovered.mcap",
+    ".db3": "sqlite3 {name} .recover | sqlite3 recovered.db3",
+    ROS1_SUFFIX: "rosbag reindex {name}",
+    ".active": "rosbag reindex {name}",
+}
 # A message of small fields takes up to 20 times its bytes as Python objects.
 OBJECT_BYTES_PER_BYTE = 20
 # Bags that stay open, so that a mixture of recordings does not read their indices again and again.
@@ -36,8 +45,27 @@ class _OpenBag(NamedTuple):
 def find_ros1_files(path: Path) -> list[Path]:
     """Return the files of ROS 1 at a path: the file itself, or those in a folder that is no bag of ROS 2."""
     if path.is_dir():
-        return [] if (path / METADATA).exists() else sorted(path.glob(f"*{ROS1_SUFFIX}"))
-    return [path] if path.suffix == ROS1_SUFFIX else []
+        files = [*path.glob(f"*{ROS1_SUFFIX}"), *path.glob(f"*{ROS1_SUFFIX}.active")]
+        return [] if (path / METADATA).exists() else sorted(files)
+    return [path] if path.name.endswith((ROS1_SUFFIX, f"{ROS1_SUFFIX}.active")) else []
+
+
+def name_remedy(path: Path) -> str:
+    """Say which command saves the messages of a damaged bag, or of one of its files."""
+    name = next((file.name for file in sorted(path.glob("*")) if file.suffix in REMEDIES), path.name)
+    command = REMEDIES.get(Path(name).suffix, "ros2 bag reindex {name}").format(name=name)
+    return f"if {name} is damaged or cut off, `{command}` saves its messages"
+
+
+@contextmanager
+def _naming_remedy(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except (ValueError, FileNotFoundError, ImportError, MemoryError):
+        raise
+    except Exception as error:
+        reason = " ".join(str(error).split())[:MAX_REASON_CHARS]
+        raise ValueError(f"not readable as a bag ({type(error).__name__}: {reason}); {name_remedy(path)}") from error
 
 
 @apart
@@ -55,7 +83,7 @@ def read_bag_index(path: Path) -> dict[str, NDArray[Any]]:
         BadFileError: A damaged bag, or one that takes too much memory.
         ImportError: rosbags is not installed.
     """
-    with naming(path, "a bag"):
+    with naming(path, "a bag"), _naming_remedy(path):
         bag = _open(path)
         types = {connection.topic: str(connection.msgtype) for one in bag.readers for connection in one.connections}
         parts = [_times_of_ros1(one) if bag.is_ros1 else _times_of_ros2(one) for one in bag.readers]
@@ -113,7 +141,8 @@ def _open_version(path: Path, _: Version) -> _OpenBag:
         check_regular(file, "a bag")
     readers = [rosbag1.Reader(file) for file in files] or [rosbag2.Reader(path)]
     for reader in readers:
-        reader.open()
+        with _naming_remedy(reader.path):
+            reader.open()
     return _OpenBag(readers, bool(files))
 
 

@@ -33,8 +33,14 @@ ON_FOOT = {"pedestrian", "person", "adult", "child"}
 RAIL_VEHICLES = {"tram", "train", "rail", "railed"}
 
 TURN = (
-    "a vehicle's x axis points forward and z up: turn it in a vehicle document, as the shape of a part with "
-    "`poses: [{yaw_deg: 90}]`"
+    "a vehicle's x axis points forward and z up: turn it in a vehicle document, as the shape of a part with `poses: "
+    "[{angles}]`"
+)
+# Axes of files: where the vehicle's front and top are, and the pose that turns them to x and z.
+WIDE = TURN.format(angles="{yaw_deg: -90}") + " if its y points forward, `{yaw_deg: 90}` if -y does"
+HIGH = (
+    TURN.format(angles="{yaw_deg: 90, roll_deg: 90}")
+    + " if its y points up and its z forward (glTF and GLB), `{roll_deg: 90}` if y points up and x forward"
 )
 UNITS = (
     "a file in millimetres needs `metres_per_unit: 0.001` beside its `path`, one in centimetres 0.01, one in inches "
@@ -53,7 +59,7 @@ def warn_of_mover(owner: str, mesh: Mesh, category: str) -> None:
     elif on_roads and longest_m < SHORTEST_M:
         _warn(owner, (x, y, z), "too small for a vehicle: is its `metres_per_unit` that of its file?")
     elif on_roads and longest_m > SHORTEST_CAR_M and max(y, z) > x:
-        _warn(owner, (x, y, z), f"{'wider' if y > z else 'higher'} than long; {TURN}")
+        _warn(owner, (x, y, z), f"wider than long; {WIDE}" if y > z else f"higher than long; {HIGH}")
 
 
 def _warn(owner: str, size_m: tuple[float, float, float], what: str) -> None:

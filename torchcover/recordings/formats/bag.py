@@ -13,6 +13,7 @@ from torchcover.recordings.bag_files import (
     METADATA,
     ROS1_SUFFIX,
     find_ros1_files,
+    name_remedy,
     read_bag_index,
     read_bag_messages,
 )
@@ -38,6 +39,10 @@ class Bag:
         files = find_ros1_files(path)
         self._is_ros1 = bool(files)
         if not files and path.is_dir():
+            if not (path / METADATA).exists():
+                raise FileNotFoundError(
+                    f"{path / METADATA}: no such file; `ros2 bag reindex {path}` writes it, or name one file of the bag"
+                )
             check_metadata(path / METADATA)
         elif not files:
             check_suffix(path)
@@ -74,7 +79,7 @@ class Bag:
         found = self.messages(topic, time_ns, time_ns + 1)
         if not found:
             with naming(self.path, "a bag"):
-                raise ValueError(f"{topic}: the message at {time_ns} is in the index only; is the bag damaged?")
+                raise ValueError(f"{topic}: the message at {time_ns} is in the index only; {name_remedy(self.path)}")
         return found[0]
 
 

@@ -1,5 +1,6 @@
 """The files beside CARLA's clouds, in its left-handed axes: sensors, the vehicle's box, objects."""
 
+import warnings
 from pathlib import Path
 from typing import Annotated, Self
 
@@ -14,6 +15,8 @@ from torchcover.files import naming, parse_yaml, read_csv, read_short_text, read
 from torchcover.geometry import BoundingBox, rigid, rotation_from_euler
 from torchcover.geometry.rigid import Matrix
 
+# Attributes of cameras that bend the image, and the values at which CARLA does not.
+LENS = {"lens_k": -1.0, "lens_kcube": 0.0, "lens_x_size": 0.08, "lens_y_size": 0.08}
 LIDARS = ("sensor.lidar.ray_cast", "sensor.lidar.ray_cast_semantic")
 DEPTH = "sensor.camera.depth"
 REFERENCE = "reference"
@@ -49,6 +52,9 @@ class CarlaSensor(BaseModel):
     def _check_camera(self) -> Self:
         if self.type == DEPTH and None in (self.width, self.height, self.fov):
             raise ValueError("a camera needs width (or image_size_x), height (or image_size_y) and fov, in degrees")
+        bent = [name for name, value in LENS.items() if float((self.model_extra or {}).get(name, value)) != value]
+        if self.type == DEPTH and bent:
+            raise ValueError(f"{', '.join(bent)}: distorted depth images are not read; record with CARLA's values")
         return self
 
     @property
@@ -80,6 +86,13 @@ class CarlaVehicle(BaseModel):
 
     location: _Point
     extent: _Point
+    rotation: dict[str, float] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _check_rotation(self) -> Self:
+        if any(self.rotation.values()):
+            raise ValueError(f"rotation: a box along the vehicle's axes is needed; got {self.rotation}")
+        return self
 
     @property
     def vehicle_T_actor(self) -> Matrix:
@@ -126,10 +139,21 @@ def read_carla_boxes(path: Path, vehicle_T_world: Matrix) -> Boxes:
     """Read the objects of a frame.
 
     The table has the columns `id, category, x, y, z, roll, pitch, yaw, extent_x, extent_y, extent_z`: the centre and
-    half the size of each bounding box in the world; `velocity_x, velocity_y` may be there too.
+    half the size of each bounding box in the world; `velocity_x, velocity_y` may be there too. Boxes without a size, as
+    CARLA 0.9.8 to 0.9.14 gives some bicycles and pedestrians, are left out, with a warning.
     """
     table = read_csv(path, (*POSE, *EXTENT), ("id", "category"), VELOCITY)
-    numbers, count = table.numbers, len(table.words["id"])
+    has_size = np.all([table.numbers[name] > 0 for name in EXTENT], axis=0)
+    words = {name: [word for word, has in zip(of, has_size, strict=True) if has] for name, of in table.words.items()}
+    numbers, count = {name: of[has_size] for name, of in table.numbers.items()}, int(has_size.sum())
+    if count < len(has_size):
+        empty = int(np.argmin(has_size))
+        extent = ", ".join(f"{name} {table.numbers[name][empty]:g}" for name in EXTENT)
+        warnings.warn(
+            f"{path.parent}: boxes of objects without a size are left out: {len(has_size) - count} of {len(has_size)} "
+            f"in one frame, such as {table.words['id'][empty]} ({table.words['category'][empty]}): {extent}",
+            stacklevel=2,
+        )
     poses = right_handed([numbers[name] for name in POSE])
     size_m = 2 * np.column_stack([numbers[name] for name in EXTENT])
     over_ground = np.column_stack([numbers.get(name, np.full(count, np.nan)) for name in VELOCITY]) * [1.0, -1.0]
@@ -138,8 +162,8 @@ def read_carla_boxes(path: Path, vehicle_T_world: Matrix) -> Boxes:
         return Boxes.from_rows(
             upright_rows(poses[:, :3, 3], size_m, poses[:, :3, 0], vehicle_T_world),
             velocity_mps=torch.from_numpy(velocity_mps).float(),
-            ids=tuple(table.words["id"]),
-            categories=tuple(table.words["category"]),
+            ids=tuple(words["id"]),
+            categories=tuple(words["category"]),
         )
 
 
