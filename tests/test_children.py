@@ -101,7 +101,7 @@ def test_it_would_not_end_by_itself(alive):
 
 def test_it_ends_though_its_parent_had_ended_before():
     begin = end_with_parent().func  # without the number of this process
-    done = subprocess.run(["sleep", "9"], check=False, preexec_fn=lambda: begin(os.getpid(), math.inf, math.inf))
+    done = subprocess.run(["sleep", "9"], check=False, preexec_fn=lambda: begin(os.getpid(), math.inf, math.inf, True))
     assert done.returncode == -signal.SIGKILL
 
 

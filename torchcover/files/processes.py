@@ -26,18 +26,20 @@ MOST_FILES = 1024
 _prctl = ctypes.CDLL(None).prctl if sys.platform == "linux" else None
 
 
-def end_with_parent(memory_gb: float = math.inf, cpu_s: float = math.inf) -> Callable[..., None] | None:
+def end_with_parent(
+    memory_gb: float = math.inf, cpu_s: float = math.inf, *, writes: bool = True
+) -> Callable[..., None] | None:
     """What a process that this one starts has to call first, to be killed when this one ends, however that ends.
 
-    `memory_gb`: what it may take in all. Returns for the `preexec_fn` of `subprocess` and the `worker_init_fn` of a
-    `DataLoader`; None where the system, any but Linux, cannot do so.
+    `memory_gb`: what it may take in all; `writes`: whether it may write files. Returns for the `preexec_fn` of
+    `subprocess` and the `worker_init_fn` of a `DataLoader`; None where the system, any but Linux, cannot do so.
 
     Example:
         >>> import subprocess
         >>> subprocess.run([sys.executable, "-c", ""], preexec_fn=end_with_parent()).returncode
         0
     """
-    return partial(_end_with, os.getpid(), memory_gb, cpu_s) if _prctl else None
+    return partial(_end_with, os.getpid(), memory_gb, cpu_s, writes) if _prctl else None
 
 
 def is_stopped(pid: int) -> bool:
@@ -111,12 +113,14 @@ def _lower(what: int, most: int) -> None:
     resource.setrlimit(what, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))
 
 
-def _end_with(parent: int, memory_gb: float, cpu_s: float, *_: object) -> None:
+def _end_with(parent: int, memory_gb: float, cpu_s: float, writes: bool, *_: object) -> None:
     assert _prctl is not None  # or nobody would have been given this
     if cpu_s < math.inf:
         _lower(resource.RLIMIT_CPU, math.ceil(cpu_s))
     if memory_gb < math.inf:
         _lower(resource.RLIMIT_AS, int(memory_gb * 1e9))
+    if not writes:
+        _lower(resource.RLIMIT_FSIZE, 0)
     _prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:  # which has ended before this was asked for, or had a server fork this one
         if (starter := parent_process()) and starter.pid == parent:

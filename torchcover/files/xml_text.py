@@ -24,11 +24,13 @@ def parse_xml(path: Path) -> ElementTree.Element:
     return ElementTree.fromstring(text)  # which resolves nothing that lies outside
 
 
-def feed_xml(pieces: Iterable[bytes], start: Callable[[str, list[str]], None]) -> None:
-    """Read XML that may be of any length, one start tag after the other; nothing of it is kept.
+def feed_xml(
+    pieces: Iterable[bytes], start: Callable[[str, list[str]], None], end: Callable[[str], None] | None = None
+) -> None:
+    """Read XML that may be of any length, one tag after the other; nothing of it is kept.
 
     `start`: called with the name of each element, and with the names and values of its attributes in turn; what it
-    raises ends the reading. ValueError: not XML, or it declares entities.
+    raises ends the reading. `end`: called with the name at its end. ValueError: not XML, or it declares entities.
 
     Example:
         >>> feed_xml([b"<a x='1'", b"><b/></a>"], lambda name, attributes: print(name, attributes))
@@ -43,6 +45,7 @@ def feed_xml(pieces: Iterable[bytes], start: Callable[[str, list[str]], None]) -
     parser.ordered_attributes = True
     parser.EntityDeclHandler = refuse
     parser.StartElementHandler = start
+    parser.EndElementHandler = end
     try:
         for piece in pieces:
             parser.Parse(piece)

@@ -1,6 +1,7 @@
 """SUMO at work: streets and traffic that are drawn, OpenDRIVE, and what it refuses."""
 
 import os
+import re
 import subprocess
 import sys
 
@@ -159,6 +160,83 @@ def test_what_sumo_says_is_passed_on_and_entities_never_get_to_it(tmp_path):
         made.world(0)
     with pytest.raises(FileNotFoundError, match=r"none\.xml"):
         Sumo(net=net, routes=(tmp_path / "none.xml",), duration_s=2.0).world(0)
+
+
+OUTPUT = "x.out"
+
+
+@pytest.fixture(scope="module")
+def road(tmp_path_factory):
+    """A network with one street, the edge -1."""
+    folder = tmp_path_factory.mktemp("road")
+    (folder / "road.xodr").write_text(XODR)
+    return simulating.from_opendrive(folder / "road.xodr", folder, leave_out_links=False)
+
+
+@pytest.mark.parametrize(
+    ("where", "added", "told"),
+    [
+        ("route", '<param key="device.ssm.file" value="{out}"/>', "'device.ssm.file' of <vehicle>"),
+        ("route", '<param key="device.toc.file" value="localhost:9"/>', "'device.toc.file' of <vehicle>"),
+        ("route", '<param key="has.ssm.device" value="true"/>', "'has.ssm.device' of <vehicle>"),
+        ("route", '<param key="device.fcd-replay.file" value="/etc/passwd"/>', "'device.fcd-replay.file' of <vehicle>"),
+        (
+            "route",
+            '<param key="device.taxi.dispatch-algorithm.output" value="{out}"/>',
+            "algorithm.output' of <vehicle>",
+        ),
+        ("root", '<include href="{out}"/>', "<include> is not read"),
+        ("root", '<calibrator id="c" edge="a" pos="1" output="{out}"/>', "<calibrator> is not read"),
+        ("root", '<vType id="t" output="{out}"/>', "'output' of <vType> names a file or an address"),
+        ("root", '<x:inductionLoop xmlns:x="a" id="e" file="{out}"/>', "<x:inductionLoop> is not read"),
+        ("net", '<inductionLoop id="e" lane="a_0" pos="1" freq="1" file="{out}"/>', "<inductionLoop> is not read"),
+        ("net", '<edgeData id="e" file="{out}"/>', "<edgeData> is not read"),
+        ("net", '<vTypeProbe id="e" file="{out}"/>', "<vTypeProbe> is not read"),
+        ("net", '<rerouter id="r" edges="a" file="{out}"/>', "<rerouter> is not read"),
+        ("net", '<timedEvent type="SaveTLSStates" source="0" dest="{out}"/>', "<timedEvent> is not read"),
+        (
+            "net",
+            '<tlLogic id="0" type="actuated" programID="p"><param key="file" value="{out}"/></tlLogic>',
+            "'file' of",
+        ),
+        ("net", '<tlLogic id="0" type="swarm" programID="p"/>', "<tlLogic> of type 'swarm' is not read"),
+        ("net", '<include href="{out}"/>', "<include> is not read"),
+    ],
+)
+def test_scenarios_name_no_outputs_and_no_addresses(road, tmp_path, where, added, told):
+    out = tmp_path / OUTPUT
+    out.write_text("a user's file")
+    added = added.format(out=out)
+    (tmp_path / "a.net.xml").write_text(road.read_text().replace("</net>", f"{added * (where == 'net')}</net>"))
+    route = f'<vehicle id="me" depart="0"><route edges="-1"/>{added * (where == "route")}</vehicle>'
+    (tmp_path / "r.xml").write_text(f"<routes>{added * (where == 'root')}{route}</routes>")
+    with pytest.raises(BadFileError, match=re.escape(told)):
+        Sumo(net=tmp_path / "a.net.xml", routes=(tmp_path / "r.xml",), ego_id="me", begin_s=0.0, duration_s=1.0).world(
+            0
+        )
+    assert [one.read_text() for one in tmp_path.glob(OUTPUT)] == ["a user's file"]
+
+
+def test_pictures_and_notes_of_scenarios_change_nothing(road, tmp_path):
+    routes = tmp_path / "a,b.xml"  # which SUMO would take for two files
+    notes = '<param key="my note" value="a/b.xml"/><param key="has.rerouting.device" value="true"/>'
+    routes.write_text(
+        '<routes><vType id="t" imgFile="car.png" emissionClass="PHEMlight/../x" lcStrategic="1" jmTimegapMinor="1"/>'
+        f'<vehicle id="me" type="t" depart="0"><route edges="-1"/>{notes}</vehicle></routes>'
+    )
+    world = Sumo(net=road, routes=(routes,), ego_id="me", begin_s=1.0, duration_s=1.0).world(0)
+    assert len(world.ego.trajectory.times_s)
+
+
+def test_a_program_that_reads_given_files_writes_none_and_talks_without_end(tmp_path, monkeypatch):
+    (tmp_path / "bin").mkdir()
+    program = tmp_path / "bin" / "sumo"
+    program.write_text(f"#!/bin/sh\nhead -c 3000000 /dev/zero >&2; echo x > {tmp_path}/new || kill -XFSZ $$")
+    program.chmod(0o700)
+    monkeypatch.setattr(simulating, "home", lambda: tmp_path)
+    with pytest.raises(ValueError, match="SUMO's sumo tried to write a file"):
+        list(simulating.output_of("sumo"))
+    assert (tmp_path / "new").read_text() == ""
 
 
 def test_a_network_that_takes_more_memory_than_it_may_says_what_to_do(tmp_path, monkeypatch):

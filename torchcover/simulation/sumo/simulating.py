@@ -9,11 +9,14 @@ from contextlib import closing
 from importlib.util import find_spec
 from pathlib import Path
 from shutil import which
-from tempfile import TemporaryFile
+from tempfile import TemporaryDirectory
+from threading import Thread
+from typing import IO
 from xml.etree import ElementTree
 
 from torchcover.files import end_with_parent, most_gb, parse_xml, reads, reporting_stopped
 from torchcover.files.bad_file import VARIABLE
+from torchcover.simulation.sumo.checked_files import copy_checked
 from torchcover.simulation.sumo.floating import ATTRIBUTES
 from torchcover.simulation.traffic.assemble import HORIZON_M
 
@@ -27,6 +30,8 @@ PIECE_BYTES = 1 << 18
 # So many links are named.
 SHOWN = 5
 MAX_TOLD_CHARS = 500
+# Errors come last, after any number of warnings.
+KEPT_MESSAGE_BYTES = 1 << 16
 # Processor time that a program may take which converts a file.
 MOST_S = 600.0
 # They would look for schemas on the network.
@@ -34,25 +39,41 @@ ALWAYS = ("--xml-validation", "never")
 
 
 def run(program: str, *options: str | Path) -> None:
-    """Run a program to its end. ImportError: SUMO is not installed. ValueError: it fails; with its own message."""
-    for _ in output_of(program, *options, cpu_s=MOST_S):
+    """Run a program on inputs of our own, which writes its outputs into files.
+
+    Raises:
+        ImportError: SUMO is not installed.
+        ValueError: The program fails; with its own message.
+    """
+    for _ in output_of(program, *options, cpu_s=MOST_S, writes=True):
         pass
 
 
-def output_of(program: str, *options: str | Path, cpu_s: float = math.inf) -> Iterator[bytes]:
-    """What a program writes to its standard output, piece by piece; whoever stops asking ends the program."""
+def output_of(program: str, *options: str | Path, cpu_s: float = math.inf, writes: bool = False) -> Iterator[bytes]:
+    """Yield what a program writes to its standard output, piece by piece; closing the iterator ends the program.
+
+    Args:
+        program: One of SUMO's programs.
+        options: Its command line.
+        cpu_s: Processor time after which it is ended.
+        writes: Whether it may write files. Programs that read what users give must not.
+    """
     folder = home()
     command = [str(folder / "bin" / program), *ALWAYS, *map(str, options)]
-    with TemporaryFile() as said:
+    with TemporaryDirectory() as working_folder:
         process = subprocess.Popen(
             command,
+            cwd=working_folder,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
-            stderr=said,
-            env={**os.environ, "SUMO_HOME": str(folder)},
-            preexec_fn=end_with_parent(most_gb(), cpu_s),  # noqa: PLW1509  (one call of the system, no lock)
+            stderr=subprocess.PIPE,
+            env={**os.environ, "SUMO_HOME": str(folder), "PROJ_NETWORK": "OFF"},
+            preexec_fn=end_with_parent(most_gb(), cpu_s, writes=writes),  # noqa: PLW1509  (system calls, no lock)
         )
         assert process.stdout is not None  # as asked for
+        assert process.stderr is not None
+        messages = _LastBytes(process.stderr)
+        messages.start()
         try:
             with closing(process.stdout):
                 while piece := _read_piece(process, program):
@@ -61,11 +82,13 @@ def output_of(program: str, *options: str | Path, cpu_s: float = math.inf) -> It
         finally:
             process.kill()
             process.wait()
+            messages.join()
         if ended == -signal.SIGXCPU:
             raise ValueError(f"SUMO's {program} took more than {cpu_s:g} s of processor time; is the file damaged?")
+        if ended == -signal.SIGXFSZ:
+            raise ValueError(f"SUMO's {program} tried to write a file, which what it reads must not make it do")
         if ended:
-            said.seek(0)
-            told = _errors(said.read().decode("utf-8", "replace").splitlines())
+            told = _errors(messages.last.decode("utf-8", "replace").splitlines())
             if "bad_alloc" in told:
                 told += f"; it may take {most_gb():g} GB: take a piece of the network, or set {VARIABLE} to more"
             raise ValueError(f"SUMO's {program} fails: {told}")
@@ -75,6 +98,20 @@ def _read_piece(process: subprocess.Popen[bytes], program: str) -> bytes:
     assert process.stdout is not None  # as asked for
     with reporting_stopped([process.pid], f"SUMO's {program}"):
         return process.stdout.read(PIECE_BYTES)
+
+
+class _LastBytes(Thread):
+    """Empties a pipe of messages, however many there are, and keeps the last of them."""
+
+    def __init__(self, pipe: IO[bytes]) -> None:
+        super().__init__(daemon=True)
+        self.last = b""
+        self._pipe = pipe
+
+    def run(self) -> None:
+        with self._pipe:
+            while piece := self._pipe.read(KEPT_MESSAGE_BYTES):
+                self.last = (self.last + piece)[-KEPT_MESSAGE_BYTES:]
 
 
 def _errors(lines: Sequence[str]) -> str:
@@ -110,12 +147,16 @@ def simulate(
     if around is not None:
         options += ["--device.fcd.explicit", around, "--person-device.fcd.explicit", around]
         options += ["--device.fcd.radius", str(HORIZON_M + BEYOND_M)]
-    return output_of(
-        "sumo", "--net-file", network, "--route-files", ",".join(map(str, routes)), "--seed", str(seed),
-        "--step-length", str(STEP_S), "--device.fcd.begin", str(begin_s), "--fcd-output", "stdout",
-        "--fcd-output.attributes", ATTRIBUTES, "--precision", "4", "--lanechange.duration", str(LANE_CHANGE_S),
-        "--collision.action", "warn", "--no-step-log", "--duration-log.disable", *options,
-    )  # fmt: skip
+    with TemporaryDirectory() as folder:
+        # Copies, whose names hold no comma either, at which SUMO would split them.
+        net = copy_checked(network, Path(folder) / "checked.net.xml", "network")
+        demand = [copy_checked(path, Path(folder) / f"{k}.rou.xml", "routes") for k, path in enumerate(routes)]
+        yield from output_of(
+            "sumo", "--net-file", net, "--route-files", ",".join(map(str, demand)), "--seed", str(seed),
+            "--step-length", str(STEP_S), "--device.fcd.begin", str(begin_s), "--fcd-output", "stdout",
+            "--fcd-output.attributes", ATTRIBUTES, "--precision", "4", "--lanechange.duration", str(LANE_CHANGE_S),
+            "--collision.action", "warn", "--no-step-log", "--duration-log.disable", *options,
+        )  # fmt: skip
 
 
 @reads("an OpenDRIVE road")
@@ -128,13 +169,14 @@ def from_opendrive(path: Path, folder: Path, *, leave_out_links: bool) -> Path:
     if lost and leave_out_links:
         for parent, link, _ in lost:
             parent.remove(link)
-        path = folder / "linked.xodr"
-        ElementTree.ElementTree(root).write(path)
+    copy = folder / "checked.xodr"  # as the parser understands it: without declarations, under a name without a comma
+    ElementTree.ElementTree(root).write(copy, encoding="utf-8")
     try:
-        run(
-            "netconvert", "--opendrive-files", path, "--output-file", network, "--precision", "3",
+        written = b"".join(output_of(
+            "netconvert", "--opendrive-files", copy, "--output-file", "stdout", "--precision", "3",
             "--opendrive.import-all-lanes", "--opendrive.curve-resolution", "2", "--walkingareas", "--crossings.guess",
-        )  # fmt: skip
+            cpu_s=MOST_S,
+        ))  # fmt: skip
     except ValueError as error:
         if not lost or leave_out_links:
             raise
@@ -144,6 +186,7 @@ def from_opendrive(path: Path, folder: Path, *, leave_out_links: bool) -> Path:
         raise ValueError(
             f"{error}; links lead to what is not there: {told}; `leave_out_links: true` goes on without"
         ) from error
+    network.write_bytes(written[: written.rindex(b">") + 1])  # "Success." follows
     converted = parse_xml(network)
     for lane in converted.iter("lane"):
         if lane.get("type") == "sidewalk" and lane.get("allow") is None:
