@@ -1,5 +1,7 @@
 """Trajectories and recorded actors from files, good and bad."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -56,6 +58,54 @@ def test_a_bad_trajectory_names_the_file(tmp_path, content, message):
     with pytest.raises(ValueError, match=message) as caught:
         read_trajectory(path)
     assert str(caught.value).startswith(f"{path}: ")
+
+
+UNIX_S = 1_700_000_000
+
+
+def scenario_at(folder, ego_s, actor_s, boxes_s):
+    """A run of 4 s of an ego, an actor and a box that drive at 2, 3 and 4 m/s from times of their own clocks."""
+    for name, start_s, speed in (("ego", ego_s, 2), ("actor", actor_s, 3)):
+        rows = "".join(f"{start_s + k / 4:.6f},{speed * k / 4},{10 * speed},0,0,0,0\n" for k in range(17))
+        write(folder, HEADER + rows, f"{name}.csv")
+    rows = "".join(f"{boxes_s + k / 4:.6f},1,car,{k},9,0,4,2,1.5,0\n" for k in range(17))
+    write(folder, BOXES + rows, "boxes.csv")
+    text = (
+        "name: clocks\nego: {trajectory: ego.csv}\nboxes: boxes.csv\nduration_s: 4\ntime_step_s: 0.5\n"
+        "bodies: [{name: ground, shape: {type: plane, size_m: [90, 90]}}]\n"
+        "actors: [{name: a, category: car, shape: {type: box, size_m: [4, 2, 1]}, trajectory: actor.csv}]\n"
+    )
+    return Scenario.load(write(folder, text, "clocks.yaml"))
+
+
+@pytest.mark.parametrize("start_s", [0, UNIX_S, 1e5])
+def test_trajectories_of_another_clock_move_alike(tmp_path, start_s):
+    world = scenario_at(tmp_path, start_s, start_s + 1, start_s).world()
+    places_m = [actor.trajectory.positions_at(np.array([0.0, 1.5, 3.0]))[:, 0] for actor in (world.ego, *world.actors)]
+    np.testing.assert_allclose(places_m, [[0, 3, 6], [0, 1.5, 6], [0, 6, 12]], atol=1e-5)
+
+
+def test_trajectories_of_different_clocks_are_named(tmp_path):
+    with pytest.warns(UserWarning, match="give all trajectories one clock") as warned:
+        scenario_at(tmp_path, UNIX_S, 0, UNIX_S).world()
+    first, second = (str(warning.message) for warning in warned)
+    assert first.startswith(
+        "ego rests: its times, 1700000000.000 to 1700000004.000 s, lie outside of the run, 0.000 to"
+    )
+    assert second.startswith("1 is not there: its times, 1700000000.000 to")
+
+
+@pytest.mark.parametrize(
+    ("times", "message"),
+    [
+        (np.arange(4) * 100_000_000, "times in seconds are needed; the usual step of these is 1e+08: divide them by"),
+        ((np.arange(4) * 0.1 + 1e5).astype("f4"), "times of float32 are up to 0.0078125 s off, with a usual step of"),
+    ],
+)
+def test_times_in_other_units_are_refused(tmp_path, times, message):
+    np.savez(tmp_path / "p.npz", times_s=times, world_T_body=np.tile(np.eye(4), (4, 1, 1)))
+    with pytest.raises(ValueError, match=f"p.npz: {re.escape(message)}"):
+        read_trajectory(tmp_path / "p.npz")
 
 
 def test_poses_that_are_not_rigid_are_refused(tmp_path):

@@ -69,6 +69,14 @@ class Trajectory:
         """From (K, 4, 4) rigid transforms."""
         return cls.from_arrays(times_s, world_T_body[:, :3, 3], euler_from_rotation(world_T_body[:, :3, :3]))
 
+    def since(self, start_s: float) -> "Trajectory":
+        """The same poses, with times that count from another instant.
+
+        Args:
+            start_s: Its time on the clock of this trajectory, in seconds.
+        """
+        return Trajectory(self.times_s - start_s, self.positions_m, self.angles_deg, self.transient)
+
     @property
     def moves(self) -> bool:
         """Whether the body ever changes its pose, enters or leaves."""

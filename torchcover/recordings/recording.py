@@ -19,6 +19,10 @@ from torchcover.recordings.clouds.arrays import Points
 
 # A return from so near to the origin of its frame is one that never came, which drivers store as zeros.
 NO_RETURN_M = 1e-3
+# Steps that are longer are counts of milliseconds, microseconds or nanoseconds.
+LONGEST_STEP_S = 60.0
+# Times may be off by this share of a step.
+COARSEST = 0.01
 
 
 @dataclass(frozen=True)
@@ -63,7 +67,32 @@ def check_times(times_s: NDArray[np.float64], count: int, source: str) -> NDArra
             f"{source}: times have to ascend; {len(bad)} do not, the first after instant {first}: "
             f"{times_s[first]:.6f} s, then {times_s[first + 1]:.6f} s"
         )
+    check_seconds(times_s, f"{source}: ")
     return times_s
+
+
+def check_seconds(times_s: NDArray[np.floating], source: str = "") -> None:
+    """Refuse ascending times that are in another unit than seconds, or too coarse.
+
+    Args:
+        times_s: (K,) times as they were stored.
+        source: What begins the message.
+
+    Raises:
+        ValueError: Their median step is longer than a minute, or they are float32 and as far apart as its digits.
+    """
+    step_s = float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0
+    if step_s > LONGEST_STEP_S:
+        raise ValueError(
+            f"{source}times in seconds are needed; the usual step of these is {step_s:g}: divide them by 1e3, 1e6 or "
+            "1e9 if they count milliseconds, microseconds or nanoseconds"
+        )
+    digits_s = float(np.spacing(np.abs(times_s).max(initial=0.0)))
+    if step_s and digits_s > COARSEST * step_s:
+        raise ValueError(
+            f"{source}times of {times_s.dtype} are up to {digits_s:g} s off, with a usual step of {step_s:g} s; store "
+            "them as float64, or count them from the first one"
+        )
 
 
 class Recording(Protocol):

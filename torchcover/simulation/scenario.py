@@ -1,6 +1,9 @@
 """A scenario: the world around the ego, what moves in it, and the ego's own body."""
 
 import math
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
@@ -304,8 +307,14 @@ class Scenario(BuiltIn):
                     f"body {static[number][1].name!r} is ground, but none of its faces is an upper side that one could "
                     f"stand on, at most {STEEPEST_DEG:g} degrees steep; is z up?"
                 )
-        driver = self.ego.actor("ego", "ego")
-        actors = tuple(actor.actor(actor.name, actor.category) for actor in self.actors)
+        driver, *actors = _on_run_clock(
+            [
+                self.ego.actor("ego", "ego"),
+                *(actor.actor(actor.name, actor.category) for actor in self.actors),
+                *(read_boxes(self.boxes) if self.boxes else ()),
+            ],
+            self.duration_s,
+        )
         static_T_world = rigid(np.eye(3), -driver.trajectory.positions_m[0])
         within = [isinstance(body.shape, MeshFile) for _, body in static]
         coincident = coincident_faces([mesh.moved(static_T_world) for mesh, _ in static], within)
@@ -313,9 +322,34 @@ class Scenario(BuiltIn):
         return World(
             static=tuple(mesh for mesh, _ in static),
             ego=driver,
-            actors=actors + (read_boxes(self.boxes) if self.boxes else ()),
+            actors=tuple(actors),
             time_step_s=self.time_step_s,
             duration_s=self.duration_s,
             ground=ground or None,
             coincident=tuple(coincident) if any(mask.any() for mask in coincident) else (),
         )
+
+
+def _on_run_clock(actors: Sequence[Actor], duration_s: float) -> list[Actor]:
+    """Let the times of trajectories count from the beginning of the run.
+
+    Files may have another clock, such as seconds since 1970: if all trajectories begin after the end of the run, the
+    first of their times is its beginning. A warning names those that still lie outside of the run.
+    """
+    moving = [actor for actor in actors if actor.trajectory.moves]
+    first_s = min((float(actor.trajectory.times_s[0]) for actor in moving), default=0.0)
+    start_s = first_s if first_s > duration_s else 0.0
+    placed = [
+        replace(actor, trajectory=actor.trajectory.since(start_s)) if start_s and actor.trajectory.moves else actor
+        for actor in actors
+    ]
+    for actor in placed:
+        times_s = actor.trajectory.times_s
+        if actor.trajectory.moves and not (times_s[0] <= duration_s and times_s[-1] >= 0.0):
+            state = "is not there" if actor.trajectory.transient else "rests"
+            warnings.warn(
+                f"{actor.name} {state}: its times, {times_s[0] + start_s:.3f} to {times_s[-1] + start_s:.3f} s, lie "
+                f"outside of the run, {start_s:.3f} to {start_s + duration_s:.3f} s; give all trajectories one clock",
+                stacklevel=3,
+            )
+    return placed

@@ -10,6 +10,7 @@ from torchcover.files import NpyHeader, read_csv, read_npz, reads
 from torchcover.geometry import check_rigid
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings.objects import Track, checked_size, class_of, moving
+from torchcover.recordings.recording import check_seconds
 
 TRAJECTORY_COLUMNS = ("t", "x", "y", "z", "roll", "pitch", "yaw")
 BOX_COLUMNS = ("t", "x", "y", "z", "length", "width", "height", "yaw")
@@ -29,6 +30,7 @@ def read_trajectory(path: Path) -> Trajectory:
     if path.suffix not in readers:
         raise ValueError(f"a trajectory is a .csv or .npz file; got {path.suffix or 'no suffix'}")
     trajectory = readers[path.suffix](path)
+    check_seconds(trajectory.times_s)
     check_gaps(trajectory.times_s)
     return trajectory
 
@@ -47,6 +49,7 @@ def read_box_tracks(path: Path) -> tuple[Track, ...]:
 def _tracks(path: Path) -> Iterator[Track]:
     table = read_csv(path, BOX_COLUMNS, ("id", "category"), None)
     rows = _columns(table.numbers, BOX_COLUMNS)
+    check_seconds(np.unique(rows[:, 0]))
     own: dict[str, list[int]] = {}
     for row, name in enumerate(table.words["id"]):
         own.setdefault(name, []).append(row)
@@ -87,6 +90,7 @@ def _read_npz(path: Path) -> Trajectory:
     times_s, poses = read_npz(path, check, choose).values()
     if times_s.ndim != 1 or poses.shape != (len(times_s), 4, 4):
         raise ValueError(f"times_s (K,) and world_T_body (K, 4, 4) are needed; got {times_s.shape} and {poses.shape}")
+    check_seconds(times_s)
     return Trajectory.from_poses(times_s, np.stack([check_rigid(pose, f"pose {k}") for k, pose in enumerate(poses)]))
 
 
