@@ -33,11 +33,10 @@ from examples.train_detector import (
     thinned,
 )
 from torchcover import Region
+from torchcover.contrib import Judged, agreement_of, lead, metric_names, score_placements
+from torchcover.contrib.ranks import LEAST
 from torchcover.data import Augmentation, SimulatedFrames
 from torchcover.detection import RecallByVisibility
-from torchcover.evaluation import score_placements
-from torchcover.published import Judged, agreement_of, lead, metric_names
-from torchcover.published.ranks import LEAST
 from torchcover.simulation import PaperReference, Rig
 
 # Where a LiDAR may be: x, y, z in metres, on the SUV's roof, before its front, and beside its left and right flank.

@@ -29,7 +29,7 @@ print(json.dumps(seen))
     [
         "torchcover.cameras.camera",
         "torchcover.placement.optimisers.gp_model",
-        "torchcover.published.perception_entropy",
+        "torchcover.contrib.perception_entropy",
     ],
 )
 def test_whoever_needs_them_has_made_the_first_calls_with_one_number_each(module):

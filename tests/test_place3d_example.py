@@ -7,10 +7,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from tests.contrib.voxel_frames import beam, place3d
 
-from tests.published.voxel_frames import beam, place3d
-from torchcover.published import agreement_of, read_results
-from torchcover.published.ranks import spearman
+from torchcover.contrib import agreement_of, read_results
+from torchcover.contrib.ranks import spearman
 from torchcover.simulation import Lidar, Pose, Rig, builtin_folder
 
 ROOT = Path(__file__).parents[1]

@@ -11,8 +11,8 @@ from pathlib import Path
 from examples.place3d.boards import DISTANCES_M, cells_hit
 from examples.place3d.page import page
 from examples.place3d.study import agree, agreements
+from torchcover.contrib import Ranking, metric_names
 from torchcover.estimation import Quantity
-from torchcover.published import Ranking, metric_names
 from torchcover.simulation import Rig
 
 

@@ -2,8 +2,7 @@
 
 from typing import NamedTuple
 
-from torchcover.evaluation import score_placements
-from torchcover.published import Judged, agreement_of, read_results
+from torchcover.contrib import Judged, agreement_of, read_results, score_placements
 from torchcover.simulation import builtin_folder, builtin_names
 
 PAPER = "place3d2024"

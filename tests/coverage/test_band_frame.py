@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from torchcover import BevGrid, Coverage, CoverageMetric
+from torchcover.contrib import FalseVisible, KCover, PointDensity
 from torchcover.coverage import Maximum, check_paired
 from torchcover.data import Frame
 from torchcover.evaluation import CoverageObserver
-from torchcover.published import FalseVisible, KCover, PointDensity
 from torchcover.simulation import Lidar
 
 EXTENT = {"x": (0.0, 40.0), "y": (0.0, 1.0), "cell": 1.0}

@@ -7,11 +7,11 @@ import pytest
 
 from tests.simulation.small_worlds import FLOOR, box, scenario
 from torchcover import BevGrid, CoverageMetric, Region
+from torchcover.contrib import PUBLISHED, Setup, Sights, SMig
 from torchcover.coverage import Maximum
 from torchcover.data import SimulatedFrames
 from torchcover.evaluation.observers import CoverageObserver
 from torchcover.placement import CommonInstants, Objective
-from torchcover.published import PUBLISHED, Setup, Sights, SMig
 from torchcover.simulation import Rig, SurfaceReference
 from torchcover.targets import Raster, Target, survey
 

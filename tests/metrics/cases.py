@@ -10,11 +10,7 @@ import torch
 from torchmetrics import Metric
 
 from torchcover import BevGrid, CoverageMetric, Region
-from torchcover.coverage import AGGREGATIONS, StepQuantiles
-from torchcover.data import Frame
-from torchcover.detection import Boxes, RecallByVisibility
-from torchcover.geometry import BoundingBox
-from torchcover.published import (
+from torchcover.contrib import (
     FalseVisible,
     KCover,
     MSog,
@@ -23,6 +19,10 @@ from torchcover.published import (
     PointDensity,
     SMig,
 )
+from torchcover.coverage import AGGREGATIONS, StepQuantiles
+from torchcover.data import Frame
+from torchcover.detection import Boxes, RecallByVisibility
+from torchcover.geometry import BoundingBox
 from torchcover.simulation import Lidar, Pose
 
 Step = Mapping[str, Any]

@@ -13,11 +13,11 @@ import torch
 from torchmetrics import Metric, MetricCollection
 from torchmetrics.aggregation import SumMetric
 
+import torchcover.contrib
 import torchcover.coverage
 import torchcover.detection
-import torchcover.published
+from torchcover.contrib import FrameMetric, WorldRatios
 from torchcover.metrics import MergeableMetric, SumsInBlocks
-from torchcover.published import FrameMetric, WorldRatios
 
 from .cases import CASES, flat, in_lists
 from .two_ranks import in_two_processes
@@ -66,13 +66,13 @@ def assert_same(result, expected):
 
 
 def test_every_metric_of_the_package_is_asked():
-    for room in (torchcover.coverage, torchcover.detection, torchcover.published):
+    for room in (torchcover.coverage, torchcover.detection, torchcover.contrib):
         for module in pkgutil.iter_modules(room.__path__, f"{room.__name__}."):
             importlib.import_module(module.name)
     bases = {MergeableMetric, SumsInBlocks, FrameMetric, WorldRatios}
     kinds = {kind for base in bases for kind in base.__subclasses__()} - bases
     # Who needs a world is asked in its own room.
-    rooms = ("torchcover.coverage.", "torchcover.detection.", "torchcover.published.")
+    rooms = ("torchcover.coverage.", "torchcover.detection.", "torchcover.contrib.")
     own = {kind for kind in kinds if kind.__module__.startswith(rooms)}
     assert {type(case.make()) for case in CASES.values()} == own
 

@@ -11,7 +11,6 @@ from torchcover.evaluation import CoverageObserver
 from torchcover.placement import Objective
 from torchcover.placement.questions import Questions
 from torchcover.placement.racing import gains
-from torchcover.published import PUBLISHED, Setup
 
 OUTLINE_M = np.array([[-2.0, -1.0], [2.0, -1.0], [2.0, 1.0], [-2.0, 1.0]])
 LANE = {"lane": {"x_m": [-7.3, -2.0], "y_m": [-1.2, 1.6]}}
@@ -150,26 +149,6 @@ def test_what_the_second_sensor_loses_without_a_block_is_known_too(several):
     assert [key for key, one in zip(NUMBERS, unknown.tolist(), strict=True) if one] == ["radius_maximum_m"]
 
 
-@pytest.mark.parametrize("key", ["object_coverage_0.4m", "k_cover_2_0.4m", "s_mig_0.2m"])
-def test_a_published_metric_says_what_it_says_of_the_same_frames(key):
-    found = held(objectives={"theirs": Objective(number=key)}, worlds=2, per_world=1)
-    estimate = found.estimates(TWO)["area"]
-    asked = found.questions
-    setup = Setup(
-        rig="two", sensors=TWO.sensors, ego=found.scenarios[0].ego_mesh(), grid=asked.grid,
-        regions=tuple(asked.regions.values()), square_metres=True,
-    )  # fmt: skip
-    name = max((name for name in PUBLISHED if key.startswith(name)), key=len)
-    metric = PUBLISHED[name].make(setup)
-    for frame in found.frames(TWO, found.order.tolist()):
-        metric.update(frame)
-    (number,) = (number for number in metric.compute() if number.quantity.key == key)
-    assert estimate.value.tolist() == [number.value]
-    (quantity,) = estimate.quantities
-    assert (quantity.key, quantity.unit) == ("theirs", number.quantity.unit)
-    assert quantity.lower_is_better == number.quantity.lower_is_better
-
-
 @pytest.mark.parametrize(
     ("given", "near"),
     [
@@ -181,7 +160,6 @@ def test_a_published_metric_says_what_it_says_of_the_same_frames(key):
         ("radius_maximal_m", "radius_maximum_m"),
         ("detection_0.4.1m", "detection_0.4m"),
         ("radius_q0.9.1_m", "radius_q0.9_m"),
-        ("s_mgi_0.2m", "s_mig_0.2m"),
     ],
 )
 def test_a_number_that_no_result_has_is_refused_with_the_nearest(given, near):
@@ -190,20 +168,11 @@ def test_a_number_that_no_result_has_is_refused_with_the_nearest(given, near):
         asked.check(TWO)
 
 
-def test_a_number_of_a_metric_that_it_does_not_have_is_refused_with_the_nearest():
-    asked = Questions.around(OUTLINE_M, {"odd": Objective(number="s_mig_0.3m")})
-    with pytest.raises(ValueError, match=r"no result has a number 's_mig_0\.3m'; near is 's_mig_0\.2m'"):
-        asked.check(TWO)
-
-
 @pytest.mark.parametrize(
     ("given", "message"),
     [
         ({"number": "radius_m", "detection": 0.4, "region": "20m"}, "number, detection: one of the two"),
         ({"number": "radius_m"}, r"region: it is needed for 'radius_m' \["),
-        ({"number": "s_mgi_0.2m"}, "region: it is needed for 's_mgi_0.2m'; near is 's_mig_0.2m' of a published"),
-        ({"number": "s_mig_0.2m", "region": "20m"}, "region: 's_mig_0.2m' has none"),
-        ({"number": "s_mig_0.2m", "band": "ground"}, "band: 's_mig_0.2m' has none"),
     ],
 )
 def test_an_objective_that_makes_no_sense_is_refused(given, message):

@@ -10,7 +10,6 @@ from torchcover.evaluation import MixedResult, Result, Study
 from torchcover.evaluation.mixed import MIXTURE
 from torchcover.evaluation.result_page import left_out_table
 from torchcover.evaluation.study import WANTED
-from torchcover.published.comparison import page_tables
 from torchcover.report import Terminal, print_table, print_whole
 
 
@@ -38,7 +37,7 @@ def print_verdict(sentences: Sequence[str], console: Terminal) -> None:
 def _print_world(result: Result, console: Terminal, *, explain: bool) -> None:
     print_table(result.table, console)
     if result.metrics:
-        print_whole(page_tables(result.metrics, parts=False))
+        print_whole(result.metrics.page_tables(parts=False))
     if explain and result.left_out:
         print_whole([left_out_table(result.left_out)])
     if explain and result.run:

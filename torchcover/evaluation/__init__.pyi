@@ -16,8 +16,6 @@ from .observers import Stateful as Stateful
 from .pipeline import Run as Run
 from .pipeline import StoppingRule as StoppingRule
 from .pipeline import observe as observe
-from .placement_scores import PlacementScores as PlacementScores
-from .placement_scores import score_placements as score_placements
 from .progress import Progress as Progress
 from .ranks import Ranks as Ranks
 from .ranks import joined_ranks as joined_ranks

@@ -11,12 +11,11 @@ from torchcover.coverage import CoverageMetric
 from torchcover.evaluation.checkpoint import Checkpoint, Journal
 from torchcover.evaluation.cores import usual_workers
 from torchcover.evaluation.observers import AnyObserver, CoverageObserver
-from torchcover.evaluation.other_metrics import compared, metrics_of
 from torchcover.evaluation.pipeline import Run, StoppingRule, observe
 from torchcover.evaluation.ranks import Ranks
 from torchcover.evaluation.result import Result
 from torchcover.evaluation.result_page import check_drawable, left_out
-from torchcover.evaluation.settings import Settings
+from torchcover.evaluation.settings import Settings, load_contrib
 from torchcover.evaluation.target_error import TargetWatch
 from torchcover.evaluation.task import CALLER, Task, casting_device, run_identity, usable_device
 from torchcover.files import claimed
@@ -44,7 +43,7 @@ def measured(task: Task[FrameSource], settings: Settings, until: StoppingRule | 
     sensors = [sensor for of_rig in task.sensors.values() for sensor in of_rig]
     check_drawable(sensors)
     settings = replace(settings, workers=_workers(task, settings))
-    metrics = metrics_of(task, settings) if settings.metrics else None
+    metrics = load_contrib().build_metrics(task, settings) if settings.metrics else None
     others = {**settings.observers, **(metrics.observers if metrics else {}), **_probes(task, settings)}
     with ranks.aborting() if ranks else nullcontext():
         coverage, seen, run = _observed(task, settings, others, until)
@@ -54,6 +53,10 @@ def measured(task: Task[FrameSource], settings: Settings, until: StoppingRule | 
             one.bodies = probes.seen_by(name)
     if len({coverage.counts["steps"] for coverage in coverages.values()}) > 1:
         run.raise_failure()  # within a step: the rigs have not seen the same
+    report = None
+    if metrics is not None:
+        after = metrics.update_from(seen)
+        report = load_contrib().compare_metrics(after, coverages, task.asked.awaited, settings.seed)
     result = Result(
         coverages=coverages,
         regions=task.asked.regions,
@@ -67,7 +70,7 @@ def measured(task: Task[FrameSource], settings: Settings, until: StoppingRule | 
         sensors=task.sensors,
         ego_outline_m=frames.ego_outline_m,
         observed={name: seen[name].compute() for name in settings.observers},
-        metrics=compared(metrics.after(seen), coverages, task.asked.awaited, settings.seed) if metrics else None,
+        metrics=report,
         left_out=left_out(
             run.counts, list(coverages.values()), settings.aggregations, sensors, workers=settings.workers or 0
         ),

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -28,8 +28,6 @@ from torchcover.evaluation.result_page import (
 from torchcover.evaluation.settings import FILES, wanted_files
 from torchcover.evaluation.target_error import TargetError, outcome
 from torchcover.files import Publication, data_frame, small_html
-from torchcover.published.comparison import MetricComparison, numbers_csv, record, tau_csv
-from torchcover.published.comparison import page_tables as metric_tables
 from torchcover.report import (
     RENDERERS,
     CoverageTable,
@@ -54,6 +52,21 @@ if TYPE_CHECKING:
 REFUSED_SHARE = 0.2
 # What `summary.json` says of how the run went.
 RUN_KEYS = ("seconds", "complete", "frame_counts", "skipped_frames", "left_out")
+
+
+class MetricReport(Protocol):
+    """Numbers of metrics of others, as `torchcover.contrib` compares them."""
+
+    def page_tables(self, *, parts: bool = True) -> list[PageTable]:
+        """Return the tables of the page; without `parts` only numbers about everything."""
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """Content of `summary.json`."""
+
+    @property
+    def files(self) -> dict[str, str]:
+        """Name and text of further files."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -90,7 +103,7 @@ class Result:
     sensors: Mapping[str, Sequence[Sensor]] = field(default_factory=dict)
     ego_outline_m: NDArray[Any] | None = None
     observed: Mapping[str, Any] = field(default_factory=dict)
-    metrics: MetricComparison | None = None
+    metrics: MetricReport | None = None
     left_out: Sequence[Omission] = ()
     inputs: Sequence[Path] = ()
 
@@ -136,7 +149,7 @@ class Result:
     @property
     def tables(self) -> list[PageTable]:
         """The tables of the page."""
-        return [*page_tables(self.table), *(metric_tables(self.metrics) if self.metrics else [])]
+        return [*page_tables(self.table), *(self.metrics.page_tables() if self.metrics else [])]
 
     @property
     def summary(self) -> list[dict[str, Any]]:
@@ -164,7 +177,7 @@ class Result:
             "measure": self.table.measure,
             "verdict": list(self.verdict),
             **table_dict(self.table),
-            **({} if self.metrics is None else {"metrics": record(self.metrics)}),
+            **({} if self.metrics is None else {"metrics": self.metrics.record}),
         }
 
     @property
@@ -269,8 +282,8 @@ class Result:
             files.add(f"coverage/{stem}.npz" if self.is_comparison else "coverage.npz", coverage.save)
         files.add_text("summary.csv", RENDERERS["csv"](self.table))
         if self.metrics is not None:
-            files.add_text("metrics.csv", numbers_csv(self.metrics))
-            files.add_text("metrics_tau.csv", tau_csv(self.metrics))
+            for name, text in self.metrics.files.items():
+                files.add_text(name, text)
 
     @property
     def _outcome(self) -> tuple[dict[str, Any] | None, list[str]]:

@@ -7,9 +7,10 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
+from importlib import import_module
 from numbers import Real
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, cast
 
 from torchcover.evaluation.arguments import Option, Read, options_of
 from torchcover.simulation.memory import check_fits
@@ -51,6 +52,11 @@ def wanted_files(given: str | Iterable[str]) -> frozenset[str]:
     if not names or not set(names).issubset(FILES):
         raise ValueError(f"files: {', '.join(FILES)}, one or more of them, are needed; got {given!r}")
     return frozenset(names)
+
+
+def load_contrib() -> Any:  # noqa: ANN401  (a package that nothing imports)
+    """Load the metrics of others, which only runs that name one need."""
+    return import_module("torchcover.contrib")
 
 
 def _rigs(given: "AnyRig | Sequence[AnyRig] | None") -> "tuple[AnyRig, ...]":
@@ -129,9 +135,8 @@ def _aggregations(given: "str | Sequence[Aggregation | str]") -> "tuple[Aggregat
 def _metrics(given: str | Iterable[str]) -> tuple[str, ...]:
     if not given:
         return ()
-    from torchcover.published import metric_names  # not needed by most runs
-
-    return metric_names(given)
+    names: tuple[str, ...] = load_contrib().metric_names(given)
+    return names
 
 
 def _asked(given: "RegionsOfInterest | str | Path | None") -> "RegionsOfInterest | None":
@@ -410,9 +415,8 @@ class Settings:
         """Whether a metric is about objects, so that frames are to have them."""
         if not self.metrics:
             return False
-        from torchcover.published import PUBLISHED
-
-        return any("boxes" in PUBLISHED[name].needs for name in self.metrics)
+        published = load_contrib().PUBLISHED
+        return any("boxes" in published[name].needs for name in self.metrics)
 
     def check_recording(self) -> None:
         """Find out whether anything was set that a recording decides itself.

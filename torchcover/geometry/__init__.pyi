@@ -15,5 +15,3 @@ from .rigid import rotation_from_quaternion as rotation_from_quaternion
 from .rigid import slerp as slerp
 from .rigid import transform as transform
 from .tensors import transform_tensor as transform_tensor
-from .voxel_walk import VoxelGrid as VoxelGrid
-from .voxel_walk import crossed_voxels as crossed_voxels

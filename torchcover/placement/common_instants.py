@@ -19,7 +19,7 @@ from torchcover.placement.questions import Questions, RigNumbers
 from torchcover.placement.racing import TOGETHER, Prefix, racing_order
 from torchcover.simulation import Rig, Scenario, SimulatedFrames, Simulator, with_ego
 from torchcover.simulation.rays import Balls
-from torchcover.simulation.simulated_frames import of_rigs, with_boxes
+from torchcover.simulation.simulated_frames import of_rigs
 
 WORLDS = 6
 PER_WORLD = 3
@@ -55,7 +55,7 @@ class AskedInstant(NamedTuple):
 class HeldWorlds(Dataset[Frame | MeasuredFrame]):
     """What any rig sees at some instants, whose worlds and references are kept in the process that is asked.
 
-    Frames are measured there, too, so that sums travel and not clouds; published metrics need the frame itself.
+    Frames are measured there, too, so that sums travel and not clouds.
     Simulations have no rigs; of the reference only the points are kept that questions are about.
     """
 
@@ -76,7 +76,7 @@ class HeldWorlds(Dataset[Frame | MeasuredFrame]):
             coverage = self._questions.coverage_of(asked.rig, measures)
             self._observers[measures] = {observer: measure for measure, observer in coverage.items()}
         sums = {measure: observer.sums_of(frame) for observer, measure in self._observers[measures].items()}
-        return MeasuredFrame(frame if self._questions.metrics else None, frame.counts, sums, 0.0)
+        return MeasuredFrame(None, frame.counts, sums, 0.0)
 
     def _frame(self, rig: Rig | None, number: int) -> Frame:
         instant = self._instants[number]
@@ -90,8 +90,7 @@ class HeldWorlds(Dataset[Frame | MeasuredFrame]):
             return held
         scans = self._with(rig, instant.scenario).scans(instant.step, within)[rig.name]
         counts = {"rays": sum(scan.rays for scan in scans), "self_hits": sum(scan.self_hits for scan in scans)}
-        frame = replace(held, **of_rigs({rig.name: rig}, {rig.name: scans}), counts=counts)
-        return frame if held.boxes is None else with_boxes(frame, held.boxes, {rig.name: rig})
+        return replace(held, **of_rigs({rig.name: rig}, {rig.name: scans}), counts=counts)
 
     def _built(self, instant: HeldInstant, number: int) -> Frame:
         frames = self._simulations[instant.scenario]
@@ -122,7 +121,7 @@ class CommonInstants:
     """Instants of many worlds, held once with the points of their reference; a rig costs one scan and one search each.
 
     Every rig sees the same instants as `SimulatedFrames` shows them, is measured against the same reference points, and
-    observed by `CoverageMetric` and the published metrics, so that differences are paired, and numbers are those of
+    observed by `CoverageMetric`, so that differences are paired, and numbers are those of
     `evaluate`. They depend on the arguments alone, and not on the number of workers.
 
     Args:
@@ -194,7 +193,7 @@ class CommonInstants:
         self._worlds = [with_ego(one, {}, vehicle) for one in self.scenarios]
         self.questions = Questions.around(Carrier.of(self._worlds).outline_m, objectives)
         shown: dict[str, Any] = {"steps": MANY, "seed": seed, "every_s": every_s, "kept_bytes": float("inf")}
-        shown |= {"reference_sensor": self.questions.reference_sensor(rays), "boxes": self.questions.boxes}
+        shown |= {"reference_sensor": self.questions.reference_sensor(rays)}
         simulations = [SimulatedFrames(one, rigs={}, **shown) for one in self._worlds]
         self.instants = _instants_of([one.simulator for one in simulations], worlds, per_world)
         self.order = racing_order([instant.world for instant in self.instants], seed)
@@ -269,10 +268,9 @@ class CommonInstants:
         return {measure: numbers.estimate(measure) for measure in MEASURES}
 
     def _numbers(self, rig: Rig, measures: Sequence[Measure]) -> RigNumbers:
-        ego = self._worlds[0].ego_mesh() if self.questions.metrics else None
         required = {name: one for name, one in self.objectives.items() if one.requires}
         kept = {name: one.share_kept(rig, self._worlds[0], self.sensor_model) for name, one in required.items()}
-        return replace(self.questions.numbers_of(rig, ego, measures), kept=kept)
+        return replace(self.questions.numbers_of(rig, measures), kept=kept)
 
     def _measured(self, rig: Rig, numbers: Sequence[int], observed: RigNumbers) -> Iterator[MeasuredFrame]:
         """What is left of a rig's frames at some instants, in their order, each once it is added."""

@@ -2,10 +2,7 @@
 
 import math
 import re
-import warnings
 from collections.abc import Mapping, Sequence
-from difflib import get_close_matches
-from functools import cache
 from typing import Annotated, Any, Literal, Self
 
 import torch
@@ -17,7 +14,6 @@ from torchcover.estimation import Estimate, Quantity
 from torchcover.evaluation.checking import check
 from torchcover.evaluation.requirements import AnyRequirement, RegionRequirement, Requirements, Verdict
 from torchcover.evaluation.target_survey import free_space
-from torchcover.published import PUBLISHED, Setup
 from torchcover.simulation import Document, Rig, Scenario
 from torchcover.simulation.regions_of_interest import RegionOfInterest
 
@@ -26,15 +22,6 @@ Name = Annotated[str, Field(min_length=1)]
 THRESHOLD_M = 0.4
 # Numbers by area or over known cells.
 CHOSEN = re.compile(r"(radius_m|(detection|sensors|seen_by_two)_[\d.]+m)(_without_|$)")
-
-
-@cache
-def published_numbers() -> tuple[str, ...]:
-    """Those of published metrics that may be objectives, of any rig."""
-    setup = Setup(sensors=Rig.load("front_roof_32").sensors)
-    with warnings.catch_warnings(action="ignore"):  # that they were fed with nothing
-        numbers = {name: each.make(setup).estimate().quantities for name, each in PUBLISHED.items()}
-    return tuple(one.key for name, each in numbers.items() for one in each if one.key.startswith(name))
 
 
 def looked_for(
@@ -54,14 +41,14 @@ class Objective(Document):
     Args:
         number: "radius_m", "detection_0.4m"; "known_radius_m" over known cells whatever the search is by;
             "radius_maximum_m" of an aggregation; "seen_by_two_0.4m" or "detection_0.4m_without_roof" of redundancy,
-            where "any" stands for the sensor whose failure is worst; or a published metric's, as "s_mig_0.2m". Whether
-            more or less of it is better, it knows itself.
+            where "any" stands for the sensor whose failure is worst. Whether more or less of it is better, it knows
+            itself.
         detection: Threshold in metres, in short for the number `detection_0.4m`: a reference point with a point of the
             rig within it counts as detected. 0.4 if no number is given.
         band: Name of a height band of the paper, "ground" or "obstacle", or several; both if not given.
         region: Name of a region, or several, as tables of `torchcover.evaluate` call them: "20m", "80m", "160m" ahead,
             "front_3m", "rear_3m", "left_3m", "right_3m" around the vehicle; or regions of one's own by name, written as
-            those in a YAML file of `RegionsOfInterest`. Not of published metrics, whose names say what they are about.
+            those in a YAML file of `RegionsOfInterest`.
         requires: Instead of all these one number that is required of a body at places, written out, or in encounters,
             as in `Requirements`: made better is the share of the places, or encounters, that keep it. It is measured
             there, the same in all worlds; what is not checked is not kept.
@@ -93,14 +80,8 @@ class Objective(Document):
             return self._check_requires()
         if self.number is not None and self.detection is not None:
             raise ValueError(f"number, detection: one of the two is possible; got {self.number!r} and a threshold")
-        if self.region is None and self.metric is None:
-            near = get_close_matches(self.key, published_numbers(), n=1)
-            meant = f"; near is {near[0]!r} of a published metric, which needs none" if near else ""
-            raise ValueError(f"region: it is needed for {self.key!r}{meant}")
-        if self.region is not None and self.metric is not None:
-            raise ValueError(f"region: {self.number!r} has none")
-        if self.metric is not None and self.band is not None:
-            raise ValueError(f"band: {self.number!r} has none")
+        if self.region is None:
+            raise ValueError(f"region: it is needed for {self.key!r}")
         return self
 
     def _check_requires(self) -> Self:
@@ -154,17 +135,12 @@ class Objective(Document):
         )
 
     @property
-    def metric(self) -> str | None:
-        """The published metric that gives it; None where the coverage does."""
-        return max((name for name in PUBLISHED if self.key.startswith(name)), key=len, default=None)
-
-    @property
     def own_estimate(self) -> str:
         """What its number is a mean over where that is no choice.
 
         Returns:
-            "known" of a number over known cells, "-" of a published metric, an aggregation or what is required; else
-            empty: "area" or "known", as a search is asked.
+            "known" of a number over known cells, "-" of an aggregation or what is required; else empty: "area" or
+            "known", as a search is asked.
 
         Example:
             >>> [Objective(number=key, region="20m").own_estimate for key in ("known_radius_m", "radius_maximum_m")]
@@ -176,7 +152,7 @@ class Objective(Document):
 
     @property
     def places(self) -> tuple[tuple[str, str], ...]:
-        """The regions and bands that it is the mean over; none of a published metric, nor of what is required."""
+        """The regions and bands that it is the mean over; none of what is required."""
         bands = (self.band,) if isinstance(self.band, str) else tuple(PAPER_HEIGHTS) if self.band is None else self.band
         regions = (self.region,) if isinstance(self.region, str) else tuple(self.region or ())
         return tuple((region, band) for region in regions for band in bands)
@@ -192,7 +168,7 @@ class Objective(Document):
         """
         if unknown := [band for _, band in self.places if band not in PAPER_HEIGHTS]:
             raise ValueError(f"band {unknown[0]!r}: {' or '.join(map(repr, PAPER_HEIGHTS))} is needed")
-        if not self.places and self.metric is None:
+        if not self.places:
             raise ValueError("band: at least one is needed")
         if isinstance(self.region, dict):
             return tuple(region.called(name) for name, region in self.region.items())

@@ -19,11 +19,9 @@ from torchcover.evaluation import CoverageObserver
 from torchcover.evaluation.measuring import BLOCKS
 from torchcover.evaluation.pipeline import MeasuredFrame
 from torchcover.geometry.arrays import Float64
-from torchcover.placement.objective import THRESHOLD_M, Objective, published_numbers
-from torchcover.published import PUBLISHED, FrameMetric, Setup, Sights
+from torchcover.placement.objective import THRESHOLD_M, Objective
 from torchcover.simulation import Areas, RegionsOfInterest, Rig, SurfaceReference
 from torchcover.simulation.regions_of_interest import RegionOfInterest
-from torchcover.simulation.shapes import Mesh
 
 # Of the cells of a search.
 CELL_M = 0.5
@@ -39,7 +37,7 @@ class Questions(NamedTuple):
     """What objectives ask of frames around one vehicle, by name, and all regions that are asked about.
 
     What is required of bodies and in encounters is not among them; `names` are those of all, in order.
-    The `grid` has cells of 0.5 m around these, or is that of `evaluate` where a published metric is asked for. Radii
+    The `grid` has cells of 0.5 m around these. Radii
     saturate at `max_radius_m`: as in `evaluate`, or at the largest threshold if no radius is asked for.
     """
 
@@ -66,33 +64,21 @@ class Questions(NamedTuple):
                         raise ValueError(f"region {region.name!r}: another objective calls another region so")
             except ValueError as error:
                 raise ValueError(f"objective {name!r}: {error}") from error
-        published = any(objective.metric for objective in objectives.values())
-        regions = regions or usual
         bands = [band for objective in objectives.values() for _, band in objective.places]
         written = {name: _written(region) for name, region in regions.items()}
-        heights = {band: PAPER_HEIGHTS[band] for band in (PAPER_HEIGHTS if published else bands)}
+        heights = {band: PAPER_HEIGHTS[band] for band in bands}
         grid = RegionsOfInterest(regions=written, heights=heights).around(ego_outline_m, CELL_M).grid
         keys = [objective.key for objective in objectives.values()]
         thresholds = sorted({float(each) for key in keys for each in SEEN_WITHIN.findall(key)})
         within = all(SEEN_WITHIN.match(key) for key in keys) and max(thresholds) > 0
         max_radius_m = max(thresholds) if within else grid.diagonal_m
-        grid = grid if published else _around(grid, regions.values())
+        grid = _around(grid, regions.values())
         return cls(objectives, regions, grid, max_radius_m, tuple(thresholds), names)
-
-    @property
-    def metrics(self) -> tuple[str, ...]:
-        """The published metrics that are asked for."""
-        return tuple(dict.fromkeys(one.metric for one in self.objectives.values() if one.metric is not None))
 
     @property
     def within_m(self) -> float | None:
         """How near to a point of the reference all lies that can change a number; None if anything can."""
         return self.max_radius_m if self.max_radius_m in self.thresholds_m else None
-
-    @property
-    def boxes(self) -> bool:
-        """Whether one of them is about objects."""
-        return any("boxes" in PUBLISHED[name].needs for name in self.metrics)
 
     @property
     def areas(self) -> Areas:
@@ -107,9 +93,7 @@ class Questions(NamedTuple):
         )
 
     def asked(self, points: Tensor, height: Tensor | None = None) -> Tensor:
-        """(M,) bool: which of (M, 3) points lie in a region and band that is asked about, or any for other metrics."""
-        if self.metrics:
-            return torch.ones(len(points), dtype=torch.bool)
+        """(M,) bool: which of (M, 3) points lie in a region and band that is asked about."""
         inside, of, cell = self.grid.bins(points, height)
         kept = torch.zeros(len(points), dtype=torch.bool)
         x, y, bands = *points[inside[of], :2].T, list(self.grid.heights)
@@ -120,24 +104,21 @@ class Questions(NamedTuple):
             kept[inside[of[own & (band == bands.index(place[1]))]]] = True
         return kept
 
-    def check(self, rig: Rig, ego: Mesh | None = None) -> None:
+    def check(self, rig: Rig) -> None:
         """Refuse objectives that are numbers of no result of such a rig on its ego.
 
         ValueError: such a one; the message has the nearest name.
         """
         asked = self._replace(thresholds_m=self.thresholds_m or (THRESHOLD_M,))
-        numbers = asked.numbers_of(rig, ego)
+        numbers = asked.numbers_of(rig)
         with warnings.catch_warnings(action="ignore"):  # that they were fed with nothing
             of_coverage = [one.key for one in numbers.coverage["area"].compute().every_quantity]
-            known = {name: [one.key for one in metric.estimate().quantities] for name, metric in numbers.others.items()}
         single = (RADIUS, *map(detection, asked.thresholds_m))
         others = [one.key for kind in AGGREGATIONS for one in kind.parse(kind.example).quantities]
         of_coverage += [one.key for one in (*single, *(without(ANY, each) for each in single))] + others
         for name, objective in self.objectives.items():
-            keys = known.get(objective.metric or "", of_coverage)
-            if objective.key not in keys:
-                keys = keys if objective.metric else [*keys, *published_numbers()]
-                near = get_close_matches(objective.key, keys, n=1, cutoff=0.0)
+            if objective.key not in of_coverage:
+                near = get_close_matches(objective.key, of_coverage, n=1, cutoff=0.0)
                 raise ValueError(f"objective {name!r}: no result has a number {objective.key!r}; near is {near[0]!r}")
 
     @property
@@ -146,19 +127,13 @@ class Questions(NamedTuple):
         keys = {objective.key for objective in self.objectives.values()}
         return tuple(one for kind in AGGREGATIONS if (one := kind.of_keys(keys)))
 
-    def numbers_of(self, rig: Rig, ego: Mesh | None = None, measures: Sequence[Measure] = ("area",)) -> "RigNumbers":
+    def numbers_of(self, rig: Rig, measures: Sequence[Measure] = ("area",)) -> "RigNumbers":
         """What observes a rig on its ego, fed with nothing yet, for numbers by these measures."""
-        setup = Setup(
-            rig=rig.name, sensors=rig.sensors, ego=ego, grid=self.grid, regions=tuple(self.regions.values()),
-            threshold_m=max(self.thresholds_m, default=THRESHOLD_M), square_metres=True, sights=Sights(),
-            sync_on_compute=False,
-        )  # fmt: skip
-        others = {name: PUBLISHED[name].make(setup) for name in self.metrics}
-        return RigNumbers(self, rig, self.coverage_of(rig, measures), others)
+        return RigNumbers(self, rig, self.coverage_of(rig, measures))
 
     def coverage_of(self, rig: Rig, measures: Sequence[Measure]) -> dict[Measure, CoverageObserver]:
         """What observes the coverage of a rig: the same for both measures where that knows both."""
-        keys = [one.key for one in self.objectives.values() if one.metric is None]
+        keys = [one.key for one in self.objectives.values()]
         failures = any(map(_of_failures, keys))
         regions = tuple(self.regions.values())
         observers: dict[Measure, CoverageObserver] = {}
@@ -179,23 +154,19 @@ class Questions(NamedTuple):
 class RigNumbers:
     """What observes a rig for its objectives: those who observe it in `evaluate`.
 
-    `coverage` is by what its numbers are means over; one for both where that knows both. `others` are published
-    metrics, `kept` what it keeps of what is required, which is so in every block.
+    `coverage` is by what its numbers are means over; one for both where that knows both. `kept` is what it
+    keeps of what is required, which is so in every block.
     """
 
     questions: Questions
     rig: Rig
     coverage: Mapping[Measure, CoverageObserver]
-    others: Mapping[str, FrameMetric]
     kept: Mapping[str, Estimate] = field(default_factory=dict)
 
     def add(self, seen: MeasuredFrame) -> None:
         """Add what is left of a frame where it was made and measured: its sums by measure."""
         for observer, measure in {observer: measure for measure, observer in self.coverage.items()}.items():
             observer.add(seen.sums[measure])
-        for metric in self.others.values():
-            assert seen.frame is not None  # published metrics need it
-            metric.update(seen.frame)
 
     def estimate(self, measure: Measure) -> Estimate:
         """The objectives so far, each a quantity under its own name, by one of the measures that it was made for."""
@@ -217,7 +188,7 @@ class RigNumbers:
         metric, objectives, regions = self.coverage[measure].metric, self.questions.objectives, self.questions.regions
         plain = [quantity.key for quantity in MeanOfMeans(metric.thresholds).quantities]
         places = list(dict.fromkeys(place for one in objectives.values() for place in one.places))
-        if measure == "area" and all(one.metric or one.key in plain for one in objectives.values()):
+        if measure == "area" and all(one.key in plain for one in objectives.values()):
             by_area = metric.estimates([(regions[region], band) for region, band in places], measure)
             found = dict(zip(places, by_area, strict=True))
 
@@ -241,11 +212,7 @@ class RigNumbers:
                 return replace(worst, quantities=(worst.quantities[0]._replace(title=title),))
             return number(key if sensor in ("", *metric.sensors) else alone, place)  # what is not there cannot fail
 
-        return {
-            name: [answer(one.key, place) for place in one.places]
-            or [_chosen(self.others[str(one.metric)].estimate(), one.key)]
-            for name, one in objectives.items()
-        }
+        return {name: [answer(one.key, place) for place in one.places] for name, one in objectives.items()}
 
 
 def _of_failures(key: str) -> bool:

@@ -227,8 +227,6 @@ class PlacementSearch:
         for name, value in zip(self.space.asked, start.prefixes[-1].estimate.value.tolist(), strict=True):
             if math.isnan(value):
                 why = "one of its regions and bands is never seen; take larger ones, more worlds or more rays"
-                if metric := self.space.asked[name].metric:
-                    why = f"what {metric} is about is never there; take another scenario, or more worlds"
                 if self.space.asked[name].requires:
                     why = "nowhere is room for the body; take another place"
                 raise ValueError(f"objectives.{name}: unknown at all {start.instants} instants: {why}")

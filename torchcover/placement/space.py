@@ -103,7 +103,7 @@ class SearchSpace(VehicleSpace):
         for name in self.free:
             self._check_place(name)
         questions = Questions.around(carrier.outline_m, self.asked)
-        questions.check(self.start, carrier.skin.mesh if questions.metrics else None)
+        questions.check(self.start)
         self._check_constraints()
         outside = self._outside()
         if outside:

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from torchcover.contrib.sights import Sights
 from torchcover.estimation import MIN_BLOCKS, Estimate, Number, Quantity
 from torchcover.frames import Frame
 from torchcover.metrics import MergeableMetric, SumsInBlocks, figure_of
 from torchcover.neighbors import check_tensor
-from torchcover.published.sights import Sights
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

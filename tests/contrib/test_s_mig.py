@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 import torch
 
+from torchcover.contrib import SMig
+from torchcover.contrib.occupancy import binary_entropy, occupancy_of, occupancy_rows
+from torchcover.contrib.voxel_walk import VoxelGrid
 from torchcover.detection import Boxes
-from torchcover.geometry import BoundingBox, VoxelGrid
-from torchcover.published import SMig
-from torchcover.published.occupancy import binary_entropy, occupancy_of, occupancy_rows
+from torchcover.geometry import BoundingBox
 
 from .voxel_frames import beam, boxes, frame, place3d
 

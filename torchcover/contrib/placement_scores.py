@@ -8,13 +8,13 @@ from typing import Any, Literal
 
 import numpy as np
 
+from torchcover.contrib.ranks import BASELINE, LEAST, OWN, Ranking, rankings
+from torchcover.contrib.registry import PUBLISHED
 from torchcover.coverage import Coverage, Region
 from torchcover.coverage.measures import Measure
 from torchcover.estimation import Quantity
 from torchcover.evaluation.evaluating import evaluate
 from torchcover.evaluation.task import AnyRig, loaded
-from torchcover.published import PUBLISHED, Ranking
-from torchcover.published.ranks import BASELINE, LEAST, OWN, rankings
 from torchcover.simulation import RegionsOfInterest, Scenario
 
 THRESHOLD_M = 0.4
@@ -76,7 +76,7 @@ def score_placements(
         rigs: Three or more, by name.
         scenario: The world.
         region: Where; a circle of 50 m around the vehicle if not given.
-        metrics: Those of others, of `torchcover.published.PUBLISHED`; all if not given. The number of points is always
+        metrics: Those of others, of `torchcover.contrib.PUBLISHED`; all if not given. The number of points is always
             there.
         steps: Steps.
         seed: Seed of the traffic.

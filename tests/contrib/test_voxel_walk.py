@@ -6,7 +6,8 @@ from itertools import product
 import numpy as np
 import pytest
 
-from torchcover.geometry import BoundingBox, VoxelGrid, crossed_voxels
+from torchcover.contrib.voxel_walk import VoxelGrid, crossed_voxels
+from torchcover.geometry import BoundingBox
 
 # Sides that are exact in binary, and are not equal in number.
 GRID = VoxelGrid(BoundingBox((-1.0, -0.5, -0.5), (1.0, 1.0, 0.5)), 0.5)
@@ -111,7 +112,7 @@ def test_order_and_division_and_length_of_directions_do_not_matter(monkeypatch):
     parts = crossed_voxels(MIDDLE, origins[:100], directions[:100], ends[:100])
     assert parts is crossed_voxels(MIDDLE, origins[100:], directions[100:], ends[100:], crossed=parts)
     assert np.array_equal(whole, parts)
-    monkeypatch.setattr("torchcover.geometry.voxel_walk.RAYS_AT_ONCE", 7)
+    monkeypatch.setattr("torchcover.contrib.voxel_walk.RAYS_AT_ONCE", 7)
     assert np.array_equal(whole, crossed_voxels(MIDDLE, origins, directions, ends))
 
 

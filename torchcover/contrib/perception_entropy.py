@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 import torchcover.geometry.first_calls  # noqa: F401
+from torchcover.contrib.frame_metric import WorldRatios, said
+from torchcover.contrib.object_strata import CATEGORIES, RANGE_BORDERS_M, ObjectStrata
+from torchcover.contrib.sights import count_in_boxes, rig_of
 from torchcover.coverage.quantity import MEASURED_WITHIN_M
 from torchcover.frames import Frame
-from torchcover.published.frame_metric import WorldRatios, said
-from torchcover.published.object_strata import CATEGORIES, RANGE_BORDERS_M, ObjectStrata
-from torchcover.published.sights import count_in_boxes, rig_of
 from torchcover.simulation import CameraSensor, Sensor
 
 # Of average precision a ln m + b over m points or pixels on the object, as GO4ROBO has them.

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from torchcover.published.ranks import kendall_tau_b, midranks, orders, permutation_p, spearman, strongest_by_chance
+from torchcover.contrib.ranks import check_best_correlation, kendall_tau_b, rank_values, spearman
 
 STATISTICS = pytest.mark.parametrize(
     ("own", "of_scipy"), [(kendall_tau_b, stats.kendalltau), (spearman, stats.spearmanr)], ids=["tau", "spearman"]
@@ -54,47 +54,44 @@ def test_any_monotone_scale_gives_the_same_and_a_sign_turns_it(own, of_scipy):
 
 def test_infinite_values_are_the_largest_not_unknown():
     assert kendall_tau_b([1.0, 2.0, math.inf], [1.0, 2.0, 3.0]) == pytest.approx(1.0)
-    assert midranks([math.inf, 1.0, math.inf]).tolist() == [2.5, 1.0, 2.5]
+    assert rank_values([math.inf, 1.0, math.inf]).tolist() == [2.5, 1.0, 2.5]
 
 
-def test_midranks_are_scipys():
+def test_rank_values_are_scipys():
     values = np.random.default_rng(2).integers(0, 4, (5, 8)).astype(float)
-    np.testing.assert_array_equal(midranks(values), stats.rankdata(values, axis=1))
+    np.testing.assert_array_equal(rank_values(values), stats.rankdata(values, axis=1))
 
 
-def test_the_p_of_one_series_is_that_of_all_orders():
+def test_the_p_of_one_series_is_that_of_all_permutations():
     one, other = [1, 2, 3, 4, 5], [2, 1, 4, 3, 5]
     found = abs(stats.spearmanr(one, other).statistic)
     expected = np.mean([abs(stats.spearmanr(one, order).statistic) >= found - 1e-9 for order in permutations(other)])
-    assert permutation_p(one, other) == pytest.approx(expected, abs=1e-15)
+    assert check_best_correlation(one, other).p == pytest.approx(expected, abs=1e-15)
 
 
-def test_of_many_the_best_is_good_by_chance():
+def test_the_best_of_many_series_is_good_by_chance():
     generator = np.random.default_rng(3)
     target, many = np.arange(6.0), generator.normal(size=(40, 6))
-    best = min(permutation_p(one, target) for one in many)
-    assert permutation_p(many, target) > 4 * best
-    assert permutation_p(many[:1], target) == permutation_p(many[0], target)
+    best = min(check_best_correlation(one, target).p for one in many)
+    assert check_best_correlation(many, target).p > 4 * best
 
 
-def test_of_more_than_eight_orders_are_drawn_the_same_each_time_and_p_is_never_0():
+def test_sampled_permutations_are_repeatable_and_p_is_never_0():
     same = np.arange(12.0)
-    assert permutation_p(same, same) == pytest.approx(1 / 40321)
-    drawn = orders(12, seed=5)
-    orders.cache_clear()
-    assert (orders(12, seed=5) == drawn).all()
-    assert not (orders(12, seed=5) == orders(12, seed=6)).all()
-    assert (np.sort(orders(9)[:50], axis=1) == np.arange(9)).all()
+    first, second = (check_best_correlation(same, same, seed=5) for _ in range(2))
+    assert first.p == pytest.approx(1 / 40321)
+    np.testing.assert_array_equal(first.by_chance, second.by_chance)
 
 
-def test_what_is_unknown_has_no_p():
-    assert math.isnan(permutation_p([1, 1, 1], [1, 2, 3]))
-    assert math.isnan(permutation_p([1, math.nan, 2], [1, 2, 3]))
+def test_unknown_series_have_no_p():
+    assert math.isnan(check_best_correlation([1, 1, 1], [1, 2, 3]).p)
+    assert math.isnan(check_best_correlation([1, math.nan, 2], [1, 2, 3]).p)
 
 
 @pytest.mark.parametrize("tied", [False, True])
-def test_the_orders_of_a_series_are_ranked_at_once_as_one_by_one(tied):
+def test_chance_is_the_correlation_with_each_permutation(tied):
     generator = np.random.default_rng(5)
     first, second = generator.normal(size=(2, 6)).round(0 if tied else 6)
-    one_by_one = [abs(spearman(first, second[order])) for order in orders(6)]
-    np.testing.assert_allclose(strongest_by_chance(first, second), np.nan_to_num(one_by_one), atol=1e-12)
+    one_by_one = [abs(spearman(first, list(order))) for order in permutations(second)]
+    by_chance = check_best_correlation(first, second).by_chance
+    np.testing.assert_allclose(np.sort(by_chance), np.sort(np.nan_to_num(one_by_one)), atol=1e-12)

@@ -10,7 +10,7 @@ import torch
 
 from tests.metrics.cases import CASES
 from torchcover import BevGrid, Region
-from torchcover.published import (
+from torchcover.contrib import (
     PUBLISHED,
     FalseVisible,
     KCover,
@@ -22,7 +22,7 @@ from torchcover.published import (
     field_of_view,
     metric_names,
 )
-from torchcover.published.perception_entropy import entropy, late_fusion, standard_deviation
+from torchcover.contrib.perception_entropy import entropy, late_fusion, standard_deviation
 from torchcover.simulation import CameraSensor, Lidar, Pose
 from torchcover.simulation.shapes import Box
 

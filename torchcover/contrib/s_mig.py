@@ -10,14 +10,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchcover.estimation import Estimate, Number
-from torchcover.frames import Frame
-from torchcover.geometry import BoundingBox
-from torchcover.metrics import with_rows
-from torchcover.neighbors import check_cloud
-from torchcover.published.frame_metric import BLOCKS, FrameMetric, said
-from torchcover.published.occupancy import COLUMNS, Occupancy, occupancy_of, occupancy_rows
-from torchcover.published.region_voxels import (
+from torchcover.contrib.frame_metric import BLOCKS, FrameMetric, said
+from torchcover.contrib.occupancy import COLUMNS, Occupancy, occupancy_of, occupancy_rows
+from torchcover.contrib.region_voxels import (
     REGION,
     check_sensors,
     checked_grid,
@@ -25,6 +20,11 @@ from torchcover.published.region_voxels import (
     crossed_on_the_way,
     ray_count,
 )
+from torchcover.estimation import Estimate, Number
+from torchcover.frames import Frame
+from torchcover.geometry import BoundingBox
+from torchcover.metrics import with_rows
+from torchcover.neighbors import check_cloud
 from torchcover.simulation import Sensor
 
 CATEGORIES = ("car", "pedestrian", "cyclist")

@@ -14,12 +14,16 @@ from .k_cover import KCover as KCover
 from .m_sog import MSog as MSog
 from .object_coverage import ObjectCoverage as ObjectCoverage
 from .perception_entropy import PerceptionEntropy as PerceptionEntropy
+from .placement_scores import PlacementScores as PlacementScores
+from .placement_scores import score_placements as score_placements
 from .point_density import PointDensity as PointDensity
 from .ranks import Ranking as Ranking
 from .registry import PUBLISHED as PUBLISHED
 from .registry import Published as Published
 from .registry import Setup as Setup
 from .registry import metric_names as metric_names
+from .run_metrics import build_metrics as build_metrics
+from .run_metrics import compare_metrics as compare_metrics
 from .s_mig import SMig as SMig
 from .s_mig import unequal_rays as unequal_rays
 from .sights import Sights as Sights

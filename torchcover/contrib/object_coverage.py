@@ -6,11 +6,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchcover.contrib.frame_metric import WorldRatios, said
+from torchcover.contrib.object_strata import CATEGORIES, RANGE_BORDERS_M, ObjectStrata
+from torchcover.contrib.sights import rig_of
 from torchcover.detection.visibility import mean_by_box
 from torchcover.frames import Frame
-from torchcover.published.frame_metric import WorldRatios, said
-from torchcover.published.object_strata import CATEGORIES, RANGE_BORDERS_M, ObjectStrata
-from torchcover.published.sights import rig_of
 
 HITS = (1, 5, 10)
 

@@ -4,16 +4,16 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
 
+from torchcover.contrib.false_visible import FalseVisible, coarse_grid
+from torchcover.contrib.frame_metric import FrameMetric
+from torchcover.contrib.k_cover import KCover
+from torchcover.contrib.m_sog import MSog
+from torchcover.contrib.object_coverage import ObjectCoverage
+from torchcover.contrib.perception_entropy import PerceptionEntropy
+from torchcover.contrib.point_density import PointDensity
+from torchcover.contrib.s_mig import SMig
+from torchcover.contrib.sights import Sights
 from torchcover.coverage import BevGrid, Region, forward_regions
-from torchcover.published.false_visible import FalseVisible, coarse_grid
-from torchcover.published.frame_metric import FrameMetric
-from torchcover.published.k_cover import KCover
-from torchcover.published.m_sog import MSog
-from torchcover.published.object_coverage import ObjectCoverage
-from torchcover.published.perception_entropy import PerceptionEntropy
-from torchcover.published.point_density import PointDensity
-from torchcover.published.s_mig import SMig
-from torchcover.published.sights import Sights
 from torchcover.simulation import Sensor
 from torchcover.simulation.shapes import Mesh
 

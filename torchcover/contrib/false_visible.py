@@ -9,12 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchcover.contrib.frame_metric import WorldRatios, said
+from torchcover.contrib.sights import rig_of
+from torchcover.contrib.voxel_walk import VoxelGrid, crossed_voxels
 from torchcover.coverage import BevGrid
 from torchcover.frames import Frame
-from torchcover.geometry import BoundingBox, VoxelGrid, crossed_voxels
+from torchcover.geometry import BoundingBox
 from torchcover.geometry.arrays import Float64
-from torchcover.published.frame_metric import WorldRatios, said
-from torchcover.published.sights import rig_of
 from torchcover.simulation import Sensor
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.shapes import Mesh

@@ -6,11 +6,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchcover.contrib.frame_metric import WorldRatios, said
+from torchcover.contrib.sights import rig_of
 from torchcover.coverage import BevGrid, Region, check_regions
 from torchcover.coverage.regions import Places
 from torchcover.frames import Frame
-from torchcover.published.frame_metric import WorldRatios, said
-from torchcover.published.sights import rig_of
 
 AT_LEAST = (1, 2, 3)
 

@@ -9,13 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchcover.contrib.frame_metric import BLOCKS, FrameMetric, said
+from torchcover.contrib.region_voxels import REGION, check_sensors, checked_grid, crossed_by, ray_count
 from torchcover.estimation import Estimate, Number
 from torchcover.frames import Frame
 from torchcover.geometry import BoundingBox
 from torchcover.metrics import SumsInBlocks
 from torchcover.neighbors import check_cloud
-from torchcover.published.frame_metric import BLOCKS, FrameMetric, said
-from torchcover.published.region_voxels import REGION, check_sensors, checked_grid, crossed_by, ray_count
 from torchcover.simulation import Sensor
 
 # Numbers that are kept of each voxel and block: frames in which it is labelled as the category, and as anything else.

@@ -13,8 +13,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchcover.contrib.voxel_walk import VoxelGrid
 from torchcover.detection import Boxes
-from torchcover.geometry import BoundingBox, VoxelGrid
+from torchcover.geometry import BoundingBox
 from torchcover.geometry.arrays import Bools, Float64, Int32, Int64
 
 # Columns of the table: the place in time of the frame, what stands for its content, the number of the category (of the

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from torchcover import Region, evaluate
+from torchcover.contrib import score_placements
+from torchcover.contrib.placement_scores import circle
 from torchcover.data import RegionsOfInterest
-from torchcover.evaluation import score_placements
-from torchcover.evaluation.placement_scores import circle
 
 RIGS = {name: f"place3d2024_{name}" for name in ("center", "line", "pyramid")}
 

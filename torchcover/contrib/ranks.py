@@ -2,21 +2,20 @@
 
 import math
 from collections.abc import Sequence
-from functools import lru_cache
-from itertools import permutations
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
+from scipy.stats import permutation_test, rankdata
 
 from torchcover.estimation import MIN_BLOCKS, Estimate, Number, Quantity
-from torchcover.geometry.arrays import Float64, Int64
+from torchcover.geometry.arrays import Float64
 
 # Two things have two orders, and are alike or opposite by chance.
 LEAST = 3
-# All orders of 8 things are tried; of more, as many are drawn.
-MOST_TRIED = math.factorial(8)
+# All permutations of eight values; of more values as many are sampled.
+MAX_PERMUTATIONS = math.factorial(8)
 # Worlds are drawn again so many times for intervals.
 DRAWS = 500
 # The metric that numbers of torchcover itself are of; and what takes no simulation to know, or little.
@@ -73,7 +72,7 @@ class Ranking(NamedTuple):
     @property
     def ranks(self) -> Float64:
         """(rigs,) 1 for the best; equal ones share the mean of theirs, NaN where unknown."""
-        return midranks(-self.gains)
+        return rank_values(-self.gains)
 
     def of(self, rigs: Sequence[int]) -> "Ranking":
         """Of some of the rigs, by their places, in another order."""
@@ -116,97 +115,107 @@ def interval95(value: float, drawn: Float64) -> tuple[float, float]:
     return low, high
 
 
-def midranks(values: ArrayLike) -> Float64:
-    """(..., n) ranks from 1, the smallest, on; equal values share the mean of theirs, and what is NaN stays so."""
-    own = np.asarray(values, dtype=np.float64)
-    smaller = (own[..., None, :] < own[..., :, None]).sum(axis=-1)
-    equal = (own[..., None, :] == own[..., :, None]).sum(axis=-1)
-    return np.where(np.isnan(own), math.nan, smaller + (equal + 1) / 2)
+def rank_values(values: ArrayLike) -> Float64:
+    """Rank values from 1, the smallest; equal values share the mean of their ranks, NaN stays NaN.
+
+    Args:
+        values: (..., n).
+    """
+    ranks: Float64 = rankdata(np.asarray(values, dtype=np.float64), axis=-1, nan_policy="omit")
+    return ranks
 
 
 def kendall_tau_b(first: ArrayLike, second: ArrayLike) -> Float64:
-    """Kendall's tau-b: 1 for the same order, -1 for the opposite one; ties count for neither.
+    """Compute Kendall's tau-b: 1 for the same order, -1 for the opposite one; ties count for neither.
 
         tau_b = (C - D) / sqrt((P - T_1) (P - T_2))
 
-    with C concordant, D discordant and P all pairs, T_i of them equal in the i-th (Kendall 1945, Biometrika 33, 239).
+    with C concordant, D discordant and P all pairs, T_i of them equal in the i-th series (Kendall 1945, Biometrika 33,
+    239). `scipy.stats.kendalltau` takes one pair of series; a bootstrap has thousands.
 
-    `first`: (..., n), NaN where unknown: what is unknown in one of the two is in no pair; `second`: (..., n), likewise;
-    the two broadcast. Returns (...); NaN for fewer than three that are known, or if all of one are equal.
+    Args:
+        first: (..., n), NaN where unknown; a value that is unknown in one series is in no pair.
+        second: (..., n), likewise; the two broadcast.
+
+    Returns:
+        (...); NaN for fewer than three known values, or if all values of a series are equal.
     """
-    one, other = _known_in_both(first, second)
-    # No difference: of two that are infinite there is none, and what is unknown is neither more nor less.
-    pairs = [(each[..., :, None], each[..., None, :]) for each in (one, other)]
-    signs = [(first > second).astype(np.float64) - (first < second) for first, second in pairs]
+    one, other = _mask_unknown(first, second)
+    signs = []
+    for values in (one, other):
+        left, right = values[..., :, None], values[..., None, :]
+        signs.append((left > right).astype(np.float64) - (left < right))
     agreement = (signs[0] * signs[1]).sum(axis=(-2, -1))
-    apart = [np.abs(sign).sum(axis=(-2, -1)) for sign in signs]
-    return _ratio(agreement, np.sqrt(apart[0] * apart[1]), one)
+    untied = [np.abs(sign).sum(axis=(-2, -1)) for sign in signs]
+    return _divide(agreement, np.sqrt(untied[0] * untied[1]), one)
 
 
 def spearman(first: ArrayLike, second: ArrayLike) -> Float64:
-    """Spearman's rank correlation: Pearson's of the midranks, so that ties are right; else as `kendall_tau_b`."""
-    one, other = (midranks(values) for values in _known_in_both(first, second))
-    count = np.maximum((~np.isnan(one)).sum(axis=-1, keepdims=True), 1)
-    one, other = (np.nan_to_num(ranks - np.nansum(ranks, axis=-1, keepdims=True) / count) for ranks in (one, other))
+    """Compute Spearman's rank correlation: Pearson's of the ranks, so that ties are right; else as `kendall_tau_b`."""
+    masked = _mask_unknown(first, second)
+    centered = []
+    for values in masked:
+        ranks = rank_values(values)
+        count = np.maximum(np.isfinite(ranks).sum(axis=-1, keepdims=True), 1)
+        centered.append(np.nan_to_num(ranks - np.nansum(ranks, axis=-1, keepdims=True) / count))
+    one, other = centered
     spread = np.sqrt((one**2).sum(axis=-1) * (other**2).sum(axis=-1))
-    return _ratio((one * other).sum(axis=-1), spread, _known_in_both(first, second)[0])
+    return _divide((one * other).sum(axis=-1), spread, masked[0])
 
 
-@lru_cache(maxsize=8)  # each metric asks for the same ones
-def orders(count: int, seed: int = 0) -> Int64:
-    """(P, n) orders of n things, to be read only: all of them up to n = 8, else as many as 8 have, drawn."""
-    if math.factorial(count) <= MOST_TRIED:
-        found = np.array(list(permutations(range(count))), dtype=np.int64)
-    else:
-        drawn = np.tile(np.arange(count), (MOST_TRIED, 1))
-        found = np.random.default_rng(seed).permuted(drawn, axis=1)
-    found.setflags(write=False)
-    return found
+class BestCorrelation(NamedTuple):
+    """How strong the best rank correlation of several series with one target is, and how strong it is by chance.
+
+    Args:
+        strongest: Absolute rank correlation of the best series; NaN if none is known.
+        p: Two-sided probability that the best series is as strong by chance.
+        by_chance: (P,) strongest correlation for each permutation of the target.
+    """
+
+    strongest: float
+    p: float
+    by_chance: Float64
 
 
-def permutation_p(first: ArrayLike, second: ArrayLike) -> float:
-    """Probability that chance gives so strong a rank correlation (`spearman`), of either sign: two-sided.
+def check_best_correlation(first: ArrayLike, second: ArrayLike, seed: int = 0) -> BestCorrelation:
+    """Compare the best of several series with what permutations of the target give (`scipy.stats.permutation_test`).
 
-    It is the share of orders of the second with as strong a one, NaN if none is known. With several first series, (k,
-    n), it is that of the best of them: of k metrics that were looked at, one is always good.
+    All permutations of up to eight values are tried, else as many are sampled.
+
+    Args:
+        first: (n,) a series, or (k, n) several: of k metrics that mean nothing, one is always good.
+        second: (n,) the target.
+        seed: Seed of sampled permutations.
     """
     series, target = np.atleast_2d(np.asarray(first, dtype=np.float64)), np.asarray(second, dtype=np.float64)
-    found = np.abs([spearman(one, target) for one in series])
-    if np.isnan(found).all():
-        return math.nan
-    best = strongest_by_chance(series, target)
-    as_strong = int((best >= np.nanmax(found) - 1e-12).sum())
-    drawn = math.factorial(target.size) > MOST_TRIED  # then the order that was found is one more
-    return (as_strong + drawn) / (len(best) + drawn)
+
+    def find_strongest(permuted: Float64, axis: int = -1) -> Float64:
+        aligned = np.moveaxis(permuted, axis, -1)
+        correlations = np.abs([spearman(values, aligned) for values in series])
+        strongest: Float64 = np.nan_to_num(correlations).max(axis=0)
+        return strongest
+
+    observed = np.abs([spearman(values, target) for values in series])
+    if np.isnan(observed).all():
+        return BestCorrelation(math.nan, math.nan, np.empty(0))
+    test = permutation_test(
+        (target,),
+        find_strongest,
+        permutation_type="pairings",
+        vectorized=True,
+        n_resamples=MAX_PERMUTATIONS,
+        alternative="greater",
+        rng=np.random.default_rng(seed),
+    )
+    return BestCorrelation(float(np.nanmax(observed)), float(test.pvalue), test.null_distribution)
 
 
-def strongest_by_chance(first: ArrayLike, second: ArrayLike) -> Float64:
-    """(P,) the strongest rank correlation of (k, n) series, of either sign, to each of many orders of the second.
-
-    From 0 to 1: what the best of k metrics that mean nothing reaches.
-    """
-    target, numbers = np.asarray(second, dtype=np.float64), orders(np.size(second))
-    best = np.zeros(len(numbers))
-    for one in np.atleast_2d(np.asarray(first, dtype=np.float64)):
-        known = not np.isnan(one + target).any()
-        found = _spearman_of_orders(one, target, numbers) if known else spearman(one, target[numbers])
-        best = np.fmax(best, np.abs(found))
-    return best
-
-
-def _spearman_of_orders(one: Float64, target: Float64, numbers: Int64) -> Float64:
-    """(P,) what `spearman` gives for each order of the second, where all is known: ranks move with what they are of."""
-    own, other = (ranks - ranks.mean() for ranks in (midranks(one), midranks(target)))
-    spread = np.sqrt((own**2).sum() * (other**2).sum())
-    return _ratio(other[numbers] @ own, np.full(len(numbers), spread), np.broadcast_to(one, numbers.shape))
-
-
-def _known_in_both(first: ArrayLike, second: ArrayLike) -> tuple[Float64, Float64]:
+def _mask_unknown(first: ArrayLike, second: ArrayLike) -> tuple[Float64, Float64]:
     one, other = np.broadcast_arrays(np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64))
     unknown = np.isnan(one) | np.isnan(other)
     return np.where(unknown, math.nan, one), np.where(unknown, math.nan, other)
 
 
-def _ratio(above: Float64, below: Float64, values: Float64) -> Float64:
+def _divide(above: Float64, below: Float64, values: Float64) -> Float64:
     enough = ((~np.isnan(values)).sum(axis=-1) >= LEAST) & (below > 0)
     return np.where(enough, above / np.where(below > 0, below, 1.0), math.nan)

@@ -9,17 +9,16 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from torchcover.files import read_csv, reads
-from torchcover.geometry.arrays import Float64, Int64
-from torchcover.published.ranks import (
+from torchcover.contrib.ranks import (
     DRAWS,
     Ranking,
+    check_best_correlation,
     interval95,
     kendall_tau_b,
-    permutation_p,
     spearman,
-    strongest_by_chance,
 )
+from torchcover.files import read_csv, reads
+from torchcover.geometry.arrays import Float64, Int64
 
 # What the best of several metrics that mean nothing exceeds in one of twenty orders.
 BY_CHANCE = 0.95
@@ -211,13 +210,13 @@ def agreement_of(
     strength = np.array([abs(row.spearman.value) for row in ranked])
     if np.isnan(strength).all():
         return Agreement(judged, ranked, None, math.nan, math.nan)
-    series = np.stack([one.gains for one in rankings])
+    best = check_best_correlation(np.stack([one.gains for one in rankings]), judged.mean)
     return Agreement(
         judged=judged,
         ranked=ranked,
         best=rankings[int(np.nanargmax(strength))].name,
-        best_p=permutation_p(series, judged.mean),
-        by_chance=float(np.quantile(strongest_by_chance(series, judged.mean), BY_CHANCE)),
+        best_p=best.p,
+        by_chance=float(np.quantile(best.by_chance, BY_CHANCE)),
     )
 
 
@@ -266,4 +265,4 @@ def _ranked(one: Ranking, truth: Float64, truths: Float64, columns: Int64) -> Ra
     rho, tau = (
         Relation.of(float(statistic(one.gains, truth)), statistic(*drawn)) for statistic in (spearman, kendall_tau_b)
     )
-    return Ranked(one.name, rho, tau, permutation_p(one.gains, truth), one.draws is not None)
+    return Ranked(one.name, rho, tau, check_best_correlation(one.gains, truth).p, one.draws is not None)

@@ -4,8 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from torchcover.contrib.voxel_walk import VoxelGrid, crossed_voxels
 from torchcover.frames import Frame
-from torchcover.geometry import BoundingBox, VoxelGrid, crossed_voxels
+from torchcover.geometry import BoundingBox
 from torchcover.geometry.arrays import Bools
 from torchcover.simulation import Sensor
 from torchcover.simulation.memory import check_fits

@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from torchcover.contrib.ranks import LEAST, Ranking, interval95, kendall_tau_b
+from torchcover.contrib.s_mig import unequal_rays
 from torchcover.estimation import Number
 from torchcover.files import csv_text
-from torchcover.published.ranks import LEAST, Ranking, interval95, kendall_tau_b
-from torchcover.published.s_mig import unequal_rays
 from torchcover.report import PageTable, Words, json_record, number_words, shown_unit
 
 TITLE, TAU_TITLE = "Metrics of others", "Kendall's tau-b with torchcover's numbers, 95 % over worlds"
@@ -84,6 +84,38 @@ class MetricComparison:
         missing = [f"Without {name}: {why}" for name, why in (self.left_out or {}).items()]
         return [NOT_VALIDATED, *few, *warnings, *rays, *missing]
 
+    def page_tables(self, *, parts: bool = True) -> list[PageTable]:
+        """Return the table of numbers, and that of Kendall's tau if there are three rigs or more.
+
+        Args:
+            parts: Whether numbers of a category or a region are rows too.
+        """
+        rows = [[Words(cell) for cell in _format_row(ranking)] for ranking in (self.rankings if parts else self.main)]
+        headings = ["metric", "unit", "better", *self.rigs]
+        title = f"{TITLE} (rank)" if len(self.rigs) > 1 else TITLE
+        return [PageTable(title, headings, rows, 3, self.notes), *_tau_tables(self)]
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """The content of `summary.json`; unknown values are None."""
+        return {"numbers": self._number_records(), "tau": self._tau_records(), "notes": self.notes}
+
+    @property
+    def files(self) -> dict[str, str]:
+        """Name and text of the CSV files: a line for each rig and number, and for each pair of numbers."""
+        lines: list[Sequence[object]] = [COLUMNS]
+        for record in self._number_records():
+            record["parameters"] = json.dumps(record["parameters"], sort_keys=True)
+            lines.append([record[name] for name in COLUMNS])
+        taus = [record.values() for record in self._tau_records()]
+        return {"metrics.csv": csv_text(lines), "metrics_tau.csv": csv_text([Tau._fields, *taus])}
+
+    def _number_records(self) -> list[dict[str, Any]]:
+        return [{**json_record(row), "parameters": json_record(row["parameters"])} for row in self.rows()]
+
+    def _tau_records(self) -> list[dict[str, Any]]:
+        return [json_record(tau._asdict()) for tau in self.taus()]
+
 
 def tau_of(first: Ranking, second: Ranking) -> Tau:
     """Kendall's tau-b of two numbers, each turned so that more is better, and its interval over drawn worlds."""
@@ -95,44 +127,7 @@ def tau_of(first: Ranking, second: Ranking) -> Tau:
     return Tau(first.name, second.name, value, low, high, known)
 
 
-def page_tables(comparison: MetricComparison, *, parts: bool = True) -> list[PageTable]:
-    """The numbers, those about a category or a region only among them if so asked, and the taus, if there are any."""
-    rows = [list(map(Words, _row(one))) for one in (comparison.rankings if parts else comparison.main)]
-    headings = ["metric", "unit", "better", *comparison.rigs]
-    title = f"{TITLE} (rank)" if len(comparison.rigs) > 1 else TITLE
-    return [PageTable(title, headings, rows, 3, comparison.notes), *_tau_tables(comparison)]
-
-
-def record(comparison: MetricComparison) -> dict[str, Any]:
-    """As `summary.json` has it: what is unknown is None."""
-    return {
-        "numbers": _number_records(comparison),
-        "tau": _tau_records(comparison),
-        "notes": comparison.notes,
-    }
-
-
-def numbers_csv(comparison: MetricComparison) -> str:
-    """A line for each rig and number; an unknown one is an empty field, parameters are JSON."""
-    rows = _number_records(comparison)
-    records = ({**row, "parameters": json.dumps(row["parameters"], sort_keys=True)} for row in rows)
-    return csv_text([COLUMNS, *([record[name] for name in COLUMNS] for record in records)])
-
-
-def tau_csv(comparison: MetricComparison) -> str:
-    """A line for each pair of numbers."""
-    return csv_text([Tau._fields, *(record.values() for record in _tau_records(comparison))])
-
-
-def _number_records(comparison: MetricComparison) -> list[dict[str, Any]]:
-    return [{**json_record(row), "parameters": json_record(row["parameters"])} for row in comparison.rows()]
-
-
-def _tau_records(comparison: MetricComparison) -> list[dict[str, Any]]:
-    return [json_record(tau._asdict()) for tau in comparison.taus()]
-
-
-def _row(one: Ranking) -> list[str]:
+def _format_row(one: Ranking) -> list[str]:
     better = "less" if one.quantity.lower_is_better else "more"
     ranks = one.ranks.tolist() if len(one.numbers) > 1 else [math.nan]
     return [one.name, shown_unit(one.quantity.unit).name, better, *map(_words, one.numbers, ranks)]

@@ -6,6 +6,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
+from torchcover.contrib.object_strata import ObjectStrata
 from torchcover.coverage import BevGrid
 from torchcover.coverage.grid import Bins
 from torchcover.coverage.quantity import MEASURED_WITHIN_M
@@ -14,7 +15,6 @@ from torchcover.detection.inside import Inside
 from torchcover.frames import Frame
 from torchcover.neighbors import check_cloud, nearest
 from torchcover.neighbors.choice import backend_of_several
-from torchcover.published.object_strata import ObjectStrata
 
 Found = TypeVar("Found")
 

@@ -1,13 +1,15 @@
 """Ranks of metrics compared with those of judges: what is equal, what is chance, and what the best of many is worth."""
 
+from itertools import permutations
+
 import numpy as np
 import pytest
 from scipy.stats import kendalltau, spearmanr
 
+from torchcover.contrib import Judged, Ranking, agreement_of, lead, read_results
+from torchcover.contrib.ranks import spearman
 from torchcover.estimation import Quantity
 from torchcover.files import BadFileError
-from torchcover.published import Judged, Ranking, agreement_of, lead, read_results
-from torchcover.published.ranks import orders, spearman
 from torchcover.simulation import Rig, builtin_folder
 
 HEADER = "placement,quantity,model,class,value\n"
@@ -56,7 +58,7 @@ def test_the_p_of_the_best_of_many_is_uniform_where_nothing_is_there_to_be_found
     generator = np.random.default_rng(0)
     many, values = [metric(generator.normal(size=4)) for _ in range(6)], generator.normal(size=4)
     # A truth that has nothing to do with the metrics is any of its orders, each as likely.
-    found = [agreement_of(many, judged_by([values[order]]), draws=1) for order in orders(4)]
+    found = [agreement_of(many, judged_by([values[order]]), draws=1) for order in map(list, permutations(range(4)))]
     best, alone = (
         np.array(p) for p in zip(*((one.best_p, [row.p for row in one.ranked]) for one in found), strict=True)
     )

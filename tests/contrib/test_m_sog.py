@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 
+from torchcover.contrib import MSog
+from torchcover.contrib.region_voxels import REGION as PUBLISHED_REGION
+from torchcover.contrib.voxel_walk import VoxelGrid, crossed_voxels
 from torchcover.detection import points_in_boxes
-from torchcover.geometry import BoundingBox, VoxelGrid, crossed_voxels
-from torchcover.published import MSog
-from torchcover.published.region_voxels import REGION as PUBLISHED_REGION
+from torchcover.geometry import BoundingBox
 
 from .voxel_frames import beam, boxes, frame, place3d
 
