@@ -129,10 +129,7 @@ def test_a_number_without_any_sensor_says_so(several):
 
 def test_numbers_that_are_by_no_choice_of_estimate_are_the_same_by_both(several):
     both = several.estimates(TWO)
-    objectives = {
-        "known": Objective(number="known_radius_m", region="20m"),
-        "theirs": Objective(number="k_cover_2_0.4m"),
-    }
+    objectives = {"known": Objective(number="known_radius_m", region="20m")}
     more = held(objectives=objectives).estimates(TWO)
     for estimates, asked in ((both, NUMBERS), (more, objectives)):
         pairs = zip(asked.values(), estimates["area"].value, estimates["known"].value, strict=True)
