@@ -163,6 +163,12 @@ def test_units_of_clouds(unit):
     assert mended.content != frames.content
 
 
+def test_clouds_in_feet_are_read_as_asked():
+    drive = Yard("unlabelled")
+    (sensor, *_), feet = drive.sensors, RecordedFrames(drive, corrections=Corrections(units="ft")).recording
+    np.testing.assert_allclose(feet.scan(sensor, 0).points_m, 0.3048 * drive.scan(sensor, 0).points_m)
+
+
 def test_labels_of_which_none_fits():
     (doubt,) = RecordedFrames(Yard("unlabelled")).doubts()
     assert "labels, and none in 12 frames" in doubt

@@ -64,6 +64,69 @@ def las_bytes(array, *, compressed=False):
     return stream.getvalue()
 
 
+def las_in(*records, **options):
+    """A survey whose records say its coordinate system: GeoKeys by key, or WKT."""
+    keys, wkt = dict(record for record in records if isinstance(record, tuple)), [*map(str, records)][-1:]
+    header = laspy.LasHeader(point_format=6, version="1.4") if not keys else laspy.LasHeader(point_format=3)
+    header.scales, header.offsets = [2**-8] * 3, [0.0, 1.0, 0.0]
+    if keys:
+        rows = [(1, 1, 0, len(keys)), *((key, 0, 1, value) for key, value in keys.items())]
+        record = laspy.VLR("LASF_Projection", 34735, "", np.array(rows, "<u2").tobytes())
+    else:
+        record = laspy.VLR("LASF_Projection", 2112, "", wkt[0].encode() + b"\0")
+    survey = laspy.LasData(header)
+    survey.x, survey.y, survey.z = CLOUD.T.astype(np.float64)
+    if options.get("extended"):
+        survey.evlrs = laspy.vlrs.vlrlist.VLRList([record])
+    else:
+        survey.vlrs.append(record)
+    stream = io.BytesIO()
+    survey.write(stream, do_compress=options.get("compressed", False))
+    return stream.getvalue()
+
+
+FTUS, FEET = 1200 / 3937, 0.3048
+DEGREES = 'GEOGCS["NAD83",DATUM["NAD",SPHEROID["GRS",6378137,298.25]],PRIMEM["G",0],UNIT["degree",0.0174]]'
+STATE_PLANE = f'PROJCS["Georgia [west] (ftUS)",{DEGREES},PROJECTION["TM"],UNIT["US survey foot",{FTUS!r}]]'
+WKT2 = (
+    'COMPOUNDCRS["a",PROJCRS["b",BASEGEOGCRS["c",DATUM["d",ELLIPSOID["e",1,2,LENGTHUNIT["metre",1]]]],'
+    'CONVERSION["f",PARAMETER["g",0,LENGTHUNIT["metre",1]]],CS[Cartesian,2],AXIS["x",east],AXIS["y",north],'
+    'LENGTHUNIT["foot",0.3048]],VERTCRS["h",CS[vertical,1],AXIS["z",up],LENGTHUNIT["metre",1]]]'
+)
+
+
+@pytest.mark.parametrize(
+    ("las", "meters"),
+    [
+        (las_in((1024, 1), (3072, 2240), (3076, 9003)), (FTUS, FTUS, FTUS)),
+        (las_in((1024, 1), (3072, 26916), (4099, 9002)), (1.0, 1.0, FEET)),
+        (las_in(STATE_PLANE), (FTUS, FTUS, FTUS)),
+        (las_in(STATE_PLANE, extended=True), (FTUS, FTUS, FTUS)),
+        (las_in(f'COMPD_CS["x",{STATE_PLANE},VERT_CS["NAVD88",UNIT["metre",1]]]', compressed=True), (FTUS, FTUS, 1)),
+        (las_in(WKT2), (FEET, FEET, 1.0)),
+    ],
+)
+def test_las_files_in_feet_are_converted_with_a_warning(tmp_path, las, meters):
+    suffix = ".laz" if las[104] & 0x80 else ".las"
+    with pytest.warns(UserWarning, match=r"converted to meters, as the file says: .* give no --units"):
+        cloud = read_cloud(store(tmp_path, suffix, las))
+    np.testing.assert_allclose(cloud, CLOUD * meters, rtol=1e-12)
+
+
+def test_las_files_in_meters_are_as_they_are_and_degrees_are_refused(tmp_path):
+    for las in (las_in((1024, 1), (3072, 32633)), las_in(STATE_PLANE.replace(repr(FTUS), "1.0")), las_in("")):
+        np.testing.assert_array_equal(read_cloud(store(tmp_path, ".las", las)), CLOUD)
+    with pytest.warns(UserWarning, match=r"EPSG:2240 without a unit .* --units ft"):
+        np.testing.assert_array_equal(read_cloud(store(tmp_path, ".las", las_in((1024, 1), (3072, 2240)))), CLOUD)
+    for las, message in (
+        (las_in((1024, 2), (2048, 4326)), r"x and y are degrees \(GTModelTypeGeoKey 2\); reproject"),
+        (las_in(DEGREES), "x and y are degrees .* reproject"),
+        (las_in((1024, 1), (3076, 9005)), "unit EPSG:9005 of its GeoKeys is unknown; known are 9001"),
+    ):
+        with pytest.raises(BadFileError, match=message):
+            read_cloud(store(tmp_path, ".las", las))
+
+
 def ply_header(encoding, *lines):
     return "\n".join(["ply", f"format {encoding} 1.0", *lines, "end_header", ""]).encode()
 

@@ -12,7 +12,7 @@ from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.corrections import Corrections
 from torchcover.recordings.recording import Recording, Scan
 
-METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
 
 
 class Corrected:

@@ -22,7 +22,7 @@ class Corrections:
         "(`held`: they are interpolated).",
     ] = "given"
     axes: Annotated[Literal["xyz", "yxz"], "What the columns of its clouds are."] = "xyz"
-    units: Annotated[Literal["m", "cm", "mm"], "What its clouds are in."] = "m"
+    units: Annotated[Literal["m", "cm", "mm", "ft"], "What its clouds are in."] = "m"
     lag_s: Annotated[float, "Seconds by which its poses are late."] = 0.0
 
     def __post_init__(self) -> None:

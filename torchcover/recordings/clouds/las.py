@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.files import check_memory, laz_points
+from torchcover.recordings.clouds.las_units import list_records, read_scale
 
 HEADER_BYTES, HEADER_BYTES_1_4 = 227, 375
 COMPRESSED = 0x80  # of the point format
@@ -24,18 +25,24 @@ class _Header(NamedTuple):
     compressed: bool
     scale: NDArray[np.float64]
     offset: NDArray[np.float64]
+    # Of records before and behind the points: first byte, count.
+    records: tuple[int, int]
+    later_records: tuple[int, int]
 
 
 def read_las(path: Path) -> NDArray[np.float64]:
-    """Read x y z of a LAS or LAZ file, its scales and offsets applied."""
+    """Read x y z of a LAS or LAZ file in meters, its scales, offsets and units applied."""
     size_bytes = path.stat().st_size
     with path.open("rb") as file:
         header = _header(file.read(HEADER_BYTES_1_4), size_bytes)
+        records = [*list_records(file, *header.records, extended=False)]
+        records += list_records(file, *header.later_records, extended=True)
+        meters = read_scale(file, records)
         check_memory(header.points * (header.record_bytes + COORDINATE_BYTES))
         if header.compressed:
             _check_chunks(file, header, size_bytes)
     if header.compressed:
-        return laz_points(path, header.points)["xyz"] * header.scale + header.offset
+        return laz_points(path, header.points)["xyz"] * (header.scale * meters) + header.offset * meters
     claimed_bytes = header.points * header.record_bytes
     if header.first_byte + claimed_bytes > size_bytes:
         raise ValueError(
@@ -44,7 +51,7 @@ def read_las(path: Path) -> NDArray[np.float64]:
         )
     columns = np.dtype({"names": ["xyz"], "formats": [("<i4", 3)], "offsets": [0], "itemsize": header.record_bytes})
     records = np.fromfile(path, columns, header.points, offset=header.first_byte)
-    return records["xyz"] * header.scale + header.offset
+    return records["xyz"] * (header.scale * meters) + header.offset * meters
 
 
 def _header(data: bytes, size_bytes: int) -> _Header:
@@ -54,6 +61,7 @@ def _header(data: bytes, size_bytes: int) -> _Header:
         raise ValueError(f"a header of {HEADER_BYTES} bytes is needed; the file has {len(data)}")
     header_bytes, first_byte, records, kind, record_bytes, points = struct.unpack_from("<HIIBHI", data, 94)
     numbers = np.frombuffer(data, "<f8", 6, offset=131)
+    later_byte = later_records = 0
     if (data[24], data[25]) >= (1, 4):
         if len(data) < HEADER_BYTES_1_4:
             raise ValueError(f"a header of {HEADER_BYTES_1_4} bytes is needed; the file has {len(data)}")
@@ -68,7 +76,16 @@ def _header(data: bytes, size_bytes: int) -> _Header:
         raise ValueError(f"records of 20 bytes or more are needed; got {record_bytes}")
     if not (np.isfinite(numbers).all() and numbers[:3].all()):
         raise ValueError(f"finite scales, not 0, and finite offsets are needed; got {numbers.tolist()}")
-    return _Header(first_byte, record_bytes, points, bool(kind & COMPRESSED), numbers[:3], numbers[3:])
+    return _Header(
+        first_byte,
+        record_bytes,
+        points,
+        bool(kind & COMPRESSED),
+        numbers[:3],
+        numbers[3:],
+        (header_bytes, records),
+        (later_byte, later_records),
+    )
 
 
 def _check_chunks(file: BinaryIO, header: _Header, size_bytes: int) -> None:
