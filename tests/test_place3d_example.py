@@ -7,8 +7,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from tests.contrib.voxel_frames import beam, place3d
 
+from tests.contrib.voxel_frames import beam, place3d
 from torchcover.contrib import agreement_of, read_results
 from torchcover.contrib.ranks import spearman
 from torchcover.simulation import Lidar, Pose, Rig, builtin_folder

@@ -135,7 +135,7 @@ def test_numbers_that_are_by_no_choice_of_estimate_are_the_same_by_both(several)
         pairs = zip(asked.values(), estimates["area"].value, estimates["known"].value, strict=True)
         for objective, by_area, by_cells in pairs:
             assert (by_area == by_cells) == (objective.own_estimate != ""), objective.key
-    assert [one.own_estimate for one in objectives.values()] == ["known", "-"]
+    assert [one.own_estimate for one in objectives.values()] == ["known"]
 
 
 def test_what_the_second_sensor_loses_without_a_block_is_known_too(several):
