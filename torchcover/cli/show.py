@@ -15,7 +15,7 @@ from torchcover.evaluation.task import as_called
 from torchcover.files import BadFileError, write_durably
 from torchcover.report import Terminal, check_film, write_film
 from torchcover.simulation import Scenario, builtin_names
-from torchcover.simulation.bodies import Body, Vehicle, VehicleShape, body_called, mover_mesh
+from torchcover.simulation.bodies import Body, Vehicle, VehicleShape, body_called, describe_windows, mover_mesh
 from torchcover.simulation.documents import nearest, read_mapping
 from torchcover.simulation.shapes import MeshFile
 
@@ -62,6 +62,7 @@ def run(
         if np.abs(moved_m).max() >= SMALLEST_MOVE_M:
             by = ", ".join(f"{axis} {metres:+.2f}" for axis, metres in zip("xyz", moved_m.round(2) + 0.0, strict=True))
             _say(console, f"Moved by {by} m: mounts are measured from the ground under the middle of its bounding box")
+        _say(console, describe_windows(shape))
         _write(console, out / Path(name).stem, [("", vehicle_picture(body))])
         return
     if kind == "rig":

@@ -197,6 +197,19 @@ def mount_regions_of(shape: Shape | None) -> dict[str, MountRegion]:
     return Vehicle.load(shape.vehicle).mount_regions
 
 
+def describe_windows(shape: Shape | None) -> str:
+    """Say which materials of a body look transparent and stop rays, and how to let these pass; empty if none does."""
+    parts = Vehicle.load(shape.vehicle).parts if isinstance(shape, VehicleShape) else ()
+    meshes = [part.shape for part in parts] or [shape]
+    for mesh in meshes:
+        if isinstance(mesh, shapes.MeshFile) and (names := mesh.clear_materials()):
+            return (
+                f"{mesh.path.name}: {', '.join(map(repr, names))} look transparent and stop rays; to let rays pass, "
+                f"give its shape `transparent: [{', '.join(names)}]` in a vehicle file"
+            )
+    return ""
+
+
 def in_vehicle_frame(mesh: Mesh) -> Mesh:
     """Move a mesh so that the origin lies on the ground under the centre of its bounding box."""
     box = BoundingBox.around(mesh.vertices_m)

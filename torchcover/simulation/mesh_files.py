@@ -1,6 +1,10 @@
 """What trimesh reads, in a process of its own; see `apart`: nothing that loads torch may be imported here."""
 
 import gc
+import io
+import re
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -8,28 +12,168 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.files import apart, check_memory, check_regular
+from torchcover.simulation.polygons import find_bad_fans, triangulate
+
+# Faces of an OBJ file with four corners or more, those with indices that count back from the last vertex, and what
+# follows the index of the position in a corner.
+OBJ_POLYGON = re.compile(rb"^[ \t]*f(?:(?:[ \t]+[^\s#]+){4}|[^\n#]*[\s/]-)", re.MULTILINE)
+OBJ_BACKWARDS = re.compile(rb"^[ \t]*f[^\n#]*[\s/]-", re.MULTILINE)
+OBJ_TEXTURE = re.compile(rb"/\S*")
 
 
 @apart
 def mesh_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """(V, 3) float64 `vertices` and (F, 3) int64 `faces` of all that a file of any format of trimesh's has."""
-    import trimesh
+    """All meshes of a file of any format of trimesh's.
 
+    Returns:
+        `vertices` (V, 3) float64 and `faces` (F, 3) int64; `part` (F,) int64, which part each face belongs to; of each
+        of the P parts `names` (P, 2), those of its object and material, and `is_clear` (P,), whether the material is
+        partly transparent.
+    """
     try:
-        with path.open("rb") as file:
-            kind = path.suffix.lstrip(".")
-            loaded = trimesh.load_mesh(file, file_type=kind, process=False, resolver=_parts_of(path))
+        parts = list(_read_parts(path))
     except MemoryError:
         raise
     except Exception as error:  # trimesh raises whatever the reader of the format raises
         raise ValueError(f"trimesh cannot read it as a mesh ({error})") from error
+    offsets = np.cumsum([0, *(len(vertices) for vertices, *_ in parts)])
+    faces = [faces + offset for (_, faces, *_), offset in zip(parts, offsets, strict=False)]
     arrays = {
-        "vertices": np.asarray(getattr(loaded, "vertices", ()), dtype=np.float64),
-        "faces": np.asarray(getattr(loaded, "faces", ()), dtype=np.int64),
+        "vertices": np.concatenate([np.empty((0, 3)), *(vertices for vertices, *_ in parts)]),
+        "faces": np.concatenate([np.empty((0, 3), dtype=np.int64), *faces]),
+        "part": np.repeat(np.arange(len(parts)), [len(of_part) for of_part in faces]),
+        "names": np.array([names for _, _, names, _ in parts], dtype=str).reshape(-1, 2),
+        "is_clear": np.array([is_clear for *_, is_clear in parts], dtype=bool),
     }
-    del loaded
+    del parts, faces
     gc.collect()  # it stands in a circle with what it was read from, four times as large as the mesh
     return arrays
+
+
+def _read_parts(path: Path) -> Iterator[tuple[NDArray[np.float64], NDArray[np.int64], tuple[str, str], bool]]:
+    """Vertices, triangles, names and transparency of each mesh of a file."""
+    import trimesh
+
+    kind = path.suffix.lstrip(".").lower()
+    if kind == "dae":
+        with suppress(ImportError):  # trimesh says that it is missing
+            _triangulate_collada()
+    data = path.read_bytes()
+    if kind == "obj":
+        data = _obj_with_triangles(data)
+    scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False, resolver=_parts_of(path))
+    for mesh in scene.dump():
+        if not isinstance(mesh, trimesh.Trimesh):
+            continue
+        vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
+        if kind == "ply":
+            vertices, faces = _with_ply_polygons(mesh, vertices, faces)
+        elif kind == "off":
+            faces = triangulate(vertices, list(_off_polygons(data.decode("utf-8", "replace"))))
+        material = getattr(mesh.visual, "material", None)
+        names = str(mesh.metadata.get("name", "")), str(getattr(material, "name", None) or "")
+        yield vertices, faces, names, _is_clear(material)
+
+
+def _is_clear(material: object) -> bool:
+    """Whether a glTF material blends with what is behind it, or an MTL material is not opaque."""
+    dissolve = (getattr(material, "kwargs", None) or {}).get("d", [1.0])
+    return getattr(material, "alphaMode", None) == "BLEND" or float(dissolve[0]) < 1.0
+
+
+def _obj_with_triangles(data: bytes) -> bytes:
+    """The text of an OBJ file whose polygons are triangles unless a fan covers them, and whose indices are positive."""
+    data = data.replace(b"\r\n", b"\n").replace(b"\\\n", b"")
+    if not OBJ_POLYGON.search(data):
+        return data
+    lines = [line.lstrip() for line in data.split(b"\n")]
+    if OBJ_BACKWARDS.search(data):
+        _count_from_first(lines)
+    positions = np.array([line.split()[1:4] for line in lines if line.startswith(b"v ")], dtype=np.float64)
+    faces = [k for k, line in enumerate(lines) if line.startswith((b"f ", b"f\t"))]
+    corners = [lines[k].partition(b"#")[0].split()[1:] for k in faces]
+    sizes = np.array(list(map(len, corners)))
+    for size in np.unique(sizes[sizes > 3]).tolist():
+        of_size = np.flatnonzero(sizes == size)
+        words = b" ".join(b" ".join(corners[k]) for k in of_size)
+        # The index of the position is what stands before the first slash.
+        polygons = np.array(OBJ_TEXTURE.sub(b"", words).split()).astype(np.int64).reshape(-1, size) - 1
+        if polygons.min() < 0 or polygons.max() >= len(positions):
+            raise ValueError(f"faces have vertices up to {polygons.max() + 1}; there are {len(positions)}")
+        for k in np.flatnonzero(find_bad_fans(positions[polygons])).tolist():
+            number = of_size[k]
+            triangles = triangulate(positions[polygons[k]], [np.arange(size)])
+            of_face = (b"f " + b" ".join(corners[number][c] for c in triangle) for triangle in triangles.tolist())
+            lines[faces[number]] = b"\n".join(of_face)
+    return b"\n".join(lines)
+
+
+def _count_from_first(lines: list[bytes]) -> None:
+    """Let the indices of all faces count from the first vertex; negative ones count back from the last one so far."""
+    counts = {b"v": 0, b"vt": 0, b"vn": 0}
+    for number, line in enumerate(lines):
+        key, *words = line.partition(b"#")[0].split() or [b""]
+        if key in counts:
+            counts[key] += 1
+        elif key == b"f":
+            lasts = tuple(counts.values())
+            corners = [
+                b"/".join(
+                    b"%d" % (int(index) + last + 1) if index.startswith(b"-") else index
+                    for index, last in zip(word.split(b"/"), lasts, strict=False)
+                )
+                for word in words
+            ]
+            lines[number] = b"f " + b" ".join(corners)
+
+
+def _with_ply_polygons(
+    mesh: Any,  # noqa: ANN401  (trimesh has no types)
+    vertices: NDArray[np.float64],
+    faces: NDArray[np.int64],
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Vertices and triangles of a PLY file from what it holds, if that is polygons, of which trimesh makes fans."""
+    raw = mesh.metadata.get("_ply_raw", {})
+    of_faces, of_vertices = (raw.get(key, {}).get("data") for key in ("face", "vertex"))
+    names = of_faces.keys() if isinstance(of_faces, dict) else getattr(of_faces.dtype, "names", None) or ()
+    name = next((name for name in ("vertex_index", "vertex_indices") if name in names), None)
+    if name is None:
+        return vertices, faces
+    lists: Iterable[Any] = of_faces[name]
+    if getattr(getattr(lists, "dtype", None), "names", None):
+        lists = of_faces[name]["f1"]
+    if isinstance(lists, np.ndarray) and lists.shape[1:] == (3,):
+        return vertices, faces
+    polygons = [np.asarray(corners, dtype=np.int64).ravel() for corners in lists]
+    if all(len(polygon) == 3 for polygon in polygons):
+        return vertices, faces
+    vertices = np.column_stack([of_vertices[axis] for axis in "xyz"]).astype(np.float64)
+    return vertices, triangulate(vertices, polygons)
+
+
+def _off_polygons(text: str) -> Iterator[NDArray[np.int64]]:
+    """The vertex indices of each face of an OFF file, which trimesh has found to be one."""
+    text = re.split("C?OFF", text, maxsplit=1)[1]
+    rows = [words for line in text.splitlines() if (words := line.partition("#")[0].split())]
+    vertices, faces = int(rows[0][0]), int(rows[0][1])
+    for words in rows[vertices + 1 : vertices + faces + 1]:
+        yield np.array(words[1 : int(words[0]) + 1], dtype=np.int64)
+
+
+def _triangulate_collada() -> None:
+    """Let pycollada triangulate polygons as here, in place of fans; this process reads meshes and nothing else."""
+    from collada.polylist import Polylist
+    from collada.triangleset import TriangleSet
+
+    def triangleset(polylist: Any) -> Any:  # noqa: ANN401  (pycollada has no types)
+        if polylist._triangleset is None:
+            polygons = [np.arange(*ends) for ends in polylist.polyindex.tolist()]
+            corners = triangulate(polylist.vertex[polylist.vertex_index].astype(np.float64), polygons)
+            indices = polylist.index[corners].flatten()
+            polylist._triangleset = TriangleSet(polylist.sources, polylist.material, indices, polylist.xmlnode)
+        return polylist._triangleset
+
+    Polylist.triangleset = triangleset
 
 
 def _parts_of(path: Path) -> object:

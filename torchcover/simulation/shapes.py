@@ -200,24 +200,55 @@ class MeshFile(Document):
     Args:
         path: The file; relative to the document that names it.
         metres_per_unit: Scale of the file: 1 for metres, 0.001 for millimetres.
+        transparent: Objects or materials of the file that all rays pass, such as windows.
     """
 
     type: Literal["mesh"]
     path: PathBeside
     metres_per_unit: PositiveFloat = 1.0
+    transparent: tuple[str, ...] = ()
 
     def mesh(self) -> Mesh:
-        """All geometry of the file in one mesh."""
-        mesh = _read_mesh(self.path)
+        """All geometry of the file in one mesh, without its transparent parts.
+
+        Raises:
+            BadFileError: The file is no mesh.
+            ValueError: No object or material has a name of `transparent`, or nothing else is in the file.
+        """
+        mesh, part, names, _ = _read_mesh(self.path)
+        if self.transparent:
+            if unknown := [name for name in self.transparent if name not in names]:
+                known = ", ".join(map(repr, sorted({*names.ravel().tolist()} - {""})))
+                raise ValueError(
+                    f"{self.path}: transparent: no object or material is called {unknown[0]!r}; it has {known}"
+                )
+            is_opaque = ~np.isin(names, self.transparent).any(axis=1)[part]
+            if not is_opaque.any():
+                raise ValueError(f"{self.path}: transparent: all {len(part):,} faces are; name the windows only")
+            mesh = mesh.with_faces(is_opaque)
         return mesh._replace(vertices_m=mesh.vertices_m * self.metres_per_unit)
+
+    def clear_materials(self) -> list[str]:
+        """Materials that are partly transparent by the file, and stop rays, since `transparent` does not name them."""
+        _, _, names, is_clear = _read_mesh(self.path)
+        return sorted({material or name for name, material in names[is_clear].tolist()} - set(self.transparent))
+
+
+class _MeshParts(NamedTuple):
+    """A mesh, the part that each face belongs to, names (object, material) of the parts, and which are transparent."""
+
+    mesh: Mesh
+    part: Int64
+    names: NDArray[np.str_]
+    is_clear: Bools
 
 
 @reads("a mesh")
-def _read_mesh(path: Path) -> Mesh:
+def _read_mesh(path: Path) -> _MeshParts:
     with path.open("rb") as file:
         is_binary = b"\0" in file.read(PART)
     check_memory((_BYTES_PER_BINARY_BYTE if is_binary else _BYTES_PER_TEXT_BYTE) * path.stat().st_size)
-    vertices, faces = mesh_arrays(path).values()
+    vertices, faces, part, names, is_clear = mesh_arrays(path).values()
     if len(faces) == 0:
         raise ValueError(f"a mesh with faces is needed; it has {len(vertices)} vertices and no face")
     if not np.isfinite(vertices).all():
@@ -225,7 +256,7 @@ def _read_mesh(path: Path) -> Mesh:
         raise ValueError(f"{bad} of {len(vertices)} vertices are NaN or infinite")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise ValueError(f"faces have vertices {faces.min()} to {faces.max()}; there are {len(vertices)}")
-    return Mesh(vertices, faces)
+    return _MeshParts(Mesh(vertices, faces), part, names, is_clear)
 
 
 def _rectangle(size_m: tuple[float, float], z_m: float) -> Float64:

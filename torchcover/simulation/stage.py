@@ -11,6 +11,7 @@ import numpy as np
 from torch.utils.data import get_worker_info
 
 from torchcover.geometry.arrays import Float64, Int64
+from torchcover.simulation.bodies import describe_windows
 from torchcover.simulation.instant import Instant
 from torchcover.simulation.local_ground import ROUNDING_M
 from torchcover.simulation.memory import machine_bytes
@@ -192,9 +193,10 @@ def mounted_on(scene: Scene, scenario: Scenario, name: str, rig: Rig) -> list[Mo
         if scene.encloses(place):
             carried = rig.vehicle in (None, getattr(scenario.ego and scenario.ego.shape, "vehicle", None))
             other = "" if carried else f", or use its own vehicle (--vehicle {rig.vehicle})"
+            windows = describe_windows(scenario.ego and scenario.ego.shape)
             raise ValueError(
                 f"{where} inside the ego of {scenario.name!r}, {scenario.ego_name}, so that all its rays start "
-                f"blocked; move its mount{other}"
+                f"blocked; move its mount{other}{windows and f'. {windows}'}"
             )
     return [
         MountedSensor(

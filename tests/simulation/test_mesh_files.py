@@ -1,0 +1,173 @@
+"""Polygons of mesh files cover their own area, and objects or materials that are named let rays pass."""
+
+import json
+import struct
+import warnings
+from contextlib import nullcontext
+
+import numpy as np
+import pytest
+
+from torchcover.files import BadFileError
+from torchcover.simulation import CameraSensor, Pose, Rig, Scenario, SimulatedFrames
+from torchcover.simulation.polygons import triangulate
+from torchcover.simulation.shapes import Box, MeshFile
+
+# An L of 5 square meters whose first corner does not see its last ones, and a dart: both wrong as a fan.
+L_SHAPE = [(1.5, -0.5), (-0.5, -0.5), (-0.5, 1.5), (-1.5, 1.5), (-1.5, -1.5), (1.5, -1.5)]
+DART = [(0.0, 0.0), (2.0, 1.0), (0.5, 1.0), (1.0, 2.0)]
+
+
+def shoelace(points):
+    x, y = np.array(points).T
+    return abs((x * np.roll(y, -1) - np.roll(x, -1) * y).sum()) / 2
+
+
+def as_obj(points):
+    """Two copies; the second counts back from its last vertex, which is no longer the last of the file."""
+    low, high = ("".join(f"v {x} {y} {z}\n" for x, y in points) for z in (0, 1))
+    back = " ".join(f"{k}//-1" for k in range(-len(points), 0))
+    ahead = " ".join(f"{k + 1}" for k in range(len(points)))
+    return f"{low}f {ahead}\nvn 0 0 1\n{high}f {back} # a comment\nv 9 9 9\n".encode(), 2
+
+
+def as_ply(points, ending):
+    header = (
+        f"ply\nformat {ending} 1.0\nelement vertex {len(points)}\nproperty float x\nproperty float y\n"
+        "property float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    ).encode()
+    if ending == "ascii":
+        rows = [f"{x} {y} 0" for x, y in points] + [" ".join(map(str, [len(points), *range(len(points))]))]
+        return header + "\n".join(rows).encode() + b"\n", 1
+    data = b"".join(struct.pack("<3f", x, y, 0) for x, y in points)
+    return header + data + struct.pack(f"<B{len(points)}i", len(points), *range(len(points))), 1
+
+
+def as_off(points):
+    rows = [f"{x} {y} 0" for x, y in points] + [" ".join(map(str, [len(points), *range(len(points))]))]
+    return (f"OFF # a comment\n{len(points)} 1 0\n" + "\n".join(rows)).encode(), 1
+
+
+def as_dae(points):
+    numbers = " ".join(f"{x} {y} 0" for x, y in points)
+    order = " ".join(map(str, range(len(points))))
+    accessor = "".join(f"<param name='{axis}' type='float'/>" for axis in "XYZ")
+    return (
+        "<COLLADA xmlns='http://www.collada.org/2005/11/COLLADASchema' version='1.4.1'><library_geometries>"
+        "<geometry id='g'><mesh><source id='p'>"
+        f"<float_array id='a' count='{3 * len(points)}'>{numbers}</float_array>"
+        f"<technique_common><accessor source='#a' count='{len(points)}' stride='3'>{accessor}</accessor>"
+        "</technique_common></source><vertices id='v'><input semantic='POSITION' source='#p'/></vertices>"
+        f"<polylist count='1'><input semantic='VERTEX' source='#v' offset='0'/><vcount>{len(points)}</vcount>"
+        f"<p>{order}</p></polylist></mesh></geometry></library_geometries><library_visual_scenes>"
+        "<visual_scene id='s'><node><instance_geometry url='#g'/></node></visual_scene></library_visual_scenes>"
+        "<scene><instance_visual_scene url='#s'/></scene></COLLADA>"
+    ).encode(), 1
+
+
+def areas(mesh):
+    a, b, c = (mesh.vertices_m[mesh.faces[:, k]] for k in range(3))
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+
+
+@pytest.mark.parametrize("points", [L_SHAPE, DART], ids=["L", "dart"])
+@pytest.mark.parametrize(
+    ("name", "write"),
+    [
+        ("a.obj", as_obj),
+        ("ascii.ply", lambda points: as_ply(points, "ascii")),
+        ("binary.ply", lambda points: as_ply(points, "binary_little_endian")),
+        ("a.off", as_off),
+        ("a.dae", as_dae),
+    ],
+)
+def test_polygons_that_are_not_convex_keep_their_area(tmp_path, name, write, points):
+    content, copies = write(points)
+    (tmp_path / name).write_bytes(content)
+    mesh = MeshFile(type="mesh", path=tmp_path / name).mesh()
+    assert areas(mesh).sum() == pytest.approx(copies * shoelace(points), rel=1e-6)
+    assert len(mesh.faces) == copies * (len(points) - 2)
+
+
+def test_polygons_of_any_shape_keep_their_area_in_any_plane():
+    """Stars seen from their middle, and a square with a hole that is joined to its outline by a cut."""
+    random = np.random.default_rng(0)
+    hole = [(0, 0), (4, 0), (4, 4), (0, 4), (0, 0), (1, 1), (1, 3), (3, 3), (3, 1), (1, 1)]
+    shapes = [np.array(hole, dtype=np.float64)]
+    for corners in (4, 5, 8, 20) * 10:
+        angle = (np.arange(corners) + random.uniform(0, 0.9, corners)) * 2 * np.pi / corners
+        shapes.append(random.uniform(0.1, 1.0, (corners, 1)) * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+    rotation = np.linalg.qr(random.normal(size=(3, 3)))[0]
+    ends = np.cumsum([0, *map(len, shapes)])
+    vertices = np.insert(np.concatenate(shapes), 2, 0.0, axis=1) @ rotation.T + [1e3, 0.0, 5.0]
+    triangles = triangulate(vertices, [np.arange(*ends[k : k + 2]) for k in range(len(shapes))])
+    a, b, c = vertices[triangles].swapaxes(0, 1)
+    each = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    of_shape = np.searchsorted(ends, triangles[:, 0], side="right") - 1
+    np.testing.assert_allclose(np.bincount(of_shape, each), [shoelace(shape) for shape in shapes], rtol=1e-9)
+
+
+def as_glb(meshes):
+    """A GLB of triangles: name -> (three corners, material number); material 1 is called glass and blends."""
+    data, document = b"", {"asset": {"version": "2.0"}, "scene": 0, "nodes": [], "meshes": [], "accessors": []}
+    document["materials"] = [{"name": "paint"}, {"name": "glass", "alphaMode": "BLEND"}]
+    document["bufferViews"] = []
+    for number, (name, (corners, material)) in enumerate(meshes.items()):
+        bounds = {"min": np.min(corners, axis=0).tolist(), "max": np.max(corners, axis=0).tolist()}
+        document["bufferViews"].append({"buffer": 0, "byteOffset": len(data), "byteLength": 36})
+        document["accessors"].append(
+            {"bufferView": number, "componentType": 5126, "count": 3, "type": "VEC3", **bounds}
+        )
+        primitive = {"attributes": {"POSITION": number}, "material": material}
+        document["meshes"].append({"name": name, "primitives": [primitive]})
+        document["nodes"].append({"name": name, "mesh": number})
+        data += np.asarray(corners, dtype="<f4").tobytes()
+    document |= {"scenes": [{"nodes": list(range(len(meshes)))}], "buffers": [{"byteLength": len(data)}]}
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def test_objects_and_materials_that_are_named_let_rays_pass(tmp_path):
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    parts = {"body": (corners, 0), "door": (2 * corners, 0), "windscreen": (4 * corners, 1), "rear": (8 * corners, 1)}
+    (tmp_path / "car.glb").write_bytes(as_glb(parts))
+
+    def read(*names):
+        return MeshFile(type="mesh", path=tmp_path / "car.glb", transparent=names)
+
+    assert sorted(areas(read().mesh())) == [0.5, 2.0, 8.0, 32.0]
+    assert sorted(areas(read("glass").mesh())) == [0.5, 2.0]
+    assert sorted(areas(read("rear", "body").mesh())) == [2.0, 8.0]
+    assert np.ptp(read("glass").mesh().vertices_m, axis=0)[0] == 8.0  # its frame stays
+    assert (read().clear_materials(), read("glass").clear_materials()) == (["glass"], [])
+    with pytest.raises(ValueError, match="no object or material is called 'window'; it has 'body', 'door', 'glass'"):
+        read("window").mesh()
+    with pytest.raises(ValueError, match="all 4 faces are; name the windows only"):
+        read("glass", "paint").mesh()
+
+
+def test_a_camera_behind_glass_is_told_how_to_look_through_it(tmp_path):
+    """A closed car of glass sides: the message names the material and the key, and with the key it looks out."""
+    box = Box(type="box", size_m=(4.0, 2.0, 1.5)).mesh()
+    sides = {f"side {k}": (box.vertices_m[face], 0 if k < 2 else 1) for k, face in enumerate(box.faces)}
+    (tmp_path / "car.glb").write_bytes(as_glb(sides))
+    camera = CameraSensor(name="cam", mount=Pose(z_m=1.0), width=64, height=48, fov_deg=90.0, max_range_m=50.0)
+    rig, courtyard = Rig(name="inside", sensors=(camera,)), Scenario.load("courtyard")
+    for key, told in (
+        ("", "glass.* look transparent .* give its shape `transparent: .glass.`"),
+        (", transparent: [glass]", ""),
+    ):
+        shape = f"{{type: mesh, path: car.glb{key}}}"
+        (tmp_path / "car.yaml").write_text(f"name: car\nparts: [{{name: body, shape: {shape}}}]\n")
+        frames = SimulatedFrames(courtyard, rig, steps=1, vehicle=tmp_path / "car.yaml")
+        with warnings.catch_warnings(), pytest.raises(ValueError, match=told) if told else nullcontext():
+            warnings.simplefilter("ignore")  # its windows are holes
+            assert len(frames[0].sensor) > 100
+
+
+def test_an_index_that_no_vertex_has_is_refused(tmp_path):
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 5\n")
+    with pytest.raises(BadFileError, match="cannot read it as a mesh"):
+        MeshFile(type="mesh", path=tmp_path / "a.obj").mesh()
