@@ -118,7 +118,11 @@ def test_a_simulation_is_evaluated_and_repeats_itself(torchcover, tmp_path):
     assert 0 < a.summary()[0].known_share <= 1
     summary = json.loads((tmp_path / "a" / "summary.json").read_text())
     assert summary["frame_counts"]["reference_rays"] == 128 * 128
-    assert summary["reference"] == {"sensor": "paper", "rays_per_step": 128 * 128, "every_s": 0.1, "notes": []}
+    # Every ray that the frame counts as ended by the ego is named beside its sensor.
+    self_hits = summary["frame_counts"]["sensor_self_hits"]
+    notes = [f"Rays that end on the own vehicle: top {self_hits} of 720 ({self_hits / 720:.1%})."]
+    assert self_hits > 50
+    assert summary["reference"] == {"sensor": "paper", "rays_per_step": 128 * 128, "every_s": 0.1, "notes": notes}
 
 
 def test_the_weights_of_the_surface_reference_reach_the_metric(torchcover, worlds, monkeypatch):

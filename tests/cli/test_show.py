@@ -100,7 +100,9 @@ def test_a_robot_of_urdf_becomes_a_vehicle_and_a_rig_that_can_be_shown(torchcove
     code, printed, _ = torchcover("robot", urdf, "--out", tmp_path / "bot")
     assert code == 0
     assert "rig.yaml with 1 sensors; look at it: torchcover show" in " ".join(printed.split())
-    assert torchcover("show", tmp_path / "bot" / "rig.yaml", "--out", tmp_path)[0] == 0
+    shown = torchcover("show", tmp_path / "bot" / "rig.yaml", "--out", tmp_path)
+    assert shown[0] == 0
+    assert "No ray ends on the own vehicle." in shown[1]
     urdf.write_text(f"<robot name='bot'><link name='b'>{box}</link></robot>")
     code, printed, _ = torchcover("robot", urdf, "--out", tmp_path / "none")
     assert code == 0

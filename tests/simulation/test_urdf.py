@@ -143,8 +143,7 @@ def test_what_a_sensor_is_built_into_is_left_out_and_the_largest_body_stays(robo
     assert len(robot.body.vertices_m) == 16
     assert robot.notes == [
         "Left out: what sensors are built into, 1 of 3 bodies.",
-        "l: 108 of 543 rays (19.9%) end on its own vehicle.",
-        "b: 543 of 543 rays (100.0%) end on its own vehicle.",
+        "Rays that end on the own vehicle: l 108 of 543 (19.9%), b 543 of 543 (100.0%).",
     ]
 
 

@@ -17,7 +17,9 @@ from torchcover.report import Terminal, check_film, write_film
 from torchcover.simulation import Scenario, builtin_names
 from torchcover.simulation.bodies import Body, Vehicle, VehicleShape, body_called, describe_windows, mover_mesh
 from torchcover.simulation.documents import nearest, read_mapping
+from torchcover.simulation.rig import with_ego
 from torchcover.simulation.shapes import MeshFile
+from torchcover.simulation.sight import describe_self_hits
 
 DEFAULT_RIG = "front_roof_128"
 # Kinds of documents, and the key that only such a one has.
@@ -72,6 +74,8 @@ def run(
             _refuse("a scenario or cameras", {"--step": step, "--seed": seed}, f"{name!r} is a rig without cameras")
         world = Scenario.load(scenario or DEFAULT_SCENARIO)
         _say(console, shown.description)
+        ego = with_ego(world, {name: shown}, vehicle).ego_mesh()
+        _say(console, describe_self_hits(shown.sensors, ego) or "No ray ends on the own vehicle.")
         _write(
             console, out / Path(name).stem, rig_pictures(shown, world, vehicle=vehicle, step=step or 0, seed=seed or 0)
         )

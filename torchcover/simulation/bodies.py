@@ -199,9 +199,8 @@ def mount_regions_of(shape: Shape | None) -> dict[str, MountRegion]:
 
 def describe_windows(shape: Shape | None) -> str:
     """Say which materials of a body look transparent and stop rays, and how to let these pass; empty if none does."""
-    parts = Vehicle.load(shape.vehicle).parts if isinstance(shape, VehicleShape) else ()
-    meshes = [part.shape for part in parts] or [shape]
-    for mesh in meshes:
+    parts: tuple[Body, ...] = Vehicle.load(shape.vehicle).parts if isinstance(shape, VehicleShape) else ()
+    for mesh in (shape, *(part.shape for part in parts)):
         if isinstance(mesh, shapes.MeshFile) and (names := mesh.clear_materials()):
             return (
                 f"{mesh.path.name}: {', '.join(map(repr, names))} look transparent and stop rays; to let rays pass, "

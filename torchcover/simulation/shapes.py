@@ -222,7 +222,7 @@ class MeshFile(Document):
                 raise ValueError(
                     f"{self.path}: transparent: no object or material is called {unknown[0]!r}; it has {known}"
                 )
-            is_opaque = ~np.isin(names, self.transparent).any(axis=1)[part]
+            is_opaque = ~np.asarray(np.isin(names, self.transparent).any(axis=1))[part]
             if not is_opaque.any():
                 raise ValueError(f"{self.path}: transparent: all {len(part):,} faces are; name the windows only")
             mesh = mesh.with_faces(is_opaque)

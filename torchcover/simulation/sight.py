@@ -180,21 +180,20 @@ def count_self_hits(sensor: Sensor, body: Mesh) -> tuple[int, int]:
     return sum(int(np.isfinite(end_m).sum()) for end_m in ends_m), sum(len(end_m) for end_m in ends_m)
 
 
-def describe_self_hits(sensors: Sequence[Sensor], body: Mesh) -> list[str]:
-    """Say of each sensor with rays that end on its own vehicle, how many these are.
+def describe_self_hits(sensors: Sequence[Sensor], body: Mesh) -> str:
+    """Say how many rays of each sensor end on its own vehicle, in one sentence; empty if none does.
 
     Example:
         >>> from torchcover.simulation import Rig, Scenario
-        >>> describe_self_hits(Rig.load("front_roof_128").sensors, Scenario.load("courtyard").ego_mesh())
-        []
+        >>> describe_self_hits(Rig.load("kitti").sensors, Scenario.load("courtyard").ego_mesh())
+        ''
     """
-    sentences = []
+    shares = []
     for sensor in sensors:
         self_hits, rays = count_self_hits(sensor, body)
         if self_hits:
-            share = f"{self_hits:,} of {rays:,} rays ({self_hits / rays:.1%})"
-            sentences.append(f"{sensor.name}: {share} end on its own vehicle.")
-    return sentences
+            shares.append(f"{sensor.name} {self_hits:,} of {rays:,} ({self_hits / rays:.1%})")
+    return f"Rays that end on the own vehicle: {', '.join(shares)}." if shares else ""
 
 
 class Sight(NamedTuple):

@@ -25,6 +25,7 @@ from torchcover.simulation.rig import Rig, with_ego
 from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.sensor import Sensor
 from torchcover.simulation.shapes import Mesh
+from torchcover.simulation.sight import describe_self_hits
 from torchcover.simulation.simulator import Observation, Simulator
 from torchcover.simulation.surface_reference import SurfaceReference
 
@@ -192,9 +193,12 @@ class SimulatedFrames(FrameDataset):
 
     @property
     def reference_record(self) -> Mapping[str, object]:
-        """The name of the reference sensor, the time between two frames, what was taken for the ground, what drawn."""
-        traffic = self.scenario.traffic
+        """The reference sensor, the time between two frames; notes on ground, traffic and rays that the ego ends."""
+        traffic, ego = self.scenario.traffic, self.ego_mesh()
         words = [self.simulator.ground_words, traffic.drawn_words if traffic else ""]
+        for name, rig in self.rigs.items():
+            self_hits = describe_self_hits(rig.sensors, ego)
+            words.append(f"{name}: {self_hits}" if self_hits and len(self.rigs) > 1 else self_hits)
         return {"sensor": self.reference_sensor.name, "every_s": self.every_s, "notes": list(filter(None, words))}
 
     @property

@@ -193,7 +193,7 @@ def mounted_on(scene: Scene, scenario: Scenario, name: str, rig: Rig) -> list[Mo
         if scene.encloses(place):
             carried = rig.vehicle in (None, getattr(scenario.ego and scenario.ego.shape, "vehicle", None))
             other = "" if carried else f", or use its own vehicle (--vehicle {rig.vehicle})"
-            windows = describe_windows(scenario.ego and scenario.ego.shape)
+            windows = describe_windows(scenario.ego.shape if scenario.ego else None)
             raise ValueError(
                 f"{where} inside the ego of {scenario.name!r}, {scenario.ego_name}, so that all its rays start "
                 f"blocked; move its mount{other}{windows and f'. {windows}'}"

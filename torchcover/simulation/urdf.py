@@ -138,7 +138,7 @@ def read_robot(path: Path, packages: Mapping[str, str | Path] | None = None) -> 
     notes += _note_limits(joints, positions)
     body = merge(kept)
     if sensors:
-        notes += describe_self_hits(_mounted(sensors), body)
+        notes += filter(None, [describe_self_hits(_mounted(sensors), body)])
     return Robot(root.get("name", path.stem), body, [sensor.keys for sensor in sensors], notes)
 
 
