@@ -50,7 +50,7 @@ cost: {small: 1}
 objectives: {near: {detection: 1.0, band: ground, region: 20m}}
 """
 WORLD = ("--scenario", "yard.yaml")
-SMALL = (*WORLD, "--rays", "64", "--cell-m", "8", "--steps", "2")
+SMALL = (*WORLD, "--rays", "64", "--set", "cell_m=8", "--steps", "2")
 RESULTS = {
     "evaluate": ("evaluate", "rig.yaml", *SMALL),
     "evaluate --resume": ("evaluate", "rig.yaml", *SMALL, "--resume"),

@@ -42,7 +42,7 @@ RANKS = (4, 16, 64)
 MANY_RIGS, MANY_SCENARIOS, STEPS = 1000, 100, 64
 RIGS_TOGETHER = 8
 RESUMED_STEPS = 150
-COMMAND = ("evaluate", "front_roof_32", "--rays", "256", "--cell-m", "8", "--resume", "--steps", str(RESUMED_STEPS))
+COMMAND = ("evaluate", "front_roof_32", "--rays", "256", "--set", "cell_m=8", "--resume", "--steps", str(RESUMED_STEPS))
 OFTEN = """
 import sys
 from torchcover.evaluation import checkpoint

@@ -140,17 +140,19 @@ def values() -> Iterator[Case]:
 def options() -> Iterator[Case]:
     """Options with values that make no sense or have no room."""
     refused = {
-        "--cell-m": ("20", "1e-310", "0.001", "nan", "inf", "-1", "1e300", "x"),
+        "--set": (
+            *(f"cell_m={value}" for value in ("20", "1e-310", "0.001", "nan", "inf", "-1", "1e300", "x")),
+            *(f"every_s={value}" for value in ("1e308", "nan", "inf", "0", "1e-300", "-1")),
+            *("estimate=[/x]", "cells_m=1", "cell_m", "=", "recording.units=km", "recording=1", "seed=true"),
+        ),
         "--thresholds-m": ("inf", "nan", "-1", "1e9", "x"),
         "--rays": ("99999999999", "9" * 30, "0", "-1", "1e9"),
         "--steps": ("9" * 20, "0", "1.5"),
         "--seed": ("-1", "x"),
-        "--every-s": ("1e308", "nan", "inf", "0", "1e-300", "-1"),
         "--device": ("meta", "abacus", "cuda:99", ""),
         "--workers": ("-1", "1000000", "9" * 20),
         "--target-error": ("0%", "nan%", "infm", "1e400%", "5", ""),
         "--reference": ("", "[/x]"),
-        "--estimate": ("[/x]",),
         "--scenario": ("", "[/x]", ".", "/", "none.yaml", "x" * 5000),
         "--out": ("link", "file", "file/below"),
     }
@@ -179,7 +181,7 @@ def _files(changed: dict[str, str]) -> dict[str, str]:
 
 
 def _evaluate(rig: str, *more: str) -> tuple[str, ...]:
-    quick = ("--scenario", "yard.yaml", "--steps", "1", "--cell-m", "4", "--rays", "64", "--out", "out")
+    quick = ("--scenario", "yard.yaml", "--steps", "1", "--set", "cell_m=4", "--rays", "64", "--out", "out")
     return ("evaluate", rig, *quick, *more)
 
 

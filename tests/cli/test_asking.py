@@ -10,11 +10,16 @@ import pytest
 import torchcover as package
 from torchcover import Coverage, Region, RegionsOfInterest
 
-SMALL = ["--steps", 9, "--cell-m", 0.5, "--thresholds-m", 2, "--rays", 1024]
-ASKED = [
-    *("--region", "behind:-6,-2,-2,2", "--region", "ahead:2,6,-2,2"),
-    *("--height", "dog:-0.1,0.5", "--height", "child:-0.1,1.1", "--grid", "-10,10,-10,10"),
-]
+SMALL = ["--steps", 9, "--set", "cell_m=0.5", "--thresholds-m", 2, "--rays", 1024]
+REGIONS = "{behind: {x_m: [-6, -2], y_m: [-2, 2]}, ahead: {x_m: [2, 6], y_m: [-2, 2]}}"
+HEIGHTS = "{dog: [-0.1, 0.5], child: [-0.1, 1.1]}"
+GRID = "{x_m: [-10, 10], y_m: [-10, 10]}"
+
+
+def write_regions(folder, regions=REGIONS, heights=HEIGHTS, grid=GRID):
+    path = folder / "ask.yaml"
+    path.write_text(f"regions: {regions}\nheights: {heights}\ngrid: {grid}\n")
+    return ["--ask", path]
 
 
 @pytest.fixture
@@ -32,7 +37,7 @@ def rows_of(folder):
 
 
 def test_what_is_asked_on_the_command_line_in_a_file_and_in_python_is_the_same(evaluate, worlds):
-    code, printed, _ = evaluate(*ASKED)
+    code, printed, _ = evaluate(*write_regions(worlds))
     assert code == 0
     assert "dog -0.1 to 0.5 m above ground, child -0.1 to 1.1 m above ground" in " ".join(printed.split())
     rows = rows_of(worlds / "out")
@@ -40,12 +45,9 @@ def test_what_is_asked_on_the_command_line_in_a_file_and_in_python_is_the_same(e
         (region, height) for region in ("behind", "ahead") for height in ("dog", "child")
     ]
     assert float(rows[0]["known_share"]) == 1.0  # the reference is aimed at it
-    (worlds / "ask.yaml").write_text(
-        "regions: {ahead: {x_m: [2, 6], y_m: [-2, 2]}}\n"
-        "heights: {dog: [-0.1, 0.5], child: [-0.1, 1.1]}\n"
-        "grid: {x_m: [-10, 10], y_m: [-10, 10]}\n"
-    )
-    assert evaluate("--ask", worlds / "ask.yaml", *ASKED[:4], out="file")[0] == 0
+    asked = write_regions(worlds, regions="{other: {x_m: [2, 6], y_m: [-2, 2]}}")
+    options = ("--region", "behind:-6,-2,-2,2", "--region", "ahead:2,6,-2,2")
+    assert evaluate(*asked, *options, out="file")[0] == 0
     assert (worlds / "file" / "summary.csv").read_text() == (worlds / "out" / "summary.csv").read_text()
     ask = RegionsOfInterest(
         regions={"behind": {"x_m": (-6.0, -2.0), "y_m": (-2.0, 2.0)}, "ahead": {"x_m": (2.0, 6.0), "y_m": (-2.0, 2.0)}},
@@ -63,7 +65,7 @@ def test_what_is_asked_on_the_command_line_in_a_file_and_in_python_is_the_same(e
 
 
 def test_the_sensor_behind_is_what_the_place_behind_depends_on(evaluate, torchcover, worlds):
-    code, printed, _ = evaluate(*ASKED, "--redundancy")
+    code, printed, _ = evaluate(*write_regions(worlds), "--redundancy")
     assert code == 0
     assert "Single point of failure: " in printed
     by_place = {(row["region"], row["height"]): row for row in rows_of(worlds / "out")}
@@ -74,7 +76,7 @@ def test_the_sensor_behind_is_what_the_place_behind_depends_on(evaluate, torchco
         assert float(row[f"detection_2m_without_{other}_change"]) == 0.0
         assert float(row["sensors_2m"]) == pytest.approx(float(row["detection_2m"]))  # never both
     # Without the sensor behind it is the rig without it, in the same frames.
-    assert evaluate(*ASKED, rig="low", out="alone")[0] == 0
+    assert evaluate(*write_regions(worlds), rig="low", out="alone")[0] == 0
     for row in rows_of(worlds / "alone"):
         found = by_place[row["region"], row["height"]]
         for key in ("radius_m", "detection_2m"):
@@ -86,17 +88,17 @@ def test_the_sensor_behind_is_what_the_place_behind_depends_on(evaluate, torchco
     assert "out: change of detection" in " ".join(printed.split())
 
 
-def test_a_run_goes_on_with_the_same_question_only(evaluate):
-    asked = [*ASKED, "--redundancy"]
+def test_a_run_goes_on_with_the_same_question_only(evaluate, worlds):
+    asked = [*write_regions(worlds), "--redundancy"]
     assert evaluate(*asked)[0] == 0
     assert evaluate(*asked, "--resume")[0] == 0
-    for changed, what in (
-        (asked[:-1], "redundancy"),
-        ([*ASKED[2:], "--redundancy"], "regions"),
-        ([*ASKED[:4], "--height", "dog:0,0.5", *ASKED[8:], "--redundancy"], "heights"),
-        ([*asked, "--grid", "-9,9,-9,9"], "grid"),
+    for changed, options, what in (
+        ({}, [], "redundancy"),
+        ({"regions": "{ahead: {x_m: [2, 6], y_m: [-2, 2]}}"}, ["--redundancy"], "regions"),
+        ({"heights": "{dog: [0, 0.5]}"}, ["--redundancy"], "heights"),
+        ({"grid": "{x_m: [-9, 9], y_m: [-9, 9]}"}, ["--redundancy"], "grid"),
     ):
-        code, _, complaints = evaluate(*changed, "--resume")
+        code, _, complaints = evaluate(*write_regions(worlds, **changed), *options, "--resume")
         assert code == 2
         assert what in complaints
 
@@ -110,12 +112,7 @@ def test_a_run_goes_on_with_the_same_question_only(evaluate):
         (["--region", "a:2,1,0,1"], "regions.a.x_m: the lower bound must be below the upper one; got 2 to 1 m"),
         (["--region", "a:nan,1,0,1"], "regions.a.x_m.0: Input should be"),
         (["--region", "a:0,1,0,1", "--region", "a:0,2,0,1"], "the name 'a' is given already"),
-        (["--region", "a:0,50,0,1", "--grid", "-9,9,-9,9"], "region 'a' spans x = 0 to 50 m, beyond the grid's"),
         (["--region", "a:0,0.1,0,1"], "region 'a' holds no cell centre; use smaller cells than 0.5 m"),
-        (["--height", "a:1,1"], "heights.a: the lower bound must be below the upper one; got 1 to 1 m"),
-        (["--height", "a:0,1", "--height", "a:0,2"], "the name 'a' is given already"),
-        (["--grid", "0,1,2"], "--grid 0,1,2: 4 numbers x0,x1,y0,y1 in metres are needed"),
-        (["--grid", "-2000,2000,-2000,2000"], "128,000,000 cells, over 100,000,000: use larger cells"),
         (["--ask", "nowhere.yaml"], "nowhere.yaml"),
     ],
 )
@@ -124,6 +121,20 @@ def test_what_asks_nothing_ends_in_one_line(evaluate, options, message):
     assert code == 2
     assert message in complaints
     assert len(complaints.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"regions": "{a: {x_m: [0, 50], y_m: [0, 1]}}"}, "region 'a' spans x = 0 to 50 m, beyond the grid's"),
+        ({"heights": "{a: [1, 1]}"}, "heights.a: the lower bound must be below the upper one; got 1 to 1 m"),
+        ({"heights": "{a: [0, 1], a: [0, 2]}"}, "'a'"),
+        ({"grid": "{x_m: [-2000, 2000], y_m: [-2000, 2000]}"}, "128,000,000 cells, over 100,000,000: use larger cells"),
+    ],
+)
+def test_a_file_of_regions_that_makes_no_sense_is_refused(evaluate, worlds, changed, message):
+    code, _, complaints = evaluate(*write_regions(worlds, **changed))
+    assert (code, message in complaints) == (2, True)
 
 
 def test_maps_without_room_are_refused_before_anything_runs(evaluate, monkeypatch):
@@ -141,15 +152,16 @@ def test_a_region_within_the_vehicle_is_unknown_and_a_line_says_why(evaluate, wo
     assert [(row["detection_2m"], row["known_cells"]) for row in rows_of(worlds / "out")] == [("", "0")] * 2
 
 
-def test_where_nothing_was_seen_no_sensor_is_called_dispensable(evaluate):
-    code, printed, _ = evaluate("--region", "sky:2,6,-2,2", "--height", "sky:50,60", "--redundancy")
+def test_where_nothing_was_seen_no_sensor_is_called_dispensable(evaluate, worlds):
+    asked = write_regions(worlds, regions="{sky: {x_m: [2, 6], y_m: [-2, 2]}}", heights="{sky: [50, 60]}")
+    code, printed, _ = evaluate(*asked, "--redundancy")
     assert (code, "unknown: nothing that was asked about was seen." in " ".join(printed.split())) == (0, True)
     assert "No single point of failure" not in printed
 
 
 def test_where_nothing_is_detected_no_sensor_is_called_dispensable_either(torchcover, worlds):
     scene = ("--scenario", worlds / "yard.yaml", "--out", worlds / "out", "--steps", 2, "--rays", 1024)
-    asked = ("--cell-m", 0.5, "--region", "ahead:2,6,-2,2", "--thresholds-m", 1e-9, "--redundancy")
+    asked = ("--set", "cell_m=0.5", "--region", "ahead:2,6,-2,2", "--thresholds-m", 1e-9, "--redundancy")
     code, printed, _ = torchcover("evaluate", worlds / "both.yaml", *scene, *asked)
     assert (code, "Nothing of what was asked about is detected" in " ".join(printed.split())) == (0, True)
     assert "No single point of failure" not in printed
@@ -157,7 +169,7 @@ def test_where_nothing_is_detected_no_sensor_is_called_dispensable_either(torchc
 
 def test_bands_over_the_ground_and_over_z_agree_on_level_ground(torchcover, evaluate, worlds):
     rows = {}
-    spans = {"ground": ("-0.5 to 0.5 m above ground",), "vehicle": ("z -0.5 to 0.5 m", "--band-frame", "vehicle")}
+    spans = {"ground": ("-0.5 to 0.5 m above ground",), "vehicle": ("z -0.5 to 0.5 m", "--set", "band_frame=vehicle")}
     for band_frame, (words, *options) in spans.items():
         code, printed, _ = evaluate(*options, "--rays", 16_384, out=band_frame)
         assert code == 0
@@ -171,7 +183,7 @@ def test_bands_over_the_ground_and_over_z_agree_on_level_ground(torchcover, eval
 def test_the_paper_s_reference_has_bands_over_z(evaluate, worlds):
     assert evaluate("--reference", "paper")[0] == 0
     assert json.loads((worlds / "out" / "summary.json").read_text())["band_frame"] == "vehicle"
-    code, _, errors = evaluate("--reference", "paper", "--band-frame", "ground")
+    code, _, errors = evaluate("--reference", "paper", "--set", "band_frame=ground")
     assert (code, len(errors.strip().splitlines())) == (2, 1)
     assert "band_frame ground: the paper's reference has bands over z of the vehicle; leave it out" in errors
 

@@ -9,6 +9,8 @@ import pytest
 from torchcover import Coverage
 from torchcover.simulation import REFERENCE_SENSORS
 
+QUICK = ("--set", "cell_m=4", "--set", "probe=none")
+
 
 def compare(torchcover, worlds, *rigs, steps=1, out="out", options=()):
     """Run it on the tiny yard; returns exit code, stdout, stderr, and the folder."""
@@ -19,14 +21,14 @@ def compare(torchcover, worlds, *rigs, steps=1, out="out", options=()):
         worlds / "yard.yaml",
         "--steps",
         steps,
-        "--cell-m",
-        4,
+        "--set",
+        "cell_m=4",
         "--thresholds-m",
         2,
         "--out",
         folder,
     ]
-    arguments += ["--rays", 4096, "--probe", "none", *options]
+    arguments += ["--rays", 4096, "--set", "probe=none", *options]
     return *torchcover("compare", *paths, *arguments), folder
 
 
@@ -48,8 +50,19 @@ def test_files_agree_with_each_other_and_with_evaluate(torchcover, worlds):
         assert row["radius_m"] == ("" if same["radius_m"] is None else str(same["radius_m"]))
         assert row["radius_m_best"] == str(same["radius_m_best"])
     alone = worlds / "alone"
-    options = ["--scenario", worlds / "yard.yaml", "--steps", 2, "--cell-m", 4, "--thresholds-m", 2, "--out", alone]
-    assert torchcover("evaluate", worlds / "both.yaml", *options, "--rays", 4096, "--probe", "none")[0] == 0
+    options = [
+        "--scenario",
+        worlds / "yard.yaml",
+        "--steps",
+        2,
+        "--set",
+        "cell_m=4",
+        "--thresholds-m",
+        2,
+        "--out",
+        alone,
+    ]
+    assert torchcover("evaluate", worlds / "both.yaml", *options, "--rays", 4096, *QUICK)[0] == 0
     np.testing.assert_array_equal(Coverage.load(alone / "coverage.npz").radius, coverages["both"].radius)
 
 
@@ -152,7 +165,7 @@ def recording(tmp_path):
 )
 def test_the_rigs_of_a_recording_are_compared(torchcover, recording, tmp_path, rigs, radii):
     out = tmp_path / "out"
-    arguments = ["--frames", recording, "--format", "folder", "--cell-m", 4, "--out", out]
+    arguments = ["--frames", recording, "--set", "recording.format=folder", "--set", "cell_m=4", "--out", out]
     code, _, complaints = torchcover("compare", *rigs, *arguments)
     assert code == 0, complaints
     summary = json.loads((out / "summary.json").read_text())
@@ -170,7 +183,11 @@ def test_what_is_not_in_a_recording_is_told_with_what_is(torchcover, recording, 
     arguments = ["--frames", recording, "--out", tmp_path / "out"]
     for command, rigs, message in (
         ("compare", ["near", "middle"], "no clouds of the rig middle; the frames have far, kitti, near"),
-        ("compare", ["near", "far", "--format", "bag"], "format 'bag': no such format of recordings; there"),
+        (
+            "compare",
+            ["near", "far", "--set", "recording.format=bag"],
+            "format 'bag': no such format of recordings; there",
+        ),
         ("compare", ["near", "far", "--scenario", "urban"], "exclude each other"),
     ):
         code, _, error = torchcover(command, *rigs, *arguments)
@@ -178,8 +195,8 @@ def test_what_is_not_in_a_recording_is_told_with_what_is(torchcover, recording, 
     assert torchcover("evaluate", "near", *arguments)[0] == 0
     assert torchcover("evaluate", *arguments)[0] == 0
     assert list(json.loads((tmp_path / "out" / "summary.json").read_text())["rigs"]) == ["far", "kitti", "near"]
-    code, _, error = torchcover("evaluate", "kitti", "--format", "folder")
-    assert (code, "--format: for a recording" in error) == (2, True)
+    code, _, error = torchcover("evaluate", "kitti", "--set", "recording.format=folder")
+    assert (code, "recording.format: for a recording" in error) == (2, True)
 
 
 @pytest.mark.parametrize(
@@ -190,7 +207,7 @@ def test_what_is_not_in_a_recording_is_told_with_what_is(torchcover, recording, 
         (["front_roof_128", "no_such_rig"], "neither a .yaml file nor one of the built-in rigs; is "),
         (["front_roof_128", "none.yaml"], "none.yaml: no such file"),
         (["front_roof_128", "front_roof_64", "--scenario", "moon"], "one of the built-in scenarios; is "),
-        (["front_roof_128", "front_roof_64", "--cell-m", "0.3"], "not a multiple of the cell"),
+        (["front_roof_128", "front_roof_64", "--set", "cell_m=0.3"], "not a multiple of the cell"),
         (["front_roof_128", "front_roof_64", "--thresholds-m", "-1"], "thresholds: finite distances >= 0"),
         (["front_roof_128", "front_roof_64", "--device", "abacus"], "device abacus: cannot be used here"),
         (["front_roof_128", "front_roof_64", "--steps", "0"], "--steps"),

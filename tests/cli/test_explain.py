@@ -2,7 +2,7 @@
 
 import json
 
-RAYS = ["--rays", "256", "--cell-m", "1"]
+RAYS = ["--rays", "256", "--set", "cell_m=1"]
 
 
 def whats(folder):

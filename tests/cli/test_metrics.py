@@ -17,8 +17,8 @@ def run(torchcover, worlds, *rigs, command="compare", options=(), out="out", ste
         worlds / "yard.yaml",
         "--steps",
         steps,
-        "--cell-m",
-        4,
+        "--set",
+        "cell_m=4",
         "--thresholds-m",
         2,
         "--rays",
@@ -30,7 +30,7 @@ def run(torchcover, worlds, *rigs, command="compare", options=(), out="out", ste
 
 
 def test_three_rigs_have_ranks_and_taus_in_every_file(torchcover, worlds):
-    code, printed, error, out = run(torchcover, worlds, "low", "both", "other/low", options=["--metrics", "all"])
+    code, printed, error, out = run(torchcover, worlds, "low", "both", "other/low", options=["--set", "metrics=all"])
     assert (code, error.count("warning")) == (0, 0)
     assert "None of these metrics is validated" in printed
     assert "m_sog: only for ranks" in " ".join(printed.split())
@@ -57,13 +57,13 @@ def test_three_rigs_have_ranks_and_taus_in_every_file(torchcover, worlds):
 
 
 def test_two_rigs_have_no_tau_and_are_told_why(torchcover, worlds):
-    _, printed, _, out = run(torchcover, worlds, "low", "both", options=["--metrics", "point_density"])
+    _, printed, _, out = run(torchcover, worlds, "low", "both", options=["--set", "metrics=point_density"])
     assert "needs three rigs or more" in " ".join(printed.split())
     assert json.loads((out / "summary.json").read_text())["metrics"]["tau"] == []
 
 
 def test_one_rig_has_its_numbers_and_its_coverage_is_what_it_is_without(torchcover, worlds):
-    code, printed, _, out = run(torchcover, worlds, "both", command="evaluate", options=["--metrics", "k_cover"])
+    code, printed, _, out = run(torchcover, worlds, "both", command="evaluate", options=["--set", "metrics=k_cover"])
     assert code == 0
     assert "k_cover_2_2m" in printed
     *_, plain = run(torchcover, worlds, "both", command="evaluate", out="plain")
@@ -73,7 +73,7 @@ def test_one_rig_has_its_numbers_and_its_coverage_is_what_it_is_without(torchcov
 
 
 def test_a_name_that_is_none_is_told_with_those_that_are(torchcover, worlds):
-    code, _, error, _ = run(torchcover, worlds, "low", "both", options=["--metrics", "nosuch"])
+    code, _, error, _ = run(torchcover, worlds, "low", "both", options=["--set", "metrics=nosuch"])
     assert code == 2
     assert error.count("\n") == 1
     assert "k_cover" in error
@@ -81,7 +81,7 @@ def test_a_name_that_is_none_is_told_with_those_that_are(torchcover, worlds):
 
 
 def test_a_run_goes_on_from_its_checkpoint_with_its_metrics(torchcover, worlds):
-    options = ["--metrics", "all"]
+    options = ["--set", "metrics=all"]
     run(torchcover, worlds, "low", "both", options=options, steps=1)
     code, *_, out = run(torchcover, worlds, "low", "both", options=[*options, "--resume"], steps=3)
     *_, whole = run(torchcover, worlds, "low", "both", options=options, steps=3, out="whole")
@@ -95,7 +95,15 @@ def test_a_recording_without_boxes_has_the_metrics_that_need_none(torchcover, wo
     )
     shutil.rmtree(worlds / "drive" / "boxes")
     code, printed, error = torchcover(
-        "evaluate", "--frames", worlds / "drive", "--metrics", "all", "--cell-m", 4, "--out", worlds / "of_drive"
+        "evaluate",
+        "--frames",
+        worlds / "drive",
+        "--set",
+        "metrics=all",
+        "--set",
+        "cell_m=4",
+        "--out",
+        worlds / "of",
     )
     assert code == 0, error
     assert "point_density" in printed

@@ -11,7 +11,7 @@ RADAR = (
 )
 FRONT = f"  - {{type: radar, name: front, mount: {{x_m: 2.05, z_m: 0.6}}, {RADAR}}}\n"
 REAR = f"  - {{type: radar, name: rear, mount: {{x_m: -2.05, z_m: 0.6, yaw_deg: 180}}, {RADAR}}}\n"
-SMALL = ("--steps", 3, "--cell-m", 0.5, "--rays", 2048, "--redundancy")
+SMALL = ("--steps", 3, "--set", "cell_m=0.5", "--rays", 2048, "--redundancy")
 
 
 @pytest.fixture

@@ -17,12 +17,14 @@ def test_a_recording_has_the_numbers_of_the_simulation(torchcover, worlds, tmp_p
     assert "3/3" in told  # the bar
     assert (code, len(printed.splitlines())) == (0, 1)
     assert printed.startswith(f"Wrote 3 frames to {recording}; ")
-    cell = ("--cell-m", 1, "--thresholds-m", 0.4, "--thresholds-m", 1)
-    assert torchcover("evaluate", worlds / "both.yaml", *options, *cell, "--probe", "none", "--out", measured)[0] == 0
+    cell = ("--set", "cell_m=1", "--thresholds-m", 0.4, "--thresholds-m", 1)
+    assert (
+        torchcover("evaluate", worlds / "both.yaml", *options, *cell, "--set", "probe=none", "--out", measured)[0] == 0
+    )
     code, printed, _ = torchcover("evaluate", "--frames", recording, *cell, "--out", read)
     assert code == 0
     assert "Bodies beside the vehicle: not for recordings" in " ".join(printed.split())
-    code, _, told = torchcover("evaluate", "--frames", recording, "--probe", "child", "--out", read)
+    code, _, told = torchcover("evaluate", "--frames", recording, "--set", "probe=child", "--out", read)
     assert (code, "probe: not for recordings" in told) == (2, True)
     first, second = (Coverage.load(folder / "coverage.npz") for folder in (measured, read))
     assert first.measure == second.measure == "area"
@@ -54,10 +56,10 @@ def test_a_recording_that_was_ended_is_not_evaluated_and_gone_on_with(torchcover
     code, _, said = torchcover(*command, "--out", out)
     assert code == 130
     assert said.endswith("torchcover: 1 of 3 frames are kept; go on by --resume\ntorchcover: interrupted\n")
-    code, _, said = torchcover("evaluate", "--frames", out, "--cell-m", 8, "--out", worlds / "out")
+    code, _, said = torchcover("evaluate", "--frames", out, "--set", "cell_m=8", "--out", worlds / "out")
     assert code == 2
     assert f"{out}: a part of a recording, 1 frames: whatever wrote it was ended; go on with `torchcover record" in said
     monkeypatch.setattr(writing, "_step", step)
     code, printed, _ = torchcover(*command, "--out", out, "--resume")
     assert (code, printed.startswith("Wrote 3 frames to ")) == (0, True)
-    assert torchcover("evaluate", "--frames", out, "--cell-m", 8, "--out", worlds / "out")[0] == 0
+    assert torchcover("evaluate", "--frames", out, "--set", "cell_m=8", "--out", worlds / "out")[0] == 0

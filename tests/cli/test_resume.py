@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-SMALL = ("--cell-m", 8, "--rays", 256)
+SMALL = ("--set", "cell_m=8", "--rays", 256)
 
 
 def files_of(folder):

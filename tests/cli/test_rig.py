@@ -23,7 +23,7 @@ def test_a_recorded_rig_is_found_again(torchcover, worlds, tmp_path):
         assert (lidar.name, lidar.columns, lidar.horizontal_fov_deg) == (of.name, 30, 90.0)
         np.testing.assert_allclose(lidar.mount.matrix(), of.mount.matrix(), atol=1e-6)
         assert lidar.max_range_m <= 60.1
-    assert torchcover("evaluate", found, *few, "--cell-m", 1, "--out", tmp_path / "out")[0] == 0
+    assert torchcover("evaluate", found, *few, "--set", "cell_m=1", "--out", tmp_path / "out")[0] == 0
     code, printed, _ = torchcover("rig", "--frames", recording, "--sensors", "rear", "--lidar", "rear=velodyne_vlp16")
     (sensor,) = yaml.safe_load(printed)["sensors"]
     assert (code, sensor["name"], sensor["model"]) == (0, "rear", "velodyne_vlp16")
@@ -33,7 +33,7 @@ def test_what_rig_refuses(torchcover, worlds, tmp_path):
     for options, told in (
         (("--frames", tmp_path / "none"), "none: no such recording"),
         (("--frames", tmp_path, "--lidar", "roof"), "--lidar roof: SENSOR=MODEL is needed"),
-        (("--frames", tmp_path, "--format", "bag"), "no such format of recordings; there are"),
+        (("--frames", tmp_path, "--set", "recording.format=bag"), "no such format of recordings; there are"),
     ):
         code, printed, error = torchcover("rig", *options)
         assert (code, printed, len(error.splitlines())) == (2, "", 1)

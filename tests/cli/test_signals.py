@@ -23,8 +23,8 @@ def arguments(worlds, *, steps=3):
     settings = [
         "--scenario",
         worlds / "yard.yaml",
-        "--cell-m",
-        4,
+        "--set",
+        "cell_m=4",
         "--thresholds-m",
         2,
         "--rays",

@@ -24,7 +24,7 @@ def test_a_small_study_writes_tables_a_diagram_and_an_advice(torchcover, tmp_pat
     codes = []
     monkeypatch.setattr("torchcover.evaluation.study.subprocess", SimpleNamespace(run=timed))
     out = tmp_path / "out"
-    options = ["--rays", "256", "--cell-m", "4", "--steps", "8"]
+    options = ["--rays", "256", "--set", "cell_m=4", "--steps", "8"]
     code, text, complaints = torchcover("study", "front_roof_32", "--scenario", "courtyard", *options, "--out", out)
     assert code == 0, complaints
     assert "…" not in text
@@ -40,8 +40,8 @@ def test_a_small_study_writes_tables_a_diagram_and_an_advice(torchcover, tmp_pat
     ("options", "message"),
     [
         (["--rays", "0"], "rays"),
-        (["--cell-m", "0.3"], "multiple of the cell"),
-        (["--every-s", "0.15"], "every_s: a positive multiple of the time step"),
+        (["--set", "cell_m=0.3"], "multiple of the cell"),
+        (["--set", "every_s=0.15"], "every_s: a positive multiple of the time step"),
         (["--scenario", "nowhere"], "nowhere"),
     ],
 )

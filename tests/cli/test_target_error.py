@@ -26,7 +26,7 @@ def long_recording(tmp_path):
 
 @pytest.mark.parametrize("workers", [0, 2])
 def test_evaluate_stops_when_it_is_good_enough(torchcover, long_recording, tmp_path, workers):
-    arguments = ["--frames", long_recording, "--cell-m", 4, "--out", tmp_path / "out", "--workers", workers]
+    arguments = ["--frames", long_recording, "--set", "cell_m=4", "--out", tmp_path / "out", "--workers", workers]
     code, printed, _ = torchcover("evaluate", *arguments, "--target-error", "0.05m", "--target-error", "20%")
     assert code == 0
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
@@ -41,7 +41,7 @@ def test_evaluate_stops_when_it_is_good_enough(torchcover, long_recording, tmp_p
 def test_a_target_beyond_the_steps_ends_the_run_as_ever_and_says_what_it_would_take(
     torchcover, long_recording, tmp_path
 ):
-    arguments = ["--frames", long_recording, "--cell-m", 4, "--out", tmp_path / "out", "--steps", 40]
+    arguments = ["--frames", long_recording, "--set", "cell_m=4", "--out", tmp_path / "out", "--steps", 40]
     code, printed, _ = torchcover("evaluate", *arguments, "--target-error", "1e-3m")
     assert code == 0
     assert "Target error not reached in 40 steps" in printed
@@ -56,8 +56,8 @@ def test_compare_stops_when_rigs_and_differences_are_good_enough(torchcover, wor
     options = [
         "--scenario",
         worlds / "yard.yaml",
-        "--cell-m",
-        4,
+        "--set",
+        "cell_m=4",
         "--thresholds-m",
         2,
         "--rays",

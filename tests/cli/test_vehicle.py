@@ -21,7 +21,18 @@ def free(worlds):
 
 
 def run(torchcover, free, command, *arguments):
-    settings = ("--scenario", free / "free.yaml", "--steps", 1, "--cell-m", 2, "--rays", 64, "--out", free / "out")
+    settings = (
+        "--scenario",
+        free / "free.yaml",
+        "--steps",
+        1,
+        "--set",
+        "cell_m=2",
+        "--rays",
+        64,
+        "--out",
+        free / "out",
+    )
     code, printed, error = torchcover(command, *arguments, *settings)
     return code, printed, error
 

@@ -19,7 +19,7 @@ from torchcover.coverage import Maximum, StepQuantiles
 from torchcover.data import BadFrameError, FrameDataset
 from torchcover.evaluation import Checkpoint, checkpoint
 from torchcover.evaluation.checkpoint import read_header, read_state, write_checkpoint
-from torchcover.evaluation.settings import OPTIONS
+from torchcover.evaluation.config import DESCRIPTIONS
 from torchcover.evaluation.task import TOLD_OTHERWISE
 from torchcover.files import BadFileError
 
@@ -222,7 +222,7 @@ def test_a_checkpoint_of_another_run_is_refused_by_what_differs(frame_of, path, 
 
 
 def test_all_options_decide_about_a_run_but_those_that_it_names():
-    assert set(OPTIONS) > TOLD_OTHERWISE
+    assert set(DESCRIPTIONS) > TOLD_OTHERWISE
 
 
 def test_without_resume_it_starts_anew(frame_of, path):

@@ -86,18 +86,18 @@ def test_the_worst_awaited_number_decides_and_what_prints_no_error_is_not_recomm
 
 def test_another_setting_is_recommended_only_where_it_saves_a_fifth():
     plan = StudyPlan(SMALL)
-    for seconds, expected in ((60.0, ""), (40.0, "--rays=64")):
-        found = Study(plan, [trial(0.04), trial(0.04, seconds, options="--rays=64")], 1.0).recommended(0.01)
+    for seconds, expected in ((60.0, ""), (40.0, "--set rays=64")):
+        found = Study(plan, [trial(0.04), trial(0.04, seconds, options="--set rays=64")], 1.0).recommended(0.01)
         assert (found[0].options, found[1]) == (expected, 400)
-    biased = Study(plan, [trial(0.04), trial(0.04, 1.0, bias=0.02, options="--rays=64")], 1.0)
+    biased = Study(plan, [trial(0.04), trial(0.04, 1.0, bias=0.02, options="--set rays=64")], 1.0)
     assert biased.recommended(0.01)[0].options == ""
     assert Study(plan, [trial(math.nan)], 1.0).recommended(0.01) is None
     assert Study(plan, [trial(math.nan)], 1.0).advice(0.01) == (
         "For 1 percentage point of every detection: not known, for 64 steps say no error of 20m ground."
     )
     assert Study(plan, [trial(0.04)], 1.0).advice(0.01) == (
-        "For 1 percentage point of every detection: front_roof_32 --scenario=courtyard --cell-m=4.0 --rays=256 "
-        "--steps=400 (401 s)."
+        "For 1 percentage point of every detection: front_roof_32 --set scenario=courtyard --set cell_m=4.0 "
+        "--set rays=256 --steps=400 (401 s)."
     )
 
 
@@ -112,7 +112,11 @@ def test_records_are_json_without_nan_and_the_files_are_written(study, tmp_path)
     paths = study.save(tmp_path / "out")
     assert [path.name for path in paths] == ["work_precision.png", "summary.json"]
     record = json.loads(json.dumps(study.record, allow_nan=False))
-    assert [one["options"] for one in record["trials"]] == ["", "--rays=64", "--reference=paper --rays=1024"]
+    assert [one["options"] for one in record["trials"]] == [
+        "",
+        "--set rays=64",
+        "--set reference=paper --set rays=1024",
+    ]
     assert [one["band_frame"] for one in record["trials"]] == ["ground", "ground", "vehicle"]
     assert [one["error"] for one in record["recommended"]] == [0.02, 0.01, 0.005]
 
@@ -120,8 +124,8 @@ def test_records_are_json_without_nan_and_the_files_are_written(study, tmp_path)
 def test_the_command_that_is_timed_has_every_option_that_is_not_as_usual():
     settings = Settings("rig", "urban", cell_m=0.5, thresholds_m=(0.2, 1), every_s=5.0, steps=7, workers=2)
     assert StudyPlan(settings).command == [
-        "evaluate", "rig", "--scenario=urban", "--cell-m=0.5", "--thresholds-m=0.2", "--thresholds-m=1.0",
-        "--every-s=5.0", "--workers=2",
+        "evaluate", "rig", *("--set", "scenario=urban"), *("--set", "cell_m=0.5"), *("--set", "thresholds_m=0.2,1.0"),
+        *("--set", "every_s=5.0"), *("--set", "workers=2"),
     ]  # fmt: skip
     assert StudyPlan(replace(settings, steps=None)).each[""].steps == 512
 

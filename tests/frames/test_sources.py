@@ -13,6 +13,7 @@ from torchcover.data import (
     Frame,
     FrameSource,
     RecordedFrames,
+    RecordingSettings,
     SimulatedFrames,
     collate_frames,
     open_recording,
@@ -88,9 +89,9 @@ def test_the_outline_of_a_simulation_is_that_of_its_ego_and_needs_no_world(monke
 def test_the_format_of_a_recording_is_recognised_or_named(tmp_path):
     folder = folder_of(tmp_path / "recording", ["sensor", "reference"])
     assert isinstance(open_recording(str(folder)), FolderRecording)
-    assert isinstance(open_recording(folder, "folder"), FolderRecording)
+    assert isinstance(open_recording(folder, RecordingSettings(format="folder")), FolderRecording)
     with pytest.raises(ValueError, match=r"format 'rosbag': no such format of recordings; there are .*folder"):
-        open_recording(folder, "rosbag")
+        open_recording(folder, RecordingSettings(format="rosbag"))
     with pytest.raises(FileNotFoundError, match="gone: no such recording"):
         open_recording(tmp_path / "gone")
     (tmp_path / "empty").mkdir()

@@ -250,7 +250,7 @@ def test_one_bad_sweep_costs_its_own_frame():
     drive = Drive(steps=6)
     scan, drive.scan = drive.scan, gone
     frames = RecordedFrames(drive, reference=AccumulatedReference(1.0))
-    with pytest.raises(BadFrameError, match=r"^f2: f2.bin: truncated; it is in the window of f0 .*--skip-bad-frames"):
+    with pytest.raises(BadFrameError, match=r"^f2: f2.bin: truncated; it is in the window of f0 .*skip_bad_frames"):
         frames[0]
     with pytest.raises(BadFrameError, match=r"^f2 \(frame 2\): f2.bin: truncated$"):
         frames[2]

@@ -2,7 +2,7 @@
 
 import pickle
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchcover.data import AccumulatedReference, Corrections, RecordedFrames, Scan
+from torchcover.data import AccumulatedReference, RecordedFrames, RecordingSettings, Scan
 from torchcover.detection import Boxes
 from torchcover.geometry import (
     euler_from_rotation,
@@ -22,7 +22,7 @@ from torchcover.geometry import (
     transform,
 )
 from torchcover.recordings.agreement import _late, clocks_apart, disagreement, jumped
-from torchcover.recordings.corrected import corrected
+from torchcover.recordings.corrected import correct_recording
 
 MOUNT = rigid(rotation_from_euler(2.0, 1.0, -1.0), [0.5, 0.1, 1.73])
 GROUND, SIDES = 3000, 6000
@@ -115,12 +115,12 @@ def test_what_is_right_is_left_alone(right):
 
 
 MENDED = {
-    "xyzw": "--quaternions xyzw",
-    "inverse": "--poses inverse",
-    "yx": "--poses yx",
-    "axes": "--axes yxz",
-    "late": "--lag 0.10",
-    "held": "--poses held",
+    "xyzw": "--set recording.quaternions=xyzw",
+    "inverse": "--set recording.poses=inverse",
+    "yx": "--set recording.poses=yx",
+    "axes": "--set recording.axes=yxz",
+    "late": "--set recording.lag_s=0.10",
+    "held": "--set recording.poses=held",
 }
 
 
@@ -128,11 +128,10 @@ MENDED = {
 def test_what_would_mend_a_fault_is_named_and_mends_it(fault):
     doubt = doubts(Yard(fault))
     assert MENDED[fault] in doubt
-    names = {"quaternions": str, "poses": str, "axes": str, "lag": float}
-    option, value = MENDED[fault].removeprefix("--").split()
-    corrections = Corrections(**{option.replace("lag", "lag_s"): names[option](value)})
-    mended = corrected(Yard(fault), corrections)
-    assert corrections.words in (MENDED[fault], "--lag 0.1")
+    name, value = MENDED[fault].removeprefix("--set recording.").split("=")
+    corrections = RecordingSettings(**{name: float(value) if name == "lag_s" else value})
+    mended = correct_recording(Yard(fault), corrections)
+    assert corrections.words in (MENDED[fault], "--set recording.lag_s=0.1")
     assert not doubts(mended)
     off = [invert(Yard().true(step)) @ pickle.loads(pickle.dumps(mended)).world_T_vehicle(step) for step in range(10)]
     # The last poses, and those between two, are not there: where the vehicle went on evenly they would be right.
@@ -156,16 +155,19 @@ def test_what_nothing_mends_is_said(fault, says):
 def test_units_of_clouds(unit):
     frames = RecordedFrames(Yard(unit), reference=AccumulatedReference(1.0))
     (doubt,) = frames.doubts()
-    assert f"(--units {unit})" in doubt
-    mended = RecordedFrames(frames.recording, corrections=Corrections(units=unit))
+    assert f"(--set recording.units={unit})" in doubt
+    mended = RecordedFrames(correct_recording(frames.recording, RecordingSettings(units=unit)))
     assert mended.doubts() == []
-    assert f"Read as asked: --units {unit}." in mended.reference_record["notes"]
+    assert f"Read as asked: --set recording.units={unit}." in mended.reference_record["notes"]
     assert mended.content != frames.content
 
 
 def test_clouds_in_feet_are_read_as_asked():
     drive = Yard("unlabelled")
-    (sensor, *_), feet = drive.sensors, RecordedFrames(drive, corrections=Corrections(units="ft")).recording
+    (sensor, *_), feet = (
+        drive.sensors,
+        RecordedFrames(correct_recording(drive, RecordingSettings(units="ft"))).recording,
+    )
     np.testing.assert_allclose(feet.scan(sensor, 0).points_m, 0.3048 * drive.scan(sensor, 0).points_m)
 
 
@@ -212,14 +214,14 @@ def test_poses_that_jump_are_told_and_no_scans_are_compared_across(jump_m, turn_
 
 
 def test_lags_that_are_none():
-    with pytest.raises(ValueError, match="lag: at most 1 s"):
-        Corrections(lag_s=3.0)
+    with pytest.raises(ValueError, match="at most 1 s"):
+        RecordingSettings(lag_s=3.0)
     untimed = Yard()
     untimed.times_s = None
-    with pytest.raises(ValueError, match=r"yard: --lag 0\.1 needs the times"):
-        corrected(untimed, Corrections(lag_s=0.1)).world_T_vehicle(0)
-    assert corrected(untimed, Corrections()) is untimed
-    assert replace(Corrections(), units="mm").words == "--units mm"
+    with pytest.raises(ValueError, match=r"yard: --set recording.lag_s=0\.1 needs the times"):
+        correct_recording(untimed, RecordingSettings(lag_s=0.1)).world_T_vehicle(0)
+    assert correct_recording(untimed, RecordingSettings()) is untimed
+    assert RecordingSettings(units="mm").words == "--set recording.units=mm"
 
 
 def test_poses_with_noise_are_not_late():
@@ -232,5 +234,5 @@ def test_poses_with_noise_are_not_late():
         def agreement(self, corrections):
             return 0.7 + 0.2 * np.exp(-(((corrections.lag_s - self.better_s) / self.width_s) ** 2))
 
-    assert "--lag 0.10" in _late([Noisy(0.1, 0.2)], 0.75)
+    assert "--set recording.lag_s=0.10" in _late([Noisy(0.1, 0.2)], 0.75)
     assert _late([Noisy(0.1, 0.2), Noisy(-0.2, 0.03)], 0.75) is None

@@ -108,7 +108,7 @@ WKT2 = (
 )
 def test_las_files_in_feet_are_converted_with_a_warning(tmp_path, las, meters):
     suffix = ".laz" if las[104] & 0x80 else ".las"
-    with pytest.warns(UserWarning, match=r"converted to meters, as the file says: .* give no --units"):
+    with pytest.warns(UserWarning, match=r"converted to meters, as the file says: .* give no recording.units"):
         cloud = read_cloud(store(tmp_path, suffix, las))
     np.testing.assert_allclose(cloud, CLOUD * meters, rtol=1e-12)
 
@@ -116,7 +116,7 @@ def test_las_files_in_feet_are_converted_with_a_warning(tmp_path, las, meters):
 def test_las_files_in_meters_are_as_they_are_and_degrees_are_refused(tmp_path):
     for las in (las_in((1024, 1), (3072, 32633)), las_in(STATE_PLANE.replace(repr(FTUS), "1.0")), las_in("")):
         np.testing.assert_array_equal(read_cloud(store(tmp_path, ".las", las)), CLOUD)
-    with pytest.warns(UserWarning, match=r"EPSG:2240 without a unit .* --units ft"):
+    with pytest.warns(UserWarning, match=r"EPSG:2240 without a unit .* --set recording.units=ft"):
         np.testing.assert_array_equal(read_cloud(store(tmp_path, ".las", las_in((1024, 1), (3072, 2240)))), CLOUD)
     for las, message in (
         (las_in((1024, 2), (2048, 4326)), r"x and y are degrees \(GTModelTypeGeoKey 2\); reproject"),

@@ -239,17 +239,17 @@ def test_mounts_may_be_told(tmp_path):
         BadFileError, match=r"base_link of the vehicle is needed; there are lidar, rack, second: name one"
     ):
         RosBag(path)
-    recording = open_recording(path, mounts={"lidar": mount})
+    recording = RosBag(path, mounts={"lidar": mount})
     assert recording.sensors == ("b", "lidar")
     np.testing.assert_allclose(recording.scan("lidar", 0).vehicle_T_sensor, mount, atol=1e-12)
     np.testing.assert_allclose(recording.scan("b", 0).vehicle_T_sensor, mount @ invert(raised) @ beside, atol=1e-12)
     np.testing.assert_allclose(recording.world_T_vehicle(2), pose_at(0.2), atol=1e-9)
-    told = open_recording(path, mounts={"lidar": mount, "b": raised})
+    told = RosBag(path, mounts={"lidar": mount, "b": raised})
     np.testing.assert_allclose(told.scan("b", 0).vehicle_T_sensor, raised, atol=1e-9)
-    alone = open_recording(bag(tmp_path / "b", clouds()), mounts={"lidar": mount})
+    alone = RosBag(bag(tmp_path / "b", clouds()), mounts={"lidar": mount})
     np.testing.assert_allclose(alone.scan("lidar", 0).vehicle_T_sensor, mount, atol=1e-12)
     with pytest.raises(BadFileError, match=r"mount of roof: there are clouds of b, lidar"):
-        open_recording(path, mounts={"roof": mount})
+        RosBag(path, mounts={"roof": mount})
 
 
 def test_files_of_ros_1_are_parts_of_one_bag(tmp_path):

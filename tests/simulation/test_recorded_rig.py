@@ -9,7 +9,7 @@ import torch
 
 from tests.recordings import bags, layouts
 from tests.recordings.drives import Drive
-from torchcover.data import Scan, open_recording, rig_document
+from torchcover.data import RecordingSettings, Scan, open_recording, rig_document
 from torchcover.files import BadFileError
 from torchcover.geometry import invert, rigid, rotation_from_euler, transform
 from torchcover.recordings.formats import argoverse2, kitti_files, nuscenes
@@ -291,7 +291,7 @@ CAMERAS = {
 def test_cameras_show_points_where_their_data_set_says(layout, raw, tmp_path):
     """Images are released undistorted or rectified; the raw ones are those of the lenses."""
     path, name, size, pixels = CAMERAS[layout](Drive(steps=3), tmp_path)
-    recording = open_recording(path, layout)
+    recording = open_recording(path, RecordingSettings(format=layout))
     models = dict.fromkeys(recording.sensors, "velodyne_vlp16")
     if raw and layout in ("nuscenes", "kitti_object"):
         with pytest.raises(ValueError, match="leave out --raw-images"):

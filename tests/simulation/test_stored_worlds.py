@@ -244,7 +244,7 @@ def test_without_a_disk_the_run_goes_on_with_one_remark(disk, monkeypatch, tmp_p
             worlds.world(number, lot().ego_mesh())
         world_of(lot())
 
-    with pytest.warns(UserWarning, match=r"worlds are not kept on disk .* --no-cache") as said:
+    with pytest.warns(UserWarning, match=r"worlds are not kept on disk .* --set no_cache=true") as said:
         run()
     assert len(said) == 1
     assert disk[1] == [0, 1, 0, 0]

@@ -192,9 +192,9 @@ def version(show: Annotated[bool, typer.Option("--version", help="Print the vers
         raise typer.Exit
 
 
-for command in (commands.report, evaluate, compare, commands.study, commands.record, commands.rig, commands.robot,
-                commands.calibrate, commands.world, commands.show, commands.targets, commands.check, commands.encounter,
-                commands.search):  # fmt: skip
+for command in (commands.report, evaluate, compare, commands.study, commands.config, commands.record, commands.rig,
+                commands.robot, commands.calibrate, commands.world, commands.show, commands.targets, commands.check,
+                commands.encounter, commands.search):  # fmt: skip
     app.command(epilog=EXIT_CODE_HELP)(command)
 app.command("list", epilog=EXIT_CODE_HELP)(commands.list_builtin)
 

@@ -9,19 +9,23 @@ import typer
 
 from torchcover.cli import options
 from torchcover.cli.options import of_criterion, of_evaluate, with_options
-from torchcover.evaluation.settings import OPTIONS
+from torchcover.evaluation.config import STUDY_SETTINGS, load_config, write_defaults
 
 UNITS_S = {"s": 1.0, "min": 60.0, "h": 3600.0}
 
 
-@with_options(of_evaluate(*(name for name, option in OPTIONS.items() if option.in_study)))
+@with_options(
+    of_evaluate("scenario", "vehicle", "ask", "thresholds_m", "reference", "rays", "seed", "device", "workers")
+)
 def study(
     rig: options.Rig,
     steps: Annotated[
         int, typer.Option(min=8, help="Steps of the first setting; the others see the first quarter of these instants.")
     ] = 512,
     out: options.Out = Path("out"),
-    **settings: Any,  # noqa: ANN401
+    config: options.Config = None,
+    assignments: options.Assignments = None,
+    **given: Any,  # noqa: ANN401
 ) -> None:
     """Find the setting for a wanted error: what each costs, how far it is off, and how many steps it needs."""
     from torchcover.cli.printing import print_study
@@ -30,6 +34,10 @@ def study(
 
     if rank_count() > 1:
         raise ValueError("study measures run times, which several ranks would change: run it without torchrun")
+    settings = load_config(config, assignments or (), options.changed(given)).config.settings()
+    settings.pop("steps", None)
+    if unused := settings.keys() - set(STUDY_SETTINGS):
+        raise ValueError(f"study does not take {', '.join(sorted(unused))}; it takes {', '.join(STUDY_SETTINGS)}")
     fewer = "rays" not in settings and settings.get("reference") != "paper"
     plan = StudyPlan(Settings(rig, steps=steps, **settings), StudyPlan.others if fewer else ())
     with claimed(out):
@@ -80,9 +88,7 @@ def _with_a_bar(steps: range) -> Iterator[int]:
 
 def rig(
     frames: Annotated[Path, typer.Option("--frames", help="The recording, of any layout in docs/recordings.md.")],
-    recording_format: options.Format = None,
-    vehicle_frame: options.VehicleFrame = None,
-    mount: options.Mount = None,
+    assignments: options.Assignments = None,
     sensors: Annotated[
         list[str] | None,
         typer.Option("--sensors", help="Its sensors, as in `roof,left`. Not given: all of the recording."),
@@ -104,34 +110,33 @@ def rig(
 
     models = dict(_pair(text) for text in lidar or ())
     names = [name for of in sensors or () for name in of.split(",")]
-    recording = options.opened(frames, recording_format, None, vehicle_frame, mount)
+    recording = options.open_recording(frames, options.load_recording_settings(assignments))
     document = rig_document(recording, sensors=names or None, models=models, raw_images=raw_images)
     typer.echo(as_yaml(document), nl=False)
 
 
-@with_options(options.of_corrections())
 def world(
     recording: Annotated[Path, typer.Argument(help="A drive with poses, of any layout in docs/recordings.md.")],
     out: Annotated[
         Path, typer.Option("--out", help="Folder for scenario.yaml and its files.", callback=options.check_out)
     ],
     steps: Annotated[int | None, typer.Option(min=1, help="How many of its frames, from the first on (all).")] = None,
-    recording_format: options.Format = None,
+    assignments: options.Assignments = None,
     vehicle: Annotated[
         str | None, typer.Option(help="Vehicle that recorded it: a name, a file, or x0,x1,y0,y1,z0,z1 of its body.")
     ] = None,
-    vehicle_frame: options.VehicleFrame = None,
-    mount: options.Mount = None,
-    **corrections: Any,  # noqa: ANN401
 ) -> None:
     """Make a drive a scenario: the ground and all that stands as it was seen, what moves on its tracks."""
-    from torchcover.recordings.corrected import corrected
-    from torchcover.recordings.corrections import Corrections
     from torchcover.simulation import write_world
 
-    opened = options.opened(recording, recording_format, vehicle, vehicle_frame, mount)
-    told = write_world(corrected(opened, Corrections(**corrections)), out, steps=steps)
+    opened = options.open_recording(recording, options.load_recording_settings(assignments), vehicle)
+    told = write_world(opened, out, steps=steps)
     typer.echo(f"{told}. Wrote {out}; try rigs in it: torchcover evaluate RIG --scenario {out / 'scenario.yaml'}")
+
+
+def config() -> None:
+    """Print all settings of a run with defaults and comments, for `--config`: torchcover config > run.yaml."""
+    typer.echo(write_defaults(), nl=False)
 
 
 def robot(
@@ -160,14 +165,14 @@ def calibrate(
         str,
         typer.Option(help="Rig that recorded it, whose LiDARs are called as there: a built-in name or a YAML file."),
     ],
-    recording_format: options.Format = None,
+    assignments: options.Assignments = None,
     out: Annotated[Path, typer.Option("--out", help="YAML file for the rig with what was found.")] = Path("rig.yaml"),
 ) -> None:
     """Fit how far each LiDAR of a rig sees, and its noise, to a recording: from road that did or did not return."""
-    from torchcover.recordings import open_recording
     from torchcover.simulation import Rig, calibrate
 
-    calibrated, found = calibrate(open_recording(recording, recording_format), Rig.load(rig))
+    opened = options.open_recording(recording, options.load_recording_settings(assignments))
+    calibrated, found = calibrate(opened, Rig.load(rig))
     calibrated.save(out)
     for one in found:
         typer.echo(one.words)

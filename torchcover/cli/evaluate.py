@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from torchcover.cli import options
-from torchcover.cli.options import of_corrections, of_evaluate, parameters_of, with_options
-from torchcover.evaluation.settings import OPTIONS, Settings
-from torchcover.recordings.corrections import Corrections
+from torchcover.cli.options import of_evaluate, parameters_of, with_options
+from torchcover.evaluation.config import load_config
+from torchcover.evaluation.settings import Settings
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from torchcover.evaluation import Checkpoint, Ranks, Result
     from torchcover.evaluation.rerun_log import RerunLog
     from torchcover.frames import FrameSource
+    from torchcover.recordings import RecordingSettings
 
 
 def _measure(
@@ -27,20 +28,11 @@ def _measure(
     frames: Annotated[
         Path | None, typer.Option(help="A recording instead of a simulation, of any layout in docs/recordings.md.")
     ] = None,
-    recording_format: options.Format = None,
-    vehicle_frame: options.VehicleFrame = None,
-    mount: options.Mount = None,
     sensors: Annotated[
         list[str] | None,
         typer.Option(
             help="With --frames: sensors of a rig, as in `roof,left`; once for each rig. Not given: those of the "
             "recording."
-        ),
-    ] = None,
-    window_s: Annotated[
-        float | None,
-        typer.Option(
-            "--window-s", help="Seconds over which `--reference accumulated` adds up what all sensors saw (2)."
         ),
     ] = None,
     region: Annotated[
@@ -50,20 +42,8 @@ def _measure(
             "--ask.",
         ),
     ] = None,
-    height: Annotated[
-        list[str] | None,
-        typer.Option(help="Height band NAME:z0,z1 in metres; may be repeated, and overlap (ground, obstacle)."),
-    ] = None,
-    grid: Annotated[
-        str | None,
-        typer.Option(help="Extent x0,x1,y0,y1 of the grid in metres (-40,160,-40,40, more if regions need it)."),
-    ] = None,
     out: options.Out = Path("out"),
     files: options.Files = options.ALL_FILES,
-    rerun: Annotated[
-        Path | None,
-        typer.Option(help="Write clouds, boxes, rigs and maps to this .rrd file for the Rerun viewer (extra `rerun`)."),
-    ] = None,
     explain: Annotated[
         bool, typer.Option("--explain", help="Say what was left out because the scene did not need it.")
     ] = False,
@@ -75,14 +55,16 @@ def _measure(
             "--steps can follow.",
         ),
     ] = False,
-    **settings: Any,  # noqa: ANN401
+    config: options.Config = None,
+    assignments: options.Assignments = None,
+    **given: Any,  # noqa: ANN401
 ) -> None:
     """Measure rigs in the same frames, save what was measured, and print it."""
     from torchcover.evaluation import evaluate as evaluate_
 
-    corrections = Corrections(**{name: settings.pop(name) for name in Corrections.__annotations__})
-    told = {"recording_format": recording_format, "vehicle_frame": vehicle_frame, "mount": mount}
-    recording = opened(frames, told, settings, sensors, window_s, corrections)
+    loaded = load_config(config, assignments or (), options.changed(given))
+    settings = {**loaded.config.settings(), "config_record": loaded.record}
+    recording = opened(frames, settings, loaded.config.recording, sensors)
     named = list(rigs or (() if recording is None else recording.rigs))
     if len(named) == 1 and at_least > 1 and len(settings.get("weather") or ()) == 1:
         settings["weather"] = ["clear", *settings["weather"]]
@@ -91,10 +73,10 @@ def _measure(
             f"compare: at least two rigs are needed; got {named[0]} only (for one: `evaluate`; of a recording, each "
             "--sensors makes a rig)"
         )
-    if (asked := options.asked(settings.get("ask"), region, height, grid)) is not None:
+    if (asked := options.add_regions(settings.get("ask"), region)) is not None:
         settings["ask"] = asked
     with sharing(out) as ranks:
-        log = logged(rerun, ranks)
+        log = logged(loaded.config.rerun, ranks)
         checkpoint = checkpoint_in(out, Settings(scenario=settings.get("scenario")), resume=resume)
         result = evaluate_(
             rigs,
@@ -110,10 +92,23 @@ def _measure(
 
 MEASURING = [
     *(each for each in parameters_of(_measure) if each.default is not inspect.Parameter.empty),
-    *of_corrections(),
-    *of_evaluate(*OPTIONS),
+    *of_evaluate(
+        "scenario",
+        "vehicle",
+        "weather",
+        "ask",
+        "thresholds_m",
+        "reference",
+        "redundancy",
+        "steps",
+        "rays",
+        "seed",
+        "target_error",
+        "device",
+        "workers",
+    ),
 ]
-USUAL = {each.name: each.default for each in MEASURING}
+DEFAULTS = {each.name: each.default for each in MEASURING}
 # Options that measure nothing.
 SAVING = ("out", "files", "explain")
 
@@ -157,7 +152,7 @@ def _compare_saved(files: list[str], given: dict[str, Any], *, only: bool) -> No
     from torchcover.evaluation import compare
 
     changed = [
-        f"--{name.replace('_', '-')}" for name, value in USUAL.items() if given[name] != value and name not in SAVING
+        f"--{name.replace('_', '-')}" for name, value in DEFAULTS.items() if given[name] != value and name not in SAVING
     ]
     if changed or not only:
         raise ValueError(
@@ -170,38 +165,30 @@ def _compare_saved(files: list[str], given: dict[str, Any], *, only: bool) -> No
 
 
 def opened(
-    frames: Path | None,
-    told: dict[str, Any],
-    settings: dict[str, Any],
-    sensors: list[str] | None,
-    window_s: float | None,
-    corrections: Corrections,
+    frames: Path | None, settings: dict[str, Any], recording_settings: "RecordingSettings", sensors: list[str] | None
 ) -> "FrameSource | None":
     """The recording of a command line, if it names one; `vehicle` and `reference` are taken out of the settings then.
 
     Raises:
-        ValueError: Options for recordings without one; what `open_recording` raises.
+        ValueError: Settings of a recording without one; what `open_recording` raises.
     """
     if frames is None:
-        for option, given in {**told, "sensors": sensors, "window_s": window_s}.items():
-            if given is not None:
-                name = option.removeprefix("recording_").replace("_", "-")
-                raise ValueError(f"--{name}: for a recording, which --frames gives")
-        if corrections.words:
-            raise ValueError(f"{corrections.words}: for a recording, which --frames gives")
+        given = [f"recording.{name}" for name in recording_settings.model_fields_set]
+        if sensors or given:
+            raise ValueError(f"{', '.join(given) or '--sensors'}: for a recording, which --frames gives")
         return None
     from rich.markup import escape
 
-    from torchcover.recordings import RecordedFrames, reference_of_recording
+    from torchcover.recordings import RecordedFrames, merge_recording_settings, reference_of_recording
     from torchcover.report import Terminal
 
     with Terminal(stderr=True).status(f"opening {escape(str(frames))}"):  # seconds, where there are 100,000 frames
-        recording = options.opened(frames, vehicle=settings.pop("vehicle", None), **told)
+        recording = options.open_recording(frames, recording_settings, settings.pop("vehicle", None))
+    window_s = merge_recording_settings(frames, recording_settings).window_s
     return RecordedFrames(
         recording,
         rigs={names: names.split(",") for names in sensors} if sensors else None,
         reference=reference_of_recording(settings.pop("reference", None), window_s),
-        corrections=corrections,
     )
 
 
@@ -239,7 +226,7 @@ def sharing(out: Path) -> "Iterator[Ranks | None]":
         yield ranks
 
 
-def logged(path: Path | None, ranks: "Ranks | None") -> "RerunLog | None":
+def logged(path: str | None, ranks: "Ranks | None") -> "RerunLog | None":
     """The recording for the Rerun viewer, if there is to be one.
 
     Raises:
@@ -248,13 +235,13 @@ def logged(path: Path | None, ranks: "Ranks | None") -> "RerunLog | None":
     if path is None:
         return None
     if ranks is not None:
-        raise ValueError(f"--rerun {path}: several processes cannot write one file; run it without torchrun")
+        raise ValueError(f"rerun {path}: several processes cannot write one file; run it without torchrun")
     from torchcover.evaluation.rerun_log import RerunLog
 
     try:
-        return RerunLog(path)
+        return RerunLog(Path(path))
     except ImportError as error:
-        raise ValueError(f"--rerun {error}") from error
+        raise ValueError(f"rerun {error}") from error
 
 
 def finish(

@@ -2,19 +2,19 @@
 
 import inspect
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import update_wrapper
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_type_hints
 
 import typer
 
 from torchcover.encounters.criterion import Criterion
-from torchcover.evaluation.settings import FILES, OPTIONS, Settings, wanted_files
-from torchcover.recordings.corrections import Corrections
+from torchcover.evaluation.config import EvaluateConfig, load_config
+from torchcover.evaluation.settings import FILES, wanted_files
 
 if TYPE_CHECKING:
-    from torchcover.recordings import Recording
+    from torchcover.recordings import Recording, RecordingSettings
     from torchcover.simulation import RegionsOfInterest
 
 Command = Callable[..., None]
@@ -22,14 +22,25 @@ Command = Callable[..., None]
 
 # The groups of `--help`, by the names of options; what is in none stands under "Options".
 PANELS = {
-    "What": "scenario frames vehicle sensor_model weather target heading encounters requirements aggregations "
-    "redundancy metrics thresholds_m threshold_m hits reference estimate phases worlds",
-    "Where": "ask region height grid cell_m band_frame probe raster",
-    "How exact": "steps rays every_s seed target_error only_detection budget evaluations optimiser fresh_worlds "
-    "per_world",
-    "Output": "out files rerun explain film",
-    "How it runs": "device workers no_cache resume skip_bad_frames",
-    "Of a recording": " ".join(["recording_format vehicle_frame mount sensors window_s", *Corrections.__annotations__]),
+    "What": "scenario frames sensors vehicle sensor_model weather target heading encounters requirements "
+    "redundancy thresholds_m threshold_m hits reference estimate phases worlds",
+    "Where": "ask region raster",
+    "How exact": "steps rays every_s seed target_error budget evaluations optimiser fresh_worlds per_world",
+    "Output": "out files explain film",
+    "How it runs": "config assignments device workers resume",
+}
+# Types of options that are no texts.
+OPTION_TYPES: dict[str, Any] = {
+    "steps": int,
+    "rays": int,
+    "workers": int,
+    "every_s": float,
+    "ask": Path,
+    "weather": list[str],
+    "thresholds_m": list[float],
+    "target_error": list[str],
+    "sensor_model": Literal["ideal", "real"],
+    "estimate": Literal["area", "known"],
 }
 PANEL_OF = {name: panel for panel, names in PANELS.items() for name in names.split()}
 
@@ -60,7 +71,7 @@ def with_options(parameters: Sequence[inspect.Parameter]) -> Callable[[Command],
 
 
 def of_evaluate(*names: str) -> list[inspect.Parameter]:
-    """Options of `evaluate`, as `Settings` declares them: their names there, with dashes for underscores."""
+    """Options of settings of `EvaluateConfig`: their names there, with dashes for underscores."""
     return [_parameter(name) for name in names]
 
 
@@ -69,16 +80,11 @@ def of_criterion() -> list[inspect.Parameter]:
     return _of_document(Criterion)
 
 
-def of_corrections() -> list[inspect.Parameter]:
-    """What `Corrections` declares."""
-    return _of_document(Corrections, ending="_s")
-
-
-def _of_document(document: type, ending: str = "") -> list[inspect.Parameter]:
+def _of_document(document: type) -> list[inspect.Parameter]:
     found = []
     for name, said in document.__annotations__.items():
         kind, words = get_args(said)
-        option = f"--{name.removesuffix(ending).replace('_', '-')}"
+        option = f"--{name.replace('_', '-')}"
         annotation: Any = Annotated[kind, typer.Option(option, help=words)]
         usual = getattr(document, name)
         found.append(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=usual, annotation=annotation))
@@ -91,13 +97,19 @@ def parameters_of(command: Command) -> list[inspect.Parameter]:
     return [each.replace(annotation=hints[each.name]) for each in inspect.signature(command).parameters.values()]
 
 
+def shorten_help(description: str) -> str:
+    """The first sentence of a description; `torchcover config` has all of it."""
+    return description.partition(". ")[0].removesuffix(".") + "."
+
+
 def _parameter(name: str) -> inspect.Parameter:
-    option, usual = OPTIONS[name], getattr(Settings, name)
-    shown = usual if type(usual) in (bool, int, str) else None
-    kind = option.typed or get_args(Settings.__annotations__[name])[0]
-    told = typer.Option(f"--{name.replace('_', '-')}", help=option.words, min=option.minimum)
-    annotation: Any = Annotated[kind if shown is not None else kind | None, told]
-    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=shown, annotation=annotation)
+    field = EvaluateConfig.model_fields[name]
+    default = field.default if type(field.default) in (bool, int, str) else None
+    kind: Any = OPTION_TYPES.get(name, type(default) if default is not None else str)
+    minimum = 0 if name in ("seed", "workers") else 1 if kind is int else None
+    option = typer.Option(f"--{name.replace('_', '-')}", help=shorten_help(field.description or ""), min=minimum)
+    annotation: Any = Annotated[kind if default is not None else kind | None, option]
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 
 def check_out(folder: Path) -> Path:
@@ -123,13 +135,16 @@ def _check_files(files: str) -> str:
 
 
 Rig = Annotated[str, typer.Argument(help="Rig: a built-in name (see `list`) or a YAML file.")]
-Format = Annotated[str | None, typer.Option("--format", help="Format of the recording, if it is not recognised.")]
-VehicleFrame = Annotated[
-    str | None, typer.Option("--vehicle-frame", help="Of a bag: the vehicle's frame (base_footprint, else base_link).")
+Config = Annotated[
+    Path | None, typer.Option(help="YAML file of settings; `torchcover config` writes all of them with their defaults.")
 ]
-Mount = Annotated[
+Assignments = Annotated[
     list[str] | None,
-    typer.Option(help="Of a bag: SENSOR=x,y,z or SENSOR=x,y,z,yaw,pitch,roll on the vehicle, metres and degrees."),
+    typer.Option(
+        "--set",
+        help="KEY=VALUE: any setting of `torchcover config`, as in cell_m=0.5, or of the recording, as in "
+        "recording.units=mm; may be repeated, and wins over --config.",
+    ),
 ]
 Out = Annotated[Path, typer.Option(help="Folder for the results.", callback=check_out)]
 ALL_FILES = ",".join(FILES)
@@ -138,25 +153,30 @@ Files = Annotated[
 ]
 
 
-def opened(
-    frames: Path,
-    recording_format: str | None,
-    vehicle: str | None,
-    vehicle_frame: str | None,
-    mount: Sequence[str] | None,
-) -> "Recording":
-    """The recording that a command line names, with what it tells of it."""
-    from torchcover.geometry import rigid, rotation_from_euler
-    from torchcover.recordings import open_recording
+def changed(given: Mapping[str, Any]) -> dict[str, Any]:
+    """The options that differ from their defaults, as values of `EvaluateConfig`."""
+    fields = EvaluateConfig.model_fields
+    values = {name: str(value) if isinstance(value, Path) else value for name, value in given.items()}
+    values = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+    return {name: value for name, value in values.items() if value not in (None, fields[name].default)}
 
-    told = {}
-    for text in mount or ():
-        sensor, _, numbers = text.partition("=")
-        x, y, z, *turn = _numbers(
-            "--mount", text, numbers, ("x", "y", "z", "yaw", "pitch", "roll")[: 6 if numbers.count(",") > 2 else 3]
-        )
-        told[sensor] = rigid(rotation_from_euler(*(turn or (0.0, 0.0, 0.0))), [x, y, z])
-    recording = open_recording(frames, recording_format, vehicle_frame=vehicle_frame, mounts=told)
+
+def load_recording_settings(assignments: Sequence[str] | None) -> "RecordingSettings":
+    """The settings of the recording that `--set recording.KEY=VALUE` gives, for commands that take no others.
+
+    Raises:
+        ValueError: Another setting, or as `load_config`.
+    """
+    if others := [text for text in assignments or () if not text.startswith("recording.")]:
+        raise ValueError(f"--set {others[0]}: here only settings of the recording, as in recording.units=mm")
+    return load_config(None, assignments or ()).config.recording
+
+
+def open_recording(frames: Path, settings: "RecordingSettings", vehicle: str | None = None) -> "Recording":
+    """Open the recording that a command line names, with the body of its vehicle if that is given."""
+    from torchcover.recordings import open_recording as open_
+
+    recording = open_(frames, settings)
     if vehicle is not None:
         from torchcover.simulation.recorded_rig import recorded_body
 
@@ -164,22 +184,18 @@ def opened(
     return recording
 
 
-def asked(
-    file: Path | None, regions: Sequence[str] | None, heights: Sequence[str] | None, grid: str | None
-) -> "RegionsOfInterest | None":
-    """What is asked about; None if nothing is said of it.
+def add_regions(file: Path | None, regions: Sequence[str] | None) -> "RegionsOfInterest | None":
+    """The regions of interest of a command line; None if it names none.
 
     Args:
-        file: YAML; what options give replaces what it says.
+        file: YAML file of `RegionsOfInterest`; options replace its regions.
         regions: NAME:x0,x1,y0,y1 each.
-        heights: NAME:z0,z1 each.
-        grid: x0,x1,y0,y1.
 
     Raises:
         FileNotFoundError: No such file.
-        ValueError: What cannot be read, or makes no sense; a name that is given twice.
+        ValueError: A text that cannot be read or makes no sense, or a name that is given twice.
     """
-    if file is None and not (regions or heights or grid):
+    if file is None and not regions:
         return None
     from pydantic import ValidationError
 
@@ -190,11 +206,6 @@ def asked(
     if regions:
         sides = _named("--region", regions, ("x0", "x1", "y0", "y1"))
         content["regions"] = {name: {"x_m": side[:2], "y_m": side[2:]} for name, side in sides.items()}
-    if heights:
-        content["heights"] = _named("--height", heights, ("z0", "z1"))
-    if grid:
-        side = _numbers("--grid", grid, grid, ("x0", "x1", "y0", "y1"))
-        content["grid"] = {**content.get("grid", {}), "x_m": side[:2], "y_m": side[2:]}
     try:
         return RegionsOfInterest.model_validate(content)
     except ValidationError as error:

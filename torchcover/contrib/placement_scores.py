@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from torchcover.contrib.comparison import MetricComparison
 from torchcover.contrib.ranks import BASELINE, LEAST, OWN, Ranking, rankings
 from torchcover.contrib.registry import PUBLISHED
 from torchcover.coverage import Coverage, Region
@@ -109,7 +110,7 @@ def score_placements(
     )
     if result.run is not None:
         result.run.raise_failure()  # ranks of a part of what was asked for would look like the whole
-    assert result.metrics is not None  # some were asked for
+    assert isinstance(result.metrics, MetricComparison)  # some were requested
     heights_m = [sum(sensor.mount.z_m for sensor in rig.sensors) / len(rig.sensors) for rig in carried.values()]
     return PlacementScores(
         rigs=tuple(rigs),

@@ -1,4 +1,4 @@
-"""The metrics of others by the names that `torchcover compare --metrics` takes: what they need, and how one is made."""
+"""The metrics of others by the names that `--set metrics=NAME` takes: what they need, and how one is made."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -60,7 +60,7 @@ class Setup:
 
 @dataclass(frozen=True)
 class Published:
-    """A metric by its name in `torchcover compare --metrics`.
+    """A metric by its name in `--set metrics=NAME`.
 
     Args:
         make: Makes it.

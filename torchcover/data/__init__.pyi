@@ -14,11 +14,11 @@ from torchcover.frames import scale as scale
 from torchcover.recordings import FORMATS as FORMATS
 from torchcover.recordings import RECORDERS as RECORDERS
 from torchcover.recordings import AccumulatedReference as AccumulatedReference
-from torchcover.recordings import Corrections as Corrections
 from torchcover.recordings import RecordedFrames as RecordedFrames
 from torchcover.recordings import RecordedReference as RecordedReference
 from torchcover.recordings import Recording as Recording
 from torchcover.recordings import RecordingFormat as RecordingFormat
+from torchcover.recordings import RecordingSettings as RecordingSettings
 from torchcover.recordings import Reference as Reference
 from torchcover.recordings import Scan as Scan
 from torchcover.recordings import open_recording as open_recording

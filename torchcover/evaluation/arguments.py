@@ -1,9 +1,8 @@
-"""Arguments that are declared once: as fields of a document, with their words and their form on the command line."""
+"""Arguments that are declared once: as fields of a dataclass, which a function takes and is documented with."""
 
 import inspect
 import textwrap
-from collections.abc import Callable
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Mapping
 from functools import update_wrapper
 from typing import Annotated, Any, Generic, ParamSpec, TypeVar, get_args, get_origin
 
@@ -12,19 +11,6 @@ ValueT = TypeVar("ValueT")
 DocumentT = TypeVar("DocumentT")
 ReturnT = TypeVar("ReturnT")
 Arguments = ParamSpec("Arguments")
-
-
-@dataclass(frozen=True)
-class Option:
-    """An argument that the command line has as an option of the same name, `torchcover study` too with `in_study`.
-
-    `typed` is its type there, if not that of Python.
-    """
-
-    words: str
-    typed: Any = None
-    minimum: int | None = None
-    in_study: bool = False
 
 
 class Read(Generic[GivenT, ValueT]):
@@ -48,16 +34,15 @@ class Read(Generic[GivenT, ValueT]):
         vars(settings)[self._name] = self._read(given)
 
 
-def options_of(document: type) -> dict[str, Option]:
-    """Those fields of a document that the command line has, by name."""
-    told = {each.name: getattr(each.type, "__metadata__", (None,))[0] for each in fields(document)}
-    return {name: option for name, option in told.items() if isinstance(option, Option)}
-
-
 def taking(
-    document: Callable[Arguments, DocumentT],
+    document: Callable[Arguments, DocumentT], descriptions: Mapping[str, str]
 ) -> Callable[[Callable[[DocumentT], ReturnT]], Callable[Arguments, ReturnT]]:
-    """A decorator: a function of one document is called with the document's fields, and is documented with them."""
+    """Decorate a function of one document: it is called with the document's fields, and documented with them.
+
+    Args:
+        document: A dataclass; the annotation of a field may hold its description.
+        descriptions: Name of a field -> its description, for the others.
+    """
 
     def decorate(function: Callable[[DocumentT], ReturnT]) -> Callable[Arguments, ReturnT]:
         signature = inspect.signature(document)
@@ -77,7 +62,7 @@ def taking(
         )
         called.__annotations__ = {**{each.name: each.annotation for each in parameters}, "return": returns}
         before, returns_line, rest = inspect.cleandoc(function.__doc__ or "").partition("\n\nReturns:")
-        called.__doc__ = f"{before}\n\nArgs:\n{_described(signature)}{returns_line}{rest}"
+        called.__doc__ = f"{before}\n\nArgs:\n{_described(signature, descriptions)}{returns_line}{rest}"
         return called
 
     return decorate
@@ -90,10 +75,9 @@ def _plain(annotation: Any) -> Any:  # noqa: ANN401  (a type)
     return getattr(given, "__forward_arg__", given)
 
 
-def _described(signature: inspect.Signature) -> str:
+def _described(signature: inspect.Signature, descriptions: Mapping[str, str]) -> str:
     lines = []
     for name, parameter in signature.parameters.items():
-        said = parameter.annotation.__metadata__[0]
-        words = f"{name}: {said.words if isinstance(said, Option) else said}"
-        lines.append(textwrap.fill(words, 116, initial_indent=" " * 4, subsequent_indent=" " * 8))
+        description = descriptions.get(name) or parameter.annotation.__metadata__[0]
+        lines.append(textwrap.fill(f"{name}: {description}", 116, initial_indent=" " * 4, subsequent_indent=" " * 8))
     return "\n".join(lines)

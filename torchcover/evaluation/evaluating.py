@@ -6,6 +6,7 @@ from typing import Any
 
 from torchcover.coverage import Coverage
 from torchcover.evaluation.arguments import taking
+from torchcover.evaluation.config import DESCRIPTIONS
 from torchcover.evaluation.measuring import measured
 from torchcover.evaluation.mixed import MixedResult, measured_in_each
 from torchcover.evaluation.result import Result
@@ -17,7 +18,7 @@ SAVED = ".npz"
 USUAL_STEM = "coverage"
 
 
-@taking(Settings)
+@taking(Settings, DESCRIPTIONS)
 def evaluate(settings: Settings) -> Result:
     """Measure the coverage of a rig, or of several in the same frames, as `torchcover evaluate` does.
 

@@ -261,7 +261,7 @@ def _left(indices: Iterator[int], run: Run, *, skip_bad_frames: bool) -> Iterato
     if run.skipped and not skip_bad_frames:
         raise ValueError(
             f"{len(run.skipped)} bad frames were skipped before the checkpoint, such as {run.skipped[0]}; go on "
-            "skipping them (--skip-bad-frames)"
+            "skipping them (--set skip_bad_frames=true)"
         )
     return indices
 

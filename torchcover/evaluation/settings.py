@@ -1,7 +1,4 @@
-"""All that can be said to `evaluate`: each argument once, with its words and its form on the command line.
-
-Nothing heavy is imported here: the command line takes its options from it, and `--help` answers at once.
-"""
+"""The arguments of `evaluate`, read into one form each; `EvaluateConfig` describes those that a file can hold."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -12,7 +9,8 @@ from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, cast
 
-from torchcover.evaluation.arguments import Option, Read, options_of
+from torchcover.evaluation.arguments import Read
+from torchcover.evaluation.config import EvaluateConfig
 from torchcover.simulation.memory import check_fits
 
 if TYPE_CHECKING:
@@ -175,6 +173,9 @@ def _probes(given: "str | Path | Iterable[str | Path] | None") -> "tuple[str | P
     return () if each == ("none",) else each
 
 
+DEFAULTS = EvaluateConfig()
+
+
 @dataclass(frozen=True, eq=False)
 class Settings:
     """The arguments of `evaluate`; None where nothing was given.
@@ -190,174 +191,38 @@ class Settings:
         "frames against the same reference, and of which the others are compared with the first. With `frames`: which "
         "of its rigs, all if not given; or what its only one is, so that the maps show its sensors.",
     ] = Read(_rigs, None)
-    scenario: Annotated[
-        "AnyScenario | Sequence[AnyScenario] | Mapping[str, float] | None",
-        Option(
-            "Scenario: a built-in name or a YAML file (courtyard). Or several kinds of world, each measured apart and "
-            "then mixed: `urban,highway`, with weights `urban=0.7,highway=0.3` (equal if not given); in Python also a "
-            "sequence, or a mapping to weights.",
-            str,
-            in_study=True,
-        ),
-    ] = None
+    scenario: "AnyScenario | Sequence[AnyScenario] | Mapping[str, float] | None" = None
     _: KW_ONLY
     frames: Annotated[
         "FrameSource | str | Path | None", "A recording, or any source of frames, instead of a scenario."
     ] = None
-    steps: Annotated[
-        int | None,
-        Option(
-            "Steps to simulate (64; with a target error at most, 4096), or frames of a recording to use at most (all).",
-            minimum=1,
-        ),
-    ] = None
-    seed: Annotated[int, Option("Seed of the simulation.", minimum=0, in_study=True)] = 0
-    vehicle: Annotated[
-        str | Path | None,
-        Option(
-            "What carries the rigs: a built-in vehicle, a YAML file or a mesh in metres. Not given: the scenario's own "
-            "ego, else the vehicle that the rigs name, else an SUV. Of a recording: what is no return from the world, "
-            "where it does not say it; or x0,x1,y0,y1,z0,z1 in metres.",
-            str,
-            in_study=True,
-        ),
-    ] = None
-    sensor_model: Annotated[
-        Literal["ideal", "real"] | None,
-        Option(
-            "What sensors make of their hits: `real`, a LiDAR has no point where too little light returns (default "
-            "where its range at 10 % is known), or `ideal`, every hit is a point (default of the `paper` reference).",
-            in_study=True,
-        ),
-    ] = None
-    weather: Annotated[
-        Read["Weather | str | Path | Sequence[Weather | str | Path]", "tuple[Weather, ...]"],
-        Option(
-            "Weather in place of the scenario's: a built-in name as fog_100m (see `list`) or a YAML file. In several, "
-            "every rig is measured in each; `compare` of one rig puts it beside `clear`.",
-            list[str],
-        ),
-    ] = Read(_weather, ())
-    ask: Annotated[
-        Read["RegionsOfInterest | str | Path | None", "RegionsOfInterest | None"],
-        Option(
-            "Regions, also polygons, height bands and grid, in a YAML file. Not given: the paper's regions in front, "
-            "and the near field on the four sides of the vehicle.",
-            Path,
-            in_study=True,
-        ),
-    ] = Read(_asked, None)
-    probe: Annotated[
-        Read["str | Path | Iterable[str | Path] | None", "tuple[str | Path, ...] | None"],
-        Option(
-            "Body that is put in free places beside the vehicle, as of `targets`; may be repeated; `none` puts none. "
-            "Not given: child, adult, cyclist and pole where nothing else is asked about.",
-            list[str],
-        ),
-    ] = Read(_probes, None)
-    cell_m: Annotated[
-        float | None, Option("Side of a grid cell in metres, whatever `ask` says (0.25).", in_study=True)
-    ] = None
-    thresholds_m: Annotated[
-        Read[float | Iterable[float], tuple[float, ...]],
-        Option("Detection thresholds in metres (0.4); may be repeated.", list[float], in_study=True),
-    ] = Read(_thresholds, (0.4,))
-    aggregations: Annotated[
-        Read["str | Sequence[Aggregation | str]", "tuple[Aggregation, ...]"],
-        Option(
-            "Maps and numbers of regions other than means, as in `maximum` or `quantiles:0.5,0.9`; any other name "
-            "lists all; may be repeated. In Python also objects, as in `CoverageMetric`.",
-            list[str],
-        ),
-    ] = Read(_aggregations, ())
-    reference: Annotated[
-        str | None,
-        Option(
-            "Reference sensor: `surface`, points drawn evenly on what can be seen (default), or `paper`. On the "
-            "command line with --frames: `recorded`, or `accumulated` from the recording itself.",
-            in_study=True,
-        ),
-    ] = None
-    rays: Annotated[
-        int | None,
-        Option(
-            "Rays of the reference sensor at each step (surface: 16384; paper: 1048576, a square).",
-            minimum=1,
-            in_study=True,
-        ),
-    ] = None
-    estimate: Annotated[
-        Literal["area", "known"] | None,
-        Option(
-            "What the number of a region is a mean over: `area`, its visible surface (default; needs `surface`), or "
-            "`known`, its known cells, as in the paper.",
-            in_study=True,
-        ),
-    ] = None
-    band_frame: Annotated[
-        Literal["ground", "vehicle"] | None,
-        Option(
-            "What height bands are over: `ground`, the local ground (default), or `vehicle`, z of the vehicle (`paper` "
-            "and recordings without heights have no other).",
-            in_study=True,
-        ),
-    ] = None
-    every_s: Annotated[
-        float | None,
-        Option(
-            "Seconds between one step and the next; steps that follow each other are alike. Not given: 10 in traffic, "
-            "which starts anew in another city every minute, else what spreads the steps over the scenario.",
-            in_study=True,
-        ),
-    ] = None
-    target_error: Annotated[
-        Read["TargetError | str | Sequence[str] | None", "TargetError | None"],
-        Option(
-            "Stop once every number (of the usual regions, those in front) is this good: 0.1% (standard error of each "
-            "detection, in percentage points) or 0.02m (of each radius); both may be given. `steps` is then the most.",
-            list[str],
-        ),
-    ] = Read(_target, None)
-    only_detection: Annotated[
-        bool,
-        Option(
-            "Only the detections of regions: no radii, rough maps, and no bodies unless given. Few reference points "
-            "(2048 rays), and of the rig only those rays are cast that can change their detection: for target errors, "
-            "with more steps.",
-            in_study=True,
-        ),
-    ] = False
-    redundancy: Annotated[
-        bool, Option("Say by how many sensors places are seen, and what is lost when each one fails.")
-    ] = False
-    metrics: Annotated[
-        Read[str | Iterable[str], tuple[str, ...]],
-        Option(
-            "Coverage metrics that others published, on the same frames: `all`, or names as in `k_cover,s_mig` "
-            "(docs/metrics.md).",
-            str,
-        ),
-    ] = Read(_metrics, ())
-    device: Annotated[
-        Read["str | torch.device", str],
-        Option("Where the search and the sums run, with Warp rays too: cpu, cuda, cuda:1, ...", str, in_study=True),
-    ] = Read(str, "cpu")
-    workers: Annotated[
-        int | None,
-        Option(
-            "Processes that make frames; 0 makes them in this one. Not given: of a simulation, as many as help.",
-            minimum=0,
-            in_study=True,
-        ),
-    ] = None
-    no_cache: Annotated[
-        bool,
-        Option(
-            "Build all worlds anew and keep none on disk. Else those that are drawn are read from ~/.cache/torchcover "
-            "where an earlier run has left them, which has room for TORCHCOVER_CACHE_GB gigabytes (1)."
-        ),
-    ] = False
-    skip_bad_frames: Annotated[bool, Option("Skip and count frames that cannot be read, instead of stopping.")] = False
+    steps: int | None = None
+    seed: int = DEFAULTS.seed
+    vehicle: str | Path | None = None
+    sensor_model: Literal["ideal", "real"] | None = None
+    weather: Read["Weather | str | Path | Sequence[Weather | str | Path]", "tuple[Weather, ...]"] = Read(
+        _weather, DEFAULTS.weather
+    )
+    ask: Read["RegionsOfInterest | str | Path | None", "RegionsOfInterest | None"] = Read(_asked, None)
+    probe: Read["str | Path | Iterable[str | Path] | None", "tuple[str | Path, ...] | None"] = Read(_probes, None)
+    cell_m: float | None = None
+    thresholds_m: Read[float | Iterable[float], tuple[float, ...]] = Read(_thresholds, DEFAULTS.thresholds_m)
+    aggregations: Read["str | Sequence[Aggregation | str]", "tuple[Aggregation, ...]"] = Read(
+        _aggregations, DEFAULTS.aggregations
+    )
+    reference: str | None = None
+    rays: int | None = None
+    estimate: Literal["area", "known"] | None = None
+    band_frame: Literal["ground", "vehicle"] | None = None
+    every_s: float | None = None
+    target_error: Read["TargetError | str | Sequence[str] | None", "TargetError | None"] = Read(_target, None)
+    only_detection: bool = DEFAULTS.only_detection
+    redundancy: bool = DEFAULTS.redundancy
+    metrics: Read[str | Iterable[str], tuple[str, ...]] = Read(_metrics, DEFAULTS.metrics)
+    device: Read["str | torch.device", str] = Read(str, DEFAULTS.device)
+    workers: int | None = None
+    no_cache: bool = DEFAULTS.no_cache
+    skip_bad_frames: bool = DEFAULTS.skip_bad_frames
     observers: Annotated[
         "Mapping[str, AnyObserver]",
         "What else looks at the same frames, by name; what they compute is in `Result.observed`.",
@@ -373,6 +238,9 @@ class Settings:
         "Processes that share the run, from `joined_ranks()`; all of them call this, and get the same result.",
     ] = None
     progress: Annotated[bool, "Whether to show a bar."] = False
+    config_record: Annotated[
+        "Mapping[str, object]", "The file of settings that the run was given, for `summary.json`; see `load_config`."
+    ] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.steps is not None and self.steps < 1:
@@ -434,6 +302,3 @@ class Settings:
             raise ValueError("probe: not for recordings, which have no scene to put a body into")
         if any(setting is not None for setting in (self.reference, self.rays, self.every_s)):
             raise ValueError("reference, rays and every_s are for simulations; a recording has its reference points")
-
-
-OPTIONS = options_of(Settings)

@@ -19,8 +19,9 @@ from torchcover import __version__
 from torchcover.coverage import Coverage, Region, shown_places
 from torchcover.coverage.grid import BandFrame
 from torchcover.estimation import MIN_BLOCKS, ROUND_OFF, Difference, ErrorModel, Estimate, Quantity
+from torchcover.evaluation.config import STUDY_SETTINGS
 from torchcover.evaluation.measuring import measured
-from torchcover.evaluation.settings import OPTIONS, Settings
+from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.target_error import MIN_STEPS, rounded_up
 from torchcover.evaluation.task import simulation
 from torchcover.files import Publication, end_with_parent, reporting_stopped
@@ -96,17 +97,16 @@ class StudyPlan:
     @property
     def command(self) -> list[str]:
         """What `torchcover` is told to do the same: the command, the rig, and the options that are not as usual."""
-        usual, given = Settings(), {name: getattr(self.settings, name) for name in OPTIONS if name != "steps"}
-        others = {
-            name: value for name, value in given.items() if OPTIONS[name].in_study and value != getattr(usual, name)
-        }
+        defaults = Settings()
+        given = {name: getattr(self.settings, name) for name in STUDY_SETTINGS}
+        others = {name: value for name, value in given.items() if value != getattr(defaults, name)}
         return ["evaluate", str(self.named[0]), *_options(others)]
 
 
 def _options(settings: Mapping[str, Any]) -> Iterator[str]:
     for name, value in settings.items():
-        for one in value if isinstance(value, tuple) else (value,):
-            yield f"--{name.replace('_', '-')}" + f"={one}" * (one is not True)
+        text = ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
+        yield from ("--set", f"{name}={text.lower() if isinstance(value, bool) else text}")
 
 
 class Studied(NamedTuple):

@@ -14,8 +14,9 @@ import torch
 
 from torchcover import __version__
 from torchcover.coverage import Region
+from torchcover.evaluation.config import DESCRIPTIONS
 from torchcover.evaluation.observers import AnyObserver
-from torchcover.evaluation.settings import DEFAULT_STEPS, MAX_STEPS, OPTIONS, Settings
+from torchcover.evaluation.settings import DEFAULT_STEPS, MAX_STEPS, Settings
 from torchcover.frames import ChosenRigs, FrameSource
 from torchcover.recordings import RecordedFrames, open_recording
 from torchcover.simulation import (
@@ -48,6 +49,7 @@ CALLER = 4
 # Options that frames, what is asked and observers say by what they are, and those that change no result.
 TOLD_OTHERWISE = {"scenario", "seed", "vehicle", "reference", "rays", "every_s", "ask", "cell_m", "band_frame"}
 TOLD_OTHERWISE |= {"sensor_model", "weather", "metrics", "steps", "device", "workers", "no_cache", "skip_bad_frames"}
+TOLD_OTHERWISE |= {"recording", "rerun"}
 # Of an identity, what is longer is told by its hash.
 MAX_TOLD = 40
 
@@ -163,6 +165,7 @@ def simulation(settings: Settings, *, boxes: bool = False) -> Task[SimulatedFram
     frames.simulator.check_run(frames.steps)
     # A path says more than the name within the file.
     description = {**frames.description, "scenario": world.name if loaded_world is scenario else str(scenario)}
+    description |= {"config": settings.config_record} if settings.config_record else {}
     return Task(frames, given, frames.sensors, description, asked, _most_steps(frames, settings))
 
 
@@ -219,7 +222,8 @@ def _recording(frames: FrameSource, settings: Settings) -> Task[FrameSource]:
     sensors = {**chosen.sensors, **{name: loaded(rig).sensors for name, rig in documents.items()}}
     band_frame = settings.band_frame or ("ground" if frames.has_heights() else "vehicle")
     asked = (settings.ask or RegionsOfInterest()).around(frames.ego_outline_m, settings.cell_m, band_frame)
-    return Task(chosen, given, sensors, frames.description, asked, settings.steps)
+    description = {**frames.description, **({"config": settings.config_record} if settings.config_record else {})}
+    return Task(chosen, given, sensors, description, asked, settings.steps)
 
 
 def _within(world: Scenario, rigs: Mapping[str, Rig]) -> Region | None:
@@ -317,7 +321,7 @@ def run_identity(
         **task.frames.content,
         "rigs": task.rigs,
         **_asked(task.asked),
-        **{name: getattr(settings, name) for name in OPTIONS if name not in TOLD_OTHERWISE},
+        **{name: getattr(settings, name) for name in DESCRIPTIONS if name not in TOLD_OTHERWISE},
         "observers": kinds,
         "ranks": ranks,
     }

@@ -1,6 +1,5 @@
 from .accumulated_reference import AccumulatedReference as AccumulatedReference
 from .clouds.readers import read_cloud as read_cloud
-from .corrections import Corrections as Corrections
 from .formats import FORMATS as FORMATS
 from .formats import RecordingFormat as RecordingFormat
 from .formats import open_recording as open_recording
@@ -12,4 +11,6 @@ from .recorded_reference import Reference as Reference
 from .recorders import RECORDERS as RECORDERS
 from .recording import Recording as Recording
 from .recording import Scan as Scan
+from .settings import RecordingSettings as RecordingSettings
+from .settings import merge_recording_settings as merge_recording_settings
 from .suspicion import suspicions as suspicions

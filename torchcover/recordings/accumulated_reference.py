@@ -148,7 +148,7 @@ class AccumulatedReference:
             raise ValueError(
                 f"no reference point is left of the scans within {self.window_s / 2:g} s of this instant, of which "
                 f"{dropped['sweeps']} were used and {dropped['sweeps_skipped']} not, as where poses jump; "
-                "--skip-bad-frames leaves it out"
+                "--set skip_bad_frames=true leaves it out"
             )
         m2 = square_metres(level_m)
         # Of few points in a box, the eighth neighbour is beside it.

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from torchcover.geometry import invert, rigid, rotation_from_euler, transform
 from torchcover.geometry.rigid import Matrix
-from torchcover.recordings.corrected import corrected_poses
-from torchcover.recordings.corrections import Corrections
+from torchcover.recordings.corrected import correct_poses
 from torchcover.recordings.in_vehicle import in_vehicle
 from torchcover.recordings.recording import Recording
+from torchcover.recordings.settings import RecordingSettings
 from torchcover.recordings.sweeps import pose_jumps, voxels
 
 WITHIN_M, CELL_M, LEAST_POINTS, THICK_M, QUERIES = 40.0, 1.0, 6, 0.1, 1500
@@ -36,12 +36,12 @@ MORE_BY_CLOCK, OF_A_SCAN_S = 0.03, 0.03
 LAGS_S = [number * 0.025 for number in range(-12, 13)]
 # Where poses say that a vehicle stands: what it is moved by to see whether it does, with every so many points.
 STANDS_M, FASTEST_MPS, TURNS_DEG, FEWER = 0.1, 40.0, [half / 2 for half in range(-8, 9)], 3
-GIVEN = Corrections()
+GIVEN = RecordingSettings()
 OTHERWISE = (
-    Corrections(quaternions="xyzw"),
-    Corrections(poses="inverse"),
-    Corrections(poses="yx"),
-    Corrections(axes="yxz"),
+    RecordingSettings(quaternions="xyzw"),
+    RecordingSettings(poses="inverse"),
+    RecordingSettings(poses="yx"),
+    RecordingSettings(axes="yxz"),
 )
 
 
@@ -94,7 +94,7 @@ class TwoSensors:
         self._surfaces, self._pair = [Surfaces(scan.points_m) for scan in scans], pair
         self.enough = min(len(each.points_m) for each in self._surfaces) >= QUERIES // 10
 
-    def agreement(self, corrections: Corrections) -> float:
+    def agreement(self, corrections: RecordingSettings) -> float:
         """How well the second fits the first, if it was later by the lag."""
         return self._surfaces[0].agreement(transform(self._pair.later(corrections), self._surfaces[1].points_m))
 
@@ -108,14 +108,14 @@ class Pair:
         self.way_m = float(np.linalg.norm(self.motion()[:3, 3]))
         self.by_lag_m = 0.0
 
-    def motion(self, corrections: Corrections = GIVEN) -> Matrix:
+    def motion(self, corrections: RecordingSettings = GIVEN) -> Matrix:
         """(4, 4) from the vehicle frame of the other to that of the one."""
-        poses = self._poses if corrections is GIVEN else corrected_poses(self._poses, self._times_s, corrections)
+        poses = self._poses if corrections is GIVEN else correct_poses(self._poses, self._times_s, corrections)
         return np.asarray(invert(poses[self.one]) @ poses[self.other])
 
-    def later(self, corrections: Corrections) -> Matrix:
+    def later(self, corrections: RecordingSettings) -> Matrix:
         """(4, 4) from the vehicle frame of the one, as it is with a lag, to that without."""
-        poses = corrected_poses(self._poses, self._times_s, corrections)
+        poses = correct_poses(self._poses, self._times_s, corrections)
         return np.asarray(invert(self._poses[self.one]) @ poses[self.one])
 
     def read(self, recording: Recording, sensor: str) -> bool:
@@ -127,7 +127,7 @@ class Pair:
             return False
         return min(len(each.points_m) for each in self._surfaces) >= QUERIES // 10
 
-    def agreement(self, corrections: Corrections = GIVEN, moved: Matrix | None = None, every: int = 1) -> float:
+    def agreement(self, corrections: RecordingSettings = GIVEN, moved: Matrix | None = None, every: int = 1) -> float:
         """How well the other fits the one, if they are read like that, or it is moved so; by every so many points."""
         moved = self.motion(corrections) if moved is None else moved
         if corrections.axes == "yxz":  # both clouds are mirrored, each in the frame of its sensor
@@ -156,7 +156,7 @@ def disagreement(recording: Recording, sensor: str, many: int) -> str | None:
     return mended and f"two scans of {sensor} agree to {given:.0%} once its poses move them, and to {mended}"
 
 
-def _mean(pairs: Sequence[Pair | TwoSensors], corrections: Corrections) -> float:
+def _mean(pairs: Sequence[Pair | TwoSensors], corrections: RecordingSettings) -> float:
     return float(np.mean([pair.agreement(corrections) for pair in pairs]))
 
 
@@ -164,12 +164,12 @@ def _late(pairs: Sequence[Pair], given: float) -> str | None:
     lag_s, agreed = _best_lag(pairs)
     if agreed < max(given + MORE_BY_LAG, WELL):
         return None
-    return f"{agreed:.0%} if they are late (early, if negative): --lag {lag_s:.2f}"
+    return f"{agreed:.0%} if they are late (early, if negative): --set recording.lag_s={lag_s:.2f}"
 
 
 def _best_lag(pairs: Sequence[Pair | TwoSensors]) -> tuple[float, float]:
     """The lag with which they agree best, and how well; 0 where ragged noise has many that are better."""
-    by_lag = np.array([_mean(pairs, Corrections(lag_s=lag_s)) for lag_s in LAGS_S])
+    by_lag = np.array([_mean(pairs, RecordingSettings(lag_s=lag_s)) for lag_s in LAGS_S])
     best = int(by_lag.argmax())
     # By how much it rises again on the way from the best.
     rises = max((side - np.minimum.accumulate(side)).max() for side in (by_lag[best::-1], by_lag[best:]))
@@ -249,7 +249,7 @@ def _held(stretches: Sequence[Matrix]) -> str | None:
         return None
     return (
         f"{repeated} of {steps} poses are those of the instant before while the vehicle drives: give a pose for each "
-        "instant, or have them interpolated (--poses held)"
+        "instant, or have them interpolated (--set recording.poses=held)"
     )
 
 
@@ -274,7 +274,7 @@ def _chosen(stretches: Sequence[tuple[NDArray[np.float64], Matrix, int]]) -> lis
     found = []
     for times_s, poses, first in stretches:
         jumps = _few_jumps(times_s, poses)
-        early, late = (corrected_poses(poses, times_s, Corrections(lag_s=lag_s)) for lag_s in (-0.1, 0.1))
+        early, late = (correct_poses(poses, times_s, RecordingSettings(lag_s=lag_s)) for lag_s in (-0.1, 0.1))
         for one in range(len(times_s) - 1):
             for other in range(one + 1, min(jumps[jumps >= one] + 1, default=len(times_s))):
                 pair = Pair(times_s, poses, first, one, other)

@@ -1,4 +1,4 @@
-"""Recordings that are read as their users say."""
+"""Correct points, poses and times of a recording as its user asks."""
 
 from dataclasses import replace
 from functools import cached_property
@@ -9,17 +9,17 @@ from numpy.typing import NDArray
 
 from torchcover import geometry
 from torchcover.geometry.rigid import Matrix
-from torchcover.recordings.corrections import Corrections
 from torchcover.recordings.recording import Recording, Scan
+from torchcover.recordings.settings import RecordingSettings
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
 
 
 class Corrected:
-    """A recording with corrections; all else is as it is there."""
+    """A recording whose points, poses and times are corrected; other attributes are those of the recording."""
 
-    def __init__(self, recording: Recording, corrections: Corrections) -> None:
-        self.recording, self.corrections = recording, corrections
+    def __init__(self, recording: Recording, settings: RecordingSettings) -> None:
+        self.recording, self.settings = recording, settings
 
     def __getattr__(self, name: str) -> Any:  # noqa: ANN401  (what the recording has)
         if name == "recording":  # while it is made from a pickle
@@ -28,8 +28,8 @@ class Corrected:
 
     def scan(self, sensor: str, index: int) -> Scan:
         """What the recording has, put right."""
-        scan, columns = self.recording.scan(sensor, index), ["xyz".index(axis) for axis in self.corrections.axes]
-        return replace(scan, points_m=scan.points_m[:, columns] * METRES[self.corrections.units])
+        scan, columns = self.recording.scan(sensor, index), ["xyz".index(axis) for axis in self.settings.axes]
+        return replace(scan, points_m=scan.points_m[:, columns] * METRES[self.settings.units])
 
     def world_T_vehicle(self, index: int) -> Matrix | None:
         """Where the vehicle was, put right."""
@@ -41,34 +41,32 @@ class Corrected:
         if any(pose is None for pose in poses):
             return None
         times_s = self.recording.times_s
-        if times_s is None and (self.corrections.lag_s or self.corrections.poses == "held"):
-            raise ValueError(f"{self.recording.path}: {self.corrections.words} needs the times of its instants")
-        return corrected_poses(
-            np.array(poses), np.arange(0.0, len(poses)) if times_s is None else times_s, self.corrections
-        )
+        if times_s is None and (self.settings.lag_s or self.settings.poses == "held"):
+            raise ValueError(f"{self.recording.path}: {self.settings.words} needs the times of its instants")
+        return correct_poses(np.array(poses), np.arange(0.0, len(poses)) if times_s is None else times_s, self.settings)
 
 
-def corrected(recording: Recording, corrections: Corrections) -> Recording:
-    """A recording as its user says that it is to be read."""
-    read: Any = Corrected(recording, corrections)  # which has what the recording has
-    found: Recording = read if corrections.words else recording
-    return found
+def correct_recording(recording: Recording, settings: RecordingSettings) -> Recording:
+    """Return a recording with the corrections of its settings; the same one if there are none."""
+    corrected: Any = Corrected(recording, settings)  # has the attributes of the recording, too
+    result: Recording = corrected if settings.corrections else recording
+    return result
 
 
-def corrected_poses(world_T_vehicle: Matrix, times_s: NDArray[np.float64], corrections: Corrections) -> Matrix:
+def correct_poses(world_T_vehicle: Matrix, times_s: NDArray[np.float64], settings: RecordingSettings) -> Matrix:
     """(N, 4, 4) poses of N instants in a row, put right; beyond the first and the last they go on as before."""
     poses = world_T_vehicle.copy()
-    if corrections.quaternions == "xyzw":  # what was read as w, x, y, z
+    if settings.quaternions == "xyzw":  # what was read as w, x, y, z
         wxyz = [geometry.quaternion_from_rotation(rotation) for rotation in poses[:, :3, :3]]
         poses[:, :3, :3] = geometry.rotation_from_quaternion(np.roll(wxyz, 1, axis=1))
-    if corrections.poses == "inverse":
+    if settings.poses == "inverse":
         poses = geometry.invert(poses)
-    elif corrections.poses == "yx":
+    elif settings.poses == "yx":
         poses[:, :3, 3] = poses[:, [1, 0, 2], 3]
-    new = np.append(True, (np.diff(poses, axis=0) != 0).any(axis=(1, 2)) | (corrections.poses != "held"))
-    if (corrections.poses != "held" and not corrections.lag_s) or new.sum() < 2:
+    new = np.append(True, (np.diff(poses, axis=0) != 0).any(axis=(1, 2)) | (settings.poses != "held"))
+    if (settings.poses != "held" and not settings.lag_s) or new.sum() < 2:
         return poses
-    known, known_s, wanted_s = poses[new], times_s[new], times_s + corrections.lag_s
+    known, known_s, wanted_s = poses[new], times_s[new], times_s + settings.lag_s
     after = np.searchsorted(known_s, wanted_s, side="right").clip(1, len(known) - 1)
     share = ((wanted_s - known_s[after - 1]) / np.diff(known_s)[after - 1])[:, None]
     angles_deg, places_m = geometry.euler_from_rotation(known[:, :3, :3]), known[:, :3, 3]

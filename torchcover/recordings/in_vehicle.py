@@ -111,6 +111,6 @@ def _check_range(farthest_m: float, source: str) -> None:
     if farthest_m > MAX_COORDINATE_M:
         raise ValueError(
             f"{source}: a coordinate of {farthest_m:.6g} m in the vehicle frame, at most {MAX_COORDINATE_M:g} m is "
-            "allowed; if it is in millimetres, say so (--units mm); for world coordinates give the pose of the sensor "
-            "(vehicle_T_sensor in frames.yaml)"
+            "allowed; if it is in millimeters, say so (--set recording.units=mm); for world coordinates give the pose "
+            "of the sensor (vehicle_T_sensor in frames.yaml)"
         )

@@ -18,8 +18,6 @@ from torchcover.frames.frame import Frame
 from torchcover.frames.source import BadFrameError, FrameDataset
 from torchcover.geometry import transform
 from torchcover.recordings.accumulated_reference import AccumulatedReference
-from torchcover.recordings.corrected import corrected
-from torchcover.recordings.corrections import Corrections
 from torchcover.recordings.in_vehicle import InVehicle, in_vehicle, joined
 from torchcover.recordings.recorded_reference import RecordedReference, Reference
 from torchcover.recordings.recording import Recording
@@ -45,8 +43,6 @@ class RecordedFrames(FrameDataset):
             else an `AccumulatedReference`.
         ground: Whether heights above the ground that were not recorded, also of boxes, come from a `GroundModel` of
             what all sensors saw: within the window of the reference if it is accumulated, else at the instant.
-        corrections: How the recording is to be read other than its format says; what looks wrong about it, and which
-            correction would mend it, is what `doubts` says.
 
     Raises:
         FileNotFoundError: There is no such recording, or a part of it is missing.
@@ -70,14 +66,14 @@ class RecordedFrames(FrameDataset):
         rigs: Mapping[str, Sequence[str]] | None = None,
         reference: Reference | None = None,
         ground: bool = True,
-        corrections: Corrections = Corrections(),  # noqa: B008  (it is frozen)
     ) -> None:
         if isinstance(recording, str | os.PathLike):
             from torchcover.recordings.formats import open_recording  # all formats, for a path only
 
             recording = open_recording(recording)
-        self.recording = corrected(recording, corrections)
-        self.corrections = corrections
+        self.recording = recording
+        settings = getattr(recording, "settings", None)
+        self.corrections: str = settings.words if settings else ""
         self.sensors_of_rigs = {name: tuple(of) for name, of in (rigs or self.recording.rigs).items()}
         self._check_sensors()
         if reference is None:
@@ -164,8 +160,8 @@ class RecordedFrames(FrameDataset):
     def reference_record(self) -> Mapping[str, object]:
         """Where the reference comes from, and the ground, if it was looked for to choose what bands are over."""
         record = self.reference.record(self.recording, self._judged)
-        if self.corrections.words:
-            notes = [*record["notes"], f"Read as asked: {self.corrections.words}."]  # type: ignore[misc]  # as below
+        if self.corrections:
+            notes = [*record["notes"], f"Read as asked: {self.corrections}."]  # type: ignore[misc]  # as below
             record = {**record, "notes": notes}
         if self._has_heights is None or not self._modelled:
             return record
@@ -187,7 +183,7 @@ class RecordedFrames(FrameDataset):
             "told": [repr(self.recording.body), getattr(self.recording, "told", {})],
             "reference": [type(self.reference).__name__, reference],
             "ground": self.ground,
-            "corrections": self.corrections.words,
+            "corrections": self.corrections,
         }
 
     def __len__(self) -> int:
@@ -206,7 +202,7 @@ class RecordedFrames(FrameDataset):
             reference = self.reference.cloud(self.recording, instant, self._judged)
             heights_m, boxes = self._above_ground(instant, reference, self.recording.boxes(instant))
         except BadFrameError as error:
-            window = f"it is in the window of {name} (frame {position}); --skip-bad-frames leaves it out"
+            window = f"it is in the window of {name} (frame {position}); --set skip_bad_frames=true leaves it out"
             raise BadFrameError(f"{error}; {window}") from error
         except (OSError, ValueError) as error:
             raise BadFrameError(f"{name} (frame {position}): {error}") from error

@@ -113,7 +113,7 @@ def wrong_units(recording: Recording, sensor: str) -> str | None:
     if usual_m < FARTHEST_USUAL_M:
         return None
     unit = "mm" if usual_m > FARTHEST_USUAL_CM else "cm"
-    return f"half of the points of {sensor} are beyond {usual_m:,.0f} m: is it {unit}? (--units {unit})"
+    return f"half of the points of {sensor} are beyond {usual_m:,.0f} m: is it {unit}? (--set recording.units={unit})"
 
 
 def nothing_labelled(recording: Recording, many: int) -> str | None:
@@ -253,7 +253,7 @@ def few_in_window(recording: Recording, reference: AccumulatedReference) -> str 
     if apart_s > window_s / 2:
         return (
             f"its instants are {apart_s:g} s apart, and a window of {window_s:g} s reaches none but its own: are "
-            "the times in seconds? Else ask for a longer window (--window-s)"
+            "the times in seconds? Else ask for a longer window (--set recording.window_s=SECONDS)"
         )
     if lasts_s >= window_s / 2:
         return None

@@ -41,7 +41,7 @@ LEAST_FREE_BYTES = 100e6
 KINDS: dict[str, Callable[..., Any]] = {kind.__name__: kind for kind in (World, Actor, Trajectory, Mesh)}
 # Whose code draws worlds.
 ROOMS = ("files", "geometry", "simulation")
-NOT_KEPT = f"worlds are not kept on disk for later runs; --no-cache, or {BUDGET}=0, asks for none"
+NOT_KEPT = f"worlds are not kept on disk for later runs; --set no_cache=true, or {BUDGET}=0, asks for none"
 
 _said: set[str] = set()
 

@@ -93,7 +93,7 @@ def read_scale(file: BinaryIO, records: list[LasRecord]) -> NDArray[np.float64]:
     if (horizontal.meters, vertical.meters) != (1.0, 1.0):
         warnings.warn(
             f"LAS coordinates are converted to meters, as the file says: x and y are in {horizontal.name}, z in "
-            f"{vertical.name}; give no --units",
+            f"{vertical.name}; give no recording.units",
             stacklevel=2,
         )
     return np.array([horizontal.meters, horizontal.meters, vertical.meters])
@@ -114,7 +114,7 @@ def _units_of_keys(data: bytes) -> tuple[_Unit, _Unit] | None:
         if not any(code in zones for zones in UTM_CODES):
             warnings.warn(
                 f"LAS coordinates of EPSG:{code} without a unit (ProjLinearUnitsGeoKey) are taken for meters; if they "
-                "are feet: --units ft",
+                "are feet: --set recording.units=ft",
                 stacklevel=3,
             )
         horizontal = _Unit("meter", 1.0)

@@ -1,12 +1,12 @@
 """The layouts of recordings, by name: a new one is a class and a line here."""
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from torchcover.files import RECORDING, noted
-from torchcover.geometry.rigid import Matrix
+from torchcover.recordings.corrected import correct_recording
 from torchcover.recordings.formats import argoverse2, commonroad, nuscenes
 from torchcover.recordings.formats.argoverse2 import Argoverse2
 from torchcover.recordings.formats.carla import Carla
@@ -18,6 +18,7 @@ from torchcover.recordings.formats.ros import RosBag
 from torchcover.recordings.formats.track_tables import read_box_tracks
 from torchcover.recordings.objects import RecordedObjects, objects_of
 from torchcover.recordings.recording import Recording, whole_recording
+from torchcover.recordings.settings import RecordingSettings, merge_recording_settings
 
 
 class RecordingFormat(Protocol):
@@ -51,20 +52,12 @@ FORMATS: dict[str, RecordingFormat] = {
 }
 
 
-def open_recording(
-    path: str | os.PathLike[str],
-    format_name: str | None = None,
-    *,
-    vehicle_frame: str | None = None,
-    mounts: Mapping[str, Matrix] | None = None,
-) -> Recording:
+def open_recording(path: str | os.PathLike[str], settings: RecordingSettings | None = None) -> Recording:
     """Open a recording; `RecordedFrames` makes frames of it.
 
     Args:
         path: Where it is.
-        format_name: A name in `FORMATS`; the first that recognises it if not given.
-        vehicle_frame: Of a bag, see `RosBag`.
-        mounts: Of a bag, see `RosBag`.
+        settings: How to read it; they win over `recording.yaml` in its folder.
 
     Raises:
         FileNotFoundError: There is nothing at the path.
@@ -73,19 +66,21 @@ def open_recording(
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such recording")
-    if format_name is not None and format_name not in FORMATS:
-        raise ValueError(f"format {format_name!r}: no such format of recordings; there are {', '.join(FORMATS)}")
+    settings = merge_recording_settings(path, settings)
+    if settings.format is not None and settings.format not in FORMATS:
+        raise ValueError(f"format {settings.format!r}: no such format of recordings; there are {', '.join(FORMATS)}")
     names = _frames_written(path)
     for name, recording_format in FORMATS.items():
-        if name != format_name and (format_name is not None or not recording_format.recognises(path)):
+        if name != settings.format and (settings.format is not None or not recording_format.recognises(path)):
             continue
         if recording_format is RosBag:
-            return RosBag(path, vehicle_frame, mounts)
-        if vehicle_frame is not None or mounts:
+            mounts = {sensor: mount.matrix() for sensor, mount in settings.mounts.items()}
+            return correct_recording(RosBag(path, settings.vehicle_frame, mounts), settings)
+        if settings.vehicle_frame is not None or settings.mounts:
             raise ValueError(
                 f"{path}: vehicle_frame and mounts are for bags; {name} has its own (a plain folder in frames.yaml)"
             )
-        return _checked(recording_format(path), names)
+        return correct_recording(_checked(recording_format(path), names), settings)
     known = "; ".join(f"{name}: {recording_format.layout}" for name, recording_format in FORMATS.items())
     raise ValueError(f"{path}: a recording of no known format{_below(path)}; known are {known}")
 

@@ -164,7 +164,7 @@ class RosBag(Layout):
         if len(lost) == len(found):
             raise ValueError(
                 f"{told}; static ones are of {', '.join(sorted(tree.frames)) or 'no frames'}: name the vehicle's "
-                "(--vehicle-frame), or give mounts (--mount SENSOR=x,y,z,yaw,pitch,roll)"
+                "(--set recording.vehicle_frame=NAME), or give mounts (recording.yaml)"
             )
         if lost:
             self._warn(f"left out, for {told}")
@@ -237,5 +237,5 @@ def _vehicle_frame(frames: Collection[str], mounts: Collection[str]) -> str:
         return VEHICLE_FRAMES[1]
     raise ValueError(
         f"the frame {' or '.join(VEHICLE_FRAMES)} of the vehicle is needed; there are {', '.join(sorted(frames))}: "
-        "name one (--vehicle-frame), or give mounts (--mount SENSOR=x,y,z,yaw,pitch,roll)"
+        "name one (--set recording.vehicle_frame=NAME), or give mounts (recording.yaml)"
     )

@@ -1,0 +1,95 @@
+"""Settings of a run in a file, by `--set` and by options of their own."""
+
+import json
+
+import pytest
+
+from torchcover.data import RecordingSettings, open_recording
+from torchcover.evaluation.config import EvaluateConfig, load_config, write_defaults
+from torchcover.files import BadFileError, parse_yaml
+
+
+def test_the_written_defaults_are_all_settings_with_a_comment_each(tmp_path):
+    text = write_defaults()
+    (tmp_path / "run.yaml").write_text(text)
+    assert load_config(tmp_path / "run.yaml").config == EvaluateConfig()
+    assert list(parse_yaml(text)) == list(EvaluateConfig.model_fields)
+    assert list(parse_yaml(text)["recording"]) == list(RecordingSettings.model_fields)
+    lines = text.splitlines()
+    keys = [number for number, line in enumerate(lines) if not line.lstrip().startswith("#")]
+    assert all(lines[number - 1].lstrip().startswith("#") for number in keys)
+
+
+def test_an_option_wins_over_set_which_wins_over_the_file_and_both_are_recorded(tmp_path):
+    path = tmp_path / "run.yaml"
+    path.write_text("rays: 1\ncell_m: 1.0\nseed: 1\nrecording: {units: mm, lag_s: 0.2}\n")
+    config, record = load_config(path, ["rays=2", "cell_m=2", "recording.units=cm"], {"rays": 3})
+    assert (config.rays, config.cell_m, config.seed) == (3, 2.0, 1)
+    assert (config.recording.units, config.recording.lag_s) == ("cm", 0.2)
+    assert record["file"] == str(path)
+    assert record["settings"]["rays"] == 1
+    assert record["replaced"]["rays"] == {"file": 1, "option": 3}
+    assert "seed" not in record["replaced"]
+    assert load_config(None, ["rays=2"]).record == {}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("rayz: 3", "rayz: unknown key"),
+        ("rays: 3\nrays: 4", "rays"),
+        ("rays: many", "rays: a valid integer is needed; got 'many'"),
+        ("rays: 1.5", "rays: a valid integer is needed; got 1.5"),
+        ("cell_m: 25cm", "cell_m: a valid number is needed; got '25cm'"),
+        ("thresholds_cm: [40]", "thresholds_cm: unknown key"),
+        ("redundancy: 1", "redundancy: a valid boolean is needed; got 1"),
+        ("target_error: 1%", "target_error: a valid list is needed; got '1%'"),
+        ("recording: {units: km}", "recording.units: 'm', 'cm', 'mm' or 'ft' is needed; got 'km'"),
+        ("recording: {lag_s: 5}", "recording.lag_s: at most 1 s of time offset"),
+        ("[1, 2]", "a YAML mapping of settings is needed"),
+    ],
+)
+def test_a_file_with_a_mistake_is_refused_with_key_and_value(tmp_path, text, message):
+    path = tmp_path / "run.yaml"
+    path.write_text(text)
+    with pytest.raises(BadFileError) as refused:
+        load_config(path)
+    assert str(path) in str(refused.value)
+    assert message in str(refused.value)
+
+
+@pytest.mark.parametrize("text", ["rays", "=", "rayz=3", "recording=1", "recording.unit=mm", "rays=x", "cell_m=25cm"])
+def test_an_assignment_that_is_no_setting_is_refused(text):
+    with pytest.raises(ValueError, match=r"^--set "):
+        load_config(None, [text])
+
+
+def test_a_run_reads_a_file_and_its_result_has_it(torchcover, worlds):
+    path = worlds / "run.yaml"
+    path.write_text(f"scenario: {worlds / 'yard.yaml'}\ncell_m: 4\nrays: 64\nsteps: 3\nprobe: [none]\n")
+    options = ("--config", path, "--steps", 2, "--files", "numbers", "--out", worlds / "out")
+    code, _, complaints = torchcover("evaluate", worlds / "both.yaml", *options)
+    assert code == 0, complaints
+    summary = json.loads((worlds / "out" / "summary.json").read_text())
+    assert summary["steps"] == 2
+    assert summary["config"]["settings"]["cell_m"] == 4
+    assert summary["config"]["replaced"]["steps"] == {"file": 3, "option": 2}
+    code, printed, _ = torchcover("config")
+    assert (code, printed) == (0, write_defaults())
+
+
+def test_a_recording_says_how_to_read_it_and_settings_win(tmp_path):
+    recording = tmp_path
+    for source in ("sensor", "reference"):
+        (tmp_path / source).mkdir()
+        (tmp_path / source / "frame0.xyz").write_text("1 2 3")
+    (recording / "recording.yaml").write_text("units: cm\n")
+    plain = open_recording(recording)
+    assert plain.settings.words == "--set recording.units=cm"
+    assert (
+        open_recording(recording, RecordingSettings(units="m")).scan("sensor", 0).points_m.tolist()
+        == (100 * plain.scan("sensor", 0).points_m).tolist()
+    )
+    (recording / "recording.yaml").write_text("unit: cm\n")
+    with pytest.raises(BadFileError, match=r"recording\.yaml: .*unit: unknown key"):
+        open_recording(recording)
