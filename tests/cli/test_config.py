@@ -3,7 +3,9 @@
 import json
 
 import pytest
+import typer
 
+from torchcover.cli.app import app
 from torchcover.data import RecordingSettings, open_recording
 from torchcover.evaluation.config import EvaluateConfig, load_config, write_defaults
 from torchcover.files import BadFileError, parse_yaml
@@ -31,6 +33,11 @@ def test_an_option_wins_over_set_which_wins_over_the_file_and_both_are_recorded(
     assert record["replaced"]["rays"] == {"file": 1, "option": 3}
     assert "seed" not in record["replaced"]
     assert load_config(None, ["rays=2"]).record == {}
+    lists = load_config(
+        None, ["aggregations=[maximum, 'quantiles:0.5,0.9']", "probe=child,pole", "thresholds_m=1,2"]
+    ).config
+    assert lists.aggregations == ("maximum", "quantiles:0.5,0.9")
+    assert (lists.probe, lists.thresholds_m) == (("child", "pole"), (1.0, 2.0))
 
 
 @pytest.mark.parametrize(
@@ -71,7 +78,7 @@ def test_a_run_reads_a_file_and_its_result_has_it(torchcover, worlds):
     code, _, complaints = torchcover("evaluate", worlds / "both.yaml", *options)
     assert code == 0, complaints
     summary = json.loads((worlds / "out" / "summary.json").read_text())
-    assert summary["steps"] == 2
+    assert summary["rows"][0]["steps"] == 2
     assert summary["config"]["settings"]["cell_m"] == 4
     assert summary["config"]["replaced"]["steps"] == {"file": 3, "option": 2}
     code, printed, _ = torchcover("config")
@@ -93,3 +100,8 @@ def test_a_recording_says_how_to_read_it_and_settings_win(tmp_path):
     (recording / "recording.yaml").write_text("unit: cm\n")
     with pytest.raises(BadFileError, match=r"recording\.yaml: .*unit: unknown key"):
         open_recording(recording)
+
+
+def test_evaluate_has_at_most_22_options():
+    command = typer.main.get_command(app).commands["evaluate"]
+    assert sum(parameter.param_type_name == "option" for parameter in command.params) <= 22

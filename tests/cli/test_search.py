@@ -70,7 +70,6 @@ def test_a_mistake_is_one_line(torchcover, space, tmp_path, options, message):
     ("objective", "message"),
     [
         ("number: radius, region: 20m", "objective 'near': no result has a number 'radius'; near is 'radius_m'"),
-        ("number: s_mig_0.3m", "objective 'near': no result has a number 's_mig_0.3m'; near is 's_mig_0.2m'"),
         ("number: radius_m", "objectives.near: region: it is needed"),
     ],
 )

@@ -1,6 +1,7 @@
 """`torchcover study`: error against run time."""
 
 import json
+import os
 import sys
 from types import SimpleNamespace
 
@@ -12,17 +13,33 @@ from torchcover.cli import app
 def test_a_small_study_writes_tables_a_diagram_and_an_advice(torchcover, tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")  # so that no heading is folded
 
-    def timed(words, **_):
+    class Timed:
         """The command that is timed, in this process, which has imported all that it needs."""
+
+        pid = os.getpid()
+
+        def __init__(self, words, **_):
+            self.returncode = run(words)
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+        def communicate(self):
+            return None, ""
+
+    def run(words):
         assert words[:3] == [sys.executable, "-m", "torchcover"]
         monkeypatch.setattr(sys, "argv", words[2:])
         with pytest.raises(SystemExit) as stop:
             app.main()
         codes.append(stop.value.code)
-        return SimpleNamespace(returncode=stop.value.code, stderr="")
+        return stop.value.code
 
     codes = []
-    monkeypatch.setattr("torchcover.evaluation.study.subprocess", SimpleNamespace(run=timed))
+    monkeypatch.setattr("torchcover.evaluation.study.subprocess", SimpleNamespace(Popen=Timed, DEVNULL=None, PIPE=None))
     out = tmp_path / "out"
     options = ["--rays", "256", "--set", "cell_m=4", "--steps", "8"]
     code, text, complaints = torchcover("study", "front_roof_32", "--scenario", "courtyard", *options, "--out", out)

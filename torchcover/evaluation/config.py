@@ -209,7 +209,8 @@ def _assign(content: dict[str, Any], text: str) -> None:
         )
         raise ValueError(f"--set {text}: KEY=VALUE is needed, with one of these keys: {known}")
     target, entry = (content["recording"], name) if dot else (content, key)
-    if isinstance(fields[entry].default, tuple) or entry == "probe":
+    is_list = isinstance(fields[entry].default, tuple) or entry == "probe"
+    if is_list and not value.startswith("["):
         parts = [part.strip() for part in value.split(",")]
         target[entry] = [parse_yaml(part) for part in parts] if entry == "thresholds_m" else parts
     else:
