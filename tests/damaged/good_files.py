@@ -308,7 +308,6 @@ def kinds(folder):
         "c64.npy": member,
         "deflated.npz": archive({"points.npy": member}),
         "stored.npz": archive({"points.npy": member}, zipfile.ZIP_STORED),
-        "bzip2.npz": archive({"points.npy": member}, zipfile.ZIP_BZIP2),
         "c.bin": cloud.tobytes(),
         "c.pcd.bin": rings.tobytes(),
         "ascii.pcd": pcd("ascii", rows(cloud, " ")),

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchcover.files import DEFLATE_MAX_RATIO, NpyHeader, check_memory, exr_image, read_npy, reads
+from torchcover.files import DEFLATE_MAX_RATIO, NpyHeader, check_memory, exr_image, png_image, read_npy, reads
 
 CARLA_FAR_M = 1000.0
 _CARLA_FULL_CODE = 2**24 - 1
@@ -111,8 +111,6 @@ def _scaled(values: NDArray[Any], scale: float | None) -> Tensor:
 
 def _read_png(path: Path) -> NDArray[Any]:
     """(H, W, 3 or 4) uint8 or (H, W) uint16; the header decides, because Pillow would narrow 16-bit colour silently."""
-    from PIL import Image
-
     with path.open("rb") as file:
         header = file.read(26)
     known = len(header) == 26 and header.startswith(_PNG_SIGNATURE)
@@ -126,8 +124,7 @@ def _read_png(path: Path) -> NDArray[Any]:
     if claimed_bytes > DEFLATE_MAX_RATIO * file_bytes:
         raise ValueError(f"truncated: the header claims {width}x{height} pixels, of which {file_bytes} bytes are not")
     check_memory(width * height * _BYTES_PER_PIXEL)
-    with Image.open(path) as image:
-        return np.asarray(image).astype(np.uint8 if bits == 8 else np.uint16)
+    return png_image(path)["pixels"].astype(np.uint8 if bits == 8 else np.uint16)
 
 
 def _read_npy(path: Path) -> NDArray[Any]:

@@ -32,7 +32,7 @@ COUNTED = (
 )
 # Packages that take long to import, and what would have needed them; not all lenses with distortion need kornia, but
 # where there is one, nobody is to think that its distortion was left out.
-HEAVY = {"kornia": "lenses with distortion", "lightning": "training", "lzf": "compressed PCD files"}
+HEAVY = {"kornia": "lenses with distortion", "lightning": "training"}
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,8 @@ from torchcover.files.csv_tables import read_csv as read_csv
 from torchcover.files.json_tables import read_json_table as read_json_table
 from torchcover.files.native import exr_image as exr_image
 from torchcover.files.native import laz_points as laz_points
+from torchcover.files.native import lzf_block as lzf_block
+from torchcover.files.native import png_image as png_image
 from torchcover.files.native import read_feather as read_feather
 from torchcover.files.notebooks import brief as brief
 from torchcover.files.notebooks import data_frame as data_frame

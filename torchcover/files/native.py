@@ -73,3 +73,28 @@ def laz_points(path: Path, points: int) -> dict[str, NDArray[Any]]:
     if len(found) != points:
         raise ValueError(f"the header claims {points} points; {len(found)} are there")
     return {"xyz": np.column_stack([found.X, found.Y, found.Z])}
+
+
+@apart
+def png_image(path: Path) -> dict[str, NDArray[Any]]:
+    """Read the `pixels` of a PNG image, whose header was checked before."""
+    from PIL import Image
+
+    try:
+        with Image.open(path, formats=["PNG"]) as image:
+            return {"pixels": np.asarray(image)}
+    except (OSError, SyntaxError) as error:  # the latter is Pillow's for chunks that do not hold together
+        raise ValueError(f"truncated or damaged: {error}") from error
+
+
+@apart
+def lzf_block(path: Path, start: int, compressed_bytes: int, plain_bytes: int) -> dict[str, NDArray[Any]]:
+    """Decompress the block of a file that begins at the byte `start`, into `plain` (plain_bytes,) uint8."""
+    import lzf
+
+    with path.open("rb") as file:
+        file.seek(start)
+        plain = lzf.decompress(file.read(compressed_bytes), plain_bytes)
+    if plain is None or len(plain) != plain_bytes:
+        raise ValueError(f"the compressed block does not grow to the {plain_bytes} bytes that it claims")
+    return {"plain": np.frombuffer(plain, np.uint8)}

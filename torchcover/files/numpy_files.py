@@ -18,7 +18,6 @@ from torchcover.files.bad_file import check_memory
 DEFLATE_MAX_RATIO = 1032
 # How often its compressed size a member can have.
 MAX_RATIOS = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: DEFLATE_MAX_RATIO}
-CHUNK_BYTES = 1 << 20
 _HEADER_READERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
@@ -52,7 +51,7 @@ def read_npz(
     check: Callable[[NpyHeader], None],
     choose: Callable[[Collection[str]], Collection[str]] = lambda names: names,
 ) -> dict[str, NDArray[Any]]:
-    """Read arrays of a `.npz` by name, whatever its compression; those that `choose` returns of all names, else all.
+    """Read arrays of a `.npz` by name, compressed or not; those that `choose` returns of all names, else all.
 
     `check` gets each header before memory is reserved, and raises ValueError if it is not what is needed. ValueError:
     not such an archive, a damaged one, or one that grows beyond what a file may take.
@@ -66,7 +65,7 @@ def read_npz(
                 raise ValueError("two arrays of one name")
             wanted = {name: members[name] for name in choose(members)}
             for member in wanted.values():
-                _check_growth(archive, member)
+                _check_growth(member)
             check_memory(sum(member.file_size for member in wanted.values()))
             return {
                 name: _load(partial(archive.open, member), member.file_size, check) for name, member in wanted.items()
@@ -86,6 +85,7 @@ def npz_headers(path: Path) -> dict[str, NpyHeader]:
     found = {}
     with zipfile.ZipFile(path) as archive:
         for member in archive.infolist():
+            _check_growth(member)
             with archive.open(member) as stream, suppress(ValueError):
                 found[member.filename.removesuffix(".npy")] = _npy_header(stream)
     return found
@@ -103,12 +103,10 @@ def write_npz(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
                 np.lib.format.write_array(stream, np.asanyarray(array), allow_pickle=False)
 
 
-def _check_growth(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> None:
-    if member.compress_type in MAX_RATIOS:
-        largest_bytes = MAX_RATIOS[member.compress_type] * member.compress_size
-    else:  # bzip2 and LZMA have no useful bound: what comes out is counted, and thrown away
-        with archive.open(member) as stream:
-            largest_bytes = sum(map(len, iter(lambda: stream.read(CHUNK_BYTES), b"")))
+def _check_growth(member: zipfile.ZipInfo) -> None:
+    if member.compress_type not in MAX_RATIOS:  # Python decompresses megabytes of these at once, without a bound
+        raise ValueError(f"{member.filename} is compressed otherwise than NumPy does it; use numpy.savez_compressed")
+    largest_bytes = MAX_RATIOS[member.compress_type] * member.compress_size
     if member.file_size > largest_bytes:
         raise ValueError(
             f"{member.filename} claims {member.file_size} bytes out of {member.compress_size} compressed ones; "

@@ -22,7 +22,7 @@ from typing import IO, Any, Concatenate, ParamSpec
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.files.bad_file import LIBRARIES_GB, VARIABLE, BadFileError, most_gb
+from torchcover.files.bad_file import LIBRARIES_GB, VARIABLE, BadFileError, check_memory, most_gb
 from torchcover.files.processes import end_with_parent, is_stopped, limit, reporting_stopped, used_bytes
 
 Arguments = ParamSpec("Arguments")
@@ -141,6 +141,7 @@ def serve() -> None:
             try:
                 read = unwrap(getattr(import_module(module), name))  # or it would ask another process
                 arrays = {key: _plain(array) for key, array in read(Path(path), *args).items()}
+                check_memory(sum(array.nbytes for array in arrays.values()))
             except Exception as error:
                 known = next((kind.__name__ for kind in type(error).__mro__ if kind.__name__ in KNOWN_ERRORS), "")
                 told = str(error) if known else f"{type(error).__name__}: {error}"

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from torchcover.files import check_memory
+from torchcover.files import check_memory, lzf_block
 from torchcover.recordings.clouds.arrays import Points
 from torchcover.recordings.clouds.binary import check_rest
 from torchcover.recordings.clouds.text import AXES, parse_rows, read_lines
@@ -55,7 +55,7 @@ def read_pcd(path: Path) -> Points:
         check_rest(body)
         return np.empty((0, 3), f"<f{max(header.sizes[axis] for axis in axes)}")
     _check_size(header, body)
-    return _columns(header, axes, body)
+    return _columns(path, header, axes, body)
 
 
 def _parse_header(data: bytes) -> tuple[_Header, bytes]:
@@ -178,10 +178,8 @@ def _check_size(header: _Header, body: bytes) -> None:
         )
 
 
-def _columns(header: _Header, axes: Sequence[int], body: bytes) -> Points:
+def _columns(path: Path, header: _Header, axes: Sequence[int], body: bytes) -> Points:
     """Records stand one after the other; compressed, all values of one field do, then those of the next."""
-    import lzf
-
     starts = [0, *accumulate(header.field_bytes)]
     if header.encoding == "binary":
         check_rest(body[header.points * header.record_bytes :])
@@ -189,9 +187,8 @@ def _columns(header: _Header, axes: Sequence[int], body: bytes) -> Points:
     else:
         compressed_bytes, plain_bytes = struct.unpack_from("<II", body)
         check_rest(body[8 + compressed_bytes :])
-        plain = lzf.decompress(body[8 : 8 + compressed_bytes], plain_bytes)
-        if plain is None or len(plain) != plain_bytes:
-            raise ValueError(f"the compressed block does not grow to the {plain_bytes} bytes that it claims")
+        block_start = path.stat().st_size - len(body) + 8
+        plain = lzf_block(path, block_start, compressed_bytes, plain_bytes)["plain"].data
         columns = [(plain, starts[axis] * header.points, header.sizes[axis]) for axis in axes]
     kinds = [f"<f{header.sizes[axis]}" for axis in axes]
     return np.column_stack(
