@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from torchcover.simulation import bodies, builtin_names
-from torchcover.simulation.bodies import Body, Vehicle, VehicleShape, in_vehicle_frame
+from torchcover.simulation import Rig, SimulatedFrames, bodies, builtin_names
+from torchcover.simulation.bodies import Body, Vehicle, VehicleShape, in_vehicle_frame, mover_mesh
 from torchcover.simulation.documents import Pose
 from torchcover.simulation.scenario import Mover
 from torchcover.simulation.shapes import Box, Cylinder, Ellipsoid, Frustum, MeshFile, Plane
@@ -244,3 +244,51 @@ def test_what_is_real_gives_no_warning(category, size_m):
 @pytest.mark.parametrize("name", builtin_names("vehicles"))
 def test_no_built_in_vehicle_gives_a_warning(name):
     Mover(shape=VehicleShape(type="vehicle", vehicle=name)).actor("ego", "ego")
+
+
+PART = "{{name: {0}, shape: {{type: box, size_m: {1}}}, poses: [{2}]}}"
+
+
+def vehicle_of(folder, name, *parts, extends=""):
+    (folder / f"{name}.yaml").write_text(f"name: {name}\nextends: {extends or 'null'}\nparts: [{', '.join(parts)}]\n")
+    return folder / f"{name}.yaml"
+
+
+def test_a_vehicle_has_the_parts_and_mount_regions_of_the_one_that_it_extends(tmp_path):
+    roof_box = PART.format("box", "[1.2, 0.9, 0.4]", "{x_m: -0.5, z_m: 1.7}")
+    suv, extended = Vehicle.load("suv"), Vehicle.load(vehicle_of(tmp_path, "suv_box", roof_box, extends="suv"))
+    assert extended.parts[:-1] == suv.parts
+    assert extended.parts[-1].name == "box"
+    assert extended.mount_regions == suv.mount_regions
+    assert np.ptp(extended.mesh().vertices_m, axis=0)[2] == pytest.approx(2.1)
+    cart = vehicle_of(tmp_path, "cart", PART.format("body", "[2, 1, 1]", "{}"))
+    pulled = vehicle_of(tmp_path, "pulled", PART.format("bar", "[0.5, 0.1, 0.1]", "{x_m: 1.25}"), extends=cart.name)
+    with pytest.warns(UserWarning, match=r"moves the middle of its bounding box.* by x \+0.25, y \+0.00 m"):
+        assert np.ptp(Vehicle.load(pulled).mesh().vertices_m, axis=0)[0] == 2.5
+    for name, base, told in (
+        ("a", "pulled.yaml", "extends 'cart.yaml' itself"),
+        ("b", "b.yaml", "extends 'b.yaml' itself"),
+    ):
+        with pytest.raises(ValueError, match=told):
+            Vehicle.load(vehicle_of(tmp_path, name, PART.format("x", "[1, 1, 1]", "{}"), extends=base))
+
+
+def test_what_a_rig_carries_hides_from_its_sensors_as_a_part_of_the_vehicle_does(tmp_path):
+    """A box ahead of a LiDAR, of the rig and of the vehicle; the reference is the same for rigs with and without it."""
+    box = PART.format("box", "[0.1, 1.0, 0.3]", "{x_m: 1.0, z_m: 1.5}")
+    plain = Rig.load("front_roof_32").model_dump(mode="json", exclude_unset=True)
+    pose, shape = {"x_m": 1.0, "z_m": 1.5}, {"type": "box", "size_m": [0.1, 1.0, 0.3]}
+    loaded = Rig.model_validate({**plain, "bodies": [{"name": "box", "shape": shape, "poses": [pose]}]})
+    extended = vehicle_of(tmp_path, "suv_box", box, extends="suv")
+    both = SimulatedFrames("courtyard", rigs={"plain": Rig.load("front_roof_32"), "loaded": loaded}, steps=1)
+    other = SimulatedFrames("courtyard", "front_roof_32", steps=1, vehicle=extended)[0]
+    np.testing.assert_array_equal(both[0].clouds["loaded"], other.sensor)
+    assert len(both[0].clouds["plain"]) - len(other.sensor) > 500
+    assert both[0].counts["sensor_self_hits"] > 2 * 3380  # those of the vehicle, twice
+    assert [note.split(":")[0] for note in both.reference_record["notes"]] == ["plain", "loaded"]
+
+
+def test_an_actor_that_floats_above_its_ground_is_put_down_with_a_warning(tmp_path):
+    floats = vehicle_of(tmp_path, "floats", PART.format("body", "[2, 1, 1]", "{z_m: 0.2}"))
+    with pytest.warns(UserWarning, match=r"all parts of floats.yaml are 0.2 m or more above z = 0"):
+        mover_mesh("actor", VehicleShape(type="vehicle", vehicle=str(floats)), "cart")

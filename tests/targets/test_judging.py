@@ -32,6 +32,7 @@ def seen_where(points, *, raster=None, state=None, share=None, hits=5, least=Non
         scenario="s",
         target="child_110cm",
         target_size_m=(0.2, 0.3, 1.1),
+        target_bottom_m=0.0,
         heading="narrow",
         raster=raster,
         vehicle=CAR,

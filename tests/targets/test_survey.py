@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from torchcover.evaluation.target_survey import target_verdict
 from torchcover.geometry import BoundingBox, rigid
 from torchcover.simulation import PaperReference, Scenario, Simulator
 from torchcover.simulation.bodies import merge
@@ -226,3 +227,20 @@ def test_a_target_hides_its_own_rear():
     raster = Raster((11.0, 13.0), (-1.0, 1.0), 2.0)
     seen = survey(rig(), world(), Target("plates", merge([front, rear])), raster, heading="wide")
     assert seen.visible_m2[0, 0] == pytest.approx(1.0, abs=0.35)
+
+
+@pytest.mark.parametrize(("low_m", "thick_m", "hit"), [(0.7, 0.03, False), (0.08, 0.05, True), (-0.4, 0.5, True)])
+def test_a_target_keeps_the_height_of_its_file_and_what_reaches_below_the_ground_is_lifted(
+    tmp_path, low_m, thick_m, hit
+):
+    """A level scan at 0.0925 m meets a bar of 0.2 m, 3 m ahead, with as many rays as its angle holds, or none."""
+    shape, pose = f"{{type: box, size_m: [0.02, 0.2, {thick_m}]}}", f"{{x_m: 7.0, z_m: {low_m}}}"
+    (tmp_path / "bar.yaml").write_text(f"name: bar\nparts: [{{name: b, shape: {shape}, poses: [{pose}]}}]\n")
+    scanner = lidar(mount={"x_m": 2.01, "z_m": 0.0925}, channels=1, vertical_fov_deg=[0, 0], columns=36_000)
+    target, raster = Target.load(tmp_path / "bar.yaml"), Raster((3.5, 5.5), (-0.5, 0.5), 1.0)
+    seen = survey(rig(scanner), world(), target, raster, heading=0.0)
+    expected = 2 * np.rad2deg(np.arctan2(0.1, 5.0 - 0.01 - 2.01)) / 0.01 if hit else 0.0
+    assert seen.points[0, 1] == pytest.approx(expected, abs=1.0)
+    assert seen.target_bottom_m == target.bottom_m == pytest.approx(max(low_m, 0.0))
+    assert f"{max(low_m, 0):.2f} to {max(low_m, 0) + thick_m:.2f} m above the ground" in seen.target_words
+    assert (f", {low_m:.2f} m above the ground, is seen" in target_verdict({"r": seen})[0]) == (low_m > 0)

@@ -75,7 +75,7 @@ def run(
         world = Scenario.load(scenario or DEFAULT_SCENARIO)
         _say(console, shown.description)
         ego = with_ego(world, {name: shown}, vehicle).ego_mesh()
-        _say(console, describe_self_hits(shown.sensors, ego) or "No ray ends on the own vehicle.")
+        _say(console, describe_self_hits(shown.sensors, shown.own_mesh(ego)) or "No ray ends on the own vehicle.")
         _write(
             console, out / Path(name).stem, rig_pictures(shown, world, vehicle=vehicle, step=step or 0, seed=seed or 0)
         )

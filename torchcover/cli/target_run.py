@@ -85,10 +85,8 @@ def parsed_heading(text: str) -> Heading:
 
 def _print(seen: TargetMap) -> None:
     console = Terminal()
-    length, width, height = seen.target_size_m
-    size = f"{length:.2f} x {width:.2f} x {height:.2f} m"
     console.print(
-        f"{seen.rig} sees {seen.target} ({size}), in {seen.scenario}, sensor model {seen.sensor_model}",
+        f"{seen.rig} sees {seen.target} ({seen.target_words}), in {seen.scenario}, sensor model {seen.sensor_model}",
         markup=False,
         soft_wrap=True,
     )

@@ -40,7 +40,7 @@ def check_paired(coverages: Mapping[str, Coverage]) -> None:
         if not _same_steps(coverage, expected):
             raise ValueError(
                 f"{first!r} and {name!r} cannot be compared: they were measured against different reference points; "
-                "evaluate both in one run"
+                "evaluate both in one run; of one rig on two vehicles, give it what only one vehicle has as `bodies`"
             )
 
 

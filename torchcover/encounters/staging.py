@@ -35,7 +35,7 @@ TOUCH_M = 1e-6
 @lru_cache(maxsize=64)
 def solid_of(shape: Shape) -> Solid:
     """The body, made once for all encounters that have it."""
-    return Solid(mover_mesh(f"body {called(shape)!r}", shape, "other"))
+    return Solid(mover_mesh(f"body {called(shape)!r}", shape, "other", keep_height=True))
 
 
 class Staged:

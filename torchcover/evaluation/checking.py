@@ -278,7 +278,8 @@ def _of_target(
             points, sensor = survey(counting=[k]).least_points, rig.sensors[k]
             x_m, y_m, z_m = sensor.mount.matrix()[:3, 3]
             away_m = np.hypot(*(at_m - (x_m, y_m)).T)
-            angle = np.arctan2(target.solid.box.size_m[2] - z_m, away_m) + np.arctan2(z_m, away_m)
+            low_m, high_m = (end_m[2] - z_m for end_m in (target.solid.box.lower_m, target.solid.box.upper_m))
+            angle = np.arctan2(high_m, away_m) - np.arctan2(low_m, away_m)
             angle_deg = np.where(points >= one.hits, np.rad2deg(angle), 0.0)
             numbers["visual_angle_deg"] = np.fmax(numbers["visual_angle_deg"], angle_deg)
             if isinstance(sensor, CameraSensor):

@@ -201,7 +201,8 @@ def target_verdict(seen: Mapping[str, TargetMap]) -> tuple[str, ...]:
     alike = [(share, ", ".join(rigs)) for share, rigs in groupby(known, lambda rig: whole_percent(shares[rig]))]
     (most, best), *others = alike
     first = seen[known[0]]
-    body = f"{body_words(first.target)} of {first.target_size_m[2]:.2f} m"
+    height = f", {first.target_bottom_m:.2f} m above the ground," if first.target_bottom_m else ""
+    body = f"{body_words(first.target)} of {first.target_size_m[2]:.2f} m{height}"
     told = [f"{capitalised(body)} is seen at {most} % of the places within {NEAR_M:g} m by {best}"]
     told += [f"at {share} % by {rigs}" for share, rigs in others]
     return (f"{', '.join(told)}.", *(_on_loss(rig, seen[rig]) for rig in known))

@@ -7,11 +7,21 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationInfo, model_validator
 
 from torchcover.geometry import BoundingBox, rigid
+from torchcover.geometry.arrays import Float64
 from torchcover.simulation import shapes
-from torchcover.simulation.documents import BuiltIn, Document, NameOrFile, Pose, is_file_name
+from torchcover.simulation.documents import (
+    BuiltIn,
+    Document,
+    NameOrFile,
+    Pose,
+    found,
+    is_file_name,
+    named,
+    read_mapping,
+)
 from torchcover.simulation.material import Material, material_number
 from torchcover.simulation.mount_regions import MountRegion
 from torchcover.simulation.shapes import Mesh
@@ -25,6 +35,8 @@ LONGEST_M = 100.0
 # Smaller robots exist with any proportions; no car is shorter.
 SHORTEST_CAR_M = 2.0
 SHORTEST_M = 0.2
+# A vehicle that is moved down onto the ground by more than this is worth a warning; less is rounding in its file.
+LOWERED_M = 0.01
 
 # Words of a category that stand for what is longer than wide and high, and no longer than lorries. Of the others,
 # people are wider than long, and trams longer.
@@ -80,6 +92,10 @@ class VehicleShape(Document):
     def mesh(self) -> Mesh:
         """All parts in one mesh, in the vehicle frame."""
         return self._read.mesh()
+
+    def placed_mesh(self) -> Mesh:
+        """All parts in one mesh, where the document of the vehicle places them."""
+        return self._read.placed_mesh()
 
     def content(self) -> dict[str, Any]:
         """Its parts, wherever they stand."""
@@ -156,7 +172,8 @@ class Vehicle(BuiltIn):
     Args:
         name: What messages call it.
         description: What it is.
-        parts: Its parts, in one frame with x forward and z up.
+        extends: Another vehicle, by its name or file, whose parts and mount regions it has, too.
+        parts: Its parts, in one frame with x forward and z up: that of the vehicle that it extends.
         mount_regions: By name, patches of its skin that sensors can be mounted on, in the vehicle frame.
     """
 
@@ -164,8 +181,24 @@ class Vehicle(BuiltIn):
 
     name: str
     description: str = ""
+    extends: NameOrFile | None = None
     parts: tuple[Body, ...] = Field(min_length=1)
     mount_regions: dict[RegionName, MountRegion] = Field(default_factory=dict)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _add_parts_of_base(cls, content: Any, info: ValidationInfo) -> Any:  # noqa: ANN401  (whatever stood in the file)
+        if not isinstance(content, dict) or not isinstance(content.get("extends"), str):
+            return content
+        name = named(content["extends"], info)
+        further = read_mapping(found(cls.folder, name)).get("extends")
+        if further is not None:  # which may be a ring, too
+            raise ValueError(f"extends: {name} extends {further!r} itself; extend that one, and copy the other parts")
+        base = cls.load(name)
+        parts, regions = content.get("parts", ()), content.get("mount_regions", {})
+        if not isinstance(parts, list | tuple) or not isinstance(regions, dict):
+            return content
+        return {**content, "parts": (*base.parts, *parts), "mount_regions": {**base.mount_regions, **regions}}
 
     @model_validator(mode="after")
     def _check_parts(self) -> Self:
@@ -179,15 +212,32 @@ class Vehicle(BuiltIn):
                 )
         return self
 
+    @model_validator(mode="after")
+    def _check_origin(self) -> Self:
+        if self.extends is not None:
+            base = Vehicle.load(self.extends).placed_mesh().vertices_m
+            shift_m = _middle_m(self.placed_mesh().vertices_m) - _middle_m(base)
+            if np.abs(shift_m).max() > LOWERED_M:
+                warnings.warn(
+                    f"vehicle {self.name!r}: what it adds to {self.extends} moves the middle of its bounding box, from "
+                    f"which mounts are measured, by x {shift_m[0]:+.2f}, y {shift_m[1]:+.2f} m; subtract that from "
+                    f"mounts on {self.extends} to keep them at the same spot",
+                    stacklevel=2,
+                )
+        return self
+
     def mesh(self) -> Mesh:
         """All parts in one mesh, in the vehicle frame; painted, where they do not say their material."""
+        return in_vehicle_frame(self.placed_mesh())
+
+    def placed_mesh(self) -> Mesh:
+        """All parts in one mesh, where the document places them."""
         meshes = [mesh for part in self.parts for mesh in part.meshes()]
-        painted = [mesh.made_of("car_paint") if mesh.material is None else mesh for mesh in meshes]
-        return in_vehicle_frame(merge(painted))
+        return merge([mesh.made_of("car_paint") if mesh.material is None else mesh for mesh in meshes])
 
     def content(self) -> dict[str, Any]:
         """Its body; where sensors may be mounted on it means nothing to those that are."""
-        return {key: value for key, value in super().content().items() if key != "mount_regions"}
+        return {key: value for key, value in super().content().items() if key not in ("mount_regions", "extends")}
 
 
 def mount_regions_of(shape: Shape | None) -> dict[str, MountRegion]:
@@ -209,16 +259,38 @@ def describe_windows(shape: Shape | None) -> str:
     return ""
 
 
-def in_vehicle_frame(mesh: Mesh) -> Mesh:
-    """Move a mesh so that the origin lies on the ground under the centre of its bounding box."""
+def _middle_m(vertices_m: Float64) -> Float64:
+    """(2,) middle of the bounding box, seen from above."""
+    return np.asarray((vertices_m.min(axis=0) + vertices_m.max(axis=0))[:2] / 2)
+
+
+def in_vehicle_frame(mesh: Mesh, *, keep_height: bool = False) -> Mesh:
+    """Move a mesh so that the origin lies on the ground under the center of its bounding box.
+
+    Args:
+        mesh: The mesh, in any frame.
+        keep_height: Whether a mesh above z = 0 stays so high above the ground. One that reaches below is lifted anyway.
+    """
     box = BoundingBox.around(mesh.vertices_m)
     (x0, y0, z0), (x1, y1, _) = box.lower_m, box.upper_m
-    return mesh.moved(rigid(np.eye(3), [-(x0 + x1) / 2, -(y0 + y1) / 2, -z0]))
+    z_m = -min(z0, 0.0) if keep_height else -z0
+    return mesh.moved(rigid(np.eye(3), [-(x0 + x1) / 2, -(y0 + y1) / 2, z_m]))
 
 
-def mover_mesh(name: str, shape: Shape, category: str = "ego") -> Mesh:
-    """The body of the ego or of an actor in its vehicle frame; a warning if it is too large, too small or turned."""
-    mesh = in_vehicle_frame(sound_mesh(shape, name))
+def mover_mesh(name: str, shape: Shape, category: str = "ego", *, keep_height: bool = False) -> Mesh:
+    """The body of the ego or of an actor in its vehicle frame; a warning if it is too large, too small or turned.
+
+    `keep_height` is that of `in_vehicle_frame`.
+    """
+    mesh = shape.placed_mesh() if isinstance(shape, VehicleShape) else sound_mesh(shape, name)
+    bottom_m = float(mesh.vertices_m[:, 2].min())
+    if isinstance(shape, VehicleShape) and category != "ego" and bottom_m > LOWERED_M and not keep_height:
+        warnings.warn(
+            f"{name}: all parts of {called(shape)} are {bottom_m:.3g} m or more above z = 0, and it is put on the "
+            "ground; give it a part that stands on the ground, or the z_m of its lowest point in the pose",
+            stacklevel=3,
+        )
+    mesh = in_vehicle_frame(mesh, keep_height=keep_height)
     if mesh.material is None:
         mesh = mesh.made_of("clothing" if category in ON_FOOT else "car_paint")
     warn_of_mover(name, mesh, category)

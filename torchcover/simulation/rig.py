@@ -8,13 +8,13 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import Field, PlainValidator, TypeAdapter, ValidationInfo, model_validator
 
 from torchcover.files import as_yaml, write_durably
-from torchcover.simulation.bodies import Shape, VehicleShape, body_called
+from torchcover.simulation.bodies import Body, Shape, VehicleShape, body_called, merge
 from torchcover.simulation.documents import BuiltIn, Document, NameOrFile, is_file_name
 from torchcover.simulation.kinds import SENSORS
 from torchcover.simulation.lidar import Lidar, LidarModel
 from torchcover.simulation.scenario import DEFAULT_EGO, Mover, Scenario
 from torchcover.simulation.sensor import Sensor
-from torchcover.simulation.shapes import MeshFile
+from torchcover.simulation.shapes import Mesh, MeshFile
 from torchcover.simulation.weather import Weather
 
 
@@ -42,6 +42,8 @@ class Rig(BuiltIn):
         vehicle: What carries it, a built-in vehicle or the YAML file of one, where neither the user nor the scenario
             decides that.
         weather: What it is measured in, in place of the scenario's.
+        bodies: What the rig carries in addition to its sensors, such as a roof box, in the vehicle frame. Its sensors
+            look around that; other rigs and the reference do not, so that rigs with and without it can be compared.
         sensors: The sensors, each of a kind in `SENSORS`; their clouds are fused.
 
     Example:
@@ -55,6 +57,7 @@ class Rig(BuiltIn):
     description: str = ""
     vehicle: NameOrFile | None = None
     weather: Weather | None = None
+    bodies: tuple[Body, ...] = ()
     sensors: tuple[Annotated[Sensor, PlainValidator(_read_mounted)], ...] = Field(min_length=1)
 
     @model_validator(mode="after")
@@ -82,6 +85,10 @@ class Rig(BuiltIn):
         keys = self.model_dump(mode="json", exclude_unset=True, exclude={"sensors"})
         keys["sensors"] = [_written(sensor) for sensor in self.sensors]
         write_durably(Path(path), lambda aside: aside.write_text(as_yaml(keys), encoding="utf-8"))
+
+    def own_mesh(self, ego: Mesh) -> Mesh:
+        """All that hides something from its sensors on a vehicle: the body of that, and what the rig carries."""
+        return merge([ego, *(mesh for body in self.bodies for mesh in body.meshes())])
 
     @property
     def sensor_model(self) -> Literal["ideal", "real"]:
@@ -153,7 +160,7 @@ def with_ego(scenario: Scenario, rigs: Mapping[str, Rig], vehicle: str | Path | 
         'van'
     """
     ego = scenario.ego or Mover()
-    shape = ego.shape if vehicle is None else _body("vehicle", body_called(vehicle))
+    shape = ego.shape if vehicle is None else _found_body("vehicle", body_called(vehicle))
     return scenario.model_copy(update={"ego": ego.model_copy(update={"shape": shape or _of_rigs(rigs)})})
 
 
@@ -163,15 +170,15 @@ def _of_rigs(rigs: Mapping[str, Rig]) -> Shape:
         told = ", ".join(f"{name} {vehicle}" for name, vehicle in named.items())
         raise ValueError(
             f"the rigs name different vehicles ({told}), but all are compared in the same frames, which have one ego: "
-            "say which by --vehicle (in Python, vehicle=)"
+            "say which by --vehicle (in Python, vehicle=), and give a rig what its vehicle has in addition as `bodies`"
         )
     if not named:
         return DEFAULT_EGO
     name, vehicle = next(iter(named.items()))
-    return _body(f"rig {name!r}: vehicle", VehicleShape(type="vehicle", vehicle=vehicle))
+    return _found_body(f"rig {name!r}: vehicle", VehicleShape(type="vehicle", vehicle=vehicle))
 
 
-def _body(owner: str, shape: VehicleShape | MeshFile) -> VehicleShape | MeshFile:
+def _found_body(owner: str, shape: VehicleShape | MeshFile) -> VehicleShape | MeshFile:
     """The shape, once its file was found."""
     try:
         shape.content()

@@ -7,6 +7,7 @@ import numpy as np
 
 from torchcover.geometry import rigid
 from torchcover.geometry.arrays import Bools, Float32, Float64, Int32, Int64
+from torchcover.simulation.bodies import Body
 from torchcover.simulation.instant import Instant, SensorScan, in_threads
 from torchcover.simulation.memory import BYTES_PER_RAY, check_fits
 from torchcover.simulation.raycaster import RayCaster
@@ -36,12 +37,18 @@ class MountedSensor:
     """What a sensor of a rig sees, whose rays are cast `reach_m` far (`Scenario.reach_m`) through some weather.
 
     Its place on the ego is fixed, so the rays that the ego's own body ends are the same at every step, as are those
-    that the housings of others end: these are not cast at again. Where nothing moves at all, the rays are cast once for
-    every step.
+    that the housings of others and the `bodies` of its rig end: these are not cast at again. Where nothing moves at
+    all, the rays are cast once for every step.
     """
 
     def __init__(
-        self, sensor: Sensor, scene: Scene, reach_m: float, weather: Weather = CLEAR, others: Sequence[Sensor] = ()
+        self,
+        sensor: Sensor,
+        scene: Scene,
+        reach_m: float,
+        weather: Weather = CLEAR,
+        others: Sequence[Sensor] = (),
+        bodies: Sequence[Body] = (),
     ) -> None:
         self.sensor = sensor
         self.reach_m = reach_m
@@ -63,6 +70,7 @@ class MountedSensor:
         housings = [
             mesh.moved(other.mount.matrix()) for other in others for body in other.housing for mesh in body.meshes()
         ]
+        housings += [mesh for body in bodies for mesh in body.meshes()]
         if housings:
             caster = RayCaster(housings)
             ends_m = [ends_at(caster, self.vehicle_T_sensor, tile, reach_m) for tile in self.tiles]

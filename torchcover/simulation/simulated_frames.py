@@ -197,7 +197,7 @@ class SimulatedFrames(FrameDataset):
         traffic, ego = self.scenario.traffic, self.ego_mesh()
         words = [self.simulator.ground_words, traffic.drawn_words if traffic else ""]
         for name, rig in self.rigs.items():
-            self_hits = describe_self_hits(rig.sensors, ego)
+            self_hits = describe_self_hits(rig.sensors, rig.own_mesh(ego))
             words.append(f"{name}: {self_hits}" if self_hits and len(self.rigs) > 1 else self_hits)
         return {"sensor": self.reference_sensor.name, "every_s": self.every_s, "notes": list(filter(None, words))}
 

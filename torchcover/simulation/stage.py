@@ -205,6 +205,7 @@ def mounted_on(scene: Scene, scenario: Scenario, name: str, rig: Rig) -> list[Mo
             scenario.reach_m(one, rig.weather),
             rig.weather or scenario.weather,
             [other for other in rig.sensors if other is not one],
+            rig.bodies,
         )
         for one in rig.sensors
     ]

@@ -75,6 +75,7 @@ class TargetMap(Spots):
         scenario: Name of the world.
         target: Name of the target.
         target_size_m: Extent of its box.
+        target_bottom_m: Height of its lowest point above the ground.
         heading: How it stands; see `Heading`.
         raster: The cells.
         vehicle: Box of the vehicle.
@@ -101,6 +102,7 @@ class TargetMap(Spots):
     scenario: str
     target: str
     target_size_m: tuple[float, float, float]
+    target_bottom_m: float
     heading: Heading
     raster: Raster
     vehicle: BoundingBox
@@ -229,9 +231,15 @@ class TargetMap(Spots):
         where = f"Free places within {WITHIN_M[-1]:g} m where it gets {self.hits} points or more: {', '.join(near)}."
         return small_html([f"Would {self.rig} see {self.target}?", where], self.plot())
 
+    @property
+    def target_words(self) -> str:
+        """Extent of the target, and how high above the ground it is."""
+        length, width, height = self.target_size_m
+        low, high = self.target_bottom_m, self.target_bottom_m + height
+        return f"{length:.2f} x {width:.2f} x {height:.2f} m, {low:.2f} to {high:.2f} m above the ground"
+
     def plot(self) -> "Figure":
         """The points on the target at every place, with the border of what is seen: a figure of its own."""
-        length, width, height = self.target_size_m
         heading = f"{self.heading} side to the vehicle" if isinstance(self.heading, str) else f"yaw {self.heading:g}°"
         steps = f"{self.step_count} step{'s' if self.step_count > 1 else ''}"
         return draw_targets(
@@ -243,7 +251,7 @@ class TargetMap(Spots):
             sensors_m=self.sensors_m,
             hits=self.hits,
             title=f"{self.rig}: points on {self.target}",
-            subtitle=f"{length:.2f} x {width:.2f} x {height:.2f} m, {heading}; {self.scenario}, {steps}",
+            subtitle=f"{self.target_words}, {heading}; {self.scenario}, {steps}",
         )
 
     def to_dataframe(self) -> "pandas.DataFrame":
@@ -280,6 +288,7 @@ class TargetMap(Spots):
             "scenario": self.scenario,
             "target": self.target,
             "target_size_m": list(self.target_size_m),
+            "target_bottom_m": self.target_bottom_m,
             "heading": self.heading,
             "raster": {"x": list(self.raster.x), "y": list(self.raster.y), "step_m": self.raster.step_m},
             "sensor_model": self.sensor_model,

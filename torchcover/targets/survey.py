@@ -53,7 +53,8 @@ def survey(
     Args:
         rig: The sensors.
         scenario: The world, whose ego carries them. The target is in none of it: other targets hide nothing.
-        target: What is placed, upright on the local ground; where there is none, the place is `OUTSIDE`.
+        target: What is placed, upright, at its own height above the local ground; where there is none, the place is
+            `OUTSIDE`.
         raster: Where; within 5 m of the vehicle in steps of 0.2 m if not given.
         steps: How many steps are averaged.
         every_s: Time between two of them; the scenario's time step if not given.
@@ -85,6 +86,7 @@ def survey(
         scenario=scenario.name,
         target=target.name,
         target_size_m=target.solid.box.size_m,
+        target_bottom_m=target.bottom_m,
         heading=heading,
         raster=raster,
         vehicle=vehicle,

@@ -15,11 +15,11 @@ TARGETS = {"child": "child_110cm", "adult": "adult", "dog": "dog_57cm", "cyclist
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A body that is asked about. It stands on the ground, whatever its own origin is.
+    """A body that is asked about. It keeps the height above the ground at which its file places it.
 
     Args:
         name: What tables call it: the name of the body, with its size where it is built in for this.
-        mesh: Its form; origin on the ground under the centre of its bounding box, x ahead, z up.
+        mesh: Its form; origin on the ground under the center of its bounding box, x ahead, z up.
 
     Example:
         >>> child = Target.load("child")
@@ -38,14 +38,21 @@ class Target:
     def __getstate__(self) -> dict[str, object]:
         return {"name": self.name, "mesh": self.mesh}  # Embree's scenes cannot be pickled
 
+    @property
+    def bottom_m(self) -> float:
+        """Height of its lowest point above the ground, in meters."""
+        return self.solid.box.lower_m[2]
+
     @classmethod
     def load(cls, name_or_path: str | Path) -> Self:
-        """One of `TARGETS`, a built-in vehicle by its name, the YAML file of one, or a mesh file in metres.
+        """One of `TARGETS`, a built-in vehicle by its name, the YAML file of one, or a mesh file in meters.
+
+        The ground is z = 0 of the file: what lies above stays there, and what reaches below is put on the ground.
 
         Raises:
             FileNotFoundError: No such file or name.
             ValueError: The file is neither a vehicle nor a mesh, or is flat.
         """
         name = TARGETS.get(str(name_or_path), str(name_or_path))
-        mesh = mover_mesh(f"target {name!r}", body_called(name), "target")
+        mesh = mover_mesh(f"target {name!r}", body_called(name), "target", keep_height=True)
         return cls(Path(name).stem if Path(name).suffix else name, mesh)
