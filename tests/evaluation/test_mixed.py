@@ -77,7 +77,7 @@ def test_marks_are_beyond_chance_in_the_mixture(mixed, yards):
     assert not any(row["detection_0.4m_best"] for row in few.summary)
     # Eight blocks in all are not eight in each.
     assert all(row["detection_0.4m_low"] is None for row in few.summary)
-    assert "Not enough steps for errors in near: 4 blocks" in " ".join(str(few).split())
+    assert "Not enough steps for intervals in near: 4 blocks" in " ".join(str(few).split())
 
 
 def test_redundancy_is_mixed_by_the_book(yards):

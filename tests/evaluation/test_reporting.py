@@ -119,8 +119,8 @@ def test_a_budget_ends_the_traffic_once_it_has_intervals():
 
 
 def test_of_too_few_steps_no_range_is_told_but_how_many_are_needed():
-    words = "Too few steps for ranges: 4 are 4 blocks of time, and intervals need 8, here some 8 steps (`--steps`)."
-    assert words in report(ONE, "courtyard", steps=4, workers=0).verdict
+    words = "Not enough frames for ranges: 4 form 4 blocks of time, intervals need about 11, which are 11 frames"
+    assert f"{words} (`--steps`)." in report(ONE, "courtyard", steps=4, workers=0).verdict
 
 
 def test_where_no_place_is_free_nothing_is_claimed(found):

@@ -18,6 +18,7 @@ from torchcover.data import (
     collate_frames,
     open_recording,
 )
+from torchcover.evaluation.measuring import find_block_ends
 from torchcover.recordings.formats.folder import FolderRecording
 from torchcover.simulation import PaperReference, SurfaceReference
 
@@ -59,7 +60,7 @@ def test_a_source_is_a_map_style_dataset_that_knows_whose_frames_they_are(tmp_pa
     assert len(source) == 2
     for index in range(2):
         frame = source[index]
-        assert frame.index == index
+        assert (frame.index, frame.place_in_time) == (index, source.place_in_time(index))
         assert list(frame.clouds) == list(source.rigs)
         assert (frame.reference_weights is not None) == source.square_metres
         heights_m = frame.reference_heights_m
@@ -146,3 +147,12 @@ def test_a_batch_has_weights_of_all_its_frames_or_of_none():
     for mixed in ([area, none], [none, area]):
         with pytest.raises(ValueError, match=r"weights: frame 'a' has the square metres .*, and 'b' has none; batch"):
             _ = collate_frames(mixed).weights
+
+
+def test_blocks_of_a_source_end_where_its_frames_show_something_else(tmp_path):
+    traffic = SimulatedFrames("urban", "front_roof_32", steps=3, every_s=10.0, reference_sensor=PaperReference(4, 4))
+    ends = find_block_ends(traffic, most_blocks=4)
+    places = [traffic.place_in_time(index) for index in range(ends[-1] + 1)]
+    assert ends == [places.index(number) for number in range(1, 5)]
+    assert find_block_ends(simulated(None), most_blocks=3) == [1, 2, 3]  # nothing moves: each frame has its reference
+    assert find_block_ends(recorded(tmp_path)) == [1, 2]

@@ -5,8 +5,9 @@ import re
 from dataclasses import replace
 
 import pytest
+import torch
 
-from torchcover.coverage import Region
+from torchcover.coverage import BevGrid, CoverageMetric, Region
 from torchcover.report import CoverageTable, verdict
 from torchcover.report.table import Row
 
@@ -51,9 +52,34 @@ def test_without_errors_nothing_is_told(pair, blind, trios, regions):
         assert verdict(CoverageTable.of(coverages, AHEAD)) == ()
     (sentence,) = verdict(CoverageTable.of(trios(4), AHEAD))
     assert sentence == (
-        "Too few steps for an answer: 4 are 4 blocks of time, and intervals need 8, here some 8 steps (`--steps`)."
+        "Not enough frames for an answer: 4 form 4 blocks of time, intervals need about 9, which are 9 frames "
+        "(`--steps`)."
     )
     assert verdict(CoverageTable.of(pair, regions[1:])) == ()
+
+
+@pytest.mark.parametrize("frames", [2, 6, 11, 21, 24])
+def test_the_advised_number_of_frames_gives_intervals(points, frames):
+    """Blocks of three frames, in which the reference sees more or less: 8 of them count as fewer."""
+
+    def table_of(count):
+        metric = CoverageMetric(BevGrid(x=(-8.0, 12.0), y=(-5.0, 5.0), cell=1.0), blocks=16, square_metres=True)
+        for index in range(count):
+            m2 = torch.full((100,), 0.2 + 0.8 * (index % 5 > 1))
+            metric.update(points(40, index), points(100, 1000 + index), weights=m2, place_in_time=index // 3)
+        return CoverageTable.of({"one": metric.compute()}, AHEAD, block_ends=range(3, 300, 3))
+
+    table = table_of(frames)
+    (sentence,) = verdict(table)
+    assert sentence.startswith(f"Not enough frames for an answer: {frames} form {-(-frames // 3)} block")
+    advised = int(re.search(r"which are (\d+) frames", sentence)[1])
+    assert not table.has_intervals
+    assert 24 < advised <= 40
+    for row in table_of(advised).rows["one"]:
+        number = row.summary.numbers[table.means[1].key]
+        assert math.isnan(number.low) == math.isnan(number.value) == (row.region is AHEAD[2])
+    short = replace(table, block_ends=(3, 6, 7))
+    assert verdict(short)[0].endswith("and this source has 3 in all.")
 
 
 @pytest.mark.parametrize(("shares", "best", "sentence"), [

@@ -5,6 +5,7 @@ from .jackknife import MIN_BLOCKS as MIN_BLOCKS
 from .jackknife import MIN_BLOCKS_OF_A_CELL as MIN_BLOCKS_OF_A_CELL
 from .jackknife import ROUND_OFF as ROUND_OFF
 from .jackknife import ErrorModel as ErrorModel
+from .jackknife import blocks_needed as blocks_needed
 from .jackknife import jackknife_error as jackknife_error
 from .jackknife import ratio_errors as ratio_errors
 from .quantity import Quantity as Quantity

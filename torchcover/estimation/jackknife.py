@@ -18,6 +18,23 @@ MIN_BLOCKS_OF_A_CELL = 8
 IMAGINED_RADIUS = 5.0
 
 
+def blocks_needed(blocks: int, effective: float, *, assumed: float = 1.25, margin: float = 1.1) -> int:
+    """How many blocks give intervals, which need 8 effective ones, if further blocks are as unequal as those of a run.
+
+    Args:
+        blocks: Blocks of the run.
+        effective: How many blocks of equal weight would say as much; see `Estimate.effective`.
+        assumed: Least ratio of the two where fewer than 4 blocks show it; that of a city's streets.
+        margin: Factor by which the advice exceeds the expected number: it has to hold for other blocks, too.
+
+    Example:
+        >>> blocks_needed(4, 4.0), blocks_needed(4, 3.5), blocks_needed(1, 1.0)
+        (9, 11, 11)
+    """
+    ratio = blocks / effective if effective > 0 else 1.0
+    return math.ceil(margin * MIN_BLOCKS * (max(ratio, assumed) if blocks < 4 else ratio))
+
+
 def jackknife_error(left_out: Tensor, whole: Tensor, steps: Tensor, least: int = MIN_BLOCKS) -> Tensor:
     """Standard error of an estimate from what it becomes as one block after the other is left out.
 

@@ -3,7 +3,7 @@
 import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack, nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -74,10 +74,33 @@ def measured(task: Task[FrameSource], settings: Settings, until: StoppingRule | 
         left_out=left_out(
             run.counts, list(coverages.values()), settings.aggregations, sensors, workers=settings.workers or 0
         ),
+        block_ends=find_block_ends(frames),
     )
     if result.cut_short:
         warnings.warn(result.cut_short, RuntimeWarning, stacklevel=CALLER)
     return result
+
+
+def find_block_ends(frames: FrameSource, most_blocks: int = 80, most_frames: int = 10_000) -> list[int]:
+    """Find after how many frames of a source one block of time after the other is complete.
+
+    Args:
+        frames: The source.
+        most_blocks: Blocks that are looked for: more than any advice on the number of frames names.
+        most_frames: Frames that are looked at; a scenario that repeats has no further block.
+
+    Returns:
+        Numbers of frames, one for each block; the last may be the number of all frames.
+    """
+    places, ends, index = set[int](), list[int](), 0
+    with suppress(IndexError):
+        while index < most_frames and len(ends) < most_blocks:
+            place = frames.place_in_time(index)
+            if place not in places and places:
+                ends.append(index)
+            places.add(place)
+            index += 1
+    return ends if len(ends) == most_blocks else [*ends, index]
 
 
 def _workers(task: Task[FrameSource], settings: Settings) -> int:

@@ -89,6 +89,7 @@ class Result:
         metrics: What metrics of others say of the rigs; None if none was asked for.
         left_out: What the run left out because the scene did not need it.
         inputs: Coverage files that it was made from.
+        block_ends: Frames of the source after which one block of time after the other is complete, as far as is known.
     """
 
     coverages: Mapping[str, Coverage]
@@ -106,6 +107,7 @@ class Result:
     metrics: MetricReport | None = None
     left_out: Sequence[Omission] = ()
     inputs: Sequence[Path] = ()
+    block_ends: Sequence[int] = ()
 
     @property
     def coverage(self) -> Coverage:
@@ -132,7 +134,7 @@ class Result:
     @cached_property
     def table(self) -> CoverageTable:
         """The numbers, with errors, differences and marks; `RENDERERS` write it down."""
-        return CoverageTable.of(self.coverages, self.regions, self.notes, self.source)
+        return CoverageTable.of(self.coverages, self.regions, self.notes, self.source, self.block_ends)
 
     @property
     def verdict(self) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ from torch import Tensor
 from torchcover import __version__
 from torchcover.coverage import Coverage, Region, shown_places
 from torchcover.coverage.grid import BandFrame
-from torchcover.estimation import MIN_BLOCKS, ROUND_OFF, Difference, ErrorModel, Estimate, Quantity
+from torchcover.estimation import MIN_BLOCKS, ROUND_OFF, Difference, ErrorModel, Estimate, Quantity, blocks_needed
 from torchcover.evaluation.config import STUDY_SETTINGS
 from torchcover.evaluation.measuring import measured
 from torchcover.evaluation.settings import Settings
@@ -353,7 +353,7 @@ def _tried(options: str, settings: Settings, first: Coverage | None) -> tuple[Tr
             bias = abs(difference.value) if difference and (is_biased or math.isnan(difference.value)) else 0.0
             place = region.name, height, region in awaited
             numbers.append(Studied(*place, quantity, value, ErrorModel(own, bias), difference, is_biased))
-    least = max(MIN_STEPS, math.ceil(MIN_BLOCKS * steps / worlds) if worlds > 0 else steps)
+    least = max(MIN_STEPS, blocks_needed(steps, worlds) if worlds > 0 else steps)
     times = result.run.seconds, processor_s
     return Trial(options, steps, least, *times, coverage.band_frame, numbers), coverage
 

@@ -93,6 +93,12 @@ class FrameSource(Protocol):
         The index itself where nothing has to be built, so that any process may make any frame.
         """
 
+    def place_in_time(self, index: int, /) -> int:
+        """`Frame.place_in_time` of a frame, without making it; of a simulation beyond its last frame, too.
+
+        IndexError: there is no such frame.
+        """
+
     def has_boxes(self) -> bool:
         """Whether frames have `Frame.boxes`."""
 
@@ -148,6 +154,10 @@ class FrameDataset(Dataset[Frame]):
     def sensor_names(self) -> Mapping[str, Sequence[str]]:
         """Nothing: which points are of which sensor is unknown."""
         return {}
+
+    def place_in_time(self, index: int) -> int:
+        """The index: no two frames are known to be alike. IndexError: there is no such frame."""
+        return range(len(self))[index]
 
     def has_boxes(self) -> bool:
         """None of them."""
@@ -215,6 +225,10 @@ class ChosenRigs(FrameDataset):
     def world_of(self, index: int) -> int:
         """As there."""
         return self.frames.world_of(index)
+
+    def place_in_time(self, index: int) -> int:
+        """As there."""
+        return self.frames.place_in_time(index)
 
     def has_boxes(self) -> bool:
         """As there."""

@@ -113,6 +113,10 @@ class RecordedFrames(FrameDataset):
         """The index: nothing has to be built."""
         return index
 
+    def place_in_time(self, index: int) -> int:
+        """The window of a frame; frames of one window share most of their reference points."""
+        return self._places_in_time[index]
+
     def has_boxes(self) -> bool:
         """Whether the first frame whose boxes can be read has any, or says that there are none."""
         for instant in self.recording.frames:

@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from torchcover.estimation import MIN_BLOCKS
+from torchcover.estimation import blocks_needed
 from torchcover.report.failures import sensors_of, single_point_of_failure
 from torchcover.report.table import CoverageTable
 from torchcover.report.wording import span, steps_and_cell
@@ -65,10 +65,11 @@ def _on_errors(table: CoverageTable, rig: str) -> Iterator[Remark]:
     blocks, steps = table.conditions[rig].blocks, table.conditions[rig].steps_per_block or 0
     if blocks is None:
         return
-    if blocks < MIN_BLOCKS:
+    if not table.has_intervals:
         where = f" in {table.conditions[rig].fewest}" * bool(table.conditions[rig].fewest)
-        few = f"Not enough steps for errors{where}: {blocks} block{'s' * (blocks != 1)}, {MIN_BLOCKS} are needed."
-        yield Remark("too_few_blocks", blocks, MIN_BLOCKS, few)
+        needed = blocks_needed(blocks, table.first.effective[0])
+        few = f"Not enough steps for intervals{where}: {blocks} block{'s' * (blocks != 1)}, about {needed} are needed."
+        yield Remark("too_few_blocks", blocks, needed, few)
         return
     means = [quantity.key for quantity in table.means]  # of a largest radius no error is ever known
     numbers = [[row.summary.numbers[key] for key in means] for row in table.rows[rig]]
@@ -103,7 +104,7 @@ def in_common_first(notes: Mapping[str, Sequence[str]]) -> list[str]:
 def marks_on(table: CoverageTable) -> dict[str, str]:
     """What the marks of differences mean, by their names; empty where there are none."""
     several, by_sensor = len(table.rigs) > 1, any(sensors_of(rows) for rows in table.rows.values())
-    if not (several or by_sensor) or (table.first.blocks or 0) < MIN_BLOCKS:
+    if not (several or by_sensor) or not table.has_intervals:
         return {}
     best = {"best": "the best of its row, where its lead over the next is more than chance."} if several else {}
     chance = "more than chance, by Student's t at 95 %: of 20 rows without a difference, one is marked."

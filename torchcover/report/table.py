@@ -18,7 +18,7 @@ from torchcover.coverage import (
 )
 from torchcover.coverage.measures import Measure
 from torchcover.coverage.paired import Parts, leaders
-from torchcover.estimation import MIN_BLOCKS, Difference, Quantity
+from torchcover.estimation import MIN_BLOCKS, ROUND_OFF, Difference, Quantity
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Conditions(NamedTuple):
     """What the numbers of one rig hold under: what happened, as in `Coverage.counts`, and how many points there were.
 
     Errors come from so many blocks of contiguous steps, None without errors; of a mixture with too few, `fewest` is the
-    kind of world that has the fewest.
+    kind of world that has the fewest. `effective` are the least and the most of `Estimate.effective` in its regions.
     """
 
     counts: Mapping[str, int]
@@ -52,6 +52,7 @@ class Conditions(NamedTuple):
     steps_per_block: int | None
     points: int
     fewest: str = ""
+    effective: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,7 @@ class CoverageTable:
         notes: What else they hold under, in words of the caller.
         source: What carried the rigs, `vehicle`, and what sensors make of their hits, `sensor_model` by rig; if known.
         bodies: Name of the rig -> its rows of bodies beside the vehicle, if any were put there.
+        block_ends: Frames of the source after which one block after the other is complete, as far as is known.
     """
 
     quantities: tuple[Quantity, ...]
@@ -81,6 +83,7 @@ class CoverageTable:
     notes: tuple[str, ...]
     source: Mapping[str, object] = field(default_factory=dict)
     bodies: Mapping[str, tuple[Row, ...]] = field(default_factory=dict)
+    block_ends: Sequence[int] = ()
 
     @classmethod
     def of(
@@ -89,6 +92,7 @@ class CoverageTable:
         regions: Sequence[Region],
         notes: Sequence[str] = (),
         source: Mapping[str, object] | None = None,
+        block_ends: Sequence[int] = (),
     ) -> "CoverageTable":
         """Make the table of one rig, or of several that were measured together.
 
@@ -97,6 +101,7 @@ class CoverageTable:
             regions: Regions within the grid.
             notes: What else the numbers hold under.
             source: Where they come from; see above.
+            block_ends: See above.
 
         Raises:
             ValueError: No rig; several that are not paired, as in `check_paired`; regions that `Coverage.summary`
@@ -121,10 +126,11 @@ class CoverageTable:
             max_radius=first.max_radius,
             measure=first.measure,
             rows={rig: tuple(row[rig] for row in rows) for rig in coverages},
-            conditions={rig: _conditions(coverage) for rig, coverage in coverages.items()},
+            conditions={rig: _conditions(coverage, regions) for rig, coverage in coverages.items()},
             notes=tuple(notes),
             source=source or {},
             bodies={rig: tuple(row[rig] for row in bodies) for rig in coverages},
+            block_ends=block_ends,
         )
 
     @property
@@ -141,6 +147,11 @@ class CoverageTable:
     def first(self) -> Conditions:
         """The conditions of the first rig; steps and blocks are those of every rig."""
         return self.conditions[self.rigs[0]]
+
+    @property
+    def has_intervals(self) -> bool:
+        """Whether enough blocks are in effect for intervals in any region."""
+        return self.first.effective[1] > MIN_BLOCKS - ROUND_OFF
 
     @property
     def places(self) -> list[tuple[Row, ...]]:
@@ -177,12 +188,21 @@ def _parts(coverage: Coverage | Mixture) -> list[Coverage]:
     return [coverage] if isinstance(coverage, Coverage) else [part for _, part in coverage.parts]
 
 
-def _conditions(coverage: Coverage | Mixture) -> Conditions:
+def _effective(coverage: Coverage | Mixture, regions: Sequence[Region], blocks: int) -> tuple[float, float]:
+    """The least and the most effective blocks of regions that were seen; the blocks themselves if none was."""
+    places = shown_places(regions, coverage.grid)
+    each = [float(one) for place in places for one in coverage.estimate(*place).effective if one > 0]
+    return (min(each), max(each)) if each else (float(blocks), float(blocks))
+
+
+def _conditions(coverage: Coverage | Mixture, regions: Sequence[Region]) -> Conditions:
     """Of a mixture those of all kinds of world, but too few blocks of any of them are too few."""
     each = [part.blocks and (part.places or part.blocks) for part in _parts(coverage)]  # by area they are the fine ones
     used = [int((blocks.steps > 0).sum()) for blocks in each if blocks]
     longest = [int(blocks.steps.max()) for blocks in each if blocks]
     found = Conditions(dict(coverage.counts), sum(used), max(longest, default=None), coverage.counts["inside_points"])
+    if used:
+        found = found._replace(effective=_effective(coverage, regions, min(used)))
     if min(used, default=0) >= MIN_BLOCKS:
         return found
     fewest = coverage.kinds[used.index(min(used))] if used and isinstance(coverage, Mixture) else ""

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Sequence
 
 from torchcover.coverage import Region
-from torchcover.estimation import MIN_BLOCKS
+from torchcover.estimation import MIN_BLOCKS, blocks_needed
 from torchcover.report.failures import decisive, sensors_of, single_point_of_failure
 from torchcover.report.table import CoverageTable, Row
 
@@ -31,12 +31,24 @@ def verdict(table: CoverageTable) -> tuple[str, ...]:
 
 
 def too_few(table: CoverageTable, what: str) -> str:
-    """That steps are too few for intervals, where these were asked for, and so for some answer."""
+    """Say that frames are too few for intervals, where these were asked for, and how many would give them.
+
+    Args:
+        table: Of one rig or several.
+        what: What intervals are needed for: "an answer".
+
+    Returns:
+        A sentence; empty where some number has an interval, or where none was asked for.
+    """
     steps, blocks = table.first.counts["steps"], table.first.blocks
-    if blocks is None or blocks >= MIN_BLOCKS:
+    if blocks is None or table.has_intervals:
         return ""
-    needed = f"{MIN_BLOCKS}, here some {MIN_BLOCKS * math.ceil(steps / max(blocks, 1)):,} steps (`--steps`)"
-    return f"Too few steps for {what}: {steps:,} are {blocks} blocks of time, and intervals need {needed}."
+    needed, ends = blocks_needed(blocks, table.first.effective[0]), table.block_ends
+    begin = f"Not enough frames for {what}: {steps:,} form {blocks} block{'s' * (blocks != 1)} of time, "
+    if ends and len(ends) < needed:
+        return f"{begin}intervals need about {needed}, and this source has {len(ends)} in all."
+    frames = ends[needed - 1] if ends else needed * (table.first.steps_per_block or 1)
+    return f"{begin}intervals need about {needed}, which are {frames:,} frames (`--steps`)."
 
 
 def on_near_field(table: CoverageTable) -> str:
@@ -64,7 +76,7 @@ def on_near_field(table: CoverageTable) -> str:
 def on_range(table: CoverageTable) -> str:
     """What is detected ahead: of one rig with intervals, of several who leads by more than chance."""
     region = ahead(table)
-    if region is None or not table.thresholds or (table.first.blocks or 0) < MIN_BLOCKS:
+    if region is None or not table.thresholds or not table.has_intervals:
         return ""
     key, where = decisive(table).key, f"to {region.x[1]:g} m ahead"
     bands = [of for of in table.places if of[0].region is region]

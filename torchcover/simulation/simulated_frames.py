@@ -157,6 +157,10 @@ class SimulatedFrames(FrameDataset):
         """Which world a frame is of; of one that plays again and again every process has it whole: the index."""
         return index if self.scenario.repeats else self.simulator.run_of(index)
 
+    def place_in_time(self, index: int) -> int:
+        """As `Simulator.place_in_time`."""
+        return self.simulator.place_in_time(index)
+
     def has_boxes(self) -> bool:
         """Whether they were asked for."""
         return self.boxes
