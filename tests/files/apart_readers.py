@@ -27,6 +27,8 @@ def loud(path: Path):
 
 @apart
 def wrong(path: Path, kind: str):
+    if kind == "module":
+        import no_such_package  # noqa: F401
     raise {"value": ValueError, "key": KeyError, "import": ImportError}[kind]("said")
 
 

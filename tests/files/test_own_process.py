@@ -36,6 +36,7 @@ def test_a_library_that_prints_does_not_answer_and_the_process_stays(path):
 
 @pytest.mark.parametrize(("kind", "error", "words"), [
     ("value", ValueError, "^said$"), ("key", ValueError, "^KeyError: 'said'$"), ("import", ImportError, "^said$"),
+    ("module", ImportError, r"file\.x: no_such_package is needed to read it: pip install no_such_package"),
 ])  # fmt: skip
 def test_errors_are_raised_here(path, kind, error, words):
     with pytest.raises(error, match=words):

@@ -171,3 +171,19 @@ def test_an_index_that_no_vertex_has_is_refused(tmp_path):
     (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 5\n")
     with pytest.raises(BadFileError, match="cannot read it as a mesh"):
         MeshFile(type="mesh", path=tmp_path / "a.obj").mesh()
+
+
+def test_text_in_latin_1_is_read_as_it_is_in_utf_8(tmp_path):
+    text = "# caf\u00e9\nmtllib caf\u00e9.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl caf\u00e9\nf 1 2 3\n"
+    (tmp_path / "a.obj").write_bytes(text.encode("latin-1"))
+    ascii_stl = "solid \u00e9\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"
+    (tmp_path / "a.stl").write_bytes(f"{ascii_stl}endloop\nendfacet\nendsolid\n".encode("latin-1"))
+    for name in ("a.obj", "a.stl"):
+        mesh = MeshFile(type="mesh", path=tmp_path / name).mesh()
+        np.testing.assert_array_equal(mesh.vertices_m[mesh.faces[0]], [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+
+
+def test_a_package_that_is_missing_is_no_damage(tmp_path):
+    (tmp_path / "a.step").write_text("ISO-10303-21;")
+    with pytest.raises(ImportError, match=r"a\.step: \.step needs cascadio: pip install cascadio"):
+        MeshFile(type="mesh", path=tmp_path / "a.step").mesh()

@@ -66,6 +66,7 @@ def laz_points(path: Path, points: int) -> dict[str, NDArray[Any]]:
     """(N, 3) int32 `xyz` as they are written in a LAZ file, of so many points."""
     try:
         import laspy
+        import lazrs  # noqa: F401  (which laspy decompresses with)
     except ImportError as error:
         raise ImportError(f"{path}: LAZ needs laspy: pip install 'torchcover[las]'") from error
     with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False) as reader:

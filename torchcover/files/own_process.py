@@ -145,6 +145,8 @@ def serve() -> None:
             except Exception as error:
                 known = next((kind.__name__ for kind in type(error).__mro__ if kind.__name__ in KNOWN_ERRORS), "")
                 told = str(error) if known else f"{type(error).__name__}: {error}"
+                if isinstance(error, ModuleNotFoundError):  # which no reader has met with words of its own
+                    told = f"{path}: {error.name} is needed to read it: pip install {error.name}"
                 _send(answers, [[known, told], []])
             else:
                 _send(answers, [None, [[key, array.dtype.str, array.shape] for key, array in arrays.items()]])

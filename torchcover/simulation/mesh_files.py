@@ -3,10 +3,12 @@
 import gc
 import io
 import re
+import sys
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from types import ModuleType, SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +21,9 @@ from torchcover.simulation.polygons import find_bad_fans, triangulate
 OBJ_POLYGON = re.compile(rb"^[ \t]*f(?:(?:[ \t]+[^\s#]+){4}|[^\n#]*[\s/]-)", re.MULTILINE)
 OBJ_BACKWARDS = re.compile(rb"^[ \t]*f[^\n#]*[\s/]-", re.MULTILINE)
 OBJ_TEXTURE = re.compile(rb"/\S*")
+
+# How to install modules that are called otherwise than their packages.
+PACKAGES = {"collada": "'torchcover[urdf]'", "openctm": "python-openctm"}
 
 
 @apart
@@ -34,6 +39,10 @@ def mesh_arrays(path: Path) -> dict[str, NDArray[Any]]:
         parts = list(_read_parts(path))
     except MemoryError:
         raise
+    except ModuleNotFoundError as error:
+        module = str(error).split("'")[1].partition(".")[0]  # trimesh raises a copy of the error without its name
+        package = PACKAGES.get(module, module)
+        raise ImportError(f"{path}: {path.suffix} needs {module}: pip install {package}") from error
     except Exception as error:  # trimesh raises whatever the reader of the format raises
         raise ValueError(f"trimesh cannot read it as a mesh ({error})") from error
     offsets = np.cumsum([0, *(len(vertices) for vertices, *_ in parts)])
@@ -58,6 +67,9 @@ def _read_parts(path: Path) -> Iterator[tuple[NDArray[np.float64], NDArray[np.in
     if kind == "dae":
         with suppress(ImportError):  # trimesh says that it is missing
             _triangulate_collada()
+    # What trimesh asks for the encoding of text that is not UTF-8.
+    latin_1 = SimpleNamespace(detect=lambda _: {"encoding": "latin-1", "confidence": 0.0})
+    sys.modules["charset_normalizer"] = cast(ModuleType, latin_1)
     data = path.read_bytes()
     if kind == "obj":
         data = _obj_with_triangles(data)
