@@ -138,11 +138,11 @@ class RecordedFrames(FrameDataset):
         return bool(self._has_heights)
 
     def doubts(self, steps: int | None = None) -> Sequence[str]:
-        """As `torchcover.recordings.suspicion` says."""
-        from torchcover.recordings.suspicion import suspicions  # only before a measurement
+        """Faults of the recording with their remedies, as `torchcover.recordings.checks` finds them."""
+        from torchcover.recordings.checks import check_recording  # only before a measurement
 
-        many = len(self) if steps is None else min(steps, len(self))
-        return suspicions(self.recording, self.reference, self.sensors_of_rigs, many)
+        num_frames = len(self) if steps is None else min(steps, len(self))
+        return check_recording(self.recording, self.reference, self.sensors_of_rigs, num_frames)
 
     @property
     def ego_outline_m(self) -> NDArray[np.float64] | None:

@@ -1,4 +1,4 @@
-"""Each suspicion fires on its mistake, and none on what is as it should be."""
+"""Each check reports its fault, and none reports a recording without faults."""
 
 import re
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from tests.recordings.drives import Drive
 from torchcover.data import AccumulatedReference, RecordedFrames, Scan
 from torchcover.detection import Boxes
 from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_euler, transform
-from torchcover.recordings.suspicion import ground_height_m, in_the_air
+from torchcover.recordings.checks import estimate_ground_height
 
 MOUNT = rigid(rotation_from_euler(2.0, 1.0, -1.0), [0.5, 0.1, 1.73])
 SIZE_M = (4.0, 1.8, 1.5)
@@ -114,11 +114,8 @@ def test_nothing_is_wrong_with_what_is_right():
             r"ground lies at z = -1.[78] m \(lidar\), -1.[78] m \(reference\), not near 0: .*vehicle_T",
         ),
         ({"mount": rigid(np.eye(3), [0.0, 0.0, 3.4])}, r"ground lies at z = \+1.[67] m \(lidar\), \+1.[67] m \(ref"),
-        ({"flipped": True}, r"20 of 20 labelled boxes have points of (lidar|reference) only if its left and right"),
-        ({"same": True}, r"points of the reference are those of the rig one itself.*--reference accumulated"),
-        ({"turned_deg": 90.0}, r"drives sideways, -90 degrees from its x axis"),
-        ({"turned_deg": -90.0}, r"drives sideways, \+90 degrees from its x axis"),
-        ({"step_s": 1e-4}, r"drives at 15,000 m/s: give both from the same clock"),
+        ({"flipped": True}, r"20 of 20 labeled boxes contain points of (lidar|reference) only if its left and right"),
+        ({"same": True}, r"reference points are those of the rig one itself.*--reference accumulated"),
     ],
 )
 def test_each_mistake_is_named(mistake, says):
@@ -137,7 +134,7 @@ def test_a_window_that_holds_one_instant():
 @pytest.mark.parametrize(("steps", "lasts"), [(1, "0 s, 1 instants"), (2, "0.1 s, 2 instants")])
 def test_a_drive_far_shorter_than_the_window(steps, lasts):
     (doubt,) = doubts(Drive(steps=steps), reference=AccumulatedReference(2.0))
-    assert f"it lasts {lasts}, and its reference is to be of 2 s" in doubt
+    assert f"it lasts {lasts}, and its reference is accumulated over 2 s" in doubt
     assert (
         doubts(Drive(steps=steps), reference=AccumulatedReference(0.0, sensors=("left",)), rigs={"b": ("right",)}) == []
     )
@@ -152,31 +149,17 @@ def test_a_sensor_that_was_off_for_a_while():
     assert "lidar has no point in 2 of 5 frames" in doubt
 
 
-def test_drops_hang_alone_in_the_air():
-    generator = np.random.default_rng(0)
-    x, y = generator.uniform(-12, 12, (2, 40_000))
-    ground_m = np.stack([x, y, np.zeros(40_000)], axis=1).astype(np.float32)
-    wall_m = np.stack([x, np.full(40_000, 8.0), generator.uniform(0, 4, 40_000)], axis=1)[:8000].astype(np.float32)
-    drops_m = generator.uniform([-8, -8, 0.5], [8, 8, 6], (1000, 3)).astype(np.float32)
-    dry, wet = (np.concatenate(of) for of in ((ground_m, wall_m), (ground_m, wall_m, drops_m)))
-    assert in_the_air({"lidar": [dry], "radar": [drops_m[:100]]}) is None
-    assert re.search(
-        r"within 15 m 1\d% \(lidar\) have no others near", in_the_air({"lidar": [wet, wet], "other": [dry]})
-    )
-    assert in_the_air({"lidar": [wet[::40]]}) is None  # where ground is as sparse, who is alone is no drop
-
-
 def test_ground_is_what_is_connected_below_the_vehicle():
     generator = np.random.default_rng(0)
     x, y = generator.uniform(-20, 20, (2, 5000))
     flat_m = np.stack([x, y, np.full(5000, -1.73)], axis=1)
-    assert ground_height_m(flat_m) == pytest.approx(-1.73)
-    assert ground_height_m(transform(rigid(np.eye(3), [0.0, 0.0, 1.73]), flat_m)) == pytest.approx(0.0, abs=1e-9)
-    assert ground_height_m(flat_m[:20]) is None  # too few
-    assert ground_height_m(np.stack([x, y, generator.uniform(2, 12, 5000)], axis=1)) is None  # roofs and trees
+    assert estimate_ground_height(flat_m) == pytest.approx(-1.73)
+    assert estimate_ground_height(transform(rigid(np.eye(3), [0.0, 0.0, 1.73]), flat_m)) == pytest.approx(0.0, abs=1e-9)
+    assert estimate_ground_height(flat_m[:20]) is None  # too few
+    assert estimate_ground_height(np.stack([x, y, generator.uniform(2, 12, 5000)], axis=1)) is None  # roofs and trees
     ahead_m = flat_m[(x > 5) & (np.abs(y) < 0.6 * x)]
     ahead_m[:, 2] = 0.15 * np.maximum(ahead_m[:, 0] - 10.0, 0.0)  # where a hill begins
-    assert abs(ground_height_m(ahead_m)) < 0.5
+    assert abs(estimate_ground_height(ahead_m)) < 0.5
 
 
 def test_a_frame_that_cannot_be_read_is_not_looked_at():
@@ -193,16 +176,6 @@ def test_a_run_warns_before_it_begins():
     with pytest.warns(UserWarning, match=r"^street: the ground lies at z = -1.[78] m \(lidar\)") as caught:
         torchcover.evaluate(frames=frames, cell_m=8.0)
     assert [warning.filename for warning in caught] == [__file__]
-
-
-def test_a_recording_that_does_not_say_that_it_is_whole(tmp_path):
-    street = Street(steps=2)
-    street.path, street.instants = tmp_path, [0, 1]
-    assert [doubt.partition(": ")[2] for doubt in doubts(street)] == [
-        "torchcover wrote it, and it has no recording.json: is it whole, with its 2 frames?"
-    ]
-    (tmp_path / "recording.json").write_text('{"frames": ["f0", "f1"]}')
-    assert doubts(street) == []
 
 
 def test_a_vehicle_that_stands_is_no_judge_of_its_own_sensors():
