@@ -13,4 +13,4 @@ from .recording import Recording as Recording
 from .recording import Scan as Scan
 from .settings import RecordingSettings as RecordingSettings
 from .settings import merge_recording_settings as merge_recording_settings
-from .suspicion import suspicions as suspicions
+from .checks import check_recording as check_recording
