@@ -100,6 +100,63 @@ def test_messages_beside_a_database_are_not_lost(tmp_path, ending):
     ],
 )
 def test_points_with_times_are_moved_to_the_instant(tmp_path, field, stored):
+    check_points_are_moved(tmp_path, field, stored)
+
+
+@pytest.mark.parametrize(
+    ("stored", "words"),
+    [
+        (
+            lambda offset_ns, _: (offset_ns // 1000).astype("u4"),
+            r"\(u4\) span 110000 where .* 0.1 s apart: .* us",
+        ),
+        (lambda offset_ns, _: (offset_ns * 1e-6).astype("f4"), "span 110 .* read as ms"),
+        (lambda offset_ns, _: (offset_ns * 1e-3).astype("f4"), r"\(f4\) .* read as us"),
+        (lambda offset_ns, time_ns: (offset_ns + time_ns) * 1e-3, r"\(f8\) .* read as us"),
+        (lambda offset_ns, time_ns: (offset_ns + time_ns) * 1e-6, "read as ms"),
+        (lambda offset_ns, _: (offset_ns / STEP_NS).astype("f4"), "read as shares of the scan period"),
+    ],
+)
+def test_the_unit_of_times_of_points_is_found_by_the_time_between_scans(tmp_path, stored, words):
+    with pytest.warns(UserWarning, match=f"lidar: the times of points .*{words}; choose another by"):
+        check_points_are_moved(tmp_path, "t", stored)
+
+
+@pytest.mark.parametrize(
+    "stored",
+    [
+        lambda offset_ns, _: (offset_ns // 10_000).astype("u2"),  # 10 us
+        lambda offset_ns, _: (offset_ns // 1000 + 5_000_000).astype("u4"),  # since another instant
+        lambda offset_ns, _: (offset_ns / STEP_NS * 36000).astype("u2"),  # an angle
+    ],
+)
+def test_times_of_points_in_no_unit_are_refused_with_the_setting(tmp_path, stored):
+    offset_ns = np.linspace(0, STEP_NS, 4)
+
+    def timed(time_ns):
+        return cloud(points(CORNERS_M, t=stored(offset_ns, time_ns)), time_ns, "lidar")
+
+    path = bag(tmp_path / "a", MOUNTED + driven() + clouds(timed, 3))
+    with pytest.raises(
+        BadFileError, match=r"lidar: .*'t'.* no unit of s, ms, us, ns .* --set recording\.point_times=UNIT \(s, ms"
+    ):
+        RosBag(path)
+    assert RosBag(path, point_times="none").scan("lidar", 1).offsets_s is None
+    with pytest.raises(ValueError, match="point_times: one of s, ms, us, ns, turn, none is needed; got 'h'"):
+        RosBag(path, point_times="h")
+
+
+def test_times_of_points_over_a_part_of_a_turn_are_said(tmp_path):
+    def timed(time_ns):
+        return cloud(points(CORNERS_M, t=np.array([0, 1e7, 2e7, 2.5e7], "u4")), time_ns, "lidar")
+
+    path = bag(tmp_path / "a", MOUNTED + driven() + clouds(timed, 3))
+    with pytest.warns(UserWarning, match="25% of the 0.1 s between scans; they are read as ns"):
+        recording = RosBag(path)
+    np.testing.assert_allclose(recording.scan("lidar", 1).offsets_s, [0, 0.01, 0.02, 0.025])
+
+
+def check_points_are_moved(tmp_path, field, stored):
     world_m = transform(pose_at(0.15), np.repeat(CORNERS_M, 50, axis=0) * np.linspace(0.5, 3.0, 200)[:, None])
     offset_ns = np.linspace(-20_000_000, 90_000_000, 200).round().astype(np.int64)
     if field == "t":
@@ -318,10 +375,6 @@ XYZ = (("x", 0, 7), ("y", 4, 7))
         ({"fields": fields(*XYZ)}, "fields x, y, z of float32"),
         ({"fields": []}, "got none"),
         ({"fields": fields(*XYZ, ("z", 8, 7), ("t", 8, 99))}, "within the 12 bytes"),
-        (
-            {"fields": fields(*XYZ, ("z", 8, 7), ("time", 0, 7))},
-            "time: times of points within 1 s of the cloud are needed; got 5",
-        ),
     ],
 )
 def test_clouds_that_lie_about_themselves(tmp_path, changes, told):
@@ -343,11 +396,14 @@ NOT_FINITE = rigid(np.eye(3), [0.0, np.nan, 0.0])
         (MOUNTED, "PointCloud2 with messages is needed; there are /tf_static .tf2_msgs/msg/TFMessage."),
         (clouds(), "the frame base_footprint or base_link of the vehicle is needed; there are lidar"),
         ([static(OTHER), *clouds()], r"of /lidar \(lidar\); static ones are of base_link, other"),
-        ([static(*LOOP), *clouds()], "lidar -> a -> b -> a are mounted on each other in a loop"),
+        ([static(*LOOP), *clouds()], "base_link of the vehicle is needed; there are a, b, lidar"),
         ([static(link("base_link", "lidar", NOT_FINITE)), *clouds()], "lidar: three finite coordinates are needed"),
         ([*MOUNTED, *clouds(), ("/odom", T0_NS, odometry(NOT_FINITE, T0_NS))], "/odom: three finite"),
         ([*MOUNTED, *clouds(), ("/odom", T0_NS, odometry(mount, T0_NS, "wheel"))], r"odometry /odom \(wheel\)"),
-        ([*MOUNTED, *clouds(), ("/tf", T0_NS, tree(*RING))], "/tf: the frames base_link -> b -> base_link are a loop"),
+        (
+            [*MOUNTED, *clouds(), ("/tf", T0_NS, tree(*RING))],
+            "/tf: b -> base_link: the transforms from base_link upward are a loop",
+        ),
         (
             [*MOUNTED, *clouds(), *OTHER_CLOCK],
             "no scan lies between the first and the last pose of /odom .* clocks match",
@@ -361,6 +417,98 @@ def test_bags_that_do_not_hold_together(tmp_path, messages, told):
         RosBag(path)
     assert str(error.value).startswith(f"{path}: ")
     assert str(error.value).count(str(path)) == 1
+
+
+def two_parents(other_every=1, off_m=(0.3, 0.25, 0.0)):
+    """`odom -> base_link` at 20 Hz, and `map -> base_link`, which is elsewhere."""
+    elsewhere = rigid(np.eye(3), off_m)
+    messages = []
+    for k in range(12):
+        time_ns = T0_NS + k * STEP_NS // 2
+        messages.append(("/tf", time_ns, tree(link("odom", "base_link", pose_at(0.05 * k), time_ns))))
+        if k % other_every == 0:
+            other_ns = time_ns + 3_000_000
+            moved = elsewhere @ pose_at(0.05 * k + 0.003)
+            messages.append(("/tf", other_ns, tree(link("map", "base_link", moved, other_ns))))
+    return messages
+
+
+@pytest.mark.parametrize("other_every", [1, 3])
+def test_poses_in_two_frames_are_not_mixed(tmp_path, other_every):
+    path = bag(tmp_path / "a", MOUNTED + two_parents(other_every) + clouds(count=5))
+    with pytest.warns(UserWarning, match=r"from /tf \(base_link in odom\), not from /tf \(base_link in map\)"):
+        recording = RosBag(path)
+    for index in range(5):
+        np.testing.assert_allclose(recording.world_T_vehicle(index), pose_at(0.1 * index), atol=1e-6)
+
+
+def test_two_senders_of_one_pose_are_told(tmp_path):
+    messages = [
+        ("/tf", time_ns, tree(link("odom", "base_link", rigid(np.eye(3), [0.0, 0.3 * (k % 2), 0.0]) @ pose, time_ns)))
+        for k, (time_ns, pose) in enumerate((T0_NS + k * 20_000_000, pose_at(0.02 * k)) for k in range(20))
+    ]
+    with pytest.warns(UserWarning, match=r"\(base_link in odom\) jump to and fro by 0.3 m: do two nodes send them"):
+        RosBag(bag(tmp_path / "a", MOUNTED + messages + clouds(count=3)))
+
+
+def test_a_frame_that_is_mounted_twice_is_told(tmp_path):
+    other_mount = rigid(np.eye(3), [1.0, 0.2, 2.1])
+    rack = [static(link("base_link", "rack", raised)), static(link("rack", "lidar", other_mount))]
+    driver = [static(link("sensor", "lidar", other_mount))]
+    for name, more, told in (
+        ("twice", [static(link("base_link", "lidar", other_mount))], "base_link -> lidar is sent with two values"),
+        ("rack", rack, r"rack -> lidar is not used: .* off base_link -> lidar"),
+        ("driver", driver, ""),
+    ):
+        path = bag(tmp_path / name, MOUNTED + more + clouds())
+        if told:
+            with pytest.warns(UserWarning, match=told):
+                recording = RosBag(path)
+        else:
+            recording = RosBag(path)  # a second tree, which says nothing of the vehicle
+        expected = other_mount if name == "twice" else mount
+        np.testing.assert_allclose(recording.scan("lidar", 0).vehicle_T_sensor, expected, atol=1e-12)
+
+
+def test_the_frame_of_the_poses_may_lie_above_the_ground(tmp_path):
+    mounted = [static(link("base_link", "lidar", mount), link("base_footprint", "base_link", raised))]
+    moved = [moved_tree(k) for k in range(8)]
+    with pytest.warns(UserWarning, match="base_footprint is taken"):
+        recording = RosBag(bag(tmp_path / "a", mounted + moved + clouds(count=3)))
+    np.testing.assert_allclose(recording.world_T_vehicle(2), pose_at(0.2) @ invert(raised), atol=1e-6)
+
+
+def test_a_static_transform_that_moves_is_told(tmp_path):
+    both = [static(link("odom", "base_link", mount), link("base_link", "lidar", mount))]
+    with pytest.warns(UserWarning, match="odom -> base_link: sent as static and as moving transforms"):
+        recording = RosBag(bag(tmp_path / "a", both + [moved_tree(k) for k in range(8)] + clouds(count=3)))
+    np.testing.assert_allclose(recording.world_T_vehicle(2), pose_at(0.2), atol=1e-6)
+
+
+@pytest.mark.parametrize("count", [5, 90])
+@pytest.mark.parametrize("slowness", [4.0, 20.0])
+def test_stamps_are_the_times(tmp_path, count, slowness):
+    """A bag that was recorded while another one played slowly."""
+    messages = [*MOUNTED, *driven(count * 10), *clouds(count=count)]
+    slow = [(topic, T0_NS + int((time_ns - T0_NS) * slowness), message) for topic, time_ns, message in messages]
+    with pytest.warns(UserWarning, match="scans of lidar were recorded 0 to .* s after their stamps, which are used"):
+        recording = RosBag(bag(tmp_path / "a", sorted(slow, key=lambda one: one[1])))
+    np.testing.assert_allclose(recording.times_s, 0.1 * np.arange(count), atol=1e-9)
+    np.testing.assert_allclose(recording.world_T_vehicle(4), pose_at(0.4), atol=1e-6)
+
+
+def test_scans_are_paired_by_their_stamps(tmp_path):
+    second = [("/b", time_ns + 80_000_000, message) for _, time_ns, message in clouds(count=9)]  # recorded late
+    recording = RosBag(bag(tmp_path / "a", [*MOUNTED, *driven(), *clouds(count=5), *second]))
+    for sensor in ("b", "lidar"):
+        assert recording.scan(sensor, 3).offsets_s is None
+    assert recording._stamped_ns["b"].tolist() == recording._stamped_ns["lidar"].tolist()
+
+
+def test_clouds_without_stamps_are_as_recorded(tmp_path):
+    unstamped = [(topic, time_ns, cloud(points(CORNERS_M), 0, "lidar")) for topic, time_ns, _ in clouds(count=3)]
+    with pytest.warns(UserWarning, match="clouds of lidar have no stamps: they are taken as made when they were"):
+        assert RosBag(bag(tmp_path / "a", MOUNTED + unstamped)).times_s.tolist() == pytest.approx([0.0, 0.1, 0.2])
 
 
 def test_a_gap_in_the_poses_is_not_bridged(tmp_path):

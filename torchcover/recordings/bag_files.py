@@ -124,6 +124,40 @@ def read_bag_messages(path: Path, topic: str, start_ns: int | None, stop_ns: int
         }
 
 
+@apart
+def read_header_stamps(path: Path, topic: str, times_ns: list[int] | None) -> dict[str, NDArray[Any]]:
+    """Read the time stamps with which the messages of a topic begin, without the messages.
+
+    Args:
+        path: The folder or the file.
+        topic: Its messages begin with a `std_msgs/Header`.
+        times_ns: When the messages were recorded that are wanted; None: all.
+
+    Returns:
+        `stamps_ns` (M,) int64, in the order of their recording.
+
+    Raises:
+        BadFileError: A damaged bag.
+    """
+    with naming(path, f"a bag, in {topic}"), _naming_remedy(path):
+        bag, found = _open(path), list[tuple[int, int]]()
+        for start_ns, stop_ns in [(None, None)] if times_ns is None else [(time, time + 1) for time in times_ns]:
+            for reader in bag.readers:
+                connections = [one for one in reader.connections if one.topic == topic]
+                for _, time_ns, raw in reader.messages(connections, start_ns, stop_ns) if connections else ():
+                    found.append((time_ns, _stamp_of_raw(bytes(raw[:12]), is_ros1=bag.is_ros1)))
+        return {"stamps_ns": np.array([stamp_ns for _, stamp_ns in sorted(found, key=itemgetter(0))], dtype=np.int64)}
+
+
+def _stamp_of_raw(raw: bytes, *, is_ros1: bool) -> int:
+    """The time of a header: behind its number in ROS 1, behind the order of bytes in ROS 2."""
+    if len(raw) < 12:
+        raise ValueError(f"a message of {len(raw)} bytes has no header")
+    order = "<" if is_ros1 or raw[1] & 1 else ">"
+    seconds, nanoseconds = np.frombuffer(raw, f"{order}u4", 2, 4).tolist()
+    return int(seconds) * 1_000_000_000 + int(nanoseconds)
+
+
 def _open(path: Path) -> _OpenBag:
     files = find_ros1_files(path) or (sorted(path.iterdir()) if path.is_dir() else [path])
     status = [(str(file), file.stat()) for file in files]

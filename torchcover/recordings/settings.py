@@ -50,6 +50,11 @@ class RecordingSettings(BaseModel):
     mounts: dict[str, Mount] = Field(
         {}, description="Of a bag: name of a sensor -> its pose on the vehicle, {x_m, y_m, z_m, yaw_deg, ...}."
     )
+    point_times: Literal["s", "ms", "us", "ns", "turn", "none"] | None = Field(
+        None,
+        description="Of a bag: unit of the times of points, or turn for shares of the scan period, or none to ignore "
+        "them. Not given: the unit that fits the time between scans.",
+    )
     units: Literal["m", "cm", "mm", "ft"] = Field("m", description="Unit of the coordinates of its clouds.")
     axes: Literal["xyz", "yxz"] = Field("xyz", description="Order of the columns of its clouds.")
     quaternions: Literal["wxyz", "xyzw"] = Field("wxyz", description="Order of the numbers of its rotations.")

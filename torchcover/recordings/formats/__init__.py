@@ -75,10 +75,11 @@ def open_recording(path: str | os.PathLike[str], settings: RecordingSettings | N
             continue
         if recording_format is RosBag:
             mounts = {sensor: mount.matrix() for sensor, mount in settings.mounts.items()}
-            return correct_recording(RosBag(path, settings.vehicle_frame, mounts), settings)
-        if settings.vehicle_frame is not None or settings.mounts:
+            return correct_recording(RosBag(path, settings.vehicle_frame, mounts, settings.point_times), settings)
+        if settings.vehicle_frame is not None or settings.mounts or settings.point_times is not None:
             raise ValueError(
-                f"{path}: vehicle_frame and mounts are for bags; {name} has its own (a plain folder in frames.yaml)"
+                f"{path}: vehicle_frame, mounts and point_times are for bags; {name} has its own (a plain folder in "
+                "frames.yaml)"
             )
         return correct_recording(_checked(recording_format(path), names), settings)
     known = "; ".join(f"{name}: {recording_format.layout}" for name, recording_format in FORMATS.items())

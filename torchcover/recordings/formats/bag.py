@@ -16,8 +16,13 @@ from torchcover.recordings.bag_files import (
     name_remedy,
     read_bag_index,
     read_bag_messages,
+    read_header_stamps,
 )
 
+# Of so many messages the stamps are read, if those were recorded equally late to this time, and so regularly.
+SAMPLED = 65
+STEADY_NS = 2_000_000
+IRREGULAR = 0.5
 SUFFIXES = {"sqlite3": ".db3", "mcap": ".mcap"}
 # What the standard definitions of ROS 1 lack, and what it was called before.
 TREE = "tf2_msgs/msg/TFMessage"
@@ -58,6 +63,32 @@ class Bag:
     def times_ns(self, topic: str) -> NDArray[np.int64]:
         """(M,) when the messages of a topic were recorded, ascending."""
         return self._times_ns.get(topic, np.empty(0, np.int64))
+
+    def stamps_ns(self, topic: str) -> NDArray[np.int64]:
+        """(M,) when the messages of a topic were made, by their headers, in the order of their recording.
+
+        In a long bag a sample is read; if all of it was recorded equally late, to `STEADY_NS`, so was the rest.
+        """
+        times_ns = self.times_ns(topic)
+        count, steps_ns = len(times_ns), np.diff(times_ns)
+        if count > SAMPLED:
+            sample_ns = times_ns[np.unique(np.linspace(0, count - 1, SAMPLED).astype(int))]
+            late_ns = sample_ns - self._read_stamps(topic, sample_ns)
+            is_regular = (np.abs(steps_ns - np.median(steps_ns)) < IRREGULAR * np.median(steps_ns)).all()
+            if is_regular and np.ptp(late_ns) <= STEADY_NS:
+                return np.asarray(times_ns - np.int64(np.median(late_ns)))
+        return self._read_stamps(topic, None)
+
+    def _read_stamps(self, topic: str, times_ns: NDArray[np.int64] | None) -> NDArray[np.int64]:
+        with naming(self.path, f"a bag, in {topic}"):
+            wanted = None if times_ns is None else times_ns.tolist()
+            stamps_ns = read_header_stamps(self.path, topic, wanted)["stamps_ns"]
+            recorded = len(self.times_ns(topic) if times_ns is None else times_ns)
+            if len(stamps_ns) != recorded:
+                raise ValueError(
+                    f"{recorded} messages are in the index, {len(stamps_ns)} are there; {name_remedy(self.path)}"
+                )
+            return np.asarray(stamps_ns)
 
     def topics(self, *types: str) -> list[str]:
         """Topics of these types that have messages, by name."""

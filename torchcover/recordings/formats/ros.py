@@ -15,8 +15,15 @@ from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.bag_files import METADATA, find_ros1_files
 from torchcover.recordings.formats.bag import SUFFIXES, Bag
 from torchcover.recordings.formats.frame_tree import FrameTree, frame_name
-from torchcover.recordings.formats.point_cloud2 import CloudMessage, cloud_of
-from torchcover.recordings.formats.ros_poses import WINDOW_NS, VehiclePoses, mounted_transforms, vehicle_poses
+from torchcover.recordings.formats.point_cloud2 import (
+    PARAMS,
+    POINT_TIMES,
+    CloudMessage,
+    PointTimes,
+    choose_point_times,
+    cloud_of,
+)
+from torchcover.recordings.formats.ros_poses import VehiclePoses, mounted_transforms, vehicle_poses
 from torchcover.recordings.recording import NO_RETURN_M, Layout, Scan, SensorCalibrations, check_times
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -26,6 +33,14 @@ VEHICLE_FRAMES = ("base_footprint", "base_link")
 RAREST = 0.25
 # Scans of one instant: none is farther from the first sensor's than this share of the time from one to the next.
 FARTHEST_SCAN = 0.75
+# Poses of one time that are farther apart are of two senders.
+APART_M = 0.05
+# Log times and stamps drift apart by latencies that are no longer.
+DRIFT_S = 0.1
+# Clocks of two sensors are no farther apart.
+CLOCKS_S = 0.5
+# Stamps that were estimated are off by less.
+STAMP_MARGIN_S = 0.01
 # Points of so short a time are moved together: 0.4 mm at 40 m/s.
 TICK_S = 1e-5
 
@@ -35,16 +50,18 @@ class RosBag(Layout):
 
     The sensors are the topics of `PointCloud2`, named without the first slash, whose frame is mounted on the vehicle's,
     by tf_static or by transforms of tf that never change; an instant is a scan of the one that has fewest, with the
-    nearest of each other. Times are those of recording, poses belong to the stamps of the clouds. Points with a time of
-    their own (a field `t`, `time`, `timestamp`, `time_stamp`, `offset_time` or `time_offset`) are taken as measured and
-    moved to the stamp of their instant; those without as one, too. Scans beyond the first and last pose are left out.
-    Needs `torchcover[ros]`.
+    nearest of each other. Times are the stamps of the clouds, unless all are 0. Points with a time of their own (a
+    field `t`, `time`, `timestamp`, `time_stamp`, `offset_time` or `time_offset`) are taken as measured and moved to the
+    stamp of their instant; those without as one, too. Scans beyond the first and last pose are left out. Needs
+    `torchcover[ros]`.
 
     Args:
         path: The folder or the file.
         vehicle_frame: The frame that is the vehicle's: x forward, y left, z up, on the ground. If not given it is
             `base_footprint`, or else `base_link`.
         mounts: Name of a sensor -> (4, 4) `vehicle_T_sensor`, where the bag does not say it, or something else.
+        point_times: What the times of points count: `s`, `ms`, `us`, `ns`, `turn` (shares of the scan period), or
+            `none` to leave them aside. If not given it is what fits the time between scans.
 
     Raises:
         FileNotFoundError: A file is missing.
@@ -58,11 +75,18 @@ class RosBag(Layout):
     layout: ClassVar[str] = "metadata.yaml and *.db3 or *.mcap, *.bag, or such a file, with topics of PointCloud2"
 
     def __init__(
-        self, path: str | os.PathLike[str], vehicle_frame: str | None = None, mounts: Mapping[str, Matrix] | None = None
+        self,
+        path: str | os.PathLike[str],
+        vehicle_frame: str | None = None,
+        mounts: Mapping[str, Matrix] | None = None,
+        point_times: str | None = None,
     ) -> None:
         self.path = Path(path)
+        if point_times not in (None, *POINT_TIMES):
+            raise ValueError(f"point_times: one of {', '.join(POINT_TIMES)} is needed; got {point_times!r}")
         self.told = {
             "vehicle_frame": vehicle_frame,
+            "point_times": point_times,
             "mounts": {name: np.asarray(of).tolist() for name, of in (mounts or {}).items()},
         }
         self._bag = Bag(self.path)
@@ -75,21 +99,26 @@ class RosBag(Layout):
             self.rigs = {"ros": self.sensors}
             found = vehicle_poses(self._bag, tree, self.vehicle_frame)
             self._poses = found[0] if found else None
-            # Sensor -> when its scan of each instant was recorded.
-            times = {sensor: self._bag.times_ns(self._topic(sensor)) for sensor in self.sensors}
-            first_ns = times[self.sensors[0]]
-            self._logged_ns = {sensor: times_ns[nearest_of(times_ns, first_ns)] for sensor, times_ns in times.items()}
             self._stamps_ns: dict[int, int] = {}
+            self._pair_scans()
+            self._point_times = {sensor: self._choose_point_times(sensor, point_times) for sensor in self.sensors}
             self._leave_out_ends()
             if vehicle_frame is None and {*VEHICLE_FRAMES} <= tree.frames:
                 self._warn(f"{self.vehicle_frame} is taken for the vehicle's frame, not {VEHICLE_FRAMES[1]}")
+            for clash in tree.find_clashes(self.vehicle_frame):
+                self._warn(clash)
             if len(found) > 1:
                 others = ", ".join(poses.source for poses in found[1:])
                 self._warn(f"poses are taken from {found[0].source}, not from {others}")
-            logged_ns = self._logged_ns[self.sensors[0]]
-            self.names = tuple(map(str, logged_ns))
+            if self._poses is not None and self._poses.apart_m > APART_M:
+                self._warn(
+                    f"poses of {self._poses.source} jump to and fro by {self._poses.apart_m:.2g} m: do two nodes "
+                    "send them? Record the bag again with one of them"
+                )
+            self.names = tuple(map(str, self._logged_ns[self.sensors[0]]))
+            stamped_ns = self._stamped_ns[self.sensors[0]]
             self.times_s = check_times(
-                np.asarray((logged_ns - logged_ns[0]) * 1e-9), len(self.names), "recorded clouds"
+                np.asarray((stamped_ns - stamped_ns[0]) * 1e-9), len(self.names), f"stamps of {self.sensors[0]}"
             )
 
     @classmethod
@@ -170,22 +199,65 @@ class RosBag(Layout):
             self._warn(f"left out, for {told}")
         return {topic.removeprefix("/"): mount for topic, mount in found.items() if mount is not None}
 
+    def _pair_scans(self) -> None:
+        """Find the scan of each sensor that was made nearest to each scan of the first one, by the stamps."""
+        logged_ns = {sensor: self._bag.times_ns(self._topic(sensor)) for sensor in self.sensors}
+        stamped_ns = {sensor: self._stamps_of(sensor, logged_ns[sensor]) for sensor in self.sensors}
+        late_s = {sensor: (logged_ns[sensor] - stamped_ns[sensor]) * 1e-9 for sensor in self.sensors}
+        first = self.sensors[0]
+        for sensor, times_s in late_s.items():
+            if np.ptp(times_s) > DRIFT_S:
+                self._warn(
+                    f"scans of {sensor} were recorded {times_s.min():.3g} to {times_s.max():.3g} s after their stamps, "
+                    "which are used"
+                )
+            elif abs(np.median(times_s) - np.median(late_s[first])) > CLOCKS_S:
+                self._warn(
+                    f"scans of {first} were recorded {np.median(late_s[first]):.3g} s after their stamps, those of "
+                    f"{sensor} {np.median(times_s):.3g} s: are their clocks apart? Scans are paired by their stamps"
+                )
+        self._logged_ns, self._stamped_ns = {}, {}
+        for sensor in self.sensors:
+            order = np.argsort(stamped_ns[sensor], kind="stable")
+            chosen = order[nearest_of(stamped_ns[sensor][order], np.sort(stamped_ns[first]))]
+            self._logged_ns[sensor] = logged_ns[sensor][chosen]
+            self._stamped_ns[sensor] = stamped_ns[sensor][chosen]
+
+    def _stamps_of(self, sensor: str, logged_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        stamped_ns = self._bag.stamps_ns(self._topic(sensor))
+        if stamped_ns.any():
+            return stamped_ns
+        self._warn(f"clouds of {sensor} have no stamps: they are taken as made when they were recorded")
+        return logged_ns
+
+    def _choose_point_times(self, sensor: str, point_times: str | None) -> PointTimes:
+        """How the times of the points of a sensor are stored, by the scan in its middle."""
+        logged_ns, stamped_ns = self._logged_ns[sensor], np.unique(self._stamped_ns[sensor])
+        period_s = float(np.median(np.diff(stamped_ns))) * 1e-9 if len(stamped_ns) > 1 else None
+        if point_times is not None:
+            return PointTimes(point_times, period_s or PARAMS.usual_period_s)
+        message = self._bag.message(self._topic(sensor), int(logged_ns[len(logged_ns) // 2]))
+        try:
+            chosen, note = choose_point_times(message, period_s)
+        except ValueError:  # whoever reads this cloud will say so; the others may be whole
+            return PointTimes("ns", period_s or PARAMS.usual_period_s)
+        if chosen is None:
+            raise ValueError(f"{sensor}: {note}")
+        if note:
+            self._warn(f"{sensor}: {note}; choose another by --set recording.point_times=UNIT")
+        return chosen
+
     def _leave_out_ends(self) -> None:
         """Keep the instants between the first pose and the last."""
         if self._poses is None:
             return
-        first_ns, logged_ns = self._logged_ns[self.sensors[0]], self._poses.logged_ns
-        inside = (first_ns >= logged_ns[0] - WINDOW_NS) & (first_ns <= logged_ns[-1] + WINDOW_NS)
-        # Scans are recorded a little after their stamp: the few at the ends are asked for it.
-        at_ends = inside & ((first_ns < logged_ns[0] + WINDOW_NS) | (first_ns > logged_ns[-1] - WINDOW_NS))
-        for index in np.flatnonzero(at_ends):
-            inside[index] = self._poses.covers(self._stamp_ns(int(index)))
+        inside = self._poses.covers(self._stamped_ns[self.sensors[0]], STAMP_MARGIN_S)
         if not inside.any():
             raise ValueError(
                 f"no scan lies between the first and the last pose of {self._poses.source}; do the clocks match?"
             )
         self._logged_ns = {sensor: times_ns[inside] for sensor, times_ns in self._logged_ns.items()}
-        self._stamps_ns = {}
+        self._stamped_ns = {sensor: times_ns[inside] for sensor, times_ns in self._stamped_ns.items()}
 
     def _warn(self, what: str) -> None:
         warnings.warn(f"{self.path}: {what}", stacklevel=5)
@@ -204,13 +276,13 @@ class RosBag(Layout):
         return self._stamps_ns[index]
 
     def _cloud(self, sensor: str, index: int) -> tuple[CloudMessage, int]:
-        logged_ns, first_ns = int(self._logged_ns[sensor][index]), self._logged_ns[self.sensors[0]]
-        apart_s = abs(logged_ns - int(first_ns[index])) * 1e-9
+        logged_ns, first_ns = int(self._logged_ns[sensor][index]), self._stamped_ns[self.sensors[0]]
+        apart_s = abs(int(self._stamped_ns[sensor][index]) - int(first_ns[index])) * 1e-9
         every_s = float(np.median(np.diff(first_ns))) * 1e-9 if len(first_ns) > 1 else np.inf
         with naming(self.path, f"a cloud of {sensor}"):
             if apart_s > FARTHEST_SCAN * every_s:
                 raise ValueError(f"the scan of {sensor} nearest to {first_ns[index]} is {apart_s:.3f} s off")
-            cloud = cloud_of(self._bag.message(self._topic(sensor), logged_ns))
+            cloud = cloud_of(self._bag.message(self._topic(sensor), logged_ns), self._point_times[sensor])
         stamp_ns = cloud.stamp_ns or logged_ns
         if sensor == self.sensors[0]:
             self._stamps_ns[index] = stamp_ns

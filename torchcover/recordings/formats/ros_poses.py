@@ -1,5 +1,6 @@
 """Where the vehicle of a bag was: from odometry, a tree of frames or poses, between two of them."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -7,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.files import naming
-from torchcover.geometry import quaternion_from_rotation, rigid, rotation_from_quaternion, slerp
+from torchcover.geometry import invert, quaternion_from_rotation, rigid, rotation_from_quaternion, slerp
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.formats.bag import Bag
-from torchcover.recordings.formats.frame_tree import FrameTree, frame_name, parent_of, pose_of
+from torchcover.recordings.formats.frame_tree import Edge, FrameTree, edge_of, frame_name, pose_of
 from torchcover.recordings.formats.point_cloud2 import stamp_of
 
 ODOMETRY, TF, POSE = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage", "geometry_msgs/msg/PoseStamped"
@@ -23,14 +24,24 @@ WINDOW_NS = 1_000_000_000
 LONGEST_GAP_S, EDGE_S = 1.0, 0.15
 # What is mounted is written down again and again, to rounding.
 SAME = 1e-6
+# A vehicle cannot be so far off the middle between the poses before and after; two senders of one transform can, in
+# such a share of its poses.
+ZIGZAG_M = 0.1
+ZIGZAG_SHARE = 0.2
+# Bags are recorded no slower than at this multiple of real time.
+SLOWEST = 100.0
 
 
 class PoseSeries(NamedTuple):
-    """Poses at ascending times. `times_ns`: (K,); `places_m`: (K, 3); `wxyz`: (K, 4) unit quaternions."""
+    """Poses at ascending times. `times_ns`: (K,); `places_m`: (K, 3); `wxyz`: (K, 4) unit quaternions.
+
+    `apart_m`: how far poses of the same time are apart.
+    """
 
     times_ns: NDArray[np.int64]
     places_m: Matrix
     wxyz: Matrix
+    apart_m: float = 0.0
 
     def at(self, times_ns: NDArray[np.int64], name: str) -> Matrix:
         """(N, 4, 4) at other times: places evenly, rotations the shorter way at an even rate (slerp)."""
@@ -59,29 +70,50 @@ class PoseSeries(NamedTuple):
         rotations = rotation_from_quaternion(slerp(self.wxyz[after - 1], self.wxyz[after], share))
         return rigid(rotations, first_m + share * (second_m - first_m))
 
+    def zigzag_m(self) -> float:
+        """How far poses jump to and fro, in metres; 0 if a vehicle can move like that."""
+        first_ns, middle_ns, last_ns = self.times_ns[:-2], self.times_ns[1:-1], self.times_ns[2:]
+        share = ((middle_ns - first_ns) / (last_ns - first_ns))[:, None]
+        expected_m = self.places_m[:-2] + share * (self.places_m[2:] - self.places_m[:-2])
+        off_m = np.linalg.norm(self.places_m[1:-1] - expected_m, axis=1)
+        jumps_m = off_m[(off_m > ZIGZAG_M) & (last_ns - first_ns < LONGEST_GAP_S * 1e9)]
+        return float(np.median(jumps_m)) if len(jumps_m) > ZIGZAG_SHARE * len(off_m) else 0.0
+
 
 class VehiclePoses:
-    """Poses of the vehicle's frame, from a topic of the bag; `source` says for people what was taken.
+    """Poses of the vehicle's frame, from a topic of the bag.
 
-    `links` lead from the world to the vehicle: frames whose poses are read, and what is mounted, as (4, 4).
+    Args:
+        bag: The bag.
+        topic: The topic.
+        links: From the world to the vehicle: keys of the poses that are read, see `series_of`, and what is mounted, as
+            (4, 4).
+        source: What was taken, for messages.
     """
 
-    def __init__(self, bag: Bag, topic: str, links: Sequence[str | Matrix], source: str) -> None:
+    def __init__(self, bag: Bag, topic: str, links: Sequence[Edge | Matrix], source: str) -> None:
         self.source = source
         self._bag, self._topic, self._links = bag, topic, links
-        self.logged_ns = bag.times_ns(topic)
-        self._last: tuple[int, Mapping[str, PoseSeries]] = (-1, {})
-        ends = [self._around(int(self.logged_ns[end])) for end in (0, -1)]
-        moving = [link for link in links if isinstance(link, str)]
+        logged_ns = bag.times_ns(topic)
+        self._window_ns = WINDOW_NS
+        self._last: tuple[int, Mapping[Edge, PoseSeries]] = (-1, {})
+        ends = [self._around(int(logged_ns[end])) for end in (0, -1)]
+        moving = [link for link in links if isinstance(link, tuple)]
         self._span_ns = (
             max(int(ends[0][link].times_ns[0]) for link in moving),
             min(int(ends[1][link].times_ns[-1]) if link in ends[1] else 0 for link in moving),
         )
+        # A bag that was recorded while another one played slowly is read in longer windows of its own clock.
+        slowness = (logged_ns[-1] - logged_ns[0]) / max(self._span_ns[1] - self._span_ns[0], 1)
+        self._window_ns = round(WINDOW_NS * np.clip(slowness, 1.0, SLOWEST))
+        self.apart_m = max(
+            max(end[link].apart_m, end[link].zigzag_m()) for end in ends for link in moving if link in end
+        )
 
-    def covers(self, time_ns: int) -> bool:
-        """Whether it lies between the first pose and the last, or nearly."""
-        edge_ns = EDGE_S * 1e9
-        return self._span_ns[0] - edge_ns <= time_ns <= self._span_ns[1] + edge_ns
+    def covers(self, times_ns: NDArray[np.int64], margin_s: float = 0.0) -> NDArray[np.bool_]:
+        """(N,) whether times lie between the first pose and the last, or nearly."""
+        edge_ns = (EDGE_S - margin_s) * 1e9
+        return (self._span_ns[0] - edge_ns <= times_ns) & (times_ns <= self._span_ns[1] + edge_ns)
 
     def at(self, times_ns: NDArray[np.int64], logged_ns: int) -> Matrix:
         """(N, 4, 4) `world_T_vehicle`. `times_ns`: (N,) when; `logged_ns`: about when such messages were recorded."""
@@ -89,7 +121,7 @@ class VehiclePoses:
             series = self._around(logged_ns)
             world_T_here = np.broadcast_to(np.eye(4), (len(times_ns), 4, 4))
             for link in self._links:
-                if isinstance(link, str):
+                if isinstance(link, tuple):
                     if link not in series:
                         raise ValueError(f"{self._topic}: no pose within 1 s of {logged_ns}")
                     world_T_here = world_T_here @ series[link].at(times_ns, self._topic)
@@ -97,47 +129,70 @@ class VehiclePoses:
                     world_T_here = world_T_here @ link
             return world_T_here
 
-    def _around(self, logged_ns: int) -> Mapping[str, PoseSeries]:
+    def _around(self, logged_ns: int) -> Mapping[Edge, PoseSeries]:
         if self._last[0] != logged_ns:
-            messages = self._bag.messages(self._topic, logged_ns - WINDOW_NS, logged_ns + WINDOW_NS)
+            messages = self._bag.messages(self._topic, logged_ns - self._window_ns, logged_ns + self._window_ns)
             self._last = (logged_ns, series_of(messages, self._bag.types[self._topic], self._topic))
         return self._last[1]
 
 
-def series_of(messages: Sequence[Any], kind: str, name: str) -> dict[str, PoseSeries]:
-    """Name of each frame -> its poses; those of `Odometry` and `PoseStamped` are called after their type."""
-    found: dict[str, dict[int, Matrix]] = {}
+def series_of(messages: Sequence[Any], kind: str, name: str) -> dict[Edge, PoseSeries]:
+    """Parent and child of each transform -> its poses; those of `Odometry` and `PoseStamped` are under (type, "")."""
+    stamped: dict[Edge, list[tuple[int, Matrix]]] = {}
     for message in messages:
         if kind == TF:
-            for one in message.transforms:
-                child = frame_name(one.child_frame_id)
-                pose = pose_of(one.transform.translation, one.transform.rotation, f"{name}: {child}")
-                found.setdefault(child, {})[stamp_of(one.header)] = pose
+            for transform in message.transforms:
+                edge, pose = _named_edge_of(transform, name)
+                stamped.setdefault(edge, []).append((stamp_of(transform.header), pose))
         else:
             pose = message.pose.pose if kind == ODOMETRY else message.pose
-            found.setdefault(kind, {})[stamp_of(message.header)] = pose_of(pose.position, pose.orientation, name)
-    return {child: _series(poses) for child, poses in found.items()}
+            placed = stamp_of(message.header), pose_of(pose.position, pose.orientation, name)
+            stamped.setdefault((kind, ""), []).append(placed)
+    return {edge: _series(poses) for edge, poses in stamped.items()}
+
+
+def _named_edge_of(transform: Any, name: str) -> tuple[Edge, Matrix]:  # noqa: ANN401
+    try:
+        return edge_of(transform)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
 
 
 def mounted_transforms(bag: Bag) -> list[Any]:
-    """Messages `TransformStamped` of what is mounted: all of tf_static, and those of tf that never change."""
-    statics, links = [], dict[str, list[Any]]()
+    """Messages `TransformStamped` of what is mounted: those of tf that never change, and those of tf_static."""
+    statics, sampled = [], dict[Edge, list[Any]]()
     for topic in bag.topics(TF):
         if topic.endswith("tf_static"):
             statics += [one for message in bag.messages(topic) for one in message.transforms]
-            continue
-        logged_ns, read_ns = bag.times_ns(topic), 0
-        for about_ns in (logged_ns[0], logged_ns[len(logged_ns) // 2], logged_ns[-1]):
-            start_ns, read_ns = max(int(about_ns) - WINDOW_NS // 2, read_ns), int(about_ns) + WINDOW_NS // 2
-            for message in bag.messages(topic, start_ns, read_ns):
-                for one in message.transforms:
-                    links.setdefault(frame_name(one.child_frame_id), []).append(one)
-    return [*(of[0] for of in links.values() if len(of) > 1 and _never_changes(of)), *statics]
+        else:
+            for edge, transforms in _sampled_transforms(bag, topic).items():
+                sampled.setdefault(edge, []).extend(transforms)
+    moving = {edge for edge, transforms in sampled.items() if not _never_changes(transforms)}
+    if both := sorted(f"{parent} -> {child}" for parent, child in {edge_of(one)[0] for one in statics} & moving):
+        warnings.warn(
+            f"{bag.path}: {', '.join(both)}: sent as static and as moving transforms; those that move are used",
+            stacklevel=2,
+        )
+    constants = [transforms[0] for edge, transforms in sampled.items() if len(transforms) > 1 and edge not in moving]
+    return [*constants, *(transform for transform in statics if edge_of(transform)[0] not in moving)]
+
+
+def _sampled_transforms(bag: Bag, topic: str) -> dict[Edge, list[Any]]:
+    """The messages `TransformStamped` of a topic, at its beginning, in its middle and at its end."""
+    sampled: dict[Edge, list[Any]] = {}
+    logged_ns, read_ns = bag.times_ns(topic), 0
+    for about_ns in (logged_ns[0], logged_ns[len(logged_ns) // 2], logged_ns[-1]):
+        start_ns, read_ns = max(int(about_ns) - WINDOW_NS, read_ns), int(about_ns) + WINDOW_NS
+        for message in bag.messages(topic, start_ns, read_ns):
+            for transform in message.transforms:
+                edge = frame_name(transform.header.frame_id), frame_name(transform.child_frame_id)
+                sampled.setdefault(edge, []).append(transform)
+    return sampled
 
 
 def _never_changes(transforms: Sequence[Any]) -> bool:
-    (parent, mount), *others = map(parent_of, transforms)
-    return all(other == parent and np.abs(pose - mount).max() < SAME for other, pose in others)
+    mounts = np.array([edge_of(transform)[1] for transform in transforms])
+    return bool(np.abs(mounts - mounts[0]).max() < SAME)
 
 
 def vehicle_poses(bag: Bag, tree: FrameTree, vehicle_frame: str) -> list[VehiclePoses]:
@@ -149,45 +204,60 @@ def vehicle_poses(bag: Bag, tree: FrameTree, vehicle_frame: str) -> list[Vehicle
         if child_T_vehicle is None:
             lost.append(f"{topic} ({child})")
         else:
-            found.append(VehiclePoses(bag, topic, (ODOMETRY, child_T_vehicle), f"{topic} (odometry of {child})"))
+            found.append(VehiclePoses(bag, topic, ((ODOMETRY, ""), child_T_vehicle), f"{topic} (odometry of {child})"))
     for topic in bag.topics(TF):
         if not topic.endswith("tf_static"):
             found += _of_tree(bag, topic, tree, vehicle_frame)
-    found += [VehiclePoses(bag, topic, (POSE,), f"{topic} (poses)") for topic in bag.topics(POSE)]
+    found += [VehiclePoses(bag, topic, ((POSE, ""),), f"{topic} (poses)") for topic in bag.topics(POSE)]
     if lost and not found:
         raise ValueError(f"no static transform links to {vehicle_frame} the frame of the odometry {', '.join(lost)}")
     return found
 
 
 def _of_tree(bag: Bag, topic: str, tree: FrameTree, vehicle_frame: str) -> list[VehiclePoses]:
-    """Poses from a topic of transforms, if any of them leads from the vehicle to a world."""
-    start_ns = int(bag.times_ns(topic)[0])
-    parents = {
-        frame_name(one.child_frame_id): frame_name(one.header.frame_id)
-        for message in bag.messages(topic, start_ns, start_ns + 2 * WINDOW_NS)
-        for one in message.transforms
-    }
-    links: list[str | Matrix] = []
-    frame, passed = vehicle_frame, [vehicle_frame]
-    while frame != WORLD:
-        if frame in parents:
-            links.insert(0, frame)
-            frame = parents[frame]
-        elif (mounted := tree.parent(frame)) is not None:
-            frame, parent_T_frame = mounted
-            links.insert(0, parent_T_frame)
-        else:
-            break
-        if frame in passed:
-            raise ValueError(f"{topic}: the frames {' -> '.join([*passed, frame])} are a loop")
-        passed.append(frame)
-    if not any(isinstance(link, str) for link in links):
-        return []
-    return [VehiclePoses(bag, topic, links, f"{topic} ({vehicle_frame} in {frame})")]
+    """Poses from a topic of transforms, in each frame that they lead to from the vehicle; the best first."""
+    sampled = _sampled_transforms(bag, topic)
+    counts = {edge: len(transforms) for edge, transforms in sampled.items()}
+    moving = {edge: count for edge, count in counts.items() if not _never_changes(sampled[edge])}
+    # Of a vehicle that stood still all the time, all transforms look as if they were mounts.
+    still = tree.without(counts)
+    ways = _ways_to_worlds(moving, tree, vehicle_frame) or _ways_to_worlds(counts, still, vehicle_frame)
+    above = [f"{parent} -> {child}" for parent, child in counts if child in still.mounted_with(vehicle_frame)]
+    if above and not ways:
+        raise ValueError(f"{topic}: {', '.join(above)}: the transforms from {vehicle_frame} upward are a loop")
+    return [VehiclePoses(bag, topic, way, f"{topic} ({vehicle_frame} in {world})") for world, way in ways.items()]
 
 
-def _series(poses: Mapping[int, Matrix]) -> PoseSeries:
+def _ways_to_worlds(moving: Mapping[Edge, int], tree: FrameTree, vehicle_frame: str) -> dict[str, list[Edge | Matrix]]:
+    """Each frame that moves in no other -> links from it to the vehicle; `odom` first, then that of most messages.
+
+    Transforms that move are followed from child to parent, mounts both ways; every frame is reached by the fewest.
+    """
+    ways: dict[str, list[Edge | Matrix]] = {vehicle_frame: []}
+    rates: dict[str, tuple[bool, int]] = {}
+    queue = [vehicle_frame]
+    for frame in queue:
+        way = ways[frame]
+        here = tree.mounted_with(frame)
+        is_world = frame == WORLD or not any(child in here for _, child in moving)
+        if way and isinstance(way[0], tuple) and is_world:
+            rates[frame] = frame == WORLD, min(moving[link] for link in way if isinstance(link, tuple))
+            continue
+        onward: list[tuple[str, Edge | Matrix]] = [(edge[0], edge) for edge in moving if edge[1] == frame]
+        onward += [(there, invert(here_T_there)) for there, here_T_there in tree.neighbors(frame)]
+        for there, link in onward:
+            if there not in ways:
+                ways[there] = [link, *way]
+                queue.append(there)
+    return {world: ways[world] for world in sorted(rates, key=lambda world: rates[world], reverse=True)}
+
+
+def _series(stamped: Sequence[tuple[int, Matrix]]) -> PoseSeries:
+    poses, apart_m = dict[int, Matrix](), 0.0
+    for time_ns, pose in stamped:
+        apart_m = max(apart_m, float(np.linalg.norm(poses.get(time_ns, pose)[:3, 3] - pose[:3, 3])))
+        poses[time_ns] = pose
     times_ns = np.array(sorted(poses), dtype=np.int64)
     sorted_poses = np.array([poses[int(time_ns)] for time_ns in times_ns])
     wxyz = np.array([quaternion_from_rotation(pose[:3, :3]) for pose in sorted_poses])
-    return PoseSeries(times_ns, sorted_poses[:, :3, 3], wxyz)
+    return PoseSeries(times_ns, sorted_poses[:, :3, 3], wxyz, apart_m)
