@@ -9,8 +9,9 @@ import torch
 import trimesh
 from torch.utils.data import DataLoader
 
+from torchcover import nearest
 from torchcover.data import SimulatedFrames, collate_frames
-from torchcover.simulation import Scenario, Simulator, SurfaceReference, patches
+from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, SurfaceReference, patches
 
 from .small_worlds import AHEAD, ALL_HEIGHTS, EGO, FLOOR, agrees, box, scenario, sums
 
@@ -223,3 +224,24 @@ def test_the_surface_is_cut_once_a_world(monkeypatch):
 def test_what_makes_no_sense_is_refused(options, message):
     with pytest.raises(ValueError, match=message):
         SurfaceReference(**{"areas": (AHEAD,), **options})
+
+
+def test_what_is_hidden_from_a_roadside_rig_counts_as_not_detected():
+    """A wall of 4 m, 10 m from a mast of 6 m, hides the ground to x = 30 m from all that looks from the mast."""
+    wall = {"name": "wall", "shape": {"type": "box", "size_m": [0.5, 100, 4]}, "poses": [{"x_m": 10}]}
+    floor = {"name": "floor", "shape": {"type": "plane", "size_m": [300, 300]}, "ground": True}
+    mast = {"shape": {"type": "cylinder", "radius_m": 0.1, "height_m": 6}, "pose": {}}
+    road = Scenario.model_validate({"name": "s", "ego": mast, "bodies": [floor, wall]})
+    lidar = {"type": "lidar", "name": "top", "mount": {"z_m": 6.2}, "channels": 64, "vertical_fov_deg": [-60, 0],
+             "horizontal_fov_deg": 360, "columns": 256, "max_range_m": 200}  # fmt: skip
+    rig = Rig.model_validate({"name": "roadside", "sensors": [lidar]})
+    frames = SimulatedFrames(road, rig, steps=1)
+    x_m, y_m, _ = frames[0].reference.T
+    behind = (x_m > 11) & (x_m < 25) & (y_m.abs() < 20)
+    assert behind.sum() > 100
+    assert nearest(frames[0].reference[behind], frames[0].sensor).distance.min() > 0.4
+    assert frames.reference_record["notes"][-1].startswith("Reference positions: anywhere in the regions")
+    with pytest.raises(ValueError, match="looks from the mast of this roadside rig"):
+        SimulatedFrames(road, rig, steps=1, reference_sensor=PaperReference())
+    on_car = SimulatedFrames("courtyard", "front_roof_32", steps=1).reference_sensor
+    assert (on_car.over_areas, on_car.shell_m) == (False, 0.5)

@@ -35,6 +35,8 @@ LONGEST_M = 100.0
 # Smaller robots exist with any proportions; no car is shorter.
 SHORTEST_CAR_M = 2.0
 SHORTEST_M = 0.2
+# A body that is higher than so many times its length and width is a mast, and no car on its nose.
+MAST_SLENDERNESS = 5.0
 # A vehicle that is moved down onto the ground by more than this is worth a warning; less is rounding in its file.
 LOWERED_M = 0.01
 
@@ -70,7 +72,7 @@ def warn_of_mover(owner: str, mesh: Mesh, category: str) -> None:
         _warn(owner, (x, y, z), f"far too large{' for a vehicle on a road' if on_roads else ''}; {UNITS}")
     elif on_roads and longest_m < SHORTEST_M:
         _warn(owner, (x, y, z), "too small for a vehicle: is its `metres_per_unit` that of its file?")
-    elif on_roads and longest_m > SHORTEST_CAR_M and max(y, z) > x:
+    elif on_roads and longest_m > SHORTEST_CAR_M and max(y, z) > x and z < MAST_SLENDERNESS * max(x, y):
         _warn(owner, (x, y, z), f"wider than long; {WIDE}" if y > z else f"higher than long; {HIGH}")
 
 

@@ -1,6 +1,7 @@
 """A rig: the sensors of a vehicle, where they are mounted, and what carries them."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
@@ -8,6 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import Field, PlainValidator, TypeAdapter, ValidationInfo, model_validator
 
 from torchcover.files import as_yaml, write_durably
+from torchcover.geometry import BoundingBox
 from torchcover.simulation.bodies import Body, Shape, VehicleShape, body_called, merge
 from torchcover.simulation.documents import BuiltIn, Document, NameOrFile, is_file_name
 from torchcover.simulation.kinds import SENSORS
@@ -137,6 +139,35 @@ def _written(sensor: Sensor) -> dict[str, Any]:
         same = LidarModel.load(sensor.model).model_dump(mode="json", exclude={"name", "description"})
         return {key: value for key, value in keys.items() if key not in same or same[key] != value}
     return keys
+
+
+@dataclass(frozen=True)
+class RoadsideParams:
+    """When a rig counts as one on a mast beside the road.
+
+    Args:
+        min_height_m: Its highest sensor is at least so high, above the sensors of most cars and robots.
+        slenderness: That height is more than so many times the length and the width of its body, as of a mast;
+        above_body_m: or the sensor is so much higher than its body, as where the mast was left out.
+    """
+
+    min_height_m: float = 2.5
+    slenderness: float = 2.0
+    above_body_m: float = 2.0
+
+
+def is_roadside(rigs: Iterable[Rig], ego: BoundingBox, params: RoadsideParams = RoadsideParams()) -> bool:
+    """Whether a rig is on a mast rather than on a vehicle, by the heights of its sensors and the size of its body.
+
+    Example:
+        >>> car = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))
+        >>> is_roadside([Rig.load("kitti")], car)
+        False
+    """
+    top_m = max((sensor.mount.z_m for rig in rigs for sensor in rig.sensors), default=0.0)
+    length_m, width_m, _ = ego.size_m
+    is_slender = top_m > params.slenderness * max(length_m, width_m)
+    return top_m >= params.min_height_m and (is_slender or top_m > ego.upper_m[2] + params.above_body_m)
 
 
 def with_ego(scenario: Scenario, rigs: Mapping[str, Rig], vehicle: str | Path | None = None) -> Scenario:

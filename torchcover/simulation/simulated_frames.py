@@ -19,9 +19,10 @@ from torchcover.frames.source import FrameDataset
 from torchcover.geometry.arrays import Float32, Float64, Int64
 from torchcover.simulation.instant import SensorScan
 from torchcover.simulation.kinds import REFERENCE_SENSORS
+from torchcover.simulation.paper_reference import PaperReference
 from torchcover.simulation.reference_sensor import ReferenceSensor
 from torchcover.simulation.regions_of_interest import Asked, RegionsOfInterest
-from torchcover.simulation.rig import Rig, with_ego
+from torchcover.simulation.rig import Rig, is_roadside, with_ego
 from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.sensor import Sensor
 from torchcover.simulation.shapes import Mesh
@@ -107,7 +108,7 @@ class SimulatedFrames(FrameDataset):
         self.simulator = Simulator(
             world,
             carried,
-            reference_sensor,
+            _fit_to_rigs(reference_sensor, carried, world),
             seed=seed,
             every_s=every_s,
             kept_bytes=kept_bytes,
@@ -200,6 +201,8 @@ class SimulatedFrames(FrameDataset):
         """The reference sensor, the time between two frames; notes on ground, traffic and rays that the ego ends."""
         traffic, ego = self.scenario.traffic, self.ego_mesh()
         words = [self.simulator.ground_words, traffic.drawn_words if traffic else ""]
+        if getattr(self.reference_sensor, "over_areas", False):
+            words.append("Reference positions: anywhere in the regions, for the rig is on a mast and not on a vehicle.")
         for name, rig in self.rigs.items():
             self_hits = describe_self_hits(rig.sensors, rig.own_mesh(ego))
             words.append(f"{name}: {self_hits}" if self_hits and len(self.rigs) > 1 else self_hits)
@@ -227,7 +230,8 @@ class SimulatedFrames(FrameDataset):
     def with_reference_sensor(self, reference_sensor: ReferenceSensor) -> Self:
         """The same instants as another reference sensor sees them; the geometry is built once for both."""
         other = copy.copy(self)
-        other.simulator = self.simulator.with_reference_sensor(reference_sensor)
+        fitted = _fit_to_rigs(reference_sensor, self.rigs, self.scenario)
+        other.simulator = self.simulator.with_reference_sensor(fitted)
         return other
 
     def __len__(self) -> int:
@@ -265,6 +269,18 @@ class SimulatedFrames(FrameDataset):
             drawn_points=None if drawn is None else torch.from_numpy(drawn[[label.number for label in found]]),
             bottom_heights_m=torch.from_numpy(self.simulator.bottom_heights_m(index, found)),
         )
+
+
+def _fit_to_rigs(sensor: ReferenceSensor, rigs: Mapping[str, Rig], scenario: Scenario) -> ReferenceSensor:
+    """The reference sensor, with positions over all regions if a rig is on a mast beside the road."""
+    if not is_roadside(rigs.values(), scenario.ego_box()):
+        return sensor
+    if isinstance(sensor, PaperReference):
+        raise ValueError(
+            "reference paper: it looks from the mast of this roadside rig, so that what is hidden from both is in no "
+            "number; use the reference surface, which looks from anywhere in the regions then"
+        )
+    return sensor.for_roadside() if isinstance(sensor, SurfaceReference) else sensor
 
 
 def of_rigs(rigs: Mapping[str, Rig], scans: Mapping[str, Sequence[SensorScan]]) -> dict[str, Any]:

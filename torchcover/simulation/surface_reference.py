@@ -1,7 +1,7 @@
 """A reference sensor that asks the surface itself: which of it is seen from beside and above the ego."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Self, get_args
 
 import numpy as np
@@ -46,13 +46,16 @@ class SurfaceReference:
         rays: About how many rays there are in all, one for each point drawn.
         places: How many places share the rays of a step.
         bands_m: Height bands (low, high) in metres; half-open, as areas are. They may overlap too.
-        shell_m: Thickness of the shell around the ego in which the places are.
+        shell_m: Thickness of the shell around the ego in which the places are; `over_areas`, how far they lie from the
+            ego at most.
         max_range_m: Farther points are not seen.
         band_frame: What heights are measured from: "ground", the local ground (`LocalGround`), or "vehicle", z = 0 of
             the vehicle frame.
         object_points: How many more points at least are drawn on each object (`World.objects`) whose surface lies
             within that range of the places, in any area and at any height, from all places together; in addition to
             `rays`.
+        over_areas: Whether the places are uniform over all areas instead, up to the height of the ego, as for a rig on
+            a mast: from there the shell sees the same as the rig, and what is hidden from both is in no number.
 
     Raises:
         ValueError: No area or no band, one with inverted or infinite bounds or below the ground, no ray, no place, a
@@ -77,6 +80,7 @@ class SurfaceReference:
     max_range_m: float = 250.0
     object_points: int = 0
     band_frame: BandFrame = DEFAULT_BAND_FRAME
+    over_areas: bool = False
 
     def __post_init__(self) -> None:
         if not self.areas:
@@ -104,6 +108,10 @@ class SurfaceReference:
         """One that asks about some areas, with 16,384 rays if it is not told how many."""
         rays = DEFAULT_RAYS if rays is None else rays
         return cls(asked.areas, rays, bands_m=asked.bands_m, band_frame=asked.grid.band_frame)
+
+    def for_roadside(self) -> Self:
+        """The same sensor with places over all areas."""
+        return replace(self, over_areas=True, shell_m=float(np.hypot(*np.abs(self.areas).max(axis=(0, 2)))))
 
     def scan(self, surroundings: Surroundings) -> ReferenceScan:
         """Draw points, and keep those that are seen; see `ReferenceSensor.scan`."""
@@ -147,6 +155,10 @@ class SurfaceReference:
         return Bounds(*np.concatenate([areas, ends_m], axis=2).swapaxes(0, 1))
 
     def _pose(self, ego: BoundingBox, generator: np.random.Generator) -> Float64:
+        if self.over_areas:
+            areas_m = np.array(self.areas)
+            lower_m, upper_m = areas_m[:, :, 0].min(axis=0), areas_m[:, :, 1].max(axis=0)
+            return rigid(np.eye(3), generator.uniform([*lower_m, 0.0], [*upper_m, ego.upper_m[2]]))
         return rigid(np.eye(3), position_in_shell(ego, self.shell_m, generator))
 
     def _gathered(self, looks: list[tuple[SurfacePoints, Sight]], objects: int, redrawn: int) -> ReferenceScan:
