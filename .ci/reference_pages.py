@@ -58,7 +58,8 @@ def on_files(files, config):
 
 
 def on_page_markdown(markdown, **_):
-    """On the site, the notebook is a page."""
+    """On the site, the notebook is a page, and what lies beside `docs` is named, not linked."""
+    markdown = re.sub(r"\[([^\]]*)\]\(\.\./(?:SECURITY|THIRD_PARTY_NOTICES)\.md\)", r"\1", markdown)
     return markdown.replace("](notebook.ipynb)", "](notebook.md)")
 
 
@@ -68,7 +69,7 @@ def first_page():
     text = re.sub(r"\]\(docs/([^)]*)\)", lambda link: f"]({link[1]})", text)
     text = text.replace("](measured)", "](measured/README.md)")
     # What is not part of the site is named, not linked.
-    return re.sub(r"\[([^\]]*)\]\((CONTRIBUTING|CHANGELOG)\.md\)", r"\1 (\2.md)", text)
+    return re.sub(r"\[([^\]]*)\]\((CONTRIBUTING|CHANGELOG|SECURITY|THIRD_PARTY_NOTICES)\.md\)", r"\1 (\2.md)", text)
 
 
 def notebook():

@@ -181,6 +181,7 @@ def _check_size(header: _Header, body: bytes) -> None:
 def _columns(path: Path, header: _Header, axes: Sequence[int], body: bytes) -> Points:
     """Records stand one after the other; compressed, all values of one field do, then those of the next."""
     starts = [0, *accumulate(header.field_bytes)]
+    columns: list[tuple[bytes | memoryview, int, int]]
     if header.encoding == "binary":
         check_rest(body[header.points * header.record_bytes :])
         columns = [(body, starts[axis], header.record_bytes) for axis in axes]
