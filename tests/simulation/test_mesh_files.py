@@ -148,6 +148,16 @@ def test_objects_and_materials_that_are_named_let_rays_pass(tmp_path):
         read("glass", "paint").mesh()
 
 
+@pytest.mark.parametrize("opacity", ["d 0.3", "Tr 0.7"])
+def test_materials_of_mtl_files_have_names_and_an_opacity(tmp_path, opacity):
+    (tmp_path / "a.mtl").write_text(f"newmtl paint\nKd 1 0 0\nd 1\nnewmtl glass\nKd 0 0 1\n{opacity}\n")
+    vertices = "".join(f"v {x} {y} 0\n" for x, y in [(0, 0), (1, 0), (1, 1), (0, 1)])
+    (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{vertices}usemtl paint\nf 1 2 3\nusemtl glass\nf 1 3 4\n")
+    mesh = MeshFile(type="mesh", path=tmp_path / "a.obj")
+    assert (len(mesh.mesh().faces), mesh.clear_materials()) == (2, ["glass"])
+    assert len(mesh.model_copy(update={"transparent": ("glass",)}).mesh().faces) == 1
+
+
 def test_a_camera_behind_glass_is_told_how_to_look_through_it(tmp_path):
     """A closed car of glass sides: the message names the material and the key, and with the key it looks out."""
     box = Box(type="box", size_m=(4.0, 2.0, 1.5)).mesh()

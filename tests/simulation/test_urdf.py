@@ -192,6 +192,13 @@ def test_lens_distortion_and_noise_of_a_camera_are_applied(robot_of):
     assert "c: cy is counted from the top of the image; Gazebo Classic 10 counts from below." in robot.notes
 
 
+def test_a_resolution_below_one_ray_leaves_one(robot_of):
+    lidar = LIDAR.format("l", "", 1.0).replace(
+        "<samples>3</samples>", "<samples>1</samples><resolution>0.1</resolution>"
+    )
+    assert robot_of(CHASSIS, on("base", lidar)).sensors[0]["channels"] == 1
+
+
 def test_settings_that_are_not_applied_are_named(robot_of):
     plugin = "<plugin><min_range>0.9</min_range><updateRate>20.0</updateRate><topic>x</topic></plugin>"
     lens = "<lens><type>equidistant</type></lens><visibility_mask>7</visibility_mask></camera>"

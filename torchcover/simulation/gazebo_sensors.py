@@ -146,13 +146,8 @@ def _read_lidar(
     block = next((block for tag in ("lidar", "ray") if (block := sensor.find(tag)) is not None), None)
     if block is None:
         raise ValueError(f"{what}: <lidar> or <ray> is missing")
-    columns, rows = (
-        round(
-            _read_number(block, f"scan/{axis}/samples", what, usual)
-            * _read_number(block, f"scan/{axis}/resolution", what, 1.0)
-        )
-        for axis, usual in (("horizontal", None), ("vertical", 1.0))
-    )
+    columns = _read_samples(block, "horizontal", what)
+    rows = _read_samples(block, "vertical", what, usual=1.0)
     left, right = (_read_number(block, f"scan/horizontal/{end}_angle", what) for end in ("min", "max"))
     low, high = (_read_number(block, f"scan/vertical/{end}_angle", what, 0.0) for end in ("min", "max"))
     spread_deg = math.degrees(right - left) * columns / max(columns - 1, 1)
@@ -170,6 +165,13 @@ def _read_lidar(
     _note_visibility_mask(block, name, notes)
     sensor_T_middle = rigid(rotation_from_euler(math.degrees((left + right) / 2), 0.0, 0.0), np.zeros(3))
     yield keys, frames[""] @ sensor_T_middle
+
+
+def _read_samples(block: Element, axis: str, what: str, usual: float | None = None) -> int:
+    """Read the number of rays along an axis: its samples times its resolution, one at least."""
+    samples = _read_number(block, f"scan/{axis}/samples", what, usual)
+    samples *= _read_number(block, f"scan/{axis}/resolution", what, 1.0)
+    return max(round(samples), int(samples > 0))
 
 
 def _read_cameras(

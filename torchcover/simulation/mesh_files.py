@@ -89,8 +89,9 @@ def _read_parts(path: Path) -> Iterator[tuple[NDArray[np.float64], NDArray[np.in
 
 def _is_clear(material: object) -> bool:
     """Whether a glTF material blends with what is behind it, or an MTL material is not opaque."""
-    dissolve = (getattr(material, "kwargs", None) or {}).get("d", [1.0])
-    return getattr(material, "alphaMode", None) == "BLEND" or float(dissolve[0]) < 1.0
+    keys = getattr(material, "kwargs", None) or {}
+    opacity = float(keys["d"][-1]) if "d" in keys else 1.0 - float(keys["tr"][0]) if "tr" in keys else 1.0
+    return getattr(material, "alphaMode", None) == "BLEND" or opacity < 1.0
 
 
 def _obj_with_triangles(data: bytes) -> bytes:
