@@ -1,9 +1,9 @@
 """Are results safe from kills? Every command, killed at each of its file operations, and real runs killed at random.
 
 Every run is a fork of this process, so that it need not import anything, into a folder that holds an earlier result.
-A copy of that folder just before each operation is what a kill leaves there. What a reader then finds is *the earlier*
-result, *the new* one, perhaps without its maps, or neither: *lost*. Of a recording, which has no earlier one, it is
-lost if what is there is read although it is a part, or `--resume` does not make it whole.
+A copy of that folder just before each operation is what a kill leaves there. A reader then finds *the earlier* result,
+*the new* one, perhaps without its maps, or is told that the folder is *incomplete*; anything else is *mixed*. A recording
+has no earlier one; it is mixed if a part of it is read, or `--resume` does not complete it.
 """
 
 import argparse
@@ -30,7 +30,7 @@ from tests.placement.surfaces import Surface
 from torchcover.cli import app, search_run
 from torchcover.data import open_recording
 from torchcover.evaluation import result
-from torchcover.files import SUMMARY, claimed, reads
+from torchcover.files import SUMMARY, BadFileError, read_manifest, reads
 from torchcover.placement import SearchPlan
 
 SPACE = """name: roof
@@ -69,7 +69,7 @@ EARLIER = {"evaluate --resume": ("--steps", "1")}
 OTHERWISE = ("--seed", "1")
 REAL = ("evaluate", "front_roof_32", "--scenario", "urban", "--steps", "4", "--workers", "2")
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
-VERDICTS = ("the earlier", "the new", "lost")
+VERDICTS = ("the earlier", "the new", "incomplete", "mixed")
 DOCUMENTS = {
     "rig": RIG,
     "other": RIG.replace("name: r", "name: other").replace("z_m: 2.0", "z_m: 2.4"),
@@ -101,10 +101,10 @@ def main():
             rows.append((name, *killed))
             print(f"{name}: {killed}", file=sys.stderr, flush=True)
         os.chdir("/")
-    table(("command", "file operations", "the earlier", "the new", "lost"), rows)
+    table(("command", "file operations", *VERDICTS), rows)
     print()
-    table(("real runs, killed at random", "runs", "the earlier", "the new", "lost"), at_random)
-    print(f"\nLost: {sum(row[-1] for row in (*rows, *at_random))}")
+    table(("real runs, killed at random", "runs", *VERDICTS), at_random)
+    print(f"\nMixed: {sum(row[-1] for row in (*rows, *at_random))}")
 
 
 def run(command, out, *options):
@@ -148,9 +148,9 @@ def killed_recording(command):
     assert code == 0
     frames, found = frames_of(whole), Counter()
     for out in (place / "killed" / str(at) for at in range(count)):
-        name = {None: "the earlier", frames: "the new"}.get(frames_of(out), "lost")
+        name = {None: "the earlier", frames: "the new"}.get(frames_of(out), "mixed")
         went_on = operations_of(lambda out=out: run(command, out, "--resume"))[1] == 0
-        found[name if went_on and frames_of(out) == frames else "lost"] += 1
+        found[name if went_on and frames_of(out) == frames else "mixed"] += 1
     return count, *(found[name] for name in VERDICTS)
 
 
@@ -199,18 +199,25 @@ def files_of(out):
 
 
 def verdict(out, earlier, whole):
-    """What a reader finds, and still does once all files are in their places."""
-    verdicts = set()
-    for _ in range(2):
+    """What a reader finds of all files that the results list."""
+    found, incomplete = {}, False
+    for name in {**earlier, **whole}:
         try:
-            found = files_of(out)
-        except (OSError, ValueError, KeyError):
-            found = {}
-        mixed = [name for name in found if found[name] == earlier.get(name) != whole.get(name)]
-        verdicts.add("the earlier" if found == earlier else "lost" if mixed or not found else "the new")
-        with claimed(out):
-            pass
-    return verdicts.pop() if len(verdicts) == 1 else "lost"
+            found[name] = content(out / name)
+        except FileNotFoundError:
+            continue
+        except BadFileError as error:
+            if "an incomplete result" not in str(error):
+                return "mixed"
+            incomplete = True
+    if incomplete:
+        return "incomplete"
+    manifest = read_manifest(out / SUMMARY) or {"files": {}}
+    found = {name: found.get(name) for name in (*manifest["files"], SUMMARY)}
+    if found == earlier:
+        return "the earlier"
+    is_mixed = any(text is None or text == earlier.get(name) != whole.get(name) for name, text in found.items())
+    return "mixed" if is_mixed else "the new"
 
 
 if __name__ == "__main__":

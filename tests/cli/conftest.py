@@ -9,7 +9,7 @@ import pytest
 from torchcover.cli import app
 
 # Of a file that is aside, or is no result.
-ASIDE = (".partial_", ".unfinished_", ".lock")
+ASIDE = (".torchcover_", ".unfinished_")
 opened = []
 
 

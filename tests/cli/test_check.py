@@ -25,7 +25,7 @@ def test_the_exit_code_is_the_verdict_on_all(torchcover, worlds, requirements, c
     assert all(state in printed for state in states)
     out = worlds / "out" / "check"
     record = json.loads((out / "summary.json").read_text())
-    assert (record["met"], record["files"]) == (not code, ["junit.xml"])
+    assert (record["met"], list(record["files"])) == (not code, ["junit.xml"])
     assert [one["state"] for one in record["rigs"]["low"]] == states
     assert record["rigs"]["low"][0]["margin"] == record["rigs"]["low"][0]["value"] - 5
     (suite,) = ElementTree.parse(out / "junit.xml").getroot()

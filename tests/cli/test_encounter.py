@@ -29,7 +29,7 @@ def test_rigs_side_by_side_in_words_and_files(torchcover, worlds, monkeypatch):
         assert words in printed
     out = worlds / "out" / "encounters"
     record = json.loads((out / "summary.json").read_text())
-    assert record["files"] == ["encounters.csv", "report.html", "encounters.png"]
+    assert list(record["files"]) == ["encounters.csv", "report.html", "encounters.png"]
     assert [(row["encounter"], row["speed_kmh"], row["rig"]) for row in record["rows"]][:2] == [
         ("child: yaw_deg 90", 10.0, "low"), ("child: yaw_deg 90", 10.0, "both")]  # fmt: skip
     assert len(record["rows"]) == len((out / "encounters.csv").read_text().splitlines()) - 1 == 8

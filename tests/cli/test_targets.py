@@ -29,7 +29,7 @@ def test_what_is_seen_is_said_and_written(call, worlds):
     assert (ended, error) == (0, "")
     assert "dome sees adult" in " ".join(printed.split())
     record = json.loads((worlds / "out" / "summary.json").read_text())
-    assert record["files"] == ["targets.csv", "targets.npz", "report.html", "targets.png"]
+    assert list(record["files"]) == ["targets.csv", "targets.npz", "report.html", "targets.png"]
 
 
 @pytest.mark.parametrize(

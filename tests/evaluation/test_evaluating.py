@@ -395,12 +395,12 @@ def test_numbers_are_safe_and_listed_although_a_map_could_not_be_written(tmp_pat
         torchcover.evaluate(frames=Single(), cell_m=8.0, steps=2).save(tmp_path)
     after = contents(tmp_path)
     assert set(after) == {"coverage.npz", "summary.csv", "summary.json"}
-    assert json.loads(after["summary.json"])["files"] == ["coverage.npz", "summary.csv"]
+    assert list(json.loads(after["summary.json"])["files"]) == ["coverage.npz", "summary.csv"]
 
 
 def test_what_a_killed_process_left_aside_is_cleared(tmp_path):
-    (tmp_path / ".partial_left").mkdir()
-    (tmp_path / ".partial_left" / "coverage.npz").write_bytes(b"half")
+    (tmp_path / ".torchcover_left").mkdir()
+    (tmp_path / ".torchcover_left" / "coverage.npz").write_bytes(b"half")
     torchcover.evaluate(frames=Single(), cell_m=8.0, steps=1).save(tmp_path)
     assert not [name for name in contents(tmp_path) if name.startswith(".")]
 

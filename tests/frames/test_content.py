@@ -78,7 +78,7 @@ def test_of_a_recording_it_is_names_sizes_times_and_poses(tmp_path, change):
     shutil.move(folder, tmp_path / "elsewhere")
     folder = tmp_path / "elsewhere"
     (folder / "out").mkdir()
-    (folder / "out" / ".lock").touch()  # results are no part of it
+    (folder / "out" / "checkpoint.npz").touch()  # results are no part of it
     assert ChosenRigs(RecordedFrames(folder), {"A": "a"}).content == before
     assert ChosenRigs(RecordedFrames(folder), {"A": "b"}).content != before
     cloud = folder / "rigs" / "a" / "f1.npy"

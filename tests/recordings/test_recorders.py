@@ -11,7 +11,7 @@ from tests.killing import operations_of
 from torchcover import Rig
 from torchcover.data import RecordedFrames, SimulatedFrames, open_recording, write_recording
 from torchcover.detection import box_visibility
-from torchcover.files import BadFileError, noted
+from torchcover.files import RECORDING, WRITING, BadFileError, read_manifest
 from torchcover.geometry import rotation_from_euler, rotation_from_quaternion
 from torchcover.geometry.rigid import quaternion_from_rotation
 from torchcover.recordings.formats.kitti_files import BODY, read_calibration, read_labels
@@ -202,7 +202,7 @@ def until(step, stop):
 
 def texts(folder):
     """Its files by name; what is in those that say no time."""
-    files = [path for path in folder.rglob("[!.]*") if path.is_file() and ".whole" not in path.parts]
+    files = [path for path in folder.rglob("[!.]*") if path.is_file() and path.name != RECORDING]
     return {path.relative_to(folder): path.suffix == ".npz" or path.read_bytes() for path in files}
 
 
@@ -256,7 +256,7 @@ def test_a_recording_has_the_frames_that_were_written(tmp_path):
     with pytest.raises(ValueError, match=r"of 2 frames \(recording.json\), and 1 are missing, such as 000001; copy or"):
         RecordedFrames(tmp_path)
     (tmp_path / "training" / "recording.json").write_text("[]")
-    with pytest.raises(BadFileError, match=r"recording.json: frames are needed, by their names; it says none"):
+    with pytest.raises(BadFileError, match=r"recording.json: a list of files with their sizes, and the names of the frames, are needed"):
         RecordedFrames(tmp_path)
     (tmp_path / "training" / "recording.json").unlink()  # as if another tool had written it
     assert len(open_recording(tmp_path).names) == 2
@@ -272,10 +272,11 @@ def test_a_kill_at_any_file_operation_costs_a_frame_at_most(tmp_path, monkeypatc
     assert (count > 40, code) == (True, 0)
     kept = set()
     for folder in (copies / str(at) for at in range(count)):
-        if noted(folder):
+        manifest = read_manifest(folder / RECORDING) or {}
+        if manifest.get(WRITING):
             with pytest.raises(ValueError, match="a part of a recording"):
                 open_recording(folder)
-            kept.add(len(noted(folder)) - 1)
+            kept.add(len(manifest.get("steps", ())))
         with contextlib.suppress(ValueError, FileNotFoundError):  # of nothing that is known: it had not begun
             assert len(open_recording(folder).names) == 2
         write_recording(frames, folder, resume=True)

@@ -153,9 +153,9 @@ def _on_signals() -> Callable[[Sequence[int]], None]:
             for stream in terminals:  # or an error in writing would be the end
                 os.dup2(nowhere, stream)
         if name == "SIGINT" and len(arrived) > 1:
-            from torchcover.files import written_since  # which nobody needs who asks for help
+            from torchcover.files import list_written  # which nobody needs who asks for help
 
-            files = written_since(start_s)
+            files = list_written(start_s)
             kept = f"kept is {', '.join(map(str, files))}" if files else "nothing of this run is kept"
             cursor = "\x1b[?25h" * (2 in terminals)  # a bar hides it
             os.write(2, f"{cursor}\ntorchcover: ended at once: {kept}\n".encode())

@@ -30,7 +30,7 @@ def study(
     """Find the setting for a wanted error: what each costs, how far it is off, and how many steps it needs."""
     from torchcover.cli.printing import print_study
     from torchcover.evaluation import Settings, StudyPlan, error_against_time, rank_count
-    from torchcover.files import claimed
+    from torchcover.files import lock_folder
 
     if rank_count() > 1:
         raise ValueError("study measures run times, which several ranks would change: run it without torchrun")
@@ -40,7 +40,7 @@ def study(
         raise ValueError(f"study does not take {', '.join(sorted(unused))}; it takes {', '.join(STUDY_SETTINGS)}")
     fewer = "rays" not in settings and settings.get("reference") != "paper"
     plan = StudyPlan(Settings(rig, steps=steps, **settings), StudyPlan.others if fewer else ())
-    with claimed(out):
+    with lock_folder(out):
         found = error_against_time(plan, progress=True)
         files = found.save(out)
     print_study(found, files, out)
@@ -64,14 +64,14 @@ def record(
     """Write what a simulated rig sees as a recording, for other tools and for `evaluate --frames`."""
     from torchcover.evaluation import Settings
     from torchcover.evaluation.task import simulation
-    from torchcover.files import noted
+    from torchcover.files import RECORDING, read_manifest
     from torchcover.simulation import Rig, write_recording
 
     frames = simulation(Settings(Rig.load(rig), steps=steps, **settings), boxes=True).frames
     try:
         write_recording(frames, out, layout, resume=resume, progress=_with_a_bar)
     except BaseException:
-        if kept := noted(out)[1:]:
+        if kept := (read_manifest(out / RECORDING) or {}).get("steps"):
             typer.echo(f"torchcover: {len(kept):,} of {len(frames):,} frames are kept; go on by --resume", err=True)
         raise
     typer.echo(f"Wrote {len(frames)} frames to {out}; read them with: torchcover evaluate --frames {out}")
@@ -281,12 +281,12 @@ def report(
     """One page for a meeting: would it see a child, what fails with a sensor, how far does it see, and how soon."""
     from torchcover.cli.printing import print_files, print_verdict
     from torchcover.evaluation import report
-    from torchcover.files import claimed
+    from torchcover.files import lock_folder
     from torchcover.report import Terminal
 
     if budget is not None:
         settings["budget_s"] = parsed_budget(budget)
-    with claimed(out):
+    with lock_folder(out):
         found = report(
             rigs,
             scenario,
@@ -321,10 +321,10 @@ def check(
     """Check requirements, as in CI. Exit code 0: all are checked and met; 1: one is not met, or not checked."""
     from torchcover.cli.printing import print_files, print_verdict
     from torchcover.evaluation import check
-    from torchcover.files import claimed
+    from torchcover.files import lock_folder
     from torchcover.report import Terminal, print_whole
 
-    with claimed(out):
+    with lock_folder(out):
         found = check(rigs, requirements, scenario, progress=True, **settings)
         written = found.save(out)
     print_whole(found.tables())
@@ -369,7 +369,7 @@ def encounter(
         met_in_traffic,
         save_encounters,
     )
-    from torchcover.files import claimed
+    from torchcover.files import lock_folder
     from torchcover.report import Terminal, check_film, print_whole, write_film
 
     criterion = Criterion(**{name: settings.pop(name) for name in Criterion.__annotations__})
@@ -385,7 +385,7 @@ def encounter(
             raise ValueError(f"{each.opts[0]}: of no use with {what}; leave it out")
     if film is not None:
         check_film(film)
-    with claimed(out):
+    with lock_folder(out):
         if frames is not None:
             found = met_in_recording(frames, criterion)
         elif scenario is not None:

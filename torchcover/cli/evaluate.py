@@ -1,7 +1,6 @@
 """The commands `evaluate` and `compare`; and what else is run and shared like them. Heavy things are imported late."""
 
 import inspect
-import json
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -201,7 +200,7 @@ def checkpoint_in(out: Path, settings: Settings, *, resume: bool) -> "Checkpoint
     for each in map(checkpoint.within, file_stems(list(settings.mixture))) if settings.mixture else [checkpoint]:
         if resume and not each.path.exists():
             typer.echo(f"torchcover: {each.path} is not there: the run starts with its first step", err=True)
-        elif each.path.exists() and not resume and not _complete(each.path.parent):
+        elif each.path.exists() and not resume and not _complete(out):
             typer.echo(
                 f"torchcover: {each.path} will be replaced; to go on from it, stop now and add --resume", err=True
             )
@@ -210,19 +209,18 @@ def checkpoint_in(out: Path, settings: Settings, *, resume: bool) -> "Checkpoint
 
 def _complete(out: Path) -> bool:
     """Whether the run of a folder has come to its end; nothing of it is lost if another one takes its place."""
-    try:
-        return json.loads((out / "summary.json").read_text(encoding="utf-8"))["complete"] is True
-    except (OSError, ValueError, LookupError, TypeError):
-        return False
+    from torchcover.files import SUMMARY, read_manifest
+
+    return (read_manifest(out / SUMMARY) or {}).get("complete") is True
 
 
 @contextmanager
 def sharing(out: Path) -> "Iterator[Ranks | None]":
     """The folder, kept for this run; and the processes that share it, the first of which writes."""
     from torchcover.evaluation import joined_ranks
-    from torchcover.files import claimed
+    from torchcover.files import lock_folder
 
-    with joined_ranks() as ranks, claimed(out) if ranks is None or ranks.rank == 0 else nullcontext():
+    with joined_ranks() as ranks, lock_folder(out) if ranks is None or ranks.rank == 0 else nullcontext():
         yield ranks
 
 

@@ -8,7 +8,7 @@ import typer
 
 from torchcover.cli.printing import print_files
 from torchcover.evaluation.cores import usual_workers
-from torchcover.files import SUMMARY, claimed
+from torchcover.files import SUMMARY, lock_folder
 from torchcover.placement import (
     ChoiceSpace,
     PlacementSearch,
@@ -48,7 +48,7 @@ def run(
     """
     find = _chosen if CHOICE_KEY in read_mapping(path) else _searched
     settings = {"workers": usual_workers(FRAMES, settings.get("worlds", WORLDS), whole=False), **settings}
-    with claimed(out):
+    with lock_folder(out):
         report = find(path, out, resume=resume, **settings).report
         written = report.save(out, files=files)
         if not resume:

@@ -12,7 +12,7 @@ from rich.progress import track
 from torchcover.evaluation import cameras_of, rig_pictures, scenario_pictures, vehicle_picture
 from torchcover.evaluation.settings import DEFAULT_SCENARIO
 from torchcover.evaluation.task import as_called
-from torchcover.files import BadFileError, write_durably
+from torchcover.files import BadFileError, write_atomically
 from torchcover.report import Terminal, check_film, write_film
 from torchcover.simulation import Scenario, builtin_names
 from torchcover.simulation.bodies import Body, Vehicle, VehicleShape, body_called, describe_windows, mover_mesh
@@ -107,7 +107,7 @@ def _say(console: Terminal, description: str) -> None:
 def _write(console: Terminal, stem: Path, figures: Iterable[tuple[str, Figure]]) -> None:
     for suffix, figure in figures:
         path = stem.with_name(f"{stem.name}{suffix}.png")
-        write_durably(path, partial(figure.savefig, dpi=figure.dpi))
+        write_atomically(path, partial(figure.savefig, dpi=figure.dpi))
         console.print(f"Wrote {path}", markup=False, soft_wrap=True)
 
 

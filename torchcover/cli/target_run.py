@@ -8,7 +8,7 @@ from typing import Any
 from torchcover.cli.printing import print_files, print_verdict
 from torchcover.evaluation import save_targets, survey_target
 from torchcover.evaluation.target_survey import places_table, sides_table, target_verdict
-from torchcover.files import claimed
+from torchcover.files import lock_folder
 from torchcover.report import Terminal, print_whole
 from torchcover.simulation import Rig
 from torchcover.targets import Heading, Raster, TargetMap
@@ -31,7 +31,7 @@ def run(
         ValueError: An option or a file that cannot be used.
         FileNotFoundError: An unknown name or file.
     """
-    with claimed(out):
+    with lock_folder(out):
         seen = survey_target(
             rig,
             target,

@@ -23,7 +23,7 @@ from torchcover.coverage.region_sums import PlaceNumbers, PlaceSums
 from torchcover.coverage.regions import Places, Region, check_regions, regions_within, shown_places
 from torchcover.coverage.summary import RegionSummary, summarise
 from torchcover.estimation import Estimate, Quantity
-from torchcover.files import data_frame, data_set, small_html, write_durably
+from torchcover.files import data_frame, data_set, small_html, write_atomically
 
 if TYPE_CHECKING:
     import pandas
@@ -314,7 +314,7 @@ class Coverage:
 
         What `load` gives back has the same numbers, errors and differences to the last bit.
         """
-        write_durably(Path(path), partial(write_coverage, self))
+        write_atomically(Path(path), partial(write_coverage, self))
 
     @classmethod
     def load(cls, path: str | Path) -> "Coverage":

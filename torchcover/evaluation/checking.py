@@ -29,7 +29,7 @@ from torchcover.evaluation.requirements import (
 from torchcover.evaluation.settings import DEFAULT_SCENARIO, Settings
 from torchcover.evaluation.target_survey import free_space, in_world
 from torchcover.evaluation.task import AnyRig, AnyScenario, distinct_names, loaded, spread_s, task_of
-from torchcover.files import Publication
+from torchcover.files import AtomicOutput
 from torchcover.report import PageTable, Words, json_record
 from torchcover.simulation import Rig, Scenario, with_ego
 from torchcover.simulation.camera_sensor import CameraSensor
@@ -109,7 +109,7 @@ class Checked:
 
     def save(self, folder: str | Path) -> list[Path]:
         """Write `junit.xml` and `summary.json` into a folder, which is made if it does not exist."""
-        with Publication(Path(folder)) as written:
+        with AtomicOutput(Path(folder)) as written:
             written.add_text("junit.xml", self.junit)
             written.publish(self.record)
         return written.paths

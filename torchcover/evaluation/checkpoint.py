@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.evaluation.observers import CoverageObserver, Stateful
-from torchcover.files import check_kind, check_memory, read_npz, reads, write_durably
+from torchcover.files import check_kind, check_memory, read_npz, reads, write_atomically
 
 EVERY_S = 60.0
 # Writing takes at most this share of the time, though it may take seconds.
@@ -159,12 +159,12 @@ def _change(here: str, there: str) -> str:
 
 
 def write_checkpoint(path: Path, header: Mapping[str, Any], states: Mapping[str, State]) -> None:
-    """Write it in the place of the one that is there; see `write_durably`.
+    """Write it in the place of the one that is there; see `write_atomically`.
 
     The header is for JSON: `identity`, and `run` with `RUN_KEYS`. States are of tensors, numbers, texts, None, and
     lists and dicts of them. TypeError: a state holds something else. OSError: there is no room.
     """
-    write_durably(path, partial(write_states, header=header, states=states))
+    write_atomically(path, partial(write_states, header=header, states=states))
 
 
 @reads("a checkpoint")

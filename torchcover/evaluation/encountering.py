@@ -20,7 +20,7 @@ from torchcover.evaluation.result_page import words_of
 from torchcover.evaluation.settings import FILES, wanted_files
 from torchcover.evaluation.target_survey import free_space
 from torchcover.evaluation.task import AnyRig, as_called
-from torchcover.files import Publication
+from torchcover.files import AtomicOutput
 from torchcover.geometry import invert, outlines_at
 from torchcover.recordings import Recording, open_recording
 from torchcover.report import ActorMark, Page, PagePicture, StandingFaces, draw_scene, page_html
@@ -226,7 +226,7 @@ def save_encounters(found: Sightings, folder: str | Path, *, files: str | Iterab
     """
     wanted = wanted_files(files)
     record = {"verdict": list(encounters_verdict(found)), **found.record()}
-    with Publication(Path(folder)) as written:
+    with AtomicOutput(Path(folder)) as written:
         with held_back():
             if "numbers" in wanted:
                 written.add("encounters.csv", found.write_csv)

@@ -18,7 +18,7 @@ from torchcover.evaluation.result_page import check_drawable, left_out
 from torchcover.evaluation.settings import Settings, load_contrib
 from torchcover.evaluation.target_error import TargetWatch
 from torchcover.evaluation.task import CALLER, Task, casting_device, run_identity, usable_device
-from torchcover.files import claimed
+from torchcover.files import lock_folder
 from torchcover.frames import BadFrameError, FrameSource
 from torchcover.simulation import Asked, SimulatedFrames
 from torchcover.simulation.memory import check_fits
@@ -153,7 +153,7 @@ def _observed(
             place = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(Path(checkpoint))
             place = place.of(ranks.rank if ranks else 0)
             if ranks is None or ranks.rank == 0:
-                stack.enter_context(claimed(place.path.parent))
+                stack.enter_context(lock_folder(place.path.parent))
             journal = Journal(place, identity, _states(coverage, others, watch))
         run = observe(
             task.frames,

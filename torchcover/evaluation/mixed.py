@@ -1,5 +1,6 @@
 """Rigs in several kinds of world, and in a mixture of them."""
 
+import json
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -12,11 +13,12 @@ from matplotlib.figure import Figure
 from torchcover.coverage import Coverage, Mixture
 from torchcover.evaluation.checkpoint import Checkpoint
 from torchcover.evaluation.measuring import measured
+from torchcover.evaluation.progress import held_back
 from torchcover.evaluation.result import Result
 from torchcover.evaluation.result_page import page_tables
 from torchcover.evaluation.settings import FILES, Settings, wanted_files
 from torchcover.evaluation.task import task_of
-from torchcover.files import Publication, csv_text
+from torchcover.files import SUMMARY, AtomicOutput, csv_text
 from torchcover.report import RENDERERS, CoverageTable, PageTable, file_stems, in_common_first, page_html
 from torchcover.report.renderers.records import records_of
 
@@ -120,16 +122,23 @@ class MixedResult(Result):
                 `report.html` and `summary.json`.
             files: As in `Result.save`.
         """
-        record, folders = self.record, file_stems(list(self.worlds))
-        each = zip(folders, self.worlds.values(), strict=True)
-        parts = [world.save(Path(folder) / name, files=files) for name, world in each]
-        with Publication(Path(folder)) as written:
-            if "numbers" in wanted_files(files):
-                written.add_text("summary.csv", self._csv())
-            if "page" in wanted_files(files):
+        wanted, record = wanted_files(files), self.record
+        worlds = dict(zip(file_stems(list(self.worlds)), self.worlds.values(), strict=True))
+        with AtomicOutput(Path(folder)) as written:
+            with held_back():  # the numbers are safe before anything ends this
+                for stem, world in worlds.items():
+                    if "numbers" in wanted:
+                        world.add_numbers(written, f"{stem}/")
+                    written.add_text(f"{stem}/{SUMMARY}", json.dumps(world.record, indent=2, allow_nan=False) + "\n")
+                if "numbers" in wanted:
+                    written.add_text("summary.csv", self._csv())
+                written.publish(record)
+            for stem, world in worlds.items():
+                world.add_pictures(written, wanted, f"{stem}/")
+            if "page" in wanted:
                 written.add_text("report.html", page_html(self.page))
             written.publish(record)
-        return [*chain.from_iterable(parts), *written.paths]
+        return written.paths
 
     def _csv(self) -> str:
         tables = {**{name: world.table for name, world in self.worlds.items()}, MIXTURE: self.table}

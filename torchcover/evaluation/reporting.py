@@ -26,7 +26,7 @@ from torchcover.evaluation.target_survey import (
     target_verdict,
 )
 from torchcover.evaluation.task import AnyRig, AnyScenario, distinct_names, loaded, simulation
-from torchcover.files import Publication, small_html
+from torchcover.files import AtomicOutput, small_html
 from torchcover.report import Page, escaped, file_stems, on_range, page_html, ranges_of, too_few
 from torchcover.simulation import Rig
 from torchcover.simulation.scenario import Mover
@@ -129,7 +129,7 @@ class Report:
             The files.
         """
         wanted, record = wanted_files(files), self.record
-        with Publication(Path(folder)) as written:
+        with AtomicOutput(Path(folder)) as written:
             with held_back():  # the numbers are safe before anything ends this
                 if "numbers" in wanted:
                     self._add_numbers(written)
@@ -142,7 +142,7 @@ class Report:
             written.publish(record)
         return written.paths
 
-    def _add_numbers(self, files: Publication) -> None:
+    def _add_numbers(self, files: AtomicOutput) -> None:
         self.result.add_numbers(files)
         for stem, one in zip(file_stems(list(self.targets)), self.targets.values(), strict=True):
             files.add(f"targets/{stem}.csv", partial(write_csv, one))

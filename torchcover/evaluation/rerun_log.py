@@ -12,7 +12,7 @@ from torch import Tensor
 from torchcover.coverage import BevGrid
 from torchcover.coverage.quantity import RADIUS, by_area
 from torchcover.detection import Boxes
-from torchcover.files import write_durably
+from torchcover.files import write_atomically
 from torchcover.frames import Frame
 from torchcover.neighbors import blind_spot_radius
 from torchcover.report import ColourScale, SensorView, scale_of
@@ -96,7 +96,7 @@ class RerunLog:
             for name, values in zip(grid.heights, layer.values.cpu().numpy(), strict=True):
                 self._stream.log([rig, "radius", name], _cells(values, grid, scale), static=True)
         self._stream.disconnect()
-        write_durably(self._path, self._unfinished.replace)
+        write_atomically(self._path, self._unfinished.replace)
 
 
 def frustum(view: SensorView) -> list[NDArray[np.float64]]:

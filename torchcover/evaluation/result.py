@@ -1,6 +1,6 @@
 """What an evaluation gives: numbers, maps and files of one rig or several. All that `report` is asked for is here."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -27,7 +27,7 @@ from torchcover.evaluation.result_page import (
 )
 from torchcover.evaluation.settings import FILES, wanted_files
 from torchcover.evaluation.target_error import TargetError, outcome
-from torchcover.files import Publication, data_frame, small_html
+from torchcover.files import AtomicOutput, data_frame, small_html
 from torchcover.report import (
     RENDERERS,
     CoverageTable,
@@ -264,28 +264,32 @@ class Result:
         for path in self.inputs:
             if path.resolve().parent in (Path(folder).resolve(), Path(folder).resolve() / "coverage"):
                 raise ValueError(f"{folder}: holds {path}, which is compared, and would lose it; choose another folder")
-        with Publication(Path(folder)) as written:
+        with AtomicOutput(Path(folder)) as written:
             with held_back():  # the numbers are safe before anything ends this, and before the maps are drawn
                 if "numbers" in wanted:
                     self.add_numbers(written)
                 summary = self.record
                 written.publish(summary)
-            if "page" in wanted:
-                written.add_text("report.html", page_html(self.page))
-            for stem, figure in self.maps() if "maps" in wanted else ():
-                written.add_figure(f"maps/{stem}.png", figure)
+            self.add_pictures(written, wanted)
             written.publish(summary)
         return written.paths
 
-    def add_numbers(self, files: Publication) -> None:
-        """Write the files of numbers; a rig may be called what no file can be."""
+    def add_pictures(self, files: AtomicOutput, wanted: Container[str], folder: str = "") -> None:
+        """Write the page and the maps, if they are wanted; `folder` is a prefix that ends with a slash."""
+        if "page" in wanted:
+            files.add_text(f"{folder}report.html", page_html(self.page))
+        for stem, figure in self.maps() if "maps" in wanted else ():
+            files.add_figure(f"{folder}maps/{stem}.png", figure)
+
+    def add_numbers(self, files: AtomicOutput, folder: str = "") -> None:
+        """Write the files of numbers; `folder` is a prefix that ends with a slash. Names of rigs become file names."""
         stems = file_stems(list(self.coverages)) if self.is_comparison else ["coverage"]
         for stem, coverage in zip(stems, self.coverages.values(), strict=True):
-            files.add(f"coverage/{stem}.npz" if self.is_comparison else "coverage.npz", coverage.save)
-        files.add_text("summary.csv", RENDERERS["csv"](self.table))
+            files.add(f"{folder}coverage/{stem}.npz" if self.is_comparison else f"{folder}coverage.npz", coverage.save)
+        files.add_text(f"{folder}summary.csv", RENDERERS["csv"](self.table))
         if self.metrics is not None:
             for name, text in self.metrics.files.items():
-                files.add_text(name, text)
+                files.add_text(f"{folder}{name}", text)
 
     @property
     def _outcome(self) -> tuple[dict[str, Any] | None, list[str]]:

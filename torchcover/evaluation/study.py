@@ -24,7 +24,7 @@ from torchcover.evaluation.measuring import measured
 from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.target_error import MIN_STEPS, rounded_up
 from torchcover.evaluation.task import simulation
-from torchcover.files import Publication, end_with_parent, reporting_stopped
+from torchcover.files import AtomicOutput, end_with_parent, reporting_stopped
 from torchcover.report import (
     PageTable,
     Words,
@@ -268,7 +268,7 @@ class Study:
     def save(self, folder: str | Path) -> list[Path]:
         """Write `work_precision.png` and `summary.json` into a folder, which is made if need be."""
         figure = self.draw()
-        with Publication(Path(folder)) as files:
+        with AtomicOutput(Path(folder)) as files:
             files.add("work_precision.png", figure.savefig)
             files.publish(self.record)
         return files.paths

@@ -13,7 +13,7 @@ from torchcover.evaluation.progress import held_back
 from torchcover.evaluation.result_page import rig_document, sensor_views, words_of
 from torchcover.evaluation.settings import FILES, wanted_files
 from torchcover.evaluation.task import AnyRig, AnyScenario, as_called, spread_s
-from torchcover.files import Publication
+from torchcover.files import AtomicOutput
 from torchcover.report import (
     ColourScale,
     Line,
@@ -132,7 +132,7 @@ def save_targets(
     """
     wanted = wanted_files(files)
     record = target_record(seen)
-    with Publication(Path(folder)) as written:
+    with AtomicOutput(Path(folder)) as written:
         with held_back():  # the numbers are safe before anything ends this
             if "numbers" in wanted:
                 written.add("targets.csv", lambda path: write_csv(seen, path))

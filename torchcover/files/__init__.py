@@ -1,10 +1,14 @@
 """What the system gives: the door of all readers, its error, files that are whole, NumPy's, tables, processes."""
 
+from torchcover.files.atomic_files import AtomicOutput as AtomicOutput
+from torchcover.files.atomic_files import write_atomically as write_atomically
 from torchcover.files.bad_file import BadFileError as BadFileError
 from torchcover.files.bad_file import TooLargeError as TooLargeError
+from torchcover.files.bad_file import allow_links as allow_links
 from torchcover.files.bad_file import check_memory as check_memory
 from torchcover.files.bad_file import check_regular as check_regular
 from torchcover.files.bad_file import decode as decode
+from torchcover.files.bad_file import find_link_roots as find_link_roots
 from torchcover.files.bad_file import most_gb as most_gb
 from torchcover.files.bad_file import naming as naming
 from torchcover.files.bad_file import read_short_text as read_short_text
@@ -13,6 +17,14 @@ from torchcover.files.bad_file import said_gb as said_gb
 from torchcover.files.csv_tables import csv_text as csv_text
 from torchcover.files.csv_tables import read_csv as read_csv
 from torchcover.files.json_tables import read_json_table as read_json_table
+from torchcover.files.locks import list_written as list_written
+from torchcover.files.locks import lock_folder as lock_folder
+from torchcover.files.locks import refuse_links as refuse_links
+from torchcover.files.manifests import RECORDING as RECORDING
+from torchcover.files.manifests import SUMMARY as SUMMARY
+from torchcover.files.manifests import WRITING as WRITING
+from torchcover.files.manifests import find_changed as find_changed
+from torchcover.files.manifests import read_manifest as read_manifest
 from torchcover.files.native import exr_image as exr_image
 from torchcover.files.native import laz_points as laz_points
 from torchcover.files.native import lzf_block as lzf_block
@@ -33,14 +45,6 @@ from torchcover.files.own_process import apart as apart
 from torchcover.files.processes import end_with_parent as end_with_parent
 from torchcover.files.processes import is_stopped as is_stopped
 from torchcover.files.processes import reporting_stopped as reporting_stopped
-from torchcover.files.publishing import RECORDING as RECORDING
-from torchcover.files.publishing import SUMMARY as SUMMARY
-from torchcover.files.publishing import Publication as Publication
-from torchcover.files.publishing import claimed as claimed
-from torchcover.files.publishing import noted as noted
-from torchcover.files.publishing import settled as settled
-from torchcover.files.publishing import write_durably as write_durably
-from torchcover.files.publishing import written_since as written_since
 from torchcover.files.shown import shown as shown
 from torchcover.files.xml_text import feed_xml as feed_xml
 from torchcover.files.xml_text import parse_xml as parse_xml

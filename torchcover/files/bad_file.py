@@ -3,18 +3,20 @@
 import math
 import os
 import stat
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
 from typing import Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 
-from torchcover.files.publishing import settled
+from torchcover.files.manifests import check_listed
 
 Arguments = ParamSpec("Arguments")
 Content = TypeVar("Content")
+
+_link_roots: dict[Path, list[Path]] = {}  # folders that links in each recording may lead to
 
 # Libraries quote what they choke on, which may be the whole file.
 MAX_REASON_CHARS = 500
@@ -57,7 +59,8 @@ def reads(
             IsADirectoryError: A folder.
             ImportError: A package that the reader needs is missing.
             BadFileError: Anything else: a device or a FIFO (which would never end), an empty file, a file that may not
-                be opened, one that needs more memory than `check_memory` allows, damaged content.
+                be opened, one that needs more memory than `check_memory` allows, damaged content, a link out of a
+                recording (see `allow_links`), a file of an incomplete result.
 
     Example:
         >>> import tempfile
@@ -77,11 +80,8 @@ def reads(
             path = Path(path)
             # Numbers of damaged files overflow; what they become is infinite or NaN, and judged as such.
             with naming(path, content), np.errstate(all="ignore"):
-                place = settled(path)
-                if place != path:
-                    with suppress(FileNotFoundError):  # another process is just putting it in its place
-                        return read(place, *args, **kwargs)
                 check_regular(path, content)
+                check_listed(path)
                 return read(path, *args, **kwargs)
 
         return door  # type: ignore[return-value]  # which would have the path without a name
@@ -111,8 +111,28 @@ def naming(path: Path, content: str) -> Iterator[None]:
         raise BadFileError(f"{path}: {reason}") from error
 
 
+def allow_links(recording: Path, roots: Iterable[Path] = ()) -> None:
+    """Refuse files of a recording from now on whose links lead out of it and of the roots."""
+    _link_roots[recording.absolute()] = [place.resolve() for place in (recording, *roots)]
+
+
+def find_link_roots(recording: Path) -> list[Path]:
+    """Return the roots that `allow_links` was given for a recording."""
+    return _link_roots.get(recording.absolute(), [])
+
+
+def _check_links(path: Path) -> None:
+    for recording, roots in _link_roots.items():
+        if not path.absolute().is_relative_to(recording):
+            continue
+        target = path.resolve()
+        if not any(target.is_relative_to(root) for root in roots):
+            raise ValueError(f"a link to {target}, outside of the recording; to read it, --allow-links {target.parent}")
+
+
 def check_regular(path: Path, content: str) -> None:
-    """Refuse what is no file, or an empty one."""
+    """Refuse what is no file, an empty one, or a link that leads out of a recording."""
+    _check_links(path)
     status = path.stat() if path.exists() else None
     if status is None:
         raise FileNotFoundError(f"{path}: no such file; {content} is needed")

@@ -16,7 +16,7 @@ from torchcover.evaluation import sensor_views
 from torchcover.evaluation.progress import held_back
 from torchcover.evaluation.result_page import rig_document, words_of
 from torchcover.evaluation.settings import FILES, wanted_files
-from torchcover.files import Publication, csv_text, data_frame, small_html
+from torchcover.files import AtomicOutput, csv_text, data_frame, small_html
 from torchcover.geometry.arrays import Float64
 from torchcover.placement.fresh import finite
 from torchcover.report import Page, PagePicture, PageRig, PageTable, page_html
@@ -68,7 +68,7 @@ class PlacementReport:
         """
         wanted = wanted_files(files)
         summary = {"torchcover": __version__, "complete": True, "sentence": self.sentence}
-        with Publication(Path(folder)) as written:
+        with AtomicOutput(Path(folder)) as written:
             with held_back():  # what was found is safe before anything ends this
                 if "numbers" in wanted:
                     self._add_numbers(written)
@@ -85,7 +85,7 @@ class PlacementReport:
             written.publish(summary)
         return written.paths
 
-    def _add_numbers(self, files: Publication) -> None:
+    def _add_numbers(self, files: AtomicOutput) -> None:
         for name, rig in self.rigs.items():
             files.add(name, rig.save)
         for name, rows in self.rows.items():

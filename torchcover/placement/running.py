@@ -15,7 +15,7 @@ from torchcover.evaluation import Checkpoint
 from torchcover.evaluation.checkpoint import Journal
 from torchcover.evaluation.pipeline import Run
 from torchcover.evaluation.progress import Progress, held_back
-from torchcover.files import BadFileError, claimed
+from torchcover.files import BadFileError, lock_folder
 from torchcover.placement.evaluation import OPTIMISER, RANDOM
 from torchcover.placement.fresh import FreshTest, amount, fresh_test
 from torchcover.placement.result import Pick, SearchResult
@@ -51,7 +51,7 @@ def run_search(
     """
     if search.evaluations:
         raise ValueError("search: one of which nothing was asked yet is needed; make another one")
-    with nullcontext() if out is None else claimed(out):
+    with nullcontext() if out is None else lock_folder(out):
         try:
             return _run(search, out, resume, progress, clock)
         finally:

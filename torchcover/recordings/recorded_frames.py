@@ -26,7 +26,7 @@ from torchcover.recordings.sweeps import Sweeps
 NO_GROUND = "Ground: none was found near the vehicle, so heights are z of the vehicle frame."
 SEEN_GROUND = "Ground: a height field through what all sensors saw of it; unknown farther than 10 m from that."
 # What a folder of results holds, during the run or after it.
-RESULTS = frozenset({".lock", "summary.json", "checkpoint.npz"})
+RESULTS = frozenset({"summary.json", "checkpoint.npz"})
 
 
 class RecordedFrames(FrameDataset):

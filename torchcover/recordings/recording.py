@@ -1,6 +1,5 @@
 """What every reader of recordings gives: scans of named sensors at instants, and where the vehicle was."""
 
-import json
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 
 from torchcover.cameras.calibration import Calibration
 from torchcover.detection.boxes import Boxes
-from torchcover.files import RECORDING, decode, reads, settled
+from torchcover.files import RECORDING, WRITING, read_manifest, reads
 from torchcover.geometry import BoundingBox
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.clouds.arrays import Points
@@ -246,21 +245,34 @@ def warn_of_missing_poses(path: Path, missing: Sequence[str], count: int) -> Non
         )
 
 
-def whole_recording(folder: Path) -> dict[str, Any] | None:
-    """What `recording.json` says of a recording that torchcover has written: `frames`, by name, and `content`.
+@reads("the manifest of a recording")
+def read_recording_manifest(path: Path) -> dict[str, Any]:
+    """Read `recording.json`, which lists the `files` of a recording that torchcover has written, and its `frames`.
 
-    Returns it; None where another tool has written the recording, or there is none. ValueError: its files are not in
-    their places, and may not be put there. BadFileError: a `recording.json` that cannot be read.
+    While it is written, `writing` is true, and `steps` are those that are complete.
+
+    Raises:
+        BadFileError: Another content.
     """
-    marker = folder / RECORDING
-    if settled(marker) != marker:
-        raise ValueError(f"{folder}: files of this recording are not in their places, and the folder is not writable")
-    return _read_marker(marker) if marker.exists() else None
+    manifest = read_manifest(path.resolve())  # a link was checked
+    if manifest is None or not isinstance(manifest.get("steps" if manifest.get(WRITING) else "frames"), list):
+        raise ValueError("a list of files with their sizes, and the names of the frames, are needed; record it again")
+    return {"content": {}, **manifest}
 
 
-@reads("the frames of a recording")
-def _read_marker(path: Path) -> dict[str, Any]:
-    said = json.loads(decode(path.read_bytes()))
-    if not isinstance(said, dict) or not isinstance(said.get("frames"), list):
-        raise ValueError("frames are needed, by their names; it says none")
-    return {"content": {}, **said}
+def whole_recording(folder: Path) -> dict[str, Any] | None:
+    """Read the manifest of a complete recording that torchcover has written; None of any other one.
+
+    Raises:
+        BadFileError: A `recording.json` that cannot be read.
+        ValueError: A part of a recording.
+    """
+    if not (folder / RECORDING).exists():
+        return None
+    manifest = read_recording_manifest(folder / RECORDING)
+    if manifest.get(WRITING):
+        raise ValueError(
+            f"{folder}: a part of a recording, {len(manifest['steps']):,} frames: whatever wrote it was ended; go on "
+            "with `torchcover record --resume`"
+        )
+    return manifest

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchcover.files import as_yaml, claimed, csv_text, write_durably
+from torchcover.files import AtomicOutput, as_yaml, csv_text
 from torchcover.geometry import (
     BoundingBox,
     HeightField,
@@ -156,11 +156,12 @@ def write_world(recording: Recording, folder: Path, *, steps: int | None = None)
     if rows:
         tables["movers"] = [("t", "id", "category", *BOX_COLUMNS[1:]), *rows]
     texts = {f"{name}.csv": csv_text(table) for name, table in tables.items()} | {"scenario.yaml": as_yaml(scenario)}
-    with claimed(folder):
+    with AtomicOutput(folder) as files:
         for name, mesh in bodies.items():
-            write_durably(folder / f"{name}.ply", partial(_export, mesh))
+            files.add(f"{name}.ply", partial(_export, mesh))
         for name, text in texts.items():
-            write_durably(folder / name, partial(Path.write_text, data=text, encoding="utf-8"))
+            files.add_text(name, text)
+        files.publish({"recording": str(recording.path), "found": told})
     return told
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import ValidationError
 from scipy.spatial import cKDTree
 
-from torchcover.files import Publication, as_yaml, parse_xml, reads
+from torchcover.files import AtomicOutput, as_yaml, parse_xml, reads
 from torchcover.geometry import BoundingBox, rigid, rotation_from_quaternion
 from torchcover.geometry.arrays import Float64
 from torchcover.simulation.bodies import merge
@@ -59,7 +59,7 @@ class Robot(NamedTuple):
         size = " x ".join(f"{length:.2f}" for length in np.ptp(self.body.vertices_m, axis=0))
         told = " ".join([f"{size} m, of a URDF.", *self.notes])
         part = {"name": "body", "shape": {"type": "mesh", "path": BODY}}
-        with Publication(Path(folder)) as written:
+        with AtomicOutput(Path(folder)) as written:
             written.add(BODY, partial(_write_ply, mesh=self.body))
             written.add_text(VEHICLE, as_yaml({"name": self.name, "description": told, "parts": [part]}))
             if self.sensors:

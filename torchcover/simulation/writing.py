@@ -6,10 +6,10 @@ import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
-from torchcover.files import RECORDING, Publication, noted
+from torchcover.files import RECORDING, WRITING, AtomicOutput
 from torchcover.recordings.recorders import RECORDERS
 from torchcover.recordings.recorders.recorder import RecordedStep, RecordingSetup
-from torchcover.recordings.recording import whole_recording
+from torchcover.recordings.recording import read_recording_manifest
 from torchcover.simulation.lidar import Lidar
 from torchcover.simulation.simulated_frames import SimulatedFrames
 
@@ -28,7 +28,7 @@ def write_recording(
 ) -> None:
     """Write what a simulated rig saw: clouds, the reference, boxes where the frames have them, mounts and poses.
 
-    It is a recording once all of it is there; until then it lies aside, and `recording.json` lists what belongs to it.
+    `recording.json` lists its files; until all of them are there, it says so, and the part is not read.
 
     Args:
         frames: A simulation of one rig.
@@ -57,29 +57,28 @@ def write_recording(
         raise ValueError(f"format {layout!r}: recordings are written as {' or '.join(RECORDERS)}")
     if len(frames.rigs) != 1:
         raise ValueError(f"a recording is of one rig; got {', '.join(frames.rigs)}")
-    files = Publication(folder, RECORDING, goes_on=True)
+    manifest = read_recording_manifest(folder / RECORDING) if (folder / RECORDING).exists() else {}
+    files = AtomicOutput(folder, RECORDING, manifest.get("files"))
     recorder = RECORDERS[layout](files.add, _setup(frames))
     content = {"layout": layout, **_hashes(frames.content)}
     names = [_name(index) for index in range(len(frames))]
-    if resume and (whole := whole_recording(folder)) is not None:
-        _check_same(folder, whole["content"], content, whole["frames"], names)
+    if resume and manifest and not manifest.get(WRITING):
+        _check_same(folder, manifest["content"], content, manifest["frames"], names)
         return
-    if folder.exists() and (not folder.is_dir() or any(folder.glob("[!.]*"))):
-        raise ValueError(f"{folder}: {'not empty' if folder.is_dir() else 'a file'}; a new or empty folder is needed")
-    if (part := noted(folder)) and not resume:
+    if manifest.get(WRITING) and not resume:
         raise ValueError(
-            f"{folder}: holds a part of a recording, {len(part) - 1:,} frames; go on with it (--resume), or choose "
-            "another folder"
+            f"{folder}: holds a part of a recording, {len(manifest['steps']):,} frames; go on with it (--resume), or "
+            "choose another folder"
         )
+    if not manifest.get(WRITING) and folder.exists() and (not folder.is_dir() or any(folder.glob("[!.]*"))):
+        raise ValueError(f"{folder}: {'not empty' if folder.is_dir() else 'a file'}; a new or empty folder is needed")
+    steps = list(manifest.get("steps", ()))
+    _check_same(folder, manifest.get("content", content), content, steps, names[: len(steps)])
     with files:
-        if not files.notes:
-            files.note({"content": content})
-        begun, *notes = files.notes
-        steps = [note["step"] for note in notes]
-        _check_same(folder, begun["content"], content, steps, names[: len(steps)])
+        files.publish({WRITING: True, "content": content, "steps": steps})
         for index in progress(range(len(steps), len(frames))):
             steps.append(recorder.write(_step(frames, index)))
-            files.note({"step": steps[-1]})
+            files.publish({WRITING: True, "content": content, "steps": steps})
         recorder.finish(steps)
         files.publish({"content": content, "frames": names})
 

@@ -1,11 +1,12 @@
 """The layouts of recordings, by name: a new one is a class and a line here."""
 
 import os
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
-from torchcover.files import RECORDING, noted
+from torchcover.files import RECORDING, allow_links, find_changed
 from torchcover.recordings.corrected import correct_recording
 from torchcover.recordings.formats import argoverse2, commonroad, nuscenes
 from torchcover.recordings.formats.argoverse2 import Argoverse2
@@ -52,12 +53,18 @@ FORMATS: dict[str, RecordingFormat] = {
 }
 
 
-def open_recording(path: str | os.PathLike[str], settings: RecordingSettings | None = None) -> Recording:
+def open_recording(
+    path: str | os.PathLike[str],
+    settings: RecordingSettings | None = None,
+    *,
+    link_roots: Sequence[str | os.PathLike[str]] = (),
+) -> Recording:
     """Open a recording; `RecordedFrames` makes frames of it.
 
     Args:
         path: Where it is.
         settings: How to read it; they win over `recording.yaml` in its folder.
+        link_roots: Other folders that links in the recording may lead to.
 
     Raises:
         FileNotFoundError: There is nothing at the path.
@@ -66,10 +73,16 @@ def open_recording(path: str | os.PathLike[str], settings: RecordingSettings | N
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such recording")
-    settings = merge_recording_settings(path, settings)
+    allow_links(path, map(Path, link_roots))
+    recording = _open_checked(path, merge_recording_settings(path, settings))
+    allow_links(recording.path, [path, *map(Path, link_roots)])
+    return recording
+
+
+def _open_checked(path: Path, settings: RecordingSettings) -> Recording:
     if settings.format is not None and settings.format not in FORMATS:
         raise ValueError(f"format {settings.format!r}: no such format of recordings; there are {', '.join(FORMATS)}")
-    names = _frames_written(path)
+    written = _read_manifest(path)
     for name, recording_format in FORMATS.items():
         if name != settings.format and (settings.format is not None or not recording_format.recognises(path)):
             continue
@@ -81,7 +94,7 @@ def open_recording(path: str | os.PathLike[str], settings: RecordingSettings | N
                 f"{path}: vehicle_frame, mounts and point_times are for bags; {name} has its own (a plain folder in "
                 "frames.yaml)"
             )
-        return correct_recording(_checked(recording_format(path), names), settings)
+        return correct_recording(_checked(recording_format(path), written), settings)
     known = "; ".join(f"{name}: {recording_format.layout}" for name, recording_format in FORMATS.items())
     raise ValueError(f"{path}: a recording of no known format{_below(path)}; known are {known}")
 
@@ -97,24 +110,28 @@ def _below(folder: Path) -> str:
     return f"; name one of those in it: {told}" if found else ""
 
 
-def _frames_written(path: Path) -> set[str] | None:
-    """The frames of a recording that torchcover has written; None of any other one."""
+def _read_manifest(path: Path) -> tuple[Path, dict[str, Any]] | None:
+    """Read the manifest of a recording that torchcover has written; None of any other one."""
     if not path.is_dir():  # a bag may be one file
         return None
-    for folder in (path, path / "training"):  # which is KITTI's
-        if notes := noted(folder):
-            raise ValueError(
-                f"{folder}: a part of a recording, {len(notes) - 1:,} frames: whatever wrote it was ended; go on with "
-                "`torchcover record --resume`"
+    manifests = ((folder, whole_recording(folder)) for folder in (path, path / "training"))  # which is KITTI's
+    return next(((folder, manifest) for folder, manifest in manifests if manifest is not None), None)
+
+
+def _checked(recording: Recording, written: tuple[Path, dict[str, Any]] | None) -> Recording:
+    """Compare a recording with its manifest: other frames are refused, other files are a warning."""
+    if written is None:
+        return recording
+    folder, manifest = written
+    names, there = set(manifest["frames"]), set(recording.names)
+    if names == there:
+        if changed := find_changed(folder, manifest["files"]):
+            more = f" and {len(changed) - BELOW:,} more" if len(changed) > BELOW else ""
+            warnings.warn(
+                f"{folder}: edited since it was recorded: {', '.join(changed[:BELOW])}{more} (missing, or of another "
+                "size)",
+                stacklevel=4,
             )
-        if whole := whole_recording(folder):
-            return set(whole["frames"])
-    return None
-
-
-def _checked(recording: Recording, names: set[str] | None) -> Recording:
-    there = set(recording.names)
-    if names is None or names == there:
         return recording
     missing, others = names - there, there - names
     what = f"{len(missing):,} are missing" if missing else f"{len(others):,} more are there"

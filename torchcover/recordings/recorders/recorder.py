@@ -38,7 +38,7 @@ class RecordedStep(NamedTuple):
     frame: Frame
 
 
-# Writes a file: its path within the folder, and what writes it to the path that it is given; see `Publication.add`.
+# Writes a file: its path within the folder, and what writes it to the path that it is given; see `AtomicOutput.add`.
 Add = Callable[[str, Callable[[Path], object]], None]
 
 

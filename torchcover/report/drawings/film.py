@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from torchcover.files import write_durably
+from torchcover.files import write_atomically
 
 WRITERS: dict[str, type[FFMpegWriter] | type[PillowWriter]] = {".gif": PillowWriter, ".mp4": FFMpegWriter}
 
@@ -44,7 +44,7 @@ def write_film(path: Path, figures: Iterable[Figure], *, per_s: float) -> None:
         figures: At least one, each drawn when it is its turn.
         per_s: How many of them a second shows.
     """
-    write_durably(path, partial(_write, figures, per_s))
+    write_atomically(path, partial(_write, figures, per_s))
 
 
 def _write(figures: Iterable[Figure], per_s: float, path: Path) -> None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.coverage import BevGrid, Coverage, check_paired
-from torchcover.files import write_durably
+from torchcover.files import write_atomically
 from torchcover.report.maps.arrays import draw_side_by_side
 from torchcover.report.maps.colours import difference_scale, scale_of
 from torchcover.report.maps.overlay import SensorView
@@ -102,7 +102,7 @@ def write_figures(figures: Iterable[Named], folder: str | Path) -> list[Path]:
     paths = []
     for name, figure in figures:
         paths.append(Path(folder, f"{name}.png"))
-        write_durably(paths[-1], partial(figure.savefig, dpi=figure.dpi))
+        write_atomically(paths[-1], partial(figure.savefig, dpi=figure.dpi))
     return paths
 
 
