@@ -11,6 +11,7 @@ def files_of(folder):
     """What was measured, by file; the time that it took aside."""
     summary = json.loads((folder / "summary.json").read_text())
     assert summary.pop("seconds") >= 0
+    summary["files"] = list(summary["files"])
     arrays = {path.name: path.read_bytes() for path in folder.rglob("coverage/*.npz")}
     arrays |= {path.name: path.read_bytes() for path in folder.glob("coverage.npz")}
     return summary, arrays

@@ -254,10 +254,10 @@ def read_recording_manifest(path: Path) -> dict[str, Any]:
     Raises:
         BadFileError: Another content.
     """
-    manifest = read_manifest(path.resolve())  # a link was checked
-    if manifest is None or not isinstance(manifest.get("steps" if manifest.get(WRITING) else "frames"), list):
+    manifest = {"content": {}, "steps": [], "frames": None, **(read_manifest(path.resolve()) or {})}
+    if not isinstance(manifest["steps"] if manifest.get(WRITING) else manifest["frames"], list):
         raise ValueError("a list of files with their sizes, and the names of the frames, are needed; record it again")
-    return {"content": {}, **manifest}
+    return manifest
 
 
 def whole_recording(folder: Path) -> dict[str, Any] | None:

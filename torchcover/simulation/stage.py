@@ -19,9 +19,9 @@ from torchcover.simulation.moving import Solids
 from torchcover.simulation.rig import Rig
 from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.scene import Scene
+from torchcover.simulation.scene_cache import SceneCache
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.sight import MountedSensor
-from torchcover.simulation.stored_worlds import StoredWorlds
 
 # Nearer than this is near enough, above or below.
 NEAR_M = 1.0
@@ -103,7 +103,7 @@ class Scenes:
     ) -> None:
         self.scenario = scenario
         self._device = device
-        self._worlds = StoredWorlds(scenario, seed, no_cache=no_cache)
+        self._cache = SceneCache(scenario, seed, no_cache=no_cache)
         self._kept_bytes = kept_bytes
         self._kept: dict[int, Scene] = {}
         self._solids = Solids()
@@ -117,7 +117,7 @@ class Scenes:
             self._make_room()
             if self._ego is None and self.scenario.traffic is not None:
                 self._ego = self.scenario.ego_mesh()
-            scene = Scene(self._worlds.world(run, self._ego), self._solids, self._device)
+            scene = Scene(self._cache.build(run, self._ego), self._solids, self._device)
         self._kept[run] = scene  # at the end: the first is the one that was asked for longest ago
         return scene
 

@@ -73,7 +73,7 @@ def write_recording(
     if not manifest.get(WRITING) and folder.exists() and (not folder.is_dir() or any(folder.glob("[!.]*"))):
         raise ValueError(f"{folder}: {'not empty' if folder.is_dir() else 'a file'}; a new or empty folder is needed")
     steps = list(manifest.get("steps", ()))
-    _check_same(folder, manifest.get("content", content), content, steps, names[: len(steps)])
+    _check_same(folder, manifest.get("content") or content, content, steps, names[: len(steps)])
     with files:
         files.publish({WRITING: True, "content": content, "steps": steps})
         for index in progress(range(len(steps), len(frames))):

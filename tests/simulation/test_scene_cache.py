@@ -1,15 +1,17 @@
 """Worlds on disk: the same to the bit as those that are built, whatever has become of the disk meanwhile."""
 
 import dataclasses
+import json
 import os
 import warnings
-import zlib
 
 import numpy as np
 import pytest
 
-from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, stored_worlds
-from torchcover.simulation.stored_worlds import BUDGET, StoredWorlds
+from torchcover.files import BadFileError
+from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, scene_cache
+from torchcover.simulation.scene_cache import SceneCache
+from torchcover.simulation.scene_file import read_scene
 from torchcover.simulation.traffic import Highway, Parking, Urban
 from torchcover.simulation.traffic.fleet import load_bodies
 
@@ -24,9 +26,9 @@ def lot(ego=EGO, **keys):
 @pytest.fixture(autouse=True)
 def disk(monkeypatch, tmp_path):
     """A disk for worlds, and nothing said so far: the files on it, and how often a world was built."""
-    monkeypatch.setenv(BUDGET, "1")
+    monkeypatch.setenv("TORCHCOVER_CACHE_GB", "1")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(stored_worlds, "_said", set())
+
     built, world = [], Scenario.world
 
     def counted(self, seed=0, episode=0, ego=None):
@@ -34,11 +36,11 @@ def disk(monkeypatch, tmp_path):
         return world(self, seed, episode, ego)
 
     monkeypatch.setattr(Scenario, "world", counted)
-    return lambda: sorted((tmp_path / "cache" / "torchcover" / "worlds").glob("*")), built
+    return lambda: sorted((tmp_path / "cache" / "torchcover" / "scenes").glob("*")), built
 
 
 def world_of(scenario, run=0, seed=0, **keys):
-    return StoredWorlds(scenario, seed, **keys).world(run, scenario.ego_mesh())
+    return SceneCache(scenario, seed, **keys).build(run, scenario.ego_mesh())
 
 
 def same(one, other):
@@ -60,8 +62,8 @@ def same(one, other):
 def test_a_world_from_disk_is_the_one_that_was_built_and_shares_its_bodies(disk, traffic):
     files, built = disk
     scenario = Scenario(name="drawn", traffic=traffic)
-    worlds, ego = StoredWorlds(scenario, 5), scenario.ego_mesh()
-    first, again = worlds.world(2, ego), worlds.world(2, ego)
+    worlds, ego = SceneCache(scenario, 5), scenario.ego_mesh()
+    first, again = worlds.build(2, ego), worlds.build(2, ego)
     assert built == [2]
     assert len(files()) == 1
     assert same(first, again)
@@ -106,7 +108,7 @@ def test_a_world_is_found_by_all_that_it_is_drawn_from_and_by_nothing_else(disk,
 def test_other_code_or_another_library_draws_anew(disk, monkeypatch, change):
     world_of(lot())
     if change == "code":
-        monkeypatch.setattr(stored_worlds, "_code", lambda: "other")
+        monkeypatch.setattr(scene_cache, "_hash_code", lambda: "other")
     else:
         monkeypatch.setattr(np, "__version__", "0")
     world_of(lot())
@@ -120,48 +122,89 @@ def harm(content, how):
         return b""
     if how == "not ours":
         return b"torchcover" * 99
-    at = {"a number": len(content) - 100, "a word": 40, "the length": 9}[how]
+    at = {"a number": 3 * len(content) // 4, "a word": 400}[how]
     return content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :]
 
 
-@pytest.mark.parametrize("how", ["a number", "a word", "the length", "cut short", "empty", "not ours"])
-def test_a_damaged_world_is_built_anew_and_said_once(disk, how):
+@pytest.mark.parametrize("how", ["a number", "a word", "cut short", "empty", "not ours", "another scene"])
+def test_a_damaged_scene_is_built_again_with_a_warning(disk, how):
     files, built = disk
-    whole = [world_of(lot(), run) for run in (0, 1)]
-    for path in files():
-        path.write_bytes(harm(path.read_bytes(), how))
-    with pytest.warns(UserWarning, match=r"^a world on disk is damaged, and built anew \(.*\.world: ") as said:
-        again = [world_of(lot(), run) for run in (0, 1)]
-    assert len(said) == 1
-    assert built == [0, 1, 0, 1]
-    assert same(again[0], whole[0])
-    assert same(again[1], whole[1])
-    world_of(lot())
-    assert len(built) == 4
-
-
-def test_the_file_of_another_world_is_none(disk):
-    files, built = disk
-    world_of(lot())
-    [first] = files()
-    world_of(lot(), 1)
-    [second] = set(files()) - {first}
-    second.write_bytes(first.read_bytes())
-    with pytest.warns(UserWarning, match="checksum"):
+    scene = world_of(lot())
+    [path] = files()
+    if how == "another scene":
         world_of(lot(), 1)
-    assert built == [0, 1, 1]
+        [other] = set(files()) - {path}
+        path.write_bytes(other.read_bytes())
+    else:
+        path.write_bytes(harm(path.read_bytes(), how))
+    built.clear()
+    with pytest.warns(UserWarning, match=r"a cached scene is not used \(.*\.npz: "):
+        assert same(world_of(lot()), scene)
+    world_of(lot())
+    assert built == [0]
 
 
-def test_what_others_wrote_runs_no_code(disk):
-    files, _ = disk
+@pytest.mark.parametrize("kind", ["|O", "<f8"])
+def test_a_scene_file_runs_no_code(disk, tmp_path, kind):
+    text = json.dumps(["a", [[kind, [1]]], [["system", "true"]]]).encode()
+    for numbers in (np.zeros(8, np.uint8), np.array([print], object)):
+        np.savez(tmp_path / "a.npz", text=np.frombuffer(text, np.uint8), numbers=numbers)
+        with pytest.raises(BadFileError, match=r"a\.npz: "):
+            read_scene(tmp_path / "a.npz", {})
+
+
+def special(path, kind, target):
+    """Make a path of the cache something that is not of it."""
+    if kind == "link":
+        path.symlink_to(target)
+    elif kind == "hard link":
+        path.hardlink_to(target)
+    elif kind == "FIFO":
+        os.mkfifo(path)
+    elif kind == "folder":
+        path.mkdir()
+    else:
+        path.write_bytes(bytes(100))
+
+
+NAMES = {"link": "a" * 64 + ".npz", "hard link": "b" * 64 + ".npz", "FIFO": "c" * 64 + ".npz",
+         "folder": "d" * 64 + ".npz", "file": "mine.npz", "longer": "e" * 65 + ".npz"}  # fmt: skip
+
+
+def test_what_is_not_of_the_cache_stays_and_does_not_stop_it(disk, monkeypatch, tmp_path):
+    files, built = disk
     world_of(lot())
     [path] = files()
-    for kind in ("|O", "<f8"):
-        text = f'[[["{kind}", [1]]], [["system", "true"]]]'.encode()
-        content = len(text).to_bytes(8, "little") + text + bytes(8)
-        path.write_bytes(zlib.crc32(content, zlib.crc32(path.stem.encode())).to_bytes(8, "little") + content)
-        with pytest.raises(ValueError, match=r"\.world: "):
-            stored_worlds._read(path, path.stem, {})
+    target = tmp_path / "target"
+    target.write_bytes(bytes(10_000_000))
+    for kind, name in NAMES.items():
+        special(path.with_name(name), kind, target)
+        os.utime(path.with_name(name), (0, 0), follow_symlinks=False)
+    before = [
+        (place.lstat().st_ino, place.lstat().st_mtime) for place in sorted(path.parent.glob("*")) if place != path
+    ]
+    monkeypatch.setenv("TORCHCOVER_CACHE_GB", str(2.5 * path.stat().st_size / 1e9))
+    for run in range(4):
+        world_of(lot(), run)
+    after = [(place.lstat().st_ino, place.lstat().st_mtime) for place in sorted(path.parent.glob("*"))]
+    assert set(before) <= set(after)
+    assert len(after) == len(before) + 2
+    assert (built, target.stat().st_size) == ([0, 1, 2, 3], 10_000_000)
+
+
+@pytest.mark.parametrize("kind", ["link", "hard link", "FIFO", "folder"])
+def test_a_scene_is_not_read_through_what_lies_under_its_name(disk, tmp_path, kind):
+    files, built = disk
+    scene = world_of(lot())
+    [path] = files()
+    path.rename(tmp_path / "target")
+    special(path, kind, tmp_path / "target")
+    content, stamp = (tmp_path / "target").read_bytes(), (tmp_path / "target").stat().st_mtime_ns
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a folder cannot be replaced
+        assert same(world_of(lot()), scene)
+    assert built == [0, 0]
+    assert ((tmp_path / "target").read_bytes(), (tmp_path / "target").stat().st_mtime_ns) == (content, stamp)
 
 
 def _age(files):
@@ -169,34 +212,33 @@ def _age(files):
         os.utime(path, (age, age))
 
 
-def test_those_that_nobody_asked_for_longest_go_but_none_of_this_run(disk, monkeypatch):
+def test_the_oldest_scenes_are_deleted_for_new_ones(disk, monkeypatch):
     files, built = disk
     for run in range(4):
         world_of(lot(), run)
     size = max(path.stat().st_size for path in files())
     _age(files())
-    world_of(lot(), 0)  # the oldest has been asked for again
-    monkeypatch.setenv(BUDGET, str(4.1 * size / 1e9))
-    world_of(lot(), 4)
-    assert len(files()) == 4
-    _age(files())
+    world_of(lot(), 0)  # which makes it the newest
     built.clear()
-    monkeypatch.setenv(BUDGET, str(2.1 * size / 1e9))
-    one_run = StoredWorlds(lot(), 0)
-    for run in (0, 7, 8, 9, 0, 7, 8):
-        one_run.world(run, lot().ego_mesh())
-    assert built == [7, 8, 9, 8]
-    assert len(files()) == 2
+    monkeypatch.setenv("TORCHCOVER_CACHE_GB", str(3.1 * size / 1e9))
+    world_of(lot(), 4)
+    assert len(files()) == 3
+    for run in (0, 3, 4):
+        world_of(lot(), run)
+    assert built == [4]
+    monkeypatch.setenv("TORCHCOVER_CACHE_GB", str(0.5 * size / 1e9))
+    world_of(lot(), 5)
+    assert len(files()) == 3  # it does not fit, and nothing is deleted for it
 
 
 def test_without_a_budget_nothing_lies_there(disk, monkeypatch):
     world_of(lot(), no_cache=True)
-    monkeypatch.setenv(BUDGET, "0")
+    monkeypatch.setenv("TORCHCOVER_CACHE_GB", "0")
     world_of(lot())
     assert disk[0]() == []
     for wrong in ("much", "-1", "nan"):
-        monkeypatch.setenv(BUDGET, wrong)
-        with pytest.raises(ValueError, match=BUDGET):
+        monkeypatch.setenv("TORCHCOVER_CACHE_GB", wrong)
+        with pytest.raises(ValueError, match="TORCHCOVER_CACHE_GB"):
             world_of(lot())
 
 
@@ -215,38 +257,40 @@ def a_file(monkeypatch, tmp_path):
 
 
 def read_only(monkeypatch, tmp_path):
-    monkeypatch.setattr(stored_worlds.os, "access", lambda *_: False)
-
-
-def full_from_the_start(monkeypatch, tmp_path):
-    monkeypatch.setattr(stored_worlds, "LEAST_FREE_BYTES", 1e30)
+    monkeypatch.setattr(scene_cache.os, "access", lambda *_: False)
 
 
 def full_at_once(monkeypatch, tmp_path):
     def full(aside, _):
         raise OSError(28, "No space left on device", str(aside))
 
-    monkeypatch.setattr(stored_worlds.os, "replace", full)
+    monkeypatch.setattr(scene_cache.os, "replace", full)
 
 
 def of_others(monkeypatch, tmp_path):
-    (tmp_path / "cache" / "torchcover" / "worlds").mkdir(parents=True)
-    (tmp_path / "cache" / "torchcover" / "worlds").chmod(0o777)
+    (tmp_path / "cache" / "torchcover" / "scenes").mkdir(parents=True)
+    (tmp_path / "cache" / "torchcover" / "scenes").chmod(0o777)
 
 
-@pytest.mark.parametrize("lacks", [no_home, a_file, read_only, full_from_the_start, full_at_once, of_others])
+def a_link(monkeypatch, tmp_path):
+    (tmp_path / "cache" / "torchcover").mkdir(parents=True)
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "cache" / "torchcover" / "scenes").symlink_to(tmp_path / "elsewhere")
+
+
+@pytest.mark.parametrize("lacks", [no_home, a_file, read_only, full_at_once, of_others, a_link])
 def test_without_a_disk_the_run_goes_on_with_one_remark(disk, monkeypatch, tmp_path, lacks):
     lacks(monkeypatch, tmp_path)
 
     def run():
-        worlds = StoredWorlds(lot(), 0)
+        worlds = SceneCache(lot(), 0)
         for number in (0, 1, 0):
-            worlds.world(number, lot().ego_mesh())
+            worlds.build(number, lot().ego_mesh())
         world_of(lot())
 
-    with pytest.warns(UserWarning, match=r"worlds are not kept on disk .* --set no_cache=true") as said:
+    with pytest.warns(UserWarning, match=r"scenes are not cached .* --set no_cache=true") as said:
         run()
-    assert len(said) == 1
+    assert len({str(warning.message) for warning in said}) == 1
     assert disk[1] == [0, 1, 0, 0]
     assert disk[0]() == []
 
@@ -256,11 +300,11 @@ def test_two_runs_write_the_same_world(disk, monkeypatch):
     replace, meanwhile = os.replace, []
 
     def late(source, target):
-        monkeypatch.setattr(stored_worlds.os, "replace", replace)
+        monkeypatch.setattr(scene_cache.os, "replace", replace)
         meanwhile.append(world_of(lot()))
         replace(source, target)
 
-    monkeypatch.setattr(stored_worlds.os, "replace", late)
+    monkeypatch.setattr(scene_cache.os, "replace", late)
     world_of(lot())
     assert built == [0, 0]
     assert len(files()) == 1
