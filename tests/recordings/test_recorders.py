@@ -256,7 +256,7 @@ def test_a_recording_has_the_frames_that_were_written(tmp_path):
     with pytest.raises(ValueError, match=r"of 2 frames \(recording.json\), and 1 are missing, such as 000001; copy or"):
         RecordedFrames(tmp_path)
     (tmp_path / "training" / "recording.json").write_text("[]")
-    with pytest.raises(BadFileError, match=r"recording.json: a list of files with their sizes, and the names of the frames, are needed"):
+    with pytest.raises(BadFileError, match=r"recording.json: a list of files with their sizes, and the names"):
         RecordedFrames(tmp_path)
     (tmp_path / "training" / "recording.json").unlink()  # as if another tool had written it
     assert len(open_recording(tmp_path).names) == 2

@@ -110,7 +110,8 @@ def _open_folder() -> Path | None:
 
 
 def _warn_without(error: Exception) -> None:
-    warnings.warn(f"scenes are not cached ({error}); --set no_cache=true, or TORCHCOVER_CACHE_GB=0, asks for none", stacklevel=3)
+    remedy = "--set no_cache=true, or TORCHCOVER_CACHE_GB=0, asks for none"
+    warnings.warn(f"scenes are not cached ({error}); {remedy}", stacklevel=3)
 
 
 def _hash_sources(scenario: Scenario) -> str:
