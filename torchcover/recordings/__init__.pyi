@@ -1,4 +1,5 @@
 from .accumulated_reference import AccumulatedReference as AccumulatedReference
+from .checks import check_recording as check_recording
 from .clouds.readers import read_cloud as read_cloud
 from .formats import FORMATS as FORMATS
 from .formats import RecordingFormat as RecordingFormat
@@ -13,4 +14,3 @@ from .recording import Recording as Recording
 from .recording import Scan as Scan
 from .settings import RecordingSettings as RecordingSettings
 from .settings import merge_recording_settings as merge_recording_settings
-from .checks import check_recording as check_recording

@@ -81,7 +81,8 @@ class SceneCache:
         except OSError as error:
             with suppress(OSError):
                 temporary.unlink()
-            self._folder = _warn_without(OSError(error.errno, error.strerror, str(path.parent)))
+            self._folder = None
+            _warn_without(OSError(error.errno, error.strerror, str(path.parent)))
 
 
 def _stat_own(path: Path) -> os.stat_result | None:
@@ -105,7 +106,8 @@ def _open_folder() -> Path | None:
         if not os.access(folder, os.W_OK):
             raise OSError(f"{folder}: it may not be written to")
     except (OSError, RuntimeError) as error:  # RuntimeError: there is no home
-        return _warn_without(error)
+        _warn_without(error)
+        return None
     return folder
 
 
