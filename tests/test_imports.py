@@ -1,5 +1,6 @@
 """What may import what, and what an import costs."""
 
+import ast
 import subprocess
 import sys
 from pathlib import Path
@@ -65,6 +66,24 @@ def test_arrows_in_the_house_go_one_way():
     """The contracts of `[tool.importlinter]` in pyproject.toml."""
     report = python("from importlinter.cli import lint_imports; raise SystemExit(lint_imports(no_cache=True))")
     assert "4 kept, 0 broken" in report
+
+
+FACTORIES = {
+    "arange", "as_tensor", "asarray", "empty", "eye", "full", "linspace", "logspace", "ones", "rand", "randint",
+    "randn", "randperm", "scalar_tensor", "tensor", "zeros",
+}  # fmt: skip
+
+
+def test_every_tensor_is_made_on_a_device_that_is_named():
+    """Else `torch.set_default_device` would mix devices."""
+    missing = []
+    for path in (ROOT / "torchcover").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in FACTORIES:
+                of_torch = isinstance(node.func.value, ast.Name) and node.func.value.id == "torch"
+                if of_torch and "device" not in [keyword.arg for keyword in node.keywords]:
+                    missing.append(f"{path.relative_to(ROOT)}:{node.lineno}")
+    assert missing == []
 
 
 def test_importing_torchcover_imports_nothing_heavy(loaded):

@@ -6,12 +6,13 @@ import torch
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_leaves, tree_map
 
-from torchcover import BevGrid, CoverageMetric
+from torchcover import BevGrid, Camera, CoverageMetric, blind_spot_radius, nearest
 from torchcover.coverage import Maximum, PooledMean, Quantiles, Region, StepQuantiles
-from torchcover.detection import Boxes, box_visibility
+from torchcover.detection import Boxes, RecallByVisibility, bev_iou, box_visibility, points_in_boxes
+from torchcover.frames import Frame, rotate
 from torchcover.neighbors import choice
 
-GPU = torch.device("cuda", 0)
+GPU, MPS = torch.device("cuda", 0), torch.device("mps", 0)
 # What takes tensors of two devices.
 MOVES = ("to", "cpu", "numpy", "tolist", "copy_")
 
@@ -23,8 +24,14 @@ class OnGpu(torch.Tensor):
     __torch_function__ = torch._C._disabled_torch_function_impl
 
 
+class OnMps(OnGpu):
+    """A tensor that says that it is on Apple's GPU."""
+
+    device = MPS
+
+
 def is_device(leaf):
-    return isinstance(leaf, torch.device)
+    return isinstance(leaf, torch.device) or (isinstance(leaf, str) and leaf in map(str, (GPU, MPS)))
 
 
 def goal_of(name, args, kwargs):
@@ -37,27 +44,31 @@ def goal_of(name, args, kwargs):
 class PretendedGpu(TorchFunctionMode):
     """Refuses what a GPU refuses or would copy silently, and lists what is copied from it, by its size."""
 
-    def __init__(self):
+    def __init__(self, device=GPU):
         super().__init__()
-        self.to_host = []
+        self.device, self.to_host = device, []
 
     def __torch_function__(self, function, types, args=(), kwargs=None):
         kwargs, name = kwargs or {}, function.__name__
+        if function is torch.device:
+            return function(*args, **kwargs)
         tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, torch.Tensor)]
         there = any(isinstance(tensor, OnGpu) for tensor in tensors)
         goal = goal_of(name, args, kwargs)
         if there and name not in MOVES:
             here = [tuple(tensor.shape) for tensor in tensors if not isinstance(tensor, OnGpu) and tensor.dim()]
             assert not here, f"{name}: one on the GPU, and on the CPU {here}"
-        elif isinstance(tensors[0] if tensors else None, OnGpu) and (name != "to" or (goal and goal != GPU)):
+        elif isinstance(tensors[0] if tensors else None, OnGpu) and (name != "to" or (goal and goal != self.device)):
             self.to_host.append((name, tensors[0].numel()))
         args, kwargs = tree_map(
             lambda leaf: torch.device("cpu") if is_device(leaf) else leaf, (args, dict(kwargs)), is_leaf=is_device
         )
-        kind = (OnGpu if goal == GPU else torch.Tensor) if goal else OnGpu if there else torch.Tensor
-        return tree_map(
-            lambda leaf: leaf.as_subclass(kind) if isinstance(leaf, torch.Tensor) else leaf, function(*args, **kwargs)
-        )
+        on_gpu = goal == self.device if goal else there
+        kind = (OnMps if self.device == MPS else OnGpu) if on_gpu else torch.Tensor
+        made = function(*args, **kwargs)
+        if kind is OnMps and any(getattr(leaf, "dtype", None) == torch.float64 for leaf in tree_leaves(made)):
+            raise TypeError("Cannot convert a MPS Tensor to float64 dtype")
+        return tree_map(lambda leaf: leaf.as_subclass(kind) if isinstance(leaf, torch.Tensor) else leaf, made)
 
 
 def on_gpu(*clouds):
@@ -128,6 +139,46 @@ def test_what_was_seen_of_boxes_stays_on_the_device(monkeypatch):
     assert isinstance(found.share, OnGpu)
     np.testing.assert_array_equal(as_values(found.share), expected.share.numpy())
     assert all(count <= len(boxes) for _, count in gpu.to_host)
+
+
+def test_devices_without_float64_get_what_the_cpu_computes():
+    """Results return to the device of the caller, in float32 where they would be float64; sums stay on the CPU."""
+    grid = BevGrid(x=(0.0, 20.0), y=(0.0, 20.0), cell=1.0, heights={"low": (0.0, 4.0), "high": (4.0, 20.0)})
+    boxes = Boxes.from_rows(torch.tensor([[5.0, 5, 5, 8, 8, 8, 0.3], [15.0, 15, 15, 8, 8, 8, 0]]))
+    camera = Camera.from_fov(4, 3, 90.0)
+    sensor, reference, weights = next(each_step())
+    depth = torch.rand(3, 4) + 1
+
+    def compute_all(sensor, reference, weights, boxes, depth):
+        seen = box_visibility(sensor, reference, boxes, reference_weights=weights)
+        frame = Frame({"rig": sensor}, reference, index=0, name="a", boxes=boxes)
+        turned = rotate(frame, 0.3)
+        region = Region.polygon("corner", [(0.0, 0.0), (20.0, 0.0), (20.0, 20.0)])
+        return [
+            *nearest(reference, sensor), blind_spot_radius(reference, sensor, max_radius=2.0), grid.cell_of(reference),
+            *grid.bins(reference), grid.points_by_column(reference), region.contains(*reference[:, :2].T),
+            *points_in_boxes(reference, boxes), seen.share, seen.reference_points, bev_iou(boxes.rows, boxes.rows),
+            turned.reference, turned.boxes.rows, *camera.project(reference), camera.unproject(depth),
+            *camera.rays(reference[:, :2]), camera.z_to_distance(depth), camera.to_vehicle(reference),
+        ]  # fmt: skip
+
+    def measure(sensor, reference, weights, boxes):
+        metric, recall = CoverageMetric(grid, max_radius=30.0, square_metres=True), RecallByVisibility()
+        for each in (metric, recall):
+            each.to(reference.device)
+        metric.update(sensor, reference, weights=weights)
+        recall.update(boxes.rows, boxes, box_visibility(sensor, reference, boxes, reference_weights=weights))
+        return metric.compute().scalars([Region("front", (0.0, 20.0), (5.0, 15.0))]) | recall.compute().scalars()
+
+    expected = compute_all(sensor, reference, weights, boxes, depth)
+    numbers = measure(sensor, reference, weights, boxes)
+    with PretendedGpu(MPS):
+        there = [tensor.as_subclass(OnMps) for tensor in (sensor, reference, weights)]
+        found = compute_all(*there, boxes.to(MPS), depth.as_subclass(OnMps))
+        assert measure(*there, boxes.to(MPS)) == pytest.approx(numbers, nan_ok=True, rel=1e-6)
+    for here, tensor in zip(expected, found, strict=True):
+        assert isinstance(tensor, OnMps)
+        np.testing.assert_allclose(as_values(tensor), here.numpy(), rtol=1e-6)
 
 
 def test_what_is_pretended_is_noticed():

@@ -1,6 +1,8 @@
 """The contract of `nearest` and `blind_spot_radius`, for every backend."""
 
 import math
+import warnings
+from functools import partial
 from importlib.util import find_spec
 
 import numpy as np
@@ -722,3 +724,47 @@ def test_out_of_memory_for_a_few_queries_is_an_error_with_the_size(monkeypatch):
     said = "^cpu: the search among 400 points for 3,000 queries, 750 at a time: CUDA out of memory.*7.00 GiB.$"
     with pytest.raises(MemoryError, match=said):
         nearest(random_cloud(3000, 64), random_cloud(400, 65))
+
+
+# Traced and transformed by torch
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")
+def test_transforms_of_torch_give_what_eager_code_gives():
+    query, points = random_cloud(50, 66), random_cloud(40, 67)
+    wanted = points.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(blind_spot_radius(query, wanted).sum(), wanted)
+
+    def total(points, **options):
+        return blind_spot_radius(query, points, **options).sum()
+
+    for backend in ("auto", "cdist", "kdtree", "packets"):
+        torch.testing.assert_close(torch.func.grad(partial(total, backend=backend))(points), gradient)
+        _, along = torch.func.jvp(partial(total, backend=backend), (points,), (torch.ones_like(points),))
+        torch.testing.assert_close(along, gradient.sum())
+        both = torch.stack([points, points + 0.5])
+        each = torch.vmap(partial(blind_spot_radius, query, backend=backend))(both)
+        assert torch.equal(each, torch.stack([blind_spot_radius(query, cloud, backend=backend) for cloud in both]))
+    assert torch.equal(
+        torch.vmap(nearest, in_dims=(1, None))(query[:, None], points).index, nearest(query, points).index[None]
+    )
+    second = torch.func.hessian(total)(points)
+    assert second.isfinite().all()
+    assert second.abs().sum() > 0
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")
+def test_compiled_code_gives_what_eager_code_gives_and_leaves_it_alone(untried):
+    compiled = torch.compile(
+        lambda query, points: nearest(query, points, max_distance=0.3), backend="eager", fullgraph=True
+    )
+    for count in (40, 50, 0):
+        query, points = random_cloud(30, 68), random_cloud(count, 69)
+        for found, expected in zip(compiled(query, points), nearest(query, points, max_distance=0.3), strict=True):
+            assert torch.equal(found, expected)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # such as that packets do not work here
+        compiled(*LARGE)
+        assert nearest(*LARGE).distance.isfinite().all()
+    with pytest.raises(ValueError, match="points: 1 of 40 points have NaN"):
+        compiled(query, torch.cat([random_cloud(39, 70), torch.full((1, 3), math.nan)]))

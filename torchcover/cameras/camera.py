@@ -18,6 +18,7 @@ from torchcover.cameras.models import check_image, check_model
 from torchcover.cameras.optics import Optics
 from torchcover.cameras.ray_table import RayTable
 from torchcover.cameras.unprojection import DepthKind, Selection, check_depth, scale_rays, select
+from torchcover.devices import through_cpu
 from torchcover.geometry import check_rigid, invert, transform_tensor
 from torchcover.geometry.rigid import Matrix
 
@@ -167,6 +168,10 @@ class Camera:
             return self._table.points(str(torch.device(device)), dtype, "distance")
         if not pixels.is_floating_point() or pixels.shape[-1:] != (2,):
             raise ValueError(f"{self.name}: pixels are floats (..., 2); got {pixels.dtype} {tuple(pixels.shape)}")
+        return self._rays_of(pixels)
+
+    @through_cpu
+    def _rays_of(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         directions, status = self._optics.directions(pixels.reshape(-1, 2).double())
         shape = pixels.shape[:-1]
         return directions.to(pixels.dtype).reshape(*shape, 3), (status == ANSWERED).reshape(shape)
@@ -180,6 +185,7 @@ class Camera:
         """
         return self._table.pixel_counts()
 
+    @through_cpu
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels at which points are seen.
 
@@ -266,12 +272,14 @@ class Camera:
         rays, has_ray = self._table.points(str(depth.device), depth.dtype, kind)
         return select(rays, has_ray, depth, stride, valid)
 
+    @through_cpu
     def z_to_distance(self, depth: Tensor) -> Tensor:
         """Distance along the ray for depth along the axis: (H, W) or (B, H, W), NaN where a pixel has no z-depth."""
         depth = check_depth(depth, "z", 1, None, (self.height, self.width), self.name)
         forward = self._forward(depth.device)
         return (depth.double() / torch.where(forward > 0, forward, torch.nan)).to(depth.dtype)
 
+    @through_cpu
     def distance_to_z(self, depth: Tensor) -> Tensor:
         """Depth along the axis for distance along the ray: (H, W) or (B, H, W), NaN where a pixel has no ray.
 

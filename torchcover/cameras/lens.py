@@ -92,7 +92,7 @@ class Lens:
 
 def as_vector(values: Sequence[Scalar], like: Tensor | None = None) -> Tensor:
     """Numbers, or tensors with their gradients, as a vector, float64 or beside another tensor."""
-    empty = torch.empty(0, dtype=torch.float64) if like is None else like.new_empty(0)
+    empty = torch.empty(0, dtype=torch.float64, device="cpu") if like is None else like.new_empty(0)
     parts = [torch.as_tensor(value, dtype=empty.dtype, device=empty.device) for value in values]
     return torch.stack(parts) if parts else empty
 

@@ -8,6 +8,7 @@ from torch import Tensor
 from torchcover.cameras.inverse import ANSWERED, OUTSIDE, UNCONVERGED
 from torchcover.cameras.optics import Optics
 from torchcover.cameras.unprojection import DepthKind
+from torchcover.devices import has_float64
 
 # Pixels whose float64 rays exist at the same time while a table is made.
 _BAND = 1 << 20
@@ -33,6 +34,9 @@ class RayTable:
         They are at depth 1 along the ray ("distance") or along the axis ("z"). The lens is solved in float64 whatever
         the type.
         """
+        if not has_float64(torch.device(device)):
+            rays, valid = self.points("cpu", dtype, kind)
+            return rays.to(device), valid.to(device)
         trace = self._trace_image if kind == "distance" else self._plane
         if self._optics.differentiable and torch.is_grad_enabled():
             return trace(device, dtype)

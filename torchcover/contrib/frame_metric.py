@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchcover.contrib.sights import Sights
+from torchcover.devices import has_float64
 from torchcover.estimation import MIN_BLOCKS, Estimate, Number, Quantity
 from torchcover.frames import Frame
 from torchcover.metrics import MergeableMetric, SumsInBlocks, figure_of
@@ -61,7 +62,7 @@ class FrameMetric(MergeableMetric):
             for name, cloud in {"reference": each.reference, **each.clouds}.items():
                 check_tensor(cloud, name, floating=True)
         for each in frames:
-            self._add_frame(each)
+            self._add_frame(each if has_float64(each.reference.device) else each.to("cpu"))
             self.steps += 1
 
     def _add_frame(self, frame: Frame) -> None:

@@ -81,7 +81,7 @@ class KCover(WorldRatios):
         self.sights.by_sensor = True
 
     def _of_frame(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
-        weights = frame.reference_weights if self.square_metres else torch.ones(len(frame.reference))
+        weights = frame.reference_weights if self.square_metres else frame.reference.new_ones(len(frame.reference))
         if weights is None:
             raise ValueError(
                 f"frame {frame.name!r}: the square metres of its reference points (reference_weights) are needed; got "

@@ -96,7 +96,7 @@ class MSog(SumsInBlocks, FrameMetric):
     def _labels(self, frame: Frame) -> tuple[Tensor, Tensor]:
         """The voxels that have the label of the category in a frame, and those that hold anything else."""
         boxes = self.sights.boxes(frame)
-        of_category = torch.tensor([each == self.category for each in boxes.categories], dtype=torch.bool)
+        of_category = torch.tensor([each == self.category for each in boxes.categories], dtype=torch.bool, device="cpu")
         inside = self.sights.reference_in_boxes(frame)
         votes = np.zeros(len(frame.reference), dtype=bool)
         votes[inside.point.cpu()[of_category[inside.box.cpu()]].numpy()] = True
@@ -128,7 +128,7 @@ class MSog(SumsInBlocks, FrameMetric):
 def _again(labelled: Tensor, steps: Tensor, weights: Tensor) -> Tensor:
     """(R, 1) the number of voxels labelled (g, 2, K) times in blocks of steps (g,), if these weigh (R, g)."""
     of_all, voxels = weights @ steps.double(), labelled.shape[2]
-    total, part = torch.zeros(len(weights), dtype=torch.float64), max(AT_ONCE // len(weights), 1)
+    total, part = torch.zeros(len(weights), dtype=torch.float64, device="cpu"), max(AT_ONCE // len(weights), 1)
     for start in range(0, voxels, part):
         some = labelled[:, :, start : start + part].double()
         share = torch.tensordot(weights, some, dims=1) / of_all[:, None, None]

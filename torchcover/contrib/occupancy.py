@@ -33,10 +33,10 @@ def occupancy_rows(boxes: Boxes, place_in_time: int, categories: Sequence[str], 
     rows = boxes.rows.double().cpu()
     half = rows[:, 3:6] / 2
     half[:, :2] = torch.linalg.vector_norm(half[:, :2], dim=1, keepdim=True)
-    low, high = (torch.tensor(corner, dtype=torch.float64) for corner in (region.lower_m, region.upper_m))
+    low, high = (torch.tensor(corner, dtype=torch.float64, device="cpu") for corner in (region.lower_m, region.upper_m))
     near = ((rows[:, :3] + half >= low) & (rows[:, :3] - half <= high)).all(dim=1)
-    number = torch.tensor([categories.index(name) for name in boxes.categories], dtype=torch.float64)
-    listed = torch.zeros(1 + int(near.sum()), COLUMNS, dtype=torch.float64)
+    number = torch.tensor([categories.index(name) for name in boxes.categories], dtype=torch.float64, device="cpu")
+    listed = torch.zeros(1 + int(near.sum()), COLUMNS, dtype=torch.float64, device="cpu")
     listed[0, CATEGORY] = FRAME
     listed[1:, CATEGORY] = number[near]
     listed[1:, BOX:] = rows[near]

@@ -54,7 +54,7 @@ class PointDensity(WorldRatios):
         ]
         super().__init__(ratios, {"grid": grid, "regions": tuple(regions)}, **kwargs)
         self.grid = grid
-        everywhere = torch.ones(grid.shape[1:], dtype=torch.bool)
+        everywhere = torch.ones(grid.shape[1:], dtype=torch.bool, device="cpu")
         self._members = torch.stack([everywhere, *(region.mask(grid) for region in regions)]).flatten(1).double()
 
     def _of_frame(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor]:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage.binning import borders_below, edges_below, with_ends
+from torchcover.devices import through_cpu
 
 # What heights are measured from: the local ground, or z = 0 of the vehicle frame, which pitches and rolls.
 BandFrame = Literal["ground", "vehicle"]
@@ -181,6 +182,7 @@ class BevGrid:
         tier, of = within[:, inside].nonzero(as_tuple=True)
         return Bins(inside, of, cells[tier, inside[of]])
 
+    @through_cpu
     def points_by_column(self, points: Tensor, height: Tensor | None = None) -> Tensor:
         """(Y, X) float64: how many points lie above each square of ground in each band, as by counting `bins`, sooner.
 
@@ -216,17 +218,20 @@ class BevGrid:
                 tiers.append([band])
         return tiers
 
+    @through_cpu
     def _cells_of(self, points: Tensor, height: Tensor | None) -> Tensor:
         """(tiers, N) int64 cell numbers, -1 for none."""
         parts = self._parts_of(points, height)
         _, rows, columns = self.shape
         x_bounds, y_bounds = self._bounds_on(points.device)
-        steps = torch.arange(columns), torch.arange(rows) * columns
+        steps = torch.arange(columns, device="cpu"), torch.arange(rows, device="cpu") * columns
         x_terms, y_terms = (with_ends(terms, OUTSIDE).to(points.device) for terms in steps)
         # Between the borders of the bands of a tier lie, in turn, a band and a gap (which may be empty).
         bounds, tiers = list(self.heights.values()), []
         for bands in self._tiers:
-            terms = torch.tensor([term for band in bands for term in (band * rows * columns, OUTSIDE)][:-1])
+            terms = torch.tensor(
+                [term for band in bands for term in (band * rows * columns, OUTSIDE)][:-1], device="cpu"
+            )
             borders = [border for band in bands for border in bounds[band]]
             tiers.append((borders, with_ends(terms, OUTSIDE).to(points.device)))
 
@@ -300,14 +305,14 @@ def _count(bounds: tuple[float, float], cell: float) -> int:
 
 def _edges(bounds: tuple[float, float], cell: float) -> Tensor:
     count = _count(bounds, cell)
-    edges = _between(bounds, torch.arange(count + 1, dtype=torch.float64), count)
+    edges = _between(bounds, torch.arange(count + 1, dtype=torch.float64, device="cpu"), count)
     edges[0], edges[-1] = bounds
     return edges
 
 
 def _centres(bounds: tuple[float, float], cell: float) -> Tensor:
     count = _count(bounds, cell)
-    return _between(bounds, 2 * torch.arange(count, dtype=torch.float64) + 1, 2 * count)
+    return _between(bounds, 2 * torch.arange(count, dtype=torch.float64, device="cpu") + 1, 2 * count)
 
 
 def _between(bounds: tuple[float, float], step: Tensor, steps: int) -> Tensor:

@@ -80,7 +80,7 @@ def estimate_redundancy(coverage: "Coverage", region: Region, height: str) -> Es
     if coverage.places is not None and place is not None:
         return coverage.places.estimate(quantities, place)
     if coverage.measure == "area":
-        return Estimate.of(quantities, torch.full((len(quantities),), math.nan, dtype=torch.float64))
+        return Estimate.of(quantities, torch.full((len(quantities),), math.nan, dtype=torch.float64, device="cpu"))
     known = coverage.known_in(region, height)
     own = torch.stack([layer.values[known].mean() for layer in layers])
     return Estimate.of(quantities, torch.cat([coverage.estimate(region, height).value, own]))

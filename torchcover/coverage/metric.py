@@ -27,6 +27,7 @@ from torchcover.coverage.steps import (
     check_parameters,
     checked_steps,
 )
+from torchcover.devices import map_tensors, with_float64
 from torchcover.estimation import Estimate
 from torchcover.metrics import SumsInBlocks, TouchedSums, added_up, figure_of
 from torchcover.metrics.blocks import FINER
@@ -197,6 +198,7 @@ class CoverageMetric(SumsInBlocks):
         It takes and refuses what `update` does.
         """
         given = dict.fromkeys(("weights", "height", "place_in_time", "error")) | given
+        sensor, reference, given = map_tensors((sensor, reference, given), with_float64)
         how: dict[str, Any] = {"grid": self.grid, "square_metres": self.square_metres, "names": self.sensors}
         return list(map(self._sums_of, checked_steps(sensor, reference, **given, first=int(self.steps), **how)))
 

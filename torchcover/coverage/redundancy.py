@@ -75,8 +75,8 @@ class SensorFailures(Aggregation):
 
     def states(self, cells: int) -> dict[str, State]:
         """`sums` (V, C): means of each step, or with square metres those times them, and `m2` (C)."""
-        m2 = {"m2": State(torch.zeros(cells, dtype=torch.float64))} if self.square_metres else {}
-        return {"sums": State(torch.zeros(len(self.quantities), cells, dtype=torch.float64)), **m2}
+        m2 = {"m2": State(torch.zeros(cells, dtype=torch.float64, device="cpu"))} if self.square_metres else {}
+        return {"sums": State(torch.zeros(len(self.quantities), cells, dtype=torch.float64, device="cpu")), **m2}
 
     def update(self, sums: Mapping[str, Tensor], step: BinnedStep) -> None:
         """Add the points of a step, whose last values are those of `values`."""

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage.grid import BevGrid
+from torchcover.devices import through_cpu
 
 # How far around the vehicle its near field reaches.
 NEAR_FIELD_M = 3.0
@@ -89,6 +90,7 @@ class Region:
         if (x_low, y_low, x_high, y_high) != bounds:
             raise ValueError(f"region {self.name!r}: its corners have other bounds than x = {self.x}, y = {self.y}")
 
+    @through_cpu
     def contains(self, x: Tensor, y: Tensor) -> Tensor:
         """Which places belong to it: the one function that decides, of points as of the centres of cells.
 
@@ -208,9 +210,7 @@ def check_regions(regions: Sequence[Region], grid: BevGrid) -> None:
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise ValueError(f"regions: each name may be given once; got {', '.join(map(repr, twice))} again")
     for region in regions:
-        with torch.device("cpu"):  # on the device `meta` nothing is true or false
-            empty = not region.mask(grid).any()
-        if empty:
+        if not region.mask(grid).any():
             raise ValueError(f"region {region.name!r} holds no cell centre; use smaller cells than {grid.cell:g} m")
 
 

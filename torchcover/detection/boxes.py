@@ -11,6 +11,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from torchcover.devices import move
 from torchcover.files import brief
 from torchcover.geometry.arrays import Float64
 from torchcover.geometry.rigid import Matrix, transform
@@ -179,15 +180,17 @@ class Boxes:
 
     def of_category(self, *categories: str) -> "Boxes":
         """Those of the given categories."""
-        return self.select(torch.tensor([category in categories for category in self.categories], dtype=torch.bool))
+        return self.select(
+            torch.tensor([category in categories for category in self.categories], dtype=torch.bool, device="cpu")
+        )
 
     def pin_memory(self) -> "Boxes":
         """A copy in page-locked memory."""
         return self._each(Tensor.pin_memory)
 
     def to(self, device: torch.device | str) -> "Boxes":
-        """A copy on another device."""
-        return self._each(lambda tensor: tensor.to(device))
+        """A copy on another device, in float32 where that has no float64."""
+        return self._each(lambda tensor: move(tensor, device))
 
     def _each(self, change: Callable[[Tensor], Tensor], **names: tuple[str, ...]) -> "Boxes":
         """With all tensors changed, and other names where their number changes."""

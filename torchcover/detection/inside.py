@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchcover.detection.boxes import Boxes
+from torchcover.devices import move, with_float64
 from torchcover.neighbors import check_tensor
 
 # A body's points lie on its box as often as in it; rounding of coordinates may put them on either side.
@@ -49,7 +50,8 @@ def points_in_boxes(points: Tensor, boxes: Boxes, *, skin_m: float = SKIN_M) -> 
         Inside(box=tensor([0]), point=tensor([0]))
     """
     check_tensor(points, "points")
-    return _BoxMap(boxes, skin_m).holding(points)
+    inside = _BoxMap(boxes, skin_m).holding(with_float64(points))
+    return Inside(*(move(numbers, points.device) for numbers in inside))
 
 
 class _BoxMap:
@@ -57,7 +59,8 @@ class _BoxMap:
 
     def __init__(self, boxes: Boxes, skin_m: float = SKIN_M) -> None:
         self._skin_m = skin_m
-        centre_m, size_m, yaw_rad = boxes.centre_m.double(), boxes.size_m.double(), boxes.yaw_rad.double()
+        boxes_m = (boxes.centre_m, boxes.size_m, boxes.yaw_rad)
+        centre_m, size_m, yaw_rad = (with_float64(tensor).double() for tensor in boxes_m)
         self._boxes = torch.cat([centre_m, size_m / 2, yaw_rad.cos()[:, None], yaw_rad.sin()[:, None]], dim=1)
         if not len(boxes):
             return
@@ -129,7 +132,7 @@ def with_hits(boxes: Boxes, clouds: Mapping[str, Tensor], counts_as: Mapping[str
     """
     of_all, hits = _BoxMap(boxes), dict[str, Tensor]()
     for rig, cloud in clouds.items():
-        inside = of_all.holding(cloud)
-        weights = counts_as[rig][inside.point] if counts_as and rig in counts_as else None
-        hits[rig] = torch.bincount(inside.box, weights, minlength=len(boxes)).long()
+        inside = of_all.holding(with_float64(cloud))
+        weights = with_float64(counts_as[rig])[inside.point] if counts_as and rig in counts_as else None
+        hits[rig] = move(torch.bincount(inside.box, weights, minlength=len(boxes)).long(), cloud.device)
     return replace(boxes, hits=hits)

@@ -6,11 +6,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchcover.devices import through_cpu
 from torchcover.neighbors import check_tensor
 
 MatchBy = Literal["distance", "iou"]
 
 
+@through_cpu
 def bev_iou(a: Tensor, b: Tensor) -> Tensor:
     """Intersection over union of boxes seen from above, exact for any yaw.
 
@@ -37,6 +39,7 @@ def bev_iou(a: Tensor, b: Tensor) -> Tensor:
     return torch.where(union > 0, overlap / union.where(union > 0, 1.0), 0.0)
 
 
+@through_cpu
 def match(detections: Tensor, scores: Tensor, truth: Tensor, by: MatchBy, threshold: float) -> Tensor:
     """Give each detection at most one object, greedily: the higher score chooses first.
 

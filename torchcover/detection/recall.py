@@ -51,7 +51,7 @@ class DetectedFrame:
         self.truth = boxes.rows.detach().cpu().double()
         self.share = _shares(visibility, len(boxes), "visibility")
         self.hidden = _hidden(visibility, len(boxes))
-        given = torch.zeros(len(bad)) if scores is None else scores.detach().cpu()
+        given = torch.zeros(len(bad), device="cpu") if scores is None else scores.detach().cpu()
         if given.shape != (len(bad),) or given.isnan().any():
             raise ValueError(
                 f"scores: one number for each of {len(bad)} detections is needed; got shape {tuple(given.shape)} with "
@@ -59,7 +59,7 @@ class DetectedFrame:
             )
         # Without scores every detection counts at every threshold.
         self.scores = given.double() if scores is not None else given.double() + math.inf
-        unknown = torch.full((len(bad),), math.nan)
+        unknown = torch.full((len(bad),), math.nan, device="cpu")
         own = unknown if detection_visibility is None else detection_visibility
         self.detection_share = _shares(own, len(bad), "detection_visibility")
         self.detection_hidden = _hidden(own, len(bad))
@@ -79,7 +79,11 @@ def _shares(visibility: BoxVisibility | Tensor, count: int, name: str) -> Tensor
 
 def _hidden(visibility: BoxVisibility | Tensor, count: int) -> Tensor:
     """(count,) whether the reference's places were asked, and saw nothing; which mere shares do not say."""
-    return visibility.hidden.cpu() if isinstance(visibility, BoxVisibility) else torch.zeros(count, dtype=torch.bool)
+    return (
+        visibility.hidden.cpu()
+        if isinstance(visibility, BoxVisibility)
+        else torch.zeros(count, dtype=torch.bool, device="cpu")
+    )
 
 
 class RecallByVisibility(MergeableMetric):
@@ -193,7 +197,7 @@ class RecallByVisibility(MergeableMetric):
         chosen = match(frame.detections, frame.scores, frame.truth, self.by, self.threshold)
         hit = chosen >= 0
         # The score at which an object is found; NaN, at no threshold, if it is not.
-        found_at = torch.full((len(frame.truth),), math.nan, dtype=torch.float64)
+        found_at = torch.full((len(frame.truth),), math.nan, dtype=torch.float64, device="cpu")
         found_at[chosen[hit]] = frame.scores[hit]
         object_bin = self._bin(frame.truth, frame.share, frame.hidden)
         detection_bin = self._bin(frame.detections, frame.detection_share, frame.detection_hidden)
@@ -206,8 +210,12 @@ class RecallByVisibility(MergeableMetric):
 
     def _bin(self, rows: Tensor, share: Tensor, hidden: Tensor) -> Tensor:
         distance = torch.linalg.vector_norm(rows[:, :2].double(), dim=1)
-        column = torch.bucketize(distance, torch.tensor(self.distance_borders, dtype=torch.float64), right=True)
-        line = torch.bucketize(share, torch.tensor(self.visibility_borders, dtype=torch.float64), right=True)
+        column = torch.bucketize(
+            distance, torch.tensor(self.distance_borders, dtype=torch.float64, device="cpu"), right=True
+        )
+        line = torch.bucketize(
+            share, torch.tensor(self.visibility_borders, dtype=torch.float64, device="cpu"), right=True
+        )
         line[share.isnan()] = len(self.visibility_borders) + 2
         line[hidden] = len(self.visibility_borders) + 1
         return line * (len(self.distance_borders) + 1) + column

@@ -1,12 +1,15 @@
 """How much of each object the rig could see."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchcover.detection.boxes import Boxes, check_boxes
 from torchcover.detection.inside import points_in_boxes
+from torchcover.devices import has_float64, move
 from torchcover.files import brief
 from torchcover.neighbors import blind_spot_radius, check_cloud, check_weights
 
@@ -64,8 +67,16 @@ class BoxVisibility:
 
     def select(self, which: Tensor) -> "BoxVisibility":
         """Some of them, as `Boxes.select` does."""
+        return self._each(lambda tensor: tensor[which.to(tensor.device)])
+
+    def to(self, device: torch.device | str) -> "BoxVisibility":
+        """A copy on another device, in float32 where that has no float64."""
+        return self._each(lambda tensor: move(tensor, device))
+
+    def _each(self, change: Callable[[Tensor], Tensor]) -> "BoxVisibility":
         names = ("share", "mean_radius_m", "reference_points", "drawn_points", "sensor_points")
-        return replace(self, **{name: getattr(self, name)[which.to(self.share.device)] for name in names})
+        changed: dict[str, Any] = {name: change(getattr(self, name)) for name in names}
+        return replace(self, **changed)
 
 
 @torch.no_grad()
@@ -120,6 +131,10 @@ def box_visibility(
     """
     check_boxes(boxes)
     _check(sensor, reference, threshold, reference_weights)
+    if not has_float64(reference.device):
+        weights = None if reference_weights is None else reference_weights.cpu()
+        there = box_visibility(sensor.cpu(), reference.cpu(), boxes.to("cpu"), threshold, reference_weights=weights)
+        return there.to(reference.device)
     sensor, boxes = sensor.to(reference.device), boxes.to(reference.device)
     box, point = points_in_boxes(reference, boxes)
     asked, weights = reference[point], None if reference_weights is None else reference_weights[point]

@@ -143,13 +143,15 @@ class Sightings:
     def _numbers(self, draws: Sequence[Sighting]) -> dict[str, Number]:
         """Those of `NUMBERS`, of which each world is a block, or each draw."""
         blocks = {name: k for k, name in enumerate(self.hours or map(str, range(len(draws))))}
-        sums = torch.zeros(len(blocks), len(NUMBERS), dtype=torch.float64)
+        sums = torch.zeros(len(blocks), len(NUMBERS), dtype=torch.float64, device="cpu")
         for k, one in enumerate(draws):
             of_one = [one.ttc_s.mean(), (one.ttc_s >= one.open_s).mean(), 1.0]
-            sums[blocks[one.world if self.hours else str(k)]] += torch.tensor(of_one, dtype=torch.float64)
+            sums[blocks[one.world if self.hours else str(k)]] += torch.tensor(of_one, dtype=torch.float64, device="cpu")
         base = sums[:, [2, 2, 2]]
-        base[:, 2] = torch.tensor(list(self.hours.values()) or [math.nan] * len(blocks))
-        return Estimate.of_ratios(NUMBERS, base, sums, torch.ones(len(blocks), dtype=torch.int64)).numbers()
+        base[:, 2] = torch.tensor(list(self.hours.values()) or [math.nan] * len(blocks), device="cpu")
+        return Estimate.of_ratios(
+            NUMBERS, base, sums, torch.ones(len(blocks), dtype=torch.int64, device="cpu")
+        ).numbers()
 
     def up_to_kmh(self) -> dict[tuple[str, str], float]:
         """Encounter and rig -> the speed up to which it is in time in every phase and draw, where speeds were swept.

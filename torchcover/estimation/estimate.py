@@ -232,7 +232,7 @@ class Estimate:
         if not self.strata:
             return [len(self.steps) - 1] * len(self.value)
         variances = torch.stack([(weight * one.error) ** 2 for weight, one in self.strata])
-        most = torch.tensor([one.freedom for _, one in self.strata]).to(variances)
+        most = torch.tensor([one.freedom for _, one in self.strata], device="cpu").to(variances)
         # As shares, as fourth powers of errors may vanish.
         found = 1 / ((variances / variances.sum(dim=0)) ** 2 / most).sum(dim=0)
         return [int(each + 1e-9) for each in found.where(found.isfinite(), most.amin(dim=0)).tolist()]

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchcover.detection.boxes import Boxes
+from torchcover.devices import through_cpu
 from torchcover.frames.frame import Frame, Measured
 
 
@@ -19,7 +20,7 @@ def flip(frame: Frame) -> Frame:
         >>> flip(frame).sensor
         tensor([[ 5., -2.,  1.]])
     """
-    return _moved(frame, torch.diag(torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64)))
+    return _moved(frame, torch.diag(torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64, device="cpu")))
 
 
 def rotate(frame: Frame, yaw_rad: float) -> Frame:
@@ -33,7 +34,7 @@ def rotate(frame: Frame, yaw_rad: float) -> Frame:
     if not math.isfinite(yaw_rad):
         raise ValueError(f"yaw_rad: a finite angle is needed; got {yaw_rad}")
     c, s = math.cos(yaw_rad), math.sin(yaw_rad)
-    return _moved(frame, torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64))
+    return _moved(frame, torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64, device="cpu"))
 
 
 def scale(frame: Frame, factor: float) -> Frame:
@@ -48,7 +49,7 @@ def scale(frame: Frame, factor: float) -> Frame:
     """
     if not (math.isfinite(factor) and factor > 0):
         raise ValueError(f"factor: a finite number > 0 is needed; got {factor}")
-    return _moved(frame, factor * torch.eye(3, dtype=torch.float64))
+    return _moved(frame, factor * torch.eye(3, dtype=torch.float64, device="cpu"))
 
 
 @dataclass(frozen=True)
@@ -125,8 +126,7 @@ def _moved(frame: Frame, similarity: Tensor) -> Frame:
 
 
 def _moved_boxes(boxes: Boxes, similarity: Tensor) -> Boxes:
-    heading = torch.stack([boxes.yaw_rad.cos(), boxes.yaw_rad.sin()], dim=1).double()
-    heading = heading @ similarity[:2, :2].T.to(heading.device)
+    heading = _times(similarity[:2, :2], torch.stack([boxes.yaw_rad.cos(), boxes.yaw_rad.sin()], dim=1))
     factor = float(similarity[2, 2])
     return replace(
         boxes,
@@ -138,5 +138,6 @@ def _moved_boxes(boxes: Boxes, similarity: Tensor) -> Boxes:
     )
 
 
+@through_cpu
 def _times(matrix: Tensor, vectors: Tensor) -> Tensor:
     return (vectors.double() @ matrix.T.to(vectors.device)).to(vectors.dtype)

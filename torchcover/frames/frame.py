@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchcover.coverage.grid import BandFrame
 from torchcover.detection.boxes import Boxes
+from torchcover.devices import move
 from torchcover.files import brief
 
 
@@ -165,8 +166,8 @@ class Frame:
         return self._each(Tensor.pin_memory, None if self.boxes is None else self.boxes.pin_memory())
 
     def to(self, device: torch.device | str) -> "Frame":
-        """A copy on another device."""
-        return self._each(lambda cloud: cloud.to(device), None if self.boxes is None else self.boxes.to(device))
+        """A copy on another device, in float32 where that has no float64."""
+        return self._each(lambda cloud: move(cloud, device), None if self.boxes is None else self.boxes.to(device))
 
     def heights_in(self, band_frame: BandFrame) -> Tensor | None:
         """The heights of the reference points that such height bands need: None for those over z of the vehicle.

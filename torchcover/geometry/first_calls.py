@@ -9,4 +9,4 @@ import torch
 
 for _function in (torch.sqrt, torch.sin, torch.cos, torch.exp, torch.log):
     for _dtype in (torch.float32, torch.float64):
-        _function(torch.ones(1, dtype=_dtype))
+        _function(torch.ones(1, dtype=_dtype, device="cpu"))

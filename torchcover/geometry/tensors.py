@@ -3,9 +3,11 @@
 import torch
 from torch import Tensor
 
+from torchcover.devices import through_cpu
 from torchcover.geometry.rigid import Matrix
 
 
+@through_cpu
 def transform_tensor(destination_T_source: Matrix | Tensor, points: Tensor) -> Tensor:
     """Points of the source frame in the destination frame.
 

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchcover.devices import has_float64
 from torchcover.metrics.lean import Metric, gather_all_tensors
 
 if TYPE_CHECKING:
@@ -30,7 +31,8 @@ class MergeableMetric(Metric):
       is compared in `merge_state`, `load_state_dict` and the synchronisation of ranks, and it keeps a
       `MetricCollection` from sharing the sums of metrics that happen to agree after the first step.
     * States are copies: nothing that is loaded or merged is written to later.
-    * `.to(torch.float16)` moves the sums but does not round them.
+    * `.to(torch.float16)` moves the sums but does not round them; on a device without float64 (MPS) they stay on the
+      CPU, to which clouds follow.
     * Under `torch.inference_mode` everything works as outside of it, and steps may be added outside afterwards.
 
     A metric passes its parameters to `__init__`, adds its states with `add_sum`, and counts `steps`. Their size is
@@ -68,11 +70,12 @@ class MergeableMetric(Metric):
 
     def __init__(self, meaning: Mapping[str, object], **kwargs: Any) -> None:  # noqa: ANN401  (whatever torchmetrics takes)
         super().__init__(**kwargs)
+        self._device = torch.device("cpu")  # where the states are, whatever the default device is
         self.meaning = dict(meaning)
         self._tables: dict[str, Reduction] = {}
         # (32,) int64 numbers in [0, 256), equal for two metrics exactly if their sums mean the same.
         words = repr((type(self).__name__, sorted(self.meaning.items())))
-        fingerprint = torch.tensor(list(hashlib.sha256(words.encode()).digest()))
+        fingerprint = torch.tensor(list(hashlib.sha256(words.encode()).digest()), device="cpu")
         self.add_state("fingerprint", fingerprint, dist_reduce_fx="max", persistent=True)
         self.add_sum("steps", (), torch.int64)
 
@@ -95,7 +98,9 @@ class MergeableMetric(Metric):
 
     def add_sum(self, name: str, shape: tuple[int, ...], dtype: torch.dtype = torch.float64) -> None:
         """Add a state that starts at zero and adds up; float64 or int64, for sums grow."""
-        self.add_state(name, torch.zeros((), dtype=dtype).expand(shape), dist_reduce_fx="sum", persistent=True)
+        self.add_state(
+            name, torch.zeros((), dtype=dtype, device="cpu").expand(shape), dist_reduce_fx="sum", persistent=True
+        )
 
     def add_table(self, name: str, columns: int, reduction: Reduction | None = None) -> None:
         """Add a float64 state of rows that begin with a finite number, none at first.
@@ -107,7 +112,7 @@ class MergeableMetric(Metric):
                 `torchcover.metrics.with_rows`.
         """
         self._tables[name] = reduction or joined
-        none = torch.empty((0, columns), dtype=torch.float64)
+        none = torch.empty((0, columns), dtype=torch.float64, device="cpu")
         of_ranks = partial(_of_filled, reduction=self._tables[name])
         self.add_state(name, none, dist_reduce_fx=of_ranks, persistent=True)
 
@@ -217,7 +222,9 @@ class MergeableMetric(Metric):
 
     @torch.inference_mode(False)
     def _apply(self, fn: Callable[[Tensor], Tensor], *args: Any, **kwargs: Any) -> "MergeableMetric":  # noqa: ANN401
-        """Move the state to another device, but leave its type."""
+        """Move the state to another device, if that has float64, but leave its type."""
+        if not has_float64(fn(torch.empty(0, dtype=torch.int64, device=self.device)).device):
+            return self
 
         def moved(state: Tensor) -> Tensor:
             converted = fn(state)

@@ -2,12 +2,13 @@
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from torchcover.devices import through_cpu
 from torchcover.neighbors.choice import choose_search
 
 # Queries that are measured together on a CPU.
@@ -56,9 +57,7 @@ def blind_spot_radius(
         >>> blind_spot_radius(reference, torch.zeros(1, 3))
         tensor([0., 5.])
     """
-    check_cloud(reference, "reference")
-    check_cloud(sensor, "sensor")
-    distance = _nearest(reference, sensor, max_radius, backend, memory_mb).distance
+    distance = _nearest(reference, sensor, max_radius, backend, memory_mb, ("reference", "sensor")).distance
     return distance.clamp(max=distance.new_tensor(max_radius))
 
 
@@ -109,41 +108,88 @@ def nearest(
         >>> nearest(torch.tensor([[0.9, 0.0, 0.0], [9.0, 0.0, 0.0]]), points, max_distance=1.0)
         Nearest(distance=tensor([0.1000,    inf]), index=tensor([ 1, -1]))
     """
-    check_cloud(query, "query")
-    check_cloud(points, "points")
-    return _nearest(query, points, max_distance, backend, memory_mb)
+    return _nearest(query, points, max_distance, backend, memory_mb, ("query", "points"))
 
 
-def _nearest(query: Tensor, points: Tensor, max_distance: float, backend: str, memory_mb: float) -> Nearest:
+@through_cpu
+def _nearest(
+    query: Tensor, points: Tensor, max_distance: float, backend: str, memory_mb: float, names: tuple[str, str]
+) -> Nearest:
+    for cloud, name in zip((query, points), names, strict=True):
+        check_shape(cloud, name)
     query, points = _check_together(query, points, max_distance, memory_mb)
-    max_distance = float(torch.tensor(max_distance, dtype=query.dtype))
+    # A custom operator costs 30 us a call, and a second at the first one: it is for traces and transforms only.
+    is_traced = torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active()
+    search = _find_indices_operator if is_traced else _find_indices
+    index = search(query.detach(), points.detach(), max_distance, backend, memory_mb, *names)
+    return _measure_distance(query, points, index, max_distance)
+
+
+def _find_indices(
+    query: Tensor,
+    points: Tensor,
+    max_distance: float,
+    backend: str,
+    memory_mb: float,
+    query_name: str,
+    points_name: str,
+) -> Tensor:
+    """Search clouds of one type and device, without gradients.
+
+    Args:
+        query: (N, 3) coordinates.
+        points: (M, 3) coordinates.
+        max_distance: As in `nearest`, and so are the next two.
+        backend: Likewise.
+        memory_mb: Likewise.
+        query_name: What messages call `query`.
+        points_name: What messages call `points`.
+
+    Returns:
+        (N,) int64 index of the nearest point; -1, or the index of any point, where none is within `max_distance`.
+    """
+    check_finite(query, query_name)
+    check_finite(points, points_name)
     search = choose_search(query, points, backend)
+    if len(query) == 0 or len(points) == 0:
+        return torch.full((len(query),), -1, dtype=torch.int64, device=query.device)
 
-    def found(query: Tensor, memory_mb: float) -> Nearest:
-        if len(query) == 0 or len(points) == 0:
-            index = torch.full((len(query),), -1, dtype=torch.int64, device=query.device)
-        else:
-            # Autocast is for networks: no coordinate may be rounded to bfloat16.
-            with torch.no_grad(), torch.autocast(query.device.type, enabled=False):
-                scaled, among, bound = _rescale(query, points, max_distance)
-                # A little more than the bound, for a search compares squares in its own type, and `_distance_to` the
-                # differences; not so little that its square vanishes: 0 still finds a point at distance 0.
-                reach = max(bound * (1 + 1e-5), 2 * math.sqrt(torch.finfo(scaled.dtype).tiny))
-                index = search(scaled, among, reach, memory_mb)
-        return _distance_to(query, points, index, max_distance)
+    def find(query: Tensor, memory_mb: float) -> Tensor:
+        # Autocast is for networks: no coordinate may be rounded to bfloat16.
+        with torch.no_grad(), torch.autocast(query.device.type, enabled=False):
+            scaled, among, bound = _rescale(query, points, max_distance)
+            # A search compares squares in its own type, `_measure_distance` the differences: the bound is a little
+            # larger, but no so little that its square vanishes, for 0 still finds a point at distance 0.
+            reach = max(bound * (1 + 1e-5), 2 * math.sqrt(torch.finfo(scaled.dtype).tiny))
+            return search(scaled, among, reach, memory_mb)
 
-    return _in_parts_that_fit(found, query, points, memory_mb)
+    return _in_parts_that_fit(find, query, points, memory_mb)
+
+
+# `_find_indices` as one opaque step of torch.compile, torch.func and vmap.
+_find_indices_operator = torch.library.custom_op("torchcover::find_indices", _find_indices, mutates_args=())
+
+
+@_find_indices_operator.register_fake
+def _(query: Tensor, points: Tensor, *_: object) -> Tensor:
+    return query.new_empty(query.shape[0], dtype=torch.int64)
+
+
+@_find_indices_operator.register_vmap
+def _(info: Any, in_dims: Any, query: Tensor, points: Tensor, *rest: Any) -> tuple[Tensor, int]:  # noqa: ANN401
+    clouds = zip((query, points), in_dims, strict=False)
+    batches = [[cloud] * info.batch_size if dim is None else cloud.unbind(dim) for cloud, dim in clouds]
+    return torch.stack([_find_indices_operator(*pair, *rest) for pair in zip(*batches, strict=True)]), 0
 
 
 def _in_parts_that_fit(
-    found: Callable[[Tensor, float], Nearest], query: Tensor, points: Tensor, memory_mb: float
-) -> Nearest:
+    find: Callable[[Tensor, float], Tensor], query: Tensor, points: Tensor, memory_mb: float
+) -> Tensor:
     """All queries at once, or as many as there is memory for on the device."""
     part = max(1, len(query))
     while True:
         try:
-            parts = [found(some, memory_mb) for some in torch.split(query, part)]
-            return parts[0] if len(parts) == 1 else Nearest(*map(torch.cat, zip(*parts, strict=True)))
+            return torch.cat([find(some, memory_mb) for some in torch.split(query, part)])
         except torch.cuda.OutOfMemoryError as error:
             # Nothing of the error is kept, for its traceback holds on to the memory.
             said = str(error).partition("\n")[0]
@@ -168,35 +214,32 @@ def _check_together(query: Tensor, points: Tensor, max_distance: float, memory_m
 
 def _rescale(query: Tensor, points: Tensor, max_distance: float) -> tuple[Tensor, Tensor, float]:
     """Keep squares of coordinates from overflowing or vanishing in the search: widen, else scale by a power of two."""
-    bounds = [bound for cloud in (query, points) for bound in cloud.detach().aminmax()]
+    bounds = [bound for cloud in (query, points) for bound in cloud.aminmax()]
     largest = float(torch.stack(bounds).abs().amax())
     limit = float(torch.finfo(query.dtype).max) ** 0.25
     if largest == 0.0 or 1 / limit < largest < limit:
-        return query.detach(), points.detach(), max_distance
+        return query, points, max_distance
     if query.dtype == torch.float32:  # any square of it fits float64
-        return query.detach().double(), points.detach().double(), max_distance
+        return query.double(), points.double(), max_distance
     scale = -math.frexp(largest)[1]
     # Two steps: 2^scale itself may lie outside the type's range when the coordinates are subnormal.
     half = 2.0 ** (scale // 2)
     rest = 2.0 ** (scale - scale // 2)
-    return query.detach() * half * rest, points.detach() * half * rest, max_distance * half * rest
+    return query * half * rest, points * half * rest, max_distance * half * rest
 
 
-def _distance_to(query: Tensor, points: Tensor, index: Tensor, max_distance: float) -> Nearest:
+def _measure_distance(query: Tensor, points: Tensor, index: Tensor, max_distance: float) -> Nearest:
     """Measure from the differences, in float64; mask what is out of reach."""
     if len(points) == 0:
         return Nearest(query.new_full((len(query),), math.inf), index)
-    found = index >= 0
-    everywhere = index if bool(found.all()) else index.clamp(min=0)
     # Squares of float32 differences always fit float64; only float64 input can need scaling.
     norm = _scaled_norm if query.dtype == torch.float64 else _norm
-    # In parts that stay in the processor's cache; a GPU takes all at once.
-    part = PART if query.device.type == "cpu" else len(query)
-    parts = zip(torch.split(query, part), torch.split(everywhere, part), strict=True)
+    # In parts that stay in the processor's cache; a GPU takes all at once, a trace knows no number of parts.
+    in_parts = query.device.type == "cpu" and not torch.compiler.is_compiling()
+    part = PART if in_parts else max(1, len(query))
+    parts = zip(torch.split(query, part), torch.split(index.clamp(min=0), part), strict=True)
     distance = torch.cat([norm(q.double() - points.index_select(0, i).double()).to(query.dtype) for q, i in parts])
-    within = found & (distance.detach() <= max_distance)
-    if bool(within.all()):
-        return Nearest(distance, index)
+    within = (index >= 0) & (distance.detach() <= distance.new_tensor(max_distance))
     return Nearest(distance.where(within, math.inf), index.where(within, -1))
 
 
@@ -255,9 +298,19 @@ def check_cloud(cloud: Tensor, name: str) -> None:
         TypeError: Not a tensor of a floating-point type.
         ValueError: Another shape, or NaN or infinite coordinates (the message says how many points have them).
     """
+    check_shape(cloud, name)
+    check_finite(cloud, name)
+
+
+def check_shape(cloud: Tensor, name: str) -> None:
+    """Raise unless `cloud` is a floating-point tensor of shape (N, 3); looks at no coordinate."""
     check_tensor(cloud, name, floating=True)
     if cloud.ndim != 2 or cloud.shape[1] != 3:
         raise ValueError(f"{name}: shape (N, 3) is needed; got {tuple(cloud.shape)}")
+
+
+def check_finite(cloud: Tensor, name: str) -> None:
+    """Raise if coordinates of `cloud` are NaN or infinite."""
     # A sum is finite only if all its terms are; one that overflows is looked at term by term.
     if not cloud.detach().sum().isfinite() and not cloud.isfinite().all():
         bad = int((~cloud.detach().isfinite()).any(dim=1).sum())

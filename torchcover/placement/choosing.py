@@ -297,9 +297,9 @@ def _worth_in(place: tuple[str, str], name: str, instants: CommonInstants, frame
     """(P,) what each point is worth in a region and band."""
     (region, band), questions, grid = place, instants.questions, instants.questions.grid
     where = Places([questions.regions[region]], grid)
-    cells = torch.zeros(grid.shape, dtype=torch.bool)
+    cells = torch.zeros(grid.shape, dtype=torch.bool, device="cpu")
     cells[list(grid.heights).index(band)] = where.regions[0].mask(grid)
-    of_frames, m2, probed = [], torch.zeros(0), torch.zeros(grid.cells, dtype=torch.int64)
+    of_frames, m2, probed = [], torch.zeros(0, device="cpu"), torch.zeros(grid.cells, dtype=torch.int64, device="cpu")
     for frame in frames:
         inside, of, cell = grid.bins(frame.reference, frame.heights_in(grid.band_frame))
         if instants.estimate == "area":
@@ -320,7 +320,7 @@ def _worth_in(place: tuple[str, str], name: str, instants: CommonInstants, frame
         if instants.estimate == "known":
             of_cell = torch.bincount(cell, weights=weight, minlength=grid.cells)
             share = weight / of_cell[cell] / probed[cell] / (probed > 0).sum()
-        found.append(torch.zeros(len(frame.reference), dtype=torch.float64).index_add_(0, points, share))
+        found.append(torch.zeros(len(frame.reference), dtype=torch.float64, device="cpu").index_add_(0, points, share))
     return torch.cat(found).numpy()
 
 

@@ -87,6 +87,8 @@ def _prefix(
     left_out: Sequence[Sequence[float]],
     steps: Sequence[int],
 ) -> Prefix:
-    each = torch.tensor(left_out, dtype=torch.float64).view(-1, len(value))
-    numbers = Estimate(quantities, torch.tensor(value, dtype=torch.float64), each, torch.tensor(steps))
+    each = torch.tensor(left_out, dtype=torch.float64, device="cpu").view(-1, len(value))
+    numbers = Estimate(
+        quantities, torch.tensor(value, dtype=torch.float64, device="cpu"), each, torch.tensor(steps, device="cpu")
+    )
     return Prefix(instants, numbers, self_hit_share)

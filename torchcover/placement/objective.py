@@ -101,7 +101,7 @@ class Objective(Document):
         (one,) = looked_for(rig, Requirements.model_validate({"requirements": [self.requires]}), world, sensor_model)
         share = (one.count - one.failed - one.unknown) / one.count if one.count else math.nan
         quantity = Quantity(self.key, self.words, "share", lower_is_better=False)
-        return Estimate.of([quantity], torch.tensor([share], dtype=torch.float64))
+        return Estimate.of([quantity], torch.tensor([share], dtype=torch.float64, device="cpu"))
 
     @property
     def key(self) -> str:

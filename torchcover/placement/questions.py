@@ -95,7 +95,7 @@ class Questions(NamedTuple):
     def asked(self, points: Tensor, height: Tensor | None = None) -> Tensor:
         """(M,) bool: which of (M, 3) points lie in a region and band that is asked about."""
         inside, of, cell = self.grid.bins(points, height)
-        kept = torch.zeros(len(points), dtype=torch.bool)
+        kept = torch.zeros(len(points), dtype=torch.bool, device="cpu")
         x, y, bands = *points[inside[of], :2].T, list(self.grid.heights)
         band, column = cell // (self.grid.cells // len(bands)), cell % (self.grid.cells // len(bands))
         for place in dict.fromkeys(place for objective in self.objectives.values() for place in objective.places):
@@ -178,7 +178,7 @@ class RigNumbers:
             quantities.append(each[0].quantities[0]._replace(key=name))
             values.append(torch.cat([one.value for one in each]).mean())
             whole = all(len(one.left_out) == len(steps) for one in each)
-            unknown = torch.full((len(steps),), math.nan, dtype=torch.float64)
+            unknown = torch.full((len(steps),), math.nan, dtype=torch.float64, device="cpu")
             known = torch.cat([one.left_out for one in each], dim=1).mean(dim=1) if whole else unknown
             left_out.append(values[-1].expand(len(steps)) if name in self.kept else known)
         return Estimate(tuple(quantities), torch.stack(values), torch.stack(left_out, dim=1), steps)

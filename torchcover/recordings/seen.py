@@ -65,7 +65,7 @@ class SeenObjects:
             rows,
             ids=tuple(one.name for one in found),
             categories=tuple(one.category for one in found),
-            visibility=torch.tensor([one.visibility for one in found], dtype=torch.float32),
+            visibility=torch.tensor([one.visibility for one in found], dtype=torch.float32, device="cpu"),
         )
 
     def _between(self, seen: Sequence[Seen], times_s: Sequence[float], time_s: float) -> Seen | None:

@@ -216,7 +216,7 @@ class Sweeps:
             (first_s, first_m), (last_s, last_m) = min(known, key=itemgetter(0)), max(known, key=itemgetter(0))
             is_known = name and last_s > first_s
             moving.append(not is_known or np.linalg.norm(last_m - first_m) > MOVES_MPS * (last_s - first_s))
-        return boxes.select(torch.tensor(moving, dtype=torch.bool))
+        return boxes.select(torch.tensor(moving, dtype=torch.bool, device="cpu"))
 
     def _places_of(self, recording: Recording, index: int) -> dict[str, NDArray[np.float64]]:
         """As `_places_m`; nothing where labels cannot be read, which is the fault of that instant alone."""

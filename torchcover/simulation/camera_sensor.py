@@ -117,9 +117,9 @@ class CameraSensor(Ranging):
 
         A single column is as wide as its pixel.
         """
-        columns = torch.arange(0, self.width, self.stride, dtype=torch.float64)
+        columns = torch.arange(0, self.width, self.stride, dtype=torch.float64, device="cpu")
         if len(columns) == 1:
-            columns = torch.tensor([-0.5, 0.5], dtype=torch.float64)
+            columns = torch.tensor([-0.5, 0.5], dtype=torch.float64, device="cpu")
         row = self.height // self.stride // 2 * self.stride
         forward, left, _ = self._directions(torch.stack([columns, torch.full_like(columns, row)], dim=1)[None])
         angle = np.rad2deg(np.arctan2(left, forward))
@@ -140,7 +140,9 @@ class CameraSensor(Ranging):
 
     def directions(self) -> Float64:
         """(3, rows, columns) unit directions in the frame of the mount; NaN where a pixel has no ray."""
-        rows, columns = (torch.arange(0, size, self.stride, dtype=torch.float64) for size in (self.height, self.width))
+        rows, columns = (
+            torch.arange(0, size, self.stride, dtype=torch.float64, device="cpu") for size in (self.height, self.width)
+        )
         return self._directions(torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=2))
 
     def times_s(self) -> Float64 | None:

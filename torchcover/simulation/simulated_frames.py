@@ -262,8 +262,8 @@ class SimulatedFrames(FrameDataset):
         rows = [[*label.centre_m, *label.size_m, label.yaw_rad] for label in found]
         velocities = np.array([label.velocity_mps for label in found])
         return Boxes.from_rows(
-            torch.tensor(rows, dtype=torch.float32).view(-1, 7),
-            velocity_mps=torch.tensor(velocities, dtype=torch.float32).view(-1, 2),
+            torch.tensor(rows, dtype=torch.float32, device="cpu").view(-1, 7),
+            velocity_mps=torch.tensor(velocities, dtype=torch.float32, device="cpu").view(-1, 2),
             ids=tuple(label.name for label in found),
             categories=tuple(label.category for label in found),
             drawn_points=None if drawn is None else torch.from_numpy(drawn[[label.number for label in found]]),
@@ -308,8 +308,8 @@ def with_boxes(frame: Frame, boxes: Boxes, rigs: Mapping[str, Rig]) -> Frame:
     for name, rig in rigs.items():
         if any(sensor.counts_as > 1 for sensor in rig.sensors):
             of_sensors = frame.clouds_by_sensor(name, within_m=MEASURED_WITHIN_M).values()
-            each = torch.tensor([sensor.counts_as for sensor in rig.sensors])
-            counts_as[name] = each.repeat_interleave(torch.tensor([len(cloud) for cloud in of_sensors]))
+            each = torch.tensor([sensor.counts_as for sensor in rig.sensors], device="cpu")
+            counts_as[name] = each.repeat_interleave(torch.tensor([len(cloud) for cloud in of_sensors], device="cpu"))
     return replace(frame, boxes=with_hits(boxes, clouds, counts_as))
 
 

@@ -106,8 +106,7 @@ class CoverageCallback(Callback):
         self._logged = {}
 
     def _start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        # The sums live where the processes can exchange them; Apple's GPUs have no float64.
-        self.metric.to("cpu" if pl_module.device.type == "mps" else pl_module.device)
+        self.metric.to(pl_module.device)  # where the processes can exchange the sums
         if self._epoch == trainer.current_epoch:
             return
         due = trainer.state.fn != "fit" or (trainer.current_epoch + 1) % self.every_n_epochs == 0
@@ -197,7 +196,9 @@ class CoverageCallback(Callback):
         if self._epoch is None:
             return {}
         with self.metric.sync_context():
-            sums = {name: torch.as_tensor(total).cpu().clone() for name, total in self.metric.metric_state.items()}
+            sums = {
+                name: torch.as_tensor(total, device="cpu").clone() for name, total in self.metric.metric_state.items()
+            }
         return {"epoch": self._epoch, "metric": sums, "frames": self._once.state_dict()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:

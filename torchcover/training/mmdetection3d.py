@@ -45,6 +45,9 @@ def frames_of_data_batch(
                 f"sample {k} has no {reference!r}; add it to the results in the pipeline, and pack them with "
                 "PackWithReference of torchcover.training.mmengine"
             )
-        clouds_of_frame = torch.as_tensor(cloud), torch.as_tensor(sample[reference])
-        frames.append(frame_of(*clouds_of_frame, sample.get("sample_idx"), vehicle_T_lidar))
+        points, reference_points = (
+            each if isinstance(each, Tensor) else torch.as_tensor(each, device="cpu")
+            for each in (cloud, sample[reference])
+        )
+        frames.append(frame_of(points, reference_points, sample.get("sample_idx"), vehicle_T_lidar))
     return FrameBatch(tuple(frames))

@@ -88,7 +88,7 @@ class MMEngineCoverage(BaseMetric):  # type: ignore[misc]  # MMEngine has no typ
         super().__init__(prefix=prefix)
         self.metric = metric if isinstance(metric, CoverageMetric) else _metric_of(metric)
         self.regions = None if regions is None else [r if isinstance(r, Region) else Region(**r) for r in regions]
-        pose = None if vehicle_T_lidar is None else torch.as_tensor(vehicle_T_lidar, dtype=torch.float64)
+        pose = None if vehicle_T_lidar is None else torch.as_tensor(vehicle_T_lidar, dtype=torch.float64, device="cpu")
         self.frames_of = frames_of or partial(frames_of_data_batch, vehicle_T_lidar=pose)
         self.coverage: Coverage | None = None
         self._once = CountOnce()

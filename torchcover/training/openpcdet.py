@@ -54,7 +54,7 @@ def frames_of_batch_dict(
 
 
 def _split(points: object, size: int, name: str) -> list[Tensor]:
-    array = torch.as_tensor(points)
+    array = points if isinstance(points, Tensor) else torch.as_tensor(points, device="cpu")
     if array.ndim != 2 or array.shape[1] < 4:
         raise ValueError(
             f"{name}: shape (N, 1 + 3 + ...), the number of the sample first, is needed; got {tuple(array.shape)}"

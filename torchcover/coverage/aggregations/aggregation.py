@@ -100,7 +100,7 @@ class Aggregation(ABC):
     def quantities(self) -> tuple[Quantity, ...]:
         """What it gives a map, and a number of each region of, whatever it has seen."""
         empty = {name: state.initial.clone() for name, state in self.states(1).items()}
-        nothing = torch.zeros(1, dtype=torch.int64)
+        nothing = torch.zeros(1, dtype=torch.int64, device="cpu")
         return tuple(layer.quantity for layer in self.layers(empty, nothing, math.inf))
 
     @abstractmethod

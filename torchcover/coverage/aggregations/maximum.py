@@ -21,7 +21,7 @@ class Maximum(Aggregation):
 
     def states(self, cells: int) -> dict[str, State]:
         """`radius` (C,): the largest so far, minus infinity before the first."""
-        return {"radius": State(torch.full((cells,), -math.inf, dtype=torch.float64), reduction="max")}
+        return {"radius": State(torch.full((cells,), -math.inf, dtype=torch.float64, device="cpu"), reduction="max")}
 
     def update(self, sums: Mapping[str, Tensor], step: BinnedStep) -> None:
         """Keep what is larger."""

@@ -38,7 +38,7 @@ class MeanOfMeans(Aggregation):
 
     def states(self, cells: int) -> dict[str, State]:
         """`sums` (Q, C): sums over the steps of the cell's mean of each quantity."""
-        return {"sums": State(torch.zeros(len(self.quantities), cells, dtype=torch.float64))}
+        return {"sums": State(torch.zeros(len(self.quantities), cells, dtype=torch.float64, device="cpu"))}
 
     def update(self, sums: Mapping[str, Tensor], step: BinnedStep) -> None:
         """Add the means of a step."""
@@ -76,8 +76,8 @@ class VisibleArea(Aggregation):
     def states(self, cells: int) -> dict[str, State]:
         """`m2` (C,): square metres; `sums` (Q, C): each quantity times them."""
         return {
-            "m2": State(torch.zeros(cells, dtype=torch.float64)),
-            "sums": State(torch.zeros(len(self.thresholds) + 1, cells, dtype=torch.float64)),
+            "m2": State(torch.zeros(cells, dtype=torch.float64, device="cpu")),
+            "sums": State(torch.zeros(len(self.thresholds) + 1, cells, dtype=torch.float64, device="cpu")),
         }
 
     def update(self, sums: Mapping[str, Tensor], step: BinnedStep) -> None:
@@ -104,7 +104,7 @@ class PooledMean(Aggregation):
 
     def states(self, cells: int) -> dict[str, State]:
         """`sum` (C,) of weighted radii and `weight` (C,) of the points."""
-        return {name: State(torch.zeros(cells, dtype=torch.float64)) for name in ("sum", "weight")}
+        return {name: State(torch.zeros(cells, dtype=torch.float64, device="cpu")) for name in ("sum", "weight")}
 
     def update(self, sums: Mapping[str, Tensor], step: BinnedStep) -> None:
         """Add the points of a step."""

@@ -17,7 +17,9 @@ from torchcover.estimation import Quantity
 # A sum of weights that misses its target by rounding has reached it: 0.1 + 0.2 + 0.3 is half of 1.2.
 ROUNDED_DOWN = 1 - 1e-9
 # Bins of radii: 20 a decade from 1 cm to 100 m, and one beyond each end.
-RADIUS_EDGES_M = torch.cat([torch.tensor([0.0]), torch.logspace(-2, 2, 81), torch.tensor([math.inf])]).double()
+RADIUS_EDGES_M = torch.cat(
+    [torch.tensor([0.0], device="cpu"), torch.logspace(-2, 2, 81, device="cpu"), torch.tensor([math.inf], device="cpu")]
+).double()
 
 
 def bin_of(values: Tensor, edges: Tensor) -> Tensor:
@@ -121,7 +123,7 @@ class Quantiles(AtLevels):
 
     def states(self, cells: int) -> dict[str, State]:
         """`histogram` (bins, C): for each step that has probed the cell, shares that add up to 1."""
-        return {"histogram": State(torch.zeros(len(RADIUS_EDGES_M) - 1, cells, dtype=torch.float64))}
+        return {"histogram": State(torch.zeros(len(RADIUS_EDGES_M) - 1, cells, dtype=torch.float64, device="cpu"))}
 
     def update(self, sums: Mapping[str, Tensor], step: BinnedStep) -> None:
         """Add the points of a step, each with its share of its cell."""
@@ -152,7 +154,7 @@ class StepQuantiles(AtLevels):
 
     def states(self, cells: int) -> dict[str, State]:
         """`histogram` (bins, C): in how many steps the mean radius of the cell fell into each bin."""
-        return {"histogram": State(torch.zeros(len(RADIUS_EDGES_M) - 1, cells, dtype=torch.int64))}
+        return {"histogram": State(torch.zeros(len(RADIUS_EDGES_M) - 1, cells, dtype=torch.int64, device="cpu"))}
 
     def update(self, sums: Mapping[str, Tensor], step: BinnedStep) -> None:
         """Count the step in every cell that it has probed."""

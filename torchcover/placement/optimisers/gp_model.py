@@ -60,7 +60,7 @@ class GaussianProcess:
         if scale != spread:
             standard = torch.zeros_like(standard)
         if like is None:
-            some = torch.linspace(0, len(values) - 1, min(len(values), MOST_LEARNT_FROM)).round().long()
+            some = torch.linspace(0, len(values) - 1, min(len(values), MOST_LEARNT_FROM), device="cpu").round().long()
             learnt = _learnt(_squared_apart(levels, places[some], places[some]), standard[some], noise[some])
         else:
             learnt = like.log_lengths, like.log_signal, like.log_noise
@@ -80,7 +80,7 @@ class GaussianProcess:
 def _squared_apart(levels: tuple[int, ...], first: Tensor, second: Tensor) -> Tensor:
     """(variables, n, m) squared distances along each variable; 1 between two options."""
     squared = (first.T[:, :, None] - second.T[:, None, :]).square()
-    is_choice = torch.tensor(levels)[:, None, None] > 0
+    is_choice = torch.tensor(levels, device="cpu")[:, None, None] > 0
     return torch.where(is_choice, (squared > 0).to(squared.dtype), squared)
 
 
@@ -106,10 +106,10 @@ def _learnt(apart: Tensor, standard: Tensor, noise: Tensor) -> tuple[Tensor, Ten
     """Logarithms of lengths, signal and noise with the highest posterior density among the restarts."""
     count = len(apart)
     length = PRIOR_LENGTH + 0.5 * math.log(count)  # distances grow with the number of variables
-    usual = torch.tensor([length] * count + [0.0, PRIOR_NOISE], dtype=standard.dtype)
+    usual = torch.tensor([length] * count + [0.0, PRIOR_NOISE], dtype=standard.dtype, device="cpu")
     ends = []
     for longer, noisier in RESTARTS:
-        values = usual + torch.tensor([longer] * count + [0.0, noisier], dtype=standard.dtype)
+        values = usual + torch.tensor([longer] * count + [0.0, noisier], dtype=standard.dtype, device="cpu")
         descent = torch.optim.LBFGS([values.requires_grad_()], **DESCENT)
 
         def loss(values: Tensor = values, descent: torch.optim.Optimizer = descent) -> Tensor:
@@ -132,7 +132,7 @@ def _loss(values: Tensor, usual: Tensor, apart: Tensor, standard: Tensor, noise:
     kernel = _kernel(apart, near[:count], near[count])
     cholesky = _factor(kernel + torch.diag(noise + near[count + 1].exp() + LEAST_NOISE))
     whitened = torch.linalg.solve_triangular(cholesky, standard[:, None], upper=False)
-    widths = torch.tensor([PRIOR_WIDTH] * (count + 1) + [PRIOR_NOISE_WIDTH], dtype=values.dtype)
+    widths = torch.tensor([PRIOR_WIDTH] * (count + 1) + [PRIOR_NOISE_WIDTH], dtype=values.dtype, device="cpu")
     off = (values - usual) / widths
     found: Tensor = 0.5 * (whitened.square().sum() + off.square().sum()) + cholesky.diagonal().log().sum()
     return found

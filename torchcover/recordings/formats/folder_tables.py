@@ -72,7 +72,7 @@ def read_boxes(path: Path) -> Boxes:
             velocity_mps = np.column_stack([numbers.get(name, unknown) for name in VELOCITY])
             known["velocity_mps"] = torch.from_numpy(velocity_mps).float()
         if DRAWN in numbers:
-            known["drawn_points"] = torch.tensor(_whole_numbers(DRAWN, numbers[DRAWN]))
+            known["drawn_points"] = torch.tensor(_whole_numbers(DRAWN, numbers[DRAWN]), device="cpu")
         if BOTTOM in numbers:
             known["bottom_heights_m"] = torch.from_numpy(numbers[BOTTOM]).float()
         return Boxes.from_rows(torch.from_numpy(np.column_stack([numbers[name] for name in BOX])).float(), **known)

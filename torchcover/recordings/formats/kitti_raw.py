@@ -105,7 +105,7 @@ class KittiRaw(Layout):
         """Return the tracklets of the frame number of a scan; None without the file."""
         if not self._tracklets.exists():
             return None
-        return self._tracked.get(self._numbers[index], Boxes.from_rows(torch.empty(0, 7)))
+        return self._tracked.get(self._numbers[index], Boxes.from_rows(torch.empty(0, 7, device="cpu")))
 
     def _read_times(self, scanned: Sequence[int]) -> NDArray[np.float64]:
         """Return the times of the scans with a pose in seconds after the first; `scanned`: frame numbers of all."""
