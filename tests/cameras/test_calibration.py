@@ -93,6 +93,10 @@ def test_a_camera_info_describes_the_image_that_is_published(tmp_path, messages,
         ),
         (ROS_MESSAGE + ros_region(400, 0, 320, 200, 1), "roi: .* width of 640 pixels is needed; got 320 from 400 on"),
         (ROS_MESSAGE + ros_region(400, 0, 0, 0, 1), "roi: .* got 0 from 400 on; give the region that was read"),
+        (
+            ROS_MESSAGE.replace("318", "79") + ros_region(0, 0, 0, 0, 4),
+            "binning_x 4: K seems .* binned image already",
+        ),
         (ROS_MESSAGE + "roi: 3", "roi: x_offset, y_offset, width and height are needed; got 3"),
         (ROS_MESSAGE.replace("height", "hight"), "image_height or height is missing"),
         (ROS_MESSAGE.replace("plumb_bob", "wide"), "'wide' is unknown; allowed: plumb_bob"),
@@ -163,6 +167,10 @@ def test_opencv_fisheye_and_stereo_names(tmp_path):
         ValueError, match=r"camera_matrix, .*image_height not in the file; it holds fisheye_model, M1, D1"
     ):
         Camera.from_opencv(tmp_path / "s.yml")
+    with (tmp_path / "s.yml").open("a") as file:
+        file.write("xi: 0.9\n")
+    with pytest.raises(BadFileError, match="xi: the omnidirectional model of OpenCV is not read"):
+        Camera.from_opencv(tmp_path / "s.yml", matrix_key="M1", distortion_key="D1", size=(640, 480))
 
 
 def test_opencv_written_as_its_manual_shows(tmp_path):

@@ -442,6 +442,23 @@ def test_poses_in_two_frames_are_not_mixed(tmp_path, other_every):
         np.testing.assert_allclose(recording.world_T_vehicle(index), pose_at(0.1 * index), atol=1e-6)
 
 
+def test_a_second_way_to_the_same_frame_is_told(tmp_path):
+    """As in hector_slam issue 27: `map -> odom -> base_link` and `map -> scanmatcher -> base_link`."""
+    messages = []
+    for k in range(12):
+        time_ns = T0_NS + k * STEP_NS // 2
+        first = link("map", "odometry", pose_at(0.05 * k), time_ns), link("odometry", "base_link", np.eye(4), time_ns)
+        other = rigid(np.eye(3), [0.3, 0.0, 0.0]) @ pose_at(0.05 * k)
+        second = link("map", "matcher", other, time_ns), link("matcher", "base_link", np.eye(4), time_ns)
+        messages.append(("/tf", time_ns, tree(*first, *second)))
+    with pytest.warns(UserWarning, match="map -> (odometry|matcher): not used, since poses are taken on another way"):
+        recording = RosBag(bag(tmp_path / "a", MOUNTED + messages + clouds(count=5)))
+    off_m = np.diff(
+        [recording.world_T_vehicle(index)[:3, 3] - pose_at(0.1 * index)[:3, 3] for index in range(5)], axis=0
+    )
+    np.testing.assert_allclose(off_m, 0.0, atol=1e-6)
+
+
 def test_two_senders_of_one_pose_are_told(tmp_path):
     messages = [
         ("/tf", time_ns, tree(link("odom", "base_link", rigid(np.eye(3), [0.0, 0.3 * (k % 2), 0.0]) @ pose, time_ns)))

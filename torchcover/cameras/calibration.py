@@ -215,6 +215,8 @@ def read_opencv(
     missing = [key for key in wanted if key not in content]
     if missing:
         raise ValueError(f"{', '.join(missing)} not in the file; it holds {', '.join(map(str, content))}")
+    if "xi" in content:
+        raise ValueError("xi: the omnidirectional model of OpenCV is not read; calibrate with its fisheye model")
     size = size or (whole(content, "image_width"), whole(content, "image_height"))
     model = model or ("kannala_brandt" if content.get("fisheye_model") else "brown_conrady")
     matrix, distortion = numbers(content, matrix_key), numbers(content, distortion_key)
@@ -312,6 +314,12 @@ def _cut_and_binned(content: Mapping[str, Any], size: tuple[int, int], K: Matrix
             raise ValueError(
                 f"roi: a part of the image's {name} of {length} pixels is needed; got {cut} from {offset} on; give the "
                 "region that was read, or 0 for all"
+            )
+        whole_center, published_center = offset + (cut or length) / 2, (cut or length) / binning / 2
+        if binning > 1 and abs(K[axis, 2] - published_center) < abs(K[axis, 2] - whole_center):
+            raise ValueError(
+                f"{key} {binning}: K seems to describe the binned image already: c{'xy'[axis]} = {K[axis, 2]:g} "
+                f"is its middle; set {key} to 1 and {name} to {(cut or length) // binning}, or give K of the sensor"
             )
         K[axis, 2] -= offset
         K[axis] /= binning

@@ -225,7 +225,19 @@ def _of_tree(bag: Bag, topic: str, tree: FrameTree, vehicle_frame: str) -> list[
     above = [f"{parent} -> {child}" for parent, child in counts if child in still.mounted_with(vehicle_frame)]
     if above and not ways:
         raise ValueError(f"{topic}: {', '.join(above)}: the transforms from {vehicle_frame} upward are a loop")
+    if unused := _unused_edges(moving, tree, list(ways.values())):
+        warnings.warn(
+            f"{bag.path}: {topic}: {', '.join(unused)}: not used, since poses are taken on another way", stacklevel=2
+        )
     return [VehiclePoses(bag, topic, way, f"{topic} ({vehicle_frame} in {world})") for world, way in ways.items()]
+
+
+def _unused_edges(moving: Mapping[Edge, int], tree: FrameTree, ways: Sequence[Sequence[Edge | Matrix]]) -> list[str]:
+    """Name the transforms that move what the best way passes, and that are on no way."""
+    edges = [{link for link in way if isinstance(link, tuple)} for way in ways]
+    passed = set[str]().union(*(tree.mounted_with(child) for _, child in (edges[0] if edges else ())))
+    used = set[Edge]().union(*edges)
+    return sorted(f"{parent} -> {child}" for parent, child in moving if child in passed and (parent, child) not in used)
 
 
 def _ways_to_worlds(moving: Mapping[Edge, int], tree: FrameTree, vehicle_frame: str) -> dict[str, list[Edge | Matrix]]:
