@@ -177,6 +177,13 @@ def test_a_camera_behind_glass_is_told_how_to_look_through_it(tmp_path):
             assert len(frames[0].sensor) > 100
 
 
+@pytest.mark.parametrize(("name", "told"), [("a.fbx", "export it as GLB"), ("a.urdf", "`torchcover robot` reads")])
+def test_a_format_that_is_not_read_is_refused_with_the_conversion_that_helps(tmp_path, name, told):
+    (tmp_path / name).write_bytes(b"Kaydara FBX Binary")
+    with pytest.raises(BadFileError, match=f"is no mesh that can be read; {told}"):
+        MeshFile(type="mesh", path=tmp_path / name).mesh()
+
+
 def test_an_index_that_no_vertex_has_is_refused(tmp_path):
     (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 5\n")
     with pytest.raises(BadFileError, match="cannot read it as a mesh"):

@@ -43,6 +43,10 @@ def mesh_arrays(path: Path) -> dict[str, NDArray[Any]]:
         module = str(error).split("'")[1].partition(".")[0]  # trimesh raises a copy of the error without its name
         package = PACKAGES.get(module, module)
         raise ImportError(f"{path}: {path.suffix} needs {module}: pip install {package}") from error
+    except NotImplementedError as error:
+        is_robot = path.suffix.lower() in (".urdf", ".xacro", ".sdf")
+        remedy = "`torchcover robot` reads a URDF" if is_robot else "export it as GLB, OBJ, PLY or STL, as by Blender"
+        raise ValueError(f"{path.suffix or 'a file without a suffix'} is no mesh that can be read; {remedy}") from error
     except Exception as error:  # trimesh raises whatever the reader of the format raises
         raise ValueError(f"trimesh cannot read it as a mesh ({error})") from error
     offsets = np.cumsum([0, *(len(vertices) for vertices, *_ in parts)])
