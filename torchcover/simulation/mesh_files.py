@@ -106,23 +106,29 @@ def _obj_with_triangles(data: bytes) -> bytes:
     lines = [line.lstrip() for line in data.split(b"\n")]
     if OBJ_BACKWARDS.search(data):
         _count_from_first(lines)
-    positions = np.array([line.split()[1:4] for line in lines if line.startswith(b"v ")], dtype=np.float64)
-    faces = [k for k, line in enumerate(lines) if line.startswith((b"f ", b"f\t"))]
-    corners = [lines[k].partition(b"#")[0].split()[1:] for k in faces]
-    sizes = np.array(list(map(len, corners)))
+    # Numbers go straight into arrays: lists of words would take several times the memory of the text.
+    coordinates = (float(word) for line in lines if line.startswith(b"v ") for word in line.split()[1:4])
+    positions = np.fromiter(coordinates, dtype=np.float64).reshape(-1, 3)
+    faces = np.array([k for k, line in enumerate(lines) if line.startswith((b"f ", b"f\t"))])
+    sizes = np.array([len(_corners_of(lines[k])) for k in faces])
     for size in np.unique(sizes[sizes > 3]).tolist():
-        of_size = np.flatnonzero(sizes == size)
-        words = b" ".join(b" ".join(corners[k]) for k in of_size)
+        of_size = faces[sizes == size]
+        words = b" ".join(b" ".join(_corners_of(lines[k])) for k in of_size)
         # The index of the position is what stands before the first slash.
-        polygons = np.array(OBJ_TEXTURE.sub(b"", words).split()).astype(np.int64).reshape(-1, size) - 1
+        polygons = np.fromstring(OBJ_TEXTURE.sub(b"", words), dtype=np.int64, sep=" ").reshape(-1, size) - 1
         if polygons.min() < 0 or polygons.max() >= len(positions):
             raise ValueError(f"faces have vertices up to {polygons.max() + 1}; there are {len(positions)}")
         for k in np.flatnonzero(find_bad_fans(positions[polygons])).tolist():
-            number = of_size[k]
+            corners = _corners_of(lines[of_size[k]])
             triangles = triangulate(positions[polygons[k]], [np.arange(size)])
-            of_face = (b"f " + b" ".join(corners[number][c] for c in triangle) for triangle in triangles.tolist())
-            lines[faces[number]] = b"\n".join(of_face)
+            of_face = (b"f " + b" ".join(corners[c] for c in triangle) for triangle in triangles.tolist())
+            lines[of_size[k]] = b"\n".join(of_face)
     return b"\n".join(lines)
+
+
+def _corners_of(line: bytes) -> list[bytes]:
+    """The words `v/vt/vn` of a face."""
+    return line.partition(b"#")[0].split()[1:]
 
 
 def _count_from_first(lines: list[bytes]) -> None:
@@ -154,9 +160,9 @@ def _with_ply_polygons(
     of_faces, of_vertices = (raw.get(key, {}).get("data") for key in ("face", "vertex"))
     names = of_faces.keys() if isinstance(of_faces, dict) else getattr(of_faces.dtype, "names", None) or ()
     name = next((name for name in ("vertex_index", "vertex_indices") if name in names), None)
-    if name is None:
+    if name is None and not (isinstance(of_faces, np.ndarray) and of_faces.ndim == 2):
         return vertices, faces
-    lists: Iterable[Any] = of_faces[name]
+    lists: Iterable[Any] = of_faces if name is None else of_faces[name]
     if getattr(getattr(lists, "dtype", None), "names", None):
         lists = of_faces[name]["f1"]
     if isinstance(lists, np.ndarray) and lists.shape[1:] == (3,):
