@@ -17,7 +17,7 @@ from torchcover import BevGrid, CoverageMetric, Scenario, evaluate
 from torchcover.data import BadFrameError, ChosenRigs, SimulatedFrames
 from torchcover.evaluation import CoverageObserver, observe, pipeline
 from torchcover.evaluation.pipeline import MOST_TOGETHER, MeasuredFrames, made_together
-from torchcover.evaluation.progress import terminable
+from torchcover.evaluation.progress import showing_wait, terminable
 from torchcover.frames import worlds_of
 from torchcover.simulation import PaperReference
 
@@ -465,3 +465,12 @@ def test_each_worker_is_left_a_core(frame_of, monkeypatch, workers, threads):
         assert (seen, torch.get_num_threads()) == ([threads] * 3, 2)
     finally:
         torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("shown", [True, False])
+def test_a_wait_without_steps_is_shown_on_a_terminal(capsys, monkeypatch, shown):
+    for variable in ("FORCE_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE"):
+        monkeypatch.setenv(variable, "1")
+    with showing_wait("preparing the scene", shown=shown):
+        pass
+    assert ("preparing the scene" in capsys.readouterr().err) == shown

@@ -73,6 +73,29 @@ class Progress:
 
 
 @contextmanager
+def showing_wait(title: str, *, shown: bool) -> Iterator[None]:
+    """Show on stderr, if that is a terminal, for how long a block without steps has run.
+
+    Args:
+        title: What the block does.
+        shown: Whether anybody sees it.
+    """
+    if not shown:
+        yield
+        return
+    from rich import progress
+
+    from torchcover.report import Terminal
+
+    columns = progress.TextColumn("{task.description}", markup=False), progress.SpinnerColumn()
+    with progress.Progress(
+        *columns, progress.TimeElapsedColumn(), console=Terminal(stderr=True), transient=True
+    ) as line:
+        line.add_task(title, total=None)
+        yield
+
+
+@contextmanager
 def terminable(told: Callable[[Sequence[int]], object]) -> Iterator[list[int]]:
     """Treat SIGTERM, as a scheduler or `docker stop` sends it, and SIGHUP, of a lost connection, as Ctrl-C.
 

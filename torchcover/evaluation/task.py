@@ -16,6 +16,7 @@ from torchcover import __version__
 from torchcover.coverage import Region
 from torchcover.evaluation.config import DESCRIPTIONS
 from torchcover.evaluation.observers import AnyObserver
+from torchcover.evaluation.progress import showing_wait
 from torchcover.evaluation.settings import DEFAULT_STEPS, MAX_STEPS, Settings
 from torchcover.frames import ChosenRigs, FrameSource
 from torchcover.recordings import RecordedFrames, open_recording
@@ -97,7 +98,9 @@ def task_of(settings: Settings) -> Task[FrameSource]:
             raise ValueError(f"{rig} is measured already: read it by Coverage.load, or compare it with others")
     frames = settings.frames
     if frames is None:
-        return simulation(settings)
+        is_first = settings.ranks is None or settings.ranks.rank == 0
+        with showing_wait("preparing the scene", shown=settings.progress and is_first):  # meshes may be large
+            return simulation(settings)
     if settings.scenario is not None:
         raise ValueError("scenario and frames exclude each other: simulate a scenario or read a recording")
     settings.check_recording()
