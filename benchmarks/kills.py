@@ -2,8 +2,8 @@
 
 Every run is a fork of this process, so that it need not import anything, into a folder that holds an earlier result.
 A copy of that folder just before each operation is what a kill leaves there. A reader then finds *the earlier* result,
-*the new* one, perhaps without its maps, or is told that the folder is *incomplete*; anything else is *mixed*. A recording
-has no earlier one; it is mixed if a part of it is read, or `--resume` does not complete it.
+*the new* one, perhaps without its maps, or is told that the folder is *incomplete*; anything else is *mixed*. A
+recording has no earlier one; it is mixed if a part of it is read, or `--resume` does not complete it.
 """
 
 import argparse
