@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from enum import IntEnum
+from pathlib import Path
 from typing import Annotated, Any, TextIO
 
 import typer
@@ -183,8 +184,18 @@ def _mistake(error: BaseException) -> str | None:
 
 
 @app.callback(invoke_without_command=True)
-def version(show: Annotated[bool, typer.Option("--version", help="Print the version and stop.")] = False) -> None:
+def version(
+    show: Annotated[bool, typer.Option("--version", help="Print the version and stop.")] = False,
+    allow_links: Annotated[
+        list[Path] | None,
+        typer.Option("--allow-links", help="Folder that links in a recording may lead to; may be repeated."),
+    ] = None,
+) -> None:
     """Blind spots and coverage of a vehicle's sensor rig, measured against a random reference sensor."""
+    if allow_links:
+        from torchcover.files import common_link_roots  # with NumPy, which help does not need
+
+        common_link_roots[:] = allow_links
     if show:
         from torchcover import __version__
 

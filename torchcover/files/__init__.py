@@ -7,6 +7,7 @@ from torchcover.files.bad_file import TooLargeError as TooLargeError
 from torchcover.files.bad_file import allow_links as allow_links
 from torchcover.files.bad_file import check_memory as check_memory
 from torchcover.files.bad_file import check_regular as check_regular
+from torchcover.files.bad_file import common_link_roots as common_link_roots
 from torchcover.files.bad_file import decode as decode
 from torchcover.files.bad_file import find_link_roots as find_link_roots
 from torchcover.files.bad_file import most_gb as most_gb

@@ -16,6 +16,7 @@ from torchcover.files.manifests import check_listed
 Arguments = ParamSpec("Arguments")
 Content = TypeVar("Content")
 
+common_link_roots: list[Path] = []  # folders that links in any recording may lead to
 _link_roots: dict[Path, list[Path]] = {}  # folders that links in each recording may lead to
 
 # Libraries quote what they choke on, which may be the whole file.
@@ -113,7 +114,7 @@ def naming(path: Path, content: str) -> Iterator[None]:
 
 def allow_links(recording: Path, roots: Iterable[Path] = ()) -> None:
     """Refuse files of a recording from now on whose links lead out of it and of the roots."""
-    _link_roots[recording.absolute()] = [place.resolve() for place in (recording, *roots)]
+    _link_roots[recording.absolute()] = [place.resolve() for place in (recording, *common_link_roots, *roots)]
 
 
 def find_link_roots(recording: Path) -> list[Path]:
@@ -127,7 +128,9 @@ def _check_links(path: Path) -> None:
             continue
         target = path.resolve()
         if not any(target.is_relative_to(root) for root in roots):
-            raise ValueError(f"a link to {target}, outside of the recording; to read it, --allow-links {target.parent}")
+            raise ValueError(
+                f"a link to {target}, outside of the recording; to read it: torchcover --allow-links FOLDER ..."
+            )
 
 
 def check_regular(path: Path, content: str) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from torchcover.detection import Boxes
 from torchcover.detection.inside import with_hits
+from torchcover.files import allow_links, find_link_roots
 from torchcover.frames.frame import Frame
 from torchcover.frames.source import BadFrameError, FrameDataset
 from torchcover.geometry import transform
@@ -84,6 +86,13 @@ class RecordedFrames(FrameDataset):
         self._sweeps = self.reference.sweeps if isinstance(self.reference, AccumulatedReference) else Sweeps(0.0)
         self._has_heights: bool | None = None
         self._modelled = False
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_link_roots": find_link_roots(self.recording.path)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        allow_links(state["recording"].path, state.pop("_link_roots"))
+        self.__dict__.update(state)
 
     def leave_out_bad_sweeps(self) -> None:
         """A scan that cannot be read costs its own frame, and not all whose window it is in; those count it."""

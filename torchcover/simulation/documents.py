@@ -331,6 +331,7 @@ def builtin_hashes(kind: str) -> dict[str, str]:
     return {path.stem: file_hash(path) for path in sorted(builtin_folder(kind).glob("*.yaml"))}
 
 
+@reads("a file")
 def file_hash(path: Path) -> str:
     """SHA-256 of what is in a file."""
     with path.open("rb") as file:

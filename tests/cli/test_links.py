@@ -1,0 +1,98 @@
+"""Links in recordings lead to regular files inside of a root that somebody named; pipes and devices stop no reader."""
+
+import os
+import pickle
+
+import numpy as np
+import pytest
+
+from torchcover.data import RecordedFrames
+from torchcover.files import BadFileError, common_link_roots
+from torchcover.frames.source import BadFrameError
+from torchcover.recordings import open_recording
+from torchcover.simulation import Rig, Scenario
+
+NO_FILE = r"a pipe, a socket or a device|a link to /dev/zero"
+
+
+def write(folder, target=None):
+    """Write a plain recording of a frame, whose cloud is a link to a target if one is given."""
+    for name in ("sensors/roof", "reference"):
+        (folder / name).mkdir(parents=True)
+        np.save(folder / name / "f.npy", np.ones((4, 3), np.float32))
+    if target is not None:
+        target.parent.mkdir(exist_ok=True)
+        (folder / "sensors" / "roof" / "f.npy").rename(target)
+        (folder / "sensors" / "roof" / "f.npy").symlink_to(target)
+    return folder
+
+
+def test_a_link_is_read_inside_of_the_recording_or_of_a_named_root_only(tmp_path, monkeypatch):
+    assert len(RecordedFrames(write(tmp_path / "within", tmp_path / "within" / "blobs" / "0"))[0].sensor) == 4
+    folder, root = write(tmp_path / "out", tmp_path / "blobs" / "0"), tmp_path / "blobs"
+    with pytest.raises(BadFrameError, match=rf"f\.npy: a link to {root}/0, outside of the recording; .*--allow-links"):
+        RecordedFrames(folder)[0]
+    assert len(RecordedFrames(open_recording(folder, link_roots=[root]))[0].sensor) == 4
+    monkeypatch.setattr("torchcover.files.bad_file.common_link_roots", [root])
+    assert len(RecordedFrames(folder)[0].sensor) == 4
+    (root / "0").unlink()
+    (root / "0").symlink_to("/dev/zero")
+    with pytest.raises(BadFrameError, match="a link to /dev/zero, outside"):
+        RecordedFrames(folder)[0]
+
+
+def test_a_folder_that_is_a_link_and_a_recording_that_is_one(tmp_path):
+    folder = write(tmp_path / "recording")
+    (folder / "sensors").rename(tmp_path / "elsewhere")
+    (folder / "sensors").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(BadFrameError, match="outside of the recording"):
+        RecordedFrames(folder)[0]
+    (tmp_path / "named").symlink_to(write(tmp_path / "real"))
+    assert len(RecordedFrames(tmp_path / "named")[0].sensor) == 4
+
+
+def test_another_process_follows_the_same_links(tmp_path, monkeypatch):
+    folder, root = write(tmp_path / "out", tmp_path / "blobs" / "0"), tmp_path / "blobs"
+    for roots in ([], [root]):
+        content = pickle.dumps(RecordedFrames(open_recording(folder, link_roots=roots)))
+        monkeypatch.setattr("torchcover.files.bad_file._link_roots", {})  # as in a process that was spawned
+        frames = pickle.loads(content)
+        if roots:
+            assert len(frames[0].sensor) == 4
+        else:
+            with pytest.raises(BadFrameError, match="outside of the recording"):
+                frames[0]
+
+
+def test_the_command_line_names_roots(tmp_path, torchcover):
+    write(tmp_path / "out", tmp_path / "blobs" / "0")
+    command = ("evaluate", "--frames", "out", "--out", "result", "--files", "numbers")
+    code, _, said = torchcover(*command)
+    assert (code, "outside of the recording" in said) == (2, True)
+    try:
+        assert torchcover("--allow-links", "blobs", *command)[0] == 0
+    finally:
+        common_link_roots.clear()
+
+
+@pytest.mark.parametrize("kind", ["FIFO", "zero"])
+def test_a_pipe_or_a_device_in_the_place_of_a_file_is_named(tmp_path, kind):
+    folder = write(tmp_path / "recording")
+    paths = [tmp_path / "rig.yaml", tmp_path / "mesh.ply", folder / "recording.json", folder / "reference" / "f.npy"]
+    paths[-1].unlink()
+    for path in paths:
+        os.mkfifo(path) if kind == "FIFO" else path.symlink_to("/dev/zero")
+    body = {"name": "b", "shape": {"type": "mesh", "path": str(paths[1])}}
+    ego = {"shape": {"type": "box", "size_m": [4, 2, 1]}}
+    scenario = Scenario.model_validate({"name": "s", "ego": ego, "bodies": [body]})
+    for read in (
+        lambda: Rig.load(paths[0]),
+        scenario.content,
+        lambda: scenario.world(0, 0),
+        lambda: open_recording(folder),
+    ):
+        with pytest.raises(BadFileError, match=NO_FILE):
+            read()
+    paths[2].unlink()
+    with pytest.raises(BadFrameError, match=NO_FILE):
+        RecordedFrames(folder)[0]
