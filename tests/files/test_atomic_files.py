@@ -181,6 +181,17 @@ def test_every_file_of_an_unfinished_result_is_refused_and_others_are_read(tmp_p
     assert read(tmp_path / "mine.txt") == "mine"
 
 
+@pytest.mark.parametrize("name", ["b.txt", "summary.json", "maps/n.png"])
+def test_a_folder_in_the_place_of_a_file_is_refused_before_the_first_is_replaced(tmp_path, name):
+    publish(tmp_path / "out", {"a.txt": "earlier"}) if name != "summary.json" else None
+    (tmp_path / "out" / name).mkdir(parents=True)
+    before = list_files(tmp_path)
+    with pytest.raises(IsADirectoryError, match=rf"a folder in the place of a file: '.*{name}'"):
+        publish(tmp_path / "out", NUMBERS | MAPS)
+    assert list_files(tmp_path) == before
+    assert name == "summary.json" or read(tmp_path / "out" / "a.txt") == "earlier"
+
+
 @pytest.mark.parametrize("text", ["NEW", "newer"])
 def test_a_file_that_differs_from_the_manifest_is_refused_and_an_edited_document_is_a_warning(tmp_path, text):
     publish(tmp_path, {**NUMBERS, "c.yaml": "new"})
@@ -203,6 +214,7 @@ FOREIGN = {
     "a list": '{"files": ["a.txt", "../mine.txt"]}',
     "nested": "[" * 100_000,
     "no sizes": '{"files": {"a.txt": {}, "b.txt": 3, "maps": null}}',
+    "many": json.dumps({"files": {f"{name}/x": {"bytes": 1} for name in range(100_000)}}),
     "huge": HUGE,
 }
 

@@ -4,6 +4,7 @@ Files are written into a temporary directory in their folder, synced, and moved 
 last. While listed files are replaced, the manifest says so. Readers never write; see `manifests`.
 """
 
+import errno
 import hashlib
 import json
 import os
@@ -98,6 +99,8 @@ class AtomicOutput:
         for path in (self.folder / name for name in (*self._pending, *outdated, self._manifest)):
             refuse_links(path)
             path.parent.mkdir(parents=True, exist_ok=True)
+            if path.is_dir():
+                raise IsADirectoryError(errno.EISDIR, "a folder in the place of a file", str(path))
         unfinished, finished = self._temporary / ".unfinished", self._temporary / ".finished"
         with _name_errors(manifest):
             _write_synced(unfinished, partial(_write_json, {WRITING: True, "files": {**listed, **self._files}}))

@@ -31,8 +31,10 @@ def lock_folder(folder: Path) -> Iterator[None]:
     """
     import fcntl
 
-    for name in ("", *(read_manifest(folder / SUMMARY) or {"files": ()})["files"]):
-        refuse_links(folder / name)
+    refuse_links(folder)
+    for name in {name.partition("/")[0] for name in (read_manifest(folder / SUMMARY) or {"files": ()})["files"]}:
+        if (folder / name).is_symlink():
+            refuse_links(folder / name)
     if (key := folder.resolve()) in _locked:
         yield
         return

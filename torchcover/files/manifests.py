@@ -7,7 +7,7 @@ import stat
 import warnings
 from collections.abc import Mapping
 from functools import lru_cache
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 SUMMARY = "summary.json"  # of a result
@@ -44,9 +44,8 @@ def _parse_manifest(path: Path, *_: int) -> dict[str, Any] | None:
 
 
 def _is_entry(name: str, entry: object) -> bool:
-    path = PurePosixPath(name)
-    within = str(path) == name and not path.is_absolute() and ".." not in path.parts and "\0" not in name
-    return within and isinstance(entry, dict) and isinstance(entry.get("bytes"), int)
+    is_within = "\0" not in name and {"", ".", ".."}.isdisjoint(name.split("/"))
+    return is_within and isinstance(entry, dict) and isinstance(entry.get("bytes"), int)
 
 
 def matches_entry(path: Path, entry: Mapping[str, Any]) -> bool:
