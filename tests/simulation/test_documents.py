@@ -1,5 +1,7 @@
 """YAML documents: what is wrong is said in one line that names the file and the key."""
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,7 @@ from torchcover.cameras.calibration import read_opencv, read_ros
 from torchcover.recordings.formats.folder_settings import read_folder_settings
 from torchcover.simulation import Lidar, LidarModel, Pose, builtin_names
 from torchcover.simulation.bodies import Vehicle
+from torchcover.simulation.camera_sensor import CameraSensor
 
 RIG = """
 name: r
@@ -33,6 +36,35 @@ def write(folder, content, name="doc.yaml"):
     path = folder / name
     path.write_text(content)
     return path
+
+
+@pytest.mark.parametrize(
+    ("keys", "told"),
+    [
+        ({"yaw_deg": 1.5708}, "yaw_deg: 1.5708 looks like 90 degrees"),
+        ({"x_m": 1.0, "pitch_deg": -0.785, "yaw_deg": 3}, "pitch_deg: -0.785 looks like -45 degrees"),
+        ({"yaw_deg": 3.141592653589793}, "looks like 180 degrees"),
+        ({"roll_deg": 3.14}, "looks like 180 degrees"),
+        ({"yaw_deg": 90, "pitch_deg": 1.5708}, None),
+        ({"yaw_deg": 1.5, "pitch_deg": -0.35, "roll_deg": 0.8}, None),
+        ({"fov_deg": 1.3963}, "fov_deg: 1.3963 looks like 80 degrees"),
+        ({"vertical_fov_deg": (-0.4363, 0.03), "horizontal_fov_deg": 3}, "vertical_fov_deg: -0.4363 looks like -25"),
+        ({"vertical_fov_deg": (-0.4363, 0.03), "horizontal_fov_deg": 360}, None),
+    ],
+)
+def test_degrees_that_look_like_radians_are_reported(keys, told):
+    document = (
+        Pose if Pose.model_fields.keys() >= keys.keys() else Lidar if "horizontal_fov_deg" in keys else CameraSensor
+    )
+    more = {
+        Pose: {},
+        Lidar: {"name": "a", "channels": 2, "columns": 8, "max_range_m": 50},
+        CameraSensor: {"name": "a", "width": 4, "height": 3, "max_range_m": 50},
+    }
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        document.model_validate({**more[document], **keys})
+    assert [told in str(one.message) for one in caught] == [True] * (told is not None)
 
 
 def test_a_rig_is_read(tmp_path):

@@ -7,7 +7,7 @@ from difflib import get_close_matches
 from itertools import islice
 from pathlib import Path
 from reprlib import Repr
-from typing import Annotated, Any, ClassVar, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Self, TypeGuard, TypeVar
 
 import numpy as np
 from pydantic import (
@@ -25,6 +25,7 @@ from pydantic_core import ErrorDetails
 
 from torchcover.files import BadFileError, parse_yaml, read_short_text, reads
 from torchcover.geometry import rigid, rotation_from_euler, rotation_from_quaternion
+from torchcover.geometry.angles import warn_of_radians
 from torchcover.geometry.arrays import Float64
 from torchcover.simulation.builtin import builtin_folder, builtin_names
 
@@ -42,6 +43,8 @@ OF_OTHERS = {
     "range": "max_range_m",
 }
 MAX_QUOTED = 60
+# Keys of angles that people measure in radians, too.
+ANGLES = ("yaw_deg", "pitch_deg", "roll_deg", "fov_deg", "horizontal_fov_deg", "vertical_fov_deg", "facing_deg")
 # Keys and numbers, from the document on.
 Place = tuple[int | str, ...]
 # Looks at no more of a value than it writes: a list of lists of lists may be endless.
@@ -63,7 +66,9 @@ class Document(BaseModel):
     def _as_python_keeps_them(cls, content: Any) -> Any:  # noqa: ANN401  (whatever stood in the file)
         if not isinstance(content, dict):
             return content
-        return {key: _kept(value) for key, value in content.items()}
+        kept = {key: _kept(value) for key, value in content.items()}
+        warn_of_radians({key: kept[key] for key in ANGLES if is_numbers(kept.get(key))})
+        return kept
 
     def content(self) -> dict[str, Any]:
         """All that it means to a simulation, for JSON: its keys, and hashes of the files that they name.
@@ -351,6 +356,11 @@ def _content(value: Any) -> Any:  # noqa: ANN401  (whatever a document holds)
 def _shorten(value: Any) -> str:  # noqa: ANN401  (whatever stood in the file)
     text = _QUOTE.repr(value)
     return text if len(text) <= MAX_QUOTED else f"{text[: MAX_QUOTED - 3]}..."
+
+
+def is_numbers(value: object) -> TypeGuard[float | tuple[float, ...]]:
+    """Return whether it is a number, or a tuple of numbers."""
+    return all(type(each) in (int, float) for each in (value if isinstance(value, tuple) else (value,)))
 
 
 def _kept(value: Any) -> Any:  # noqa: ANN401

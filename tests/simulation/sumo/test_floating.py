@@ -79,6 +79,18 @@ def test_rows_may_have_different_attributes():
     assert {track.name: track.places_m[0, 2] for track in recorded(steps).tracks} == {"a": 1.0, "b": 2.0}
 
 
+def geo(**more):
+    """A vehicle on its way north, as SUMO writes longitude and latitude."""
+    places = {t: ("8.402076", f"{49.00011 + 1.3e-5 * t / 0.1:.6f}") for t in (0.0, 0.2, 0.4, 0.6)}
+    return {t: [vehicle("a", *place, angle="0.00", **more)] for t, place in places.items()}
+
+
+def test_what_stands_near_the_origin_is_no_longitude():
+    there = [vehicle("a", "8.402076", "49.000110", angle="0.00", speed=0.0)]
+    (track,) = recorded({0.0: there, 0.2: there}).tracks
+    assert track.places_m[0].tolist() == [8.402076, 49.00011, 0.0]
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -93,6 +105,8 @@ def test_rows_may_have_different_attributes():
         ),
         (fcd({0.0: [vehicle("a", "nan", 0)]}), "1 of 1 positions are NaN or infinite"),
         (fcd({0.0: [vehicle("a", "east", 0)]}), "east"),
+        (fcd(geo(speed=13.9)), r"x and y are degrees .* such as 8.40208, 49.0001; .* without --fcd-output.geo"),
+        (fcd(geo()), "without --fcd-output.geo"),
         ("<fcd-export/>", "at least one <timestep>"),
         ("<fcd-export><timestep time='0'>", "not XML"),
         ("<!DOCTYPE a [<!ENTITY e SYSTEM 'file:///etc/passwd'>]><a>&e;</a>", "without entities"),

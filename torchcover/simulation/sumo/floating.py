@@ -18,6 +18,12 @@ MAX_STEPS = 1.5
 FASTEST_MPS = 90.0
 PIECE_BYTES = 1 << 18
 TIME_SLACK_S = 1e-6
+# Largest longitude and latitude.
+DEGREES = (180.0, 90.0)
+# SUMO writes degrees with six decimals unless told otherwise, and all else with two.
+GEO_DIGITS = 5
+# By its speed, a road user gets farther than the degree that all positions lie within.
+MIN_DRIVEN_M = 2.0
 
 
 class SumoTrack(NamedTuple):
@@ -64,6 +70,8 @@ class _Collector:
         self.times_s: list[float] = []
         self.of: list[int] = []
         self.rows: list[Float64] = []
+        # Whether x always has the decimals of degrees, and angles fewer.
+        self.has_more_digits = True
         self.counts: list[int] = []
 
     def start(self, name: str, attributes: list[str]) -> None:
@@ -113,6 +121,8 @@ class _Collector:
             zeros = ("0",) * len(rows)
             numbers = [columns[name] for name in ("x", "y", "angle")]
             numbers += [columns.get(name, zeros) for name in ("z", "slope")]
+            numbers.append(columns.get("speed", ("nan",) * len(rows)))
+            self.has_more_digits &= _digits(columns["x"]) >= GEO_DIGITS > _digits(columns["angle"])
             self.rows.append(np.array([list(map(float, column)) for column in numbers]).T)
 
     def _columns(self, rows: list[list[str]]) -> dict[str, tuple[str, ...]]:
@@ -164,13 +174,42 @@ def read_floating(path: Path, window: TimeWindow) -> Recorded:
     return recorded
 
 
+def _digits(numbers: tuple[str, ...]) -> int:
+    """Return how many decimals the first of these numbers has."""
+    return len(numbers[0].partition(".")[2])
+
+
+def _check_meters(places: Float64, speed_mps: Float64, times_s: Float64, has_more_digits: bool) -> None:
+    """Refuse longitude and latitude: everything lies within a degree, although it drives.
+
+    Args:
+        places: (N, 2) x and y of everybody at all times.
+        speed_mps: (N,) NaN where the file does not say it.
+        times_s: (K,) times of the window.
+        has_more_digits: Whether x is written with the decimals of degrees, and angles with fewer.
+
+    Raises:
+        ValueError: They are degrees.
+    """
+    if not len(places) or (np.abs(places) > DEGREES).any() or (np.ptp(places, axis=0) >= 1.0).any():
+        return
+    driven_m = float(np.nan_to_num(speed_mps).max(initial=0.0)) * float(np.ptp(times_s))
+    if driven_m > MIN_DRIVEN_M if np.isfinite(speed_mps).any() else has_more_digits:
+        raise ValueError(
+            f"x and y are degrees of longitude and latitude, such as {places[0, 0]:g}, {places[0, 1]:g}; meters of the "
+            "network are needed: write it without --fcd-output.geo"
+        )
+
+
 def _tracks(collector: _Collector) -> Iterator[SumoTrack]:
     times_s = np.array(collector.times_s) - collector.begin_s
     of = np.array(collector.of, dtype=np.int64)
     step = np.repeat(np.arange(len(times_s)), collector.counts)
-    rows = np.concatenate([*collector.rows, np.empty((0, 5))])
+    rows = np.concatenate([*collector.rows, np.empty((0, 6))])
+    rows, speed_mps = rows[:, :5], rows[:, 5]
     if not np.isfinite(rows).all():
         raise ValueError(f"{int((~np.isfinite(rows)).any(axis=1).sum())} of {len(rows)} positions are NaN or infinite")
+    _check_meters(rows[:, :2], speed_mps, times_s, collector.has_more_digits)
     usual_s = float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0
     order = np.argsort(of, kind="stable")
     ends = np.concatenate([[0], np.cumsum(np.bincount(of, minlength=len(collector.kinds)))])
