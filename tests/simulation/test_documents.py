@@ -8,6 +8,7 @@ import pytest
 from torchcover import Rig, Scenario
 from torchcover.cameras.calibration import read_opencv, read_ros
 from torchcover.recordings.formats.folder_settings import read_folder_settings
+from torchcover.recordings.settings import Mount
 from torchcover.simulation import Lidar, LidarModel, Pose, builtin_names
 from torchcover.simulation.bodies import Vehicle
 from torchcover.simulation.camera_sensor import CameraSensor
@@ -65,6 +66,11 @@ def test_degrees_that_look_like_radians_are_reported(keys, told):
         warnings.simplefilter("always")
         document.model_validate({**more[document], **keys})
     assert [told in str(one.message) for one in caught] == [True] * (told is not None)
+
+
+def test_mounts_of_recordings_that_look_like_radians_are_reported():
+    with pytest.warns(UserWarning, match="yaw_deg: 1.5708 looks like 90 degrees"):
+        Mount(x_m=1.0, y_m=0.0, z_m=0.0, yaw_deg=1.5708).matrix()
 
 
 def test_a_rig_is_read(tmp_path):

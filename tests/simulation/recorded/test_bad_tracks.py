@@ -3,6 +3,7 @@
 import json
 import re
 import sys
+import warnings
 
 import numpy as np
 import pytest
@@ -15,6 +16,8 @@ from tests.simulation.recorded.test_tracks import FEW, RIG, scenario
 from torchcover import Scenario
 from torchcover.cli.app import main
 from torchcover.files import BadFileError, own_process
+from torchcover.geometry import rotation_from_euler
+from torchcover.recordings.formats import read_objects
 from torchcover.simulation import Simulator
 
 
@@ -136,6 +139,61 @@ def test_shapes_of_commonroad(tmp_path):
     actor = scenario(path, ego_id=5, duration_s=0.4).world().actors[0]
     np.testing.assert_allclose(np.ptp(actor.mesh.vertices_m, axis=0)[:2], [4.0, 2.0])
     np.testing.assert_allclose(actor.trajectory.at(0.0)[:2, 3], [1426.0, 2200.0])
+
+
+RECTANGLE = "<rectangle><length>4.5</length><width>1.8</width>{}</rectangle>"
+
+
+@pytest.mark.parametrize(
+    ("shapes", "size_m", "middle_m", "turn_deg"),
+    [
+        (RECTANGLE.format("<center><x>1.4</x><y>-0.5</y></center>"), (4.5, 1.8), (1.4, -0.5), 0),
+        (
+            RECTANGLE.format("<orientation>0.5</orientation><center><x>1</x><y>2</y></center>"),
+            (4.5, 1.8),
+            (1, 2),
+            28.648,
+        ),
+        ("<circle><radius>1</radius><center><x>0.3</x><y>0</y></center></circle>", (2, 2), (0.3, 0), 0),
+        (
+            RECTANGLE.format("") + "<circle><radius>1</radius><center><x>4</x><y>0</y></center></circle>",
+            (7.25, 2),
+            (1.375, 0),
+            0,
+        ),
+    ],
+)
+def test_shapes_of_commonroad_have_centers_and_turns(tmp_path, shapes, size_m, middle_m, turn_deg):
+    path = write_commonroad(tmp_path / "a.xml")
+    before = read_objects(path).tracks[0].trajectory
+    replaced(path, RECTANGLE.format(""), shapes)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        track = read_objects(path).tracks[0]
+    assert ["taken as the box around them" in str(one.message) for one in caught] == [True] * (
+        shapes.count("<center>") == 1 and shapes.count("rectangle") == 2 and "circle" in shapes
+    )
+    np.testing.assert_allclose(track.size_m[:2], size_m)
+    yaw_deg = before.angles_deg[0, 0]
+    turn = rotation_from_euler(yaw_deg, 0.0, 0.0)[:2, :2]
+    np.testing.assert_allclose(
+        track.trajectory.positions_m[0, :2], before.positions_m[0, :2] + turn @ middle_m, atol=1e-6
+    )
+    np.testing.assert_allclose(track.trajectory.angles_deg[0, 0] - yaw_deg, turn_deg, atol=1e-3)
+
+
+def test_commonroad_scenarios_report_what_is_left_out_and_drop_a_repeated_initial_state(tmp_path):
+    path = write_commonroad(tmp_path / "a.xml")
+    before = read_objects(path).tracks[0].trajectory
+    text = path.read_text()
+    building = '<environmentObstacle id="90"><type>building</type></environmentObstacle></commonRoad>'
+    start = text[text.index("<initialState>") + len("<initialState>") : text.index("</initialState>")]
+    text = text.replace("<trajectory>", f"<trajectory><state>{start}</state>", 1)
+    path.write_text(text.replace("</commonRoad>", building))
+    with pytest.warns(UserWarning, match=r"1 environmentObstacle \(building\) left out"):
+        after = read_objects(path).tracks[0].trajectory
+    np.testing.assert_array_equal(after.times_s, before.times_s)
+    np.testing.assert_array_equal(after.positions_m, before.positions_m)
 
 
 def test_tables_of_nuscenes(tmp_path):

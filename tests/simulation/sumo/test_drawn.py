@@ -16,6 +16,7 @@ from torchcover.simulation import PaperReference
 from torchcover.simulation.sumo import Sumo, simulating, traffic
 from torchcover.simulation.sumo.demand import write_routes
 from torchcover.simulation.sumo.network import read_network
+from torchcover.simulation.sumo.simulating import from_opendrive
 from torchcover.simulation.sumo.streets import TURN_MPS2, DrawnStreets, turning_mps
 from torchcover.simulation.traffic.fleet import KIND_OF, Fleet, load_bodies
 
@@ -116,6 +117,37 @@ def test_open_drive_brings_its_heights_and_sidewalks(tmp_path):
     assert np.abs(world.ego.trajectory.positions_m[:, 1]).max() < 1.0  # no car goes onto the sidewalk
     np.testing.assert_allclose(world.ego.trajectory.angles_deg[:, 1].mean(), -np.rad2deg(np.arctan(0.04)), atol=0.5)
     assert len(world.static) == 4  # ground, sidewalk, houses, trees
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        (
+            "<lanes>",
+            '<lateralProfile><superelevation s="0" a="0.1" b="0" c="0" d="0"/></lateralProfile><lanes>',
+            "superel",
+        ),
+        ("<lanes>", '<lateralProfile><crossfall s="0" a="0.02"/></lateralProfile><lanes>', "crossfall of 1 pieces"),
+        (
+            "</lanes>",
+            '</lanes><objects><object id="1" type="building" s="9" t="9"/></objects>',
+            r"objects \(1 building\)",
+        ),
+        (
+            '<width sOffset="0" a="2" b="0" c="0" d="0"/>',
+            '<border sOffset="0" a="-9" b="0" c="0" d="0"/>',
+            "1 lanes whose width is given by <border>",
+        ),
+    ],
+)
+def test_losses_of_open_drive_are_reported(old, new, told, tmp_path):
+    assert XODR.count(old) == 1
+    (tmp_path / "road.xodr").write_text(XODR.replace(old, new))
+    with pytest.warns(UserWarning, match=f"OpenDRIVE: left out, .*{told}"):
+        from_opendrive(tmp_path / "road.xodr", tmp_path, leave_out_links=False)
+    (tmp_path / "road.xodr").write_text(XODR.replace('junction="-1"', 'junction="-1" rule="LHT"'))
+    with pytest.raises(BadFileError, match=r"road 1: left-hand traffic .* netconvert --lefthand"):
+        from_opendrive(tmp_path / "road.xodr", tmp_path, leave_out_links=False)
 
 
 def test_links_of_open_drive_that_lead_nowhere_are_named_and_may_be_left_out(tmp_path):

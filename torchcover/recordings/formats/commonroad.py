@@ -1,6 +1,8 @@
 """Scenarios of CommonRoad (Althoff et al., IV 2017), versions 2018b and 2020a: obstacles and planning problems."""
 
 import math
+import warnings
+from collections import Counter
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -29,6 +31,7 @@ def read_objects(path: Path) -> RecordedObjects:
     step_s = float(root.get("timeStepSize", "nan"))
     if not 0 < step_s < math.inf:
         raise ValueError(f"timeStepSize: a positive number is needed; got {root.get('timeStepSize')}")
+    _warn_of_skipped_elements(root)
     found = [_track(element, step_s) for tag in OBSTACLES for element in root.iter(tag)]
     egos = tuple(_ego(problem, step_s) for problem in root.iter("planningProblem"))
     if not found:
@@ -49,40 +52,75 @@ def _ego(problem: Element, step_s: float) -> Ego:
 def _track(obstacle: Element, step_s: float) -> Track:
     name = obstacle.get("id", "")
     category = (obstacle.findtext("type") or "unknown").strip().lower()
-    size_m, middle_m = _shape(obstacle, name)
+    size_m, middle_m, turn_rad = _shape(obstacle, name)
     states = [state for tag in ("initialState", "trajectory/state") for state in obstacle.findall(tag)]
     if not states:
         raise ValueError(f"id {name}: no initialState")
     rows = [_state(state, step_s, f"id {name}") for state in states]
+    if len(rows) > 1 and rows[0] == rows[1]:
+        del rows[0]  # a known flaw of some scenarios: the trajectory begins with the initial state
     times_s, yaw = np.array([row[0] for row in rows]), np.array([row[2] for row in rows])
     forward = np.stack([np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))], axis=1)
     left = np.stack([-forward[:, 1], forward[:, 0], forward[:, 2]], axis=1)
     places_m = np.array([row[1] for row in rows]) + middle_m[0] * forward + middle_m[1] * left
-    angles_deg = np.column_stack([np.rad2deg(yaw), np.zeros((len(yaw), 2))])
+    angles_deg = np.column_stack([np.rad2deg(yaw + turn_rad), np.zeros((len(yaw), 2))])
     trajectory = moving(name, times_s, places_m, angles_deg)
     if obstacle.tag == "staticObstacle" or (obstacle.findtext("role") or "").strip() == "static":
         trajectory = Trajectory(times_s[:1], places_m[:1], angles_deg[:1])
     return Track(name, category, class_of(category), size_m, trajectory)
 
 
-def _shape(obstacle: Element, name: str) -> tuple[tuple[float, float, float], tuple[float, float]]:
-    """Length and width, no height; and the middle, as seen from the obstacle's place."""
-    owner = f"id {name}"
-    rectangle, circle, polygon = (obstacle.find(f"shape/{tag}") for tag in ("rectangle", "circle", "polygon"))
-    if rectangle is not None:
-        low = -np.array([_number(rectangle, "length", owner), _number(rectangle, "width", owner)]) / 2
-        high = -low
-    elif circle is not None:
-        high = np.full(2, _number(circle, "radius", owner))
-        low = -high
-    elif polygon is not None:
-        corners = [(_number(point, "x", owner), _number(point, "y", owner)) for point in polygon.iter("point")]
-        low, high = np.min(corners, axis=0), np.max(corners, axis=0)
-    else:
-        raise ValueError(f"{owner}: no rectangle, circle or polygon as its shape, so no size")
-    middle_m: Matrix = (low + high) / 2
+def _shape(obstacle: Element, name: str) -> tuple[tuple[float, float, float], tuple[float, float], float]:
+    """Return the size of the box around all shapes (no height), its middle and its turn, seen from the obstacle."""
+    shapes = [shape for tag in ("rectangle", "circle", "polygon") for shape in obstacle.findall(f"shape/{tag}")]
+    if not shapes:
+        raise ValueError(f"id {name}: no rectangle, circle or polygon as its shape, so no size")
+    turn_rad = 0.0
+    if len(shapes) == 1 and shapes[0].find("orientation") is not None:
+        turn_rad = _number(shapes[0], "orientation", f"id {name}")
+    c, s = math.cos(turn_rad), math.sin(turn_rad)
+    corners = np.concatenate([_corners(shape, name) for shape in shapes]) @ np.array([[c, -s], [s, c]])
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    middle_m: Matrix = np.array([[c, -s], [s, c]]) @ (low + high) / 2
     length, width = checked_size(name, high - low)
-    return (length, width, math.nan), (float(middle_m[0]), float(middle_m[1]))
+    return (length, width, math.nan), (float(middle_m[0]), float(middle_m[1])), turn_rad
+
+
+def _corners(shape: Element, name: str) -> Matrix:
+    """Return (K, 2) corners of a shape in the frame of its obstacle; of a circle those of the square around it."""
+    owner = f"id {name}"
+    if shape.tag == "polygon":
+        return np.array([(_number(point, "x", owner), _number(point, "y", owner)) for point in shape.iter("point")])
+    if shape.tag == "circle":
+        half = np.full(2, _number(shape, "radius", owner))
+    else:
+        half = np.array([_number(shape, "length", owner), _number(shape, "width", owner)]) / 2
+    checked_size(name, 2 * half)
+    turn_rad = 0.0 if shape.find("orientation") is None else _number(shape, "orientation", owner)
+    c, s = math.cos(turn_rad), math.sin(turn_rad)
+    center = shape.find("center")
+    middle_m = np.zeros(2) if center is None else np.array([_number(center, axis, owner) for axis in "xy"])
+    signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    return np.asarray((signs * half) @ np.array([[c, s], [-s, c]]) + middle_m)
+
+
+def _warn_of_skipped_elements(root: Element) -> None:
+    """Warn of obstacles that are left out, moved no further than their initial state, or put into one box."""
+    skipped = Counter(
+        f"{tag} ({(element.findtext('type') or 'unknown').strip()})"
+        for tag in ("environmentObstacle", "phantomObstacle")
+        for element in root.iter(tag)
+    )
+    reports = [f"{count} {name} left out, which hide nothing" for name, count in skipped.items()]
+    obstacles = [element for tag in OBSTACLES for element in root.iter(tag)]
+    uncertain = [obstacle.get("id", "") for obstacle in obstacles if obstacle.find("occupancySet") is not None]
+    if uncertain:
+        reports.append(f"occupancySet of id {', '.join(uncertain[:5])} left out, of which only other states are used")
+    joined = [obstacle.get("id", "") for obstacle in obstacles if len(obstacle.findall("shape/*")) > 1]
+    if joined:
+        reports.append(f"shapes of id {', '.join(joined[:5])} taken as the box around them")
+    if reports:
+        warnings.warn(f"CommonRoad scenario: {'; '.join(reports)}", stacklevel=3)
 
 
 def _state(state: Element, step_s: float, owner: str) -> tuple[float, list[float], float]:

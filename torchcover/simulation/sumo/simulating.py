@@ -4,6 +4,8 @@ import math
 import os
 import signal
 import subprocess
+import warnings
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from importlib.util import find_spec
@@ -165,6 +167,7 @@ def from_opendrive(path: Path, folder: Path, *, leave_out_links: bool) -> Path:
     root = parse_xml(path)
     if root.tag != "OpenDRIVE":
         raise ValueError(f"an OpenDRIVE file begins with <OpenDRIVE>; got <{root.tag}>")
+    _check_losses(root)
     network, lost = folder / "converted.net.xml", list(_lost_links(root))
     if lost and leave_out_links:
         for parent, link, _ in lost:
@@ -193,6 +196,39 @@ def from_opendrive(path: Path, folder: Path, *, leave_out_links: bool) -> Path:
             lane.set("allow", "pedestrian")  # netconvert lets cars onto sidewalks that lead to no crossing
     ElementTree.ElementTree(converted).write(network)
     return network
+
+
+def _check_losses(root: ElementTree.Element) -> None:
+    """Refuse left-hand roads, and warn of what netconvert leaves out of an OpenDRIVE file.
+
+    Raises:
+        ValueError: A road with left-hand traffic.
+
+    Warns:
+        UserWarning: Banked roads, lanes given by borders, objects beside the road.
+    """
+    left = [road.get("id", "") for road in root.findall("road") if road.get("rule", "RHT").upper() == "LHT"]
+    if left:
+        raise ValueError(
+            f"road {', '.join(left[:SHOWN])}: left-hand traffic (LHT), that SUMO's netconvert turns to right-hand "
+            "traffic; convert the road with netconvert --lefthand and give the .net.xml"
+        )
+    losses = []
+    for name in ("superelevation", "crossfall", "shape"):
+        profiles = root.findall(f"road/lateralProfile/{name}")
+        count = sum(any(float(profile.get(key, "0")) for key in "abcd") for profile in profiles)
+        if count:
+            losses.append(f"{name} of {count} pieces of road (they are level across)")
+    lanes = [lane for lane in root.iter("lane") if lane.find("border") is not None and lane.find("width") is None]
+    if lanes:
+        losses.append(f"{len(lanes)} lanes whose width is given by <border>")
+    objects = Counter(item.get("type") or "untyped" for item in root.findall("road/objects/object"))
+    if objects:
+        losses.append(f"objects ({', '.join(f'{count} {name}' for name, count in objects.most_common(SHOWN))})")
+    if losses:
+        warnings.warn(
+            f"OpenDRIVE: left out, for SUMO's netconvert does not keep them: {'; '.join(losses)}", stacklevel=3
+        )
 
 
 def _lost_links(root: ElementTree.Element) -> Iterator[tuple[ElementTree.Element, ElementTree.Element, str]]:
