@@ -214,6 +214,8 @@ FOREIGN = {
     "a list": '{"files": ["a.txt", "../mine.txt"]}',
     "nested": "[" * 100_000,
     "no sizes": '{"files": {"a.txt": {}, "b.txt": 3, "maps": null}}',
+    "surrogates": '{"files": {"a\\ud800": {"bytes": 1}}}',
+    "a long name": json.dumps({"files": {"n" * 5000: {"bytes": 1}}}),
     "many": json.dumps({"files": {f"{name}/x": {"bytes": 1} for name in range(100_000)}}),
     "huge": HUGE,
 }

@@ -14,6 +14,7 @@ SUMMARY = "summary.json"  # of a result
 RECORDING = "recording.json"
 WRITING = "writing"  # key of a manifest while its files are written
 MAX_MANIFEST_BYTES = 100_000_000  # larger files are not manifests; a million files of a recording take 60 MB
+MAX_NAME_BYTES = 255  # of a listed path; what file systems allow for a name
 FOLDER_DEPTH = 3  # files are listed at most this deep
 
 
@@ -44,7 +45,8 @@ def _parse_manifest(path: Path, *_: int) -> dict[str, Any] | None:
 
 
 def _is_entry(name: str, entry: object) -> bool:
-    is_within = "\0" not in name and {"", ".", ".."}.isdisjoint(name.split("/"))
+    is_short = len(os.fsencode(name)) <= MAX_NAME_BYTES
+    is_within = is_short and "\0" not in name and {"", ".", ".."}.isdisjoint(name.split("/"))
     return is_within and isinstance(entry, dict) and isinstance(entry.get("bytes"), int)
 
 
