@@ -1,7 +1,6 @@
 """Atomic writes: a file, or a folder of files with a manifest, is old, new, or recognizable as incomplete.
 
-Files are written into a temporary directory in their folder, synced, and moved to their names one by one, the manifest
-last. While listed files are replaced, the manifest says so. Readers never write; see `manifests`.
+Files are written into a temporary directory, synced, and moved one by one, the manifest last, which says so meanwhile.
 """
 
 import errno
@@ -32,8 +31,7 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     Example:
         >>> with TemporaryDirectory() as folder:
         ...     write_atomically(Path(folder, "a.txt"), lambda path: path.write_text("content"))
-        ...     Path(folder, "a.txt").read_text()
-        'content'
+        ...     assert Path(folder, "a.txt").read_text() == "content"
     """
     refuse_links(path)
     with _name_errors(path):
