@@ -110,6 +110,15 @@ def test_a_robot_of_urdf_becomes_a_vehicle_and_a_rig_that_can_be_shown(torchcove
     assert torchcover("robot", urdf, "--package", "bot")[0] == 2
 
 
+def test_a_roadside_rig_can_be_shown(torchcover, tmp_path):
+    rig = tmp_path / "mast.yaml"
+    rig.write_text(
+        "name: mast\nsensors: [{name: top, mount: {z_m: 6.0}, channels: 8, vertical_fov_deg: [-60, 0], columns: 64, "
+        "horizontal_fov_deg: 360, max_range_m: 50}]\n"
+    )
+    assert torchcover("show", "courtyard", "--rig", rig, "--out", tmp_path)[0] == 0
+
+
 def test_a_vehicle_is_drawn_with_its_mount_regions_on_its_skin(torchcover, tmp_path, drawn):
     (tmp_path / "cart.yaml").write_text(
         """

@@ -6,7 +6,7 @@ import pytest
 from torchcover.data import SimulatedFrames
 from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, with_ego
 
-SENSOR = {"name": "top", "mount": {"z_m": 5.0}, "channels": 4, "columns": 8, "vertical_fov_deg": [-30, 0]}
+SENSOR = {"name": "top", "mount": {"z_m": 3.5}, "channels": 4, "columns": 8, "vertical_fov_deg": [-30, 0]}
 PATTERN = {"horizontal_fov_deg": 360.0, "max_range_m": 50.0}
 GROUND = {"name": "ground", "shape": {"type": "plane", "size_m": [200, 200]}}
 BOX = {"type": "box", "size_m": [6, 2.5, 3]}

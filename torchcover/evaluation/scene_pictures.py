@@ -13,6 +13,7 @@ from torchcover.report import ActorMark, SkinPatch, StandingFaces, draw_depths, 
 from torchcover.simulation import GRID_X_M, GRID_Y_M, CameraSensor, PaperReference, Rig, Scenario, SimulatedFrames
 from torchcover.simulation.bodies import Vehicle
 from torchcover.simulation.mount_regions import MountRegion, Skin
+from torchcover.simulation.rig import is_roadside, with_ego
 from torchcover.simulation.world import World
 
 PATCH_PLACES = 12  # along each side of a mount region
@@ -115,7 +116,9 @@ def _patch(name: str, region: MountRegion, skin: Skin) -> SkinPatch:
 
 
 def _frames(scenario: Scenario, rig: Rig, vehicle: str | None, step: int, seed: int) -> SimulatedFrames:
-    return SimulatedFrames(scenario, rig, steps=step + 1, seed=seed, vehicle=vehicle, reference_sensor=REFERENCE)
+    ego = with_ego(scenario, {rig.name: rig}, vehicle).ego_box()
+    reference = None if is_roadside([rig], ego) else REFERENCE
+    return SimulatedFrames(scenario, rig, steps=step + 1, seed=seed, vehicle=vehicle, reference_sensor=reference)
 
 
 def _standing(world: World, time_s: float) -> StandingFaces:
