@@ -15,7 +15,10 @@ def test_a_scene_in_which_nothing_moves_reuses_its_scan(torchcover, worlds):
     assert code == 0, complaints
     assert "Left out, for this run did not need it" in text
     reused = whats(worlds / "out")["rays of sensors where nothing moves: cast once, for all steps"]
-    assert reused["count"] == reused["of"] == 3 * 8 * 30
+    assert (reused["count"], reused["of"]) == (2 * 8 * 30, 3 * 8 * 30)  # the first step casts them
+    once = [*options[:3], "1", *options[4:]]
+    assert torchcover("evaluate", worlds / "low.yaml", *once)[0] == 0
+    assert not any("cast once" in what or "first scan" in what for what in whats(worlds / "out"))
 
 
 def test_without_the_option_it_stands_in_the_summary_only(torchcover, worlds):

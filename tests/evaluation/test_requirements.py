@@ -1,6 +1,7 @@
 """Requirements: what keeps a bound, where bodies are put, what is measured there, and what says nothing."""
 
 import re
+from itertools import permutations
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +10,14 @@ from pydantic import ValidationError
 
 from tests.targets.worlds import drive, lidar, rig, world
 from torchcover.encounters import Criterion
+from torchcover.encounters.encounter import EncounterSet
 from torchcover.evaluation import Readings, Requirements, check, encounter, evaluate, verdicts
 from torchcover.evaluation.requirements import BodyPlaces, TargetRequirement
 from torchcover.geometry import BoundingBox
-from torchcover.simulation import RegionsOfInterest, builtin_names
+from torchcover.placement.choice_space import ChoiceSpace
+from torchcover.placement.space import SearchSpace
+from torchcover.simulation import RegionsOfInterest, Rig, Scenario, builtin_names, documents
+from torchcover.simulation.bodies import Vehicle
 from torchcover.simulation.documents import explain
 from torchcover.targets import SIDES, Raster, Target, survey
 
@@ -348,3 +353,43 @@ def test_built_in_sets_say_where_they_are_from_and_that_they_are_no_homologation
     bodies = [one for one in found.requirements if isinstance(one, TargetRequirement)]
     assert all((one.points is None) == (one.by == ("camera",)) != (one.pixels is None) for one in bodies)
     assert "memory" not in found.description
+
+
+KINDS = {
+    "a rig": (Rig, "sensors: []"),
+    "a vehicle": (Vehicle, "parts: []"),
+    "a scenario": (Scenario, "traffic: {type: city}"),
+    "a search space": (SearchSpace, "scenario: urban\nobjectives: []\nfree: {}\nstart: kitti"),
+    "a set of requirements": (Requirements, "requirements: []\nscenario: urban"),
+    "a set of encounters": (EncounterSet, "encounters: []"),
+    "a file of regions": (RegionsOfInterest, "regions: {}\ngrid: {}"),
+}
+
+
+@pytest.mark.parametrize(("needed", "given"), list(permutations(KINDS, 2)))
+def test_a_file_of_another_kind_is_called_what_it_is(tmp_path, needed, given):
+    (tmp_path / "file.yaml").write_text(f"name: x\n{KINDS[given][1]}\n")
+    with pytest.raises(ValueError, match=rf"file\.yaml: this is {given}; {needed} is needed$"):
+        KINDS[needed][0].load(tmp_path / "file.yaml")
+
+
+def test_the_keys_of_kinds_are_those_of_their_documents():
+    for kind, (document, _) in KINDS.items():
+        of_kind = (document, ChoiceSpace) if document is SearchSpace else (document,)
+        known = {name for one in of_kind for name in one.model_fields} - {"name", "description"}
+        assert document.kind == kind
+        assert set(" ".join(documents.KINDS[kind]).split()) == known
+
+
+@pytest.mark.parametrize(("kind", "name"), [("rigs", "urban"), ("scenarios", "kitti"), ("vehicles", "urban")])
+def test_a_built_in_name_of_another_kind_is_called_what_it_is(kind, name):
+    document = {"rigs": Rig, "scenarios": Scenario, "vehicles": Vehicle}[kind]
+    with pytest.raises(FileNotFoundError, match=rf"'{name}' is one of the built-in \w+; one of the {kind} is needed"):
+        document.load(name)
+
+
+def test_a_key_in_another_unit_names_the_right_one():
+    for key, right in (("yaw_rad", "yaw_deg"), ("x_mm", "x_m"), ("pitch_rad", "pitch_deg"), ("max_range_km", None)):
+        with pytest.raises(ValueError, match="x") as told:
+            Rig.model_validate({"name": "x", "sensors": [{"name": "s", "type": "lidar", "mount": {key: 1.0}}]})
+        assert f"is {right} meant?" in explain(told.value) or right is None

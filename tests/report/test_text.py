@@ -158,11 +158,11 @@ def test_an_infinite_number_has_no_error():
     assert cells_of(text_of(coverage.compute(), NEAR), "near")[2] == "infinite"
 
 
-@pytest.mark.parametrize(("steps", "blocks"), [(1, "1 block"), (7, "7 blocks")])
-def test_too_few_steps_for_an_error_are_told_once_and_never_as_0(steps, blocks):
+@pytest.mark.parametrize(("steps", "blocks", "needed"), [(1, "1 block", 11), (7, "7 blocks", 9)])
+def test_too_few_steps_for_an_error_are_told_once_and_never_as_0(steps, blocks, needed):
     text = text_of(over_steps(steps), NEAR)
     assert "[" not in text
-    assert text.count(f"Not enough steps for errors: {blocks}, 8 are needed.") == 1
+    assert text.count(f"Not enough steps for intervals: {blocks}, about {needed} are needed.") == 1
 
 
 def test_without_blocks_nothing_is_said_about_errors():
@@ -219,7 +219,7 @@ def test_differences_have_a_part_of_their_own_and_what_is_no_chance_is_marked(tr
 def test_from_too_few_steps_no_difference_is_called_significant(trios, regions):
     text = printed(trios(5), regions)
     assert "[" not in text
-    assert text.count("Not enough steps for errors: 5 blocks, 8 are needed.") == 1
+    assert " ".join(text.split()).count("Not enough steps for intervals: 5 blocks, about 9 are needed.") == 1
     assert "Difference to few" in text
     assert not re.search(r"│ +! ", text)
 

@@ -189,6 +189,7 @@ class EncounterSet(BuiltIn):
         (22, 'child from behind a parked car: hatchback')
     """
 
+    kind: ClassVar[str] = "a set of encounters"
     folder: ClassVar[str] = "encounters"
 
     name: str

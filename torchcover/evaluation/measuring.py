@@ -72,7 +72,12 @@ def measured(task: Task[FrameSource], settings: Settings, until: StoppingRule | 
         observed={name: seen[name].compute() for name in settings.observers},
         metrics=report,
         left_out=left_out(
-            run.counts, list(coverages.values()), settings.aggregations, sensors, workers=settings.workers or 0
+            run.counts,
+            list(coverages.values()),
+            settings.aggregations,
+            sensors,
+            workers=settings.workers or 0,
+            ranks=ranks.size if ranks else 1,
         ),
         block_ends=find_block_ends(frames),
     )

@@ -445,6 +445,7 @@ class Requirements(BuiltIn, RegionsOfInterest):
         requirements: All of them must be kept.
     """
 
+    kind: ClassVar[str] = "a set of requirements"
     folder: ClassVar[str] = "requirements"
 
     name: str = "requirements"

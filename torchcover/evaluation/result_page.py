@@ -57,6 +57,7 @@ def left_out(
     sensors: Sequence[Sensor] = (),
     *,
     workers: int = 0,
+    ranks: int = 1,
 ) -> list[Omission]:
     """List what was left out of a run, at its end: later, other modules may have been imported for other reasons.
 
@@ -65,11 +66,20 @@ def left_out(
         coverages: What the metrics gave, one for each rig.
         aggregations: Those that were asked for.
         sensors: Those that are known of all rigs.
-        workers: Processes that made the frames. What they have imported is unknown.
+        workers: Processes that made the frames of each rank. What they have imported is unknown.
+        ranks: Ranks that shared the run.
     """
-    found = [
-        Omission(what, frame_counts[count], frame_counts[of]) for what, count, of in COUNTED if frame_counts.get(count)
-    ]
+    steps = max((coverage.counts["steps"] for coverage in coverages), default=0)
+    is_static = 0 < frame_counts.get("sensor_rays", 0) == frame_counts.get("sensor_rays_reused", 0)
+    # Where nothing moves, each process casts the rays of its first step.
+    first_steps = min(steps, ranks * max(workers, 1)) if is_static else 0
+    found = []
+    for what, count, of in COUNTED:
+        omitted = frame_counts.get(count, 0)
+        if first_steps and count.endswith("_reused"):
+            omitted = omitted * (steps - first_steps) // steps
+        if omitted:
+            found.append(Omission(what, omitted, frame_counts[of]))
     outside = sum(coverage.counts["outside_points"] for coverage in coverages)
     inside = sum(coverage.counts["inside_points"] for coverage in coverages)
     if outside:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 from pydantic import AfterValidator, Field
 
@@ -73,6 +73,7 @@ class Carrier(NamedTuple):
 class VehicleSpace(Readable):
     """What a search and a choice have in common: the worlds, the vehicle in them, and what a good rig is."""
 
+    kind: ClassVar[str] = "a search space"
     name: str
     description: str = ""
     scenario: Names

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from textwrap import fill
 
 from torchcover.coverage import RegionRedundancy
@@ -54,28 +55,66 @@ def failure_words(table: CoverageTable, row: Row) -> list[tuple[str, bool]]:
     return [*words, (redundancy.indispensable or (NONE if known else UNKNOWN), False)]
 
 
-def single_point_of_failure(table: CoverageTable, rig: str) -> str:
-    """The sensor of a rig with which most is lost, and where; no words if redundancy was not asked for."""
+@dataclass(frozen=True)
+class FailureParams:
+    """When the loss of a sensor is called a single point of failure.
+
+    Args:
+        least_share: Least loss that is more than chance: the share of the detection that is lost, or by which the
+            radius grows. A tenth is more than settings move a number, see docs/accuracy.md.
+    """
+
+    least_share: float = 0.1
+
+
+def single_point_of_failure(table: CoverageTable, rig: str, params: FailureParams = FailureParams()) -> str:
+    """Name the sensor of a rig with which most is lost, and where, if the loss is large and more than chance.
+
+    Args:
+        table: Of one rig or several.
+        rig: Its name.
+        params: What counts as a single point of failure.
+
+    Returns:
+        A sentence; empty if redundancy was not asked for.
+    """
     quantity, rows = decisive(table), table.rows[rig]
     if not sensors_of(rows):
         return ""
-    worst = max(rows, key=lambda row: _loss(row.summary.redundancy, quantity))
-    redundancy = worst.summary.redundancy
     if all(math.isnan(row.summary.numbers[quantity.key].value) for row in rows):
         return "Whether one sensor is indispensable is unknown: nothing that was asked about was seen."
     if quantity.key != RADIUS.key and not any(row.summary.numbers[quantity.key].value > 0.0 for row in rows):
         return "Nothing of what was asked about is detected: no failure could take anything away."
     if len(sensors_of(rows)) == 1:
         return f"Its only sensor is {sensors_of(rows)[0]}: without it nothing is seen."
-    if redundancy is None or redundancy.indispensable is None:
-        return "No single point of failure: whichever sensor fails, nothing that is known changes."
+    large = [row for row in rows if _lost_share(row, quantity) >= params.least_share]
+    real = [row for row in large if _is_significant(row, quantity)]
+    worst = max(real or large, key=lambda row: _loss(row.summary.redundancy, quantity), default=None)
+    if worst is None or (redundancy := worst.summary.redundancy) is None or redundancy.indispensable is None:
+        least = f"{params.least_share:.0%}"
+        return f"No single point of failure: no sensor's failure costs {least} or more of any number that is known."
     sensor = redundancy.indispensable
     before, after = worst.summary.numbers[quantity.key].value, redundancy.without[sensor][quantity.key].value
     whole, rest = (value_words(value, quantity.unit) for value in (before, after))
     unit = "m" if quantity.unit == "m" else "%"
     where = f"{worst.summary.region} {worst.summary.height}"
     change = f"{quantity.title} is {rest} {unit} in {where}, not {whole} {unit}"
-    return f"Single point of failure: {sensor}; without it {change}."
+    if real:
+        return f"Single point of failure: {sensor}; without it {change}."
+    return f"Most is lost without {sensor}: {change}; whether that is more than chance is unknown."
+
+
+def _lost_share(row: Row, quantity: Quantity) -> float:
+    """The loss with the sensor with which most is lost, as a share of the number with all sensors."""
+    loss, whole = _loss(row.summary.redundancy, quantity), row.summary.numbers[quantity.key].value
+    return loss / whole if loss > 0 and whole > 0 else 0.0
+
+
+def _is_significant(row: Row, quantity: Quantity) -> bool:
+    redundancy = row.summary.redundancy
+    if redundancy is None or redundancy.indispensable is None:
+        return False
+    return bool(redundancy.change[redundancy.indispensable][quantity.key].significant)
 
 
 def _loss(redundancy: RegionRedundancy | None, quantity: Quantity) -> float:

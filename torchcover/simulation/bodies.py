@@ -179,6 +179,7 @@ class Vehicle(BuiltIn):
         mount_regions: By name, patches of its skin that sensors can be mounted on, in the vehicle frame.
     """
 
+    kind: ClassVar[str] = "a vehicle"
     folder: ClassVar[str] = "vehicles"
 
     name: str

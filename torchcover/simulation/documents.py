@@ -2,7 +2,7 @@
 
 import hashlib
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from itertools import islice
 from pathlib import Path
@@ -42,6 +42,20 @@ OF_OTHERS = {
     "resolution": "width, height",
     "range": "max_range_m",
 }
+# Top-level keys of the files that commands take: those that a kind needs, then those that it may have.
+KINDS = {
+    "a rig": ("sensors", "vehicle weather bodies"),
+    "a vehicle": ("parts", "extends mount_regions"),
+    "a scenario": ("", "ego bodies actors boxes time_step_s duration_s weather traffic"),
+    "a search space": (
+        "scenario objectives",
+        "vehicle not_worse requirements start free constraints cost always candidates choose now",
+    ),
+    "a set of requirements": ("requirements", "regions heights grid scenario places"),
+    "a set of encounters": ("encounters", "draws seed"),
+    "a file of regions": ("", "regions heights grid"),
+}
+UNITS = ("rad", "deg", "mm", "cm", "m", "km", "ft", "in", "s", "ms", "hz", "mps", "kmh")
 MAX_QUOTED = 60
 # Keys of angles that people measure in radians, too.
 ANGLES = ("yaw_deg", "pitch_deg", "roll_deg", "fov_deg", "horizontal_fov_deg", "vertical_fov_deg", "facing_deg")
@@ -59,6 +73,7 @@ class Document(BaseModel):
     for a tuple, and a number of NumPy's for Python's.
     """
 
+    kind: ClassVar[str] = ""
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
 
     @model_validator(mode="before")
@@ -148,7 +163,34 @@ def read_document(model: type[DocumentT], path: Path) -> DocumentT:
     try:
         return model.model_validate(content, context={"folder": path.parent})
     except ValidationError as error:
-        raise BadFileError(f"{path}: {explain(error)}") from error
+        other = find_other_kind(model.kind, content)
+        words = f"this is {other}; {model.kind} is needed" if other else explain(error)
+        raise BadFileError(f"{path}: {words}") from error
+
+
+def find_other_kind(kind: str, content: Mapping[str, Any]) -> str:
+    """Find the kind of document that a file is, if it fits another kind better than the one that is needed.
+
+    Args:
+        kind: The kind that is needed, a key of `KINDS`.
+        content: The keys of the file.
+
+    Returns:
+        A key of `KINDS`; empty if no other kind has more of the keys.
+
+    Example:
+        >>> find_other_kind("a vehicle", {"name": "roof", "sensors": []}), find_other_kind("a rig", {"sensor": []})
+        ('a rig', '')
+    """
+    keys, mistakes, known = set(content) - {"name", "description"}, {}, {}
+    for each, (needed, allowed) in KINDS.items():
+        known[each] = {*needed.split(), *allowed.split()}
+        mistakes[each] = len(keys - known[each]) + len(set(needed.split()) - keys)
+    best = min(mistakes, key=mistakes.__getitem__)
+    if kind not in KINDS or mistakes[best] >= mistakes[kind]:
+        return ""
+    has_own_keys = bool(keys & (known[best] - known[kind]))
+    return best if has_own_keys or (keys and not mistakes[best]) else ""
 
 
 class Readable(Document):
@@ -237,7 +279,8 @@ def _alike(key: str) -> str:
     if key in OF_OTHERS:
         return OF_OTHERS[key]
     known = sorted(_keys(Document))
-    with_unit = [name for name in known if name.rpartition("_")[0] == key]
+    stem, _, unit = key.rpartition("_")
+    with_unit = [name for name in known if name.rpartition("_")[0] == (stem if unit in UNITS else key)]
     return next(iter(with_unit or get_close_matches(key, known, n=1, cutoff=0.8)), "")
 
 
@@ -324,6 +367,9 @@ def found(kind: str, path_or_name: str | Path) -> Path:
         return path
     builtin = builtin_folder(kind) / f"{path_or_name}.yaml"
     if path.name != str(path_or_name) or not builtin.is_file():
+        kinds = [other for other in ("rigs", "scenarios", "vehicles", "encounters", "requirements") if other != kind]
+        if of := [other for other in kinds if path.name in builtin_names(other)]:
+            raise FileNotFoundError(f"{path.name!r} is one of the built-in {of[0]}; one of the {kind} is needed")
         raise FileNotFoundError(
             f"{str(path_or_name)!r} is neither a .yaml file nor one of the built-in {kind}; "
             + nearest(str(path_or_name), builtin_names(kind))

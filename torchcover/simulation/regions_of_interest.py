@@ -3,7 +3,7 @@
 import math
 import warnings
 from dataclasses import replace
-from typing import Annotated, NamedTuple, Self
+from typing import Annotated, ClassVar, NamedTuple, Self
 
 from pydantic import Field, PositiveFloat, model_validator
 
@@ -93,6 +93,7 @@ class RegionsOfInterest(Readable):
         ((-4.0, -2.5), {'child': (0.1, 1.1)}, ((-4.0, -2.5), (-1.0, 1.0)))
     """
 
+    kind: ClassVar[str] = "a file of regions"
     regions: dict[Name, RegionOfInterest] = Field(default_factory=dict)
     heights: dict[Name, Bounds] = Field(default_factory=dict)
     grid: GridOfInterest = GridOfInterest()

@@ -53,6 +53,7 @@ class Rig(BuiltIn):
         ['roof']
     """
 
+    kind: ClassVar[str] = "a rig"
     folder: ClassVar[str] = "rigs"
 
     name: str

@@ -110,6 +110,7 @@ class Scenario(BuiltIn):
         0.0
     """
 
+    kind: ClassVar[str] = "a scenario"
     folder: ClassVar[str] = "scenarios"
 
     name: str
