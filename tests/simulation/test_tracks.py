@@ -99,11 +99,14 @@ def test_trajectories_of_different_clocks_are_named(tmp_path):
     ("times", "message"),
     [
         (np.arange(4) * 100_000_000, "times in seconds are needed; the usual step of these is 1e+08: divide them by"),
+        (np.arange(4) * 100, "times in seconds are needed; the usual step of these is 100: divide them by 1e3"),
         ((np.arange(4) * 0.1 + 1e5).astype("f4"), "times of float32 are up to 0.0078125 s off, with a usual step of"),
     ],
 )
 def test_times_in_other_units_are_refused(tmp_path, times, message):
-    np.savez(tmp_path / "p.npz", times_s=times, world_T_body=np.tile(np.eye(4), (4, 1, 1)))
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[:, 0, 3] = np.arange(4)
+    np.savez(tmp_path / "p.npz", times_s=times, world_T_body=poses)
     with pytest.raises(ValueError, match=f"p.npz: {re.escape(message)}"):
         read_trajectory(tmp_path / "p.npz")
 

@@ -12,7 +12,6 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictFloat, ValidationError
 
-from torchcover.files import parse_yaml, read_short_text, reads
 from torchcover.recordings.settings import RecordingSettings, explain_settings
 
 Names = tuple[str, ...]
@@ -170,7 +169,9 @@ def load_config(
         BadFileError: Not YAML, an unknown or doubled key, a value of a wrong type or unit.
         ValueError: An assignment that is no setting.
     """
-    content = {} if path is None else _read_config(path)
+    from torchcover.files import reads  # loads NumPy, whose threads have to be set before
+
+    content = {} if path is None else reads("settings of a run")(_read_config)(path)
     merged: dict[str, Any] = {**content, "recording": dict(content.get("recording") or {})}
     for text in assignments:
         _assign(merged, text)
@@ -187,8 +188,9 @@ def load_config(
     return LoadedConfig(config, {"file": str(path), "settings": content, "replaced": replaced})
 
 
-@reads("settings of a run")
 def _read_config(path: Path) -> dict[str, Any]:
+    from torchcover.files import parse_yaml, read_short_text
+
     content = parse_yaml(read_short_text(path))
     if not isinstance(content, dict):
         raise ValueError(f"a YAML mapping of settings is needed (`torchcover config`); got {type(content).__name__}")
@@ -200,6 +202,8 @@ def _read_config(path: Path) -> dict[str, Any]:
 
 
 def _assign(content: dict[str, Any], text: str) -> None:
+    from torchcover.files import parse_yaml
+
     key, equals, value = text.partition("=")
     group, dot, name = key.partition(".")
     fields = RecordingSettings.model_fields if dot else EvaluateConfig.model_fields

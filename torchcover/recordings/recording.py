@@ -19,7 +19,10 @@ from torchcover.recordings.clouds.arrays import Points
 # A return from so near to the origin of its frame is one that never came, which drivers store as zeros.
 NO_RETURN_M = 1e-3
 # Steps that are longer are counts of milliseconds, microseconds or nanoseconds.
-LONGEST_STEP_S = 60.0
+LONGEST_STEP_S = 3600.0
+# Steps that are longer and shorter than these, in s and m/s, are milliseconds of somebody who moves.
+LONG_STEP_S = 10.0
+SLOW_MPS = 0.2
 # Times may be off by this share of a step.
 COARSEST = 0.01
 
@@ -70,18 +73,25 @@ def check_times(times_s: NDArray[np.float64], count: int, source: str) -> NDArra
     return times_s
 
 
-def check_seconds(times_s: NDArray[np.floating], source: str = "") -> None:
+def check_seconds(
+    times_s: NDArray[np.floating], source: str = "", positions_m: NDArray[np.floating] | None = None
+) -> None:
     """Refuse ascending times that are in another unit than seconds, or too coarse.
 
     Args:
         times_s: (K,) times as they were stored.
         source: What begins the message.
+        positions_m: (K, 3) positions at these times, whose speed tells milliseconds from seconds.
 
     Raises:
-        ValueError: Their median step is longer than a minute, or they are float32 and as far apart as its digits.
+        ValueError: Their median step is longer than an hour, or than 10 s at a crawl, or they are float32 and as far
+            apart as its digits.
     """
     step_s = float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0
-    if step_s > LONGEST_STEP_S:
+    speed_mps = 0.0
+    if positions_m is not None and step_s:
+        speed_mps = float(np.median(np.linalg.norm(np.diff(positions_m, axis=0), axis=1) / np.diff(times_s)))
+    if step_s > LONGEST_STEP_S or (step_s > LONG_STEP_S and 0.0 < speed_mps < SLOW_MPS):
         raise ValueError(
             f"{source}times in seconds are needed; the usual step of these is {step_s:g}: divide them by 1e3, 1e6 or "
             "1e9 if they count milliseconds, microseconds or nanoseconds"

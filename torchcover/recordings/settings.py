@@ -6,8 +6,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
-from torchcover.files import parse_yaml, read_short_text, reads
-
 if TYPE_CHECKING:
     from torchcover.geometry.rigid import Matrix
 
@@ -103,14 +101,17 @@ def merge_recording_settings(recording: Path, settings: RecordingSettings | None
     Raises:
         BadFileError: Not YAML, or a key or value that is no setting; the message names the file and the key.
     """
+    from torchcover.files import reads  # loads NumPy, which `--help` does without
+
     path = recording / SETTINGS_FILE
-    content = _read(path) if path.is_file() else {}
+    content = reads("settings of a recording")(_read)(path) if path.is_file() else {}
     given = {} if settings is None else settings.model_dump(exclude_unset=True)
     return RecordingSettings.model_validate({**content, **given})
 
 
-@reads("settings of a recording")
 def _read(path: Path) -> dict[str, Any]:
+    from torchcover.files import parse_yaml, read_short_text
+
     content = parse_yaml(read_short_text(path))
     if not isinstance(content, dict):
         raise ValueError(f"a YAML mapping of keys is needed; got {type(content).__name__}")

@@ -30,7 +30,7 @@ def read_trajectory(path: Path) -> Trajectory:
     if path.suffix not in readers:
         raise ValueError(f"a trajectory is a .csv or .npz file; got {path.suffix or 'no suffix'}")
     trajectory = readers[path.suffix](path)
-    check_seconds(trajectory.times_s)
+    check_seconds(trajectory.times_s, positions_m=trajectory.positions_m)
     check_gaps(trajectory.times_s)
     return trajectory
 
