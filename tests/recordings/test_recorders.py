@@ -15,7 +15,7 @@ from torchcover.files import RECORDING, WRITING, BadFileError, read_manifest
 from torchcover.geometry import rotation_from_euler, rotation_from_quaternion
 from torchcover.geometry.rigid import quaternion_from_rotation
 from torchcover.recordings.formats.kitti_files import BODY, read_calibration, read_labels
-from torchcover.recordings.recorders.kitti import NOTHING, KittiRecorder
+from torchcover.recordings.recorders import NOTHING, KittiRecorder
 from torchcover.simulation import SurfaceReference, writing
 
 PATTERN = {"channels": 8, "vertical_fov_deg": (-30, 5), "horizontal_fov_deg": 360, "columns": 60, "max_range_m": 60}

@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 
 from torchcover.detection.boxes import Boxes
 from torchcover.geometry import BoundingBox, invert, transform
+from torchcover.recordings.free_space import Key, seen_share, square_metres
 from torchcover.recordings.in_vehicle import InVehicle, within
 from torchcover.recordings.movers import COMPARED_S, WITHIN_M, Moved, movers
 from torchcover.recordings.recording import Recording
-from torchcover.recordings.seen_past import Key
 from torchcover.recordings.sweeps import MOVES_MPS, Sweeps, Thinned, first_of_each, pose_of, voxels
-from torchcover.recordings.visible import seen_share, square_metres
 
 # So many scans have to see past a point.
 VOTES = 2

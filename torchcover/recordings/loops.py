@@ -5,8 +5,7 @@ import math
 import numpy as np
 
 from torchcover.neighbors.compiled import Array, compiled, inlined
-from torchcover.recordings.seen_past import COLUMNS, ROWS
-from torchcover.recordings.visible import A1, A3, A5, A7, A9, BEHIND, BEHIND_M, OVER_M, TINY
+from torchcover.recordings.free_space import A1, A3, A5, A7, A9, BEHIND, BEHIND_M, COLUMNS, OVER_M, ROWS, TINY
 
 
 @compiled("void(f8[:, ::1], f4[:, ::1], i8, f8[:, ::1], f8, i2[::1], i8)")

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.recordings.seen_past import compiled_or
+from torchcover.recordings.free_space import compiled_or
 
 Float64 = NDArray[np.float64]
 Cells = NDArray[np.int64]

@@ -15,10 +15,10 @@ from torchcover.detection import Boxes, points_in_boxes
 from torchcover.frames.source import BadFrameError
 from torchcover.geometry import invert, rigid, rotation_from_euler, transform
 from torchcover.geometry.rigid import Matrix
+from torchcover.recordings.free_space import Key, RangeImage, Votes
 from torchcover.recordings.ground_model import GroundModel, low_surfaces
 from torchcover.recordings.in_vehicle import in_vehicle
 from torchcover.recordings.recording import Recording, Scan
-from torchcover.recordings.seen_past import Key, RangeImage, Votes
 
 # What is slower stands: between a time before and one after.
 MOVES_MPS, MOVED_S = 0.5, 0.5

@@ -12,7 +12,7 @@ from torchcover.cameras.calibration import Calibration
 from torchcover.geometry import BoundingBox, euler_from_rotation, invert, rigid, rotation_from_euler
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.formats.ros import RosBag
-from torchcover.recordings.recorders.folder import CLEARANCE_M
+from torchcover.recordings.recorders import CLEARANCE_M
 from torchcover.recordings.recording import CalibratedRecording, Recording, SensorCalibrations, UndistortedRecording
 from torchcover.simulation.as_cast import as_cast
 from torchcover.simulation.bodies import body_called, mover_mesh

@@ -29,11 +29,11 @@ from torchcover.recordings.accumulated_reference import (
     AccumulatedReference,
 )
 from torchcover.recordings.formats.track_tables import BOX_COLUMNS, TRAJECTORY_COLUMNS
+from torchcover.recordings.free_space import RangeImage
 from torchcover.recordings.in_vehicle import within
 from torchcover.recordings.movers import COMPARED_S, WITHIN_M, Moved, movers
 from torchcover.recordings.objects import objects_of
 from torchcover.recordings.recording import Recording
-from torchcover.recordings.seen_past import RangeImage
 from torchcover.recordings.sweeps import MOVES_MPS, first_of_each, voxels
 from torchcover.simulation.height_field import Slopes
 from torchcover.simulation.recorded.run import pieces

@@ -7,8 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 from torchcover.files import RECORDING, WRITING, AtomicOutput
-from torchcover.recordings.recorders import RECORDERS
-from torchcover.recordings.recorders.recorder import RecordedStep, RecordingSetup
+from torchcover.recordings.recorders import RECORDERS, RecordedStep, RecordingSetup
 from torchcover.recordings.recording import read_recording_manifest
 from torchcover.simulation.lidar import Lidar
 from torchcover.simulation.simulated_frames import SimulatedFrames

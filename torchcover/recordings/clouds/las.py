@@ -1,6 +1,10 @@
-"""Surveys: LAS, versions 1.0 to 1.4, and LAZ, which is LAS compressed and read by laspy."""
+"""Surveys: LAS, versions 1.0 to 1.4, and LAZ, which is LAS compressed and read by laspy; scales and units."""
 
+import os
+import re
 import struct
+import warnings
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
@@ -8,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.files import check_memory, laz_points
-from torchcover.recordings.clouds.las_units import list_records, read_scale
 
 HEADER_BYTES, HEADER_BYTES_1_4 = 227, 375
 COMPRESSED = 0x80  # of the point format
@@ -16,6 +19,134 @@ COMPRESSED = 0x80  # of the point format
 RECORD_HEADER_BYTES, LATER_RECORD_HEADER_BYTES = 54, 60
 # Of x, y and z as float64, while they are made of whole numbers.
 COORDINATE_BYTES = 72
+# Records about the coordinate system.
+PROJECTION = b"LASF_Projection"
+WKT_RECORD, GEO_KEYS_RECORD = 2112, 34735
+# GeoTIFF keys, and values of the first one.
+MODEL_KEY, CRS_KEY, HORIZONTAL_UNIT_KEY, VERTICAL_UNIT_KEY = 1024, 3072, 3076, 4099
+GEOGRAPHIC = 2
+# EPSG code of a unit -> its name and meters.
+EPSG_UNITS = {9001: ("meter", 1.0), 9002: ("foot", 0.3048), 9003: ("US survey foot", 1200 / 3937)}
+# EPSG codes of UTM zones of WGS84, ETRS89 and NAD83, which are in meters.
+UTM_CODES = (range(32601, 32761), range(25828, 25839), range(26901, 26924))
+# A record of text or of keys is smaller.
+MAX_RECORD_BYTES = 1 << 16
+# Keywords of coordinate systems in WKT.
+PROJECTED_SYSTEMS = frozenset({"PROJCS", "PROJCRS", "PROJECTEDCRS", "GEOCCS"})
+VERTICAL_SYSTEMS = frozenset({"VERT_CS", "VERTCRS", "VERTICALCRS"})
+GEOGRAPHIC_SYSTEMS = frozenset({"GEOGCS", "GEOGCRS", "GEOGRAPHICCRS", "BASEGEOGCRS", "BASEGEODCRS", "GEODCRS"})
+REPROJECT = "reproject the file into a coordinate system in meters (pdal translate, las2las)"
+
+
+class _Unit(NamedTuple):
+    name: str
+    meters: float
+
+
+def _read_projection(file: BinaryIO, first_byte: int, count: int, header: struct.Struct) -> dict[int, bytes]:
+    """Read the variable length records about the coordinate system, by their identifiers."""
+    contents: dict[int, bytes] = {}
+    end_byte = file.seek(0, os.SEEK_END)
+    for _ in range(count):
+        if first_byte + header.size > end_byte:
+            break
+        file.seek(first_byte)
+        _, user, identifier, length, _ = header.unpack(file.read(header.size))
+        if user.rstrip(b"\0") == PROJECTION and length <= MAX_RECORD_BYTES:
+            contents[identifier] = file.read(length)
+        first_byte += header.size + length
+    return contents
+
+
+def _choose_scale(contents: Mapping[int, bytes]) -> NDArray[np.float64]:
+    """Return how many meters a unit of x, y and z is, by the records about the coordinate system.
+
+    Args:
+        contents: Records by their identifiers, of which WKT wins over GeoKeys.
+
+    Returns:
+        (3,) factors: 1 where nothing is said.
+
+    Raises:
+        ValueError: Degrees, or an unknown unit.
+
+    Warns:
+        UserWarning: Coordinates are converted, or only a code is given that does not say the unit.
+    """
+    units = _units_of_wkt(contents.get(WKT_RECORD, b"")) or _units_of_keys(contents.get(GEO_KEYS_RECORD, b""))
+    if units is None:
+        return np.ones(3)
+    horizontal, vertical = units
+    if (horizontal.meters, vertical.meters) != (1.0, 1.0):
+        warnings.warn(
+            f"LAS coordinates are converted to meters, as the file says: x and y are in {horizontal.name}, z in "
+            f"{vertical.name}; give no recording.units",
+            stacklevel=2,
+        )
+    return np.array([horizontal.meters, horizontal.meters, vertical.meters])
+
+
+def _units_of_keys(data: bytes) -> tuple[_Unit, _Unit] | None:
+    """Return the units of x and y, and of z, by GeoKeys; None where they say none."""
+    numbers = np.frombuffer(data[: len(data) // 8 * 8], "<u2").reshape(-1, 4)[1:].tolist()
+    keys = {key: value for key, location, _, value in numbers if location == 0}
+    if keys.get(MODEL_KEY) == GEOGRAPHIC:
+        raise ValueError(f"x and y are degrees (GTModelTypeGeoKey 2); {REPROJECT}")
+    code = keys.get(CRS_KEY)
+    if HORIZONTAL_UNIT_KEY in keys:
+        horizontal = _unit_of_code(keys[HORIZONTAL_UNIT_KEY])
+    elif code is None:
+        return None
+    else:
+        if not any(code in zones for zones in UTM_CODES):
+            warnings.warn(
+                f"LAS coordinates of EPSG:{code} without a unit (ProjLinearUnitsGeoKey) are taken for meters; if they "
+                "are feet: --set recording.units=ft",
+                stacklevel=3,
+            )
+        horizontal = _Unit("meter", 1.0)
+    return horizontal, _unit_of_code(keys[VERTICAL_UNIT_KEY]) if VERTICAL_UNIT_KEY in keys else horizontal
+
+
+def _unit_of_code(code: int) -> _Unit:
+    if code not in EPSG_UNITS:
+        known = ", ".join(f"{code} ({name})" for code, (name, _) in EPSG_UNITS.items())
+        raise ValueError(f"unit EPSG:{code} of its GeoKeys is unknown; known are {known}; {REPROJECT}")
+    return _Unit(*EPSG_UNITS[code])
+
+
+def _units_of_wkt(data: bytes) -> tuple[_Unit, _Unit] | None:
+    """Return the units of x and y, and of z, by WKT of version 1 or 2; None without any."""
+    text = data.rstrip(b"\0").decode("utf-8", "replace")
+    horizontal = vertical = None
+    is_geographic = False
+    for systems, unit in _list_units(text):
+        if unit is None:
+            is_geographic |= bool(GEOGRAPHIC_SYSTEMS & systems)
+        elif VERTICAL_SYSTEMS & systems:
+            vertical = unit
+        elif PROJECTED_SYSTEMS & systems and not (GEOGRAPHIC_SYSTEMS | {"CONVERSION"}) & systems:
+            horizontal = unit
+    if horizontal is not None:
+        return horizontal, vertical or horizontal
+    if is_geographic:
+        raise ValueError(f"x and y are degrees (its WKT has a geographic coordinate system only); {REPROJECT}")
+    return None
+
+
+def _list_units(text: str) -> Iterator[tuple[set[str], _Unit | None]]:
+    """Yield the length units of WKT with the keywords that they are inside of, and None for an angular unit."""
+    inside: list[str] = []
+    for token in re.finditer(r'"[^"]*"|([A-Za-z_]\w*)\s*[\[(]|[\])]', text):
+        keyword = (token[1] or "").upper()
+        if keyword:
+            value = re.compile(r'\s*"([^"]*)"\s*,\s*([0-9.eE+-]+)').match(text, token.end())
+            if keyword in ("UNIT", "LENGTHUNIT", "ANGLEUNIT") and value is not None:
+                is_angle = keyword == "ANGLEUNIT" or value[1].lower() in ("degree", "radian", "grad")
+                yield set(inside), None if is_angle else _Unit(value[1], float(value[2]))
+            inside.append(keyword)
+        elif token[0] in "])" and inside:
+            inside.pop()
 
 
 class _Header(NamedTuple):
@@ -35,14 +166,15 @@ def read_las(path: Path) -> NDArray[np.float64]:
     size_bytes = path.stat().st_size
     with path.open("rb") as file:
         header = _header(file.read(HEADER_BYTES_1_4), size_bytes)
-        records = [*list_records(file, *header.records, extended=False)]
-        records += list_records(file, *header.later_records, extended=True)
-        meters = read_scale(file, records)
+        contents = _read_projection(file, *header.records, struct.Struct("<H16sHH32s"))
+        contents |= _read_projection(file, *header.later_records, struct.Struct("<H16sHQ32s"))
+        meters = _choose_scale(contents)
         check_memory(header.points * (header.record_bytes + COORDINATE_BYTES))
         if header.compressed:
             _check_chunks(file, header, size_bytes)
+    scale, offset_m = header.scale * meters, header.offset * meters
     if header.compressed:
-        return laz_points(path, header.points)["xyz"] * (header.scale * meters) + header.offset * meters
+        return np.asarray(laz_points(path, header.points)["xyz"] * scale + offset_m)
     claimed_bytes = header.points * header.record_bytes
     if header.first_byte + claimed_bytes > size_bytes:
         raise ValueError(
@@ -50,8 +182,8 @@ def read_las(path: Path) -> NDArray[np.float64]:
             f"on; the file has {size_bytes} bytes"
         )
     columns = np.dtype({"names": ["xyz"], "formats": [("<i4", 3)], "offsets": [0], "itemsize": header.record_bytes})
-    records = np.fromfile(path, columns, header.points, offset=header.first_byte)
-    return records["xyz"] * (header.scale * meters) + header.offset * meters
+    points = np.fromfile(path, columns, header.points, offset=header.first_byte)
+    return np.asarray(points["xyz"] * scale + offset_m)
 
 
 def _header(data: bytes, size_bytes: int) -> _Header:

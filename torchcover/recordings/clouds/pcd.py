@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from torchcover.files import check_memory, lzf_block
-from torchcover.recordings.clouds.arrays import Points
-from torchcover.recordings.clouds.binary import check_rest
+from torchcover.recordings.clouds.arrays import Points, check_rest
 from torchcover.recordings.clouds.text import AXES, parse_rows, read_lines
 
 # The real ones have about 300 bytes; this bounds the search for the DATA line in a file that is no PCD.

@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from torchcover.files import check_memory
-from torchcover.recordings.clouds.arrays import Points
-from torchcover.recordings.clouds.binary import check_rest
+from torchcover.recordings.clouds.arrays import Points, check_rest
 from torchcover.recordings.clouds.text import AXES, parse_rows, read_lines
 
 # Bounds the search for end_header in a file that is no PLY.

@@ -16,9 +16,8 @@ from torchcover.files import naming, read_feather, road_user_classes
 from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_quaternion
 from torchcover.geometry.rigid import Matrix
 from torchcover.geometry.trajectory import Trajectory
-from torchcover.recordings.objects import Ego, RecordedObjects, track_of
+from torchcover.recordings.objects import Ego, RecordedObjects, Seen, SeenObjects, by_name, track_of
 from torchcover.recordings.recording import Layout, Scan, SensorCalibrations, check_times, warn_of_missing_poses
-from torchcover.recordings.seen import Seen, SeenObjects, by_name
 
 # The ego frame lies in the rear axle, 0.30 m above the ground; the centre of a Ford Fusion is 1.339 m before it, as in
 # the rig `argoverse2`, where the source is.

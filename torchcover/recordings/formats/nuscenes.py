@@ -17,9 +17,8 @@ from torchcover.files import naming, read_json_table, road_user_classes
 from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_quaternion
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.clouds.arrays import read_ringed_cloud
-from torchcover.recordings.objects import Ego, RecordedObjects, track_of
+from torchcover.recordings.objects import Ego, RecordedObjects, Seen, SeenObjects, by_name, track_of
 from torchcover.recordings.recording import Scan, SensorCalibrations, check_times
-from torchcover.recordings.seen import Seen, SeenObjects, by_name
 
 # The ego frame lies under the rear axle, on the ground; the centre of a Renault Zoe's box is 1.385 m before it, as in
 # the rig `nuscenes`, where the source is.

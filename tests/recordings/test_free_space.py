@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_euler
+from torchcover.recordings import free_space
 from torchcover.recordings import movers as moved
-from torchcover.recordings import seen_past, visible
+from torchcover.recordings.free_space import RangeImage, Votes, seen_share, square_metres
 from torchcover.recordings.movers import movers
-from torchcover.recordings.seen_past import RangeImage, Votes
-from torchcover.recordings.visible import seen_share, square_metres
 
 CAR = BoundingBox((-2.4, -0.95, 0.0), (2.4, 0.95, 1.7))
 
@@ -88,19 +87,19 @@ def test_loops_do_what_arrays_do():
     sensor_T_local = invert(rigid(rotation_from_euler(20.0, 3.0, -2.0), [1.0, 2.0, 0.5]))
     image = RangeImage.of(generator.normal(0.0, 30.0, (40_000, 3)), sensor_T_local)
     one, other = np.zeros((2, 5000), np.int16)
-    for kernel, votes in ((loops.vote_by_loop, one), (seen_past.vote_by_arrays, other)):
+    for kernel, votes in ((loops.vote_by_loop, one), (free_space.vote_by_arrays, other)):
         kernel(points_m, *image, votes, 2)
     np.testing.assert_array_equal(one, other)
     assert 0 < one.sum() < 2 * len(one)
 
     hidden = np.zeros((2, 5000), np.bool_)
     reach_m = np.array([np.inf, 70.0, 30.0, 10.0])
-    for kernel, of in zip((loops.hide_by_loop, visible.hide_by_arrays), hidden, strict=True):
+    for kernel, of in zip((loops.hide_by_loop, free_space.hide_by_arrays), hidden, strict=True):
         kernel(
             points_m,
             np.array([0.1, 3.2, 0.3]),
             np.array([[-2.0, -1.0, -1.0], [2.0, 1.0, 1.5]]),
-            visible.BINS_RAD,
+            free_space.BINS_RAD,
             reach_m,
             of,
         )
