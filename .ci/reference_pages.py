@@ -21,7 +21,7 @@ from typer.main import get_command
 
 import torchcover
 from torchcover.cli.app import app
-from torchcover.report.renderers.records import COLUMNS
+from torchcover.report.records import COLUMNS
 
 ROOT = Path(__file__).parent.parent
 ROOMS = (

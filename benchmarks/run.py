@@ -33,7 +33,7 @@ WATCHED = {
     "torchcover.coverage.metric:CoverageMetric.sums_of": SUMS,
     "torchcover.coverage.metric:CoverageMetric.add": SUMS,
     "torchcover.targets.probing:Probes.sums_of": BODIES,
-    "torchcover.report.maps.figures:draw_side_by_side": MAPS,
+    "torchcover.report.maps:draw_side_by_side": MAPS,
     "torchcover.files.atomic_files:AtomicOutput.add_figure": MAPS,
     "torchcover.evaluation.result:Result.save": FILES,
 }

@@ -9,13 +9,11 @@ os.environ["TORCHCOVER_CACHE_GB"] = "0"  # what tests draw does not go to the us
 import pytest
 from matplotlib.figure import Figure
 
-from torchcover.report.maps import figures
-
 
 @pytest.fixture
 def blank_maps(monkeypatch):
     """Maps with nothing on them, under their names: drawing one takes a third of a second."""
-    monkeypatch.setattr(figures, "draw_side_by_side", lambda *_, **__: Figure((0.2, 0.2)))
+    monkeypatch.setattr("torchcover.report.maps.draw_side_by_side", lambda *_, **__: Figure((0.2, 0.2)))
 
 
 @pytest.fixture

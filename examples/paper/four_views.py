@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.patches import Patch, Wedge
 
 from torchcover.coverage.quantity import RADIUS
-from torchcover.report.maps.colours import (
+from torchcover.report.colours import (
     NEVER_PROBED,
     ColourScale,
     cell_entries,
@@ -15,8 +15,8 @@ from torchcover.report.maps.colours import (
     draw_colour_bar,
     scale_of,
 )
-from torchcover.report.maps.overlay import draw_ego, draw_sensors, sensor_colour
-from torchcover.report.maps.sheet import (
+from torchcover.report.overlay import draw_ego, draw_sensors, sensor_colour
+from torchcover.report.sheet import (
     HEADING_POINTS,
     fit_paper,
     lay_out,

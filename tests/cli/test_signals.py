@@ -14,7 +14,9 @@ from tests.killing import operations_of
 from torchcover import Coverage, CoverageMetric
 from torchcover.cli import app
 from torchcover.evaluation import progress
-from torchcover.report.maps import figures
+from torchcover.report.maps import draw_side_by_side
+
+DRAW = "torchcover.report.maps.draw_side_by_side"
 
 
 def arguments(worlds, *, steps=3):
@@ -102,8 +104,7 @@ def test_one_that_is_sent_again_changes_nothing(torchcover, worlds, at_update, m
     """To the process and to its group, by the system and by the shell."""
     monkeypatch.setattr(progress, "TOGETHER_S", 600.0)  # on a machine that is as slow as it likes
     at_update(3, lambda: send(number, times=2))
-    draw = figures.draw_side_by_side
-    monkeypatch.setattr(figures, "draw_side_by_side", lambda *given, **more: (send(number), draw(*given, **more))[1])
+    monkeypatch.setattr(DRAW, lambda *given, **more: (send(number), draw_side_by_side(*given, **more))[1])
     code, _, complaints = torchcover(*arguments(worlds))
     assert code == 128 + number
     assert complaints.count("torchcover:") == 1
@@ -138,7 +139,7 @@ def run(worlds):
 
 def test_ctrl_c_again_ends_at_once_and_says_what_is_kept(worlds, at_update, monkeypatch):
     at_update(3, lambda: send(signal.SIGINT))
-    monkeypatch.setattr(figures, "draw_side_by_side", lambda *_, **__: (send(signal.SIGINT), time.sleep(60)))
+    monkeypatch.setattr(DRAW, lambda *_, **__: (send(signal.SIGINT), time.sleep(60)))
     code, said = in_a_fork(worlds, worlds / "log")
     out = worlds / "out"
     kept = ", ".join(str(out / name) for name in ("checkpoint.npz", "coverage", "summary.csv", "summary.json"))

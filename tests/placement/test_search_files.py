@@ -12,7 +12,7 @@ from torchcover.coverage.quantity import RADIUS, detection
 from torchcover.estimation import Difference
 from torchcover.placement import PlacementSearch, run_search
 from torchcover.placement.fresh import FreshGain, told
-from torchcover.report.page.answer import words_html
+from torchcover.report.page.drawings import words_html
 from torchcover.simulation import Rig
 
 

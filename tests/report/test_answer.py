@@ -9,7 +9,7 @@ import pytest
 
 from torchcover.estimation import Number, Quantity
 from torchcover.report import PageRange
-from torchcover.report.page.answer import plans_html, ranges_html
+from torchcover.report.page.drawings import plans_html, ranges_html
 
 # Machado, Oliveira and Fernandes 2009, severity 1: of linear red, green and blue.
 SEEING = {

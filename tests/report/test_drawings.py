@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 
 from torchcover.geometry import rigid, rotation_from_euler
 from torchcover.report import ActorMark, SensorView, StandingFaces, draw_depths, draw_rig, draw_scene
-from torchcover.report.drawings.frame import PATH, REFERENCE, SENSOR, SKY
-from torchcover.report.maps.overlay import COLOURS
+from torchcover.report.overlay import COLOURS
+from torchcover.report.scene import PATH, REFERENCE, SENSOR, SKY
 
 VERTICES = np.array([[x, y, z] for x in (-2.0, 2.0) for y in (-1.0, 1.0) for z in (0.0, 1.5)])
 FACES = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [1, 5, 7], [1, 7, 3], [0, 4, 5], [0, 5, 1]])

@@ -15,7 +15,7 @@ from torchcover.coverage import BevGrid
 from torchcover.coverage.quantity import RADIUS, detection
 from torchcover.geometry import rigid, rotation_from_euler
 from torchcover.report import ColourScale, SensorView, draw_side_by_side, scale_of
-from torchcover.report.maps.colours import INFINITE, UNKNOWN
+from torchcover.report.colours import INFINITE, UNKNOWN
 
 SCALE = ColourScale("blind spot radius", "m", "viridis_r", 0.0, 1.0)
 SQUARE = BevGrid(x=(-20.0, 20.0), y=(-10.0, 10.0), cell=1.0)

@@ -9,7 +9,7 @@ import torch
 
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric, Region
 from torchcover.report import RENDERERS, CoverageTable, band_figures, map_figures, notes_on, parts_of, remarks_on
-from torchcover.report.renderers.records import COLUMNS, records_of
+from torchcover.report.records import COLUMNS, records_of
 
 KEYS = ("radius_m", "detection_0.4m")
 SURFACE, CELLS = "Means over the square metres that the reference sees.", "Means over the known cells only"

@@ -28,8 +28,8 @@ from torchcover.report import (
     page_html,
     scale_of,
 )
-from torchcover.report.page.codes import CellBytes, encoded
 from torchcover.report.page.content import Array
+from torchcover.report.page.map_content import CellBytes, encoded
 from torchcover.report.page.writing import fitted
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")

@@ -195,8 +195,3 @@ def test_a_renderer_of_ones_own_needs_no_more_than_what_is_public(trio, regions)
 @pytest.mark.parametrize(("steps", "explained"), [(4, False), (24, True)])
 def test_the_mark_of_chance_is_explained_where_there_are_errors(trios, regions, steps, explained):
     assert ("significant" in marks_on(CoverageTable.of(trios(steps), regions))) is explained
-
-
-@pytest.mark.parametrize("name", RENDERERS)
-def test_a_renderer_is_in_the_file_of_its_name(name):
-    assert RENDERERS[name].__module__.rpartition(".")[2] == f"{name}_file"

@@ -8,7 +8,7 @@ import torch
 
 from torchcover.coverage import BevGrid, CoverageMetric, Region
 from torchcover.coverage.blocks import BlockSums
-from torchcover.report.maps.surface import (
+from torchcover.report.map_subjects import (
     FAINTEST,
     MIN_POINTS,
     as_drawn,

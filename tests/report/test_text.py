@@ -9,8 +9,8 @@ from rich.console import Console
 
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric, Region
 from torchcover.report import CoverageTable, PageTable, Words, print_table, print_whole
-from torchcover.report.renderers.records import COLUMNS
-from torchcover.report.renderers.text_file import narrowest_width, rich_tables
+from torchcover.report.records import COLUMNS
+from torchcover.report.renderers import narrowest_width, rich_tables
 
 NEAR = Region("near", x=(0.0, 2.0), y=(0.0, 2.0))
 FAR = Region("far", x=(2.0, 4.0), y=(0.0, 2.0))
@@ -21,7 +21,7 @@ ORIGIN = torch.zeros(1, 3)
 def no_other_columns(monkeypatch):
     """But how much the numbers are means over: rows are as these tests say whatever else the table has."""
     kept = tuple(column for column in COLUMNS if column.key in ("visible_m2", "known_share"))
-    monkeypatch.setattr("torchcover.report.renderers.layout.COLUMNS", kept)
+    monkeypatch.setattr("torchcover.report.layout.COLUMNS", kept)
 
 
 def metric(thresholds=(0.4, 1.0), **options) -> CoverageMetric:

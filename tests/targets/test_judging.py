@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from torchcover.evaluation import free_space, save_targets, survey_target, target_record
 from torchcover.geometry import BoundingBox
-from torchcover.report.drawings.targets import UNSEEN
+from torchcover.report.scene import UNSEEN
 from torchcover.simulation import with_ego
 from torchcover.targets import Raster, Target, TargetMap
 

@@ -20,7 +20,7 @@ from torchcover.evaluation.settings import FILES, Settings, wanted_files
 from torchcover.evaluation.task import task_of
 from torchcover.files import SUMMARY, AtomicOutput, csv_text
 from torchcover.report import RENDERERS, CoverageTable, PageTable, file_stems, in_common_first, page_html
-from torchcover.report.renderers.records import records_of
+from torchcover.report.records import records_of
 
 MIXTURE = "mixture"
 

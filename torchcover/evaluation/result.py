@@ -41,8 +41,8 @@ from torchcover.report import (
     table_dict,
     verdict,
 )
-from torchcover.report.failures import decisive
-from torchcover.report.renderers.records import records_of
+from torchcover.report.records import records_of
+from torchcover.report.remarks import decisive
 from torchcover.simulation import Sensor
 
 if TYPE_CHECKING:

@@ -1,13 +1,135 @@
-"""What the reader of a table has to know about its numbers: as data, and as sentences."""
+"""A table in sentences: what is lost when a sensor fails, what a reader has to know, and the answer in plain words."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from textwrap import fill
 
-from torchcover.estimation import blocks_needed
-from torchcover.report.failures import sensors_of, single_point_of_failure
-from torchcover.report.table import CoverageTable
-from torchcover.report.wording import span, steps_and_cell
+from torchcover.coverage import Region, RegionRedundancy
+from torchcover.coverage.quantity import RADIUS, seen_by_two, sensors_seeing
+from torchcover.estimation import MIN_BLOCKS, Quantity, blocks_needed
+from torchcover.report.table import CoverageTable, Row
+from torchcover.report.wording import (
+    UNKNOWN,
+    difference_heading,
+    difference_words,
+    number_words,
+    span,
+    steps_and_cell,
+    value_words,
+)
+
+MAX_HEADING_CHARS = 16
+NONE = "none"
+
+
+def decisive(table: CoverageTable) -> Quantity:
+    """What sensors are judged by: the detection at the first threshold, or the radius where there is none."""
+    return table.means[min(1, len(table.thresholds))]
+
+
+def sensors_of(rows: Sequence[Row]) -> tuple[str, ...]:
+    """The sensors that the rows of a rig have numbers without; none if that was not asked for."""
+    known = (row.summary.redundancy for row in rows)
+    return next((tuple(redundancy.without) for redundancy in known if redundancy), ())
+
+
+def failure_title(table: CoverageTable, rig: str) -> str:
+    """What stands above the part of the table that is about one rig."""
+    beginning = f"{rig}: change" if len(table.rigs) > 1 else "Change"
+    return f"{beginning} of {difference_heading(decisive(table))} when one sensor fails"
+
+
+def failure_headings(table: CoverageTable, rig: str) -> list[str]:
+    """Of its columns, but for the place."""
+    several = [fill(heading, MAX_HEADING_CHARS) for heading in ("sensors that see it", "by two or more (%)")]
+    return [*(several if table.thresholds else ()), *sensors_of(table.rows[rig]), "most lost with"]
+
+
+def failure_words(table: CoverageTable, row: Row) -> list[tuple[str, bool]]:
+    """The cells of one row but for the place, each with whether it is marked as more than chance."""
+    redundancy, key = row.summary.redundancy, decisive(table).key
+    sensors = sensors_of(table.rows[row.rig])
+    if redundancy is None:
+        return [(UNKNOWN, False)] * len(failure_headings(table, row.rig))
+    words = []
+    for threshold in table.thresholds[:1]:
+        words.append((number_words(redundancy.seen_by[sensors_seeing(threshold).key]), False))
+        words.append((number_words(redundancy.seen_by[seen_by_two(threshold).key]), False))
+    for sensor in sensors:
+        change = redundancy.change[sensor][key]
+        words.append((difference_words(change), bool(change.significant)))
+    known = not math.isnan(row.summary.numbers[key].value)
+    return [*words, (redundancy.indispensable or (NONE if known else UNKNOWN), False)]
+
+
+@dataclass(frozen=True)
+class FailureParams:
+    """When the loss of a sensor is called a single point of failure.
+
+    Args:
+        least_share: Least loss that is more than chance: the share of the detection that is lost, or by which the
+            radius grows. A tenth is more than settings move a number, see docs/accuracy.md.
+    """
+
+    least_share: float = 0.1
+
+
+def single_point_of_failure(table: CoverageTable, rig: str, params: FailureParams = FailureParams()) -> str:
+    """Name the sensor of a rig with which most is lost, and where, if the loss is large and more than chance.
+
+    Args:
+        table: Of one rig or several.
+        rig: Its name.
+        params: What counts as a single point of failure.
+
+    Returns:
+        A sentence; empty if redundancy was not asked for.
+    """
+    quantity, rows = decisive(table), table.rows[rig]
+    if not sensors_of(rows):
+        return ""
+    if all(math.isnan(row.summary.numbers[quantity.key].value) for row in rows):
+        return "Whether one sensor is indispensable is unknown: nothing that was asked about was seen."
+    if quantity.key != RADIUS.key and not any(row.summary.numbers[quantity.key].value > 0.0 for row in rows):
+        return "Nothing of what was asked about is detected: no failure could take anything away."
+    if len(sensors_of(rows)) == 1:
+        return f"Its only sensor is {sensors_of(rows)[0]}: without it nothing is seen."
+    large = [row for row in rows if _lost_share(row, quantity) >= params.least_share]
+    real = [row for row in large if _is_significant(row, quantity)]
+    worst = max(real or large, key=lambda row: _loss(row.summary.redundancy, quantity), default=None)
+    if worst is None or (redundancy := worst.summary.redundancy) is None or redundancy.indispensable is None:
+        least = f"{params.least_share:.0%}"
+        return f"No single point of failure: no sensor's failure costs {least} or more of any number that is known."
+    sensor = redundancy.indispensable
+    before, after = worst.summary.numbers[quantity.key].value, redundancy.without[sensor][quantity.key].value
+    whole, rest = (value_words(value, quantity.unit) for value in (before, after))
+    unit = "m" if quantity.unit == "m" else "%"
+    where = f"{worst.summary.region} {worst.summary.height}"
+    change = f"{quantity.title} is {rest} {unit} in {where}, not {whole} {unit}"
+    if real:
+        return f"Single point of failure: {sensor}; without it {change}."
+    return f"Most is lost without {sensor}: {change}; whether that is more than chance is unknown."
+
+
+def _lost_share(row: Row, quantity: Quantity) -> float:
+    """The loss with the sensor with which most is lost, as a share of the number with all sensors."""
+    loss, whole = _loss(row.summary.redundancy, quantity), row.summary.numbers[quantity.key].value
+    return loss / whole if loss > 0 and whole > 0 else 0.0
+
+
+def _is_significant(row: Row, quantity: Quantity) -> bool:
+    redundancy = row.summary.redundancy
+    if redundancy is None or redundancy.indispensable is None:
+        return False
+    return bool(redundancy.change[redundancy.indispensable][quantity.key].significant)
+
+
+def _loss(redundancy: RegionRedundancy | None, quantity: Quantity) -> float:
+    if redundancy is None or redundancy.indispensable is None:
+        return 0.0
+    return -redundancy.change[redundancy.indispensable][quantity.key].gain
+
 
 # Buildings and trees are above every band; where more than such a share is outside, the clouds may be elsewhere.
 MOSTLY = 0.8
@@ -117,3 +239,135 @@ def _of_rig(table: CoverageTable, rig: str) -> list[str]:
     sentences = (remark.sentence for remark in remarks_on(table, rig))
     failure = single_point_of_failure(table, rig)
     return [first, *sentences, *([failure] if failure else [])]
+
+
+# The range that is told is that of the region ahead that reaches farthest, but no farther than this.
+RANGE_M = 80.0
+BANDS = {"ground": "the ground", "obstacle": "obstacles"}
+# Of so many places that all say the same, at least nine in ten say it anywhere, with 95 % confidence: 0.9**30 < 0.05.
+LEAST_AGREED = 30
+SIDES = {"front_3m": "in front", "rear_3m": "behind", "left_3m": "on the left", "right_3m": "on the right"}
+
+
+def verdict(table: CoverageTable) -> tuple[str, ...]:
+    """What a meeting is told of a table; the first sentence says most.
+
+    Args:
+        table: Of one rig, or of several that are compared.
+
+    Returns:
+        Sentences: on bodies beside the vehicle, on the range, on the failure of a sensor; those that there are numbers
+        for, or that steps are too few.
+    """
+    told = tuple(filter(None, (rule(table) for rule in RULES)))
+    return tuple(filter(None, (*told, too_few(table, "ranges" if told else "an answer"))))
+
+
+def too_few(table: CoverageTable, what: str) -> str:
+    """Say that frames are too few for intervals, where these were asked for, and how many would give them.
+
+    Args:
+        table: Of one rig or several.
+        what: What intervals are needed for: "an answer".
+
+    Returns:
+        A sentence; empty where some number has an interval, or where none was asked for.
+    """
+    steps, blocks = table.first.counts["steps"], table.first.blocks
+    if blocks is None or table.has_intervals:
+        return ""
+    needed, ends = blocks_needed(blocks, table.first.effective[0]), table.block_ends
+    begin = f"Not enough frames for {what}: {steps:,} form {blocks} block{'s' * (blocks != 1)} of time, "
+    if ends and len(ends) < needed:
+        return f"{begin}intervals need about {needed}, and this source has {len(ends)} in all."
+    frames = ends[needed - 1] if ends else needed * (table.first.steps_per_block or 1)
+    return f"{begin}intervals need about {needed}, which are {frames:,} frames (`--steps`)."
+
+
+def on_near_field(table: CoverageTable) -> str:
+    """At what share of the free places beside the vehicle the first body is seen, side by side."""
+    rows = list(zip(*table.bodies.values(), strict=True))
+    if not rows:
+        return ""
+    body, key = rows[0][0].summary.height, table.body_quantities[0].key
+    near = [of for of in rows if of[0].summary.height == body and of[0].region.name in SIDES]
+    of_sides = {SIDES[of[0].region.name]: of for of in near}
+    enough = (table.first.blocks or 0) >= MIN_BLOCKS
+    told = {
+        side: _told(of, key, enough=enough and of[0].summary.numbers[key].count >= LEAST_AGREED)
+        for side, of in of_sides.items()
+    }
+    known = [f"{side} {words}" for side, words in told.items() if words]
+    seen = f"{body_words(body)} is seen"
+    if known:
+        return f"Free places within 3 m where {seen}: {'; '.join(known)}."
+    unknown = all(math.isnan(row.summary.numbers[key].error) for of in of_sides.values() for row in of)
+    several = len(table.rigs) > 1 and not unknown
+    return f"Of the places within 3 m where {seen}, no rig has more than the others beyond chance." * several
+
+
+def on_range(table: CoverageTable) -> str:
+    """What is detected ahead: of one rig with intervals, of several who leads by more than chance."""
+    region = ahead(table)
+    if region is None or not table.thresholds or not table.has_intervals:
+        return ""
+    key, where = decisive(table).key, f"to {region.x[1]:g} m ahead"
+    bands = [of for of in table.places if of[0].region is region]
+    told = {BANDS.get(of[0].summary.height, of[0].summary.height): _told(of, key, enough=True) for of in bands}
+    known = [f"of {band} {words}" for band, words in told.items() if words]
+    if known:
+        return f"Detected {where}: {'; '.join(known)}."
+    return f"No rig detects more than the others {where} beyond chance." * (len(table.rigs) > 1)
+
+
+def ahead(table: CoverageTable) -> Region | None:
+    """The region that the range is told of: of those that begin at the vehicle the farthest to `RANGE_M`; else none."""
+    regions = dict.fromkeys(of[0].region for of in table.places)
+    reached = [one for one in regions if one.x[0] == 0.0 and one.x[1] <= RANGE_M and not one.corners_m]
+    return max(reached, key=lambda one: one.x[1], default=None)
+
+
+def on_failure(table: CoverageTable) -> str:
+    """The sensor that most hangs on, of each rig."""
+    asked = [rig for rig in table.rigs if sensors_of(table.rows[rig])]
+    several = len(table.rigs) > 1
+    return " ".join(f"{rig}: " * several + single_point_of_failure(table, rig) for rig in asked)
+
+
+RULES: tuple[Callable[[CoverageTable], str], ...] = (on_near_field, on_range, on_failure)
+
+
+def _told(rows: Sequence[Row], key: str, *, enough: bool) -> str:
+    """A share of one rig with its interval; of several who leads by more than chance; no words if nobody knows."""
+    if len(rows) == 1:
+        number = rows[0].summary.numbers[key]
+        # Where all blocks say the same there is no interval, and nothing is left to chance.
+        agreed = math.isnan(number.low) and number.value in (0.0, 1.0) and enough
+        interval = "" if agreed else f" [{whole_percent(number.low)}, {whole_percent(number.high)}]"
+        return f"{whole_percent(number.value)} %{interval}" if agreed or not math.isnan(number.low) else ""
+    leader = next((row for row in rows if key in row.best), None)
+    if leader is None:
+        return ""
+    second = max((row for row in rows if row is not leader), key=lambda row: row.summary.numbers[key].value)
+    return ", ".join(f"{row.rig} {whole_percent(row.summary.numbers[key].value)} %" for row in (leader, second))
+
+
+def body_words(name: str) -> str:
+    """What a body is called in a sentence.
+
+    Example:
+        >>> body_words("child_110cm"), body_words("adult")
+        ('a child', 'an adult')
+    """
+    plain = name.partition("_")[0]
+    return f"{'an' if plain[:1] in 'aeiou' else 'a'} {plain}"
+
+
+def whole_percent(share: float) -> str:
+    """Without decimals, but some is not none, and nearly all is not all.
+
+    Example:
+        >>> [whole_percent(share) for share in (0.0, 0.001, 0.126, 0.999, 1.0)]
+        ['0', '1', '13', '99', '100']
+    """
+    return f"{min(max(round(100 * share), 1), 99) if 0 < share < 1 else 100 * share:.0f}"

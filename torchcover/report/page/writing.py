@@ -12,12 +12,10 @@ from string import Template
 
 import numpy as np
 
-from torchcover.report.page.answer import plans_html, ranges_html, words_html
-from torchcover.report.page.codes import CellBytes, Codes
+from torchcover.report.layout import PageTable, Words
 from torchcover.report.page.content import Array, Page, PageMap, PagePicture, PageRig
-from torchcover.report.page.map_content import arrays_of, map_content
-from torchcover.report.page.rig_drawing import rig_drawing, sensor_table
-from torchcover.report.renderers.layout import PageTable, Words
+from torchcover.report.page.drawings import plans_html, ranges_html, rig_drawing, sensor_table, words_html
+from torchcover.report.page.map_content import CellBytes, Codes, arrays_of, map_content
 
 # What maps and pictures may take in a file that is sent by mail without a thought, and the maps in any case; and how
 # many times that they may take before they are packed.
@@ -66,7 +64,7 @@ def coarser(one: PageMap) -> PageMap:
     """A map with four cells in each, without errors: their mean as the weights say, or all alike.
 
     Example:
-        >>> from torchcover.report.maps.colours import ColourScale
+        >>> from torchcover.report.colours import ColourScale
         >>> scale = ColourScale("radius", "m", "viridis_r", 0.0, 4.0)
         >>> cells = np.array([[1.0, 3.0], [np.nan, 2.0]])
         >>> coarser(PageMap("radius", "ground", "rig", (0.0, 2.0), (0.0, 2.0), 1.0, cells, scale)).values

@@ -7,8 +7,8 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 from torchcover.estimation import Quantity
-from torchcover.report.failures import decisive, failure_headings, failure_title, failure_words, sensors_of
-from torchcover.report.renderers.records import COLUMNS
+from torchcover.report.records import COLUMNS
+from torchcover.report.remarks import decisive, failure_headings, failure_title, failure_words, sensors_of
 from torchcover.report.table import CoverageTable, Row
 from torchcover.report.wording import UNKNOWN, capitalised, difference_heading, difference_words, heading, number_words
 

@@ -14,12 +14,17 @@ from torch import Tensor
 
 from torchcover.coverage import BevGrid, Coverage, check_paired
 from torchcover.files import write_atomically
-from torchcover.report.maps.arrays import draw_side_by_side
-from torchcover.report.maps.colours import difference_scale, scale_of
-from torchcover.report.maps.overlay import SensorView
-from torchcover.report.maps.subjects import Subject, difference, subjects_of
-from torchcover.report.maps.surface import as_drawn
-from torchcover.report.maps.window import Window, asked_and_known, near_field
+from torchcover.report.colours import difference_scale, draw_side_by_side, scale_of
+from torchcover.report.map_subjects import (
+    Subject,
+    Window,
+    as_drawn,
+    asked_and_known,
+    difference,
+    near_field,
+    subjects_of,
+)
+from torchcover.report.overlay import SensorView
 from torchcover.report.wording import capitalised, span
 
 MAX_FILE_NAME = 48

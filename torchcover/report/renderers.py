@@ -1,10 +1,12 @@
-"""A table as text for a terminal."""
+"""Renderers: a table as text for a terminal and as Markdown; `RENDERERS` has all formats by name."""
 
 import io
-from collections.abc import Iterable, Iterator, Sequence
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
 from operator import itemgetter
+from types import MappingProxyType
 from typing import Any
 
 from rich.cells import cell_len
@@ -15,8 +17,9 @@ from rich.table import Table
 from rich.text import Text
 
 from torchcover.files import shown
-from torchcover.report.remarks import marks_on, notes_on
-from torchcover.report.renderers.layout import PageTable, Words, parts_of
+from torchcover.report.layout import BOLD_MARKS, PageTable, Words, parts_of
+from torchcover.report.records import render_csv, render_json
+from torchcover.report.remarks import marks_on, notes_on, verdict
 from torchcover.report.table import CoverageTable
 
 # Survive files and terminals without bold type.
@@ -30,13 +33,13 @@ LEAST_HEADING_CHARS = 10
 class Terminal(Console):
     """Rich's console, on which control characters in names of others are shown and not obeyed."""
 
-    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
+    def render_text(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
         """What is to be printed: our own control codes, such as a cursor's, are segments of their own."""
         for segment in super().render(renderable, options):
             yield segment if segment.control else segment._replace(text=shown(segment.text))
 
 
-def render(table: CoverageTable) -> str:
+def render_text(table: CoverageTable) -> str:
     """The table as it is printed where lines may be as long as they like."""
     file = io.StringIO()
     print_table(table, Terminal(file=file, width=1))
@@ -163,3 +166,43 @@ def _below(part: PageTable) -> PageTable:
 
 def _text(cell: Words) -> Text:
     return Text(f"{SIGNS[cell.mark]} {cell.text}", style="bold") if cell.mark else Text(cell.text)
+
+
+# What Markdown would take for something else: an underscore does so at the end of a word only.
+SPECIAL = re.compile(r"[\\`*|\[\]]|<(?=[A-Za-z/!?])|&(?=[\w#]+;)|(?<![^\W_])_|_(?![^\W_])")
+
+
+def render_markdown(table: CoverageTable) -> str:
+    """The table as Markdown text; what is marked is bold."""
+    marks = [f"{BOLD_MARKS[mark]}: {meaning}" for mark, meaning in marks_on(table).items()]
+    notes = [f"* {escaped(note)}" for note in (*marks, *notes_on(table))]
+    told = escaped(" ".join(verdict(table)))
+    first = [told, ""] if told else []
+    return "\n".join([*first, *(line for part in parts_of(table) for line in _markdown_lines(part)), *notes, ""])
+
+
+def _markdown_lines(part: PageTable) -> Iterator[str]:
+    if part.title:
+        yield f"{escaped(part.title)}\n"
+    yield _markdown_line(map(escaped, part.headings))
+    yield _markdown_line(["---"] * part.words_first + ["---:"] * (len(part.headings) - part.words_first))
+    yield from (_markdown_line(map(_markdown_cell, row)) for row in part.rows)
+    yield ""
+
+
+def _markdown_cell(cell: Words) -> str:
+    return f"**{escaped(cell.text)}**" if cell.mark else escaped(cell.text)
+
+
+def escaped(words: str) -> str:
+    """Words that Markdown takes for nothing else."""
+    return SPECIAL.sub(r"\\\g<0>", shown(" ".join(words.split())))
+
+
+def _markdown_line(cells: Iterable[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+RENDERERS: Mapping[str, Callable[[CoverageTable], str]] = MappingProxyType(
+    {"text": render_text, "csv": render_csv, "json": render_json, "markdown": render_markdown}
+)

@@ -1,20 +1,62 @@
-"""A search for a better rig, how it went on and what its variables do; a choice of sensors, what more of them bring."""
+"""Charts: when encounters are detected, how a search went on, what more sensors bring, error against run time."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
-from torchcover.report.maps.sheet import charts
+from torchcover.report.sheet import charts
+
+# Speed in km/h, least and most time to collision in s.
+Band = Sequence[tuple[float, float, float]]
+
+
+def draw_encounters(
+    panels: Sequence[tuple[str, Mapping[str, Band], Sequence[tuple[float, float]]]], *, title: str
+) -> Figure:
+    """Draw when rigs detected whom they met: a panel each encounter, a band each rig, a line for what is needed.
+
+    Args:
+        panels: Name of each encounter, the band of each rig, and what is needed: speed in km/h, time to collision in s.
+        title: Above all.
+
+    Returns:
+        A figure of its own, outside pyplot.
+    """
+    across = min(len(panels), 3)
+    down = -(-len(panels) // across)
+    figure, grid = charts(down, across, (1.5 + 4.2 * across, 0.8 + 3.6 * down), title, sharey=True)
+    views = [axes for row in grid for axes in row]
+    for axes, (name, bands, needed) in zip(views, panels, strict=False):
+        for number, (rig, band) in enumerate(bands.items()):
+            speed_kmh, low_s, high_s = np.array(band).T
+            colour = colormaps["tab10"](number % 10)
+            axes.fill_between(speed_kmh, low_s, high_s, color=colour, alpha=0.25, linewidth=0)
+            # Of one speed alone there is no area.
+            axes.vlines(speed_kmh, low_s, high_s, color=colour, linewidth=1.5, label=rig)
+        axes.plot(*np.array(needed).T, color="black", linestyle="--", marker=".", linewidth=1.2, label="needed")
+        axes.set_title(name, fontsize="small", parse_math=False)
+        axes.set(xlabel="speed of the vehicle (km/h)")
+        axes.set_ylim(bottom=0.0)
+        axes.grid(visible=True, alpha=0.2)
+    for axes in views[len(panels) :]:
+        axes.set_visible(False)
+    views[0].set_ylabel("time to collision at detection (s)")
+    handles, labels = views[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right upper", frameon=False)
+    return figure
+
 
 Float64 = NDArray[np.float64]
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
-MARKERS = "osD^"
+MARKERS = "osD^vP*X"
 BEST = "#000000"
 COLUMNS = 3
 BOUND = "#999999"
@@ -175,3 +217,46 @@ def draw_choice(
 
 def _sheet(rows: int, columns: int, title: str) -> tuple[Figure, list[list[Axes]]]:
     return charts(rows, columns, (max(4.2 * columns, 6.4), 3.6 * rows + 0.9), title)
+
+
+COLORMAP = "viridis"
+MAX_LIGHTNESS = 0.85
+
+Lines = Mapping[str, Sequence[tuple[float, float]]]
+
+
+def draw_work_precision(panels: Mapping[str, Lines], *, title: str, legend_title: str = "") -> Figure:
+    """Draw the work-precision diagram: error over time, both logarithmic.
+
+    Args:
+        panels: What is beside each other: what the errors are, with their unit -> name of a line, such as a setting ->
+            its points, run time in seconds and error as it is shown. All have the same lines.
+        title: What was measured.
+        legend_title: What the names of the lines are.
+
+    Returns:
+        A figure of its own, outside pyplot. Lines differ in marker and colour, by their order.
+    """
+    figure, (views,) = charts(1, len(panels), (12.0, 5.6), title)
+    for axes, (label, lines) in zip(views, panels.items(), strict=True):
+        _draw_panel(axes, label, lines)
+    handles, labels = views[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right upper", title=legend_title, frameon=False)
+    return figure
+
+
+def _draw_panel(axes: Axes, label: str, lines: Lines) -> None:
+    colours = colormaps[COLORMAP]
+    for at, (name, points) in enumerate(lines.items()):
+        colour, marker = colours(MAX_LIGHTNESS * at / max(len(lines) - 1, 1)), MARKERS[at % len(MARKERS)]
+        axes.plot(*zip(*points, strict=True), marker=marker, markersize=5, linewidth=1.2, color=colour, label=name)
+    axes.set(xlabel="run time (s)", ylabel=label)
+    if not any(math.isfinite(error) for points in lines.values() for _, error in points):
+        return  # what is unknown has no logarithm
+    axes.set(xscale="log", yscale="log")
+    for axis in (axes.xaxis, axes.yaxis):
+        # Few numbers, written out: powers of ten lie on each other where there is less than a decade.
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter(NullFormatter())
+    axes.grid(visible=True, which="both", alpha=0.2)

@@ -1,0 +1,284 @@
+"""What the maps of a run show: the quantities of its measure and of other aggregations, and which part of a grid.
+
+Maps of the visible surface have cells where points are many and larger squares where they are few, paler the less is
+seen. The measure is a ratio of sums, so that a square of several cells has the ratio of their sums, and the squares of
+a region together have its number.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from torchcover.coverage import BevGrid, Coverage, Layer
+from torchcover.coverage.blocks import BlockSums, KnownCells
+from torchcover.coverage.quantity import by_area
+from torchcover.estimation import Quantity
+from torchcover.metrics import added_up
+from torchcover.report.colours import NEVER_PROBED, ColourScale, scale_of
+from torchcover.report.wording import shown_unit, steps_and_cell
+
+# A detection from 8 points is off by 18 percentage points at most: 1 / sqrt(4 * 8).
+MIN_POINTS = 8
+LARGEST_M = 2.0
+SMALLEST_M = 0.25
+# Of what is seen at all.
+FAINTEST = 0.3
+
+
+def square_sides(points: Tensor, cell_m: float) -> Tensor:
+    """Cut a grid into squares of cells: a square is cut in four if each quarter has 8 points at least, or none at all.
+
+    Of (H, Y, X) points in each cell, gives (H, Y, X) int64 how many cells wide the square is that it lies in: a power
+    of 2, at most 2 m. Squares begin at the lower corner of the grid; those at the upper ends may be cut off.
+    """
+    side = 2 ** max(0, math.floor(math.log2(LARGEST_M / cell_m)))
+    sides = torch.full_like(points, side)
+    is_cut = torch.ones_like(points, dtype=torch.bool)
+    while side > 1:
+        side //= 2
+        inside = _pooled(points, side)
+        too_few = (inside > 0) & (inside < MIN_POINTS)
+        is_cut &= _spread(_pooled(too_few, 2) == 0, 2 * side, points.shape)
+        sides[is_cut] = side
+    return sides
+
+
+def over_squares(values: Tensor, sides: Tensor) -> Tensor:
+    """The sum over the square that each cell lies in.
+
+    `values`: (..., H, Y, X) what is added up; `sides`: (H, Y, X) as from `square_sides`. Returns (..., H, Y, X)
+    float64.
+    """
+    sums, side = values.double(), 2
+    while side <= int(sides.max()):
+        sums = _spread(_pooled(values, side), side, values.shape).where(sides == side, sums)
+        side *= 2
+    return sums
+
+
+def ratios(area: BlockSums, sides: Tensor) -> Tensor:
+    """(Q, H, Y, X) the radius in metres, then the detection at each threshold; NaN where nothing was seen."""
+    m2, *sums = area.totals()
+    return over_squares(torch.stack(sums), sides) / over_squares(m2, sides)
+
+
+def as_drawn(coverage: Coverage) -> Coverage:
+    """The same over squares of cells that are smaller than pictures show: of the largest up to 0.25 m.
+
+    Itself where cells are as large, and where there are layers that are no ratios of sums.
+    """
+    grid, known, means = coverage.grid, coverage.known, coverage.quantities
+    side = 2 ** max(0, math.floor(math.log2(SMALLEST_M / grid.cell)))
+    by_surface = tuple(map(by_area, means)) if coverage.area else ()
+    if side == 1 or coverage.redundancy or len(coverage.listed) > len(means) + len(by_surface):
+        return coverage
+    rows, columns = (-(-count // side) for count in grid.shape[1:])
+    cell_m = side * grid.cell
+    coarse = replace(
+        grid, x=(grid.x[0], grid.x[0] + columns * cell_m), y=(grid.y[0], grid.y[0] + rows * cell_m), cell=cell_m
+    )
+
+    def square(cell: Tensor) -> Tensor:
+        y, x = cell // grid.shape[2], cell % grid.shape[2]
+        own: Tensor = (y // grid.shape[1] * rows + y % grid.shape[1] // side) * columns + x // side
+        return own
+
+    def moved(sums: BlockSums | None) -> BlockSums | None:
+        return None if sums is None else sums.moved(square, coarse.cells, coarse.shape)
+
+    area, own = moved(coverage.area), [known.probed_steps * coverage.listed[one.key].values for one in means]
+    columns_of = [square(known.at), known.points, *own, known.probed_steps]
+    summed = added_up(torch.stack(columns_of, dim=1).double()).T
+    layers = list(map(Layer, means, summed[2:-1] / summed[-1]))
+    if area is not None:
+        m2, *sums = area.totals().flatten(1)[:, summed[0].long()]
+        layers += [Layer(quantity, own / m2) for quantity, own in zip(by_surface, sums, strict=True)]
+    return Coverage(
+        grid=coarse,
+        thresholds=coverage.thresholds,
+        max_radius=coverage.max_radius,
+        known=KnownCells(coarse.shape, summed[0].long(), summed[-1].long(), summed[1].long()),
+        layers=layers,
+        counts=coverage.counts,
+        blocks=moved(coverage.blocks),
+        area=area,
+        regions=coverage.regions,
+    )
+
+
+def opacity_of(area: BlockSums, steps: int, sides: Tensor, cell_m: float) -> Tensor:
+    """How opaque a place is drawn, by how much surface is seen there in a step.
+
+    Returns (H, Y, X): 0 where nothing was seen, 1 where as much as open ground has, which is the footprint of the
+    square, or more; between them the root of the share, from 0.3 on.
+    """
+    m2 = over_squares(area.totals()[0], sides)
+    footprint_m2 = over_squares(torch.full_like(m2, cell_m**2), sides)
+    share = (m2 / (max(steps, 1) * footprint_m2)).clamp(max=1)
+    return (FAINTEST + (1 - FAINTEST) * share.sqrt()).where(m2 > 0, 0.0)
+
+
+def _pooled(values: Tensor, side: int) -> Tensor:
+    """(..., ceil(Y / side), ceil(X / side)) float64 sums over squares."""
+    flat = values.double().reshape(1, -1, *values.shape[-2:])
+    pooled = avg_pool2d(flat, side, ceil_mode=True, divisor_override=1)
+    return pooled.view(*values.shape[:-2], *pooled.shape[-2:])
+
+
+def _spread(pooled: Tensor, side: int, shape: torch.Size) -> Tensor:
+    """Each number to all cells of its square."""
+    return pooled.repeat_interleave(side, -2).repeat_interleave(side, -1)[..., : shape[-2], : shape[-1]]
+
+
+Outline = NDArray[np.floating]
+Bounds = tuple[float, float]
+
+# The near field, in lengths of the ego, to all its sides.
+NEAR_LENGTHS = 2.0
+MARGIN_M = 1.0
+
+
+class Window(NamedTuple):
+    """Some rows and columns of a grid, and the grid that they are."""
+
+    grid: BevGrid
+    rows: slice
+    columns: slice
+
+    def of(self, values: Tensor) -> Tensor:
+        """(..., Y, X) values in it."""
+        return values[..., self.rows, self.columns]
+
+
+def asked_and_known(coverage: Coverage, ego_outline_m: Outline | None = None) -> Window:
+    """What of a result is worth paper: where it knows cells within the regions' bounds, and the ego.
+
+    `coverage`: the result; the whole grid if it knows nothing; `ego_outline_m`: (K, 2) corners x, y of the ego in
+    metres.
+    """
+    grid = coverage.grid
+    known = coverage.known.spread(coverage.known.points > 0, False).any(dim=0)
+    x, y = _held(known.any(dim=0), grid.x_edges_m, grid.x), _held(known.any(dim=1), grid.y_edges_m, grid.y)
+    if coverage.regions:
+        in_x = _both(x, (min(one.x[0] for one in coverage.regions), max(one.x[1] for one in coverage.regions)))
+        in_y = _both(y, (min(one.y[0] for one in coverage.regions), max(one.y[1] for one in coverage.regions)))
+        x, y = (in_x, in_y) if in_x and in_y else (x, y)
+    if ego_outline_m is not None:
+        x, y = (_including(bounds, ego_outline_m[:, axis].tolist()) for axis, bounds in enumerate((x, y)))
+    return window(grid, x, y)
+
+
+def near_field(grid: BevGrid, ego_outline_m: Outline) -> Window | None:
+    """The ego and two of its lengths around it, as far as the grid goes; None where that is nothing."""
+    low, high = ego_outline_m.min(axis=0), ego_outline_m.max(axis=0)
+    reach_m = NEAR_LENGTHS * float(high[0] - low[0])
+    x, y = ((float(low[axis]) - reach_m, float(high[axis]) + reach_m) for axis in (0, 1))
+    return window(grid, x, y) if _both(x, grid.x) and _both(y, grid.y) else None
+
+
+def window(grid: BevGrid, x: Bounds, y: Bounds) -> Window:
+    """The cells of a grid that lie within some bounds, or in part; at least one."""
+    (columns, own_x), (rows, own_y) = (
+        _cells(bounds, whole, grid.cell, count)
+        for bounds, whole, count in ((x, grid.x, grid.shape[2]), (y, grid.y, grid.shape[1]))
+    )
+    return Window(replace(grid, x=own_x, y=own_y), rows, columns)
+
+
+def _cells(bounds: Bounds, whole: Bounds, cell_m: float, count: int) -> tuple[slice, Bounds]:
+    first = min(max(math.floor((bounds[0] - whole[0]) / cell_m + 1e-6), 0), count - 1)
+    last = min(max(math.ceil((bounds[1] - whole[0]) / cell_m - 1e-6), first + 1), count)
+    return slice(first, last), (whole[0] + first * cell_m, whole[0] + last * cell_m)
+
+
+def _held(known: Tensor, edges_m: Tensor, whole: Bounds) -> Bounds:
+    at = known.nonzero().flatten()
+    return (float(edges_m[at[0]]), float(edges_m[at[-1] + 1])) if len(at) else whole
+
+
+def _both(a: Bounds, b: Bounds) -> Bounds | None:
+    low, high = max(a[0], b[0]), min(a[1], b[1])
+    return (low, high) if low < high else None
+
+
+def _including(bounds: Bounds, values: Sequence[float]) -> Bounds:
+    return min(bounds[0], min(values) - MARGIN_M), max(bounds[1], max(values) + MARGIN_M)
+
+
+LARGER = ", larger where points are few"
+NOTHING_FOUND = "no visible surface found"
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What some maps show: one quantity of every rig, (H, Y, X) in the unit that is shown, by one scale in every band.
+
+    For the legend: why a cell has no number, and how much was measured, and how finely. `opacity` (H, Y, X) is None if
+    all cells are alike.
+    """
+
+    quantity: Quantity
+    values: Mapping[str, Tensor]
+    scale: ColourScale
+    unknown: str
+    conditions: str
+    opacity: Tensor | None = None
+
+
+def subjects_of(coverages: Mapping[str, Coverage]) -> Iterator[Subject]:
+    """The quantities of the measure that the results have, then those of other aggregations.
+
+    `coverages`: by the name of the rig; one, or several that are paired.
+    """
+    first = next(iter(coverages.values()))
+    if first.measure == "area":
+        yield from _of_surface(coverages)
+    for quantity, by_surface in quantities_shown(first):
+        if not by_surface:
+            values = {name: coverage.layers[quantity.key].values for name, coverage in coverages.items()}
+            yield _subject(quantity, values, NEVER_PROBED, _conditions(first))
+
+
+def quantities_shown(coverage: Coverage) -> list[tuple[Quantity, bool]]:
+    """The quantities of the measure, then those of other aggregations, and whether each is over the visible surface."""
+    of_surface = [by_area(quantity) for quantity in coverage.quantities]
+    of_both = {quantity.key for quantity in (*coverage.quantities, *of_surface)}
+    of_measure = of_surface if coverage.measure == "area" else coverage.quantities
+    others = [layer.quantity for key, layer in coverage.layers.items() if key not in of_both]
+    return [*((one, coverage.measure == "area") for one in of_measure), *((one, False) for one in others)]
+
+
+def difference(values: Tensor, expected: Tensor) -> Tensor:
+    """Where both are infinite there is no difference, rather than NaN, which means unknown."""
+    return (values - expected).where(values != expected, 0.0)
+
+
+def _of_surface(coverages: Mapping[str, Coverage]) -> Iterator[Subject]:
+    first = next(iter(coverages.values()))
+    areas = {name: coverage.area for name, coverage in coverages.items() if coverage.area is not None}
+    sides = square_sides(first.points, first.grid.cell)
+    # The rigs share the reference points, and so the square metres.
+    opacity = opacity_of(next(iter(areas.values())), first.counts["steps"], sides, first.grid.cell)
+    each = {name: ratios(area, sides) for name, area in areas.items()}
+    for at, quantity in enumerate(map(by_area, first.quantities)):
+        values = {name: values[at] for name, values in each.items()}
+        yield _subject(quantity, values, NOTHING_FOUND, _conditions(first) + LARGER, opacity)
+
+
+def _conditions(coverage: Coverage) -> str:
+    return steps_and_cell(coverage.counts["steps"], coverage.grid)
+
+
+def _subject(
+    quantity: Quantity, values: Mapping[str, Tensor], unknown: str, conditions: str, opacity: Tensor | None = None
+) -> Subject:
+    """With the values in the unit that is shown, and one scale for all."""
+    shown = {name: shown_unit(quantity.unit).factor * each for name, each in values.items()}
+    return Subject(quantity, shown, scale_of(quantity, torch.stack(list(shown.values()))), unknown, conditions, opacity)

@@ -1,1 +1,0 @@
-"""Maps: what was measured in every cell, seen from above."""
