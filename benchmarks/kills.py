@@ -114,9 +114,9 @@ def run(command, out, *options):
     os.dup2(nowhere, 1)
     os.dup2(nowhere, 2)
     sys.argv = ["torchcover", *command, *options, "--out", str(out)]
-    if "space.yaml" in command:  # instants are made up
+    if "space.yaml" in command:  # frames are made up
         makes = lambda space, plan, seed, worlds: Surface(seed, worlds, plan.per_world)  # noqa: E731
-        search_run.SearchPlan = partial(SearchPlan, instants=makes)
+        search_run.SearchPlan = partial(SearchPlan, make_frames=makes)
     if command is not REAL:  # drawing takes most of the time
         result.map_figures = lambda *_, **__: [("map1", Figure((1, 1)))]
     try:

@@ -1,94 +1,221 @@
-"""Placement search: the roof LiDAR's gain in fresh cities, and its optimiser against random search on an emulator."""
+"""Placement: the optimizer against random candidates, pairing of rigs, selections of sensors, and false alarms.
+
+The optimizer and random search get the same number of candidates and the same frames; gains are percentage points of
+the objective over the start of the space, in the search itself.
+"""
 
 import argparse
+import json
 import time
+from concurrent.futures import ProcessPoolExecutor
 
 import numpy as np
 import torch
 
 from benchmarks import table
-from torchcover.placement import OPTIMISERS, Cube, PlacementSearch, SearchSpace, run_search
-from torchcover.placement.optimisers.gp_model import GaussianProcess
+from torchcover.placement import (
+    ChoiceSpace,
+    CommonFrames,
+    Objective,
+    OptimizerParams,
+    PlacementSearch,
+    SearchSpace,
+    run_search,
+)
+from torchcover.placement.search import measure_gains
+from torchcover.placement.selection import observe_points, point_weights
+from torchcover.placement.selection_solver import CandidateCoverage, SelectionLimits, select_sensors
+from torchcover.simulation import Rig
 
-SPACE = {
-    "name": "roof",
-    "start": "front_roof_32",
-    "scenario": "urban",
-    "free": {"roof": {"x_m": (-0.6, 0.8), "z_m": (1.68, 1.85), "pitch_deg": (-10.0, 15.0)}},
-    "objectives": {"near and far": {"region": ("20m", "80m")}},
+NEAR = ("front_3m", "rear_3m", "left_3m", "right_3m")
+FRAMES = {"worlds": 4, "per_world": 1, "every_s": 5.0, "rays": 4096}
+
+
+def roof_lidar(name, vehicle, model, **mounts):
+    sensors = [{"type": "lidar", "name": key, "model": model, "mount": mount} for key, mount in mounts.items()]
+    return {"name": name, "vehicle": vehicle, "sensors": sensors}
+
+
+PAIR = roof_lidar("pair", "suv", "velodyne_vlp16", left={"x_m": -0.8, "y_m": 0.5, "z_m": 1.75},
+                  right={"x_m": -0.8, "y_m": -0.5, "z_m": 1.75})  # fmt: skip
+MODELS = ("velodyne_vlp16", "velodyne_vlp32c", "hesai_pandar64", "hesai_at128", "velodyne_hdl32e")
+SIDE = {"x_m": (-1.6, 0.3), "z_above_body_m": (0.05, 0.4), "pitch_deg": (-10.0, 40.0)}
+SPACES = {
+    "x, z, pitch on a van; near ground": {
+        "start": roof_lidar("van", "van", "velodyne_vlp32c", roof={"x_m": 0.5, "z_m": 2.8}),
+        "free": {"roof": {"x_m": (-2.4, 2.6), "z_m": (1.2, 3.2), "pitch_deg": (-15.0, 45.0)}},
+        "objectives": {"near": {"region": NEAR, "band": "ground"}},
+    },
+    "one of 5 models, x, z, pitch": {
+        "start": "front_roof_32",
+        "free": {
+            "roof": {"model": MODELS, "x_m": (-0.6, 0.8), "z_above_body_m": (0.05, 0.5), "pitch_deg": (-10.0, 25.0)}
+        },
+        "objectives": {"around": {"region": (*NEAR, "20m")}},
+    },
+    "two LiDARs, 10 numbers": {
+        "start": PAIR,
+        "free": {
+            "left": {**SIDE, "y_m": (0.1, 0.7), "yaw_deg": (-45.0, 120.0)},
+            "right": {**SIDE, "y_m": (-0.7, -0.1), "yaw_deg": (-120.0, 45.0)},
+        },
+        "constraints": {"min_distance_m": 0.4, "max_self_hits": 0.35},
+        "objectives": {"sides": {"region": NEAR}},
+    },
+    "one of 3 mount regions, pose on it": {
+        "start": PAIR,
+        "free": {
+            "left": {"region": ("fender_left", "mirror_left", "roof"), "height_m": (0.05, 0.3),
+                     "yaw_deg": (-90.0, 90.0), "pitch_deg": (-10.0, 40.0)}
+        },
+        "constraints": {"max_self_hits": 0.6},
+        "objectives": {"sides": {"region": ("left_3m", "front_3m")}},
+    },
+}  # fmt: skip
+STRATEGIES = {"optimizer": OptimizerParams(), "random": OptimizerParams(startup=0, control_every=1)}
+# The Gaussian process of commit c13c497e with the same spaces, frames and candidates: median, difference to random.
+FORMER = {
+    "x, z, pitch on a van; near ground": "34.9, +7.5 ± 2.2",
+    "one of 5 models, x, z, pitch": "43.4, +4.8 ± 1.5",
+    "two LiDARs, 10 numbers": "30.1, +4.1 ± 1.9",
+    "one of 3 mount regions, pose on it": "27.8, +2.0 ± 0.7",
 }
-REPEATS, TURNS = 10, (10, 20, 30)
-NAMES = ("gp", "random")
 
 
-def gains(result):
-    """A row for what each arm found, by each estimate."""
-    for pick in result.picks:
-        if pick.is_start:
-            yield pick.arm, "-", "nothing better than the start", "", "", "", ""
-        for gain in pick.gains:
-            places = ", ".join(f"{value:.2f}" for value in pick.evaluation.values.values())
-            test = gain.test
-            searched, better = f"{100 * gain.search_gain:+.2f}", f"{test.better} of {test.blocks}"
-            yield pick.arm, gain.estimate, places, searched, gain.words, f"{gain.t:.1f}", better
+def search_gains(name, seeds, evaluations):
+    """Best gain of each strategy for each seed, (strategies, seeds), on the same frames."""
+    torch.set_num_threads(1)
+    space = SearchSpace.model_validate({"name": "space", "scenario": "parking", **SPACES[name]})
+    frames = CommonFrames(space.scenarios, space.numbers, **FRAMES)
+    gains = np.zeros((len(STRATEGIES), seeds))
+    for row, params in zip(gains, STRATEGIES.values(), strict=True):
+        for seed in range(seeds):
+            search = PlacementSearch(
+                space, evaluations=evaluations, seed=seed, optimizer=params, make_frames=lambda *_: frames
+            )
+            while (candidate := search.ask()) is not None:
+                search.evaluate(candidate)
+            row[seed] = 100 * np.nanmax(search.gains)
+    return gains
 
 
-def emulator(search):
-    """The gain that a Gaussian process of all evaluations expects: (n, 3) places -> (n,)."""
-    arms = search.arms.values()
-    told = [(arm, at) for arm in arms for at in range(len(arm.evaluations)) if np.isfinite(arm.gains[at, 0])]
-    values = [torch.tensor([getattr(arm, name)[at, 0] for arm, at in told]) for name in ("gains", "left")]
-    places = torch.from_numpy(np.array([arm.evaluations[at].unit for arm, at in told]))
-    model = GaussianProcess.fitted((0, 0, 0), places, *values)
-    return lambda units: model.predict(torch.from_numpy(np.atleast_2d(units)))[0].numpy()
+def compare_strategies(seeds, evaluations, processes):
+    rows = []
+    with ProcessPoolExecutor(processes) as pool:
+        runs = {name: pool.submit(search_gains, name, seeds, evaluations) for name in SPACES}
+        for name, run in runs.items():
+            optimizer, random = run.result()
+            difference = optimizer - random
+            error = difference.std(ddof=1) / np.sqrt(seeds) if seeds > 1 else np.nan
+            medians = f"{np.median(optimizer):.1f}", f"{np.median(random):.1f}"
+            better = f"{(difference > 0).sum()} of {seeds}"
+            rows.append((name, *medians, f"{difference.mean():+.1f} ± {error:.1f}", better, FORMER[name]))
+    header = "free", "optimizer", "random", "difference", "better in", "c13c497e: median, difference"
+    table(header, rows)
 
 
-def regrets(name, worth, start, seed):
-    """How far below the top the best is, after so many turns."""
-    top = max(worth(np.random.default_rng(0).random((100_000, 3))).max(), 0.0)
-    optimiser, zero, best, found = OPTIMISERS[name](Cube((0, 0, 0), start), seed), worth(start)[0], 0.0, []
-    for turn in range(1, max(TURNS) + 1):
-        unit = optimiser.ask()
-        gain = float(worth(unit)[0] - zero)
-        optimiser.tell(unit, gain, 0.0)
-        best = max(best, gain)
-        if turn in TURNS:
-            found.append(top - zero - best)
-    return found
+def compare_pairs(rigs=24, worlds=16):
+    """Standard error of the difference of two rigs on the same and on other frames."""
+    objective = {"near and far": Objective(region=["20m", "80m"])}
+    start, (roof,) = Rig.load("front_roof_32"), Rig.load("front_roof_32").sensors
+    each = [start]
+    for number in range(1, rigs):
+        x_m, z_m, pitch_deg = np.random.default_rng(number).uniform((-0.6, 1.68, -10.0), (0.8, 1.85, 15.0)).tolist()
+        mount = roof.mount.model_copy(update={"x_m": x_m, "z_m": z_m, "pitch_deg": pitch_deg})
+        each.append(start.model_copy(update={"sensors": (roof.model_copy(update={"mount": mount}),)}))
+    with CommonFrames("urban", objective, worlds=worlds) as frames:
+        began_s = time.process_time()
+        scores = [frames.estimates(rig) for rig in each]
+        score_s = (time.process_time() - began_s) / len(each) / len(frames)
+    rows = []
+    for measure in ("area", "known"):
+        first, *others = [score[measure] for score in scores]
+        paired = np.median([measure_gains(other, first)[1][0] for other in others])
+        alone = np.median([float(torch.hypot(other.error, first.error)[0]) for other in others])
+        rows.append((measure, f"{100 * alone:.2f}", f"{100 * paired:.2f}", f"{(alone / paired) ** 2:.0f}"))
+    table(("average", "unpaired (points)", "paired (points)", "fewer worlds by"), rows)
+    print(f"\nScoring a rig takes {score_s:.3f} s of processor time a frame.")
+
+
+WIDE = {"type": "lidar", "channels": 32, "vertical_fov_deg": [-45, 15], "horizontal_fov_deg": 360, "columns": 600,
+        "min_range_m": 0.3, "max_range_m": 60}  # fmt: skip
+NARROW = WIDE | {"channels": 16, "vertical_fov_deg": [-30, 10], "horizontal_fov_deg": 120, "columns": 300}
+GRID = {"region": ["roof", "fender_left", "fender_right", "mirror_left", "mirror_right", "grille", "rear_bumper"],
+        "spacing_m": 0.45}  # fmt: skip
+CHOICE = {
+    "name": "around",
+    "scenario": "urban",
+    "vehicle": "suv",
+    "candidates": {"wide": {"sensor": WIDE, "grid": GRID},
+                   "narrow": {"sensor": NARROW, "grid": GRID | {"yaw_deg": [-20.0, 20.0]}}},
+    "choose": {"at_most": 8, "max_cost_eur": 9000, "min_distance_m": 0.2},
+    "cost": {"wide": 2500, "narrow": 900, "mount": 100},
+    "objectives": {"around": {"region": [*NEAR, "20m"]}},
+}  # fmt: skip
+
+
+def time_selections():
+    space = ChoiceSpace.model_validate(CHOICE)
+    with CommonFrames(space.scenarios, space.numbers, worlds=4, per_world=2, rays=8192) as frames:
+        rigs = [Rig(name=one.name, vehicle="suv", sensors=(one,)) for one in space.sensors]
+        observed, weights = [observe_points(rig, frames)[0] for rig in rigs], point_weights(frames)
+    rows = []
+    for count in (40, len(observed)):
+        some = np.random.default_rng(0).permutation(len(observed))[:count].tolist()
+        base = np.zeros(weights.shape[1], dtype=bool)
+        coverage = CandidateCoverage.from_points(weights, [observed[one] for one in some], base)
+        limits = space.limits(some)
+        free = [SelectionLimits(size, compatible=limits.compatible) for size in (8, 4)]
+        for what, each in zip(("8 for 9,000 EUR", "8", "4"), (limits, *free), strict=True):
+            began_s = time.process_time()
+            selection = select_sensors(coverage, each)
+            gap = "proven" if selection.is_proven else f"at most {100 * selection.gap:.2f} points below"
+            seconds = f"{time.process_time() - began_s:.2f}"
+            rows.append((count, len(coverage.observes), what, f"{100 * selection.values[0]:.2f}", seconds, gap))
+    table(("candidates", "groups of points", "at most", "objective (%)", "HiGHS (s)", ""), rows)
+
+
+TURNING = {"type": "lidar", "name": "top", "mount": {"x_m": 0.2, "z_m": 1.9}, "channels": 32, "columns": 1000,
+           "vertical_fov_deg": [-30, 10], "horizontal_fov_deg": 360, "range_noise_m": 0.03,
+           "max_range_m": 120}  # fmt: skip
+# A full turn covers the same whichever way it begins: no candidate is better.
+NOTHING = {
+    "name": "nothing",
+    "start": {"name": "turning", "vehicle": "suv", "sensors": [TURNING]},
+    "scenario": "urban",
+    "free": {"top": {"yaw_deg": (-170.0, 170.0)}},
+    "not_worse": ["80m"],
+    "objectives": {"near": {"region": "20m"}},
+}
+
+
+def count_false_alarms(searches):
+    space = SearchSpace.model_validate(json.loads(json.dumps(NOTHING)))
+    given = {"evaluations": 6, "worlds": 2, "fresh_worlds": 8, "rays": 4096}
+    results = [run_search(PlacementSearch(space, seed=2 * seed, **given)) for seed in range(searches)]
+    tests = [result.test for result in results if result.test is not None]
+    worse = sum(any(change.is_worse for change in test.changes) for test in tests)
+    gained = sum(result.best.gains[0].test.significant for result in results if result.best.gains)
+    numbers = max((len(test.changes) for test in tests), default=0)
+    table(("searches", "tested", "numbers each", "report worse", "report a gain or loss"),
+          [(len(results), len(tests), numbers, worse, gained)])  # fmt: skip
 
 
 def main(arguments=()):
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--budget-s", type=float, default=600.0)
-    parser.add_argument("--evaluations", type=int)
-    parser.add_argument("--worlds", type=int, default=6)
-    parser.add_argument("--fresh-worlds", type=int, default=16)
-    parser.add_argument("--rays", type=int, default=16_384)
-    parser.add_argument("--estimate", default="known")
-    parser.add_argument("--repeats", type=int, default=REPEATS)
+    parser.add_argument("part", choices=("optimizer", "pairs", "selections", "nothing"))
+    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--evaluations", type=int, default=25)
+    parser.add_argument("--processes", type=int, default=2)
     options = parser.parse_args(arguments)
-    budget = {"evaluations": options.evaluations} if options.evaluations else {"budget_s": options.budget_s}
-    given = {"worlds": options.worlds, "fresh_worlds": options.fresh_worlds, "rays": options.rays}
-    torch.set_num_threads(1)
-    search = PlacementSearch(SearchSpace.model_validate(SPACE), estimate=options.estimate, **budget, **given)
-    start = time.process_time()
-    result = run_search(search)
-    seconds = time.process_time() - start
-    spent = [f"{name} {len(arm.evaluations) - 1}" for name, arm in search.arms.items()]
-    print(f"{search.plan.optimiser_name}, {len(search.instants)} instants; candidates: {', '.join(spent)}; "
-          f"{seconds:.0f} s of processor time in this process; racing saved {search.share_saved:.0%}.\n")  # fmt: skip
-    table(
-        ("found by", "estimate", "x, z (m), pitch (°)", "search", "fresh (points)", "t", "better"), list(gains(result))
-    )
-    worth, where = emulator(search), search.evaluations[0].unit
-    runs = {name: np.array([regrets(name, worth, where, seed) for seed in range(options.repeats)]) for name in NAMES}
-    print(f"\nOn an emulator of these evaluations, {options.repeats} repeats, points below its top (median):\n")
-    rows = [
-        (name, *(f"{100 * regret:.2f}" for regret in np.median(run, axis=0)),
-         f"{(run[:, -1] <= runs['random'][:, -1]).sum()} of {options.repeats}")
-        for name, run in runs.items()
-    ]  # fmt: skip
-    table(("optimiser", *(f"after {turns}" for turns in TURNS), "at least as good as random"), rows)
+    if options.part == "optimizer":
+        compare_strategies(options.seeds, options.evaluations, options.processes)
+    elif options.part == "pairs":
+        compare_pairs()
+    elif options.part == "selections":
+        time_selections()
+    else:
+        count_false_alarms(options.seeds)
 
 
 if __name__ == "__main__":

@@ -28,7 +28,6 @@ print(json.dumps(seen))
     "module",
     [
         "torchcover.cameras.camera",
-        "torchcover.placement.optimisers.gp_model",
         "torchcover.contrib.perception_entropy",
     ],
 )

@@ -36,7 +36,9 @@ def torchcover(monkeypatch, capsys, tmp_path):
             app.main()
         captured = capsys.readouterr()
         results = [path.relative_to(tmp_path) for path in opened if path.is_relative_to(tmp_path)]
-        in_place = [path for path in results if not any(part.startswith(ASIDE) for part in path.parts)]
+        # The journal of a search grows line by line, so that a torn line is recognized.
+        others = [path for path in results if path.name != "search.journal"]
+        in_place = [path for path in others if not any(part.startswith(ASIDE) for part in path.parts)]
         assert in_place == []
         return stop.value.code, captured.out, captured.err
 

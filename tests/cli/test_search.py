@@ -1,5 +1,6 @@
 """The command `search`."""
 
+import sys
 from functools import partial
 from pathlib import Path
 
@@ -22,30 +23,29 @@ objectives: {near: {region: 20m}}
 
 @pytest.fixture
 def space(tmp_path, monkeypatch):
-    """A file; instants are surfaces, and one target is looked at in the end."""
-    monkeypatch.setattr("torchcover.placement.fresh.TARGETS", ("pole",))
-    monkeypatch.setattr("torchcover.placement.fresh.WITHIN_M", 1.0)
+    """A file; frames are surfaces, and one target is looked at in the end."""
+    monkeypatch.setattr("torchcover.placement.validation.TARGETS", ("pole",))
+    monkeypatch.setattr("torchcover.placement.validation.WITHIN_M", 1.0)
     makes = lambda space, plan, seed, worlds: Surface(seed, worlds, plan.per_world)  # noqa: E731
-    monkeypatch.setattr(search_run, "SearchPlan", partial(SearchPlan, instants=makes))
+    monkeypatch.setattr(search_run, "SearchPlan", partial(SearchPlan, make_frames=makes))
     (tmp_path / "space.yaml").write_text(SPACE)
     return tmp_path / "space.yaml"
 
 
-def test_a_search_ends_with_what_was_gained_and_what_random_search_got(torchcover, space, tmp_path):
+def test_a_search_ends_with_its_gain_and_that_of_random_candidates(torchcover, space, tmp_path):
     out = tmp_path / "found"
     code, printed, _ = torchcover("search", space, "--evaluations", 12, "--out", out, "--seed", 3)
     assert code == 0
     last = printed.splitlines()[-1]
     assert last.startswith("near: ")
-    assert "Random search with the same budget" in last
-    assert last.endswith("of the instants. Sensor model: ideal, every hit is a point.")
-    assert "optimiser" in printed
+    assert "random candidates" in last
+    assert last.endswith("Sensor model: ideal, every hit is a point.")
     assert (out / "best.yaml").exists()
     code, again, _ = torchcover("search", space, "--evaluations", 12, "--out", out, "--seed", 3, "--resume")
     assert again.splitlines()[-1] == last
     code, _, said = torchcover("search", space, "--evaluations", 12, "--out", out, "--resume")
     assert code == 2
-    assert "of another run: seed (3 there, 0 here)" in said
+    assert "the journal of another search: seed (3 there, 0 here)" in said
 
 
 @pytest.mark.parametrize(
@@ -53,10 +53,9 @@ def test_a_search_ends_with_what_was_gained_and_what_random_search_got(torchcove
     [
         (("--budget", "30"), "--budget: a time is needed, as in 90s, 30min or 2h; got '30'"),
         (("--budget", "1h", "--evaluations", "3"), "one of them; both are given"),
-        (("--optimiser", "luck"), "one of gp, random is needed; got 'luck'"),
         (("--evaluations", "3", "--sensor-model", "real"), "no LiDAR of the rig 'front_roof_32' has a range_at_10"),
         (("--budget", "0s"), "more than 0 s is needed; got 0"),
-        (("--budget", "0.00001s"), "are less than one evaluation"),
+        (("--budget", "0.00001s"), "are less than two evaluations"),
     ],
 )
 def test_a_mistake_is_one_line(torchcover, space, tmp_path, options, message):
@@ -82,9 +81,7 @@ def test_an_objective_that_no_result_has_is_one_line(torchcover, tmp_path, objec
     assert said.count("\n") == 1
 
 
-@pytest.mark.parametrize(
-    "options", [("--budget", "5s"), ("--evaluations", "3"), ("--optimiser", "random"), ("--resume",)]
-)
+@pytest.mark.parametrize("options", [("--budget", "5s"), ("--evaluations", "3"), ("--resume",)])
 def test_a_choice_has_no_budget(torchcover, tmp_path, options):
     code, _, said = torchcover("search", CHOICE, "--out", tmp_path / "found", *options)
     assert code == 2
@@ -93,3 +90,10 @@ def test_a_choice_has_no_budget(torchcover, tmp_path, options):
 
 def test_times():
     assert [parsed_budget(text) for text in ("10s", "30min", "2h", "0.5 h")] == [10, 1800, 7200, 1800]
+
+
+def test_a_search_without_optuna_is_one_line(torchcover, space, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    code, _, said = torchcover("search", space, "--evaluations", 3, "--out", tmp_path / "found")
+    assert code == 2
+    assert said == "torchcover: a placement search needs Optuna: pip install 'torchcover[search]'\n"

@@ -11,7 +11,7 @@ from torchcover.contrib import PUBLISHED, Setup, Sights, SMig
 from torchcover.coverage import Maximum
 from torchcover.data import SimulatedFrames
 from torchcover.evaluation.observers import CoverageObserver
-from torchcover.placement import CommonInstants, Objective
+from torchcover.placement import CommonFrames, Objective
 from torchcover.simulation import Rig, SurfaceReference
 from torchcover.targets import Raster, Target, survey
 
@@ -136,7 +136,7 @@ def test_what_does_not_err_is_what_it_was(kind):
 
 @pytest.mark.parametrize("number", ["detection_0.2m", "radius_m", "seen_by_two_0.4m", "detection_0.4m_without_any"])
 def test_no_imperfection_lets_a_search_prefer_a_rig(number):
-    instants = CommonInstants([WORLD], {"asked": Objective(number=number, region="20m", band="ground")}, rays=1024)
+    instants = CommonFrames([WORLD], {"asked": Objective(number=number, region="20m", band="ground")}, rays=1024)
     for chain in ("range noise", "drop-out", "missing returns"):
         rigs = [rig("lidar", "r", **keys) for keys in CHAINS[chain]]
         found = [float(instants.estimates(one)["area"].value[0]) for one in rigs]

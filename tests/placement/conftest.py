@@ -1,19 +1,19 @@
-"""Instants that several tests look at."""
+"""Frames that several tests use."""
 
 import pytest
 
 from tests.placement.worlds import held
-from torchcover.placement import fresh
+from torchcover.placement import validation
 
 
 @pytest.fixture(autouse=True, scope="session")
 def no_targets():
     """Targets around the winner of every small search would take most of the time."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fresh, "TARGETS", ())
+        patch.setattr(validation, "TARGETS", ())
         yield
 
 
 @pytest.fixture(scope="session")
-def instants():
+def frames():
     return held()

@@ -1,10 +1,10 @@
-"""Instants without a scene: a rig scores by where its sensors are, in closed form, with noise that pairing removes."""
+"""Frames without a scene: a rig scores by where its sensors are, in closed form, with noise that pairing removes."""
 
 import numpy as np
 
 from tests.placement.worlds import estimate_of
 from torchcover.placement import Objective, SearchPlan, SearchSpace
-from torchcover.placement.racing import Prefix, racing_order
+from torchcover.placement.common_frames import Score
 from torchcover.simulation import Scenario
 
 QUESTIONS = 2
@@ -39,7 +39,6 @@ class Surface:
         self.seed, self.worth, self.noise, self.blind = seed, worth, noise, blind
         self.objectives, self.estimate = dict(objectives), estimate
         self.world_of = np.repeat(np.arange(worlds), per_world)
-        self.order = racing_order(self.world_of, seed)
         self.level = draws.normal(0.0, 0.1, (len(self.world_of), QUESTIONS))
         self.tilt = draws.normal(0.0, noise, (len(self.world_of), QUESTIONS, 2))
         self.scored, self.closed = [], False
@@ -48,28 +47,24 @@ class Surface:
     def __len__(self):
         return len(self.world_of)
 
-    def _estimate(self, rig, numbers, shift=0.0):
+    def _estimate(self, rig, shift=0.0):
         mount = rig.sensors[0].mount
-        offset = self.tilt[numbers] @ np.array([mount.x_m, mount.pitch_deg / 10])
-        share = self.worth(rig)[None] + self.level[numbers] + offset + shift
+        offset = self.tilt @ np.array([mount.x_m, mount.pitch_deg / 10])
+        share = self.worth(rig)[None] + self.level + offset + shift
         share = np.where(self.blind, np.nan, share)
         share = share[:, np.arange(len(self.objectives)) % QUESTIONS]  # what nobody asked for is near or far, too
-        found = estimate_of(share, self.world_of[numbers])
+        found = estimate_of(share, self.world_of)
         named = [one._replace(key=name) for one, name in zip(found.quantities, self.objectives, strict=True)]
         return type(found)(tuple(named), found.value, found.left_out, found.steps)
 
-    def prefixes(self, rig):
-        for start in range(0, len(self), 3):
-            done = min(start + 3, len(self))
-            self.scored += self.order[start:done].tolist()
-            self_hits = max(0.0, rig.sensors[0].mount.pitch_deg) / 100
-            yield Prefix(done, self._estimate(rig, self.order[:done]), self_hits)
+    def score(self, rig):
+        self.scored.append(rig.name)
+        return Score(self._estimate(rig), max(0.0, rig.sensors[0].mount.pitch_deg) / 100)
 
     def estimates(self, rig):
-        self.scored += self.order.tolist()
-        return {"area": self._estimate(rig, self.order), "known": self._estimate(rig, self.order, shift=-0.1)}
+        return {"area": self._estimate(rig), "known": self._estimate(rig, shift=-0.1)}
 
-    def anew(self, seed, worlds, more):
+    def resampled(self, seed, worlds, more):
         return Surface(seed, worlds, 3, self.worth, self.noise, {**self.objectives, **more}, estimate=self.estimate)
 
     def close(self):
@@ -93,7 +88,7 @@ def plan(**settings):
     worth = settings.pop("worth", near_far)
     blind = settings.pop("blind", False)
     makes = lambda space, plan, seed, worlds: Surface(  # noqa: E731
-        seed, worlds, plan.per_world, worth, objectives=space.asked, blind=blind, estimate=plan.estimate
+        seed, worlds, plan.per_world, worth, objectives=space.numbers, blind=blind, estimate=plan.estimate
     )
     budget = {} if "budget_s" in settings else {"evaluations": 20}
-    return SearchPlan(**{**budget, "instants": makes, **settings})
+    return SearchPlan(**{**budget, "make_frames": makes, **settings})

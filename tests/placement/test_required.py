@@ -49,7 +49,7 @@ def test_the_number_is_the_share_of_the_places_that_are_seen_well_enough_and_has
     without = held(objectives={"near": Objective(region="20m"), "far": Objective(region="80m")})
     empty, shares = free_space().model_copy(update={"ego": some._worlds[0].ego}), []
     for each in (LEVEL, DOWN):
-        *_, last = some.prefixes(each)
+        last = some.score(each)
         both = some.estimates(each)
         points = survey_places(each, empty, Target.load("child"), np.array(PLACES)).least_points
         assert np.isnan(points[3])
@@ -82,18 +82,14 @@ def test_of_encounters_those_count_that_are_kept_in_all_phases_on_the_vehicle_of
 def test_a_search_finds_where_the_child_is_seen_and_resumed_it_finds_the_same(lot, tmp_path):
     searched(lot, tmp_path, evaluations=2)
     resumed, found = (searched(lot, out, resume=out is not None) for out in (tmp_path, None))
-    told = [[(one.values, one.instants) for one in of.search.evaluations] for of in (resumed, found)]
-    assert told[0] == told[1]
-    start, best = (one.prefixes[-1].estimate.value[0] for one in (found.search.evaluations[0], found.best.evaluation))
+    values = [[one.values for one in of.search.evaluations] for of in (resumed, found)]
+    assert values[0] == values[1]
+    start, best = (one.estimate.value[0] for one in (found.search.evaluations[0], found.best.evaluation))
     assert (start, best) == (0.0, 0.75)
     assert found.sentence.startswith("child: gained +75.0 points in any world, optimism +0.00. ")
     (gain,) = found.best.gains
     assert (gain.estimate, gain.test.p, gain.test.error, gain.test.significant) == ("-", 0.0, 0.0, True)
     assert gain.test.value == gain.search_gain == best - start
-    # What is below the best is dropped at the first look, and nothing else.
-    for arm in found.search.arms.values():
-        for at, one in enumerate(arm.evaluations[1:], start=1):
-            assert (one.instants == 3) == (arm.gains[at, 0] < arm.gains[:at, 0].max())
     resumed.save(tmp_path)
     record = json.loads((tmp_path / "search.json").read_text())["found"][0]
     assert record["gains"]["child"]["-"]["p"] == 0.0
@@ -102,10 +98,10 @@ def test_a_search_finds_where_the_child_is_seen_and_resumed_it_finds_the_same(lo
 def test_what_must_not_be_worse_for_a_child_is_kept_and_changes_by_no_chance(lot):
     """Of the ground ahead more is seen with the nose down, and of an adult far ahead with the nose up."""
     level = {"requires": {"target": "adult", "at": {"points_m": [[20.0, 0.0]]}, "points": 1}}
-    objectives = {"near": {"region": "front_3m", "band": "ground"}}
-    free, kept = (searched(lot, objectives=objectives, not_worse=worse) for worse in ((), (level,)))
-    (name,) = kept.search.space.asked.keys() - {"near"}
-    assert kept.search.evaluations[0].prefixes[-1].estimate.value.tolist()[1] == 1.0
+    objectives = {"near": {"region": ("front_3m", "20m"), "band": "ground"}}
+    free, kept = (searched(lot, objectives=objectives, evaluations=16, not_worse=worse) for worse in ((), (level,)))
+    (name,) = kept.search.space.numbers.keys() - {"near"}
+    assert kept.search.evaluations[0].estimate.value.tolist()[1] == 1.0
     assert free.best.evaluation.values["top.pitch_deg"] > 8 > kept.best.evaluation.values["top.pitch_deg"]
     (row,) = (one for one in kept.test.changes if one.what == name)
     assert (row.p, row.test.value, row.test.error) == (1.0, 0.0, 0.0)
@@ -114,9 +110,8 @@ def test_what_must_not_be_worse_for_a_child_is_kept_and_changes_by_no_chance(lot
 def test_where_nothing_is_ever_seen_nothing_is_unknown(lot, tmp_path):
     never = child(points=10**6)
     found = searched(lot, objectives={"near": {"region": "20m"}, "never": never}, evaluations=6)
-    arm = found.search.arms["optimiser"]
-    assert not np.isnan(arm.gains).any()
-    assert (arm.gains[:, 1] == 0).all()
+    assert not np.isnan(found.gains).any()
+    assert (found.gains[:, 1] == 0).all()
     assert "never: no gain is shown: 0 points in any world" in found.sentence
     alone = searched(lot, objectives={"never": never}, evaluations=6)
     assert alone.best.is_start
@@ -143,5 +138,5 @@ def test_what_cannot_be_an_objective_is_refused(given, message):
 
 def test_a_place_without_room_is_refused_with_the_start(lot):
     inside = child(at={"x_m": [-0.5, 0.5], "y_m": [-0.3, 0.3]})
-    with pytest.raises(ValueError, match=r"objectives.child: .* nowhere is room for the body; take another place"):
+    with pytest.raises(ValueError, match=r"objectives.child: .* there is no room for the target anywhere"):
         searched(lot, objectives={"child": inside})

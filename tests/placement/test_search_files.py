@@ -11,7 +11,8 @@ from tests.placement.surfaces import plan, space
 from torchcover.coverage.quantity import RADIUS, detection
 from torchcover.estimation import Difference
 from torchcover.placement import PlacementSearch, run_search
-from torchcover.placement.fresh import FreshGain, told
+from torchcover.placement.search import JOURNAL
+from torchcover.placement.validation import HeldOutGain, describe_gain
 from torchcover.report.page.drawings import words_html
 from torchcover.simulation import Rig
 
@@ -44,7 +45,7 @@ def test_the_summary_comes_last_and_lists_all_files(one):
     assert files[-1].name == "summary.json"
     assert set(summary["files"]) == {path.name for path in files[:-1]}
     assert set(summary["files"]) >= {"best.yaml", "evaluations.csv", "pareto.csv", "search.json", "report.html"}
-    assert {path.name for path in folder.iterdir()} == {path.name for path in files} | {"checkpoint.npz"}
+    assert {path.name for path in folder.iterdir()} == {path.name for path in files} | {JOURNAL}
 
 
 def test_there_is_a_row_for_every_evaluation_and_its_gain_is_the_difference_of_means(one):
@@ -53,17 +54,10 @@ def test_there_is_a_row_for_every_evaluation_and_its_gain_is_the_difference_of_m
     assert [int(row["number"]) for row in table] == list(range(17))
     start = float(table[0]["near_value"])
     for row, evaluation in zip(table, result.search.evaluations, strict=True):
-        assert int(row["instants"]) == evaluation.instants
-        assert row["arm"] == evaluation.arm
-        if row["state"] == "complete":
-            assert float(row["near_gain"]) == pytest.approx(float(row["near_value"]) - start, abs=1e-8)
-            assert row["why"] == ""
-        else:
-            assert row["state"] == "dropped"
-            assert row["why"] == "two standard errors below the best so far"
-            assert int(row["instants"]) < 18
-    best = max((row for row in table if row["state"] == "complete" and row["arm"] != "random"),
-               key=lambda row: float(row["near_gain"]))  # fmt: skip
+        assert row["strategy"] == evaluation.strategy
+        assert (row["state"], row["why"]) == ("complete", "")
+        assert float(row["near_gain"]) == pytest.approx(float(row["near_value"]) - start, abs=1e-8)
+    best = max(table, key=lambda row: float(row["near_gain"]))
     assert int(best["number"]) == result.best.evaluation.number
 
 
@@ -75,17 +69,14 @@ def test_a_notebook_is_told_the_sentence_and_has_a_row_for_every_evaluation(one)
     assert table["number"].tolist() == [each.number for each in result.search.evaluations]
 
 
-def test_the_record_has_seeds_gains_and_what_was_saved(one):
+def test_the_record_has_seeds_gains_and_counts(one):
     result, folder, _ = one
     record = json.loads((folder / "search.json").read_text())
     assert record["band_frame"] == "ground"
-    assert (record["seed"], record["test_seed"], record["optimiser"]) == (0, 1, "gp")
-    assert record["share_of_instants_saved"] == result.search.share_saved
+    assert (record["seed"], record["test_seed"]) == (0, 1)
     gain = record["found"][0]["gains"]["near"]["area"]
     assert gain["optimism"] == pytest.approx(gain["search_gain"] - gain["gain"])
-    assert record["arms"]["random"]["instants"] == sum(
-        each.instants for each in result.search.evaluations if each.arm == "random"
-    )
+    assert record["candidates"] == result.counts
 
 
 def test_the_page_shows_the_gains_the_rigs_and_the_pictures(one):
@@ -96,7 +87,7 @@ def test_the_page_shows_the_gains_the_rigs_and_the_pictures(one):
     assert all(f"<li>{words_html(words)}</li>" in page for words in others)
     assert page.count("data:image/png;base64,") == 2
     assert "start: front_roof_32" in page
-    assert "optimiser: roof_best" in page
+    assert "best: roof_best" in page
     assert f"{result.best.evaluation.values['roof.pitch_deg']:.3f}" in page
 
 
@@ -104,12 +95,7 @@ def test_of_several_objectives_there_are_rigs_of_the_ends_and_a_front(tmp_path):
     result = run_search(PlacementSearch(space(objectives=("near", "far")), plan(evaluations=16)))
     names = {path.name for path in result.save(tmp_path)}
     assert names >= {"best.yaml", "best_near.yaml", "best_far.yaml", "pareto.png", "objective_1.png", "objective_2.png"}
-    front = rows(tmp_path / "pareto.csv")
-    arm = result.search.arms["optimiser"]
-    assert [int(row["number"]) for row in front if row["arm"] == "optimiser"] == [
-        arm.evaluations[at].number for at in arm.front
-    ]
-    assert json.loads((tmp_path / "search.json").read_text())["hypervolume"]["random"] > 0
+    assert [int(row["number"]) for row in rows(tmp_path / "pareto.csv")] == result.search.best_of()
 
 
 def test_where_nothing_can_be_there_are_files_all_the_same(tmp_path):
@@ -130,34 +116,34 @@ DETECTION = detection(0.4)
 
 def gain(mean, error, significant, worlds=16, quantity=DETECTION):
     ends = mean - 2 * error, mean + 2 * error
-    return FreshGain("near", "area", Difference(quantity, mean, error, *ends, significant, 0.1, worlds, 9), 0.04)
+    return HeldOutGain("near", "area", Difference(quantity, mean, error, *ends, significant, 0.1, worlds, 9), 0.04)
 
 
 @pytest.mark.parametrize(
     ("found", "words"),
     [
-        (gain(-0.02, 0.004, True), "lost -2.00  [-2.80, -1.20] points on 16 fresh worlds (t -5.0, better in 9)"),
-        (gain(0.03, 0.01, True), "gained +3.0  [+1.0, +5.0] points on 16 fresh worlds (t 3.0, better in 9)"),
+        (gain(-0.02, 0.004, True), "lost -2.00  [-2.80, -1.20] points on 16 held-out worlds (t -5.0, better in 9)"),
+        (gain(0.03, 0.01, True), "gained +3.0  [+1.0, +5.0] points on 16 held-out worlds (t 3.0, better in 9)"),
         (
             gain(0.03, 0.01, None, 3),
-            "no gain is shown: +3.0  [+1.0, +5.0] points on 3 fresh worlds (t 3.0, better in 9)",
+            "no gain is shown: +3.0  [+1.0, +5.0] points on 3 held-out worlds (t 3.0, better in 9)",
         ),
         (
             gain(0.0202, 0.01, False),
-            "no gain is shown: +2.0  [0.0, +4.0] points on 16 fresh worlds (t 2.0, better in 9)",
+            "no gain is shown: +2.0  [0.0, +4.0] points on 16 held-out worlds (t 2.0, better in 9)",
         ),
-        (gain(0.02, np.nan, None), "no gain is shown: +2.0 points on 16 fresh worlds (t unknown, better in 9)"),
+        (gain(0.02, np.nan, None), "no gain is shown: +2.0 points on 16 held-out worlds (t unknown, better in 9)"),
         (
             gain(-0.1, 0.02, True, quantity=RADIUS),
-            "gained +0.100  [+0.060, +0.140] m on 16 fresh worlds (t 5.0, better in 9)",
+            "gained +0.100  [+0.060, +0.140] m on 16 held-out worlds (t 5.0, better in 9)",
         ),
-        (gain(np.nan, np.nan, None), "unknown in the fresh worlds"),
+        (gain(np.nan, np.nan, None), "unknown in the held-out worlds"),
     ],
 )
 def test_only_what_is_told_from_chance_is_called_a_gain(found, words):
-    assert told(found) == words
+    assert describe_gain(found) == words
     if np.isfinite(found.test.value):
-        assert told(found, optimism=True).startswith(f"{words}, optimism ")
+        assert describe_gain(found, optimism=True).startswith(f"{words}, optimism ")
 
 
 def test_a_number_that_is_by_no_choice_of_estimate_has_one_row(tmp_path):

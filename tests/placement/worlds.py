@@ -4,8 +4,7 @@ import numpy as np
 import torch
 
 from torchcover.estimation import Estimate, Quantity
-from torchcover.placement import CommonInstants, Objective
-from torchcover.placement.racing import Prefix
+from torchcover.placement import CommonFrames, Objective
 from torchcover.simulation import Rig, Scenario
 
 EGO = {"shape": {"type": "box", "size_m": [4, 2, 1.5]}}
@@ -42,7 +41,7 @@ def rig(*sensors, name="small", **keys):
 
 
 def held(scenarios=(LOT,), objectives=OBJECTIVES, **keys):
-    return CommonInstants(scenarios, objectives, **{"worlds": 3, "per_world": 2, "every_s": 0.4, "rays": 1024} | keys)
+    return CommonFrames(scenarios, objectives, **{"worlds": 3, "per_world": 2, "every_s": 0.4, "rays": 1024} | keys)
 
 
 def estimate_of(values, world, lower_is_better=()):
@@ -54,10 +53,3 @@ def estimate_of(values, world, lower_is_better=()):
     names = [f"o{k}" for k in range(values.shape[1])]
     quantities = [Quantity(name, name, "share", name in lower_is_better) for name in names]
     return Estimate.of_ratios(quantities, steps.double(), sums, steps)
-
-
-def prefixes_of(values, world, together=3, **keys):
-    """What is known after more and more of some instants."""
-    for start in range(0, len(world), together):
-        done = min(start + together, len(world))
-        yield Prefix(done, estimate_of(values[:done], world[:done], **keys), 0.0)

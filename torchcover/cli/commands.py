@@ -403,24 +403,27 @@ def encounter(
 
 @with_options(of_evaluate("sensor_model"))
 def search(
-    space: Annotated[Path, typer.Argument(help="YAML file of what is free, and of what a good rig is.")],
+    space: Annotated[Path, typer.Argument(help="YAML file of free variables, constraints and objectives.")],
     budget: Annotated[
         str | None, typer.Option(help="Time for all of it: 30min (if nothing is given), 90s, 2h; or --evaluations.")
     ] = None,
     evaluations: Annotated[
-        int | None, typer.Option(min=1, help="Candidates instead of a time: the same ones whatever the machine.")
+        int | None, typer.Option(min=1, help="Number of candidates instead of a time: the same ones on any machine.")
     ] = None,
-    optimiser: Annotated[str, typer.Option(help="gp (Gaussian process) or random.")] = "gp",
     estimate: Annotated[
         Literal["area", "known"],
-        typer.Option(help="What a score is: `area`, the share of the visible surface, or `known`, of the known cells."),
+        typer.Option(help="Average of a score: `area`, the visible surface, or `known`, the observed cells."),
     ] = "area",
     worlds: Annotated[int | None, typer.Option(min=1, help="Worlds of each scenario to search in (6).")] = None,
-    fresh_worlds: Annotated[int | None, typer.Option(min=1, help="Fresh worlds of each to test in (16).")] = None,
-    per_world: Annotated[int | None, typer.Option(min=1, help="Instants of each world (3).")] = None,
+    fresh_worlds: Annotated[
+        int | None, typer.Option(min=1, help="Held-out worlds of each scenario to test in (16).")
+    ] = None,
+    per_world: Annotated[int | None, typer.Option(min=1, help="Frames of each world (3).")] = None,
     every_s: Annotated[float | None, typer.Option("--every-s", help="Seconds between two of them (20).")] = None,
-    rays: Annotated[int | None, typer.Option(min=1, help="Rays of the reference at each instant (16384).")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the search and its worlds; fresh ones have the next.")] = 0,
+    rays: Annotated[int | None, typer.Option(min=1, help="Reference rays of each frame (16384).")] = None,
+    seed: Annotated[
+        int, typer.Option(min=0, help="Seed of the search and its worlds; held-out worlds have the next.")
+    ] = 0,
     workers: Annotated[
         int | None, typer.Option(min=0, help="Processes that score; 0 scores in this one. Not given: as many as help.")
     ] = None,
@@ -428,14 +431,14 @@ def search(
         bool,
         typer.Option(
             "--resume",
-            help="Go on from the evaluations in --out, whatever ended that search, and keep them at the end.",
+            help="Continue the search whose journal is in --out.",
         ),
     ] = False,
     out: options.Out = Path("out/search"),
     files: options.Files = options.ALL_FILES,
     **settings: Any,  # noqa: ANN401
 ) -> None:
-    """Look for better places for sensors, compared with a random search, and test what was found in fresh worlds."""
+    """Search for better mounting positions, or select sensors, and test the result on held-out worlds."""
     from torchcover.cli.search_run import run
 
     if budget is not None and evaluations is not None:
@@ -449,7 +452,6 @@ def search(
         files=files,
         evaluations=evaluations,
         budget_s=None if budget is None else parsed_budget(budget),
-        optimiser=optimiser,
         estimate=estimate,
         seed=seed,
         **{name: value for name, value in given.items() if value is not None},

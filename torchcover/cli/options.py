@@ -25,7 +25,7 @@ PANELS = {
     "What": "scenario frames sensors vehicle sensor_model weather target heading encounters requirements "
     "redundancy thresholds_m threshold_m hits reference estimate phases worlds",
     "Where": "ask region raster",
-    "How exact": "steps rays every_s seed target_error budget evaluations optimiser fresh_worlds per_world",
+    "How exact": "steps rays every_s seed target_error budget evaluations fresh_worlds per_world",
     "Output": "out files explain film",
     "How it runs": "config assignments device workers resume",
 }

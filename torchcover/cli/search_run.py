@@ -19,17 +19,15 @@ from torchcover.placement import (
     choose,
     run_search,
 )
-from torchcover.placement.common_instants import WORLDS
-from torchcover.placement.plan import common_instants
-from torchcover.placement.running import CHECKPOINT
+from torchcover.placement.common_frames import WORLDS
+from torchcover.placement.search import JOURNAL, make_common_frames
 from torchcover.report import Terminal, print_whole
 from torchcover.simulation.documents import read_mapping
 
 CHOICE_KEY = "candidates"
 # Of a search, if nothing is given.
 BUDGET_S = 30 * 60.0
-# As many as a search looks at, about: each of its instants a hundred times or more.
-FRAMES = 1000
+FRAMES = 1000  # approximate number of frames that a search scores
 
 
 def run(
@@ -51,8 +49,6 @@ def run(
     with lock_folder(out):
         report = find(path, out, resume=resume, **settings).report
         written = report.save(out, files=files)
-        if not resume:
-            (out / CHECKPOINT).unlink(missing_ok=True)  # there is nothing left that would go on from it
     print_whole(report.tables[:2])
     console = Terminal()
     print_files(written, out, console)
@@ -63,11 +59,11 @@ def _searched(path: Path, out: Path, *, resume: bool, **settings: Any) -> Search
     if settings["budget_s"] is None and settings["evaluations"] is None:
         settings["budget_s"] = BUDGET_S
     search = PlacementSearch(SearchSpace.load(path), SearchPlan(**settings))
-    if resume and not (out / CHECKPOINT).exists():
-        typer.echo(f"torchcover: {out / CHECKPOINT} is not there: the search starts with its first candidate", err=True)
-    elif not resume and (out / CHECKPOINT).exists() and not (out / SUMMARY).exists():
-        left = f"{out / CHECKPOINT} will be replaced; to go on from it, stop now and add --resume"
-        typer.echo(f"torchcover: {left}", err=True)
+    journal = out / JOURNAL
+    if resume and not journal.exists():
+        typer.echo(f"torchcover: {journal} is not there: the search starts with its first candidate", err=True)
+    elif not resume and journal.exists() and not (out / SUMMARY).exists():
+        typer.echo(f"torchcover: {journal} will be replaced; to go on from it, stop now and add --resume", err=True)
     return run_search(search, out, resume=resume, progress=True)
 
 
@@ -75,11 +71,10 @@ def _chosen(path: Path, out: Path, *, resume: bool, **settings: Any) -> SensorCh
     asked = {
         "--budget": settings["budget_s"] is not None,
         "--evaluations": settings["evaluations"] is not None,
-        "--optimiser": settings["optimiser"] != "gp",
         "--resume": resume,
     }
     if useless := [option for option, given in asked.items() if given]:
         raise ValueError(f"{', '.join(useless)}: the {CHOICE_KEY} of this file are all looked at; leave it out")
     space, plan = ChoiceSpace.load(path), SearchPlan(**settings | {"budget_s": math.inf})
-    with common_instants(space, plan, plan.seed, plan.worlds) as instants:
-        return choose(space, instants, test_seed=plan.seed_of_test, fresh_worlds=plan.fresh_worlds, progress=True)
+    with make_common_frames(space, plan, plan.seed, plan.worlds) as frames:
+        return choose(space, frames, test_seed=plan.seed_of_test, fresh_worlds=plan.fresh_worlds, progress=True)

@@ -1,14 +1,13 @@
-"""What of a sensor is free, as a space writes it, and the sensor that values of it make."""
+"""Free variables of a sensor in a search space, and the sensor that their values give."""
 
 import math
 from collections.abc import Mapping
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, NamedTuple, Self
 
 from pydantic import Field, PlainValidator, model_validator
 
 from torchcover.geometry import euler_from_rotation
-from torchcover.placement.carrier import Carrier
-from torchcover.placement.variables import DECIMALS, FreeChoice, FreeNumber, Value, Variable
+from torchcover.placement.host_vehicle import HostVehicle
 from torchcover.simulation import Document, Lidar, Pose, Sensor
 from torchcover.simulation.documents import FARTHEST_M, NameOrFile
 
@@ -18,6 +17,61 @@ ON_REGIONS = ("u", "v", "height_m")
 MIRRORED = ("y_m", "yaw_deg", "roll_deg")
 # The middle of what a sensor measures from is about this far above its foot.
 HEIGHT_M = 0.1
+
+Value = float | str | bool
+DECIMALS = 6  # of numbers: micrometers and millionths of a degree, so that a table of them can be read back
+
+
+class FreeNumber(NamedTuple):
+    """A free number with its bounds, under the name of its sensor and key, as "roof.pitch_deg"."""
+
+    name: str
+    low: float
+    high: float
+
+    def at(self, share: float) -> float:
+        """Return the value at a share, 0 to 1, of the way from the lowest to the highest."""
+        return self.rounded(self.low + share * (self.high - self.low))
+
+    def rounded(self, value: Value) -> float:
+        """Return a value with the digits that files keep, within the bounds."""
+        return min(max(round(float(value), DECIMALS), self.low), self.high)
+
+    def check(self, value: object) -> None:
+        """ValueError: the value is not a number within the bounds."""
+        if not self.holds(value):
+            raise ValueError(f"{self.name}: a number from {self.low:g} to {self.high:g} is needed; got {value!r}")
+
+    def holds(self, value: object) -> bool:
+        """Return whether a value is a number within the bounds."""
+        return isinstance(value, int | float) and not isinstance(value, bool) and self.low <= value <= self.high
+
+
+class FreeChoice(NamedTuple):
+    """A free choice of several options."""
+
+    name: str
+    options: tuple[Value, ...]
+
+    def at(self, share: float) -> Value:
+        """Return the option at a share, 0 to 1, of all options."""
+        return self.options[min(int(share * len(self.options)), len(self.options) - 1)]
+
+    def rounded(self, value: Value) -> Value:
+        """Return the option itself."""
+        return value
+
+    def check(self, value: object) -> None:
+        """ValueError: the value is not one of the options."""
+        if not self.holds(value):
+            raise ValueError(f"{self.name}: one of {', '.join(map(str, self.options))} is needed; got {value!r}")
+
+    def holds(self, value: object) -> bool:
+        """Return whether a value is one of the options."""
+        return any(value == option and type(value) is type(option) for option in self.options)
+
+
+Variable = FreeNumber | FreeChoice
 
 
 def _span(low: float, high: float) -> PlainValidator:
@@ -127,7 +181,7 @@ class FreeSensor(Document):
         usual = {"u": (0.0, 1.0), "v": (0.0, 1.0), "height_m": HEIGHT_M, **dict.fromkeys(ANGLES, 0.0)}
         return usual | given
 
-    def made(self, start: Sensor, values: Mapping[str, Value], carrier: Carrier) -> Sensor | None:
+    def made(self, start: Sensor, values: Mapping[str, Value], host: HostVehicle) -> Sensor | None:
         """The sensor that values make of that of the start, by the names of `variables`; None where they leave it out.
 
         ValueError: nothing of the body is at its place.
@@ -136,7 +190,7 @@ class FreeSensor(Document):
         if own.get("present") is False:
             return None
         try:
-            mount = self._mount(start.mount, own, carrier)
+            mount = self._mount(start.mount, own, host)
         except ValueError as error:
             raise ValueError(f"{start.name}: {error}") from error
         if own.get("model", getattr(start, "model", None)) != getattr(start, "model", None):
@@ -144,19 +198,19 @@ class FreeSensor(Document):
         assert isinstance(start, Document)  # as all sensors of a rig
         return start.model_copy(update={"mount": mount})
 
-    def _mount(self, start: Pose, own: Mapping[str, Any], carrier: Carrier) -> Pose:
+    def _mount(self, start: Pose, own: Mapping[str, Any], host: HostVehicle) -> Pose:
         if self.region is None:
             numbers = {key: own[key] for key in (*PLACES[:3], *ANGLES) if key in own}
             mount = moved(start, numbers)
             if "z_above_body_m" in own:
-                mount = moved(mount, {"z_m": top_m(carrier, mount) + own["z_above_body_m"]})
+                mount = moved(mount, {"z_m": top_m(host, mount) + own["z_above_body_m"]})
             return mount
-        region = carrier.region(own["region"])
-        point = region.on(carrier.skin, own["u"], own["v"])
+        region = host.region(own["region"])
+        point = region.on(host.skin, own["u"], own["v"])
         x, y, z = (point.place_m + own["height_m"] * point.outward).tolist()
         return pose_of(x, y, z, region.heading_deg + own["yaw_deg"], own["pitch_deg"], own["roll_deg"])
 
-    def start_values(self, start: Sensor, carrier: Carrier) -> dict[str, Value]:
+    def start_values(self, start: Sensor, host: HostVehicle) -> dict[str, Value]:
         """What the variables are in the rig that the search starts from, whether they may be that or not.
 
         On an unknown region: the sensor may be anywhere.
@@ -167,7 +221,7 @@ class FreeSensor(Document):
         if self.region is None:
             known |= numbers_of(start.mount)
             if self.z_above_body_m is not None:
-                known["z_above_body_m"] = round(start.mount.z_m - top_m(carrier, start.mount), DECIMALS)
+                known["z_above_body_m"] = round(start.mount.z_m - top_m(host, start.mount), DECIMALS)
         names = {variable.name for variable in self.variables(start.name)}
         return {f"{start.name}.{key}": value for key, value in known.items() if f"{start.name}.{key}" in names}
 
@@ -206,11 +260,11 @@ def pose_of(x_m: float, y_m: float, z_m: float, yaw_deg: float, pitch_deg: float
     return Pose(x_m=x, y_m=y, z_m=z, yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll)
 
 
-def top_m(carrier: Carrier, mount: Pose) -> float:
+def top_m(host: HostVehicle, mount: Pose) -> float:
     """How high the vehicle's body is where a sensor is mounted. ValueError: the body is not below it."""
-    below = carrier.skin.seen_from("above", (mount.x_m, mount.y_m))
+    below = host.skin.seen_from("above", (mount.x_m, mount.y_m))
     if below is None:
         raise ValueError(
-            f"z_above_body_m: nothing of {carrier.name} is below x = {mount.x_m:.3f} m, y = {mount.y_m:.3f} m"
+            f"z_above_body_m: nothing of {host.name} is below x = {mount.x_m:.3f} m, y = {mount.y_m:.3f} m"
         )
     return float(below.place_m[2])

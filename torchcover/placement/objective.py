@@ -24,10 +24,10 @@ THRESHOLD_M = 0.4
 CHOSEN = re.compile(r"(radius_m|(detection|sensors|seen_by_two)_[\d.]+m)(_without_|$)")
 
 
-def looked_for(
+def check_requirements(
     rig: Rig, asked: Requirements, world: Scenario, sensor_model: Literal["ideal", "real"] | None
 ) -> Sequence[Verdict]:
-    """Whether a rig on a world's ego keeps what bodies and encounters require, in free space or where that says."""
+    """Check requirements of targets and encounters for a rig on the ego of a world, in free space or their scenario."""
     ego: Any = world.ego
     where = asked.scenario or free_space().model_copy(update={"ego": ego})
     vehicle = getattr(ego.shape, "vehicle", None)
@@ -98,7 +98,9 @@ class Objective(Document):
 
     def share_kept(self, rig: Rig, world: Scenario, sensor_model: Literal["ideal", "real"] | None) -> Estimate:
         """Of what `requires` asks about, in no blocks; NaN if it is nowhere, as no body has room."""
-        (one,) = looked_for(rig, Requirements.model_validate({"requirements": [self.requires]}), world, sensor_model)
+        (one,) = check_requirements(
+            rig, Requirements.model_validate({"requirements": [self.requires]}), world, sensor_model
+        )
         share = (one.count - one.failed - one.unknown) / one.count if one.count else math.nan
         quantity = Quantity(self.key, self.words, "share", lower_is_better=False)
         return Estimate.of([quantity], torch.tensor([share], dtype=torch.float64, device="cpu"))

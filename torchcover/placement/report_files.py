@@ -18,7 +18,7 @@ from torchcover.evaluation.result_page import rig_document, words_of
 from torchcover.evaluation.settings import FILES, wanted_files
 from torchcover.files import AtomicOutput, csv_text, data_frame, small_html
 from torchcover.geometry.arrays import Float64
-from torchcover.placement.fresh import finite
+from torchcover.placement.validation import replace_nan
 from torchcover.report import Page, PagePicture, PageRig, PageTable, page_html
 from torchcover.simulation import Rig
 
@@ -90,11 +90,11 @@ class PlacementReport:
             files.add(name, rig.save)
         for name, rows in self.rows.items():
             files.add_text(name, csv_text([*map(_digits, row)] for row in rows))
-        record = json.dumps(finite({**self.record, "sentence": self.sentence}), indent=2, allow_nan=False)
+        record = json.dumps(replace_nan({**self.record, "sentence": self.sentence}), indent=2, allow_nan=False)
         files.add_text("search.json", f"{record}\n")
 
     def _page(self, pictures: Sequence[PagePicture]) -> Page:
-        record = finite(self.record)
+        record = replace_nan(self.record)
         facts = {"Settings": self.settings, "Run": [name for name in OF_THE_RUN if name in record]}
         return Page(
             title=self.title,

@@ -1,169 +1,171 @@
-"""What a search has found, in numbers, words and tables."""
+"""The result of a placement search: its best rig, tables, sentences and pictures."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from torchcover.evaluation.result import sensor_model_words
-from torchcover.placement.arm import Arm
-from torchcover.placement.evaluation import OPTIMISER, RANDOM, START, Evaluation
-from torchcover.placement.fresh import FreshGain, FreshTest, amount, told, unit_words
-from torchcover.placement.pareto import hypervolume
+from torchcover.placement.free_sensor import FreeNumber
 from torchcover.placement.report_files import OF_THE_RUN, PlacementReport, Reported
-from torchcover.placement.result_pictures import search_pictures
-from torchcover.placement.search import PlacementSearch
-from torchcover.placement.variables import FreeNumber
-from torchcover.report import PageTable, Words, file_stems
-from torchcover.report.wording import UNKNOWN
+from torchcover.placement.search import OPTIMIZER, RANDOM, START, Evaluation, PlacementSearch
+from torchcover.placement.validation import HeldOutGain, ValidationTest, describe_gain, format_gain, unit_words
+from torchcover.report import PageTable, Words, draw_fronts, draw_progress, draw_slices, file_stems
+from torchcover.report.wording import UNKNOWN, shown_unit
 from torchcover.simulation import Rig
 
-# Of a range: nearer to its end, a number is on it.
-BOUND = 0.005
-HEADINGS = ("found by", "objective", "estimate", "gain in\nthe search", "gain on\nfresh worlds", "t",
+BOUND_SHARE = 0.005  # a number closer to an end of its range, as a share of that, lies on the end
+HEADINGS = ("rig", "objective", "estimate", "gain in\nthe search", "gain on\nheld-out worlds", "t",
             "better in\n(worlds)", "optimism")  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
-class Pick:
-    """A rig that was found by an arm, "optimiser" or "random".
+class Finalist:
+    """A rig of a search that is tested on held-out worlds.
 
-    `role` is, of several objectives, "middle" of the front, or the name of the objective that it is best in. `gains`
-    are on fresh worlds, by the estimate of the search first; empty if it was not tested, as the start itself.
+    Args:
+        role: "best"; "random", the best random candidate; of several objectives "compromise" or the name of the
+            objective that the rig is best in.
+        evaluation: Its scores in the search.
+        rig: The rig.
+        gains: Gains on held-out worlds, by the estimate of the search first; empty if it was not tested.
     """
 
-    arm: str
     role: str
     evaluation: Evaluation
     rig: Rig
-    gains: Sequence[FreshGain] = ()
+    gains: Sequence[HeldOutGain] = ()
 
     @property
     def is_start(self) -> bool:
-        """Whether nothing better was found."""
-        return self.evaluation.arm == START
-
-    @property
-    def name(self) -> str:
-        """What tables call it."""
-        return f"{self.arm}: {self.role}" if self.role else self.arm
+        """Whether nothing better than the start was found."""
+        return self.evaluation.strategy == START
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SearchResult(Reported):
-    """What `run_search` returns. Its first picture shows how the search went.
+    """Result of `run_search`. Its first picture shows the progress of the search.
 
     Args:
-        search: With all its evaluations.
-        picks: What was found, the better of both first, of several objectives the middle of a front.
-        test: Of them, on fresh worlds: what else the first that is not the start has changed.
-        untested: Why there is no test on fresh worlds; empty if there is one.
-        seconds: What it took, with what was spent before it was resumed.
+        search: The search with all its evaluations.
+        finalists: The best first; of several objectives the compromise.
+        test: Side effects of the first finalist on held-out worlds.
+        untested: Reason why there is no test; empty if there is one.
+        seconds: Duration, with the time before it was resumed.
     """
 
     search: PlacementSearch
-    picks: Sequence[Pick]
-    test: FreshTest | None
+    finalists: Sequence[Finalist]
+    test: ValidationTest | None
     untested: str
     seconds: float
 
     @property
-    def best(self) -> Pick | None:
-        """The better of what both arms found, in the search; None if no candidate can be, nor the start."""
-        return self.picks[0] if self.picks else None
+    def best(self) -> Finalist | None:
+        """The best rig of the search; None if no rig is possible, not even the start."""
+        return self.finalists[0] if self.finalists else None
 
     @property
     def rig(self) -> Rig:
-        """The best, or the start if nothing better was found."""
+        """The best rig, or the start if nothing better was found."""
         return self.search.space.start if self.best is None else self.best.rig
 
-    @property
-    def hypervolumes(self) -> dict[str, float]:
-        """Of the front of each arm, above the least that any candidate of both gained in each objective."""
-        gains = {name: arm.gains[arm.complete] for name, arm in self.search.arms.items()}
-        every = np.vstack([*gains.values(), np.zeros((1, len(self.search.space.objectives)))])
-        return {name: hypervolume(values, every.min(axis=0)) for name, values in gains.items()}
+    @cached_property
+    def gains(self) -> Any:  # noqa: ANN401  (an array; see `PlacementSearch.gains`)
+        """(evaluations, objectives) improvements over the start in the search."""
+        return self.search.gains
+
+    @cached_property
+    def counts(self) -> dict[str, int]:
+        """Number of candidates of each strategy."""
+        strategies = [evaluation.strategy for evaluation in self.search.evaluations]
+        return {name: strategies.count(name) for name in (OPTIMIZER, RANDOM)}
 
     @property
     def units(self) -> list[str]:
-        """Of the objectives."""
-        return [each.unit for each in self.search.evaluations[0].prefixes[-1].estimate.quantities]
+        """Units of the objectives."""
+        start = self.search.evaluations[0].estimate
+        assert start is not None  # it always is scored
+        return [quantity.unit for quantity in start.quantities[: len(self.search.space.objectives)]]
 
     @property
     def sentence(self) -> str:
-        """The last line: what was gained on fresh worlds, and what random search got with the same budget."""
+        """The summary: the gain on held-out worlds, side effects, and what random candidates reached."""
         return " ".join(self._sentences())
 
     def _sentences(self) -> Iterator[str]:
         search, best = self.search, self.best
         others = search.evaluations[1:]
-        refused = [one.infeasible for one in others if one.infeasible]
-        if others and len(refused) == len(others):
-            yield f"None of {len(others)} candidates can be, the last for this reason: {refused[-1]}."
+        reasons = [evaluation.infeasible for evaluation in others if evaluation.infeasible]
+        if others and len(reasons) == len(others):
+            yield f"None of {len(others)} candidates is possible, the last for this reason: {reasons[-1]}."
             return
         if best is None:
-            yield f"None of {len(others)} candidates can be."
-        elif best.is_start:
-            yield f"Nothing better than {search.space.start.name} was found in {self._spent(OPTIMISER)}."
+            yield f"None of {len(others)} candidates is possible."
+            return
+        if best.is_start:
+            yield f"Nothing better than {search.space.start.name} was found in {len(others)} candidates."
         elif not best.gains:
-            yield f"Found in {self._spent(best.arm)}, but not tested, so that no gain is shown: {self.untested}."
+            yield f"Found in {len(others)} candidates, but not tested, so that no gain is shown: {self.untested}."
         else:
-            yield f"{self._told(best, optimism=True)}."
-        if best is not None and (lacks := _lacks(search.leader, search.leader.best)):
-            yield f"No candidate keeps all that must be kept; this one lacks the least: {lacks}."
+            yield f"{self._describe(best, optimism=True)}."
+        if missing := self._describe_shortfalls(best.evaluation):
+            yield f"No candidate keeps all that must be kept; this one misses the least: {missing}."
         if self.test is not None:
             yield f"{self.test.sentence}."
-        if best is not None and (bounds := self._on_bounds(best.evaluation)):
+        if bounds := self._find_bounds(best.evaluation):
             yield f"On the bounds of their ranges ended {', '.join(bounds)}: more room may be worth more."
-        yield self._control()
-        yield f"Racing saved {search.share_saved:.0%} of the instants."
-        asked = {"start": search.space.start, **{pick.name: pick.rig for pick in self.picks}}
-        ideal = search.plan.sensor_model == "ideal"
-        yield from sensor_model_words({name: "ideal" if ideal else rig.sensor_model for name, rig in asked.items()})
+        yield self._compare_random()
+        rigs = {"start": search.space.start, **{finalist.role: finalist.rig for finalist in self.finalists}}
+        is_ideal = search.plan.sensor_model == "ideal"
+        yield from sensor_model_words({name: "ideal" if is_ideal else rig.sensor_model for name, rig in rigs.items()})
 
-    def _on_bounds(self, found: Evaluation) -> list[str]:
-        """Numbers that are at an end of their range."""
-        if found.unit is None or found.number == 0:
-            return []
-        pairs = zip(self.search.space.variables, found.unit.tolist(), strict=True)
-        ends = ((one.name, min(share, 1 - share)) for one, share in pairs if isinstance(one, FreeNumber))
-        return [f"{name} ({found.values[name]:g})" for name, away in ends if away < BOUND]
+    def _find_bounds(self, evaluation: Evaluation) -> list[str]:
+        """Return the numbers of a candidate that lie at an end of their range."""
+        bounds = []
+        for variable in self.search.space.variables:
+            if evaluation.number == 0 or not isinstance(variable, FreeNumber):
+                continue
+            value = float(evaluation.values[variable.name])
+            if min(value - variable.low, variable.high - value) < BOUND_SHARE * (variable.high - variable.low):
+                bounds.append(f"{variable.name} ({value:g})")
+        return bounds
 
-    def _control(self) -> str:
-        """What the other arm got: random search, unless that found the best."""
+    def _compare_random(self) -> str:
+        """Return what random candidates reached: the control of the optimizer."""
+        count = f"{self.counts[RANDOM]} random candidates"
         if len(self.search.space.objectives) > 1:
-            volumes = self.hypervolumes
-            shares = ", ".join(
-                f"{100 * volume / (max(volumes.values()) or 1):.0f} by {name}" for name, volume in volumes.items()
-            )
-            return f"Hypervolume of the fronts, with the same budget, in per cent of the larger: {shares}."
-        is_random = self.best is not None and self.best.arm == RANDOM
-        name = OPTIMISER if is_random else RANDOM
-        who = "Random search found that, and the optimiser" if is_random else "Random search"
-        other = next((pick for pick in self.picks if pick.arm == name), None)
-        if other is not None and other.gains:
-            return f"{who} with the same budget: {self._told(other, optimism=False)}."
-        what = "no rig" if other is None else "nothing better" if other.is_start else "a rig that was not tested"
-        return f"{who} with the same budget found {what} in {self._spent(name)}."
+            front = [self.search.evaluations[at].strategy for at in self.search.best_of()]
+            return f"Of the front's {len(front)} rigs, {front.count(RANDOM)} are among the {count}."
+        finalist = self.finalists[-1]
+        if finalist.is_start:
+            return f"The {count} are not better than the start."
+        if self.best is not None and finalist.evaluation is self.best.evaluation:
+            return f"It is one of the {count}: the optimizer found nothing better."
+        gain = f": {self._describe(finalist, optimism=False)}" if finalist.gains else " was not tested"
+        return f"The best of {count}{gain}."
 
-    def _told(self, pick: Pick, *, optimism: bool) -> str:
-        gains = pick.gains[: len(self.search.space.objectives)]
-        return "; ".join(f"{gain.objective}: {told(gain, optimism=optimism)}" for gain in gains)
+    def _describe(self, finalist: Finalist, *, optimism: bool) -> str:
+        gains = finalist.gains[: len(self.search.space.objectives)]
+        return "; ".join(f"{gain.objective}: {describe_gain(gain, optimism=optimism)}" for gain in gains)
 
-    def _spent(self, arm: str) -> str:
-        return f"{len(self.search.arms[arm].evaluations) - 1} candidates"
+    def _describe_shortfalls(self, evaluation: Evaluation) -> str:
+        """Return what a candidate misses of what must be kept, the largest first; empty if it keeps all."""
+        missing = self.search.shortfalls(evaluation)
+        names = sorted(missing, key=lambda name: -missing[name])
+        return "; ".join(f"{missing[name]:.2%} of {name}" for name in names)
 
     @property
     def report(self) -> PlacementReport:
-        """For its files, its page, and the terminal."""
+        """Tables, files and pictures of the result."""
         search, settings = self.search, self.search.plan.settings(self.search.space)
-        ends = [pick for pick in self.picks if pick.arm == search.leader.name][1:]
-        best_of = zip(file_stems([pick.role for pick in ends]), ends, strict=True)
-        several = len(search.space.objectives) > 1
-        volumes = self.hypervolumes if several else None
+        ends = [finalist for finalist in self.finalists[1:] if finalist.role != RANDOM]
+        best_of = zip(file_stems([finalist.role for finalist in ends]), ends, strict=True)
         of_plan = {name: getattr(search.plan, name) for name in ("evaluations", "budget_s", "fresh_worlds")}
+        rigs = {finalist.role: finalist.rig for finalist in self.finalists}
         return PlacementReport(
             title=f"{search.space.name}: where should the sensors go?",
             sentence=self.sentence,
@@ -172,118 +174,116 @@ class SearchResult(Reported):
                 **of_plan,
                 "test_seed": search.plan.seed_of_test,
                 "seconds": round(self.seconds, 3),
-                "arms": {name: _arm_record(arm) for name, arm in search.arms.items()},
-                "share_of_instants_saved": search.share_saved,
-                "hypervolume": volumes,
+                "candidates": self.counts,
+                "infeasible": sum(bool(evaluation.infeasible) for evaluation in search.evaluations[1:]),
                 "changes": self.test and self.test.record,
-                "found": [self._pick_record(pick) for pick in self.picks],
+                "found": [self._record_finalist(finalist) for finalist in self.finalists],
                 "untested": self.untested or None,
             },
             settings=[name for name in (*settings, *of_plan, "test_seed") if name not in OF_THE_RUN],
             rigs={"best.yaml": self.rig} | {f"best_{stem}.yaml": end.rig for stem, end in best_of},
-            shown={"start": search.space.start, **{pick.name: pick.rig for pick in self.picks}},
+            shown={"start": search.space.start} | rigs,
             tables=[
                 PageTable(f"{search.space.name}: against {search.space.start.name}", HEADINGS, self._gain_rows(), 3),
                 *([self.test.table] if self.test else ()),
-                self._values(),
-                _spent_table(search, volumes),
+                self._values_table(),
             ],
             rows={"evaluations.csv": self._evaluation_rows(), "pareto.csv": self._pareto_rows()},
-            pictures=partial(search_pictures, search, None if self.best is None else self.best.evaluation),
-            ego_outline_m=search.space.scenarios[0].ego_box().outline_m,
+            pictures=self._pictures,
+            ego_outline_m=search.space.host.outline_m,
         )
 
     def __repr__(self) -> str:
         return f"SearchResult in {self.search.space.name}: {self.sentence}"
 
-    def _pick_record(self, pick: Pick) -> dict[str, Any]:
+    def _record_finalist(self, finalist: Finalist) -> dict[str, Any]:
         gains: dict[str, dict[str, Any]] = {}
-        for gain in pick.gains:
+        for gain in finalist.gains:
             gains.setdefault(gain.objective, {})[gain.estimate] = gain.record
         return {
-            "arm": pick.arm,
-            "role": pick.role or None,
-            "evaluation": pick.evaluation.number,
-            "values": pick.evaluation.values,
-            "cost_eur": None if pick.is_start else self.search.space.cost_eur(pick.rig),
+            "role": finalist.role,
+            "strategy": finalist.evaluation.strategy,
+            "evaluation": finalist.evaluation.number,
+            "values": finalist.evaluation.values,
+            "cost_eur": self._cost(finalist.evaluation),
             "gains": gains or None,
         }
 
     def _gain_rows(self) -> list[tuple[Words, ...]]:
-        """Cells below `HEADINGS`; of what was not tested too."""
+        """Return cells below `HEADINGS`; those of the test are "-" for a finalist that was not tested."""
         rows, objectives = [], self.search.space.objectives
-        for pick in self.picks:
-            for gain in pick.gains:
+        for finalist in self.finalists:
+            for gain in finalist.gains:
                 test, unit = gain.test, gain.test.quantity.unit
-                words = (
-                    pick.name,
+                cells = (
+                    finalist.role,
                     f"{gain.objective} ({unit_words(unit)})",
                     gain.estimate,
-                    amount(gain.search_gain, unit),
+                    format_gain(gain.search_gain, unit),
                     gain.words,
                     f"{gain.t:.1f}",
                     f"{test.better} of {test.blocks}",
-                    amount(gain.optimism, unit),
+                    format_gain(gain.optimism, unit),
                 )
-                known = ["-" if word in ("nan", "+nan", UNKNOWN) else word.replace("nan", "?") for word in words]
-                marked = ["significant" if at == 4 and test.significant else "" for at in range(len(words))]
-                rows.append(tuple(map(Words, known, marked)))
-            if not pick.gains:
-                arm = self.search.arms[pick.arm]
-                gained = arm.gains[arm.evaluations.index(pick.evaluation)].tolist()
-                name = pick.name + " (the start)" * pick.is_start
-                for (objective, asked), unit, each in zip(objectives.items(), self.units, gained, strict=False):
-                    estimate = asked.own_estimate or self.search.plan.estimate
-                    cells = (name, f"{objective} ({unit_words(unit)})", estimate, amount(each, unit), *"----")
-                    rows.append(tuple(map(Words, cells)))
+                known = ["-" if cell in ("nan", "+nan", UNKNOWN) else cell.replace("nan", "?") for cell in cells]
+                styles = ["significant" if at == 4 and test.significant else "" for at in range(len(cells))]
+                rows.append(tuple(map(Words, known, styles)))
+            if finalist.gains:
+                continue
+            name = finalist.role + " (the start)" * finalist.is_start
+            gains = self.gains[finalist.evaluation.number].tolist()
+            for (objective, asked), unit, gained in zip(objectives.items(), self.units, gains, strict=True):
+                estimate = asked.own_estimate or self.search.plan.estimate
+                row = (name, f"{objective} ({unit_words(unit)})", estimate, format_gain(gained, unit), *"----")
+                rows.append(tuple(map(Words, row)))
         return rows
 
-    def _values(self) -> PageTable:
+    def _values_table(self) -> PageTable:
         columns: dict[str, Mapping[str, object]] = {"start": self.search.space.start_values()}
-        columns |= {pick.name: pick.evaluation.values for pick in self.picks}
+        columns |= {finalist.role: finalist.evaluation.values for finalist in self.finalists}
         names = [variable.name for variable in self.search.space.variables]
-        rows = [(Words(name), *(Words(_value(values.get(name))) for values in columns.values())) for name in names]
+        rows = [
+            (Words(name), *(Words(_format_value(column.get(name))) for column in columns.values())) for name in names
+        ]
         return PageTable("Values", ("variable", *columns), rows)
 
     def _evaluation_rows(self) -> Iterator[Sequence[object]]:
-        """A row for each candidate, with a heading: gains over the start are in the units of the objectives."""
+        """Yield the heading, and a row for each candidate: gains are in the units of the objectives."""
         search = self.search
         names, variables = list(search.space.objectives), [variable.name for variable in search.space.variables]
         of_objectives = [f"{name}_{what}" for name in names for what in ("value", "gain", "gain_error")]
-        at_end = ("instants", "self_hit_share", "cost_eur", "seconds", "why")
-        yield ["number", "arm", "state", *variables, *of_objectives, *at_end]
-        places = {one.number: (arm, at) for arm in search.arms.values() for at, one in enumerate(arm.evaluations)}
+        yield [
+            "number",
+            "strategy",
+            "state",
+            *variables,
+            *of_objectives,
+            "self_hit_share",
+            "cost_eur",
+            "seconds",
+            "why",
+        ]
         for one in search.evaluations:
-            arm, at = places[one.number]
-            pair, unknown = arm.against_start(at), [None] * len(names)
-            values = one.prefixes[-1].estimate.value.tolist()[: len(names)] if one.prefixes else unknown
-            errors = unknown if pair is None else pair[1].tolist()
-            each = [value for triple in zip(values, arm.gains[at].tolist(), errors, strict=True) for value in triple]
-            state, why = self._state(one, _lacks(arm, at))
-            hits = one.prefixes[-1].self_hit_share if one.prefixes else None
-            own = [one.values.get(name) for name in variables]
-            costs = self._cost(one), round(one.seconds, 3)
-            yield [one.number, one.arm, state, *own, *each, one.instants, hits, *costs, why]
+            numbers: list[object] = [None] * len(of_objectives)
+            if one.estimate is not None:
+                gains, errors = search.compare(one)
+                triples = zip(one.estimate.value.tolist(), gains.tolist(), errors.tolist(), strict=True)
+                numbers = [number for triple in list(triples)[: len(names)] for number in triple]
+            missing = "" if one.infeasible else self._describe_shortfalls(one)
+            state = "infeasible" if one.infeasible else "misses bounds" if missing else "complete"
+            values = [one.values.get(name) for name in variables]
+            last = (one.self_hit_share, self._cost(one), round(one.seconds, 3), one.infeasible or missing)
+            yield [one.number, one.strategy, state, *values, *numbers, *last]
 
     def _pareto_rows(self) -> Iterator[Sequence[object]]:
-        """Candidates of each arm that no other of it beats, with a heading."""
-        search = self.search
-        variables = [variable.name for variable in search.space.variables]
-        yield ["arm", "number", *(f"{name}_gain" for name in search.space.objectives), "cost_eur", *variables]
-        for name, arm in search.arms.items():
-            for at in arm.front:
-                one = arm.evaluations[at]
-                values = [one.values.get(variable) for variable in variables]
-                yield [name, one.number, *arm.gains[at].tolist(), self._cost(one), *values]
-
-    def _state(self, one: Evaluation, lacks: str) -> tuple[str, str]:
-        if one.infeasible:
-            return "infeasible", one.infeasible
-        if lacks:
-            return "lacking", lacks
-        if one.instants < len(self.search.instants):
-            return "dropped", "two standard errors below the best so far"
-        return "complete", ""
+        """Yield the heading, and the candidates that no other dominates."""
+        variables = [variable.name for variable in self.search.space.variables]
+        gains = [f"{name}_gain" for name in self.search.space.objectives]
+        yield ["number", "strategy", *gains, "cost_eur", *variables]
+        for at in self.search.best_of():
+            one = self.search.evaluations[at]
+            values = [one.values.get(variable) for variable in variables]
+            yield [one.number, one.strategy, *self.gains[at].tolist(), self._cost(one), *values]
 
     def _cost(self, one: Evaluation) -> float | None:
         space = self.search.space
@@ -291,34 +291,39 @@ class SearchResult(Reported):
             return None
         return space.cost_eur(space.start if one.number == 0 else space.rig(one.values, str(one.number)))
 
+    def _pictures(self) -> Iterator[tuple[str, str, Figure]]:
+        """Yield stem, description and figure: progress, each objective over each variable, and the front."""
+        search, names = self.search, list(self.search.space.objectives)
+        factors = np.array([shown_unit(unit).factor for unit in self.units])
+        labels = [f"gain in {name} ({unit_words(unit)})" for name, unit in zip(names, self.units, strict=True)]
+        gains = factors * self.gains
+        strategies = np.array([evaluation.strategy for evaluation in search.evaluations])
+        best_so_far = np.maximum.accumulate(np.nan_to_num(gains, nan=-np.inf), axis=0)
+        lines = {
+            label: np.column_stack([np.arange(len(line)), line])
+            for label, line in zip(labels, best_so_far.T, strict=True)
+        }
+        yield "progress", "The best so far over the candidates", draw_progress(lines, title=search.space.name)
+        groups = {name: strategies == name for name in (OPTIMIZER, RANDOM)}
+        for at, label in enumerate(labels):
+            points = {}
+            for variable in search.space.variables:
+                values = [evaluation.values.get(variable.name) for evaluation in search.evaluations]
+                points[variable.name] = {
+                    name: ([values[k] for k in np.flatnonzero(group)], gains[group, at])
+                    for name, group in groups.items()
+                }
+            stem = "objective" if len(names) == 1 else f"objective_{at + 1}"
+            description = f"Gain in {names[at]} over each variable"
+            yield stem, description, draw_slices(points, label=label, title=search.space.name)
+        if len(names) > 1:
+            is_on_front = np.isin(np.arange(len(gains)), search.best_of())
+            every = {name: gains[group] for name, group in groups.items()}
+            fronts = {name: gains[group & is_on_front] for name, group in groups.items()}
+            yield "pareto", "Trade-off of the objectives", draw_fronts(labels, every, fronts, title=search.space.name)
 
-def _arm_record(arm: Arm) -> dict[str, Any]:
-    others = arm.evaluations[1:]
-    return {
-        "candidates": len(others),
-        "infeasible": sum(bool(one.infeasible) for one in others),
-        "scored at all instants": len(arm.complete) - (0 in arm.complete),
-        "instants": sum(one.instants for one in others),
-        "seconds": round(sum(one.seconds for one in others), 3),
-    }
 
-
-def _lacks(arm: Arm, at: int | None) -> str:
-    """What a candidate lacks of what must be kept, the most first; nothing if it keeps all."""
-    each = {} if at is None else arm.lacking(at)
-    return "; ".join(f"{each[name]:.2%} of {name}" for name in sorted(each, key=lambda name: -each[name]))
-
-
-def _value(value: object) -> str:
+def _format_value(value: object) -> str:
     if value is None:
         return "-"
     return f"{value:.3f}" if isinstance(value, float) else str(value)
-
-
-def _spent_table(search: PlacementSearch, volumes: Mapping[str, float] | None) -> PageTable:
-    arms = {name: _arm_record(arm) for name, arm in search.arms.items()}
-    rows = [(Words(name), *(Words(f"{value:g}") for value in arm.values())) for name, arm in arms.items()]
-    notes = [f"Racing saved {search.share_saved:.0%} of the instants."]
-    if volumes:
-        notes.append("Hypervolume: " + ", ".join(f"{name} {volume:.3g}" for name, volume in volumes.items()) + ".")
-    return PageTable("What was spent", ("arm", *next(iter(arms.values()))), rows, notes=notes)

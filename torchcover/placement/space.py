@@ -9,11 +9,10 @@ from typing import Self
 import numpy as np
 from pydantic import Field, NonNegativeFloat, model_validator
 
-from torchcover.placement.carrier import NamedRig, VehicleSpace
 from torchcover.placement.constraints import Constraints, check_prices, misplaced, price_eur
-from torchcover.placement.free_sensor import FreeSensor, mirrored
-from torchcover.placement.questions import Questions
-from torchcover.placement.variables import Value, Variable
+from torchcover.placement.free_sensor import FreeSensor, Value, Variable, mirrored
+from torchcover.placement.host_vehicle import NamedRig, VehicleSpace
+from torchcover.placement.queries import Queries
 from torchcover.simulation import Lidar, LidarModel, Rig, Sensor
 from torchcover.simulation.documents import NameOrFile
 
@@ -91,19 +90,19 @@ class SearchSpace(VehicleSpace):
     @model_validator(mode="after")
     def _check_places(self) -> Self:
         try:
-            carrier = self.carrier
+            host = self.host
         except FileNotFoundError as error:
             raise ValueError(str(error)) from error
         for name, free in self.free.items():
             for region in (free.region,) if isinstance(free.region, str) else free.region or ():
                 try:
-                    carrier.region(region)
+                    host.region(region)
                 except ValueError as error:
                     raise ValueError(f"free.{name}.{error}") from error
         for name in self.free:
             self._check_place(name)
-        questions = Questions.around(carrier.outline_m, self.asked)
-        questions.check(self.start)
+        queries = Queries.around(host.outline_m, self.numbers)
+        queries.check(self.start)
         self._check_constraints()
         outside = self._outside()
         if outside:
@@ -122,7 +121,7 @@ class SearchSpace(VehicleSpace):
             except ValueError as error:
                 complaint = str(error)
                 continue
-            wrong = misplaced(sensor, self.carrier.skin) if sensor is not None else complaint
+            wrong = misplaced(sensor, self.host.skin) if sensor is not None else complaint
             if wrong is None:
                 return
             complaint = wrong
@@ -182,7 +181,7 @@ class SearchSpace(VehicleSpace):
             odd = ", ".join(sorted(values.keys() ^ known.keys()))
             raise ValueError(f"values of {', '.join(known)} are needed; missing or unknown: {odd}")
         for variable in self.variables:
-            variable.unit(values[variable.name])
+            variable.check(values[variable.name])
         sensors = [self._sensor(sensor.name, values) for sensor in self.start.sensors]
         if all(sensor is None for sensor in sensors):
             raise ValueError("no sensor is left")
@@ -205,7 +204,7 @@ class SearchSpace(VehicleSpace):
             return start
         if free.mirror_of is not None:
             return mirrored(start, self._sensor(free.mirror_of, values))
-        return free.made(start, values, self.carrier)
+        return free.made(start, values, self.host)
 
     def start_values(self) -> dict[str, Value]:
         """Values of the rig that the search starts from, of those variables of which it has one in the space.
@@ -220,12 +219,12 @@ class SearchSpace(VehicleSpace):
             name: value
             for sensor in self.start.sensors
             if sensor.name in self.free
-            for name, value in self.free[sensor.name].start_values(sensor, self.carrier).items()
+            for name, value in self.free[sensor.name].start_values(sensor, self.host).items()
         }
 
     def violations(self, rig: Rig) -> tuple[str, ...]:
         """Why a rig cannot be, in words; nothing if it can. Self-hits are not among it: they are known after a scan."""
-        wrong = (misplaced(sensor, self.carrier.skin) for sensor in rig.sensors if sensor.name in self.free)
+        wrong = (misplaced(sensor, self.host.skin) for sensor in rig.sensors if sensor.name in self.free)
         places = tuple(each for each in wrong if each is not None)
         return (*places, *self.constraints.broken_by(rig, self.free, self.cost_eur(rig)))
 

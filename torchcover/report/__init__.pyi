@@ -1,5 +1,4 @@
 from .charts import ChoiceSize as ChoiceSize
-from .charts import Slice as Slice
 from .charts import draw_choice as draw_choice
 from .charts import draw_encounters as draw_encounters
 from .charts import draw_fronts as draw_fronts

@@ -62,82 +62,53 @@ COLUMNS = 3
 BOUND = "#999999"
 
 
-class Slice(NamedTuple):
-    """What a model says about one variable, with all others as they are at the best candidate.
+def draw_progress(lines: Mapping[str, Float64], *, title: str) -> Figure:
+    """Draw how much was gained after how many candidates.
 
     Args:
-        name: Of the variable.
-        x: (n,) values of a number, or the places of options.
-        mean: (n,) what the model expects there.
-        deviation: (n,) its standard deviation.
-        points: Name of an arm -> (k, 2) values of its candidates and what they gained, wherever they are otherwise.
-        best: Where the best candidate is.
-        options: Names of the options at the places; none for a number.
-    """
-
-    name: str
-    x: Float64
-    mean: Float64
-    deviation: Float64
-    points: Mapping[str, Float64]
-    best: float
-    options: Sequence[str] = ()
-
-
-def draw_progress(lines: Mapping[str, Float64], *, label: str, title: str) -> Figure:
-    """Draw how much was found after how much work.
-
-    Args:
-        lines: Name of an arm -> (k, 2) work and the best so far, a step each.
-        label: What the best is, with its unit.
-        title: What was searched.
+        lines: Label with unit -> (k, 2) number of the candidate, and the best so far.
+        title: Name of the search space.
     """
     figure, ((axes,),) = _sheet(1, 1, title)
-    for at, (name, line) in enumerate(lines.items()):
-        axes.step(*line.T, where="post", color=COLOURS[at], marker=MARKERS[at], markersize=3, label=name)
+    for at, (label, line) in enumerate(lines.items()):
+        style: dict[str, Any] = {"color": COLOURS[at], "marker": MARKERS[at], "markersize": 3}
+        axes.step(*line[np.isfinite(line[:, 1])].T, where="post", label=label, **style)
     axes.axhline(0.0, color="grey", linewidth=0.8, linestyle=":", label="start")
-    axes.set(xlabel="instants that rigs were scored at", ylabel=label)
+    axes.set(xlabel="candidates", ylabel="best so far")
     axes.grid(visible=True, alpha=0.2)
     axes.legend(frameon=False)
     return figure
 
 
-def draw_slices(slices: Sequence[Slice], *, label: str, title: str) -> Figure:
-    """Draw a model along each variable, with a band of two standard deviations.
+def draw_slices(points: Mapping[str, Mapping[str, tuple[Sequence[Any], Float64]]], *, label: str, title: str) -> Figure:
+    """Draw the gains of candidates over each variable.
 
     Args:
-        slices: One for each variable.
-        label: What is on the upright axis, with its unit.
-        title: What was searched.
+        points: Name of a variable -> strategy -> values, numbers or options, and their gains.
+        label: Label of the upright axis, with its unit.
+        title: Name of the search space.
     """
-    rows = -(-len(slices) // COLUMNS)
-    figure, grid = _sheet(rows, min(len(slices), COLUMNS), title)
+    rows = -(-len(points) // COLUMNS)
+    figure, grid = _sheet(rows, min(len(points), COLUMNS), title)
     views = [axes for row in grid for axes in row]
-    for axes, one in zip(views, slices, strict=False):
-        _draw_slice(axes, one)
-    for axes in views[len(slices) :]:
+    for axes, (variable, groups) in zip(views, points.items(), strict=False):
+        options = sorted(
+            {str(value) for values, _ in groups.values() for value in values if not isinstance(value, float)}
+        )
+        for at, (name, (values, gains)) in enumerate(groups.items()):
+            x = [options.index(str(value)) if options else value for value in values]
+            axes.plot(x, gains, linestyle="none", marker=MARKERS[at], markersize=4, color=COLOURS[at], label=name)
+        if options:
+            axes.set_xticks(range(len(options)), options, rotation=20, ha="right", parse_math=False)
+        axes.axhline(0.0, color="grey", linewidth=0.8, linestyle=":", label="start")
+        axes.set_xlabel(variable, parse_math=False)
+        axes.grid(visible=True, alpha=0.2)
+    for axes in views[len(points) :]:
         axes.set_axis_off()
     for row in grid:
         row[0].set_ylabel(label)
     figure.legend(*grid[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
     return figure
-
-
-def _draw_slice(axes: Axes, one: Slice) -> None:
-    low, high = one.mean - 2 * one.deviation, one.mean + 2 * one.deviation
-    if one.options:
-        axes.errorbar(
-            one.x, one.mean, yerr=2 * one.deviation, fmt="s", color="grey", capsize=4, label="model, two deviations"
-        )
-        axes.set_xticks(one.x, one.options, rotation=20, ha="right", parse_math=False)
-    else:
-        axes.fill_between(one.x, low, high, color="grey", alpha=0.25, linewidth=0, label="two deviations")
-        axes.plot(one.x, one.mean, color="grey", label="model at the best")
-    for at, (name, points) in enumerate(one.points.items()):
-        axes.plot(*points.T, linestyle="none", marker=MARKERS[at], markersize=3, color=COLOURS[at], label=name)
-    axes.axvline(one.best, color=BEST, linewidth=0.8, linestyle="--", label="best")
-    axes.set_xlabel(one.name, parse_math=False)
-    axes.grid(visible=True, alpha=0.2)
 
 
 def draw_fronts(
@@ -147,8 +118,8 @@ def draw_fronts(
 
     Args:
         names: Of the objectives, with units.
-        candidates: Name of an arm -> (k, objectives) gains.
-        fronts: The same, of those that no other beats.
+        candidates: Name of a strategy -> (k, objectives) gains.
+        fronts: The same, of those that no other dominates.
         title: What was searched.
     """
     pairs = [(one, other) for one in range(len(names)) for other in range(one + 1, len(names))]
@@ -157,7 +128,7 @@ def draw_fronts(
         for at, name in enumerate(candidates):
             style: dict[str, Any] = {"color": COLOURS[at], "marker": MARKERS[at], "linestyle": "none"}
             axes.plot(*candidates[name][:, [one, other]].T, markersize=3, alpha=0.4, label=name, **style)
-            axes.plot(*fronts[name][:, [one, other]].T, markersize=7, label=f"{name}: beaten by none", **style)
+            axes.plot(*fronts[name][:, [one, other]].T, markersize=7, label=f"{name}: front", **style)
         axes.plot(0.0, 0.0, "*", color=BEST, markersize=10, label="start")
         axes.set_xlabel(names[one], parse_math=False)
         axes.set_ylabel(names[other], parse_math=False)

@@ -1,4 +1,4 @@
-"""What carries the sensors of a space: its vehicle, in its worlds, and the skin that they are mounted on."""
+"""The host vehicle of a search or a selection, and what both documents have in common."""
 
 from collections.abc import Sequence
 from functools import cached_property
@@ -17,10 +17,9 @@ from torchcover.simulation.bodies import mount_regions_of
 from torchcover.simulation.documents import SEVERAL, NameOrFile, Readable, by_name, is_file_name
 from torchcover.simulation.mount_regions import MountRegion, Skin
 
-# More of them make no front that anybody can look at.
-MAX_OBJECTIVES = 3
-# What begin the names of what must not be worse, or is required, among what rigs are scored by.
-NOT_WORSE, REQUIRED = "not worse: ", "required: "
+MAX_OBJECTIVES = 3  # a front of more cannot be plotted
+NOT_WORSE = "not worse: "  # prefix of the name of a number that must not become worse
+REQUIRED = "required: "  # prefix of the name of a number that a requirement bounds
 
 
 def _vehicle(given: str) -> str:
@@ -37,8 +36,8 @@ Names = Annotated[tuple[NameOrFile, ...], SEVERAL, Field(min_length=1)]
 NamedVehicle = Annotated[NameOrFile, AfterValidator(_vehicle)]
 
 
-class Carrier(NamedTuple):
-    """The vehicle that all candidates are mounted on: its name, its skin, and by name where sensors can be mounted."""
+class HostVehicle(NamedTuple):
+    """The vehicle that all candidates are mounted on: its name, its surface, and its mount regions by name."""
 
     name: str
     skin: Skin
@@ -50,8 +49,8 @@ class Carrier(NamedTuple):
         return BoundingBox.around(self.skin.mesh.vertices_m).outline_m
 
     @classmethod
-    def of(cls, scenarios: Sequence[Scenario]) -> "Carrier":
-        """The ego of all scenarios.
+    def of(cls, scenarios: Sequence[Scenario]) -> "HostVehicle":
+        """Return the ego vehicle of all scenarios.
 
         ValueError: they have different ones. FileNotFoundError: a mesh or vehicle file is missing.
         """
@@ -63,7 +62,7 @@ class Carrier(NamedTuple):
         return cls(first.ego_name, Skin(first.ego_mesh()), mount_regions_of(shape))
 
     def region(self, name: str) -> MountRegion:
-        """A mount region by its name. ValueError: there is none; the message lists those that there are."""
+        """Return a mount region. ValueError: there is none of this name; the message lists the others."""
         if name not in self.regions:
             told = ", ".join(self.regions) or "none at all: add mount_regions to its document"
             raise ValueError(f"region: {self.name} has no {name!r}; it has {told}")
@@ -71,7 +70,7 @@ class Carrier(NamedTuple):
 
 
 class VehicleSpace(Readable):
-    """What a search and a choice have in common: the worlds, the vehicle in them, and what a good rig is."""
+    """Base of a search space and a selection: the scenarios, the host vehicle, objectives and requirements."""
 
     kind: ClassVar[str] = "a search space"
     name: str
@@ -84,54 +83,54 @@ class VehicleSpace(Readable):
 
     @property
     def first_rig(self) -> Rig | None:
-        """The rig that it begins with."""
+        """The rig that is there in any case."""
         raise NotImplementedError
 
     @cached_property
-    def asked(self) -> dict[str, Objective]:
-        """All that rigs are scored by: the objectives, what must not be worse, by its words, what regions require."""
+    def numbers(self) -> dict[str, Objective]:
+        """Numbers that rigs are scored by: the objectives, those that must not be worse, and those of requirements."""
         kept = [Objective(region=one) if isinstance(one, str) else one for one in self.not_worse]
         named = {f"{NOT_WORSE}{one.words}": one for one in kept}
         return self.objectives | named | {name: one for name, (one, _) in self._required.items()}
 
     @property
-    def floors(self) -> dict[str, float]:
-        """What numbers must be at least, or of lower ones at most, by their names in `asked`."""
-        return {name: floor for name, (_, floor) in self._required.items()}
+    def bounds(self) -> dict[str, float]:
+        """Bounds of the requirements, by the names of their numbers: the least, or of lower ones the largest value."""
+        return {name: bound for name, (_, bound) in self._required.items()}
 
     @cached_property
     def _required(self) -> dict[str, tuple[Objective, float]]:
-        """Of regions; what bodies and encounters require is measured on its own."""
-        asked, found = self.requirements, dict[str, tuple[Objective, float]]()
-        for one in asked.requirements if asked else ():
-            if asked is None or not isinstance(one, RegionRequirement):
+        """Numbers of regions with their bounds; those of targets and encounters are measured apart."""
+        required, numbers = self.requirements, dict[str, tuple[Objective, float]]()
+        for one in required.requirements if required else ():
+            if required is None or not isinstance(one, RegionRequirement):
                 continue
-            usual_m, own_m = PAPER_HEIGHTS.get(one.height), asked.heights.get(one.height)
+            usual_m, own_m = PAPER_HEIGHTS.get(one.height), required.heights.get(one.height)
             if usual_m is None or own_m not in (None, usual_m):
                 raise ValueError(
                     f"requirements: a search has the bands {dict(PAPER_HEIGHTS)} alone, and {one.height!r} is {own_m} "
                     "there; leave heights out, or check what was found"
                 )
-            region = {one.region: asked.regions[one.region]} if one.region in asked.regions else one.region
+            region = {one.region: required.regions[one.region]} if one.region in required.regions else one.region
             for key in (one.number, *(f"{one.number}_without_{name}" for name in one.without)):
                 each = Objective(number=key, region=region, band=one.height)
-                found |= {f"{REQUIRED}{each.words}, {bound.words}": (each, bound.value) for bound in one.bounds}
-        return found
+                numbers |= {f"{REQUIRED}{each.words}, {bound.words}": (each, bound.value) for bound in one.bounds}
+        return numbers
 
     @cached_property
     def to_check(self) -> Requirements | None:
-        """What of the requirements is about bodies and encounters; None if nothing is."""
-        asked = self.requirements
-        others = tuple(one for one in asked.requirements if not isinstance(one, RegionRequirement)) if asked else ()
-        return asked.model_copy(update={"requirements": others}) if asked and others else None
+        """The requirements of targets and encounters; None if there are none."""
+        required = self.requirements
+        others = [one for one in required.requirements if not isinstance(one, RegionRequirement)] if required else []
+        return required.model_copy(update={"requirements": tuple(others)}) if required and others else None
 
     @cached_property
     def scenarios(self) -> tuple[Scenario, ...]:
-        """The scenarios, each with what carries the sensors as its ego."""
+        """The scenarios, each with the host vehicle as its ego."""
         rigs = {self.first_rig.name: self.first_rig} if self.first_rig else {}
         return tuple(with_ego(Scenario.load(each), rigs, self.vehicle) for each in self.scenario)
 
     @cached_property
-    def carrier(self) -> Carrier:
-        """That ego."""
-        return Carrier.of(self.scenarios)
+    def host(self) -> HostVehicle:
+        """The host vehicle."""
+        return HostVehicle.of(self.scenarios)

@@ -11,7 +11,7 @@ import yaml
 from tests.placement.worlds import BAY, EGO, FLOOR, LOT, WALL, held, lidar, rig
 from torchcover import Rig
 from torchcover.placement import ChoiceSpace, Objective, choose
-from torchcover.placement.choosing import seen_by, worth_of
+from torchcover.placement.selection import observe_points, point_weights
 
 SENSOR = {"type": "lidar", "channels": 16, "vertical_fov_deg": [-40, 2], "columns": 91, "horizontal_fov_deg": 180,
           "max_range_m": 60}  # fmt: skip
@@ -57,9 +57,9 @@ def test_what_points_are_worth_is_what_evaluate_says_of_the_rig(objective, measu
         lidar("c"),
     ]
     with held(objectives={"a": objective}, estimate=measure) as instants:
-        worth = worth_of(instants)
+        worth = point_weights(instants)
         assert worth.sum() == pytest.approx(1.0, rel=1e-12)
-        seen = [seen_by(rig(sensor), instants)[0] for sensor in sensors]
+        seen = [observe_points(rig(sensor), instants)[0] for sensor in sensors]
         for each in ([0], [1, 2], [0, 1, 2]):
             expected = float(instants.estimates(rig(*(sensors[one] for one in each)))[measure].value[0])
             assert worth[0] @ np.any([seen[one] for one in each], axis=0) == pytest.approx(expected, rel=1e-12)
@@ -73,17 +73,17 @@ def test_worlds_that_know_nothing_of_a_part_count_for_nothing(measure):
     asked = {"a": Objective(region="20m", band="obstacle")}
     with held(scenarios, asked, per_world=1, every_s=0.1, estimate=measure) as two:
         value = float(two.estimates(rig())[measure].value[0])
-        assert worth_of(two)[0] @ seen_by(rig(), two)[0] == pytest.approx(value, rel=1e-12)
+        assert point_weights(two)[0] @ observe_points(rig(), two)[0] == pytest.approx(value, rel=1e-12)
     with (
         held(scenarios[:1], asked, per_world=1, every_s=0.1) as one,
-        pytest.raises(ValueError, match="no instant shows any surface of obstacle in 20m"),
+        pytest.raises(ValueError, match="no frame shows any surface of obstacle in 20m"),
     ):
-        worth_of(one)
+        point_weights(one)
 
 
 def test_the_choice_is_the_rig_with_the_best_score_and_its_files_say_so(folder):
     space = loaded(folder, now=["wide_left"])
-    with held(space.scenarios, space.asked, worlds=2) as instants:
+    with held(space.scenarios, space.numbers, worlds=2) as instants:
         found = choose(space, instants, test_seed=5, fresh_worlds=3)
         pairs = [("front", "rear"), ("front", "left"), ("rear", "left")]
         named = {sensor.name: sensor for sensor in space.sensors}
@@ -94,15 +94,15 @@ def test_the_choice_is_the_rig_with_the_best_score_and_its_files_say_so(folder):
             for pair in pairs
         }
     best = max(scores, key=lambda pair: scores[pair])
-    assert set(found.names(found.best.chosen)) == {f"wide_{one}" for one in best}
+    assert set(found.names(found.best.selected)) == {f"wide_{one}" for one in best}
     assert found.best.values[0] == pytest.approx(scores[best], rel=1e-12)
     assert found.numbers["around"].value == scores[best]
     assert f"{100 * found.numbers['around'].value:.2f} %" in found.sentence
-    assert found.best.proven
+    assert found.best.is_proven
     assert list(found.refused) == ["wide_inside"]
     assert found.gains[0].test.blocks == 3
     assert found.gains[0].search_gain == pytest.approx(
-        found.best.values[0] - found.candidates.values(found.now)[0], rel=1e-6
+        found.best.values[0] - found.coverage.values(found.now)[0], rel=1e-6
     )
     written = {path.name for path in found.save(folder / "out")}
     assert written == {
@@ -110,7 +110,7 @@ def test_the_choice_is_the_rig_with_the_best_score_and_its_files_say_so(folder):
     }  # fmt: skip
     assert Rig.load(folder / "out" / "best.yaml").sensors == found.rig.sensors
     rows = list(csv.DictReader((folder / "out" / "candidates.csv").read_text().splitlines()))
-    assert [row["name"] for row in rows if row["chosen"] == "True"] == sorted(found.names(found.best.chosen))
+    assert [row["name"] for row in rows if row["chosen"] == "True"] == sorted(found.names(found.best.selected))
     assert "inside" in rows[-1]["why_not"]
     assert found.to_dataframe()["name"].tolist() == [row["name"] for row in rows]
     assert found.sentence in repr(found)
@@ -120,14 +120,14 @@ def test_the_choice_is_the_rig_with_the_best_score_and_its_files_say_so(folder):
 def test_what_must_not_be_worse_is_kept_by_the_best_of_several_objectives(folder):
     objectives = {side: {"band": "ground", "region": f"{side}_3m", "detection": 0.3} for side in ("front", "rear")}
     space = loaded(folder, objectives=objectives, now=["wide_left"], not_worse=["left_3m"])
-    with held(space.scenarios, space.asked, worlds=2) as instants:
+    with held(space.scenarios, space.numbers, worlds=2) as instants:
         found = choose(space, instants, test_seed=5, fresh_worlds=3)
-        kept = found.candidates.values(found.now)[2]
+        kept = found.coverage.values(found.now)[2]
         # The thresholds differ: what a point is worth is a matter of both.
         values = instants.estimates(found.rig)["area"].value.tolist()
     assert found.best.values == pytest.approx(values, rel=1e-12)
-    assert list(space.asked) == ["front", "rear", "not worse: left_3m"]
-    assert all(one.values[2] >= kept - 2e-6 and "wide_left" in found.names(one.chosen) for one in found.found)
+    assert list(space.numbers) == ["front", "rear", "not worse: left_3m"]
+    assert all(one.values[2] >= kept - 2e-6 and "wide_left" in found.names(one.selected) for one in found.found)
     assert [one.values[at] for at, one in enumerate(found.found[1:])] == [
         max(one.values[at] for one in found.found) for at in range(2)
     ]
@@ -138,16 +138,16 @@ def test_what_must_not_be_worse_is_kept_by_the_best_of_several_objectives(folder
 
 def test_where_no_choice_keeps_what_is_there_the_least_bad_says_by_how_much(folder):
     space = loaded(folder, choose={"at_most": 1}, now=["wide_front", "wide_rear"], not_worse=["front_3m", "rear_3m"])
-    with held(space.scenarios, space.asked, worlds=1) as instants:
+    with held(space.scenarios, space.numbers, worlds=1) as instants:
         found = choose(space, instants, test_seed=5, fresh_worlds=1)
-        each = {at: found.candidates.values([at])[1:] for at in range(len(found.sensors))}
-        kept = found.candidates.values(found.now)[1:]
+        each = {at: found.coverage.values([at])[1:] for at in range(len(found.sensors))}
+        kept = found.coverage.values(found.now)[1:]
     short = {at: (kept - values).clip(0).sum() for at, values in each.items()}
-    assert found.best.short == pytest.approx(min(short.values()))
-    assert found.best.short > 0.01
-    assert short[found.best.chosen[0]] == min(short.values())
-    lost = kept - each[found.best.chosen[0]]
-    names = [name for name in space.asked if name not in space.objectives]
+    assert found.best.shortfall == pytest.approx(min(short.values()))
+    assert found.best.shortfall > 0.01
+    assert short[found.best.selected[0]] == min(short.values())
+    lost = kept - each[found.best.selected[0]]
+    names = [name for name in space.numbers if name not in space.objectives]
     told = [f"{100 * lack:.2f} points of {name}" for lack, name in zip(lost, names, strict=True) if lack > 1e-6]
     assert f"keeps all that must be kept, and this one lacks the least: {'; '.join(told)}" in found.sentence
 
@@ -156,7 +156,7 @@ def test_a_candidate_with_too_many_rays_on_the_vehicle_is_refused(folder):
     low = {"front": PLACES["front"], "flat": {"z_m": 1.51}}
     candidates, limits = {"wide": {"sensor": SENSOR, "places": low}}, {"at_most": 1, "max_self_hits": 0.4}
     space = loaded(folder, candidates=candidates, choose=limits)
-    with held(space.scenarios, space.asked, worlds=1) as instants:
+    with held(space.scenarios, space.numbers, worlds=1) as instants:
         found = choose(space, instants, test_seed=5, fresh_worlds=1)
     assert "of its rays end on the vehicle; max_self_hits is 40.0%" in found.refused["wide_flat"]
 
@@ -210,7 +210,7 @@ def test_what_cannot_be_chosen_is_refused_in_one_line(folder, changes, message):
 def test_candidates_that_are_all_inside_are_refused(folder):
     space = loaded(folder, candidates={"wide": {"sensor": SENSOR, "places": {"a": {"z_m": 0.7}}}})
     with (
-        held(space.scenarios, space.asked, worlds=1) as instants,
+        held(space.scenarios, space.numbers, worlds=1) as instants,
         pytest.raises(ValueError, match=r"none of 1 can be there; of wide_a: .* inside the ego"),
     ):
         choose(space, instants, test_seed=5, fresh_worlds=1)
@@ -220,7 +220,7 @@ def test_candidates_that_see_nothing_that_counts_are_refused(folder):
     up = {**SENSOR, "vertical_fov_deg": [60, 80]}
     space = loaded(folder, candidates={"wide": {"sensor": up, "places": PLACES}})
     with (
-        held(space.scenarios, space.asked, worlds=1) as instants,
+        held(space.scenarios, space.numbers, worlds=1) as instants,
         pytest.raises(ValueError, match="none of the 3 that can be there adds anything"),
     ):
         choose(space, instants, test_seed=5, fresh_worlds=1)
@@ -228,7 +228,7 @@ def test_candidates_that_see_nothing_that_counts_are_refused(folder):
 
 def test_of_few_fresh_worlds_there_is_no_error_and_no_gain_is_shown(folder):
     space = loaded(folder, now=["wide_left"])
-    with held(space.scenarios, space.asked, worlds=1) as instants:
+    with held(space.scenarios, space.numbers, worlds=1) as instants:
         found = choose(space, instants, test_seed=5, fresh_worlds=1)
     assert "no gain is shown" in found.sentence
     assert "nan" not in found.sentence

@@ -1,4 +1,4 @@
-"""Common instants: the frames of SimulatedFrames, the numbers of evaluate, whoever holds the worlds."""
+"""Common frames: those of SimulatedFrames, with the numbers of evaluate, in any number of processes."""
 
 import gc
 import os
@@ -9,11 +9,10 @@ import pytest
 import torch
 
 from tests.placement.worlds import BAY, FLOOR, LOT, OBJECTIVES, WALL, held, lidar, rig, yard
-from torchcover.coverage import CoverageMetric
 from torchcover.evaluation import evaluate
 from torchcover.placement import Objective
-from torchcover.placement.common_instants import HeldWorlds
-from torchcover.placement.questions import Questions
+from torchcover.placement.common_frames import HeldFrames
+from torchcover.placement.queries import Queries
 from torchcover.simulation import RegionsOfInterest, Scenario, SimulatedFrames, Simulator, SurfaceReference
 
 NOISY = lidar("noisy", range_noise_m=0.03, dropout=0.2, mount={"x_m": 0.5, "z_m": 2.2, "yaw_deg": 40})
@@ -50,36 +49,36 @@ def test_ideal_sensors_have_a_point_for_every_hit():
     points = [[len(frame.sensor) for frame in of.frames(short)] for of in (ideal, real)]
     assert points[0] == [len(frame.sensor) for frame in real.frames(rig(name=short.name))]
     assert points[1][0] < points[0][0]
-    assert ideal.anew(1, 1, {}).sensor_model == "ideal"
+    assert ideal.resampled(1, 1, {}).sensor_model == "ideal"
 
 
 def test_rays_that_change_no_objective_are_not_cast_and_change_none(monkeypatch):
     near = {"near": Objective(detection=0.2, band="ground", region={"ahead": {"x_m": (3, 8), "y_m": (-2, 2)}})}
     some = held(objectives=near, worlds=1, rays=200)
-    monkeypatch.setattr(Questions, "within_m", None)
+    monkeypatch.setattr(Queries, "within_m", None)
     every = held(objectives=near, worlds=1, rays=200)
     same(every.estimates(TWO), some.estimates(TWO))
     assert len(next(some.frames(TWO)).sensor) < 0.7 * len(next(every.frames(TWO)).sensor)
 
 
-def test_numbers_are_those_of_evaluate_on_the_same_instants_to_the_last_bit():
+def test_numbers_are_those_of_evaluate_on_the_same_frames_to_the_last_bit():
     """By area and over known cells, in regions of several objectives, from frames that nobody has cut."""
     found = held(objectives=OBJECTIVES, worlds=4, per_world=2)
     frames = SimulatedFrames(
         found._worlds[0],
         TWO,
-        steps=max(instant.step for instant in found.instants) + 1,
+        steps=max(index.step for index in found.indices) + 1,
         every_s=0.4,
-        reference_sensor=found.questions.reference_sensor(1024),
+        reference_sensor=found.queries.reference_sensor(1024),
     )
-    steps = [instant.step for instant in found.instants]
+    steps = [index.step for index in found.indices]
     assert len(steps) == 8
 
     class InOrder(SimulatedFrames):
-        """The instants of the search, in its order."""
+        """The frames of the search."""
 
         def __getitem__(self, index):
-            return frames[steps[found.order[index]]]
+            return frames[steps[index]]
 
     in_order = copy(frames)
     in_order.__class__, in_order.steps = InOrder, len(steps)
@@ -96,64 +95,38 @@ def test_numbers_are_those_of_evaluate_on_the_same_instants_to_the_last_bit():
             ]
             values = torch.tensor([number.value for number in numbers], dtype=torch.float64)
             assert own.value[column] == values.mean()
-    last = list(found.prefixes(TWO))[-1]
-    np.testing.assert_array_equal(last.estimate.value, estimates["area"].value)
-
-
-def test_every_prefix_is_the_coverage_of_its_instants(instants):
-    questions = instants.questions
-    metric = CoverageMetric(
-        questions.grid,
-        questions.thresholds_m,
-        max_radius=90.0,
-        blocks=16,
-        regions=questions.regions.values(),
-        square_metres=True,
-    )
-    frames = instants.frames(TWO, instants.order.tolist())
-    for prefix in instants.prefixes(TWO):
-        for frame in (next(frames) for _ in range(3)):
-            metric.update(
-                frame.sensor,
-                frame.reference,
-                weights=frame.reference_weights,
-                place_in_time=frame.place_in_time,
-                height=frame.reference_heights_m,
-            )
-        (near,) = metric.estimates([(questions.regions["bay"], "ground")], "area")
-        (other,) = metric.estimates([(questions.regions["bay"], "obstacle")], "area")
-        both = torch.stack([other.value[2], near.value[2]]).mean()
-        np.testing.assert_array_equal(prefix.estimate.value[2], both)
-    assert prefix.instants == 6
+    np.testing.assert_array_equal(found.score(TWO).estimate.value, estimates["area"].value)
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_it_makes_no_difference_who_holds_the_worlds(instants, workers):
+def test_it_makes_no_difference_who_holds_the_worlds(frames, workers):
     with held(workers=workers) as elsewhere:
-        same(elsewhere.estimates(TWO), instants.estimates(TWO))
-        assert all(seen.frame is None for seen in elsewhere._made(TWO, [0, 3], ("area",)))  # clouds stay where they are
-        for one, other in zip(elsewhere.prefixes(rig()), instants.prefixes(rig()), strict=True):
-            np.testing.assert_array_equal(one.estimate.left_out, other.estimate.left_out)
-            assert one.self_hit_share == other.self_hit_share
-        for held_by in (elsewhere, instants):
+        same(elsewhere.estimates(TWO), frames.estimates(TWO))
+        assert all(
+            seen.frame is None for seen in elsewhere._compute(TWO, [0, 3], ("area",))
+        )  # clouds stay where they are
+        one, other = elsewhere.score(rig()), frames.score(rig())
+        np.testing.assert_array_equal(one.estimate.left_out, other.estimate.left_out)
+        assert one.self_hit_share == other.self_hit_share
+        for held_by in (elsewhere, frames):
             with pytest.raises(ValueError, match="inside the ego of 'lot'"):
                 held_by.estimates(rig(lidar(mount={"z_m": 1.0})))
-        same(elsewhere.estimates(TWO), instants.estimates(TWO))  # nothing is left over of the error
+        same(elsewhere.estimates(TWO), frames.estimates(TWO))  # nothing is left over of the error
 
 
 def test_a_world_stays_with_the_process_that_has_built_it(monkeypatch, tmp_path):
     """The k-th batch of a DataLoader is for its k-th worker."""
-    built = HeldWorlds._built
+    built = HeldFrames._build
 
-    def noted(self, instant, number):
-        (tmp_path / f"{instant.world} {number} {os.getpid()}").touch()
-        return built(self, instant, number)
+    def noted(self, index, number):
+        (tmp_path / f"{index.world} {number} {os.getpid()}").touch()
+        return built(self, index, number)
 
-    monkeypatch.setattr(HeldWorlds, "_built", noted)
+    monkeypatch.setattr(HeldFrames, "_build", noted)
     with held(workers=2, worlds=4) as elsewhere:
         for _ in range(2):
             elsewhere.estimates(rig())
-        list(elsewhere.prefixes(TWO))
+        elsewhere.score(TWO)
     world, number, process = zip(*(path.name.split() for path in tmp_path.iterdir()), strict=True)
     assert sorted(map(int, number)) == list(range(8))
     of_worlds = dict(zip(world, process, strict=True))
@@ -161,21 +134,21 @@ def test_a_world_stays_with_the_process_that_has_built_it(monkeypatch, tmp_path)
     assert sorted(map(list(of_worlds.values()).count, set(process))) == [2, 2]
 
 
-def test_the_order_of_rigs_makes_no_difference(instants):
-    whole = instants.estimates(TWO)
-    other = instants.estimates(rig())
-    same(instants.estimates(TWO), whole)
+def test_the_order_of_rigs_makes_no_difference(frames):
+    whole = frames.estimates(TWO)
+    other = frames.estimates(rig())
+    same(frames.estimates(TWO), whole)
     assert not torch.equal(other["area"].value, whole["area"].value)
-    shares = [prefix.self_hit_share for prefix in instants.prefixes(TWO)]
-    counts = [frame.counts for frame in instants.frames(TWO)]
-    assert shares[-1] == sum(one["self_hits"] for one in counts) / sum(one["rays"] for one in counts)
+    share = frames.score(TWO).self_hit_share
+    counts = [frame.counts for frame in frames.frames(TWO)]
+    assert share == sum(one["self_hits"] for one in counts) / sum(one["rays"] for one in counts)
 
 
 def test_what_some_worlds_do_not_show_is_about_the_others():
     obstacles = {"ahead": Objective(region="20m", band="obstacle"), "ground": Objective(region="20m", band="ground")}
     scenarios = [yard(WALL), yard(name="empty"), LOT]
     found = held(scenarios, obstacles, worlds=1, per_world=1)
-    assert [instant.world for instant in found.instants] == [0, 1, 2]
+    assert [index.world for index in found.indices] == [0, 1, 2]
     estimate = found.estimates(rig())["area"]
     assert torch.isfinite(estimate.left_out).all()
     assert estimate.left_out[1, 0] == estimate.value[0]  # the empty one has no obstacle
@@ -185,7 +158,7 @@ def test_what_some_worlds_do_not_show_is_about_the_others():
 
 def test_a_world_without_traffic_shows_each_instant_once():
     found = held([yard(WALL)], per_world=4)
-    assert [instant.world for instant in found.instants] == [0] * 4
+    assert [index.world for index in found.indices] == [0] * 4
     assert len({float(frame.reference_weights.sum()) for frame in found.frames()}) == 4  # draws of the reference
 
 
@@ -195,7 +168,7 @@ def test_a_world_without_traffic_shows_each_instant_once():
         ({"scenarios": []}, "scenarios: at least one"),
         ({"objectives": {}}, "objectives: at least one"),
         ({"worlds": 0}, "worlds: at least 1"),
-        ({"per_world": 4}, "per_world: a run of 'lot' has 3 instants that are 0.4 s apart; got 4"),
+        ({"per_world": 4}, "per_world: a run of 'lot' has 3 frames that are 0.4 s apart; got 4"),
         ({"every_s": 0.3}, "every_s: a positive multiple"),
         ({"workers": -1}, "workers: a number >= 0"),
         ({"seed": -1}, "seed: a number >= 0"),
@@ -216,49 +189,49 @@ def test_what_makes_no_sense_is_said_at_the_door(change, message):
         held(**change)
 
 
-def test_rigs_that_cannot_be(instants):
+def test_rigs_that_cannot_be(frames):
     with pytest.raises(ValueError, match="below the ground"):
-        instants.estimates(rig(lidar(mount={"x_m": 3.0, "z_m": -1.0})))
+        frames.estimates(rig(lidar(mount={"x_m": 3.0, "z_m": -1.0})))
 
 
 def test_a_rig_for_another_vehicle_is_refused_unless_the_vehicle_was_said():
     open_lot = Scenario.model_validate({"name": "open", "bodies": [FLOOR], "ego": {"pose": {}}})
     near = {"near": Objective(region="20m", band="ground")}
     roof = rig(vehicle="renault_zoe")
-    with pytest.raises(ValueError, match="is for the vehicle renault_zoe, and these instants have suv: say which"):
+    with pytest.raises(ValueError, match="is for the vehicle renault_zoe, and these frames have suv: say which"):
         held([open_lot], near).estimates(roof)
     assert len(held([open_lot], near, vehicle="renault_zoe").estimates(roof)["area"].value) == 1
 
 
 def test_a_process_that_was_killed_is_told_and_the_others_end_with_the_search():
-    instants = held(workers=9, worlds=2, per_world=1)
-    killed, other = instants._loader._iterator._workers
+    frames = held(workers=9, worlds=2, per_world=1)
+    killed, other = frames._loader._iterator._workers
 
     def ask():
         killed.kill()
         killed.join()
-        instants.estimates(rig())
+        frames.estimates(rig())
 
     with pytest.raises((ChildProcessError, RuntimeError), match=r"was killed|is killed by signal"):  # at any time
         ask()
-    instants.close()
+    frames.close()
     gc.collect()  # the error knows of what it was raised from
     other.join(20)
     assert other.exitcode == 0
 
 
-def test_threads_make_no_difference(instants):
+def test_threads_make_no_difference(frames):
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(1 if before > 1 else 2)
-        other = instants.estimates(TWO)
+        other = frames.estimates(TWO)
     finally:
         torch.set_num_threads(before)
-    same(other, instants.estimates(TWO))
+    same(other, frames.estimates(TWO))
 
 
 def test_a_recording_is_one_world_for_any_seed_and_none_of_it_is_fresh():
     with held(["tracks_table"], {"near": Objective(region="20m", band="ground")}, worlds=3, every_s=0.5) as recorded:
-        assert [instant.world for instant in recorded.instants] == [0, 0]
+        assert [index.world for index in recorded.indices] == [0, 0]
         with pytest.raises(ValueError, match="one whose worlds are drawn is needed; 'tracks_table' is the same"):
-            recorded.anew(9, 3, {})
+            recorded.resampled(9, 3, {})

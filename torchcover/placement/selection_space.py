@@ -18,11 +18,11 @@ from pydantic import (
 )
 
 from torchcover.geometry.arrays import Float64
-from torchcover.placement.carrier import Carrier, NamedRig, VehicleSpace
 from torchcover.placement.constraints import APART_M, MOUNT
 from torchcover.placement.free_sensor import HEIGHT_M, pose_of
-from torchcover.placement.questions import Questions
-from torchcover.placement.subsets import Limits
+from torchcover.placement.host_vehicle import HostVehicle, NamedRig, VehicleSpace
+from torchcover.placement.queries import Queries
+from torchcover.placement.selection_solver import SelectionLimits
 from torchcover.simulation import Document, Pose, Rig, Sensor
 from torchcover.simulation.rig import read_sensor
 
@@ -53,19 +53,19 @@ class MountGrid(Document):
     yaw_deg: tuple[float, ...] = Field(default=(0.0,), min_length=1)
     pitch_deg: tuple[float, ...] = Field(default=(0.0,), min_length=1)
 
-    def poses(self, carrier: Carrier) -> Iterator[tuple[str, Pose]]:
+    def poses(self, host: HostVehicle) -> Iterator[tuple[str, Pose]]:
         """Names and poses; where a window of a region has nothing of the body, there is none.
 
         ValueError: the vehicle has no such region.
         """
         for name in self.region:
-            region = carrier.region(name)
+            region = host.region(name)
             spans = [bounds[1] - bounds[0] for bounds in (region.x_m, region.y_m, region.z_m) if bounds is not None]
             counts = [max(round(span / self.spacing_m), 1) for span in spans]
             shares = [((np.arange(count) + 0.5) / count).tolist() for count in counts]
             for number, (u, v) in enumerate(product(*shares)):
                 try:
-                    point = region.on(carrier.skin, u, v)
+                    point = region.on(host.skin, u, v)
                 except ValueError:
                     continue
                 x, y, z = (point.place_m + self.height_m * point.outward).tolist()
@@ -101,14 +101,14 @@ class CandidateGroup(Document):
             raise ValueError("places, grid: at least one of the two is needed; got neither")
         return self
 
-    def sensors(self, group: str, carrier: Carrier) -> Iterator[Sensor]:
+    def sensors(self, group: str, host: HostVehicle) -> Iterator[Sensor]:
         """A sensor at each place on a vehicle, called after the group and the place.
 
         ValueError: the vehicle has no such region.
         """
         places = list(self.places.items())
         if self.grid is not None:
-            places += self.grid.poses(carrier)
+            places += self.grid.poses(host)
         assert isinstance(self.sensor, Document)  # as all sensors of a rig
         for place, pose in places:
             yield self.sensor.model_copy(update={"name": f"{group}_{place}", "mount": pose})
@@ -206,12 +206,12 @@ class ChoiceSpace(VehicleSpace):
             )
         if self.not_worse and not self.now:
             raise ValueError("not_worse: say what is there today, now, or there is nothing to be worse than")
-        questions = Questions.around(self.carrier.outline_m, self.asked)
-        for name, one in self.asked.items():
+        queries = Queries.around(self.host.outline_m, self.numbers)
+        for name, one in self.numbers.items():
             if not one.key.startswith("detection_") or "_without_" in one.key:
                 wanted = f"a detection, as in detection: 0.4; got {one.key!r}"
                 raise ValueError(f"objective {name!r}: candidates are chosen by {wanted}")
-        questions.check(self.rig(self.sensors[:1], self.name))
+        queries.check(self.rig(self.sensors[:1], self.name))
         return self
 
     def _check_prices(self) -> None:
@@ -236,10 +236,10 @@ class ChoiceSpace(VehicleSpace):
     @cached_property
     def sensors(self) -> tuple[Sensor, ...]:
         """The candidates, group by group."""
-        carrier, found = self.carrier, list[Sensor]()
+        host, found = self.host, list[Sensor]()
         for name, group in self.candidates.items():
             try:
-                found += group.sensors(name, carrier)
+                found += group.sensors(name, host)
             except ValueError as error:
                 raise ValueError(f"candidates.{name}.grid.{error}") from error
         return tuple(found)
@@ -250,10 +250,10 @@ class ChoiceSpace(VehicleSpace):
         return tuple(
             self.cost.get(name, 0.0) + (self.cost.get(MOUNT, 0.0) if self.cost else 0.0)
             for name, group in self.candidates.items()
-            for _ in group.sensors(name, self.carrier)
+            for _ in group.sensors(name, self.host)
         )
 
-    def limits(self, kept: list[int]) -> Limits:
+    def limits(self, kept: list[int]) -> SelectionLimits:
         """What a subset of some candidates must keep to.
 
         Args:
@@ -262,11 +262,11 @@ class ChoiceSpace(VehicleSpace):
         places_m = np.array([self.sensors[one].mount.matrix()[:3, 3] for one in kept]).reshape(-1, 3)
         apart_m = np.linalg.norm(places_m[:, None] - places_m[None], axis=2)
         most_to_pay = self.choose.max_cost_eur
-        return Limits(
-            most=min(self.choose.at_most or len(kept), len(kept)),
-            prices=[self.prices[one] for one in kept] if self.cost else (),
-            most_to_pay=np.inf if most_to_pay is None else most_to_pay,
-            apart=apart_m >= self.choose.min_distance_m,
+        return SelectionLimits(
+            max_sensors=min(self.choose.at_most or len(kept), len(kept)),
+            prices_eur=[self.prices[one] for one in kept] if self.cost else (),
+            max_cost_eur=np.inf if most_to_pay is None else most_to_pay,
+            compatible=apart_m >= self.choose.min_distance_m,
         )
 
     def too_close(self, one: Sensor) -> bool:

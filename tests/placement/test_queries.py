@@ -9,8 +9,8 @@ from torchcover.coverage import CoverageMetric, Maximum, Quantiles
 from torchcover.estimation import Estimate
 from torchcover.evaluation import CoverageObserver
 from torchcover.placement import Objective
-from torchcover.placement.questions import Questions
-from torchcover.placement.racing import gains
+from torchcover.placement.queries import Queries
+from torchcover.placement.search import measure_gains
 
 OUTLINE_M = np.array([[-2.0, -1.0], [2.0, -1.0], [2.0, 1.0], [-2.0, 1.0]])
 LANE = {"lane": {"x_m": [-7.3, -2.0], "y_m": [-1.2, 1.6]}}
@@ -19,7 +19,7 @@ TWO = rig(lidar(), lidar("low", mount={"x_m": 2.2, "z_m": 0.6}), name="two")
 
 def test_the_points_that_are_kept_are_those_in_the_regions_and_in_their_cells():
     near = Objective(region="20m", band="obstacle"), Objective(region="20m")
-    asked = Questions.around(OUTLINE_M, {"a": near[0], "b": Objective(region=LANE, detection=0.1), "c": near[1]})
+    asked = Queries.around(OUTLINE_M, {"a": near[0], "b": Objective(region=LANE, detection=0.1), "c": near[1]})
     assert asked.thresholds_m == (0.1, 0.4)
     assert asked.max_radius_m == 0.4
     # Cells of half a metre that the lane touches.
@@ -29,7 +29,7 @@ def test_the_points_that_are_kept_are_those_in_the_regions_and_in_their_cells():
     points = generator.uniform([-50, -45, -1], [30, 45, 3], (40_000, 3)).astype(np.float32)
     # Bands are over the ground, which is 5 m below the vehicle there.
     height = torch.from_numpy(points[:, 2].copy())
-    kept = asked.asked(torch.from_numpy(points - np.float32([0, 0, 5])), height).numpy()
+    kept = asked.contains(torch.from_numpy(points - np.float32([0, 0, 5])), height).numpy()
     # The lane, and the cells whose centres lie in it.
     lane = [((-7.3, -2.0), (-1.2, 1.6), (-0.5, 2)), ((-7.5, -2.0), (-1.0, 1.5), (-0.5, 2))]
     boxes = [((0, 20), (-5, 5), (-0.5, 2)), *lane]
@@ -62,10 +62,10 @@ def several():
 def test_an_objective_is_any_number_of_a_result_and_knows_its_direction(several):
     one, two = (several.estimates(each)["area"] for each in (rig(), TWO))
     value = dict(zip(NUMBERS, two.value.tolist(), strict=True))
-    region = several.questions.regions["20m"]
+    region = several.queries.regions["20m"]
     metric = CoverageMetric(
-        several.questions.grid,
-        max_radius=several.questions.max_radius_m,
+        several.queries.grid,
+        max_radius=several.queries.max_radius_m,
         blocks=16,
         aggregations=[Maximum(), Quantiles((0.5, 0.9))],
         regions=[region],
@@ -73,7 +73,7 @@ def test_an_objective_is_any_number_of_a_result_and_knows_its_direction(several)
         square_metres=True,
     )
     observer = CoverageObserver(metric)
-    for frame in several.frames(TWO, several.order.tolist()):
+    for frame in several.frames(TWO):
         observer.update(frame)
     (row,) = (row for row in observer.compute().summary() if row.height == "ground")
     assert value["radius_m"] == row.numbers["radius_m"].value
@@ -91,7 +91,7 @@ def test_an_objective_is_any_number_of_a_result_and_knows_its_direction(several)
     low = several.estimates(rig(lidar("low")))["area"].value.tolist()
     assert low[3] == low[0]
     # Fewer metres and more detection are both a gain of the second sensor.
-    gain, error = gains(two, one)
+    gain, error = measure_gains(two, one)
     assert (gain > 0).all()
     assert (error[[0, 1]] > 0).all()
 
@@ -99,12 +99,12 @@ def test_an_objective_is_any_number_of_a_result_and_knows_its_direction(several)
 def test_what_a_failure_leaves_is_over_known_cells_where_evaluate_has_it_so(several):
     estimates = several.estimates(TWO)
     by_area, by_cells = (dict(zip(NUMBERS, estimates[one].value.tolist(), strict=True)) for one in ("area", "known"))
-    region = several.questions.regions["20m"]
+    region = several.queries.regions["20m"]
     metric = CoverageMetric(
-        several.questions.grid, max_radius=several.questions.max_radius_m, regions=[region], sensors=["top", "low"]
+        several.queries.grid, max_radius=several.queries.max_radius_m, regions=[region], sensors=["top", "low"]
     )
     observer = CoverageObserver(metric)
-    for frame in several.frames(TWO, several.order.tolist()):
+    for frame in several.frames(TWO):
         observer.update(frame)
     for key in ("detection_0.4m", "radius_m", "seen_by_two_0.4m", "detection_0.4m_without_top"):
         assert by_cells[key] == float(observer.compute().estimate_of(key, region, "ground").value)
@@ -116,7 +116,7 @@ def test_what_a_failure_leaves_is_over_known_cells_where_evaluate_has_it_so(seve
 def test_a_search_over_known_cells_scores_what_it_is_tested_by():
     objectives = {key: NUMBERS[key] for key in ("detection_0.4m", "detection_0.4m_without_any")}
     found = held(objectives=objectives, estimate="known")
-    last = list(found.prefixes(TWO))[-1].estimate
+    last = found.score(TWO).estimate
     for name in ("value", "left_out", "steps"):
         np.testing.assert_array_equal(getattr(last, name), getattr(found.estimates(TWO)["known"], name))
 
@@ -160,7 +160,7 @@ def test_what_the_second_sensor_loses_without_a_block_is_known_too(several):
     ],
 )
 def test_a_number_that_no_result_has_is_refused_with_the_nearest(given, near):
-    asked = Questions.around(OUTLINE_M, {"odd": Objective(number=given, region="20m")})
+    asked = Queries.around(OUTLINE_M, {"odd": Objective(number=given, region="20m")})
     with pytest.raises(ValueError, match=f"objective 'odd': no result has a number '{given}'; near is '{near}'"):
         asked.check(TWO)
 
@@ -179,7 +179,7 @@ def test_an_objective_that_makes_no_sense_is_refused(given, message):
 
 def test_the_worst_sensor_is_the_worst_without_each_block_too():
     from torchcover.coverage.quantity import RADIUS, detection
-    from torchcover.placement.questions import _worst
+    from torchcover.placement.queries import _worst
 
     value, left_out = torch.tensor([0.4]), torch.tensor([[0.3], [0.6]])
     other = torch.tensor([0.5]), torch.tensor([[0.5], [0.5]])

@@ -1,4 +1,4 @@
-"""Choose some of many candidates, and test the choice in fresh worlds."""
+"""Select some of many candidate sensors, and test the selection on held-out worlds."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -19,20 +19,27 @@ from torchcover.evaluation.result import sensor_model_words
 from torchcover.frames import Frame
 from torchcover.geometry.arrays import Bools, Float64
 from torchcover.neighbors import nearest
-from torchcover.placement.choice_space import ChoiceSpace
-from torchcover.placement.common_instants import CommonInstants
-from torchcover.placement.fresh import FreshGain, FreshTest, fresh_test, told
+from torchcover.placement.common_frames import CommonFrames
 from torchcover.placement.report_files import PlacementReport, Reported
-from torchcover.placement.subsets import SAME, Candidates, Limits, Subset, best, best_of_several, random_subsets
+from torchcover.placement.selection_solver import (
+    CandidateCoverage,
+    SelectionLimits,
+    SensorSelection,
+    SolverParams,
+    sample_selections,
+    select_for_objectives,
+    select_sensors,
+)
+from torchcover.placement.selection_space import ChoiceSpace
+from torchcover.placement.validation import HeldOutGain, ValidationTest, describe_gain, validate
 from torchcover.report import ChoiceSize, PageTable, Words, draw_choice, file_stems
 from torchcover.simulation import Rig, Sensor
 from torchcover.simulation.regions_of_interest import DEFAULT_BAND_FRAME
 
-# Random choices that keep to the limits, as a control.
-DRAWN = 1000
+SAMPLED = 1000  # random selections within the limits, as a control
 HEADINGS = ("sensor", "alone (%)", "lost without it\n(points)", "cost (EUR)")
-# Sizes of choices that are looked at, for the picture.
-MOST_SIZES = 12
+MAX_SIZES = 12  # numbers of sensors in the picture
+SIZE_LIMIT_S = 5.0  # time of the solver for each of them
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -51,7 +58,7 @@ class SensorChoice(Reported):
         numbers: What the rig of the first of them scores, from the same observers as `evaluate`.
         drawn: Random choices, by the first objective, ascending.
         now: What it is compared with.
-        test: On fresh worlds; None if the two are the same, or there are no fresh worlds.
+        test: On held-out worlds; None if the two are the same, or there are no held-out worlds.
         untested: Why there is no test.
     """
 
@@ -60,24 +67,24 @@ class SensorChoice(Reported):
     sensor_model: str
     sensors: tuple[Sensor, ...]
     refused: dict[str, str]
-    candidates: Candidates
-    limits: Limits
-    found: tuple[Subset, ...]
+    coverage: CandidateCoverage
+    limits: SelectionLimits
+    found: tuple[SensorSelection, ...]
     numbers: dict[str, Number]
-    drawn: tuple[Subset, ...]
+    drawn: tuple[SensorSelection, ...]
     now: tuple[int, ...]
-    test: FreshTest | None = None
+    test: ValidationTest | None = None
     untested: str = ""
 
     @property
-    def best(self) -> Subset:
+    def best(self) -> SensorSelection:
         """The choice."""
         return self.found[0]
 
     @cached_property
     def rig(self) -> Rig:
         """The rig of the best choice."""
-        return self.rig_of(self.best.chosen, f"{self.space.name}_best")
+        return self.rig_of(self.best.selected, f"{self.space.name}_best")
 
     def rig_of(self, chosen: tuple[int, ...], name: str) -> Rig:
         """The rig of a choice."""
@@ -90,11 +97,11 @@ class SensorChoice(Reported):
     @cached_property
     def lost(self) -> dict[int, float]:
         """Number of each chosen sensor -> what is lost of the first objective when it fails."""
-        return dict(zip(self.best.chosen, self.candidates.lost_without(self.best.chosen)[:, 0].tolist(), strict=True))
+        return dict(zip(self.best.selected, self.coverage.losses(self.best.selected)[:, 0].tolist(), strict=True))
 
     @property
-    def gains(self) -> tuple[FreshGain, ...]:
-        """Of the best on fresh worlds."""
+    def gains(self) -> tuple[HeldOutGain, ...]:
+        """Of the best on held-out worlds."""
         return self.test.gains["best"] if self.test else ()
 
     @property
@@ -104,19 +111,21 @@ class SensorChoice(Reported):
         kind = (
             "the best there is" if len(self.found) == 1 else f"between the best of {', '.join(self.space.objectives)}"
         )
-        if self.best.short:
-            lacks = zip(self.space.asked, (np.array(self.limits.least) - self.best.values).tolist(), strict=True)
-            short = "; ".join(f"{100 * lack:.2f} points of {name}" for name, lack in lacks if lack > SAME)
+        if self.best.shortfall:
+            lacks = zip(self.space.numbers, (np.array(self.limits.minimum) - self.best.values).tolist(), strict=True)
+            short = "; ".join(
+                f"{100 * lack:.2f} points of {name}" for name, lack in lacks if lack > SolverParams.tolerance
+            )
             kind = f"no choice keeps all that must be kept, and this one lacks the least: {short}"
-        elif not self.best.proven:
+        elif not self.best.is_proven:
             gap = f"at most {100 * self.best.gap:.2f} points below" if len(self.found) == 1 else "not proven to be"
             kind = f"{gap} the best"
-        found = f"{', '.join(self.names(self.best.chosen))}: {values}, {kind}"
+        found = f"{', '.join(self.names(self.best.selected))}: {values}, {kind}"
         (model,) = sensor_model_words({self.rig.name: self.sensor_model})
         if self.test is None:
-            return f"{found}; not tested in fresh worlds: {self.untested}. {model}"
+            return f"{found}; not tested in held-out worlds: {self.untested}. {model}"
         asked = self.gains[: len(self.space.objectives)]
-        gains = "; ".join(f"{gain.objective}: {told(gain, optimism=True)}" for gain in asked)
+        gains = "; ".join(f"{gain.objective}: {describe_gain(gain, optimism=True)}" for gain in asked)
         return f"{found}. Against {', '.join(self.names(self.now))}: {gains}. {self.test.sentence}. {model}"
 
     @property
@@ -125,7 +134,7 @@ class SensorChoice(Reported):
         table = PageTable(f"{self.space.name}: {len(self.sensors)} candidates", HEADINGS, self._chosen_rows(), 1)
         record = self._record
         ends = zip(file_stems(list(self.space.objectives)), self.found[1:], strict=False)
-        rigs = {f"best_{stem}.yaml": self.rig_of(end.chosen, f"{self.space.name}_{stem}") for stem, end in ends}
+        rigs = {f"best_{stem}.yaml": self.rig_of(end.selected, f"{self.space.name}_{stem}") for stem, end in ends}
         return PlacementReport(
             title=f"{self.space.name}: which sensors, and how many?",
             sentence=self.sentence,
@@ -152,12 +161,12 @@ class SensorChoice(Reported):
             "band_frame": DEFAULT_BAND_FRAME,
             "found": [
                 {
-                    "sensors": self.names(one.chosen),
-                    "values": dict(zip(self.space.asked, one.values, strict=True)),
+                    "sensors": self.names(one.selected),
+                    "values": dict(zip(self.space.numbers, one.values, strict=True)),
                     "gap": one.gap,
-                    "proven": one.proven,
-                    "lacks": one.short,
-                    "cost_eur": self.limits.price(one.chosen) if self.space.cost else None,
+                    "proven": one.is_proven,
+                    "lacks": one.shortfall,
+                    "cost_eur": self.limits.price(one.selected) if self.space.cost else None,
                 }
                 for one in self.found
             ],
@@ -169,7 +178,7 @@ class SensorChoice(Reported):
                 "best": self.drawn[-1].values[0],
                 "share_below_best": float(np.mean([one.values[0] < self.best.values[0] for one in self.drawn])),
             },
-            "now": {"sensors": self.names(self.now), "values": self.candidates.values(self.now).tolist()},
+            "now": {"sensors": self.names(self.now), "values": self.coverage.values(self.now).tolist()},
             "fresh": {f"{gain.objective}, {gain.estimate}": gain.record for gain in self.gains} or None,
             "changes": self.test and self.test.record,
             "refused": self.refused,
@@ -179,7 +188,7 @@ class SensorChoice(Reported):
         """A row for each candidate, with a heading: values are shares, with what is always there."""
         yield ["name", "value_alone", "cost_eur", "chosen", "lost_without", "why_not"]
         for at, sensor in enumerate(self.sensors):
-            alone = float(self.candidates.values([at])[0])
+            alone = float(self.coverage.values([at])[0])
             yield [sensor.name, alone, self._price(at), at in self.lost, self.lost.get(at), ""]
         for name, why in self.refused.items():
             yield [name, "", "", False, "", why]
@@ -189,7 +198,7 @@ class SensorChoice(Reported):
         rows = []
         for at, lost in sorted(self.lost.items(), key=lambda one: -one[1]):
             price = self._price(at)
-            numbers = f"{100 * self.candidates.values([at])[0]:.2f}", f"{100 * lost:.2f}"
+            numbers = f"{100 * self.coverage.values([at])[0]:.2f}", f"{100 * lost:.2f}"
             rows.append(tuple(map(Words, (self.sensors[at].name, *numbers, "-" if price is None else f"{price:g}"))))
         return rows
 
@@ -200,31 +209,31 @@ class SensorChoice(Reported):
     def _sizes(self) -> list[ChoiceSize]:
         """The best choices of so many sensors, by the first objective."""
         found = []
-        for size in range(1, min(self.limits.most, MOST_SIZES) + 1):
-            one = best(self.candidates, replace(self.limits, most=size))
-            if len(one.chosen) == size and not one.short:
+        for size in range(1, min(self.limits.max_sensors, MAX_SIZES) + 1):
+            one = select_sensors(self.coverage, replace(self.limits, max_sensors=size), time_limit_s=SIZE_LIMIT_S)
+            if len(one.selected) == size and not one.shortfall:
                 found.append(ChoiceSize(size, one.values[0], one.values[0] + one.gap))
         return found
 
     def _pictures(self) -> Iterator[tuple[str, str, Figure]]:
         drawn = [one.values[0] for one in self.drawn]
-        figure = draw_choice(self._sizes, drawn, len(self.best.chosen), self.best.values[0], title=self.space.name)
+        figure = draw_choice(self._sizes, drawn, len(self.best.selected), self.best.values[0], title=self.space.name)
         yield "sizes", "What more sensors bring, and what random choices are worth", figure
 
 
 def choose(
-    space: ChoiceSpace, instants: CommonInstants, *, test_seed: int, fresh_worlds: int, progress: bool = False
+    space: ChoiceSpace, frames: CommonFrames, *, test_seed: int, fresh_worlds: int, progress: bool = False
 ) -> SensorChoice:
     """Find the best choice of candidates, and compare it with today's in worlds that it was not chosen by.
 
-    Each candidate is scanned once at each instant. The distance to the nearest point of several sensors is the least of
+    Each candidate is scanned once in each frame. The distance to the nearest point of several sensors is the least of
     their distances, so that what a choice sees is the OR of what its sensors see. Noise and drop-out are drawn anew for
     each place in a rig's list of sensors: there it is that of other draws.
 
     Args:
         space: The candidates and the limits.
-        instants: Of the scenarios of the space, for what it asks.
-        test_seed: Seed of the fresh worlds.
+        frames: Frames of the scenarios of the space, with its numbers.
+        test_seed: Seed of the held-out worlds.
         fresh_worlds: How many.
         progress: Whether to show a bar.
 
@@ -232,9 +241,9 @@ def choose(
         ValueError: No candidate can be mounted, or sees anything that counts; one of `now` cannot be mounted; the
             sensor model is to be real, and of none of the chosen sensors that is known.
     """
-    sensors, seen, refused = _mounted(space, instants, progress=progress)
-    always = seen_by(space.always, instants)[0] if space.always else np.zeros_like(seen[0])
-    candidates = Candidates.grouped(worth_of(instants), seen, always)
+    sensors, seen, refused = _mount_candidates(space, frames, progress=progress)
+    always = observe_points(space.always, frames)[0] if space.always else np.zeros_like(seen[0])
+    coverage = CandidateCoverage.from_points(point_weights(frames), seen, always)
     places = {sensor.name: at for at, sensor in enumerate(sensors)}
     if lost := [name for name in space.now or () if name not in places]:
         raise ValueError(f"now: {lost[0]} cannot be there: {refused[lost[0]]}")
@@ -242,90 +251,93 @@ def choose(
     numbers = {sensor.name: number for number, sensor in enumerate(space.sensors)}
     limits = space.limits([numbers[sensor.name] for sensor in sensors])
     objectives = len(space.objectives)
-    kept = zip(space.asked, candidates.values(now).tolist(), strict=True)
-    least = [-np.inf if name in space.objectives else space.floors.get(name, own) for name, own in kept]
-    limits = replace(limits, least=least)
-    found = best_of_several(candidates, limits, objectives)
-    if not found[0].chosen:
+    kept = zip(space.numbers, coverage.values(now).tolist(), strict=True)
+    minimum = [-np.inf if name in space.objectives else space.bounds.get(name, own) for name, own in kept]
+    limits = replace(limits, minimum=minimum)
+    found = select_for_objectives(coverage, limits, objectives)
+    if not found[0].selected:
         raise ValueError(
             f"candidates: none of the {len(sensors)} that can be there adds anything to the objective; move or turn "
             "them, or ask about places that they see"
         )
-    drawn = sorted(random_subsets(candidates, limits, DRAWN, instants.seed), key=lambda one: one.values[0])
-    now = now or drawn[len(drawn) // 2].chosen
-    rig = space.rig(tuple(sensors[one] for one in found[0].chosen), f"{space.name}_best")
-    scored = instants.estimates(rig)[instants.estimate].numbers()
-    model = rig.sensing(instants.sensor_model).sensor_model
+    drawn = sorted(sample_selections(coverage, limits, SAMPLED, frames.seed), key=lambda one: one.values[0])
+    now = now or drawn[len(drawn) // 2].selected
+    rig = space.rig(tuple(sensors[one] for one in found[0].selected), f"{space.name}_best")
+    scored = frames.score(rig).estimate.numbers()
+    model = rig.sensing(frames.sensor_model).sensor_model
     choice = tuple(found), scored, tuple(drawn), now
-    chosen = SensorChoice(space, instants.estimate, model, sensors, refused, candidates, limits, *choice)
-    return _tested(chosen, instants, test_seed, fresh_worlds)
+    chosen = SensorChoice(space, frames.estimate, model, sensors, refused, coverage, limits, *choice)
+    return _validate(chosen, frames, test_seed, fresh_worlds)
 
 
-def seen_by(rig: Rig, instants: CommonInstants) -> tuple[Bools, float]:
-    """(T P,) which reference points have a point of a rig within each threshold; the share of rays on the vehicle."""
-    questions, rays, self_hits = instants.questions, 0, 0
-    near: list[list[Bools]] = [[] for _ in questions.thresholds_m]
-    for frame in instants.frames(rig):
-        for threshold, found in zip(questions.thresholds_m, near, strict=True):
+def observe_points(rig: Rig, frames: CommonFrames) -> tuple[Bools, float]:
+    """Return which reference points a rig detects, (T * P,) threshold by threshold, and its share of self-hits."""
+    queries, rays, self_hits = frames.queries, 0, 0
+    within: list[list[Bools]] = [[] for _ in queries.thresholds_m]
+    for frame in frames.frames(rig):
+        for threshold, masks in zip(queries.thresholds_m, within, strict=True):
             points = frame.cloud_of(within_m=threshold)
-            distance = nearest(frame.reference, points, max_distance=questions.max_radius_m).distance
-            found.append((distance <= threshold).numpy())
+            distance = nearest(frame.reference, points, max_distance=queries.max_radius_m).distance
+            masks.append((distance <= threshold).numpy())
         rays, self_hits = rays + frame.counts["rays"], self_hits + frame.counts["self_hits"]
-    return np.concatenate([np.concatenate(found) for found in near]), self_hits / rays
+    return np.concatenate([np.concatenate(masks) for masks in within]), self_hits / rays
 
 
-def worth_of(instants: CommonInstants) -> Float64:
-    """(Q, T P) what each reference point adds to each number: the same numbers as those of `CoverageMetric`.
+def point_weights(frames: CommonFrames) -> Float64:
+    """Return (Q, T * P) what each reference point adds to each number: the sums are those of `CoverageMetric`.
 
-    By area, a point is worth its share of the square metres that are seen. Over known cells it is worth its share of
-    the square metres in its cell at its instant, which share the cell with its other instants, and that the mean with
-    all known cells. For a threshold that is not that of the number it is worth nothing.
+    By area, a point adds its share of the visible square meters. Over observed cells it adds its share of the square
+    meters in its cell and frame, divided by the frames that observe the cell and by the number of observed cells. For a
+    threshold that is not that of the number it adds nothing.
 
-    ValueError: a region and band that no instant shows.
+    Raises:
+        ValueError: No frame shows a surface in one of the regions and bands.
     """
-    questions, frames = instants.questions, list(instants.frames())
-    keys = [detection(threshold).key for threshold in questions.thresholds_m]
-    points = sum(len(frame.reference) for frame in frames)
-    worth = np.zeros((len(questions.objectives), len(keys), points))
-    for row, (name, asked) in zip(worth, questions.objectives.items(), strict=True):
-        for place in asked.places:
-            row[keys.index(asked.key)] += _worth_in(place, name, instants, frames) / len(asked.places)
-    return worth.reshape(len(worth), -1)
+    queries, reference = frames.queries, list(frames.frames())
+    keys = [detection(threshold).key for threshold in queries.thresholds_m]
+    points = sum(len(frame.reference) for frame in reference)
+    weights = np.zeros((len(queries.objectives), len(keys), points))
+    for row, (name, objective) in zip(weights, queries.objectives.items(), strict=True):
+        for place in objective.places:
+            row[keys.index(objective.key)] += _weights_in(place, name, frames, reference) / len(objective.places)
+    return weights.reshape(len(weights), -1)
 
 
-def _worth_in(place: tuple[str, str], name: str, instants: CommonInstants, frames: Sequence[Frame]) -> Float64:
-    """(P,) what each point is worth in a region and band."""
-    (region, band), questions, grid = place, instants.questions, instants.questions.grid
-    where = Places([questions.regions[region]], grid)
+def _weights_in(place: tuple[str, str], name: str, frames: CommonFrames, reference: Sequence[Frame]) -> Float64:
+    """Return (P,) what each point adds to the number of a region and band."""
+    (region, band), queries, grid = place, frames.queries, frames.queries.grid
+    where = Places([queries.regions[region]], grid)
     cells = torch.zeros(grid.shape, dtype=torch.bool, device="cpu")
     cells[list(grid.heights).index(band)] = where.regions[0].mask(grid)
     of_frames, m2, probed = [], torch.zeros(0, device="cpu"), torch.zeros(grid.cells, dtype=torch.int64, device="cpu")
-    for frame in frames:
+    for frame in reference:
         inside, of, cell = grid.bins(frame.reference, frame.heights_in(grid.band_frame))
-        if instants.estimate == "area":
+        if frames.estimate == "area":
             at, point = where.of_points(frame.reference[inside[of]], cell)
-            own = point[at == where.number_of(where.regions[0], band)]
+            selected = point[at == where.number_of(where.regions[0], band)]
         else:
-            own = cells.view(-1)[cell].nonzero().squeeze(1)
-        points, cell = inside[of[own]], cell[own]
-        assert frame.reference_weights is not None  # square metres
+            selected = cells.view(-1)[cell].nonzero().squeeze(1)
+        points, cell = inside[of[selected]], cell[selected]
+        assert frame.reference_weights is not None  # square meters
         weight = frame.reference_weights[points].double()
         of_frames.append((points, weight, cell))
         m2, probed = torch.cat([m2, weight]), probed + torch.bincount(cell, minlength=grid.cells).bool()
     if not len(m2):
-        raise ValueError(f"{name}: no instant shows any surface of {band} in {region}; use more worlds")
-    found = []
-    for frame, (points, weight, cell) in zip(frames, of_frames, strict=True):
+        raise ValueError(f"{name}: no frame shows any surface of {band} in {region}; use more worlds")
+    weights = []
+    for frame, (points, weight, cell) in zip(reference, of_frames, strict=True):
         share = weight / m2.sum()
-        if instants.estimate == "known":
+        if frames.estimate == "known":
             of_cell = torch.bincount(cell, weights=weight, minlength=grid.cells)
             share = weight / of_cell[cell] / probed[cell] / (probed > 0).sum()
-        found.append(torch.zeros(len(frame.reference), dtype=torch.float64, device="cpu").index_add_(0, points, share))
-    return torch.cat(found).numpy()
+        weights.append(
+            torch.zeros(len(frame.reference), dtype=torch.float64, device="cpu").index_add_(0, points, share)
+        )
+    return torch.cat(weights).numpy()
 
 
-def _mounted(
-    space: ChoiceSpace, instants: CommonInstants, *, progress: bool
+def _mount_candidates(
+    space: ChoiceSpace, frames: CommonFrames, *, progress: bool
 ) -> tuple[tuple[Sensor, ...], list[Bools], dict[str, str]]:
     """The candidates that can be mounted, what they see, and why the others cannot."""
     sensors: list[Sensor] = []
@@ -340,7 +352,7 @@ def _mounted(
                 continue
             alone = Rig(name=sensor.name, vehicle=space.rig((sensor,), "any").vehicle, sensors=(sensor,))
             try:
-                points, own = seen_by(alone, instants)
+                points, own = observe_points(alone, frames)
             except ValueError as error:
                 refused[sensor.name] = str(error)
                 continue
@@ -355,11 +367,11 @@ def _mounted(
     return tuple(sensors), seen, refused
 
 
-def _tested(found: SensorChoice, instants: CommonInstants, test_seed: int, worlds: int) -> SensorChoice:
-    if set(found.best.chosen) == set(found.now):
+def _validate(found: SensorChoice, frames: CommonFrames, test_seed: int, worlds: int) -> SensorChoice:
+    if set(found.best.selected) == set(found.now):
         return replace(found, untested="it is what is there today")
     now = found.rig_of(found.now, f"{found.space.name}_now")
     try:
-        return replace(found, test=fresh_test({"best": found.rig}, now, instants, test_seed=test_seed, worlds=worlds))
+        return replace(found, test=validate({"best": found.rig}, now, frames, test_seed=test_seed, worlds=worlds))
     except ValueError as error:
         return replace(found, untested=str(error))

@@ -1,4 +1,4 @@
-"""What objectives ask around one vehicle, and what observes a rig for it: who observes it in `evaluate`, too."""
+"""Queries of objectives around one vehicle, and the observers of `evaluate` that answer them for a rig."""
 
 import math
 import re
@@ -33,10 +33,10 @@ FOR_STEPS = {"": Objective(region="20m", band="ground")}
 FAILURE = re.compile(r"(.+)_without_(.+)")
 
 
-class Questions(NamedTuple):
-    """What objectives ask of frames around one vehicle, by name, and all regions that are asked about.
+class Queries(NamedTuple):
+    """Objectives by name, and the regions, bands and thresholds that they query around one vehicle.
 
-    What is required of bodies and in encounters is not among them; `names` are those of all, in order.
+    Requirements of targets and encounters are not among them; `names` are those of all, in order.
     The `grid` has cells of 0.5 m around these. Radii
     saturate at `max_radius_m`: as in `evaluate`, or at the largest threshold if no radius is asked for.
     """
@@ -50,7 +50,7 @@ class Questions(NamedTuple):
 
     @classmethod
     def around(cls, ego_outline_m: Float64, objectives: Mapping[str, Objective]) -> Self:
-        """What follows for a vehicle with (K, 2) corners x, y.
+        """Return the queries for a vehicle with (K, 2) corners x, y.
 
         ValueError: a region or a band that is none; two regions of one name; one that holds no cell centre.
         """
@@ -92,8 +92,8 @@ class Questions(NamedTuple):
             self.areas, rays, bands_m=tuple(self.grid.heights.values()), band_frame=self.grid.band_frame
         )
 
-    def asked(self, points: Tensor, height: Tensor | None = None) -> Tensor:
-        """(M,) bool: which of (M, 3) points lie in a region and band that is asked about."""
+    def contains(self, points: Tensor, height: Tensor | None = None) -> Tensor:
+        """Return (M,) bool: which of (M, 3) points lie in a queried region and band."""
         inside, of, cell = self.grid.bins(points, height)
         kept = torch.zeros(len(points), dtype=torch.bool, device="cpu")
         x, y, bands = *points[inside[of], :2].T, list(self.grid.heights)
@@ -109,11 +109,11 @@ class Questions(NamedTuple):
 
         ValueError: such a one; the message has the nearest name.
         """
-        asked = self._replace(thresholds_m=self.thresholds_m or (THRESHOLD_M,))
-        numbers = asked.numbers_of(rig)
+        queries = self._replace(thresholds_m=self.thresholds_m or (THRESHOLD_M,))
+        numbers = queries.numbers_of(rig)
         with warnings.catch_warnings(action="ignore"):  # that they were fed with nothing
             of_coverage = [one.key for one in numbers.coverage["area"].compute().every_quantity]
-        single = (RADIUS, *map(detection, asked.thresholds_m))
+        single = (RADIUS, *map(detection, queries.thresholds_m))
         others = [one.key for kind in AGGREGATIONS for one in kind.parse(kind.example).quantities]
         of_coverage += [one.key for one in (*single, *(without(ANY, each) for each in single))] + others
         for name, objective in self.objectives.items():
@@ -127,9 +127,9 @@ class Questions(NamedTuple):
         keys = {objective.key for objective in self.objectives.values()}
         return tuple(one for kind in AGGREGATIONS if (one := kind.of_keys(keys)))
 
-    def numbers_of(self, rig: Rig, measures: Sequence[Measure] = ("area",)) -> "RigNumbers":
+    def numbers_of(self, rig: Rig, measures: Sequence[Measure] = ("area",)) -> "RigObservers":
         """What observes a rig on its ego, fed with nothing yet, for numbers by these measures."""
-        return RigNumbers(self, rig, self.coverage_of(rig, measures))
+        return RigObservers(self, rig, self.coverage_of(rig, measures))
 
     def coverage_of(self, rig: Rig, measures: Sequence[Measure]) -> dict[Measure, CoverageObserver]:
         """What observes the coverage of a rig: the same for both measures where that knows both."""
@@ -151,14 +151,14 @@ class Questions(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class RigNumbers:
-    """What observes a rig for its objectives: those who observe it in `evaluate`.
+class RigObservers:
+    """Observers of a rig for its objectives: the same as in `evaluate`.
 
-    `coverage` is by what its numbers are means over; one for both where that knows both. `kept` is what it
-    keeps of what is required, which is so in every block.
+    `coverage` is by what its numbers are means over; one for both where that has both. `kept` are the
+    shares of requirements that are met, the same in every block.
     """
 
-    questions: Questions
+    queries: Queries
     rig: Rig
     coverage: Mapping[Measure, CoverageObserver]
     kept: Mapping[str, Estimate] = field(default_factory=dict)
@@ -173,7 +173,7 @@ class RigNumbers:
         answers = self._answers(measure)
         steps = max((one.steps for each in answers.values() for one in each), key=len)
         quantities, values, left_out = [], [], []
-        for name in self.questions.names:
+        for name in self.queries.names:
             each = answers.get(name) or [self.kept[name]]
             quantities.append(each[0].quantities[0]._replace(key=name))
             values.append(torch.cat([one.value for one in each]).mean())
@@ -185,7 +185,7 @@ class RigNumbers:
 
     def _answers(self, measure: Measure) -> dict[str, list[Estimate]]:
         """Name of each objective -> its number in each of its places."""
-        metric, objectives, regions = self.coverage[measure].metric, self.questions.objectives, self.questions.regions
+        metric, objectives, regions = self.coverage[measure].metric, self.queries.objectives, self.queries.regions
         plain = [quantity.key for quantity in MeanOfMeans(metric.thresholds).quantities]
         places = list(dict.fromkeys(place for one in objectives.values() for place in one.places))
         if measure == "area" and all(one.key in plain for one in objectives.values()):

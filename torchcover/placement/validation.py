@@ -1,4 +1,4 @@
-"""The winner of a search against its start, in worlds that the search has never seen, in numbers and words."""
+"""Validation of the finalists of a search: paired with the start on held-out worlds, in numbers and words."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -13,8 +13,8 @@ from torchcover.coverage.quantity import detection
 from torchcover.estimation import Difference, Estimate, Quantity
 from torchcover.estimation.jackknife import ROUND_OFF
 from torchcover.evaluation.target_survey import free_space
-from torchcover.placement.carrier import NOT_WORSE
-from torchcover.placement.common_instants import CommonInstants
+from torchcover.placement.common_frames import CommonFrames
+from torchcover.placement.host_vehicle import NOT_WORSE
 from torchcover.placement.objective import THRESHOLD_M, Objective
 from torchcover.report import PageTable, Words
 from torchcover.report.wording import difference_words, shown_unit
@@ -27,14 +27,17 @@ MOST_TOLD = 4
 WITHIN_M, STEP_M = 3.0, 0.4
 # Usual regions have the same names around any vehicle.
 ANY_OUTLINE_M = np.array([[-2.0, -1.0], [2.0, -1.0], [2.0, 1.0], [-2.0, 1.0]])
-CHANGE_HEADINGS = ("what", "gain on\nfresh worlds", "unit", "p (Holm)", "share of\nthe gain")
+CHANGE_HEADINGS = ("what", "gain on\nheld-out worlds", "unit", "p (Holm)", "share of\nthe gain")
 
 
-class FreshGain(NamedTuple):
-    """What the winner has better than the start, of one objective by one estimate; "-" where there is no such choice.
+class HeldOutGain(NamedTuple):
+    """Improvement of a finalist over the start in one objective.
 
-    `test` is the difference on fresh worlds, paired; `search_gain` that on the instants of the search, which chose by
-    it.
+    Args:
+        objective: Its name.
+        estimate: Average of the number, "area" or "known"; "-" where the number has no such choice.
+        test: Paired difference on held-out worlds.
+        search_gain: The same difference on the frames of the search.
     """
 
     objective: str
@@ -44,12 +47,12 @@ class FreshGain(NamedTuple):
 
     @property
     def words(self) -> str:
-        """The gain on fresh worlds with its interval, without its unit: shares in percentage points."""
+        """The improvement on held-out worlds with its interval, without its unit: shares in percentage points."""
         return signed_words(self.test)
 
     @property
     def optimism(self) -> float:
-        """How much more the search had promised."""
+        """How much larger the improvement was in the search."""
         return self.search_gain - self.test.gain
 
     @property
@@ -76,10 +79,13 @@ class FreshGain(NamedTuple):
 
 
 class SideEffect(NamedTuple):
-    """What else the winner has better or worse than the start on fresh worlds, whether anybody asked for it or not.
+    """A change of another number on held-out worlds.
 
-    `p` is the probability of a difference as large to either side by chance, with all other changes looked at (Holm
-    1979), `shares` what share of an objective's gain this is, if it is a part of it.
+    Args:
+        what: The number in words.
+        test: Paired difference to the start.
+        p: Its p value, adjusted for all changes (Holm 1979).
+        shares: Objective -> share of its improvement, if the number is a part of it.
     """
 
     what: str
@@ -99,19 +105,20 @@ class SideEffect(NamedTuple):
         return f"{self.what} {signed_words(self.test)} {unit_words(unit)}"
 
 
-class FreshTest(NamedTuple):
-    """Winners of a search in worlds that it has never seen.
+class ValidationTest(NamedTuple):
+    """Result of `validate`.
 
-    `gains` are by the names of the winners: in each objective by the estimate of the search, then by the other one
-    where that is a choice; `changes` what else the first of them changed, what got worse beyond chance first.
+    Args:
+        gains: Name of a finalist -> improvements, by the estimate of the search, then by the other one.
+        changes: Side effects of the first finalist, significant deteriorations first.
     """
 
-    gains: Mapping[str, tuple[FreshGain, ...]]
+    gains: Mapping[str, tuple[HeldOutGain, ...]]
     changes: tuple[SideEffect, ...]
 
     @property
     def sentence(self) -> str:
-        """What got worse."""
+        """The side effects in words."""
         worse = [change.words for change in self.changes if change.is_worse]
         told = [*worse[:MOST_TOLD], *([f"{len(worse) - MOST_TOLD} more"] if len(worse) > MOST_TOLD else [])]
         number = f"of {len(self.changes)} numbers around the vehicle"
@@ -143,10 +150,10 @@ class FreshTest(NamedTuple):
         ]
 
 
-def fresh_test(
-    winners: Mapping[str, Rig], start: Rig, searched: CommonInstants, *, test_seed: int, worlds: int
-) -> FreshTest:
-    """Score winners of a search, by name, in worlds of another seed, instant by instant against the same reference.
+def validate(
+    winners: Mapping[str, Rig], start: Rig, searched: CommonFrames, *, test_seed: int, worlds: int
+) -> ValidationTest:
+    """Score finalists of a search, by name, on worlds of another seed, frame by frame against the same reference.
 
     A scenario without traffic is the same world for any seed, and is left out.
 
@@ -154,7 +161,7 @@ def fresh_test(
     """
     first = next(iter(winners))
     others, parts = _others(searched.objectives, failures=max(len(start.sensors), len(winners[first].sensors)) > 1)
-    with closing(searched.anew(test_seed, worlds, others)) as fresh:
+    with closing(searched.resampled(test_seed, worlds, others)) as fresh:
         start_by_test = fresh.estimates(start)
         by_test = {name: fresh.estimates(winner) for name, winner in winners.items()}
     start_by_search = searched.estimates(start)
@@ -163,7 +170,7 @@ def fresh_test(
     for name, winner in winners.items():
         by_search = searched.estimates(winner)
         gains[name] = tuple(
-            FreshGain(objective, own[objective] or estimate, test, in_search[objective].gain)
+            HeldOutGain(objective, own[objective] or estimate, test, in_search[objective].gain)
             for estimate in sorted(start_by_search, key=lambda one: one != searched.estimate)
             for in_search in [by_search[estimate].differences(start_by_search[estimate])]
             for objective, test in _differences(
@@ -181,10 +188,10 @@ def fresh_test(
             shares[part][objective] = found[part].gain / whole
     changes = [
         SideEffect(name, test, p, shares[name])
-        for (name, test), p in zip(tests.items(), holm([test.p for test in tests.values()]), strict=True)
+        for (name, test), p in zip(tests.items(), adjust_holm([test.p for test in tests.values()]), strict=True)
     ]
     changes.sort(key=lambda one: (not one.is_worse, math.isnan(one.p), one.p, one.test.gain))
-    return FreshTest(gains, tuple(changes))
+    return ValidationTest(gains, tuple(changes))
 
 
 def _differences(one: Estimate, other: Estimate, asked: Mapping[str, Objective]) -> dict[str, Difference]:
@@ -198,11 +205,11 @@ def _differences(one: Estimate, other: Estimate, asked: Mapping[str, Objective])
     return found
 
 
-def holm(p: Sequence[float]) -> list[float]:
+def adjust_holm(p: Sequence[float]) -> list[float]:
     """Of each probability, what it is with all others looked at (Holm 1979); what is unknown stays so, and counts not.
 
     Example:
-        >>> holm([0.02, 0.001, math.nan, 0.9])
+        >>> adjust_holm([0.02, 0.001, math.nan, 0.9])
         [0.04, 0.003, nan, 0.9]
     """
     known = sorted((one, at) for at, one in enumerate(p) if not math.isnan(one))
@@ -213,7 +220,7 @@ def holm(p: Sequence[float]) -> list[float]:
 
 
 def _others(asked: Mapping[str, Objective], *, failures: bool) -> tuple[dict[str, Objective], dict[str, list[str]]]:
-    """What is asked in fresh worlds beside what is asked for, by its words; and which of it objectives are made of."""
+    """Return further numbers to test, by their words, and the names of those that each objective is the mean of."""
     found, parts = dict[str, Objective](), dict[str, list[str]]()
     for name, objective in asked.items():
         if name.startswith(NOT_WORSE) or len(objective.places) < 2:
@@ -231,7 +238,7 @@ def _others(asked: Mapping[str, Objective], *, failures: bool) -> tuple[dict[str
     return {name: one for name, one in found.items() if name not in asked}, parts
 
 
-def _of_targets(rig: Rig, start: Rig, searched: CommonInstants) -> dict[str, Difference]:
+def _of_targets(rig: Rig, start: Rig, searched: CommonFrames) -> dict[str, Difference]:
     """Places within a few metres of the vehicle at which targets are seen, on empty ground."""
     found = {}
     for target in TARGETS:
@@ -259,11 +266,11 @@ def signed_words(test: Difference) -> str:
     return difference_words(test)
 
 
-def amount(value: float, unit: str) -> str:
+def format_gain(value: float, unit: str) -> str:
     """A gain without its unit: shares in percentage points.
 
     Example:
-        >>> amount(0.01234, "share"), amount(0.01234, "m")
+        >>> format_gain(0.01234, "share"), format_gain(0.01234, "m")
         ('+1.23', '+0.012')
     """
     return f"{shown_unit(unit).factor * value:+.{2 if unit == 'share' else 3}f}"
@@ -274,25 +281,25 @@ def unit_words(unit: str) -> str:
     return "points" if unit == "share" else unit
 
 
-def told(gain: FreshGain, *, optimism: bool = False) -> str:
-    """A gain in words, which call it one only where it is told from chance: by Student's t at 95 %."""
+def describe_gain(gain: HeldOutGain, *, optimism: bool = False) -> str:
+    """Describe an improvement; it is called one only if it is significant by Student's t at 95 %."""
     test, unit = gain.test, gain.test.quantity.unit
     if math.isnan(test.value):
-        return "unknown in the fresh worlds"
+        return "unknown in the held-out worlds"
     t = "t unknown" if math.isnan(gain.t) else f"t {gain.t:.1f}"
-    where = f"on {test.blocks} fresh worlds ({t}, better in {test.better})"
+    where = f"on {test.blocks} held-out worlds ({t}, better in {test.better})"
     rest = f"{gain.words} {unit_words(unit)} {'in any world' if test.low == test.high else where}"
     if optimism and not math.isnan(gain.optimism):
-        rest += f", optimism {amount(gain.optimism, unit)}"
+        rest += f", optimism {format_gain(gain.optimism, unit)}"
     if test.significant:
         return f"{'gained' if test.gain > 0 else 'lost'} {rest}"
     return f"no gain is shown: {rest}"
 
 
-def finite(value: Any) -> Any:  # noqa: ANN401  (whatever a record holds)
+def replace_nan(value: Any) -> Any:  # noqa: ANN401  (whatever a record holds)
     """A record as JSON can have it: what is unknown is None."""
     if isinstance(value, Mapping):
-        return {key: finite(each) for key, each in value.items()}
+        return {key: replace_nan(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
-        return [finite(each) for each in value]
+        return [replace_nan(each) for each in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

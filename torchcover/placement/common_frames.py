@@ -1,4 +1,4 @@
-"""Instants of many worlds that any rig is scored at: held once, with their reference."""
+"""Frames of many worlds that any rig is scored on: made once, with their reference points."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -13,36 +13,47 @@ from torchcover.evaluation import CoverageObserver
 from torchcover.evaluation.cores import start_method
 from torchcover.evaluation.pipeline import FramesOrErrors, MeasuredFrame, batches_of, killed_worker
 from torchcover.frames import Frame
-from torchcover.placement.carrier import Carrier
+from torchcover.placement.host_vehicle import HostVehicle
 from torchcover.placement.objective import Objective
-from torchcover.placement.questions import Questions, RigNumbers
-from torchcover.placement.racing import TOGETHER, Prefix, racing_order
+from torchcover.placement.queries import Queries, RigObservers
 from torchcover.simulation import Rig, Scenario, SimulatedFrames, Simulator, with_ego
 from torchcover.simulation.rays import Balls
 from torchcover.simulation.simulated_frames import of_rigs
 
 WORLDS = 6
-PER_WORLD = 3
+FRAMES_PER_WORLD = 3
 EVERY_S = 20.0
 RAYS = 16_384
+BATCH = 3  # frames with their clouds that are in memory together
 BUDGET_BYTES = 2e9
 MEASURES: tuple[Measure, Measure] = ("area", "known")
-# What a simulation that looks at a few instants of many worlds is asked for.
-MANY = 10**9
+MANY = 10**9  # steps of a simulation, of which a few of many worlds are used
 
 AnyScenario = Scenario | str | Path
 
 
-class HeldInstant(NamedTuple):
-    """Which instant: the number of its scenario, the step there, and its world among all worlds."""
+class Score(NamedTuple):
+    """The numbers of a rig on all frames.
+
+    Args:
+        estimate: The numbers.
+        self_hit_share: Share of the rig's rays that end on the vehicle.
+    """
+
+    estimate: Estimate
+    self_hit_share: float
+
+
+class FrameIndex(NamedTuple):
+    """A frame by the number of its scenario, the step there, and its world among all worlds."""
 
     scenario: int
     step: int
     world: int
 
 
-class AskedInstant(NamedTuple):
-    """What is asked of an instant: the frame of a rig, or without one the reference, with the bytes of its world.
+class FrameRequest(NamedTuple):
+    """Request for the frame of a rig, or without one for the reference, with the bytes of its world.
 
     With `measures` the coverage is summed up where the frame is made, and the frame itself stays there.
     """
@@ -52,64 +63,62 @@ class AskedInstant(NamedTuple):
     measures: tuple[Measure, ...] = ()
 
 
-class HeldWorlds(Dataset[Frame | MeasuredFrame]):
-    """What any rig sees at some instants, whose worlds and references are kept in the process that is asked.
+class HeldFrames(Dataset[Frame | MeasuredFrame]):
+    """Frames of any rig; their worlds and reference points stay in the process that made them.
 
     Frames are measured there, too, so that sums travel and not clouds.
-    Simulations have no rigs; of the reference only the points are kept that questions are about.
+    Simulations have no rigs. Only reference points inside the queried regions and bands are kept.
     """
 
-    def __init__(
-        self, simulations: Sequence[SimulatedFrames], instants: Sequence[HeldInstant], questions: Questions
-    ) -> None:
-        self._simulations, self._instants, self._questions = simulations, instants, questions
+    def __init__(self, simulations: Sequence[SimulatedFrames], indices: Sequence[FrameIndex], queries: Queries) -> None:
+        self._simulations, self._indices, self._queries = simulations, indices, queries
         self._held: dict[int, tuple[Frame, Balls | None]] = {}
         self._rig: Rig | None = None
         self._mounted: dict[int, Simulator] = {}
         self._observers: dict[tuple[Measure, ...], Mapping[CoverageObserver, Measure]] = {}
 
-    def __getitem__(self, asked: AskedInstant) -> Frame | MeasuredFrame:
-        frame, measures = self._frame(asked.rig, asked.number), asked.measures
-        if asked.rig is None or not measures:
+    def __getitem__(self, request: FrameRequest) -> Frame | MeasuredFrame:
+        frame, measures = self._frame(request.rig, request.number), request.measures
+        if request.rig is None or not measures:
             return frame
         if measures not in self._observers:
-            coverage = self._questions.coverage_of(asked.rig, measures)
+            coverage = self._queries.coverage_of(request.rig, measures)
             self._observers[measures] = {observer: measure for measure, observer in coverage.items()}
         sums = {measure: observer.sums_of(frame) for observer, measure in self._observers[measures].items()}
         return MeasuredFrame(None, frame.counts, sums, 0.0)
 
     def _frame(self, rig: Rig | None, number: int) -> Frame:
-        instant = self._instants[number]
+        index = self._indices[number]
         if number not in self._held:
-            built, within_m = self._built(instant, number), self._questions.within_m
+            built, within_m = self._build(index, number), self._queries.within_m
             # The memory of a tensor that travels to another process is given up.
             points = built.reference.numpy().copy()
             self._held[number] = built, None if within_m is None else Balls.around(points, within_m)
         held, within = self._held[number]
         if rig is None:
             return held
-        scans = self._with(rig, instant.scenario).scans(instant.step, within)[rig.name]
+        scans = self._mount(rig, index.scenario).scans(index.step, within)[rig.name]
         counts = {"rays": sum(scan.rays for scan in scans), "self_hits": sum(scan.self_hits for scan in scans)}
         return replace(held, **of_rigs({rig.name: rig}, {rig.name: scans}), counts=counts)
 
-    def _built(self, instant: HeldInstant, number: int) -> Frame:
-        frames = self._simulations[instant.scenario]
-        seen = frames[instant.step]
-        heights_m = seen.heights_in(self._questions.grid.band_frame)
-        kept = self._questions.asked(seen.reference, heights_m)
-        assert seen.reference_weights is not None  # those of a SurfaceReference
+    def _build(self, index: FrameIndex, number: int) -> Frame:
+        frames = self._simulations[index.scenario]
+        frame = frames[index.step]
+        heights_m = frame.heights_in(self._queries.grid.band_frame)
+        mask = self._queries.contains(frame.reference, heights_m)
+        assert frame.reference_weights is not None  # those of a SurfaceReference
         return replace(
-            seen,
-            reference=seen.reference[kept],
-            reference_weights=seen.reference_weights[kept],
-            reference_heights_m=None if heights_m is None else heights_m[kept],
+            frame,
+            reference=frame.reference[mask],
+            reference_weights=frame.reference_weights[mask],
+            reference_heights_m=None if heights_m is None else heights_m[mask],
             index=number,
-            place_in_time=instant.world,
-            counts={"world_bytes": frames.simulator.scene_of(instant.step)[0].bytes},
+            place_in_time=index.world,
+            counts={"world_bytes": frames.simulator.scene_of(index.step)[0].bytes},
         )
 
-    def _with(self, rig: Rig, scenario: int) -> Simulator:
-        """A scenario with the rig, which is kept until another one comes: a race asks about it again and again."""
+    def _mount(self, rig: Rig, scenario: int) -> Simulator:
+        """Return a scenario with the rig, which is kept until another rig comes."""
         if rig != self._rig:
             self._rig, self._mounted, self._observers = rig, {}, {}
         if scenario not in self._mounted:
@@ -117,44 +126,43 @@ class HeldWorlds(Dataset[Frame | MeasuredFrame]):
         return self._mounted[scenario]
 
 
-class CommonInstants:
-    """Instants of many worlds, held once with the points of their reference; a rig costs one scan and one search each.
+class CommonFrames:
+    """Frames of many worlds, made once with their reference points; a rig costs one scan and one search each.
 
-    Every rig sees the same instants as `SimulatedFrames` shows them, is measured against the same reference points, and
-    observed by `CoverageMetric`, so that differences are paired, and numbers are those of
-    `evaluate`. They depend on the arguments alone, and not on the number of workers.
+    Every rig is scored on the same frames of `SimulatedFrames` and the same reference points by `CoverageMetric`,
+    so that differences are paired, and numbers are those of `evaluate`. They depend on the
+    arguments alone, and not on the number of workers.
 
     Args:
-        scenarios: What is played, one or several.
-        objectives: What rigs are scored by, by name.
-        vehicle: What carries the rigs: a built-in vehicle, the YAML file of one, or a mesh file. Not given: each
+        scenarios: One or several.
+        objectives: Numbers that rigs are scored by, by name.
+        vehicle: Host vehicle: a built-in vehicle, the YAML file of one, or a mesh file. Not given: each
             scenario's own ego, else an SUV.
         worlds: Worlds of each scenario that has traffic; any other scenario is one world.
-        per_world: Instants in each.
+        per_world: Frames in each.
         every_s: Time between them.
-        seed: Seed of the traffic, of the reference, and of the order of the instants.
-        rays: About how many rays the reference casts at each instant.
-        estimate: What numbers of the coverage are means over: "area", the visible surface, or "known", the known cells.
-        sensor_model: What sensors make of their hits, as of `evaluate`: "ideal", or else each rig as it is.
+        seed: Seed of the traffic and of the reference.
+        rays: Approximate number of reference rays of each frame.
+        estimate: Average of the numbers: "area", the visible surface, or "known", the observed cells.
+        sensor_model: "ideal", or else each rig as it is, as in `evaluate`.
         budget_bytes: What all worlds may take, about 35 MB for one of `urban`. All are held: to build one again takes
-            five times as long as to score a rig on three instants of it.
+            five times as long as to score a rig on three frames of it.
         workers: Processes that hold the worlds; 0 holds them in this one.
 
     Attributes:
-        questions: What the objectives ask.
-        instants: Which step of which scenario each instant is, and its world.
-        order: (n,) int64 the one order in which all rigs are scored.
+        queries: Regions, bands and numbers of the objectives.
+        indices: Scenario, step and world of each frame.
 
     Raises:
         FileNotFoundError: An unknown name or file.
         ValueError: No scenario, objective or world; scenarios with different egos; a region or a band that is none; a
-            run with fewer instants; worlds beyond the budget.
+            run with fewer frames; worlds beyond the budget.
 
     Example:
         >>> near = Objective(region="20m", band="ground")
-        >>> instants = CommonInstants(["courtyard"], {"near": near}, per_world=1, rays=2048)
-        >>> estimate = instants.estimates(Rig.load("front_roof_128"))["area"]
-        >>> len(instants), bool(0.5 < estimate.value[0] < 1)
+        >>> frames = CommonFrames(["courtyard"], {"near": near}, per_world=1, rays=2048)
+        >>> estimate = frames.score(Rig.load("front_roof_128")).estimate
+        >>> len(frames), bool(0.5 < estimate.value[0] < 1)
         (1, True)
     """
 
@@ -165,7 +173,7 @@ class CommonInstants:
         *,
         vehicle: str | Path | None = None,
         worlds: int = WORLDS,
-        per_world: int = PER_WORLD,
+        per_world: int = FRAMES_PER_WORLD,
         every_s: float = EVERY_S,
         seed: int = 0,
         rays: int = RAYS,
@@ -191,16 +199,15 @@ class CommonInstants:
         self._settings |= {"budget_bytes": budget_bytes, "workers": workers}
         self._vehicles: set[str | None] = {None}  # that were found to be that of these worlds
         self._worlds = [with_ego(one, {}, vehicle) for one in self.scenarios]
-        self.questions = Questions.around(Carrier.of(self._worlds).outline_m, objectives)
+        self.queries = Queries.around(HostVehicle.of(self._worlds).outline_m, objectives)
         shown: dict[str, Any] = {"steps": MANY, "seed": seed, "every_s": every_s, "kept_bytes": float("inf")}
-        shown |= {"reference_sensor": self.questions.reference_sensor(rays)}
+        shown |= {"reference_sensor": self.queries.reference_sensor(rays)}
         simulations = [SimulatedFrames(one, rigs={}, **shown) for one in self._worlds]
-        self.instants = _instants_of([one.simulator for one in simulations], worlds, per_world)
-        self.order = racing_order([instant.world for instant in self.instants], seed)
-        self._batches: list[list[AskedInstant]] = []
-        self._processes = min(workers, self.instants[-1].world + 1)
+        self.indices = _index_frames([simulation.simulator for simulation in simulations], worlds, per_world)
+        self._batches: list[list[FrameRequest]] = []
+        self._processes = min(workers, self.indices[-1].world + 1)
         self._loader = DataLoader(
-            FramesOrErrors(HeldWorlds(simulations, self.instants, self.questions)),
+            FramesOrErrors(HeldFrames(simulations, self.indices, self.queries)),
             batch_sampler=self._batches,
             collate_fn=list,
             num_workers=self._processes,
@@ -212,10 +219,10 @@ class CommonInstants:
 
     def _hold(self, budget_bytes: float) -> None:
         """Build all worlds, as many at a time as there are processes, unless they take more than there is room for."""
-        worlds, bytes_of = self.instants[-1].world + 1, dict[int, float]()
+        worlds, bytes_of = self.indices[-1].world + 1, dict[int, float]()
         together = max(self._processes, 1)
         for first in range(0, worlds, together):
-            some = [at for at, one in enumerate(self.instants) if first <= one.world < first + together]
+            some = [at for at, one in enumerate(self.indices) if first <= one.world < first + together]
             for frame in self.frames(None, some):
                 bytes_of[frame.place_in_time] = frame.counts["world_bytes"]
             largest = max(bytes_of.values())
@@ -227,10 +234,10 @@ class CommonInstants:
                 )
 
     def __len__(self) -> int:
-        return len(self.instants)
+        return len(self.indices)
 
-    def anew(self, seed: int, worlds: int, more: Mapping[str, Objective]) -> "CommonInstants":
-        """The same questions, and more, at as many instants in each of other worlds.
+    def resampled(self, seed: int, worlds: int, more: Mapping[str, Objective]) -> "CommonFrames":
+        """Return the same queries, and more, on as many frames in each of other worlds.
 
         Args:
             seed: Another one, so that no world is the same.
@@ -245,63 +252,58 @@ class CommonInstants:
         if not (fresh := [one for one in self.scenarios if not one.repeats]):
             names = ", ".join(repr(one.name) for one in self.scenarios)
             raise ValueError(f"scenarios: one whose worlds are drawn is needed; {names} is the same for any seed")
-        return CommonInstants(fresh, {**self.objectives, **more}, worlds=worlds, seed=seed, **self._settings)
+        return CommonFrames(fresh, {**self.objectives, **more}, worlds=worlds, seed=seed, **self._settings)
 
-    def prefixes(self, rig: Rig) -> Iterator[Prefix]:
-        """What is known of a rig after three instants more at a time; nothing is scored before it is asked for.
+    def score(self, rig: Rig) -> Score:
+        """Return the numbers of a rig on all frames, and its share of self-hits.
 
         Raises:
-            ValueError: The rig cannot be mounted: a sensor inside the vehicle or another body, or below the ground.
+            ValueError: A sensor lies inside the vehicle or another body, or below the ground.
         """
-        numbers, rays, self_hits = self._numbers(rig, [self.estimate]), 0, 0
-        for start in range(0, len(self), TOGETHER):
-            for seen in self._measured(rig, self.order[start : start + TOGETHER].tolist(), numbers):
-                rays, self_hits = rays + seen.counts["rays"], self_hits + seen.counts["self_hits"]
-            done = min(start + TOGETHER, len(self))
-            yield Prefix(done, numbers.estimate(self.estimate), self_hits / rays)
+        observers, self_hit_share = self._observe(rig, [self.estimate])
+        return Score(observers.estimate(self.estimate), self_hit_share)
 
     def estimates(self, rig: Rig) -> dict[Measure, Estimate]:
-        """What is known of a rig after all instants, by either measure; ValueError as `prefixes`."""
-        numbers = self._numbers(rig, MEASURES)
-        for _ in self._measured(rig, self.order.tolist(), numbers):
-            pass
-        return {measure: numbers.estimate(measure) for measure in MEASURES}
+        """Return the numbers of a rig on all frames by both averages; ValueError as `score`."""
+        observers, _ = self._observe(rig, MEASURES)
+        return {measure: observers.estimate(measure) for measure in MEASURES}
 
-    def _numbers(self, rig: Rig, measures: Sequence[Measure]) -> RigNumbers:
+    def _observe(self, rig: Rig, measures: Sequence[Measure]) -> tuple[RigObservers, float]:
+        observers, rays, self_hits = self._observers_of(rig, measures), 0, 0
+        for measured in self._compute(self._as_requested(rig), range(len(self)), tuple(observers.coverage)):
+            observers.add(measured)
+            rays, self_hits = rays + measured.counts["rays"], self_hits + measured.counts["self_hits"]
+        return observers, self_hits / rays
+
+    def _observers_of(self, rig: Rig, measures: Sequence[Measure]) -> RigObservers:
         required = {name: one for name, one in self.objectives.items() if one.requires}
         kept = {name: one.share_kept(rig, self._worlds[0], self.sensor_model) for name, one in required.items()}
-        return replace(self.questions.numbers_of(rig, measures), kept=kept)
-
-    def _measured(self, rig: Rig, numbers: Sequence[int], observed: RigNumbers) -> Iterator[MeasuredFrame]:
-        """What is left of a rig's frames at some instants, in their order, each once it is added."""
-        for seen in self._made(self._as_asked(rig), numbers, tuple(observed.coverage)):
-            observed.add(seen)
-            yield seen
+        return replace(self.queries.numbers_of(rig, measures), kept=kept)
 
     def frames(self, rig: Rig | None = None, numbers: Sequence[int] | None = None) -> Iterator[Frame]:
-        """What a rig sees at some instants, in their order, with the points of the reference that are asked about.
+        """Yield frames of a rig, in order, with the reference points inside the queried regions.
 
         Args:
             rig: The sensors; none gives the reference alone.
-            numbers: Of the instants; all if not given.
+            numbers: Numbers of the frames; all if not given.
 
         Raises:
-            ValueError: As `prefixes`.
+            ValueError: As `score`.
         """
-        rig, wanted = rig and self._as_asked(rig), range(len(self)) if numbers is None else numbers
-        for start in range(0, len(wanted), TOGETHER):
-            yield from self._made(rig, wanted[start : start + TOGETHER])
+        rig, wanted = rig and self._as_requested(rig), range(len(self)) if numbers is None else numbers
+        for start in range(0, len(wanted), BATCH):
+            yield from self._compute(rig, wanted[start : start + BATCH])
 
-    def _as_asked(self, rig: Rig) -> Rig:
+    def _as_requested(self, rig: Rig) -> Rig:
         self._check_vehicle(rig)
         return rig.sensing("ideal") if self.sensor_model == "ideal" else rig
 
-    def _made(self, rig: Rig | None, numbers: Sequence[int], measures: tuple[Measure, ...] = ()) -> list[Any]:
+    def _compute(self, rig: Rig | None, numbers: Sequence[int], measures: tuple[Measure, ...] = ()) -> list[Any]:
         shares: list[list[int]] = [[] for _ in range(max(self._processes, 1))]
         for number in numbers:
-            shares[self.instants[number].world % len(shares)].append(number)
+            shares[self.indices[number].world % len(shares)].append(number)
         # The k-th batch goes to the k-th process, which has built these worlds.
-        self._batches[:] = [[AskedInstant(rig, number, measures) for number in share] for share in shares]
+        self._batches[:] = [[FrameRequest(rig, number, measures) for number in share] for share in shares]
         made: dict[int, Frame | MeasuredFrame | ValueError] = {}
         try:
             for share, batch in zip(shares, batches_of(self._loader), strict=True):
@@ -324,7 +326,7 @@ class CommonInstants:
         for scenario, world in zip(self.scenarios, self._worlds, strict=True):
             if with_ego(scenario, {rig.name: rig}).ego != world.ego:
                 raise ValueError(
-                    f"rig {rig.name!r} is for the vehicle {rig.vehicle}, and these instants have {world.ego_name}: say "
+                    f"rig {rig.name!r} is for the vehicle {rig.vehicle}, and these frames have {world.ego_name}: say "
                     "which by vehicle="
                 )
         self._vehicles.add(rig.vehicle)
@@ -340,10 +342,10 @@ class CommonInstants:
         self.close()
 
 
-def _instants_of(simulators: Sequence[Simulator], worlds: int, per_world: int) -> list[HeldInstant]:
-    """The instants of all scenarios, world by world. ValueError: a run through a scenario has fewer instants."""
+def _index_frames(simulators: Sequence[Simulator], worlds: int, per_world: int) -> list[FrameIndex]:
+    """Return the frames of all scenarios, world by world. ValueError: a run through a scenario has fewer frames."""
     of_worlds = [(k, steps) for k, one in enumerate(simulators) for steps in _steps(one, worlds, per_world)]
-    return [HeldInstant(scenario, step, world) for world, (scenario, steps) in enumerate(of_worlds) for step in steps]
+    return [FrameIndex(scenario, step, world) for world, (scenario, steps) in enumerate(of_worlds) for step in steps]
 
 
 def _steps(simulator: Simulator, worlds: int, per_world: int) -> list[list[int]]:
@@ -360,7 +362,7 @@ def _steps(simulator: Simulator, worlds: int, per_world: int) -> list[list[int]]
         index += 1
     if (fewest := min(map(len, of_worlds))) < per_world:
         raise ValueError(
-            f"per_world: a run of {simulator.scenario.name!r} has {fewest} instants that are {simulator.every_s:g} s "
+            f"per_world: a run of {simulator.scenario.name!r} has {fewest} frames that are {simulator.every_s:g} s "
             f"apart; got {per_world}"
         )
     return of_worlds

@@ -1,0 +1,113 @@
+"""Paired improvements, and the validation on held-out worlds."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from tests.placement.worlds import estimate_of, held, lidar, rig, yard
+from torchcover.placement import Objective, validation
+from torchcover.placement.search import find_non_dominated, measure_gains
+from torchcover.placement.validation import SideEffect, _others, adjust_holm, validate
+
+WORLDS, PER_WORLD = 6, 3
+WORLD = np.repeat(np.arange(WORLDS), PER_WORLD)
+
+
+def test_gains_are_those_of_a_paired_t_test_and_have_the_direction_of_the_number():
+    generator = np.random.default_rng(0)
+    one, other = generator.normal(size=(2, 18, 2))
+    lower = {"lower_is_better": ["o1"]}
+    gain, error = measure_gains(estimate_of(one, WORLD, **lower), estimate_of(other, WORLD, **lower))
+    of_worlds = (one - other).reshape(6, 3, 2).mean(axis=1)
+    expected = stats.ttest_1samp(of_worlds, 0.0)
+    np.testing.assert_allclose(gain, of_worlds.mean(axis=0) * [1, -1])
+    np.testing.assert_allclose(gain / error, expected.statistic * [1, -1])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_pareto_front_is_what_no_other_candidate_dominates_in_any_order(seed):
+    values = np.random.default_rng(seed).integers(0, 5, (12, 3)).astype(float)
+    order, front = np.random.default_rng(seed).permutation(12), find_non_dominated(values)
+    assert np.array_equal(find_non_dominated(values[order]), front[order])
+    for at, is_on_front in enumerate(front):
+        assert is_on_front != ((values >= values[at]).all(1) & (values > values[at]).any(1)).any()
+
+
+def test_two_worlds_have_no_error_however_many_frames():
+    values = np.random.default_rng(0).normal(size=12)
+    gain, error = measure_gains(estimate_of(values, [0, 1] * 6), estimate_of(np.zeros(12), [0, 1] * 6))
+    assert np.isnan(error[0])
+    assert gain[0] == pytest.approx(values.mean())
+
+
+def test_pairing_takes_out_what_a_world_does_to_all():
+    generator = np.random.default_rng(1)
+    city = generator.normal(0, 0.07, (400, 1))
+    own = generator.normal([0.5, 0.51], 0.009, (400, 2))
+    one, other = (city + own[:, :1])[:, 0], (city + own[:, 1:])[:, 0]
+    _, error = measure_gains(estimate_of(other, range(400)), estimate_of(one, range(400)))
+    unpaired = np.sqrt((one.var(ddof=1) + other.var(ddof=1)) / 400)
+    assert (unpaired / error[0]) ** 2 > 30
+
+
+def test_a_number_that_is_by_no_choice_of_estimate_is_tested_once():
+    low, high = rig(lidar(mount={"z_m": 1.6}), name="low"), rig(lidar(mount={"z_m": 2.4}), name="high")
+    keys = {"near": "radius_m", "largest": "radius_maximum_m", "cells": "known_radius_m"}
+    objectives = {name: Objective(number=key, region="20m") for name, key in keys.items()}
+    with held(objectives=objectives, estimate="known", worlds=2) as searched:
+        found = validate({"higher": high}, low, searched, test_seed=1, worlds=2).gains["higher"]
+    said = [("near", "known"), ("largest", "-"), ("cells", "known"), ("near", "area")]
+    assert [(gain.objective, gain.estimate) for gain in found] == said
+
+
+def test_the_fresh_test_is_about_other_worlds_and_says_what_was_optimism(frames):
+    low, high = rig(lidar(mount={"z_m": 1.6}), name="low"), rig(lidar(mount={"z_m": 2.4}), name="high")
+    test = validate({"higher": high}, low, frames, test_seed=1, worlds=8)
+    found, others = test.gains["higher"], _others(frames.objectives, failures=False)[0]
+    anew = held(seed=1, worlds=8, objectives={**frames.objectives, **others})
+    assert [(gain.objective, gain.estimate) for gain in found] == [
+        (name, measure) for measure in ("area", "known") for name in ("near", "far", "bay")
+    ]
+    by_test, by_search = ([of.estimates(one) for one in (high, low)] for of in (anew, frames))
+    for gain in found:
+        expected = by_test[0][gain.estimate].differences(by_test[1][gain.estimate])
+        in_search = by_search[0][gain.estimate].minus(by_search[1][gain.estimate])
+        column = ["near", "far", "bay"].index(gain.objective)
+        np.testing.assert_equal(gain.test, expected[gain.objective])
+        assert gain.search_gain == float(in_search.value[column])
+        np.testing.assert_equal(gain.optimism, gain.search_gain - expected[gain.objective].value)
+    assert found[1].test.p < 0.5
+    assert {change.what for change in test.changes} == others.keys()
+    # What a gain is made of sums up to it, whatever else the parts are; a loss has no share of a gain.
+    for name in ("near", "far", "bay"):
+        shares = [change.shares[name] for change in test.changes if name in change.shares]
+        assert len(shares) == len(frames.objectives[name].places)
+        assert sum(shares) == pytest.approx(1)
+    lost = validate({"lower": low}, high, frames, test_seed=1, worlds=2)
+    assert not any(change.shares for change in lost.changes)
+    with pytest.raises(ValueError, match="seed: another one than that of these worlds is needed; got 0 for both"):
+        frames.resampled(0, 4, {})
+    with pytest.raises(ValueError, match="one whose worlds are drawn is needed; 'yard' is the same for any seed"):
+        held([yard()], {"far": frames.objectives["far"]}).resampled(1, 4, {})
+
+
+def test_of_twenty_searches_that_change_nothing_at_most_one_says_that_something_got_worse():
+    draws, alarms = np.random.default_rng(0), 0
+    for _ in range(200):
+        shared = draws.normal(0.0, 1.0, (16, 4)) @ draws.normal(0.0, 1.0, (4, 33))  # regions overlap
+        one, other = (estimate_of(shared + draws.normal(0.0, 0.5, (16, 33)), np.arange(16)) for _ in range(2))
+        tests = list(one.differences(other).values())
+        changes = [
+            SideEffect("a", test, p, {}) for test, p in zip(tests, adjust_holm([test.p for test in tests]), strict=True)
+        ]
+        alarms += any(change.is_worse for change in changes)
+    assert alarms <= 10
+
+
+def test_targets_are_counted_around_the_vehicle(frames, monkeypatch):
+    monkeypatch.setattr(validation, "TARGETS", ("child",))
+    low, high = rig(lidar(mount={"z_m": 1.6}), name="low"), rig(lidar(mount={"z_m": 2.4}), name="high")
+    (change,) = validation._of_targets(high, low, frames).values()
+    assert change.gain > 0
+    assert change.p < 0.05
+    assert change.blocks == 16
