@@ -73,13 +73,6 @@ SPACES = {
     },
 }  # fmt: skip
 STRATEGIES = {"optimizer": OptimizerParams(), "random": OptimizerParams(startup=0, control_every=1)}
-# The Gaussian process of commit c13c497e with the same spaces, frames and candidates: median, difference to random.
-FORMER = {
-    "x, z, pitch on a van; near ground": "34.9, +7.5 ± 2.2",
-    "one of 5 models, x, z, pitch": "43.4, +4.8 ± 1.5",
-    "two LiDARs, 10 numbers": "30.1, +4.1 ± 1.9",
-    "one of 3 mount regions, pose on it": "27.8, +2.0 ± 0.7",
-}
 
 
 def search_gains(name, seeds, evaluations):
@@ -109,9 +102,8 @@ def compare_strategies(seeds, evaluations, processes):
             error = difference.std(ddof=1) / np.sqrt(seeds) if seeds > 1 else np.nan
             medians = f"{np.median(optimizer):.1f}", f"{np.median(random):.1f}"
             better = f"{(difference > 0).sum()} of {seeds}"
-            rows.append((name, *medians, f"{difference.mean():+.1f} ± {error:.1f}", better, FORMER[name]))
-    header = "free", "optimizer", "random", "difference", "better in", "c13c497e: median, difference"
-    table(header, rows)
+            rows.append((name, *medians, f"{difference.mean():+.1f} ± {error:.1f}", better))
+    table(("free", "optimizer", "random", "difference", "better in"), rows)
 
 
 def compare_pairs(rigs=24, worlds=16):
