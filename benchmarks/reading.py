@@ -14,7 +14,7 @@ import torch
 
 from benchmarks import compare, table
 from torchcover.data import AccumulatedReference, RecordedFrames, open_recording
-from torchcover.recordings.formats.kitti_files import vehicle_T_velodyne
+from torchcover.recordings.formats.kitti import vehicle_T_velodyne
 from torchcover.recordings.in_vehicle import in_vehicle
 
 POINTS, SWEEPS, LONG = 120_000, 50, 100_000

@@ -23,7 +23,7 @@ import numpy as np
 from PIL import Image
 
 from torchcover.geometry import euler_from_rotation, invert
-from torchcover.recordings.formats.carla_files import (
+from torchcover.recordings.formats.carla import (
     DEPTH,
     EXTENT,
     LIDARS,

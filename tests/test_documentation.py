@@ -24,7 +24,7 @@ from torchcover.data import RegionsOfInterest, SimulatedFrames, collate_frames
 from torchcover.encounters import EncounterSet
 from torchcover.evaluation import Requirements
 from torchcover.placement import ChoiceSpace, SearchSpace
-from torchcover.recordings.formats.folder_settings import read_folder_settings
+from torchcover.recordings.formats.folder import read_folder_settings
 from torchcover.simulation import Rig, Scenario
 from torchcover.simulation.bodies import Vehicle
 

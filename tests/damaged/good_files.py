@@ -24,14 +24,19 @@ from torchcover.coverage import BevGrid, Coverage, CoverageMetric
 from torchcover.data import read_cloud
 from torchcover.evaluation.checkpoint import read_header, read_state, write_checkpoint
 from torchcover.files import read_feather, read_json_table
-from torchcover.recordings.formats import kitti_files, read_objects
-from torchcover.recordings.formats.carla_files import read_carla_sensors
-from torchcover.recordings.formats.folder_settings import read_folder_settings
-from torchcover.recordings.formats.folder_tables import PoseTable
-from torchcover.recordings.formats.folder_tables import read_boxes as read_labels
+from torchcover.recordings.formats import frame_files, read_objects
+from torchcover.recordings.formats.carla import read_carla_sensors
+from torchcover.recordings.formats.folder import read_folder_settings
+from torchcover.recordings.formats.kitti import (
+    read_calibration,
+    read_labels,
+    read_oxts,
+    read_timestamps,
+    vehicle_T_velodyne,
+)
 from torchcover.recordings.formats.kitti_raw import read_tracklets
 from torchcover.recordings.formats.ros import RosBag
-from torchcover.recordings.formats.track_tables import read_trajectory
+from torchcover.recordings.formats.tracks import read_trajectory
 from torchcover.simulation import Rig, Scenario
 from torchcover.simulation.recorded.bodies import read_boxes
 from torchcover.simulation.shapes import MeshFile
@@ -250,21 +255,21 @@ def recording_files(folder):
     kitti, nuscenes, argoverse2 = (places[layout] for layout in ("kitti_raw", "nuscenes", "argoverse2"))
 
     def boxes(path):
-        return read_tracklets(path, kitti_files.vehicle_T_velodyne)
+        return read_tracklets(path, vehicle_T_velodyne)
 
     def cuboids(path):
         return read_feather(path, ("timestamp_ns", "track_uuid", "qw", "tx_m"))
 
     for path, read in (
-        (kitti.parent / "calib_imu_to_velo.txt", kitti_files.read_calibration),
-        (kitti / "oxts" / "data" / "0000000000.txt", kitti_files.read_oxts),
-        (kitti / "velodyne_points" / "timestamps.txt", lambda path: kitti_files.read_timestamps(path, [0])),
+        (kitti.parent / "calib_imu_to_velo.txt", read_calibration),
+        (kitti / "oxts" / "data" / "0000000000.txt", read_oxts),
+        (kitti / "velodyne_points" / "timestamps.txt", lambda path: read_timestamps(path, [0])),
         (kitti / "tracklet_labels.xml", boxes),
         (nuscenes / "v1.0-mini" / "sample_data.json", read_json_table),
         (argoverse2 / "annotations.feather", cuboids),
     ):
         yield Kind(path.name, path.read_bytes(), read)
-    yield Kind("label_2.txt", KITTI_LABEL, kitti_files.read_labels)
+    yield Kind("label_2.txt", KITTI_LABEL, read_labels)
     yield Kind("drive.mcap", (places["ros"] / "drive.mcap").read_bytes(), bag)
     yield Kind("drive.db3", (places["ros database"] / "drive.db3").read_bytes(), bag)
 
@@ -345,9 +350,9 @@ def kinds(folder):
         Kind("sensor.json", SENSORS, nuscenes, (("calibrated_sensor.json", CALIBRATED),)),
         Kind("calibrated_sensor.json", CALIBRATED, nuscenes, (("sensor.json", SENSORS),)),
         Kind("frames.yaml", POSES, read_folder_settings),
-        Kind("poses.csv", DRIVEN, lambda path: PoseTable(path, ("f1", "f2"), timed=True)),
+        Kind("poses.csv", DRIVEN, lambda path: frame_files.PoseTable(path, ("f1", "f2"), timed=True)),
         Kind("sensors.json", CARLA, read_carla_sensors),
-        Kind("labels.csv", LABELS, read_labels),
+        Kind("labels.csv", LABELS, frame_files.read_boxes),
         Kind("coverage.npz", coverage(folder), Coverage.load),
         *scene_files(),
         *track_files(folder),

@@ -8,7 +8,7 @@ import numpy as np
 
 from tests.recordings.bags import ros, ros1, ros_database
 from torchcover.geometry import euler_from_rotation, invert, rigid, rotation_from_euler, transform
-from torchcover.recordings.formats import argoverse2, kitti_files, nuscenes
+from torchcover.recordings.formats import argoverse2, kitti, nuscenes
 
 T0_NS = 1_532_402_927_600_000_000
 LATITUDE_DEG, LONGITUDE_DEG, ALTITUDE_M = 49.01, 8.43, 115.0
@@ -46,8 +46,8 @@ def kitti_raw(drive, root):
     (day / "calib_imu_to_velo.txt").write_text("\n".join(lines))
     times = [np.datetime64(T0_NS + round(1e9 * time_s), "ns") for time_s in drive.times_s]
     (path / "velodyne_points" / "timestamps.txt").write_text("".join(f"{str(t).replace('T', ' ')}\n" for t in times))
-    vehicle_T_velodyne = kitti_files.vehicle_T_velodyne
-    radius_m = kitti_files.EARTH_RADIUS_M
+    vehicle_T_velodyne = kitti.vehicle_T_velodyne
+    radius_m = kitti.EARTH_RADIUS_M
     first_m = None
     for index, name in enumerate(f"{k:010d}" for k in range(drive.steps)):
         points_m = transform(invert(vehicle_T_velodyne), np.concatenate(seen(drive, index)))
@@ -68,7 +68,7 @@ def kitti_raw(drive, root):
 
 
 def tracklets(drive):
-    velodyne_T_vehicle = invert(kitti_files.vehicle_T_velodyne)
+    velodyne_T_vehicle = invert(kitti.vehicle_T_velodyne)
     poses = []
     for index in range(drive.steps):
         row = drive.boxes(index).rows[0].double().numpy()

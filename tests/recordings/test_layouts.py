@@ -13,7 +13,7 @@ from tests.recordings.test_accumulated_reference import distances_m, moving, sta
 from torchcover.data import FORMATS, AccumulatedReference, RecordedFrames, open_recording
 from torchcover.files import BadFileError
 from torchcover.geometry import invert
-from torchcover.recordings.formats.kitti_files import read_timestamps
+from torchcover.recordings.formats.kitti import read_timestamps
 
 
 @pytest.fixture(params=LAYOUTS)
@@ -76,7 +76,7 @@ def test_a_recording_survives_pickle(written):
 
 def test_a_reader_reads_nothing_but_what_is_asked_for(written, monkeypatch):
     _, recording = written
-    monkeypatch.setattr("torchcover.recordings.clouds.readers.read_cloud", lambda path: pytest.fail("a scan was read"))
+    monkeypatch.setattr("torchcover.recordings.clouds.read_cloud", lambda path: pytest.fail("a scan was read"))
     assert recording.world_T_vehicle(1).shape == (4, 4)
 
 

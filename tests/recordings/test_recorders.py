@@ -14,7 +14,7 @@ from torchcover.detection import box_visibility
 from torchcover.files import RECORDING, WRITING, BadFileError, read_manifest
 from torchcover.geometry import rotation_from_euler, rotation_from_quaternion
 from torchcover.geometry.rigid import quaternion_from_rotation
-from torchcover.recordings.formats.kitti_files import BODY, read_calibration, read_labels
+from torchcover.recordings.formats.kitti import BODY, read_calibration, read_labels
 from torchcover.recordings.recorders import NOTHING, KittiRecorder
 from torchcover.simulation import SurfaceReference, writing
 

@@ -7,7 +7,7 @@ import pytest
 
 from torchcover import Rig, Scenario
 from torchcover.cameras.calibration import read_opencv, read_ros
-from torchcover.recordings.formats.folder_settings import read_folder_settings
+from torchcover.recordings.formats.folder import read_folder_settings
 from torchcover.recordings.settings import Mount
 from torchcover.simulation import Lidar, LidarModel, Pose, builtin_names
 from torchcover.simulation.bodies import Vehicle

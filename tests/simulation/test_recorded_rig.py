@@ -12,7 +12,7 @@ from tests.recordings.drives import Drive
 from torchcover.data import RecordingSettings, Scan, open_recording, rig_document
 from torchcover.files import BadFileError
 from torchcover.geometry import invert, rigid, rotation_from_euler, transform
-from torchcover.recordings.formats import argoverse2, kitti_files, nuscenes
+from torchcover.recordings.formats import argoverse2, kitti, nuscenes
 from torchcover.simulation import Lidar, Rig, builtin_names
 from torchcover.simulation.camera_sensor import MOUNT_T_CAMERA
 from torchcover.simulation.scan_estimate import estimate_scan, lasers_in_order
@@ -228,7 +228,7 @@ camera2_T_camera0 = rigid(rotation_from_euler(0.3, 0.2, -0.4), [0.06, 0.0, 0.004
 
 def by_kitti(points_m, raw=False):
     """Pixels of the left color camera, by the formula of the development kit, or by OpenCV's of the raw image."""
-    velodyne_m = transform(invert(kitti_files.vehicle_T_velodyne), points_m)
+    velodyne_m = transform(invert(kitti.vehicle_T_velodyne), points_m)
     if raw:
         x, y, z = transform(camera2_T_camera0 @ camera0_T_velodyne, velodyne_m).T
         x, y = x / z, y / z

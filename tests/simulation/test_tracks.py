@@ -7,7 +7,7 @@ import pytest
 
 from torchcover import Scenario
 from torchcover.geometry import rotation_from_euler
-from torchcover.recordings.formats.track_tables import read_trajectory
+from torchcover.recordings.formats.tracks import read_trajectory
 from torchcover.simulation import Pose
 from torchcover.simulation.rays import into_tiles, unit_directions
 from torchcover.simulation.recorded.bodies import read_boxes

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from torchcover.detection import Boxes, points_in_boxes
 from torchcover.neighbors import nearest
-from torchcover.recordings.accumulated_reference import AccumulatedReference
 from torchcover.recordings.ground_model import GroundModel, low_surfaces
 from torchcover.recordings.in_vehicle import in_vehicle
 from torchcover.recordings.pose_checks import (
@@ -21,8 +20,8 @@ from torchcover.recordings.pose_checks import (
     check_pose_jumps,
     read_stretches,
 )
-from torchcover.recordings.recorded_reference import RecordedReference, Reference
 from torchcover.recordings.recording import Recording, whole_recording
+from torchcover.recordings.reference import AccumulatedReference, RecordedReference, Reference
 
 Cloud = NDArray[np.float32]
 

@@ -19,10 +19,9 @@ from torchcover.files import allow_links, find_link_roots
 from torchcover.frames.frame import Frame
 from torchcover.frames.source import BadFrameError, FrameDataset
 from torchcover.geometry import transform
-from torchcover.recordings.accumulated_reference import AccumulatedReference
 from torchcover.recordings.in_vehicle import InVehicle, in_vehicle, joined
-from torchcover.recordings.recorded_reference import RecordedReference, Reference
 from torchcover.recordings.recording import Recording
+from torchcover.recordings.reference import AccumulatedReference, RecordedReference, Reference
 from torchcover.recordings.sweeps import Sweeps
 
 NO_GROUND = "Ground: none was found near the vehicle, so heights are z of the vehicle frame."

@@ -16,8 +16,8 @@ from torchcover.geometry import BoundingBox, invert, quaternion_from_rotation, t
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.clouds.arrays import Points
 from torchcover.recordings.formats.folder import BOXES, POSES_FILE, REFERENCE, SETTINGS_FILE
-from torchcover.recordings.formats.folder_tables import PLACE, ROTATION, write_boxes
-from torchcover.recordings.formats.kitti_files import vehicle_T_velodyne
+from torchcover.recordings.formats.frame_files import PLACE, ROTATION, write_boxes
+from torchcover.recordings.formats.kitti import vehicle_T_velodyne
 
 
 class RecordingSetup(NamedTuple):

@@ -21,19 +21,19 @@ from torchcover.geometry import (
 from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.geometry.rigid import Matrix
 from torchcover.geometry.trajectory import Trajectory
-from torchcover.recordings.accumulated_reference import (
+from torchcover.recordings.formats.tracks import BOX_COLUMNS, TRAJECTORY_COLUMNS
+from torchcover.recordings.free_space import RangeImage
+from torchcover.recordings.in_vehicle import within
+from torchcover.recordings.movers import COMPARED_S, WITHIN_M, Moved, movers
+from torchcover.recordings.objects import objects_of
+from torchcover.recordings.recording import Recording
+from torchcover.recordings.reference import (
     KNOWN_POINTS,
     ON_GROUND_M,
     USUAL_BODY,
     VOTES,
     AccumulatedReference,
 )
-from torchcover.recordings.formats.track_tables import BOX_COLUMNS, TRAJECTORY_COLUMNS
-from torchcover.recordings.free_space import RangeImage
-from torchcover.recordings.in_vehicle import within
-from torchcover.recordings.movers import COMPARED_S, WITHIN_M, Moved, movers
-from torchcover.recordings.objects import objects_of
-from torchcover.recordings.recording import Recording
 from torchcover.recordings.sweeps import MOVES_MPS, first_of_each, voxels
 from torchcover.simulation.height_field import Slopes
 from torchcover.simulation.recorded.run import pieces

@@ -11,7 +11,7 @@ from pydantic import NonNegativeFloat, PlainValidator, PositiveFloat, TypeAdapte
 
 from torchcover.geometry import BoundingBox, invert, rigid, transform
 from torchcover.geometry.trajectory import Trajectory
-from torchcover.recordings.formats.track_tables import read_trajectory
+from torchcover.recordings.formats.tracks import read_trajectory
 from torchcover.simulation.bodies import Body, Shape, VehicleShape, called, mover_mesh
 from torchcover.simulation.documents import BuiltIn, Document, PathBeside, Pose
 from torchcover.simulation.kinds import TRAFFIC

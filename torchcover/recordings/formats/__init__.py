@@ -8,15 +8,15 @@ from typing import Any, NamedTuple, Protocol
 
 from torchcover.files import RECORDING, allow_links, find_changed
 from torchcover.recordings.corrected import correct_recording
-from torchcover.recordings.formats import argoverse2, commonroad, nuscenes
+from torchcover.recordings.formats import argoverse2, nuscenes
 from torchcover.recordings.formats.argoverse2 import Argoverse2
 from torchcover.recordings.formats.carla import Carla
 from torchcover.recordings.formats.folder import FolderRecording
-from torchcover.recordings.formats.kitti_object import KittiObject
+from torchcover.recordings.formats.kitti import KittiObject
 from torchcover.recordings.formats.kitti_raw import KittiRaw
 from torchcover.recordings.formats.nuscenes import NuScenes
 from torchcover.recordings.formats.ros import RosBag
-from torchcover.recordings.formats.track_tables import read_box_tracks
+from torchcover.recordings.formats.tracks import read_box_tracks, read_commonroad
 from torchcover.recordings.objects import RecordedObjects, objects_of
 from torchcover.recordings.recording import Recording, whole_recording
 from torchcover.recordings.settings import RecordingSettings, merge_recording_settings
@@ -156,7 +156,7 @@ OBJECT_FORMATS = {
     "a log of Argoverse 2 (a folder with annotations.feather)": ObjectFormat(
         argoverse2.has_objects, argoverse2.read_objects
     ),
-    "a scenario of CommonRoad (.xml)": ObjectFormat(lambda path: path.suffix == ".xml", commonroad.read_objects),
+    "a scenario of CommonRoad (.xml)": ObjectFormat(lambda path: path.suffix == ".xml", read_commonroad),
     "a table of boxes (.csv)": ObjectFormat(
         lambda path: path.suffix == ".csv", lambda path: RecordedObjects(read_box_tracks(path))
     ),

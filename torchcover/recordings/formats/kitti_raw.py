@@ -16,9 +16,9 @@ from torchcover.detection.boxes import Boxes
 from torchcover.files import parse_xml, reads
 from torchcover.geometry import BoundingBox
 from torchcover.geometry.rigid import Matrix, euler_from_rotation, invert, rotation_from_euler, transform
-from torchcover.recordings.clouds.readers import read_cloud
-from torchcover.recordings.formats.file_names import check_same_names, frame_files, some_of
-from torchcover.recordings.formats.kitti_files import (
+from torchcover.recordings.clouds import read_cloud
+from torchcover.recordings.formats.frame_files import check_same_names, frame_files, some_of
+from torchcover.recordings.formats.kitti import (
     BODY,
     read_distorted,
     read_oxts,

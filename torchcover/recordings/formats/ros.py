@@ -13,17 +13,23 @@ from torchcover.files import naming
 from torchcover.geometry import invert
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.bag_files import METADATA, find_ros1_files
-from torchcover.recordings.formats.bag import SUFFIXES, Bag
-from torchcover.recordings.formats.frame_tree import FrameTree, frame_name
-from torchcover.recordings.formats.point_cloud2 import (
+from torchcover.recordings.formats.bag import (
     PARAMS,
     POINT_TIMES,
+    SUFFIXES,
+    Bag,
     CloudMessage,
     PointTimes,
     choose_point_times,
     cloud_of,
 )
-from torchcover.recordings.formats.ros_poses import VehiclePoses, mounted_transforms, vehicle_poses
+from torchcover.recordings.formats.ros_poses import (
+    FrameTree,
+    VehiclePoses,
+    frame_name,
+    mounted_transforms,
+    vehicle_poses,
+)
 from torchcover.recordings.recording import NO_RETURN_M, Layout, Scan, SensorCalibrations, check_times
 
 CLOUD = "sensor_msgs/msg/PointCloud2"

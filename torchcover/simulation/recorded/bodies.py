@@ -7,7 +7,7 @@ import numpy as np
 
 from torchcover.files import reads
 from torchcover.geometry import BoundingBox
-from torchcover.recordings.formats.track_tables import check_gaps, read_box_tracks
+from torchcover.recordings.formats.tracks import check_gaps, read_box_tracks
 from torchcover.recordings.objects import Track
 from torchcover.simulation.bodies import Vehicle
 from torchcover.simulation.shapes import Box, Mesh

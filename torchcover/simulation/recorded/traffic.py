@@ -13,7 +13,7 @@ from torchcover.geometry import BoundingBox, invert, overlapping
 from torchcover.geometry.rigid import Matrix
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings.formats import read_objects
-from torchcover.recordings.formats.track_tables import read_trajectory
+from torchcover.recordings.formats.tracks import read_trajectory
 from torchcover.recordings.objects import Ego, RecordedObjects
 from torchcover.simulation.bodies import sound_mesh
 from torchcover.simulation.documents import PathBeside, Pose, builtin_hashes

@@ -1,9 +1,9 @@
-"""A reference made of a recording itself: what all sensors saw within some time."""
+"""Reference clouds of a recording: recorded ones, and what all sensors saw within some time."""
 
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
 from operator import itemgetter
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +11,73 @@ from numpy.typing import NDArray
 from torchcover.detection.boxes import Boxes
 from torchcover.geometry import BoundingBox, invert, transform
 from torchcover.recordings.free_space import Key, seen_share, square_metres
-from torchcover.recordings.in_vehicle import InVehicle, within
+from torchcover.recordings.in_vehicle import InVehicle, in_vehicle, joined, within
 from torchcover.recordings.movers import COMPARED_S, WITHIN_M, Moved, movers
 from torchcover.recordings.recording import Recording
 from torchcover.recordings.sweeps import MOVES_MPS, Sweeps, Thinned, first_of_each, pose_of, voxels
+
+
+class Reference(Protocol):
+    """Where the reference clouds of a recording come from."""
+
+    def check(self, recording: Recording, judged: Collection[str], /) -> None:
+        """Whether a recording has what is needed.
+
+        Args:
+            recording: The recording.
+            judged: Names of the sensors that are measured against the reference.
+
+        Raises:
+            ValueError: It has not.
+        """
+        ...
+
+    def cloud(self, recording: Recording, index: int, judged: Collection[str], /) -> InVehicle:
+        """The reference cloud of an instant.
+
+        Raises:
+            OSError, ValueError: It cannot be read, or has no points.
+        """
+        ...
+
+    def square_metres(self, recording: Recording, /) -> bool:
+        """Whether its points have weights, the square metres that they stand for."""
+        ...
+
+    def record(self, recording: Recording, judged: Collection[str], /) -> Mapping[str, object]:
+        """For `summary.json`: `sensor`, settings, and `notes`: what the reader of the numbers has to know."""
+        ...
+
+
+class RecordedReference:
+    """The clouds of the sensors that were recorded to be the reference."""
+
+    def check(self, recording: Recording, judged: Collection[str]) -> None:
+        """Whether there are any."""
+        if not recording.reference_sensors:
+            raise ValueError(
+                f"{recording.path}: no sensor of it was recorded as a reference; accumulate one of all its sensors "
+                "(--reference accumulated, AccumulatedReference())"
+            )
+
+    def cloud(self, recording: Recording, index: int, judged: Collection[str]) -> InVehicle:
+        """All of them, at that instant."""
+        scans = [recording.scan(sensor, index) for sensor in recording.reference_sensors]
+        found = joined([in_vehicle(scan, recording.body) for scan in scans])
+        if not len(found.points_m):
+            where = ", ".join(scan.source for scan in scans)
+            raise ValueError(f"{where}: the reference cloud has no points, so there is nothing to measure against")
+        return found
+
+    def square_metres(self, recording: Recording) -> bool:
+        """Whether they were recorded with them."""
+        return recording.square_metres
+
+    def record(self, recording: Recording, judged: Collection[str]) -> Mapping[str, object]:
+        """That it was recorded."""
+        sensors = ", ".join(recording.reference_sensors)
+        return {"sensor": "recorded", "notes": [f"Reference: recorded by {sensors}."]}
+
 
 # So many scans have to see past a point.
 VOTES = 2
