@@ -247,7 +247,9 @@ def test_interleaved_parts_merge_into_the_whole(parts):
 def test_a_run_goes_on_from_its_state_dict_as_if_it_had_never_stopped():
     steps = random_steps(70, dyadic=True)
     resumed = CoverageMetric(GRID, (THRESHOLD,), blocks=16)
-    resumed.load_state_dict(metric_over(steps[:23]).state_dict())
+    stopped = metric_over(steps[:23])
+    stopped.persistent(True)
+    resumed.load_state_dict(stopped.state_dict())
     for step in steps[23:]:
         resumed.update(*step["clouds"], **step["more"])
     assert_same_state(resumed, metric_over(steps))

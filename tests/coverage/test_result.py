@@ -1,5 +1,6 @@
 """`Coverage`: region numbers, files, and the quantiles behind them."""
 
+import io
 import json
 import math
 import pickle
@@ -12,7 +13,10 @@ import torch
 from torchcover import BevGrid, Coverage, CoverageMetric, Region
 from torchcover.coverage import Layer, Maximum, MeanOfMeans, PooledMean, Quantiles, StepQuantiles, differences
 from torchcover.coverage.blocks import KnownCells
+from torchcover.detection import Boxes, box_visibility
 from torchcover.files import BadFileError
+from torchcover.frames import Frame, collate_frames
+from torchcover.frames.frame import Measured
 
 GRID = BevGrid(x=(-1.0, 20.0), y=(-5.0, 5.0), cell=0.5)
 EVERY_AGGREGATION = (Maximum(), PooledMean(), Quantiles((0.5, 0.9)), StepQuantiles((0.9,)))
@@ -358,3 +362,26 @@ def test_another_format_is_refused_by_its_number(saved, number, then):
     said = rf"coverage\.npz: coverage format {number}; this torchcover reads format 10{then}"
     with pytest.raises(ValueError, match=said):
         Coverage.load(saved)
+
+
+def test_torch_loads_plain_objects_without_running_what_a_file_says():
+    """As Lightning does with the hyperparameters of a checkpoint."""
+    grid, region = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0)), Region("a", x=(0.0, 1.0), y=(0.0, 1.0))
+    options = {"blocks": 8, "square_metres": True, "sensors": ("a",), "aggregations": (Maximum(), PooledMean())}
+    metric = CoverageMetric(grid, max_radius=5.0, regions=[region], **options)
+    clouds = torch.rand(5, 3)
+    for _ in range(9):
+        metric.update({"a": clouds}, clouds, weights=torch.ones(5))
+    boxes = Boxes.from_rows(torch.tensor([[1.0, 0, 0, 4, 2, 2, 0]]))
+    frame = Frame(
+        {"a": clouds}, clouds, index=np.int64(3), name="a", boxes=boxes, measured={"a": Measured(clouds, clouds[:, 0])}
+    )
+    seen = box_visibility(clouds, clouds, boxes, reference_weights=None)
+    stream = io.BytesIO()
+    torch.save([grid, region, metric.compute(), frame, collate_frames([frame]), seen], stream)
+    stream.seek(0)
+    loaded = torch.load(stream, weights_only=True)
+    assert loaded[:2] == [grid, region]
+    assert loaded[2].scalars() == metric.compute().scalars()
+    assert torch.equal(loaded[3].boxes.rows, boxes.rows)
+    assert loaded[4].place_in_time == [3]

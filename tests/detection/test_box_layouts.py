@@ -78,3 +78,10 @@ def test_labels_at_once_are_those_one_by_one():
     together = Boxes.from_kitti_label(labels, camera).rows
     assert together.shape == (5, 7)
     torch.testing.assert_close(together, torch.cat([Boxes.from_kitti_label([one], camera).rows for one in labels]))
+
+
+@pytest.mark.parametrize("shape", [(14, 15), (13, 15), (28, 7), (14,), (2, 2, 14)])
+def test_labels_of_kitti_have_14_numbers_each(shape):
+    with pytest.raises(ValueError, match=rf"numbers: shape \(K, 14\) is needed, .* got \({shape[0]},"):
+        Boxes.from_kitti_label(np.ones(shape))
+    assert len(Boxes.from_kitti_label([])) == 0

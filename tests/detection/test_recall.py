@@ -1,6 +1,7 @@
 """Matching, and recall and precision over visibility and distance."""
 
 import math
+import re
 from dataclasses import replace
 
 import matplotlib.pyplot as plt
@@ -325,7 +326,7 @@ def test_scalars_are_flat_floats_that_say_how_much_they_rest_on():
     assert flat["precision/distance over 0 m"] == 1.0
     assert all(isinstance(value, float) for value in flat.values())
     several = filled(FRAMES).compute().scalars()
-    assert several["recall@0.5/all"] <= several["recall@0/all"]
+    assert several["recall_score_0.5/all"] <= several["recall_score_0/all"]
 
 
 def test_intervals_are_wilson_s_and_unknown_without_trials():
@@ -430,3 +431,28 @@ def test_a_plot_of_recall_has_a_point_and_its_wilson_interval_for_every_bin_with
         plt.close(figure)
     with pytest.raises(ValueError, match=r"score_threshold: one of \(0.0, 0.5\) is needed; got 0.4"):
         metric.plot(score_threshold=0.4)
+
+
+def test_boxes_whose_z_is_that_of_the_bottom_are_warned_of_once():
+    """As MMDetection3D has them; 24 objects in 3 frames."""
+    rows = torch.rand(8, 7) * 30 + torch.tensor([0.0, 0, 0, 4, 2, 1.5, 0])
+    rows[:, 5], rows[:, 6] = 1.5, 0.0
+    rows[:, 2] = 0.75  # the center of what stands on the ground
+
+    def run(rows):
+        metric = RecallByVisibility()
+        for _ in range(4):
+            metric.update(rows, Boxes.from_rows(rows), torch.ones(len(rows)))
+
+    run(rows)
+    rows[:, 2] = 0.1
+    with pytest.warns(UserWarning, match="boxes: 24 of 24 have their center on the ground") as warned:
+        run(rows)
+    assert len(warned) == 1
+
+
+def test_keys_are_those_that_every_logger_takes():
+    metric = RecallByVisibility(score_thresholds=(0.0, 0.5))
+    metric.update([], [], [])
+    legal = re.compile(r"[\w\-. /]+")  # of MLflow
+    assert all(legal.fullmatch(key) for key in metric.compute().scalars())

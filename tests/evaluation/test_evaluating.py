@@ -5,6 +5,7 @@ import dataclasses
 import inspect
 import json
 import math
+import random
 import re
 import sys
 from collections.abc import Iterable
@@ -58,6 +59,19 @@ class Source(FrameDataset):
         reference = torch.tensor([[2.0, 0.5, 0.0], [6.0, 0.5, 1.0]])
         clouds = {"low": torch.zeros(1, 3), "high": torch.tensor([[2.0, 0.5, 0.0]])}
         return Frame(clouds, reference, index, f"f{index}")
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_the_random_states_and_the_default_device_of_the_user_are_neither_used_nor_changed(workers):
+    expected = torchcover.evaluate("front_roof_32", **SMALL)
+    before = torch.get_rng_state(), np.random.get_state(), random.getstate()  # noqa: NPY002
+    with torch.device("meta"):  # a tensor that is made on the default device has no numbers
+        found = torchcover.evaluate("front_roof_32", **SMALL, workers=workers)
+    assert found.summary == expected.summary
+    after = torch.get_rng_state(), np.random.get_state(), random.getstate()  # noqa: NPY002
+    assert torch.equal(before[0], after[0])
+    assert np.array_equal(before[1][1], after[1][1])
+    assert (before[1][2:], before[2]) == (after[1][2:], after[2])
 
 
 def test_one_rig(tmp_path):

@@ -67,8 +67,12 @@ def test_a_source_is_a_map_style_dataset_that_knows_whose_frames_they_are(tmp_pa
         assert (heights_m is not None and bool(heights_m.isfinite().any())) == source.has_heights()
         assert all(cloud.dtype == torch.float32 for cloud in (*frame.clouds.values(), frame.reference))
     assert [frame.index for frame in source] == [frame.index for frame in source] == [0, 1]
-    with pytest.raises(IndexError):
-        source[2]
+    for outside in (2, -3):
+        with pytest.raises(IndexError, match=f"frame {outside} of 2"):
+            source[outside]
+    assert [source[number].index for number in (-1, torch.tensor(1), np.int64(1))] == [1, 1, 1]
+    assert [frame.index for frame in source[:1]] == [0]
+    assert len(source[1:5]) == 1
     assert set(source.sensors) <= set(source.rigs)
     assert set(source.description) >= {"scenario", "vehicle", "frames", "seed"}
     simulated = source.description["scenario"] is not None

@@ -12,6 +12,7 @@ import pytest
 import torch
 from torchmetrics import Metric, MetricCollection
 from torchmetrics.aggregation import SumMetric
+from torchmetrics.wrappers import BootStrapper, MinMaxMetric
 
 import torchcover.contrib
 import torchcover.coverage
@@ -294,6 +295,7 @@ def test_a_state_dict_goes_round_without_aliases(case, inside):
         return torch.nn.ModuleDict({"metric": metric}) if inside else metric
 
     metric, other = case.over(case.steps[:1]), case.over(case.steps[5:7])
+    metric.persistent(True)
     other.compute()
     saved = wrap(metric).state_dict()
     kept = copy.deepcopy(saved)
@@ -308,8 +310,9 @@ def test_a_state_dict_goes_round_without_aliases(case, inside):
 
 @EVERY
 def test_a_fresh_metric_that_loads_steps_computes_without_a_warning(case):
-    fresh = case.make()
-    fresh.load_state_dict(case.over(case.steps[:3]).state_dict())
+    fresh, saved = case.make(), case.over(case.steps[:3])
+    saved.persistent(True)
+    fresh.load_state_dict(saved.state_dict())
     assert fresh.update_called
     assert_same(fresh.compute(), case.after(0, 1, 2))
 
@@ -317,6 +320,7 @@ def test_a_fresh_metric_that_loads_steps_computes_without_a_warning(case):
 @EVERY
 def test_a_state_rounded_on_the_way_does_not_make_the_sums_short(case):
     metric = case.make()
+    metric.persistent(True)
     types = {name: value.dtype for name, value in metric.metric_state.items()}
     short = {name: v.float() if v.is_floating_point() else v for name, v in metric.state_dict().items()}
     metric.load_state_dict(short)
@@ -324,14 +328,22 @@ def test_a_state_rounded_on_the_way_does_not_make_the_sums_short(case):
 
 
 @EVERY
-def test_the_state_can_be_left_out_of_the_state_dict(case):
+def test_the_state_is_part_of_the_state_dict_only_if_asked_for(case):
+    """As in torchmetrics: a checkpoint of a model loads into one with another metric, or with none."""
     metric = case.over(case.steps[:1])
-    assert set(metric.state_dict()) == set(metric.metric_state)
-    metric.persistent(False)
     assert not metric.state_dict()
     before = states(metric)
     metric.load_state_dict({})
     assert_states(metric, before)
+    metric.persistent(True)
+    assert set(metric.state_dict()) == set(metric.metric_state)
+    other = case.make(**next(iter(case.changes.values())))
+    model, saved = torch.nn.ModuleDict({"metric": other}), torch.nn.ModuleDict({"metric": metric}).state_dict()
+    before = states(other)
+    assert len(model.load_state_dict(saved, strict=False).unexpected_keys) == len(saved)
+    assert_states(other, before)
+    with pytest.raises(RuntimeError, match="the state was made by another metric"):
+        model.load_state_dict(saved)
 
 
 # Merging.
@@ -396,7 +408,8 @@ def test_sums_that_mean_something_else_are_not_merged_or_loaded(case, change):
         metric.merge_state(other)
     with pytest.raises(ValueError, match=rf"the state was made by another .* or with other .*\b{parameter}\b"):
         metric.merge_state(other.metric_state)
-    with pytest.raises(ValueError, match=rf"the state was made by another .* or with other .*\b{parameter}\b"):
+    other.persistent(True)
+    with pytest.raises(RuntimeError, match=rf"the state was made by another .* or with other .*\b{parameter}\b"):
         metric.load_state_dict(other.state_dict())
     assert_states(metric, before)
 
@@ -433,9 +446,19 @@ def test_a_state_that_lacks_something_or_has_another_shape_is_refused(case):
         for broken in (lacks, wrong):
             with pytest.raises(ValueError, match=f"'{name}'|made by another metric"):
                 metric.merge_state(broken)
-            with pytest.raises(ValueError, match=f"'{name}'|made by another metric"):
+            with pytest.raises(RuntimeError, match=f"'{name}'|made by another metric"):
                 metric.load_state_dict(broken)
     assert_states(metric, before)
+
+
+@EVERY
+def test_resampling_points_instead_of_frames_is_refused(case):
+    for wrapped in (case.make(), MinMaxMetric(case.make())):
+        with pytest.raises(
+            TypeError, match="BootStrapper resamples the points of each frame, not the frames"
+        ):
+            BootStrapper(wrapped, num_bootstraps=2)
+    BootStrapper(SumMetric(), num_bootstraps=2)
 
 
 # Collections.

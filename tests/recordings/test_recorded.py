@@ -121,7 +121,7 @@ def test_indices_count_from_both_ends_and_stop_there(tmp_path):
     assert (frames[-1].name, frames[-1].index) == ("c", 2)
     assert frames[np.int64(1)].name == "b"
     for index in (3, -4):
-        with pytest.raises(IndexError, match=rf"frame {index} of 3 in .*{tmp_path.name}"):
+        with pytest.raises(IndexError, match=f"frame {index} of 3"):
             frames[index]
 
 

@@ -14,7 +14,7 @@ from mmengine.structures import BaseDataElement
 
 from torchcover import BevGrid, CoverageMetric, Region
 from torchcover.data import Frame
-from torchcover.training import MMEngineCoverage, frames_of_batch_dict, frames_of_data_batch
+from torchcover.training import CountOnce, MMEngineCoverage, frames_of_batch_dict, frames_of_data_batch
 from torchcover.training import mmengine as adapter
 
 GRID = {"x": (0.0, 8.0), "y": (-2.0, 2.0), "cell": 1.0}
@@ -23,6 +23,8 @@ REGION = {"name": "all", "x": GRID["x"], "y": GRID["y"]}
 VEHICLE_T_LIDAR = torch.tensor(
     [[0.0, -1.0, 0.0, 0.5], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.7], [0.0, 0.0, 0.0, 1.0]]
 )
+
+KINDS_OF_THREE = [3, np.int64(3), torch.tensor(3)]
 
 
 def cloud(points, seed, columns=4):
@@ -267,3 +269,10 @@ def test_without_a_framework_only_its_own_class_is_missing():
     assert "pip install 'torchcover[lightning]'" in callback
     assert evaluator.startswith("MMEngineCoverage")
     assert "pip install mmengine" in evaluator
+
+
+def test_a_frame_counts_once_whatever_kind_of_number_its_index_is():
+    once = CountOnce()
+    frames = [Frame({"rig": torch.zeros(5, 3)}, torch.zeros(9, 3), index=index, name="a") for index in KINDS_OF_THREE]
+    assert len(once.new(frames)) == 1
+    assert {type(frame.index) for frame in frames} == {type(frame.place_in_time) for frame in frames} == {int}

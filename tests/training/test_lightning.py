@@ -565,3 +565,51 @@ def test_batches_without_frames_and_unknown_rigs_are_refused(tmp_path):
         make_trainer(tmp_path, CoverageCallback(make_metric())).fit(Validated(), loader(2), plain)
     with pytest.raises(ValueError, match="has no rig 'roof'; it has rig"):
         make_trainer(tmp_path, CoverageCallback(make_metric(), rig="roof")).fit(Validated(), loader(2), loader(2))
+
+
+# What Lightning sees of a batch
+
+
+class LogsOwn(Validated):
+    """Logs a number of its own, and hands clouds to a layer of the precision that was asked for."""
+
+    def validation_step(self, batch, batch_idx, dataloader_idx=0):
+        assert {cloud.dtype for frame in batch.frames for cloud in (frame.sensor, frame.reference)} == {torch.float32}
+        self.log("own", float(batch_idx), batch_size=len(batch))
+
+
+@pytest.mark.parametrize("precision", ["64-true", "bf16-true", "16-true", "bf16-mixed"])
+def test_a_batch_is_left_as_it_is_in_any_precision(tmp_path, precision):
+    wanted = CoverageMetric(BevGrid(**GRID), max_radius=9.0)
+    for frame in RandomFrames(5):
+        wanted.update(frame.sensor, frame.reference)
+    callback = CoverageCallback(CoverageMetric(BevGrid(**GRID), max_radius=9.0), regions=REGIONS, maps=False)
+    trainer = make_trainer(tmp_path, callback, precision=precision)
+    trainer.fit(LogsOwn(), loader(3), loader(5))
+    assert callback.coverage.scalars(REGIONS) == wanted.compute().scalars(REGIONS)
+    assert float(trainer.callback_metrics["own"]) == pytest.approx((2 * 0 + 2 * 1 + 1 * 2) / 5)
+
+
+def test_a_size_that_cannot_be_told_from_a_batch_is_asked_for(tmp_path):
+    class LogsNoSize(Validated):
+        def validation_step(self, batch, batch_idx, dataloader_idx=0):
+            self.log("own", float(batch_idx))
+
+    with pytest.raises(Exception, match="batch_size"):
+        make_trainer(tmp_path).fit(LogsNoSize(), loader(3), loader(5))
+
+
+def test_a_test_is_measured_under_a_name_of_its_own(tmp_path):
+    class Tested(Model):
+        def test_step(self, batch, batch_idx):
+            pass
+
+    wanted = CoverageMetric(BevGrid(**GRID), max_radius=9.0)
+    for frame in RandomFrames(5):
+        wanted.update(frame.sensor, frame.reference)
+    callback = CoverageCallback(CoverageMetric(BevGrid(**GRID), max_radius=9.0), regions=REGIONS, maps=False)
+    trainer = make_trainer(tmp_path, callback)
+    trainer.test(Tested(), loader(5), verbose=False)
+    logged = {name: float(value) for name, value in trainer.callback_metrics.items()}
+    expected = {f"coverage/test/{name}": value for name, value in wanted.compute().scalars(REGIONS).items()}
+    assert {name: logged[name] for name in expected} == pytest.approx(expected, rel=1e-6)

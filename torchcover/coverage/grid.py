@@ -318,3 +318,7 @@ def _centres(bounds: tuple[float, float], cell: float) -> Tensor:
 def _between(bounds: tuple[float, float], step: Tensor, steps: int) -> Tensor:
     # (lo (n - i) + hi i) / n rounds once where lo and hi are whole numbers: the border at 0.3 is 0.3, not 3 * 0.1.
     return (bounds[0] * (steps - step) + bounds[1] * step) / steps
+
+
+# `torch.load` gives them back with weights_only=True, its default.
+torch.serialization.add_safe_globals([BevGrid])

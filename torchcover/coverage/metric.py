@@ -1,6 +1,7 @@
 """The coverage metric: clouds in, sums over the cells that were touched, coverage out."""
 
 import math
+import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -36,6 +37,11 @@ from torchcover.neighbors import nearest
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+# With a larger share of the reference points, and of as many at least, in no cell, the clouds are probably in another
+# frame.
+MOST_OUTSIDE = 0.9
+MIN_POINTS = 1000
 
 
 class CoverageMetric(SumsInBlocks):
@@ -138,6 +144,7 @@ class CoverageMetric(SumsInBlocks):
         self._failures = SensorFailures(self.sensors, thresholds, square_metres) if sensors else None
         self.aggregations: tuple[Aggregation, ...] = (*self._of_grid, *([self._failures] if self._failures else []))
         self._aggregated, self._columns = tuple(aggregations), Columns(self.aggregations)
+        self._is_updated, self._warnings = False, set[str]()
         self._places = Places(regions if square_metres or aggregations else (), grid)
         shape: dict[str, Any] = {"columns": self._columns.count, "maxima": self._columns.maxima}
         self.add_touched_sums("cells", grid.cells, **shape)
@@ -184,6 +191,18 @@ class CoverageMetric(SumsInBlocks):
         given = {"weights": weights, "height": height, "place_in_time": place_in_time, "error": error}
         for sums in self.sums_of(sensor, reference, **given):
             self.add(sums)
+        self._is_updated = True
+        if weights is not None and len(weights) and not self.square_metres:
+            self._warn_once(
+                "weights",
+                "square metres were given, but this metric averages over cells; square_metres=True makes it average "
+                "over area, too",
+            )
+
+    def _warn_once(self, subject: str, message: str) -> None:
+        if subject not in self._warnings:
+            self._warnings.add(subject)
+            warnings.warn(f"{subject}: {message}", stacklevel=3)
 
     def forward(self, sensor: SensorClouds, reference: Clouds, **given: Any) -> Coverage:  # noqa: ANN401
         """Add steps as `update` does, which takes the same, and return the coverage of these steps alone."""
@@ -199,8 +218,9 @@ class CoverageMetric(SumsInBlocks):
         """
         given = dict.fromkeys(("weights", "height", "place_in_time", "error")) | given
         sensor, reference, given = map_tensors((sensor, reference, given), with_float64)
-        how: dict[str, Any] = {"grid": self.grid, "square_metres": self.square_metres, "names": self.sensors}
-        return list(map(self._sums_of, checked_steps(sensor, reference, **given, first=int(self.steps), **how)))
+        parameters: dict[str, Any] = {name: getattr(self, name) for name in ("grid", "thresholds", "square_metres")}
+        parameters |= {"names": self.sensors, "first": int(self.steps)}
+        return list(map(self._sums_of, checked_steps(sensor, reference, **given, **parameters)))
 
     @torch.no_grad()  # torchmetrics enables gradients in `forward`; the sums would hold on to every step's graph
     def _sums_of(self, step: CheckedStep) -> StepSums:
@@ -269,7 +289,18 @@ class CoverageMetric(SumsInBlocks):
         return values
 
     def compute(self) -> Coverage:
-        """The coverage so far. Cells that no reference point ever probed are NaN with count 0."""
+        """The coverage so far. Cells that no reference point ever probed are NaN with count 0.
+
+        Warns:
+            UserWarning: Nearly all reference points that `update` was given are outside the grid, or in no band.
+        """
+        inside, outside = int(self.inside_points), int(self.outside_points)
+        if self._is_updated and outside > MOST_OUTSIDE * max(inside + outside, MIN_POINTS):
+            self._warn_once(
+                "reference",
+                f"{outside:,} of {inside + outside:,} points lie outside the grid or in no height band; are the clouds "
+                "in the vehicle frame (z = 0 on the ground), not that of a sensor?",
+            )
         cells, table = self.grid.cells, self.cells
         whole = added_up(torch.cat([table[:, :1] % cells, table[:, 1:]], dim=1), self._columns.maxima)
         at, sums = whole[:, 0].long(), self._columns.read(whole[:, 1:].T)

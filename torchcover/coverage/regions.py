@@ -270,3 +270,7 @@ def near_field_regions(
         "right": (x, (across[0], y[0])),
     }
     return tuple(Region(f"{side}_{reach_m:g}m", *bounds) for side, bounds in sides.items())
+
+
+# `torch.load` gives them back with weights_only=True, its default.
+torch.serialization.add_safe_globals([Region])

@@ -345,3 +345,8 @@ class Coverage:
         if height not in self.grid.heights:
             raise ValueError(f"height {height!r}: the grid has {', '.join(self.grid.heights)}")
         return list(self.grid.heights).index(height)
+
+
+# `torch.load` gives them back with weights_only=True, its default.
+torch.serialization.add_safe_globals([Coverage, BlockSums, KnownCells, PlaceNumbers, PlaceSums])
+torch.serialization.add_safe_globals([Layer, Quantity, Redundancy])

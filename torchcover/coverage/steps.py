@@ -21,7 +21,7 @@ BUILT_IN = frozenset({MeanOfMeans.name, VisibleArea.name, SensorFailures.name})
 # Steps are numbered in int64, and blocks double until one holds the last.
 MAX_NUMBER = 10**15
 
-# What rounding may move a point by, as a share of a cell.
+# What rounding may move a point by, as a share of a cell or of the smallest threshold.
 MOST_OF_A_CELL = 0.05
 
 # One step, or a list with an entry for each.
@@ -110,6 +110,7 @@ def checked_steps(
     error: Clouds | None,
     *,
     grid: BevGrid,
+    thresholds: Sequence[float],
     square_metres: bool,
     names: Sequence[str] = (),
     first: int,
@@ -140,11 +141,11 @@ def checked_steps(
     for at, (clouds, off, *parts) in enumerate(each):
         for name, cloud in clouds.items():
             check_cloud(cloud, f"sensor[{at}]" + f"[{name!r}]" * bool(name))
-            _check_resolution(cloud, grid, f"sensor[{at}]" + f"[{name!r}]" * bool(name))
+            _check_resolution(cloud, grid, thresholds, f"sensor[{at}]" + f"[{name!r}]" * bool(name))
         step = CheckedStep(clouds, None if off is None else _by_sensor(off, rigs[at], clouds, f"error[{at}]"), *parts)
         steps.append(step)
         check_cloud(step.reference, f"reference[{at}]")
-        _check_resolution(step.reference, grid, f"reference[{at}]")
+        _check_resolution(step.reference, grid, thresholds, f"reference[{at}]")
         check_weights(step.weights, len(step.reference), f"weights[{at}]")
         _check_height(step.height, step.reference, grid, f"height[{at}]")
         if not 0 <= step.number <= MAX_NUMBER:
@@ -152,14 +153,17 @@ def checked_steps(
     return steps
 
 
-def _check_resolution(cloud: Tensor, grid: BevGrid, name: str) -> None:
-    """Of the usual type: who chooses a shorter one knows that it is short."""
-    farthest_m = max(map(abs, (*grid.x, *grid.y)))
-    apart_m = farthest_m * torch.finfo(torch.float32).eps
-    if cloud.dtype == torch.float32 and apart_m > MOST_OF_A_CELL * grid.cell:
+def _check_resolution(cloud: Tensor, grid: BevGrid, thresholds: Sequence[float], name: str) -> None:
+    """Refuse coordinates of a type whose numbers are too far apart at the end of the grid."""
+    farthest_m = max(abs(bound) for bounds in (grid.x, grid.y, *grid.heights.values()) for bound in bounds)
+    apart_m = farthest_m * torch.finfo(cloud.dtype).eps
+    finest_m = min([grid.cell, *(threshold for threshold in thresholds if threshold > 0)])
+    if apart_m > MOST_OF_A_CELL * finest_m:
         raise ValueError(
-            f"{name}: float32 coordinates are {apart_m:.2g} m apart at {farthest_m:,.0f} m, where the grid ends, and "
-            f"its cells are {grid.cell:g} m; subtract a place near the vehicle from clouds and grid, or give float64"
+            f"{name}: {str(cloud.dtype).removeprefix('torch.')} coordinates are {apart_m:.2g} m apart at "
+            f"{farthest_m:,.0f} m, where the grid ends, and its cells, or a threshold, are {finest_m:g} m; subtract a "
+            "place near the vehicle from clouds and grid, or give a wider type (a precision of Lightning such as "
+            "bf16-true casts tensors of a batch, but no FrameBatch)"
         )
 
 

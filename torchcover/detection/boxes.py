@@ -148,7 +148,12 @@ class Boxes:
         Raises:
             ValueError: Another shape, or as the constructor.
         """
-        given = np.asarray(numbers, dtype=np.float64).reshape(-1, 14)
+        given = np.asarray(numbers, dtype=np.float64)
+        given = given.reshape(0, 14) if given.size == 0 else given
+        if given.ndim != 2 or given.shape[1] != 14:
+            raise ValueError(
+                f"numbers: shape (K, 14) is needed, what follows the type without a score; got {given.shape}"
+            )
         height, width, length, x, y, z, turn = given[:, 7:].T
         centre = np.column_stack([x, y - height / 2, z])  # the camera's y points down
         ahead = np.column_stack([np.cos(turn), np.zeros_like(turn), -np.sin(turn)])
@@ -234,3 +239,7 @@ def _rows(name: str, given: ArrayLike) -> Float64:
         bad = int((~np.isfinite(array)).any(axis=1).sum())
         raise ValueError(f"{name} of boxes: {bad} of {len(array)} are not finite")
     return array
+
+
+# `torch.load` gives them back with weights_only=True, its default.
+torch.serialization.add_safe_globals([Boxes])

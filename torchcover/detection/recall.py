@@ -1,6 +1,7 @@
 """Recall and precision of a detector over what was visible, frame by frame as it finds it."""
 
 import math
+import warnings
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
@@ -20,6 +21,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 T = TypeVar("T")
+
+# A box looks as if z were that of its bottom if its center is lower than this share of its height above z = 0.
+LOW_CENTER = 0.15
+# The share of boxes that look so, and how many there have to be, for a warning.
+MOST_LOW = 0.9
+MIN_BOXES = 20
 
 
 class DetectedFrame:
@@ -146,6 +153,7 @@ class RecallByVisibility(MergeableMetric):
         scores = tuple(float(score) for score in score_thresholds)
         _check_parameters(by, threshold, borders, scores)
         super().__init__({"by": by, "threshold": threshold, **borders, "score_thresholds": scores}, **kwargs)
+        self._box_counts: tuple[int, int] | None = (0, 0)  # low and all; None once it has been warned of
         self.by = by
         self.threshold = threshold
         self.visibility_borders = borders["visibility_borders"]
@@ -191,6 +199,21 @@ class RecallByVisibility(MergeableMetric):
         checked = [DetectedFrame(*frame) for frame in zip(*frames, strict=True)]
         for frame in checked:
             self._add_frame(frame)
+        self._warn_of_low_boxes(torch.cat([frame.truth for frame in checked]) if checked else None)
+
+    def _warn_of_low_boxes(self, truth: Tensor | None) -> None:
+        """Warn once if the centers of most objects so far are on the ground, as if z were that of the bottom."""
+        if truth is None or self._box_counts is None:
+            return
+        low = (truth[:, 2].abs() < LOW_CENTER * truth[:, 5]).sum()
+        self._box_counts = (self._box_counts[0] + int(low), self._box_counts[1] + len(truth))
+        if self._box_counts[1] >= MIN_BOXES and self._box_counts[0] > MOST_LOW * self._box_counts[1]:
+            warnings.warn(
+                f"boxes: {self._box_counts[0]} of {self._box_counts[1]} have their center on the ground; z has to be "
+                "that of the center, not of the bottom: add half of the height",
+                stacklevel=3,
+            )
+            self._box_counts = None
 
     @torch.no_grad()
     def _add_frame(self, frame: DetectedFrame) -> None:

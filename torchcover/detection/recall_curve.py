@@ -106,12 +106,12 @@ class DetectionCounts:
         Returns:
             `"recall/all"`, `"recall/visibility 0.2-0.4"`, `"objects/visibility 0.2-0.4"`,
             `"precision/distance 0-20 m"`, `"detections/distance 0-20 m"` and so on; with several score thresholds
-            `"recall@0.5/all"`.
+            `"recall_score_0.5/all"`.
         """
         flat = {}
         curves = {"": self.overall(), "visibility ": self.over("visibility"), "distance ": self.over("distance")}
         for row, score in enumerate(self.score_thresholds):
-            at = f"@{score:g}" if len(self.score_thresholds) > 1 else ""
+            at = f"_score_{score:g}" if len(self.score_thresholds) > 1 else ""
             for axis, curve in curves.items():
                 for column, name in enumerate(curve.bins):
                     flat[f"recall{at}/{axis}{name}"] = float(curve.recall.value[row, column])

@@ -208,3 +208,7 @@ def _check(sensor: Tensor, reference: Tensor, threshold: float, weights: Tensor 
     if not threshold >= 0:
         raise ValueError(f"threshold: a distance >= 0 in metres is needed; got {threshold}")
     check_weights(weights, len(reference), "reference_weights")
+
+
+# `torch.load` gives them back with weights_only=True, its default.
+torch.serialization.add_safe_globals([BoxVisibility])

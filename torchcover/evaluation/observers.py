@@ -118,7 +118,8 @@ class CoverageObserver:
         Raises:
             ValueError: Of a metric with other parameters.
         """
-        self.metric.load_state_dict(state_dict)
+        self.metric.reset()
+        self.metric.merge_state(dict(state_dict))
 
     def merge_state(self, other: "CoverageObserver") -> None:
         """Add the frames of another one of the same rig.

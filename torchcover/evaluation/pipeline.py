@@ -301,6 +301,7 @@ def _each(
         collate_fn=list,
         num_workers=workers,
         worker_init_fn=end_with_parent(),
+        generator=torch.Generator("cpu"),  # the loader draws a number: not from the generator of the user
         multiprocessing_context=method if workers else None,
         prefetch_factor=1 if workers else None,  # what is made ahead waits in shared memory
     )
@@ -319,7 +320,8 @@ def batches_of(loader: DataLoader[Any]) -> Iterator[Any]:
 
     Whatever ends the loop early kills workers that are stopped, for which the end of the program would wait.
     """
-    batches = iter(loader)
+    with torch.device("cpu"):  # the number that the loader draws is a tensor of the default device
+        batches = iter(loader)
     workers = [worker.pid or 0 for worker in active_children()] if loader.num_workers else []
     try:
         while True:

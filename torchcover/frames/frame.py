@@ -1,6 +1,7 @@
 """One instant: what the rig saw and what was there to be seen."""
 
 import math
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
@@ -67,8 +68,10 @@ class Frame:
     __repr__ = brief
 
     def __post_init__(self) -> None:
-        if self.place_in_time is None:
-            object.__setattr__(self, "place_in_time", self.index)
+        # Plain numbers: those of NumPy would not be equal to them as text, nor load with `weights_only=True`.
+        for name in ("index", "place_in_time"):
+            number = getattr(self, name)
+            object.__setattr__(self, name, self.index if number is None else operator.index(number))
         for rig in self.measured.keys() & self.clouds.keys():
             sizes = [len(self.clouds[rig]), *map(len, self.measured[rig])]
             if len(set(sizes)) > 1:
@@ -204,17 +207,21 @@ class Frame:
         )
 
 
-@dataclass(frozen=True, repr=False)
 class FrameBatch:
     """Frames side by side, in order, as `CoverageMetric.update` takes them.
+
+    It is no dataclass and cannot be iterated over, so that Lightning neither casts the clouds to the precision of the
+    model nor takes their sizes for the size of the batch: give `self.log(..., batch_size=len(batch))`.
 
     `metric.update(batch.sensor, batch.reference, error=batch.errors_of(), weights=batch.weights,
     height=batch.heights_in(grid.band_frame), place_in_time=batch.place_in_time)`.
     """
 
-    frames: tuple[Frame, ...]
+    def __init__(self, frames: Sequence[Frame]) -> None:
+        self.frames = tuple(frames)
 
-    __repr__ = brief
+    def __repr__(self) -> str:
+        return f"FrameBatch({len(self.frames)} frames)"
 
     @property
     def sensor(self) -> list[Tensor]:
@@ -356,3 +363,7 @@ def collate_frames(frames: Sequence[Frame]) -> FrameBatch:
         [9, 9]
     """
     return FrameBatch(tuple(frames))
+
+
+# `torch.load` gives them back with weights_only=True, its default.
+torch.serialization.add_safe_globals([Frame, FrameBatch, Measured])

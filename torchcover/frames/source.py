@@ -1,14 +1,15 @@
 """What every source of frames says of itself, be it a simulation, a recording or another format."""
 
+import operator
 import re
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Protocol, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, SupportsIndex, TypeVar, overload, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
-from torch.utils.data import Dataset
+from torch.utils.data import Dataset, Subset
 
 from torchcover.frames.frame import Frame
 
@@ -179,6 +180,28 @@ class FrameDataset(Dataset[Frame]):
     def __len__(self) -> int:
         """Number of frames."""
 
+    @overload
+    def __getitem__(self, index: SupportsIndex, /) -> Frame: ...
+    @overload
+    def __getitem__(self, index: slice, /) -> Subset[Frame]: ...
+    def __getitem__(self, index: SupportsIndex | slice, /) -> Frame | Subset[Frame]:
+        """Make one frame, counted from the end if negative; a slice gives a `Subset`, which makes none yet.
+
+        Raises:
+            IndexError: There are fewer frames.
+            BadFrameError: The frame cannot be used; the others can.
+        """
+        if isinstance(index, slice):
+            return Subset(self, range(*index.indices(len(self))))
+        position = operator.index(index)
+        if not -len(self) <= position < len(self):
+            raise IndexError(f"frame {position} of {len(self)}")
+        return self._frame_at(position % len(self))
+
+    def _frame_at(self, position: int) -> Frame:
+        """Make the frame at a position from 0 to `len(self) - 1`."""
+        raise NotImplementedError
+
     def __iter__(self) -> Iterator[Frame]:
         """The frames, one after the other."""
         return (self[index] for index in range(len(self)))
@@ -269,8 +292,8 @@ class ChosenRigs(FrameDataset):
     def __len__(self) -> int:
         return len(self.frames)
 
-    def __getitem__(self, index: int) -> Frame:
-        frame = self.frames[index]
+    def _frame_at(self, position: int) -> Frame:
+        frame = self.frames[position]
         boxes = None if frame.boxes is None else replace(frame.boxes, hits=self._chosen(frame.boxes.hits))
         points = None if frame.sensor_points is None else self._chosen(frame.sensor_points)
         clouds = {name: frame.cloud_of(of) for name, of in self.names.items()}

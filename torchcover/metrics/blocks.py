@@ -136,7 +136,7 @@ class SumsInBlocks(MergeableMetric):
         self.rows_of: dict[str, Rows] = {}
         self.add_block_sum("block_steps", (), torch.int64)
         self.add_block_sum("fine_steps", (), torch.int64, fine=True)
-        self.add_state("block_length", torch.tensor(1, device="cpu"), dist_reduce_fx="max", persistent=True)
+        self.add_state("block_length", torch.tensor(1, device="cpu"), dist_reduce_fx="max")
 
     def add_block_sum(
         self, name: str, shape: tuple[int, ...], dtype: torch.dtype = torch.float64, *, fine: bool = False

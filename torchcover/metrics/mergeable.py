@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.modules.module import register_module_module_registration_hook
 
 from torchcover.devices import has_float64
 from torchcover.metrics.lean import Metric, gather_all_tensors
@@ -23,6 +24,19 @@ FILLER = math.inf
 Reduction = Callable[[Sequence[Tensor]], Tensor]
 
 
+def _refuse_resampling(module: torch.nn.Module, _name: str, submodule: torch.nn.Module | None) -> None:
+    """Refuse to be wrapped in a `BootStrapper`: it resamples the points of a cloud, not the frames."""
+    is_bootstrap = type(module).__name__ == "BootStrapper" and isinstance(module, Metric)
+    if is_bootstrap and submodule is not None and any(isinstance(one, MergeableMetric) for one in submodule.modules()):
+        raise TypeError(
+            "BootStrapper resamples the points of each frame, not the frames; use blocks= of the metric, whose results "
+            "have standard errors"
+        )
+
+
+register_module_module_registration_hook(_refuse_resampling)
+
+
 class MergeableMetric(Metric):
     """Base of the metrics: sums over steps, and the parameters that say what they are sums of.
 
@@ -30,6 +44,7 @@ class MergeableMetric(Metric):
     * Sums that mean different things are never added: a fingerprint of class and parameters is part of the state. It
       is compared in `merge_state`, `load_state_dict` and the synchronisation of ranks, and it keeps a
       `MetricCollection` from sharing the sums of metrics that happen to agree after the first step.
+    * As of any torchmetrics metric, states are no part of `state_dict` unless `metric.persistent(True)` says so.
     * States are copies: nothing that is loaded or merged is written to later.
     * `.to(torch.float16)` moves the sums but does not round them; on a device without float64 (MPS) they stay on the
       CPU, to which clouds follow.
@@ -76,7 +91,7 @@ class MergeableMetric(Metric):
         # (32,) int64 numbers in [0, 256), equal for two metrics exactly if their sums mean the same.
         words = repr((type(self).__name__, sorted(self.meaning.items())))
         fingerprint = torch.tensor(list(hashlib.sha256(words.encode()).digest()), device="cpu")
-        self.add_state("fingerprint", fingerprint, dist_reduce_fx="max", persistent=True)
+        self.add_state("fingerprint", fingerprint, dist_reduce_fx="max")
         self.add_sum("steps", (), torch.int64)
 
     @torch.inference_mode(False)  # here and below: a tensor made under it could not be added to outside of it
@@ -98,9 +113,7 @@ class MergeableMetric(Metric):
 
     def add_sum(self, name: str, shape: tuple[int, ...], dtype: torch.dtype = torch.float64) -> None:
         """Add a state that starts at zero and adds up; float64 or int64, for sums grow."""
-        self.add_state(
-            name, torch.zeros((), dtype=dtype, device="cpu").expand(shape), dist_reduce_fx="sum", persistent=True
-        )
+        self.add_state(name, torch.zeros((), dtype=dtype, device="cpu").expand(shape), dist_reduce_fx="sum")
 
     def add_table(self, name: str, columns: int, reduction: Reduction | None = None) -> None:
         """Add a float64 state of rows that begin with a finite number, none at first.
@@ -114,7 +127,7 @@ class MergeableMetric(Metric):
         self._tables[name] = reduction or joined
         none = torch.empty((0, columns), dtype=torch.float64, device="cpu")
         of_ranks = partial(_of_filled, reduction=self._tables[name])
-        self.add_state(name, none, dist_reduce_fx=of_ranks, persistent=True)
+        self.add_state(name, none, dist_reduce_fx=of_ranks)
 
     @torch.inference_mode(False)
     def reset(self) -> None:
@@ -183,8 +196,13 @@ class MergeableMetric(Metric):
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:  # noqa: ANN401
         # torchmetrics would keep the very tensors it is given, of any shape, and pass over those that are missing.
         given = {name: state_dict[prefix + name] for name in self._defaults if prefix + name in state_dict}
-        if given:
-            state_dict.update({prefix + name: value for name, value in self._copied(given).items()})
+        try:
+            state_dict.update({prefix + name: value for name, value in (self._copied(given) if given else {}).items()})
+        except ValueError as error:
+            # As all that is not expected: refused by name, or passed over with strict=False.
+            unexpected_keys: list[str] = args[-2]
+            unexpected_keys.extend(f"{prefix}{name} ({error})" for name in given)
+            return
         super()._load_from_state_dict(state_dict, prefix, *args)
         self._follow_steps()
 

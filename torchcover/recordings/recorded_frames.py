@@ -1,6 +1,5 @@
 """Frames of a recording."""
 
-import operator
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -201,12 +200,7 @@ class RecordedFrames(FrameDataset):
     def __len__(self) -> int:
         return len(self.recording.frames)
 
-    def __getitem__(self, index: int) -> Frame:
-        """Read one frame. IndexError: there are fewer frames. BadFrameError: one of its files cannot be used."""
-        position = operator.index(index)
-        if not -len(self) <= position < len(self):
-            raise IndexError(f"frame {position} of {len(self)} in {self.recording.path}")
-        position %= len(self)
+    def _frame_at(self, position: int) -> Frame:
         instant = self.recording.frames[position]
         name = self.recording.names[instant]
         try:

@@ -237,10 +237,8 @@ class SimulatedFrames(FrameDataset):
     def __len__(self) -> int:
         return self.steps
 
-    def __getitem__(self, index: int) -> Frame:
-        if not 0 <= index < self.steps:
-            raise IndexError(f"frame {index} of {self.steps}")
-        return self.frame_of(self.simulator.step(index), index)
+    def _frame_at(self, position: int) -> Frame:
+        return self.frame_of(self.simulator.step(position), position)
 
     def frame_of(self, seen: Observation, index: int) -> Frame:
         """The frame of what the simulator saw at a step."""

@@ -24,9 +24,9 @@ class CoverageCallback(Callback):
     """Measures the coverage of the frames that a model trains or is validated on, and logs it.
 
     At the end of an epoch every number of `Coverage.scalars(regions)` and the number of frames go to `self.log_dict`
-    under `coverage/val/` or `coverage/train/`, so that loggers, `ModelCheckpoint` and `EarlyStopping` see them; the
-    maps go to the loggers that take figures or images, from rank zero. The other loggers get the numbers, and one
-    warning says so.
+    under `coverage/val/`, `coverage/test/` (in `trainer.test`) or `coverage/train/`, so that loggers, `ModelCheckpoint`
+    and `EarlyStopping` see them; the maps go to the loggers that take figures or images, from rank zero. The other
+    loggers get the numbers, and one warning says so.
 
     With several processes each measures its own frames and the sums are added up. The samples that a
     `DistributedSampler` repeats to fill the last batch are left out, see `CountOnce`. A checkpoint within an epoch
@@ -37,7 +37,7 @@ class CoverageCallback(Callback):
         metric: What to measure. The callback resets it at the start of each epoch, or of each fit with `fixed_frames`,
             and moves it to the model's device.
         regions: Regions to log; those of the paper that fit the grid if not given.
-        stage: `"validation"` or `"train"`: whose batches to measure.
+        stage: `"validation"` or `"train"`: whose batches to measure; the former also in `trainer.test`.
         every_n_epochs: Measure the last of every n epochs. The others cost nothing.
         every_n_steps: With `stage="train"`: also log the coverage of the epoch so far after every n batches.
         fixed_frames: With `stage="validation"`: say that the frames are the same at every epoch. Each is then measured
@@ -91,6 +91,7 @@ class CoverageCallback(Callback):
         self.coverage: Coverage | None = None
         self._epoch: int | None = None  # being measured; the same on every process, as collective calls need it
         self._once = CountOnce()
+        self._prefix = self.tag  # of what is logged: in `trainer.test` another one
         self._logged: dict[str, float] = {}  # the last numbers of this fit
         self._added = False  # whether there are frames that are not in them
         self._warned: set[str] = set()
@@ -102,6 +103,7 @@ class CoverageCallback(Callback):
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Forget what came before; a checkpoint is restored after this."""
+        self._prefix = f"{self.tag.rpartition('/')[0]}/test" if stage == "test" else self.tag
         self._epoch = None
         self._logged = {}
 
@@ -141,7 +143,8 @@ class CoverageCallback(Callback):
         )
 
     def _shard(self, trainer: Trainer, loader_index: int) -> Shard | None:
-        loaders: Any = trainer.train_dataloader if self.stage == "train" else trainer.val_dataloaders
+        evaluated = trainer.test_dataloaders if trainer.testing else trainer.val_dataloaders
+        loaders: Any = trainer.train_dataloader if self.stage == "train" else evaluated
         flat = CombinedLoader(loaders, "sequential").flattened
         # A batch of several training loaders side by side does not say which frame came from which.
         shard = None if self.stage == "train" and len(flat) > 1 else shard_of(flat[loader_index])
@@ -176,14 +179,14 @@ class CoverageCallback(Callback):
 
     def _scalars(self, coverage: Coverage) -> dict[str, float]:
         scalars = {**coverage.scalars(self.regions), "steps": float(coverage.counts["steps"])}
-        return {f"{self.tag}/{name}": value for name, value in scalars.items()}
+        return {f"{self._prefix}/{name}": value for name, value in scalars.items()}
 
     def _log_maps(self, trainer: Trainer, coverage: Coverage) -> None:
         if not (self.maps and trainer.is_global_zero and trainer.loggers):
             return
         from torchcover.training.figures import log_maps  # matplotlib only where there is something to draw
 
-        if refused := log_maps(coverage, trainer.loggers, self.tag, _step(trainer)):
+        if refused := log_maps(coverage, trainer.loggers, self._prefix, _step(trainer)):
             self._warn_once(f"{', '.join(refused)} takes neither figures nor images: it gets the numbers alone")
 
     def _warn_once(self, text: str) -> None:
@@ -232,6 +235,26 @@ class CoverageCallback(Callback):
         """Log."""
         if self.stage == "validation":
             self._finish(trainer, pl_module)
+
+    def on_test_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start from nothing."""
+        self.on_validation_epoch_start(trainer, pl_module)
+
+    def on_test_batch_end(
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        outputs: object,
+        batch: object,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        """Add the frames of a batch."""
+        self.on_validation_batch_end(trainer, pl_module, outputs, batch, batch_idx, dataloader_idx)
+
+    def on_test_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Log."""
+        self.on_validation_epoch_end(trainer, pl_module)
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start from nothing, unless the epoch was resumed."""
