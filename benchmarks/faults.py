@@ -22,7 +22,7 @@ from tests.cli.hostile import PLAIN, cases
 from tests.damaged.good_files import kinds
 from tests.damaged.mutated_files import attempt, attempt_pipe, bombs, largest_mb, mutated, silence_libraries
 from torchcover.cli import app
-from torchcover.files import own_process
+from torchcover.files import isolated
 
 # Of the processor's time.
 LIMIT_S = 20
@@ -73,7 +73,7 @@ def show_damaged_files(arguments):
                 for key in columns
             }
         )
-    for reading in own_process._processes.values():
+    for reading in isolated._processes.values():
         reading.end()
     children_mb = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
     print(

@@ -34,7 +34,7 @@ WATCHED = {
     "torchcover.coverage.metric:CoverageMetric.add": SUMS,
     "torchcover.targets.probing:Probes.sums_of": BODIES,
     "torchcover.report.maps:draw_side_by_side": MAPS,
-    "torchcover.files.atomic_files:AtomicOutput.add_figure": MAPS,
+    "torchcover.files.atomic:AtomicOutput.add_figure": MAPS,
     "torchcover.evaluation.result:Result.save": FILES,
 }
 

@@ -20,7 +20,7 @@ from tests.files import apart_readers
 from torchcover.data import Frame
 from torchcover.evaluation import observe
 from torchcover.evaluation.heartbeat import Heartbeat, HeartbeatParams, reporting_silent_ranks
-from torchcover.files import end_with_parent, own_process, reporting_stopped
+from torchcover.files import end_with_parent, isolated, reporting_stopped
 from torchcover.simulation.sumo import simulating
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs Linux, which ends processes with their parent")
@@ -139,7 +139,7 @@ def stopped(monkeypatch):
         os.kill(int(re.search(r"kill -CONT (\d+)", message)[1]), signal.SIGCONT)
 
     monkeypatch.setattr("torchcover.files.processes.warnings.warn", warn)
-    for place in ("evaluation.pipeline", "files.own_process", "simulation.sumo.simulating"):
+    for place in ("evaluation.pipeline", "files.isolated", "simulation.sumo.simulating"):
         monkeypatch.setattr(f"torchcover.{place}.reporting_stopped", partial(reporting_stopped, look_every_s=0.1))
     return reported
 
@@ -187,7 +187,7 @@ def test_a_stopped_reader_is_reported_and_ends_after_its_time(stopped, tmp_path,
     assert apart_readers.stopping(tmp_path / "file.x")["one"] == 1
     assert [message.split(" (process ")[0] for message in stopped] == ["the process that reads files"]
     monkeypatch.setattr("torchcover.files.processes.warnings.warn", lambda *_, **__: None)
-    monkeypatch.setattr(own_process, "MOST_S", 0.5)
+    monkeypatch.setattr(isolated, "MOST_S", 0.5)
     with pytest.raises(ValueError, match="the process that reads it was stopped"):
         apart_readers.stopping(tmp_path / "file.x")
 

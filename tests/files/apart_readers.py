@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from torchcover.files.own_process import apart
+from torchcover.files.isolated import apart
 
 
 @apart

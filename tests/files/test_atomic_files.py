@@ -14,7 +14,7 @@ import pytest
 
 from tests.killing import operations_of
 from torchcover.files import RECORDING, WRITING, AtomicOutput, BadFileError, lock_folder, reads, write_atomically
-from torchcover.files.manifests import MAX_MANIFEST_BYTES
+from torchcover.files.atomic import MAX_MANIFEST_BYTES
 
 # Content of each file in two publications. `mine.txt` and `maps/mine.png` belong to the user.
 EARLIER = {"a.txt": "earlier", "gone.txt": "earlier", "maps/m.png": "earlier", "maps/gone.png": "earlier"}

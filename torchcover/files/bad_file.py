@@ -11,7 +11,7 @@ from typing import Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 
-from torchcover.files.manifests import check_listed
+from torchcover.files.atomic import check_listed
 
 Arguments = ParamSpec("Arguments")
 Content = TypeVar("Content")

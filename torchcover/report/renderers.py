@@ -33,7 +33,7 @@ LEAST_HEADING_CHARS = 10
 class Terminal(Console):
     """Rich's console, on which control characters in names of others are shown and not obeyed."""
 
-    def render_text(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
         """What is to be printed: our own control codes, such as a cursor's, are segments of their own."""
         for segment in super().render(renderable, options):
             yield segment if segment.control else segment._replace(text=shown(segment.text))

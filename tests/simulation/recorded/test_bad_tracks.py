@@ -15,7 +15,7 @@ from tests.simulation.recorded.drives import EGO, OTHERS, write_argoverse2, writ
 from tests.simulation.recorded.test_tracks import FEW, RIG, scenario
 from torchcover import Scenario
 from torchcover.cli.app import main
-from torchcover.files import BadFileError, own_process
+from torchcover.files import BadFileError, isolated
 from torchcover.geometry import rotation_from_euler
 from torchcover.recordings.formats import read_objects
 from torchcover.simulation import Simulator
@@ -258,8 +258,8 @@ def test_logs_that_lack_something(tmp_path, monkeypatch):
 
 def lack_pyarrow(monkeypatch):
     """Of the process that reads."""
-    monkeypatch.setattr(own_process, "_processes", {})
-    monkeypatch.setattr(own_process, "PROGRAM", f"import sys; sys.modules['pyarrow'] = None; {own_process.PROGRAM}")
+    monkeypatch.setattr(isolated, "_processes", {})
+    monkeypatch.setattr(isolated, "PROGRAM", f"import sys; sys.modules['pyarrow'] = None; {isolated.PROGRAM}")
 
 
 def test_a_missing_package_is_one_line_of_the_command_line(monkeypatch, capsys):

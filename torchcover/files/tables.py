@@ -1,9 +1,13 @@
-"""NumPy's `.npy` and `.npz`, without trust in what their headers claim."""
+"""Tables of others: CSV, JSON, NumPy's arrays and archives, and words of them that are safe to show."""
 
+import csv
+import io
+import json
 import math
+import re
 import warnings
 import zipfile
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -12,7 +16,160 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.files.bad_file import check_memory
+from torchcover.files.bad_file import check_memory, decode, reads
+
+# Of terminals: control characters, and marks that turn the direction of what follows. Lines and tabs may stay.
+CONTROLS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+# What makes a formula of a cell in spreadsheets.
+FORMULA = re.compile(r"[=+\-@\t\r]")
+NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?(e[+-]?\d+)?|inf)", re.IGNORECASE)
+# What makes text of it again.
+QUOTE = "'"
+
+
+def shown(text: str) -> str:
+    r"""Text whose control characters are written out.
+
+    Example:
+        >>> print(shown("roof\x1b[2J"))
+        roof\x1b[2J
+    """
+    return CONTROLS.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+
+
+def as_cell(value: object) -> object:
+    """A value as a cell of a spreadsheet: text that begins like a formula begins with a quote, numbers stay.
+
+    Example:
+        >>> as_cell("=1+1"), as_cell(-1.5)
+        ("'=1+1", -1.5)
+    """
+    if not isinstance(value, str):
+        return value
+    return f"{QUOTE * _is_formula(value)}{shown(value)}"
+
+
+def of_cell(text: str) -> str:
+    """The text that `as_cell` made a cell of."""
+    return text[1:] if text[:1] == QUOTE and _is_formula(text[1:]) else text
+
+
+def _is_formula(text: str) -> bool:
+    return FORMULA.match(text.lstrip(QUOTE)) is not None and NUMBER.fullmatch(text) is None
+
+
+# Of a word of a row, once it is an object of Python, for each byte of the file.
+BYTES_PER_BYTE = 20
+
+
+class CsvTable(NamedTuple):
+    """Columns of a table by name: `numbers` (N,) float64, finite, and `words`, N of them each."""
+
+    numbers: dict[str, NDArray[np.float64]]
+    words: dict[str, list[str]]
+
+
+@reads("a table in CSV")
+def read_csv(
+    path: Path, numbers: Sequence[str], words: Sequence[str] = (), optional: Sequence[str] | None = ()
+) -> CsvTable:
+    """Read a table whose first line names its columns, of numbers or of any words, in any order.
+
+    Optional columns of numbers may be missing; None: any others may be there, and are not read. BadFileError: columns
+    that are missing, doubled or unknown, a row of another width, or what is no finite number; it names line and column.
+    """
+    check_memory(BYTES_PER_BYTE * path.stat().st_size)
+    rows = _rows(decode(path.read_bytes()))
+    _, header = next(rows, (0, []))
+    names = [name.strip() for name in header]
+    _check_names(names, (*words, *numbers), optional)
+    lines, table = [], []
+    for line, row in rows:
+        if len(row) != len(names):
+            raise ValueError(f"line {line}: {len(names)} columns are needed ({', '.join(names)}); got {len(row)}")
+        lines.append(line)
+        table.append(row)
+    columns = dict(zip(names, zip(*table, strict=True) if table else [()] * len(names), strict=True))
+    return CsvTable(
+        {name: _finite(name, columns[name], lines) for name in (*numbers, *(optional or ())) if name in columns},
+        {name: [of_cell(word.strip()) for word in columns[name]] for name in words},
+    )
+
+
+def csv_text(rows: Iterable[Iterable[object]]) -> str:
+    """Rows as CSV; an empty field for None and NaN, infinity is `inf`, and text is safe to show in a spreadsheet."""
+    text = io.StringIO()
+    cells = (["" if value != value else as_cell(value) for value in row] for row in rows)
+    csv.writer(text, lineterminator="\n").writerows(cells)
+    return text.getvalue()
+
+
+def _rows(text: str) -> Iterator[tuple[int, list[str]]]:
+    reader = csv.reader(text.splitlines(keepends=True), strict=True)
+    try:
+        for row in reader:
+            if row:
+                yield reader.line_num, row
+    except csv.Error as error:
+        raise ValueError(f"line {reader.line_num}: not CSV ({error})") from error
+
+
+def _check_names(names: Sequence[str], needed: Sequence[str], optional: Sequence[str] | None) -> None:
+    if optional is None:
+        names, optional = [name for name in names if name in needed], ()
+    missing = [name for name in needed if name not in names]
+    unknown = [name for name in names if name not in (*needed, *optional)]
+    doubled = sorted({name for name in names if names.count(name) > 1})
+    for what, which in (("missing", missing), ("unknown", unknown), ("there twice", doubled)):
+        if which:
+            raise ValueError(f"the first line has to name the columns {', '.join(needed)}; {what}: {', '.join(which)}")
+
+
+def _finite(name: str, words: Sequence[str], lines: Sequence[int]) -> NDArray[np.float64]:
+    try:
+        values = np.array(words, dtype=np.float64)
+        if np.isfinite(values).all():
+            return values
+    except ValueError:
+        pass
+    line, word = next((line, word) for line, word in zip(lines, words, strict=True) if not _is_finite(word))
+    raise ValueError(f"line {line}: {name}: a finite number is needed; got {word[:80]!r}")
+
+
+def _is_finite(word: str) -> bool:
+    try:
+        return bool(np.isfinite(float(word)))
+    except ValueError:
+        return False
+
+
+# Python's objects take about so many times the bytes of their text.
+OBJECTS_PER_BYTE = 8
+
+
+class JsonTable(NamedTuple):
+    """A table. `rows`: as they were written; `by_token`: the same by their `token`."""
+
+    path: Path
+    rows: list[dict[str, Any]]
+    by_token: dict[str, dict[str, Any]]
+
+    def row(self, token: str) -> dict[str, Any]:
+        """The row of a token."""
+        if token not in self.by_token:
+            raise ValueError(f"{self.path}: no row has the token {str(token)[:40]!r}, which another table names")
+        return self.by_token[token]
+
+
+@reads("a table of rows")
+def read_json_table(path: Path) -> JsonTable:
+    """Read a JSON list of objects. BadFileError: another content."""
+    check_memory(OBJECTS_PER_BYTE * path.stat().st_size)
+    rows = json.loads(decode(path.read_bytes()))
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise ValueError(f"a list of objects is needed; got {type(rows).__name__}")
+    return JsonTable(path, rows, {row["token"]: row for row in rows if "token" in row})
+
 
 # Deflate spends at least 2 bits on 258 bytes.
 DEFLATE_MAX_RATIO = 1032

@@ -1,14 +1,18 @@
-"""YAML without its traps: every key once, numbers that look like numbers, and an end."""
+"""YAML and XML without their traps: every key once, numbers that look like numbers, no entities, and an end."""
 
 import re
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NoReturn
+from xml.etree import ElementTree
+from xml.parsers import expat
 
 import yaml
 from yaml.constructor import ConstructorError
 from yaml.nodes import MappingNode, Node, ScalarNode
+
+from torchcover.files.bad_file import check_memory, decode
 
 # Far above what people write, and read in seconds.
 MAX_CHARACTERS = 1_000_000
@@ -195,3 +199,49 @@ _Loader.add_constructor(None, _Loader.refuse)
 def _quoted(value: Any) -> str:  # noqa: ANN401
     text = str(value)
     return repr(text if len(text) <= MAX_QUOTED else f"{text[:MAX_QUOTED]}...")
+
+
+# A tree of elements takes about so many times the bytes of its text.
+TREE_PER_BYTE = 20
+
+
+def parse_xml(path: Path) -> ElementTree.Element:
+    """The tree of an XML file.
+
+    ValueError: not XML in UTF-8, it declares entities, or its tree would not fit into memory.
+    """
+    check_memory(TREE_PER_BYTE * path.stat().st_size)
+    text = decode(path.read_bytes())
+    if "<!ENTITY" in text:
+        raise ValueError("an XML file without entities is needed")
+    return ElementTree.fromstring(text)  # which resolves nothing that lies outside
+
+
+def feed_xml(
+    pieces: Iterable[bytes], start: Callable[[str, list[str]], None], end: Callable[[str], None] | None = None
+) -> None:
+    """Read XML that may be of any length, one tag after the other; nothing of it is kept.
+
+    `start`: called with the name of each element, and with the names and values of its attributes in turn; what it
+    raises ends the reading. `end`: called with the name at its end. ValueError: not XML, or it declares entities.
+
+    Example:
+        >>> feed_xml([b"<a x='1'", b"><b/></a>"], lambda name, attributes: print(name, attributes))
+        a ['x', '1']
+        b []
+    """
+
+    def refuse(*_: object) -> NoReturn:
+        raise ValueError("an XML file without entities is needed")
+
+    parser = expat.ParserCreate()
+    parser.ordered_attributes = True
+    parser.EntityDeclHandler = refuse
+    parser.StartElementHandler = start
+    parser.EndElementHandler = end
+    try:
+        for piece in pieces:
+            parser.Parse(piece)
+        parser.Parse(b"", True)
+    except expat.ExpatError as error:
+        raise ValueError(f"not XML ({error})") from error

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.files import apart_readers
-from torchcover.files import BadFileError, own_process, reads
+from torchcover.files import BadFileError, isolated, reads
 from torchcover.simulation.mesh_files import mesh_arrays
 
 
@@ -52,7 +52,7 @@ def test_a_crash_is_a_bad_file_and_the_next_one_is_read(path):
 
 
 def test_a_library_that_never_ends_is_ended(path, monkeypatch):
-    monkeypatch.setattr(own_process, "MOST_S", 0.3)
+    monkeypatch.setattr(isolated, "MOST_S", 0.3)
     with pytest.raises(ValueError, match="it took more than 0 s"):
         apart_readers.hanging(path)
     monkeypatch.undo()
