@@ -24,6 +24,7 @@ from torchcover.data import RegionsOfInterest, SimulatedFrames, collate_frames
 from torchcover.encounters import EncounterSet
 from torchcover.evaluation import Requirements
 from torchcover.placement import ChoiceSpace, SearchSpace
+from torchcover.recordings.formats import FORMATS
 from torchcover.recordings.formats.folder import read_folder_settings
 from torchcover.simulation import Rig, Scenario
 from torchcover.simulation.bodies import Vehicle
@@ -169,3 +170,16 @@ def test_a_document_is_valid_for_one_of_its_readers(text, tmp_path):
         except ValueError as error:
             refusals.append(str(error))
     pytest.fail("\n".join(refusals))
+
+
+def test_make_targets_formats_of_recordings_and_imports_of_scripts_exist():
+    pages = "\n".join(page.read_text(encoding="utf-8") for page in (*PAGES, ROOT / "CONTRIBUTING.md"))
+    targets = re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+    lines = re.findall(r"(?:`|\$ )make ((?:[a-z]+\b ?)+)", pages)
+    assert {name for line in lines for name in line.split()} <= set(targets)
+    table = (
+        (ROOT / "docs" / "recordings.md").read_text(encoding="utf-8").partition("| format |")[2].partition("\n\n")[0]
+    )
+    assert re.findall(r"^\| `(\w+)`", table, re.MULTILINE) == list(FORMATS)
+    for line in re.findall(r"^from torchcover.*", (ROOT / ".ci" / "smoke").read_text(encoding="utf-8"), re.MULTILINE):
+        exec(line, {})

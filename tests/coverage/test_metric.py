@@ -263,9 +263,7 @@ def test_numbers_that_mean_something_else_than_they_seem_are_warned_of_once():
     ground = torch.rand(1200, 3) * torch.tensor([10.0, 10.0, 0.2])
     in_lidar_frame, over_cells, right = (CoverageMetric(grid, max_radius=9.0) for _ in range(3))
     in_lidar_frame.update(ground, ground - torch.tensor([0.0, 0.0, 1.8]))
-    with pytest.warns(
-        UserWarning, match=r"reference: 1,200 of 1,200 points lie outside .* in the vehicle frame"
-    ):
+    with pytest.warns(UserWarning, match=r"reference: 1,200 of 1,200 points lie outside .* in the vehicle frame"):
         in_lidar_frame.compute()
     in_lidar_frame.update(ground, ground - torch.tensor([0.0, 0.0, 1.8]))
     in_lidar_frame.compute()

@@ -454,9 +454,7 @@ def test_a_state_that_lacks_something_or_has_another_shape_is_refused(case):
 @EVERY
 def test_resampling_points_instead_of_frames_is_refused(case):
     for wrapped in (case.make(), MinMaxMetric(case.make())):
-        with pytest.raises(
-            TypeError, match="BootStrapper resamples the points of each frame, not the frames"
-        ):
+        with pytest.raises(TypeError, match="BootStrapper resamples the points of each frame, not the frames"):
             BootStrapper(wrapped, num_bootstraps=2)
     BootStrapper(SumMetric(), num_bootstraps=2)
 

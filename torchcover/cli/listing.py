@@ -12,9 +12,6 @@ import typer
 
 from torchcover.simulation import builtin_documents
 
-# What one may look for, and why it is not there.
-ABSENT = {"FMVSS 111": {"description": "Not built in: the places of its cylinders were read in no public text."}}
-
 
 def run(word: str | None) -> None:
     """Print what is built in: the names of each kind.
@@ -41,7 +38,7 @@ def run(word: str | None) -> None:
     for kind, what_of in kinds.items():
         if word in kinds and word != kind:
             continue
-        documents = builtin_documents(kind) | (ABSENT if kind == "requirements" else {})
+        documents = builtin_documents(kind)
         if word is None:
             names = textwrap.fill(", ".join(documents), width or 80, initial_indent="  ", subsequent_indent="  ")
             typer.echo(f"{kind} ({len(documents)})\n{names}\n")
