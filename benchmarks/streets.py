@@ -20,7 +20,7 @@ from torchcover.recordings.ground_model import GroundModel, low_surfaces
 from torchcover.recordings.in_vehicle import in_vehicle
 from torchcover.recordings.recording import Scan
 from torchcover.simulation import PaperReference, Rig, Scenario, Simulator
-from torchcover.simulation.material import material_number
+from torchcover.simulation.returns import material_number
 from torchcover.simulation.scene import Scene as Scenery
 from torchcover.simulation.traffic.fleet import REAR_OF
 from torchcover.simulation.world import World

@@ -10,7 +10,7 @@ import pytest
 
 from torchcover.files import BadFileError
 from torchcover.simulation import CameraSensor, Pose, Rig, Scenario, SimulatedFrames
-from torchcover.simulation.polygons import triangulate
+from torchcover.simulation.mesh_files import triangulate
 from torchcover.simulation.shapes import Box, MeshFile
 
 # An L of 5 square meters whose first corner does not see its last ones, and a dart: both wrong as a fan.

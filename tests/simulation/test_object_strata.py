@@ -13,7 +13,7 @@ from torchcover.simulation.reference_sensor import Surroundings
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.shapes import Box, Plane
 from torchcover.simulation.sight import sight
-from torchcover.simulation.surface_points import SurfaceStrata
+from torchcover.simulation.surface_reference import SurfaceStrata
 from torchcover.simulation.world import Actor, World
 
 from .small_worlds import AHEAD, FLOOR, agrees, box, scenario

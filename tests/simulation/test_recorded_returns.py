@@ -5,9 +5,8 @@ import pytest
 
 from torchcover.recordings import open_recording
 from torchcover.simulation import Rig, calibrate
-from torchcover.simulation.material import Material
 from torchcover.simulation.recorded_returns import HALF_LANES_M, NEAREST_M, fit_returns, ground_rays, road_profile
-from torchcover.simulation.returns import log_excess, return_probability
+from torchcover.simulation.returns import Material, log_excess, return_probability
 
 RANGE_M, SPREAD, NOISE_M, HEIGHT_M = 60.0, 0.25, 0.02, 1.9
 RIG = Rig.model_validate(

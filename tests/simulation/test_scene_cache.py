@@ -10,8 +10,7 @@ import pytest
 
 from torchcover.files import BadFileError
 from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, scene_cache
-from torchcover.simulation.scene_cache import SceneCache
-from torchcover.simulation.scene_file import read_scene
+from torchcover.simulation.scene_cache import SceneCache, read_scene
 from torchcover.simulation.traffic import Highway, Parking, Urban
 from torchcover.simulation.traffic.fleet import load_bodies
 
@@ -144,11 +143,10 @@ def test_a_damaged_scene_is_built_again_with_a_warning(disk, how):
     assert built == [0]
 
 
-@pytest.mark.parametrize("kind", ["|O", "<f8"])
-def test_a_scene_file_runs_no_code(disk, tmp_path, kind):
-    text = json.dumps(["a", [[kind, [1]]], [["system", "true"]]]).encode()
-    for numbers in (np.zeros(8, np.uint8), np.array([print], object)):
-        np.savez(tmp_path / "a.npz", text=np.frombuffer(text, np.uint8), numbers=numbers)
+def test_a_scene_file_runs_no_code(disk, tmp_path):
+    text = np.frombuffer(json.dumps(["a", {"system": ["true"]}]).encode(), np.uint8)
+    for numbers in (np.zeros(8), np.array([print], object)):
+        np.savez(tmp_path / "a.npz", scene=text, numbers=numbers)
         with pytest.raises(BadFileError, match=r"a\.npz: "):
             read_scene(tmp_path / "a.npz", {})
 

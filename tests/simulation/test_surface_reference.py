@@ -216,7 +216,7 @@ def test_the_surface_is_cut_once_a_world(monkeypatch):
         ({"bands_m": ((0.0, math.inf),)}, "bands_m: at least one"),
         ({"rays": 0}, "rays: at least 1 is needed; got 0"),
         ({"places": 0}, "places: at least 1 is needed; got 0"),
-        ({"object_points": -1}, "object_points: a number >= 0 is needed; got -1"),
+        ({"object_points": -1}, "object_points: at least 0 is needed; got -1"),
         ({"shell_m": 0.0}, "shell_m: a positive thickness"),
         ({"max_range_m": math.nan}, "max_range_m: a positive distance"),
     ],

@@ -7,11 +7,10 @@ import pytest
 
 from torchcover.simulation import Rig, Scenario
 from torchcover.simulation.scene import Scene
-from torchcover.targets.placing import ground_under
-from torchcover.targets.raster import Raster
+from torchcover.targets.placing import Raster, ground_under
 from torchcover.targets.result import FREE, OUTSIDE
+from torchcover.targets.surface import Target
 from torchcover.targets.survey import survey
-from torchcover.targets.target import Target
 
 EGO = {"shape": {"type": "box", "size_m": [4, 2, 1.5]}}
 FLOOR = {"name": "floor", "shape": {"type": "plane", "size_m": [60, 60]}, "ground": True}

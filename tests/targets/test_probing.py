@@ -12,7 +12,7 @@ from torchcover.data import SimulatedFrames
 from torchcover.geometry import rigid
 from torchcover.simulation import PaperReference
 from torchcover.simulation.regions_of_interest import near_field
-from torchcover.targets import Probes, Raster, Target, probing, steps, survey
+from torchcover.targets import Probes, Raster, Target, counting, probing, survey
 from torchcover.targets.probing import Probe
 
 from .worlds import WALL, drive, lidar, rig, world
@@ -43,7 +43,7 @@ def numbers(probes, region, rig="small"):
 @pytest.mark.parametrize(("name", "bodies"), [("child", ()), ("pole", (WALL,))], ids=["free space", "a wall"])
 def test_the_numbers_are_those_of_targets_over_the_same_cells(name, bodies, monkeypatch):
     scenario, target = world(*bodies), Target.load(name)
-    for module in (steps, probing):  # its surface is looked at from random places
+    for module in (counting, probing):  # its surface is looked at from random places
         monkeypatch.setattr(module, "pose_in_shell", lambda *_: rigid(np.eye(3), np.array([0.3, 0.2, 1.3])))
     found = survey(TOP, scenario, target, Raster.around(scenario.ego_box(), 3.0))
     probes = probed(simulated(scenario, steps=1), body=name, places=ALL)

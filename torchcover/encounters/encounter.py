@@ -20,7 +20,7 @@ from pydantic import (
 
 from torchcover.simulation.bodies import Shape, Vehicle, VehicleShape
 from torchcover.simulation.documents import BuiltIn, Document, by_name, explain
-from torchcover.simulation.weather import CLEAR, Weather
+from torchcover.simulation.returns import CLEAR, Weather
 
 # Of a family: ten times what anybody would wait for.
 MOST = 10_000

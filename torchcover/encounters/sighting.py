@@ -7,11 +7,11 @@ from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchcover.encounters.criterion import Criterion
 from torchcover.encounters.encounter import Encounter
 from torchcover.encounters.staging import STEP_S, Staged
+from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.simulation.camera_sensor import CameraSensor
 from torchcover.simulation.lidar import Lidar
 from torchcover.simulation.moving import Moving, Solid, Solids
@@ -22,16 +22,12 @@ from torchcover.simulation.scene import Scene
 from torchcover.simulation.sensor import Draws, Sensor
 from torchcover.simulation.sight import Ends, MountedSensor, sight
 from torchcover.simulation.stage import mounted_on
-from torchcover.targets.counting import Beams, Met, measured_points, meetings
-from torchcover.targets.steps import SensorStep
+from torchcover.targets.counting import Beams, Met, SensorStep, measured_points, meetings
 
 if TYPE_CHECKING:
     from torchcover.encounters.traffic import Approach
 
-Float64 = NDArray[np.float64]
-Numbers = NDArray[np.int64]
-Bools = NDArray[np.bool_]
-IsEnough = Callable[[Numbers], Bools]
+IsEnough = Callable[[Int64], Bools]
 
 # A point that is measured farther from where it is than this is none on the other.
 WITHIN_M = 0.4
@@ -149,9 +145,9 @@ def sight_encounter(
 def detections(
     periods: Sequence[float | None],
     enough: Sequence[int],
-    points: Callable[[Sequence[int], Numbers], Numbers],
-    first: Callable[[IsEnough, int], Numbers],
-) -> tuple[Numbers, Numbers, Numbers]:
+    points: Callable[[Sequence[int], Int64], Int64],
+    first: Callable[[IsEnough, int], Int64],
+) -> tuple[Int64, Int64, Int64]:
     """At which step S sensors detect somebody, or `NEVER`: together (P,), each alone (S, P), and without each (S, P).
 
     Args:
@@ -160,14 +156,14 @@ def detections(
         points: What some sensors have together at (N,) steps.
         first: (P,) the steps at which looks in a row were enough first, by what is enough and whose looks they are.
     """
-    everything, known = range(len(periods)), dict[tuple[int, ...], Numbers]()
+    everything, known = range(len(periods)), dict[tuple[int, ...], Int64]()
 
-    def first_of(channel: tuple[int, ...]) -> Numbers:
+    def first_of(channel: tuple[int, ...]) -> Int64:
         if channel not in known:
             known[channel] = first(lambda steps: points(channel, steps) >= enough[channel[0]], channel[0])
         return known[channel]
 
-    def of(sensors: Sequence[int]) -> Numbers:
+    def of(sensors: Sequence[int]) -> Int64:
         each = [first_of(channel) for channel in channels(periods, sensors)]
         return np.min(each, axis=0) if each else np.full_like(together, NEVER)
 
@@ -195,7 +191,7 @@ def channels(periods: Sequence[float | None], numbers: Sequence[int]) -> list[tu
     return [*alone, *(tuple(k for k in slowest_first if lidars[k] <= period) for period in longest)]
 
 
-def look_steps(rate_hz: float, phases: int, contact_s: float) -> Numbers:
+def look_steps(rate_hz: float, phases: int, contact_s: float) -> Int64:
     """(P, J) whole milliseconds of the looks before the contact, for each phase; those after it are `NEVER`."""
     count = math.ceil(contact_s * rate_hz)
     times = (np.arange(count) + np.arange(phases)[:, None] / phases) / rate_hz / STEP_S
@@ -203,7 +199,7 @@ def look_steps(rate_hz: float, phases: int, contact_s: float) -> Numbers:
     return np.where(steps * STEP_S < contact_s, steps, NEVER)
 
 
-def first_run(is_enough: IsEnough, steps: Numbers, looks: int) -> Numbers:
+def first_run(is_enough: IsEnough, steps: Int64, looks: int) -> Int64:
     """When so many looks in a row were enough for the first time: (P,) the step of the last of them, or `NEVER`.
 
     A look that is not enough rules out all runs that it is in, so the last look of a run is asked first: before
@@ -248,18 +244,18 @@ class Looks:
         self._mounted = mounted_rig.mounted(staged.encounter, self._scene)
         self._points: list[dict[int, int]] = [{} for _ in self._mounted]
 
-    def points(self, sensors: Sequence[int], steps: Numbers) -> Numbers:
+    def points(self, sensors: Sequence[int], steps: Int64) -> Int64:
         """(N,) points, or pixels, of some sensors together at (N,) steps."""
         return np.asarray(np.sum([self._of_sensor(k, steps) for k in sensors], axis=0, dtype=np.int64))
 
-    def _of_sensor(self, number: int, steps: Numbers) -> Numbers:
+    def _of_sensor(self, number: int, steps: Int64) -> Int64:
         known = self._points[number]
         new = np.array(sorted({step for step in steps.tolist() if step not in known}), dtype=np.int64)
         if len(new):
             known.update(zip(new.tolist(), self._look(number, new).tolist(), strict=True))
         return np.array([known[step] for step in steps.tolist()])
 
-    def _look(self, number: int, steps: Numbers) -> Numbers:
+    def _look(self, number: int, steps: Int64) -> Int64:
         mounted, other = self._mounted[number], self._staged.other
         poses = self._staged.vehicle_T_other(STEP_S * steps.astype(np.float64))
         placed = Moving.placed([other] * len(steps), poses, np.full(len(steps), -1))

@@ -5,10 +5,10 @@ from functools import lru_cache
 from itertools import combinations, groupby
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchcover.encounters.encounter import Encounter, Obstacle, Way
 from torchcover.geometry import BoundingBox, contact_s, invert, outlines_at, overlapping
+from torchcover.geometry.arrays import Bools, Float64
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.bodies import Shape, called, mover_mesh
 from torchcover.simulation.moving import Solid, Solids
@@ -16,8 +16,6 @@ from torchcover.simulation.scene import Scene
 from torchcover.simulation.shapes import Plane
 from torchcover.simulation.world import Actor, World
 from torchcover.targets.placing import poses
-
-Float64 = NDArray[np.float64]
 
 # Looks are at whole ones of these.
 STEP_S = 0.001
@@ -162,7 +160,7 @@ class Staged:
                     )
 
 
-def _inside(solid: Solid, there: Float64, other: Solid) -> NDArray[np.bool_]:
+def _inside(solid: Solid, there: Float64, other: Solid) -> Bools:
     """(P,) whether the box of a body at (P, 4, 4) poses is inside that of another, by more than a touch."""
     corners_m = other.box.corners_m
     return overlapping(solid.box, there, corners_m - TOUCH_M * np.sign(corners_m - corners_m.mean(axis=0)))

@@ -12,6 +12,7 @@ from torchcover.detection.inside import SKIN_M
 from torchcover.encounters.criterion import Criterion
 from torchcover.encounters.sighting import NEVER, IsEnough, Sighting, detections, enough_of, first_run
 from torchcover.geometry import BoundingBox, contact_s, invert, outlines_at
+from torchcover.geometry.arrays import Float64, Int64
 from torchcover.recordings.in_vehicle import in_vehicle
 from torchcover.recordings.objects import Track, class_of, objects_of
 from torchcover.recordings.recording import Recording
@@ -21,8 +22,6 @@ from torchcover.simulation.simulator import Simulator
 from torchcover.simulation.traffic.fleet import REAR_OF
 from torchcover.simulation.world import World
 
-Float64 = NDArray[np.float64]
-Numbers = NDArray[np.int64]
 Clouds = Sequence[NDArray[np.floating]]
 
 # What tables call road users, in their order; by SUMO's names of classes.
@@ -201,15 +200,15 @@ class Watch:
 
     def __init__(self, drive: Drive, track: Track, eyes: Eyes) -> None:
         self._drive, self._track, self._eyes = drive, track, eyes
-        self._known: dict[int, Numbers] = {}
+        self._known: dict[int, Int64] = {}
 
-    def points(self, sensors: Sequence[int], steps: Numbers) -> Numbers:
+    def points(self, sensors: Sequence[int], steps: Int64) -> Int64:
         """(N,) points of some sensors together at (N,) steps."""
         new = [step for step in steps.tolist() if step not in self._known]
         self._known.update({step: self._look(step) for step in new})
         return np.array([self._known[step][list(sensors)].sum() for step in steps.tolist()])
 
-    def _look(self, step: int) -> Numbers:
+    def _look(self, step: int) -> Int64:
         """(S,) the points in his box, which stands as he does; sides and top as `points_in_boxes` has them."""
         time_s, way, size_m = self._drive.times_s[step], self._track.trajectory, np.array(self._track.size_m)
         if np.isnan(way.positions_at(np.array([time_s]))).any():
@@ -237,7 +236,7 @@ def sight_approach(rig: str, drive: Drive, approach: Approach, eyes: Eyes, crite
     first = int(np.searchsorted(drive.times_s, drive.times_s[begin] - criterion.within_s))
     watch = Watch(drive, approach.track, eyes)
 
-    def first_run_of(is_enough: IsEnough, k: int) -> Numbers:
+    def first_run_of(is_enough: IsEnough, k: int) -> Int64:
         steps = np.arange(0, end, eyes.every[k])
         latest = steps[steps <= begin][-criterion.looks :]
         if first_run(is_enough, latest[None], criterion.looks)[0] < NEVER:

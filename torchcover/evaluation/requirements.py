@@ -31,7 +31,7 @@ from torchcover.simulation import RegionsOfInterest, Sensor, builtin_names
 from torchcover.simulation.documents import SEVERAL, Bounds, BuiltIn, Coordinate, Document, NameOrFile, beside, by_name
 from torchcover.simulation.kinds import SENSORS
 from torchcover.targets import SIDES, TARGETS
-from torchcover.targets.raster import side_of
+from torchcover.targets.placing import side_of
 from torchcover.targets.survey import HITS, THRESHOLD_M
 
 Float64 = NDArray[np.float64]

@@ -8,8 +8,6 @@ from .kinds import REFERENCE_SENSORS as REFERENCE_SENSORS
 from .kinds import SENSORS as SENSORS
 from .lidar import Lidar as Lidar
 from .lidar import LidarModel as LidarModel
-from .material import Material as Material
-from .paper_reference import PaperReference as PaperReference
 from .radar import Radar as Radar
 from .rays import Tile as Tile
 from .rays import into_tiles as into_tiles
@@ -17,6 +15,7 @@ from .recorded_returns import LidarCalibration as LidarCalibration
 from .recorded_returns import calibrate as calibrate
 from .recorded_rig import rig_document as rig_document
 from .recorded_world import write_world as write_world
+from .reference_sensor import PaperReference as PaperReference
 from .reference_sensor import ReferenceScan as ReferenceScan
 from .reference_sensor import ReferenceSensor as ReferenceSensor
 from .reference_sensor import Surroundings as Surroundings
@@ -26,6 +25,8 @@ from .regions_of_interest import GRID_Y_M as GRID_Y_M
 from .regions_of_interest import Areas as Areas
 from .regions_of_interest import Asked as Asked
 from .regions_of_interest import RegionsOfInterest as RegionsOfInterest
+from .returns import Material as Material
+from .returns import Weather as Weather
 from .rig import Rig as Rig
 from .rig import with_ego as with_ego
 from .scenario import Scenario as Scenario
@@ -44,6 +45,5 @@ from .simulator import Simulator as Simulator
 from .surface_reference import SurfaceReference as SurfaceReference
 from .urdf import Robot as Robot
 from .urdf import read_robot as read_robot
-from .weather import Weather as Weather
 from .world import Label as Label
 from .writing import write_recording as write_recording

@@ -22,8 +22,8 @@ from torchcover.simulation.documents import (
     named,
     read_mapping,
 )
-from torchcover.simulation.material import Material, material_number
 from torchcover.simulation.mount_regions import MountRegion
+from torchcover.simulation.returns import Material, material_number
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.sound import told
 

@@ -2,10 +2,9 @@
 
 from torchcover.simulation.camera_sensor import CameraSensor
 from torchcover.simulation.lidar import Lidar
-from torchcover.simulation.paper_reference import PaperReference
 from torchcover.simulation.radar import Radar
 from torchcover.simulation.recorded.traffic import RecordedTraffic
-from torchcover.simulation.reference_sensor import ReferenceSensor
+from torchcover.simulation.reference_sensor import PaperReference, ReferenceSensor
 from torchcover.simulation.sensor import Sensor
 from torchcover.simulation.sumo import Sumo
 from torchcover.simulation.surface_reference import SurfaceReference

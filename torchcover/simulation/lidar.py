@@ -8,9 +8,8 @@ from pydantic import Field, PositiveFloat, ValidationInfo, model_validator
 
 from torchcover.geometry.arrays import Float32, Float64
 from torchcover.simulation.documents import BuiltIn, Pose, named
-from torchcover.simulation.material import material_number, materials, tone
 from torchcover.simulation.rays import unit_directions
-from torchcover.simulation.returns import log_excess, return_probability
+from torchcover.simulation.returns import log_excess, material_number, materials, return_probability, tone
 from torchcover.simulation.sensor import Draws, Elevation, Ranging, RayHits, Returns, ScanTimes
 
 # Two ways to write rows: a sensor that chooses one of them takes nothing of the other from its model.

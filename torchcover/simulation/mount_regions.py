@@ -4,15 +4,14 @@ from functools import cached_property
 from typing import Literal, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import model_validator
 
+from torchcover.geometry.arrays import Float64
 from torchcover.simulation.documents import Bounds, Document
 from torchcover.simulation.instant import encloses
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.shapes import Mesh
 
-Vector = NDArray[np.float64]
 Side = Literal["above", "front", "rear", "left", "right"]
 
 # Which axis one looks along, and on which end of it one is.
@@ -33,8 +32,8 @@ EDGE_SHARE = 1e-9
 class SkinPoint(NamedTuple):
     """A place on a body, `place_m` (3,), and the direction `outward` (3,) in which its skin faces there."""
 
-    place_m: Vector
-    outward: Vector
+    place_m: Float64
+    outward: Float64
 
 
 class Skin:
@@ -42,7 +41,7 @@ class Skin:
 
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
-        self._corners_m: Vector = mesh.vertices_m[mesh.faces]
+        self._corners_m: Float64 = mesh.vertices_m[mesh.faces]
 
     def __reduce__(self) -> tuple[type["Skin"], tuple[Mesh]]:
         return Skin, (self.mesh,)
@@ -75,7 +74,7 @@ class Skin:
         # Outwards is where the line came from, whichever way the face's corners turn.
         return SkinPoint(place_m, normal / np.linalg.norm(normal) * np.sign(sign * normal[axis]) + 0.0)
 
-    def encloses(self, place_m: Vector) -> bool:
+    def encloses(self, place_m: Float64) -> bool:
         """Whether a (3,) place lies inside the body, so that no ray gets out."""
         return encloses(self._caster, place_m)
 

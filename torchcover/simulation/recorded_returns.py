@@ -11,8 +11,7 @@ from torchcover.geometry.arrays import Bools, Float32, Float64, Int64
 from torchcover.recordings.in_vehicle import in_vehicle
 from torchcover.recordings.recording import Recording
 from torchcover.simulation.lidar import Lidar
-from torchcover.simulation.material import Material
-from torchcover.simulation.returns import SURE, log_excess
+from torchcover.simulation.returns import SURE, Material, log_excess
 from torchcover.simulation.rig import Rig
 
 # Of a road that is straight ahead; beside it there are kerbs and grass. Its height is fitted to the inner part.

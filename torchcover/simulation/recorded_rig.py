@@ -14,12 +14,11 @@ from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.formats.ros import RosBag
 from torchcover.recordings.recorders import CLEARANCE_M
 from torchcover.recordings.recording import CalibratedRecording, Recording, SensorCalibrations, UndistortedRecording
-from torchcover.simulation.as_cast import as_cast
 from torchcover.simulation.bodies import body_called, mover_mesh
 from torchcover.simulation.camera_sensor import MOUNT_T_CAMERA
 from torchcover.simulation.lidar import LidarModel
 from torchcover.simulation.rig import Rig
-from torchcover.simulation.scan_estimate import estimate_scan
+from torchcover.simulation.scan_estimate import as_cast, estimate_scan
 
 # What is on a roof reaches so far above the highest LiDAR.
 ABOVE_SENSOR_M = 0.2

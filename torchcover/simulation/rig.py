@@ -14,10 +14,10 @@ from torchcover.simulation.bodies import Body, Shape, VehicleShape, body_called,
 from torchcover.simulation.documents import BuiltIn, Document, NameOrFile, is_file_name
 from torchcover.simulation.kinds import SENSORS
 from torchcover.simulation.lidar import Lidar, LidarModel
+from torchcover.simulation.returns import Weather
 from torchcover.simulation.scenario import DEFAULT_EGO, Mover, Scenario
 from torchcover.simulation.sensor import Sensor
 from torchcover.simulation.shapes import Mesh, MeshFile
-from torchcover.simulation.weather import Weather
 
 
 def read_sensor(content: Any, info: ValidationInfo) -> Sensor:  # noqa: ANN401  (whatever stood in the file, or a sensor)

@@ -19,11 +19,11 @@ from torchcover.simulation.lidar import Lidar
 from torchcover.simulation.local_ground import STEEPEST_DEG, level_faces
 from torchcover.simulation.radar import Radar
 from torchcover.simulation.recorded.bodies import read_boxes
+from torchcover.simulation.returns import CLEAR, Weather
 from torchcover.simulation.sensor import Sensor
 from torchcover.simulation.shapes import Mesh, MeshFile
 from torchcover.simulation.sound import coincident_faces, warn_of_coincidence
 from torchcover.simulation.traffic.kind import Traffic
-from torchcover.simulation.weather import CLEAR, Weather
 from torchcover.simulation.world import Actor, World, steps_of
 
 # What carries a rig that names no vehicle, unless the document says otherwise.

@@ -7,7 +7,8 @@ import re
 import warnings
 from collections.abc import Mapping
 from contextlib import suppress
-from functools import cache
+from dataclasses import fields
+from functools import cache, partial
 from pathlib import Path
 from stat import S_ISDIR, S_ISREG
 from typing import Any
@@ -18,17 +19,18 @@ import shapely
 from numpy.typing import NDArray
 
 from torchcover import __version__
-from torchcover.files import BadFileError, said_gb
+from torchcover.files import BadFileError, check_kind, read_npz, reads, said_gb
+from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.builtin import builtin_names
 from torchcover.simulation.documents import builtin_hashes
 from torchcover.simulation.scenario import Mover, Scenario
-from torchcover.simulation.scene_file import encode_scene, read_scene
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.sumo.simulating import home
 from torchcover.simulation.traffic.fleet import load_bodies
-from torchcover.simulation.world import World
+from torchcover.simulation.world import Actor, World
 
 OWN_NAME = re.compile(r"[0-9a-f]{64}\.(npz|[0-9a-f]{32})")  # scenes, and temporary files of them; all others stay
+KINDS: dict[str, Any] = {kind.__name__: kind for kind in (World, Actor, Trajectory, Mesh)}
 
 
 class SceneCache:
@@ -66,7 +68,10 @@ class SceneCache:
 
     def _write(self, path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Write a scene; before it, delete the oldest until there is room."""
-        temporary, room_bytes = path.with_suffix(f".{uuid4().hex}"), self._limit_bytes - arrays["numbers"].nbytes
+        temporary, room_bytes = (
+            path.with_suffix(f".{uuid4().hex}"),
+            self._limit_bytes - sum(array.nbytes for array in arrays.values()),
+        )
         if room_bytes < 0:
             return
         try:
@@ -134,3 +139,50 @@ def _hash_code() -> str:
     for path in sorted(path for room in ("files", "geometry", "simulation") for path in (package / room).rglob("*.py")):
         digest.update(f"{path.relative_to(package)} {path.stat().st_size} ".encode() + path.read_bytes())
     return digest.hexdigest()
+
+
+def encode_scene(key: str, scene: World, bodies: Mapping[str, Mesh]) -> dict[str, NDArray[Any]]:
+    """Return a scene as arrays by number, and `scene`: the JSON of its key and of itself, in bytes.
+
+    An array that is there several times is written once; of `bodies`, which scenes share, the names only.
+    """
+    names, arrays, number_of = {id(mesh): name for name, mesh in bodies.items()}, dict[str, Any](), dict[object, str]()
+
+    def encode(value: Any) -> Any:  # noqa: ANN401
+        if isinstance(value, np.ndarray):
+            memory = value.__array_interface__["data"], value.shape, value.strides, value.dtype.str
+            number = number_of.setdefault(memory, str(len(number_of)))
+            arrays[number] = value
+            return {"array": number}
+        if id(value) in names:
+            return {"body": names[id(value)]}
+        if type(value).__name__ in KINDS:
+            items = value if isinstance(value, Mesh) else [getattr(value, field.name) for field in fields(value)]
+            return {type(value).__name__: [encode(item) for item in items]}
+        return [encode(item) for item in value] if isinstance(value, tuple) else value
+
+    text = json.dumps([key, encode(scene)], default=np.generic.item).encode()
+    return {"scene": np.frombuffer(text, np.uint8), **arrays}
+
+
+@reads("a scene")
+def read_scene(path: Path, bodies: Mapping[str, Mesh]) -> World:
+    """Read a scene, whose key is the stem of the path, without running code of it; its arrays are read-only."""
+    arrays, meshes = read_npz(path, partial(check_kind, "biuf")), dict[str, Mesh]()
+    for array in arrays.values():
+        array.flags.writeable = False
+    key, scene = json.loads(arrays["scene"].tobytes())
+    if key != path.stem:
+        raise ValueError("it holds another scene")
+
+    def decode(value: Any) -> Any:  # noqa: ANN401
+        if not isinstance(value, dict):
+            return tuple(map(decode, value)) if isinstance(value, list) else value
+        ((kind, items),) = value.items()
+        if kind in ("array", "body"):
+            return arrays[items] if kind == "array" else bodies[items]
+        part = KINDS[kind](*map(decode, items))
+        return meshes.setdefault(str(items), part) if kind == "Mesh" else part  # actors share meshes
+
+    world: World = decode(scene)
+    return world

@@ -17,7 +17,7 @@ from torchcover.geometry.arrays import Float64, Int64
 from torchcover.simulation.bodies import Body
 from torchcover.simulation.documents import Document, Pose
 from torchcover.simulation.raycaster import Struck
-from torchcover.simulation.weather import CLEAR, Weather
+from torchcover.simulation.returns import CLEAR, Weather
 
 Elevation = Annotated[float, Field(ge=-90.0, le=90.0)]
 

@@ -13,8 +13,8 @@ from torchcover.files import check_memory, reads
 from torchcover.geometry import transform
 from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.simulation.documents import Document, PathBeside
-from torchcover.simulation.material import material_number
 from torchcover.simulation.mesh_files import mesh_arrays
+from torchcover.simulation.returns import material_number
 
 CYLINDER_SIDES = 24
 MAX_SIDES = 10_000

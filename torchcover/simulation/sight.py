@@ -12,11 +12,11 @@ from torchcover.simulation.instant import Instant, SensorScan, in_threads
 from torchcover.simulation.memory import BYTES_PER_RAY, check_fits
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.rays import BLOCK, Balls, Tile, into_tiles, pixels_in_tiles, rotate
+from torchcover.simulation.returns import CLEAR, Weather
 from torchcover.simulation.scene import Scene, ends_at
 from torchcover.simulation.sensor import Draws, RayHits, ScanTimes, Sensor
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.sweep import RayTimes
-from torchcover.simulation.weather import CLEAR, Weather
 
 # Rays in a tile: of neighbours all, so that a tile is narrow. A constant, so that nothing depends on threads.
 TILE_RAYS = 8192

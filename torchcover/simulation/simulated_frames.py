@@ -19,8 +19,7 @@ from torchcover.frames.source import FrameDataset
 from torchcover.geometry.arrays import Float32, Float64, Int64
 from torchcover.simulation.instant import SensorScan
 from torchcover.simulation.kinds import REFERENCE_SENSORS
-from torchcover.simulation.paper_reference import PaperReference
-from torchcover.simulation.reference_sensor import ReferenceSensor
+from torchcover.simulation.reference_sensor import PaperReference, ReferenceSensor
 from torchcover.simulation.regions_of_interest import Asked, RegionsOfInterest
 from torchcover.simulation.rig import Rig, is_roadside, with_ego
 from torchcover.simulation.scenario import Scenario

@@ -1,21 +1,232 @@
-"""A reference sensor that asks the surface itself: which of it is seen from beside and above the ego."""
+"""A reference sensor that asks the surface itself: points drawn evenly over it, seen from beside and above the ego."""
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Self, get_args
+from typing import ClassVar, NamedTuple, Self, get_args
 
 import numpy as np
 
 from torchcover.coverage.grid import PAPER_HEIGHTS, BandFrame
 from torchcover.geometry import BoundingBox, rigid
-from torchcover.geometry.arrays import Float64
+from torchcover.geometry.arrays import Bools, Float32, Float64, Int32, Int64
+from torchcover.simulation.local_ground import SLACK_M as HEIGHT_SLACK_M
 from torchcover.simulation.local_ground import TOLERANCE_M
-from torchcover.simulation.patches import Bounds
+from torchcover.simulation.patches import Bounds, Patches
 from torchcover.simulation.reference_sensor import ReferenceScan, Surroundings, check_reach, position_in_shell
 from torchcover.simulation.regions_of_interest import DEFAULT_BAND_FRAME, Areas, Asked, Bands
 from torchcover.simulation.sight import Sight, sight
 from torchcover.simulation.sound import UPON_M
-from torchcover.simulation.surface_points import SurfacePoints, SurfaceStrata
+
+# Patches are looked up with this much to spare: drawn points are rounded to float32.
+SLACK_M = 1e-3
+# Steps of a sequence in the plane whose points keep apart, whatever their number (Roberts 2018, "R2").
+PLANE_STEPS = (0.7548776662466927, 0.5698402909980532)
+# Where a stratum holds little of its patches, at most this many points are drawn for one that is wanted.
+MOST_DRAWN = 16.0
+
+
+class SurfacePoints(NamedTuple):
+    """K points of a surface.
+
+    `points_m` (K, 3) where; `heights_m` (K,) above what bands are measured from; `normals` (K, 3) of length one on the
+    side from which they are looked at; `per_m2` (K,) how many points a square metre was given there, from all strata
+    together; `of_object` (K,) number of the object that they are on, -1 for none; `face` (1, K) or (0, K) as in
+    `Patches`.
+    """
+
+    points_m: Float32
+    heights_m: Float32
+    normals: Float32
+    per_m2: Float64
+    of_object: Int32
+    face: Int32
+
+    def some(self, which: Bools) -> Self:
+        """Those of them for which (K,) is true."""
+        turned = self._replace(face=self.face.T)
+        some = type(self)._make(part[which] for part in turned)
+        return some._replace(face=some.face.T)
+
+
+class Stratum(NamedTuple):
+    """The patches that may meet one box: numbers, whole areas, and about what lies within, judged by their own boxes.
+
+    All three are (K,).
+    """
+
+    patch: Int64
+    m2: Float64
+    inside_m2: Float64
+
+
+class Objects(NamedTuple):
+    """The patches that belong to objects: `patch` (K,) numbers, object by object; `m2` (K,) their areas.
+
+    `number` (J,) of each object, and `first` (J,) of its patches among these.
+    """
+
+    patch: Int64
+    m2: Float64
+    number: Int32
+    first: Int64
+
+
+class SurfaceStrata:
+    """A surface, ready to draw points from: evenly within each of some boxes, which may overlap, and on each object.
+
+    Boxes are half-open, in the frame of the patches; their third bounds are about what `heights_m` makes of (K, 3)
+    points, (K,), NaN for none, as `Patches.heights_m` are, or about z if it is not given.
+    """
+
+    def __init__(self, patches: Patches, boxes: Bounds, heights_m: Callable[[Float32], Float32] | None = None) -> None:
+        self._patches = patches
+        self._boxes = boxes
+        self._heights_m = heights_m
+        normals = patches.normals_m2
+        twice_m2 = np.sqrt((normals**2).sum(axis=0))
+        self._normals = normals / np.maximum(twice_m2, np.finfo(np.float32).tiny)
+        self._plane_m = (self._normals * patches.corner_m).sum(axis=0)
+        lower_m, upper_m = patches.lower_m - np.float32(SLACK_M), patches.upper_m + np.float32(SLACK_M)
+        if heights_m is not None:
+            lower_m[2], upper_m[2] = patches.heights_m
+        self._strata = _strata(twice_m2 / 2, lower_m, upper_m, boxes)
+        self._objects = _objects(patches.of_object, twice_m2 / 2)
+
+    def draw(
+        self, place_m: Float64, each: float, generator: np.random.Generator, *, on_objects: int = 0
+    ) -> SurfacePoints:
+        """Points on patches that a place is in front of, about `each` a box; below 1, one with that probability.
+
+        Each object gets `on_objects` more, wherever it is. One that turns no face to the place gets them on the outer
+        side of all its faces, which hide them.
+        """
+        x, y, z = place_m.tolist()
+        height_m = x * self._normals[0] + y * self._normals[1] + z * self._normals[2] - self._plane_m
+        front = (height_m > 0) | (~self._patches.outward & (height_m < 0))
+        drawn = [_drawn(stratum, front, each, generator) for stratum in self._strata]
+        number = np.repeat(np.arange(len(drawn)), [len(patch) for patch, _ in drawn])
+        of_objects, object_per_m2 = _drawn_on_objects(self._objects, front, on_objects, generator)
+        patch = np.concatenate([*(patch for patch, _ in drawn), of_objects])
+        points_m = self._points(patch, generator)
+        heights_m = self._heights_of(points_m, patch)
+        placed_m = points_m[0], points_m[1], heights_m
+        inside = np.stack([_inside(placed_m, low, high) for low, high in zip(*self._boxes, strict=True)])
+        kept = np.ones(len(patch), dtype=bool)
+        kept[: len(number)] = inside[number, np.arange(len(number))]
+        patch, of_object = patch[kept], self._patches.of_object[patch[kept]]
+        # A face of something closed is looked at from its outer side only, whatever side the place is on.
+        side = np.where(self._patches.outward[patch], np.float32(1), np.sign(height_m[patch]))
+        return SurfacePoints(
+            np.ascontiguousarray(points_m[:, kept].T),
+            heights_m[kept],
+            (self._normals[:, patch] * side).T,
+            np.array([density for _, density in drawn]) @ inside[:, kept] + object_per_m2[of_object],
+            of_object,
+            self._patches.face.take(patch, axis=1),
+        )
+
+    def _heights_of(self, points_m: Float32, patch: Int64) -> Float32:
+        """(K,) what the third bounds of the boxes are about, of (3, K) points on the patches."""
+        if self._heights_m is None:
+            return np.asarray(points_m[2])
+        asked = np.flatnonzero(self._patches.heights_m[1].take(patch) > HEIGHT_SLACK_M)  # the others are the ground
+        heights_m = np.zeros(len(patch), dtype=np.float32)
+        heights_m[asked] = self._heights_m(points_m.take(asked, axis=1).T)
+        return heights_m
+
+    def _points(self, patch: Int64, generator: np.random.Generator) -> Float32:
+        """(3, K) one point on each of the patches."""
+        start = generator.random((2, 1))
+        a, b = ((start + np.arange(len(patch)) * np.array(PLANE_STEPS)[:, None]) % 1).astype(np.float32)
+        beyond = a + b > 1
+        a, b = np.where(beyond, 1 - a, a), np.where(beyond, 1 - b, b)
+        taken = self._patches.taken(patch)
+        return np.asarray(taken.corner_m + a * taken.first_m + b * taken.second_m)
+
+
+def _inside(placed_m: Sequence[Float32], low: Float64, high: Float64) -> Bools:
+    inside = np.ones(len(placed_m[0]), dtype=bool)
+    for along_m, least_m, most_m in zip(placed_m, low, high, strict=True):
+        inside &= (along_m >= least_m) & (along_m < most_m)
+    return inside
+
+
+def _strata(m2: Float32, lower_m: Float32, upper_m: Float32, boxes: Bounds) -> list[Stratum]:
+    # What lies in an area, whatever its height, and how much of it: several bands ask about it.
+    above: dict[bytes, tuple[Int64, Float32, Float32]] = {}
+    strata = []
+    for low, high in zip(*boxes, strict=True):
+        area = np.stack([low[:2], high[:2]]).tobytes()
+        if area not in above:
+            (x_low, y_low, _), (x_high, y_high, _) = low.tolist(), high.tolist()
+            meets = (upper_m[0] >= x_low) & (lower_m[0] <= x_high) & (upper_m[1] >= y_low) & (lower_m[1] <= y_high)
+            patch = np.flatnonzero(meets)
+            inside_m2 = m2.take(patch) * _share(lower_m[0].take(patch), upper_m[0].take(patch), x_low, x_high)
+            inside_m2 *= _share(lower_m[1].take(patch), upper_m[1].take(patch), y_low, y_high)
+            above[area] = patch, m2.take(patch), inside_m2
+        patch, whole_m2, inside_m2 = above[area]
+        from_m, to_m, z_low, z_high = lower_m[2].take(patch), upper_m[2].take(patch), float(low[2]), float(high[2])
+        in_band = np.flatnonzero((to_m >= z_low) & (from_m <= z_high))
+        inside_m2 = inside_m2.take(in_band) * _share(from_m.take(in_band), to_m.take(in_band), z_low, z_high)
+        stratum = Stratum(patch.take(in_band), whole_m2.take(in_band).astype(np.float64), inside_m2.astype(np.float64))
+        strata.append(stratum)
+    return strata
+
+
+def _share(from_m: Float32, to_m: Float32, low: float, high: float) -> Float32:
+    """Which share of each stretch lies between two bounds, of those that meet them."""
+    return np.asarray((np.minimum(to_m, high) - np.maximum(from_m, low)) / (to_m - from_m))
+
+
+def _drawn(stratum: Stratum, front: Bools, each: float, generator: np.random.Generator) -> tuple[Int64, float]:
+    """Patches, drawn by their area so that about `each` points lie in the stratum, and points per square metre."""
+    seen = front.take(stratum.patch)
+    up_to_m2 = np.cumsum(stratum.m2 * seen)
+    whole_m2 = float(up_to_m2[-1]) if len(up_to_m2) else 0.0
+    if whole_m2 == 0:
+        return np.empty(0, dtype=np.int64), 0.0
+    inside_m2 = max(float((stratum.inside_m2 * seen).sum()), whole_m2 / MOST_DRAWN)
+    wanted = each * whole_m2 / inside_m2
+    expected = float(round(wanted)) if wanted >= 1 else wanted
+    count = int(expected + generator.random())
+    # One in each of as many equal parts of the area: the order of patches is one of places.
+    at_m2 = (np.arange(count) + generator.random(count)) / max(count, 1) * whole_m2
+    # Rounding must not take the last one beyond the end, where patches may follow that are not seen.
+    number = np.searchsorted(up_to_m2, np.minimum(at_m2, np.nextafter(whole_m2, 0.0)), side="right")
+    return stratum.patch[number], expected / whole_m2
+
+
+def _objects(of_object: Int32, m2: Float32) -> Objects:
+    patch = np.flatnonzero(of_object >= 0)
+    patch = patch[np.argsort(of_object[patch], kind="stable")]
+    number, first = np.unique(of_object[patch], return_index=True)
+    return Objects(patch, m2[patch].astype(np.float64), number, first)
+
+
+def _drawn_on_objects(
+    objects: Objects, front: Bools, each: int, generator: np.random.Generator
+) -> tuple[Int64, Float64]:
+    """Patches, `each` for every object, drawn by their area, and points per square metre by the object's number.
+
+    The last density is for what is no object.
+    """
+    per_m2 = np.zeros(objects.number.max(initial=-1) + 2)
+    if each == 0 or len(objects.number) == 0:
+        return np.empty(0, dtype=np.int64), per_m2
+    facing = front[objects.patch]
+    away = ~np.logical_or.reduceat(facing, objects.first)
+    facing |= away.repeat(np.diff(objects.first, append=len(facing)))
+    up_to_m2 = np.cumsum(objects.m2 * facing)
+    end_m2 = up_to_m2[np.append(objects.first[1:], len(facing)) - 1]
+    start_m2 = np.append(0.0, end_m2[:-1])
+    per_m2[objects.number] = each / (end_m2 - start_m2)
+    # One in each of as many equal parts of the object's area; rounding must not take the last one to the next object.
+    parts = (np.arange(each) + generator.random((len(end_m2), each))) / each
+    at_m2 = start_m2[:, None] + parts * (end_m2 - start_m2)[:, None]
+    at_m2 = np.minimum(at_m2, np.nextafter(end_m2, 0.0)[:, None])
+    return objects.patch[np.searchsorted(up_to_m2, at_m2.ravel(), side="right")], per_m2
+
 
 DEFAULT_RAYS = 16_384
 # How far above the surface a ray to it ends, in metres, and as a share of the coordinates that casting rounds. What
@@ -90,12 +301,9 @@ class SurfaceReference:
                 raise ValueError(f"areas: finite bounds, lower first, are needed; got {area}")
         if not self.bands_m or not all(-math.inf < low < high < math.inf for low, high in self.bands_m):
             raise ValueError(f"bands_m: at least one (low, high) with finite bounds is needed; got {self.bands_m}")
-        if self.rays < 1:
-            raise ValueError(f"rays: at least 1 is needed; got {self.rays}")
-        if self.places < 1:
-            raise ValueError(f"places: at least 1 is needed; got {self.places}")
-        if self.object_points < 0:
-            raise ValueError(f"object_points: a number >= 0 is needed; got {self.object_points}")
+        for name, least in (("rays", 1), ("places", 1), ("object_points", 0)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name}: at least {least} is needed; got {getattr(self, name)}")
         if self.band_frame not in get_args(BandFrame):
             raise ValueError(f"band_frame: ground or vehicle is needed; got {self.band_frame!r}")
         below = [band for band in self.bands_m if self.band_frame == "ground" and band[1] <= -TOLERANCE_M]

@@ -5,24 +5,21 @@ from typing import NamedTuple, Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.coverage import NEAR_FIELD_M, BevGrid, BodySums, Region
 from torchcover.coverage.bodies import COLUMNS, FREE, SEEN, TRIED
 from torchcover.frames import Frame
 from torchcover.geometry import BoundingBox, overlapping
+from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.metrics import SumsInBlocks
 from torchcover.simulation.reference_sensor import Surroundings
 from torchcover.simulation.regions_of_interest import near_field
 from torchcover.simulation.simulator import Simulator
-from torchcover.targets.counting import count
-from torchcover.targets.placing import holding, poses, standing, yaws
-from torchcover.targets.raster import Raster
-from torchcover.targets.steps import SensorStep, Step, free_places, pose_in_shell
-from torchcover.targets.surface import Surface
+from torchcover.targets.counting import SensorStep, Step, count, free_places, pose_in_shell
+from torchcover.targets.placing import Raster, holding, poses, standing, yaws
+from torchcover.targets.surface import Surface, Target
 from torchcover.targets.survey import HITS, THRESHOLD_M
-from torchcover.targets.target import Target
 
 # Steps from one at which bodies are put to the next, and places of each in each region then: a tenth of a run's time.
 EVERY, PLACES = 4, 3
@@ -43,10 +40,10 @@ class Probe(NamedTuple):
 
     body: Target
     surface: Surface
-    region: NDArray[np.int64]
-    room: NDArray[np.bool_]
-    vehicle_T_body: NDArray[np.float64]
-    cell: NDArray[np.int64]
+    region: Int64
+    room: Bools
+    vehicle_T_body: Float64
+    cell: Int64
 
     @classmethod
     def of(cls, body: Target, vehicle: BoundingBox, regions: Sequence[Region], grid: BevGrid) -> Self:
@@ -59,7 +56,7 @@ class Probe(NamedTuple):
         cell = grid.cell_of(torch.from_numpy(vehicle_T_body[:, :3, 3].copy())).numpy()
         return cls(body, Surface.of(body), region, room, vehicle_T_body, cell)
 
-    def some(self, places: int, generator: np.random.Generator) -> NDArray[np.int64]:
+    def some(self, places: int, generator: np.random.Generator) -> Int64:
         """So many in each region, any as likely as the others there, and spread evenly; all if there are no more."""
         found = []
         for region in range(self.region.max() + 1):

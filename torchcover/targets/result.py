@@ -1,4 +1,4 @@
-"""What a rig sees of a target, for every place around the vehicle."""
+"""What a rig sees of a target, for every place around the vehicle, and the files of such a map."""
 
 import math
 from dataclasses import dataclass
@@ -10,17 +10,19 @@ from numpy.typing import NDArray
 from torchcover.coverage import BevGrid
 from torchcover.files import data_set, small_html
 from torchcover.geometry import BoundingBox
+from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.report import draw_targets, percent
-from torchcover.targets.placing import Heading
-from torchcover.targets.raster import SIDES, Raster, from_outline_m, side_of
+from torchcover.targets.placing import SIDES, Heading, Raster, from_outline_m, side_of
 
 if TYPE_CHECKING:
     import pandas
     import xarray
     from matplotlib.figure import Figure
 
-Float64 = NDArray[np.float64]
-Numbers = NDArray[np.int64]
+import json
+from pathlib import Path
+
+from torchcover.files import csv_text, write_npz
 
 # What a cell is: there is room for the target in a step at least; the vehicle is there; there is none in any step.
 STATES = ("free", "occupied", "outside")
@@ -56,7 +58,7 @@ class Spots:
     """What some sensors get of a target at P places: the arrays of `TargetMap` that are called so, of one row."""
 
     state: NDArray[np.uint8]
-    steps: Numbers
+    steps: Int64
     sensor_points: Float64
     sensors: Float64
     seen: Float64
@@ -131,14 +133,14 @@ class TargetMap(Spots):
         return np.asarray(self.sensor_points.sum(axis=0))
 
     @property
-    def free(self) -> NDArray[np.bool_]:
+    def free(self) -> Bools:
         """(Y, X) whether it can stand there."""
         return np.asarray(self.state == FREE)
 
     @property
-    def enough(self) -> NDArray[np.bool_]:
+    def enough(self) -> Bools:
         """(Y, X) whether it is seen: by `hits` points at least, in every step."""
-        enough: NDArray[np.bool_] = np.nan_to_num(self.least_points) >= self.hits
+        enough: Bools = np.nan_to_num(self.least_points) >= self.hits
         return enough & self.free
 
     @property
@@ -148,7 +150,7 @@ class TargetMap(Spots):
         return away_m.reshape(self.raster.shape)
 
     @property
-    def side(self) -> NDArray[np.int64]:
+    def side(self) -> Int64:
         """(Y, X) number in `SIDES` of the side that each cell is on, from corners at 45 degrees; -1 within the box."""
         return side_of(self.vehicle, self.raster.positions_m).reshape(self.raster.shape)
 
@@ -298,3 +300,38 @@ class TargetMap(Spots):
             "seed": self.seed,
             "steps": self.step_count,
         }
+
+
+COLUMNS = ("x_m", "y_m", "distance_m", "side", "state", "steps", "points", "sensors", "seen", "least_points",
+           "least_sensors", "share", "visible_m2")  # fmt: skip
+
+ARRAYS = ("x_m", "y_m", "state", "steps", "points", "sensor_points", "sensors", "seen", "least_points",
+          "least_sensors", "share", "visible_m2",
+          "distance_m", "side", "vehicle_outline_m")  # fmt: skip
+
+
+def write_csv(seen: TargetMap, path: Path) -> None:
+    """One row a cell, row by row; empty where nothing is known. Last columns: the points of each sensor."""
+    rows: list[list[object]] = [[*COLUMNS, *(f"points_{name}" for name in seen.sensor_names)]]
+    points = seen.points
+    for row, column in np.ndindex(seen.raster.shape):
+        at = row, column
+        place = seen.place(row, column)
+        means = points[at], seen.sensors[at], seen.seen[at]
+        known = *means, seen.least_points[at], seen.least_sensors[at], seen.share[at], seen.visible_m2[at]
+        of_sensors = seen.sensor_points[(slice(None), row, column)]
+        rows.append([
+            f"{place.x_m:.9g}", f"{place.y_m:.9g}", f"{place.distance_m:.9g}", place.side, STATES[seen.state[at]],
+            int(seen.steps[at]), *(_number(value) for value in (*known, *of_sensors)),
+        ])  # fmt: skip
+    path.write_text(csv_text(rows), encoding="utf-8")
+
+
+def _number(value: float) -> str:
+    return "" if np.isnan(value) else f"{value:.9g}"
+
+
+def write_arrays(seen: TargetMap, path: Path) -> None:
+    """All arrays, and the settings as JSON text in `settings`; `np.load` reads it."""
+    arrays = {name: getattr(seen, name) for name in ARRAYS}
+    write_npz(path, {**arrays, "border_m": seen.border_m(), "settings": np.array(json.dumps(seen.settings()))})

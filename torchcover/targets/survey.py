@@ -8,18 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.geometry import overlapping
+from torchcover.geometry.arrays import Float64
 from torchcover.simulation.memory import check_fits
 from torchcover.simulation.rig import Rig, with_ego
 from torchcover.simulation.scenario import Scenario
-from torchcover.targets.counting import count
-from torchcover.targets.placing import Heading, holding, poses, yaws
-from torchcover.targets.raster import Raster
+from torchcover.targets.counting import PLACES, Steps, count
+from torchcover.targets.placing import Heading, Raster, holding, poses, yaws
 from torchcover.targets.result import FREE, OCCUPIED, OUTSIDE, Spots, TargetMap
-from torchcover.targets.steps import PLACES, Steps
-from torchcover.targets.surface import SAMPLES, Surface
-from torchcover.targets.target import Target
-
-Float64 = NDArray[np.float64]
+from torchcover.targets.surface import SAMPLES, Surface, Target
 
 # Of one step: where each ends, on what, two random numbers. Of one cell: poses, sums, and what is made on the way.
 BYTES_PER_RAY = 21
