@@ -4,7 +4,7 @@ Runs short commands of each checkout and compares every number of `summary.json`
 bytes of recordings and scenarios that are written, and every tensor of the first frames of each kind of source.
 Numbers have to be equal to the last bit; `--tolerance KEY=RELATIVE` allows a relative difference for keys that contain
 KEY. `--renamed OLD=NEW` names the new name of a key or an array; a `*` in NEW stands for all arrays that match,
-stacked. `--called NEW=OLD` names an option of NEW and how OLD calls it. `--expected TEXT` names an intended difference:
+stacked. `--called 'NEW=>OLD'` replaces a text in the commands of OLD. `--expected TEXT` names an intended difference:
 complaints that contain the text are counted and listed apart. Times, versions and hashes of files are not compared.
 """
 
@@ -94,13 +94,13 @@ def main():
     parser.add_argument("old", type=Path)
     parser.add_argument("new", type=Path, nargs="?", default=ROOT)
     parser.add_argument("--renamed", action="append", default=[], metavar="OLD=NEW")
-    parser.add_argument("--called", action="append", default=[], metavar="NEW=OLD")
+    parser.add_argument("--called", action="append", default=[], metavar="NEW=>OLD")
     parser.add_argument("--tolerance", action="append", default=[], metavar="KEY=RELATIVE")
     parser.add_argument("--expected", action="append", default=[], metavar="TEXT")
     parser.add_argument("--runs", nargs="+", choices=[*RUNS, *SOURCES], default=[*RUNS, *SOURCES])
     options = parser.parse_args()
     renamed = dict(pair.split("=") for pair in options.renamed)
-    called = {f"--{new}": f"--{old}" for new, old in (pair.split("=") for pair in options.called)}
+    called = dict(pair.split("=>") for pair in options.called)
     tolerances = {key: float(value) for key, value in (pair.split("=") for pair in options.tolerance)}
     unexpected = 0
     with tempfile.TemporaryDirectory() as folder:
@@ -115,8 +115,8 @@ def main():
                 if name in SOURCES:
                     results.append(hash_frames(checkout, substitute(SOURCES[name], places), folder))
                 else:
-                    words = substitute(RUNS[name], places).split()
-                    words = [called.get(word, word) for word in words] if side == "old" else words
+                    text = substitute(RUNS[name], called) if side == "old" else RUNS[name]
+                    words = substitute(text, places).split()
                     results.append(run_and_read(name, checkout, words, Path(folder, side, name), folder))
             complaints = list(compare(*results, renamed, tolerances))
             intended = [complaint for complaint in complaints if any(text in complaint for text in options.expected)]
