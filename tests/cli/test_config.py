@@ -9,6 +9,7 @@ from torchcover.cli.app import app
 from torchcover.data import RecordingSettings, open_recording
 from torchcover.evaluation.config import EvaluateConfig, load_config, write_defaults
 from torchcover.files import BadFileError, parse_yaml
+from torchcover.simulation.documents import KINDS, SETTINGS_KIND
 
 
 def test_the_written_defaults_are_all_settings_with_a_comment_each(tmp_path):
@@ -16,10 +17,13 @@ def test_the_written_defaults_are_all_settings_with_a_comment_each(tmp_path):
     (tmp_path / "run.yaml").write_text(text)
     assert load_config(tmp_path / "run.yaml").config == EvaluateConfig()
     assert list(parse_yaml(text)) == list(EvaluateConfig.model_fields)
-    assert list(parse_yaml(text)["recording"]) == list(RecordingSettings.model_fields)
+    assert not load_config(tmp_path / "run.yaml").config.recording.model_fields_set
     lines = text.splitlines()
-    keys = [number for number, line in enumerate(lines) if not line.lstrip().startswith("#")]
-    assert all(lines[number - 1].lstrip().startswith("#") for number in keys)
+    keys = [number for number, line in enumerate(lines) if not line.startswith("#")]
+    assert all(lines[number - 1].startswith("#") for number in keys)
+    assert set(KINDS[SETTINGS_KIND][1].split()) == set(EvaluateConfig.model_fields)
+    section = text.partition("recording: {}")[2].replace("\n#", "\n")
+    assert list(parse_yaml(f"recording:{section}")["recording"]) == list(RecordingSettings.model_fields)
 
 
 def test_an_option_wins_over_set_which_wins_over_the_file_and_both_are_recorded(tmp_path):
@@ -54,6 +58,7 @@ def test_an_option_wins_over_set_which_wins_over_the_file_and_both_are_recorded(
         ("recording: {units: km}", "recording.units: 'm', 'cm', 'mm' or 'ft' is needed; got 'km'"),
         ("recording: {lag_s: 5}", "recording.lag_s: at most 1 s of time offset"),
         ("[1, 2]", "a YAML mapping of settings is needed"),
+        ("name: r\nsensors: []", "this is a rig; a file of settings is needed"),
     ],
 )
 def test_a_file_with_a_mistake_is_refused_with_key_and_value(tmp_path, text, message):

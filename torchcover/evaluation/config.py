@@ -197,7 +197,11 @@ def _read_config(path: Path) -> dict[str, Any]:
     try:
         EvaluateConfig.model_validate(content)
     except ValidationError as error:
-        raise ValueError("; ".join(explain_settings(error))) from error
+        from torchcover.simulation.documents import SETTINGS_KIND, find_other_kind
+
+        other = find_other_kind(SETTINGS_KIND, content)
+        mistakes = "; ".join(explain_settings(error))
+        raise ValueError(f"this is {other}; {SETTINGS_KIND} is needed" if other else mistakes) from error
     return content
 
 
@@ -231,7 +235,9 @@ def _describe_fields(model: type[BaseModel], indent: str = "") -> Iterator[str]:
         comment = f"{indent}# "
         yield textwrap.fill(field.description or "", 118, initial_indent=comment, subsequent_indent=comment)
         if isinstance(field.default, BaseModel):
-            yield f"{indent}{name}:"
-            yield from _describe_fields(type(field.default), indent + "  ")
+            # As comments: a setting of the recording that is given wins over `recording.yaml`, defaults are not.
+            yield f"{indent}{name}: {{}}"
+            for line in _describe_fields(type(field.default), indent + "  "):
+                yield "#" + line.replace("\n", "\n#")
         else:
             yield f"{indent}{name}: {json.dumps(field.default)}"

@@ -42,8 +42,15 @@ OF_OTHERS = {
     "resolution": "width, height",
     "range": "max_range_m",
 }
+SETTINGS_KIND = "a file of settings"
 # Top-level keys of the files that commands take: those that a kind needs, then those that it may have.
 KINDS = {
+    SETTINGS_KIND: (
+        "",
+        "scenario steps seed vehicle sensor_model weather ask probe cell_m thresholds_m aggregations reference rays "
+        "estimate band_frame every_s target_error only_detection redundancy metrics device workers no_cache "
+        "skip_bad_frames rerun recording",
+    ),
     "a rig": ("sensors", "vehicle weather bodies"),
     "a vehicle": ("parts", "extends mount_regions"),
     "a scenario": ("", "ego bodies actors boxes time_step_s duration_s weather traffic"),
