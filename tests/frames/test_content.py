@@ -62,7 +62,7 @@ def test_where_the_files_are_and_what_they_say_of_themselves_does_not_matter(tmp
 def test_traffic_has_its_vehicles_in_it(monkeypatch):
     frames = SimulatedFrames("urban", "front_roof_32", steps=1)
     before = frames.content
-    monkeypatch.setattr("torchcover.simulation.traffic.procedural.builtin_hashes", lambda _: {"van": "larger"})
+    monkeypatch.setattr("torchcover.simulation.traffic.kind.builtin_hashes", lambda _: {"van": "larger"})
     assert frames.content["scenario"]["traffic"].pop("vehicles") == {"van": "larger"}
     assert len(before["scenario"]["traffic"].pop("vehicles")) > 5
     assert before["scenario"]["traffic"]["type"] == "urban"

@@ -14,7 +14,7 @@ from torchcover.geometry import contact_s
 from torchcover.simulation import Rig, Scenario
 from torchcover.simulation.moving import Solid
 from torchcover.simulation.shapes import Box
-from torchcover.simulation.traffic.articulated import tractrix
+from torchcover.simulation.traffic.fleet import tractrix
 from torchcover.simulation.traffic.idm import Driver, acceleration_in, advance, tightness
 
 from .case import Case, most

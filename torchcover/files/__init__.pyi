@@ -27,6 +27,7 @@ from .documents import feed_xml as feed_xml
 from .documents import parse_xml as parse_xml
 from .documents import parse_yaml as parse_yaml
 from .documents import parse_yaml_stream as parse_yaml_stream
+from .documents import read_pieces as read_pieces
 from .documents import road_user_classes as road_user_classes
 from .isolated import apart as apart
 from .isolated import exr_image as exr_image

@@ -1,7 +1,7 @@
 """YAML and XML without their traps: every key once, numbers that look like numbers, no entities, and an end."""
 
 import re
-from collections.abc import Callable, Hashable, Iterable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar, NoReturn
@@ -203,6 +203,7 @@ def _quoted(value: Any) -> str:  # noqa: ANN401
 
 # A tree of elements takes about so many times the bytes of its text.
 TREE_PER_BYTE = 20
+PIECE_BYTES = 1 << 18
 
 
 def parse_xml(path: Path) -> ElementTree.Element:
@@ -215,6 +216,12 @@ def parse_xml(path: Path) -> ElementTree.Element:
     if "<!ENTITY" in text:
         raise ValueError("an XML file without entities is needed")
     return ElementTree.fromstring(text)  # which resolves nothing that lies outside
+
+
+def read_pieces(path: Path) -> Iterator[bytes]:
+    """Yield a file in pieces of 256 KiB, for `feed_xml`."""
+    with path.open("rb") as file:
+        yield from iter(lambda: file.read(PIECE_BYTES), b"")
 
 
 def feed_xml(

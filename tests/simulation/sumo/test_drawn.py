@@ -14,10 +14,9 @@ from torchcover.data import SimulatedFrames
 from torchcover.files import BadFileError, parse_xml
 from torchcover.simulation import PaperReference
 from torchcover.simulation.sumo import Sumo, simulating, traffic
-from torchcover.simulation.sumo.demand import write_routes
 from torchcover.simulation.sumo.network import read_network
 from torchcover.simulation.sumo.simulating import from_opendrive
-from torchcover.simulation.sumo.streets import TURN_MPS2, DrawnStreets, turning_mps
+from torchcover.simulation.sumo.streets import TURN_MPS2, DrawnStreets, turning_mps, write_routes
 from torchcover.simulation.traffic.fleet import KIND_OF, Fleet, load_bodies
 
 from .towns import XODR, street, write_net

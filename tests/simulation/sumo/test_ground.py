@@ -6,8 +6,7 @@ import trimesh
 
 from torchcover.simulation.height_field import Plain, Slopes
 from torchcover.simulation.sumo.ground import Pavement, decks, ground_of, tilts_deg
-from torchcover.simulation.sumo.network import read_network
-from torchcover.simulation.sumo.vicinity import Vicinity
+from torchcover.simulation.sumo.network import Vicinity, read_network
 
 from .towns import DRIVE, WALK, edge, street, write_net
 

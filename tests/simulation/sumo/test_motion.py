@@ -7,9 +7,8 @@ import shapely
 from torchcover.simulation.sumo.floating import SumoTrack
 from torchcover.simulation.sumo.ground import Pavement, ground_of
 from torchcover.simulation.sumo.motion import CATCH_UP_MPS, RoadUser, corners_m, motions, possible
-from torchcover.simulation.sumo.network import read_network
-from torchcover.simulation.sumo.vicinity import Vicinity
-from torchcover.simulation.traffic.articulated import DRAWS, tractrix
+from torchcover.simulation.sumo.network import Vicinity, read_network
+from torchcover.simulation.traffic.fleet import DRAWS, tractrix
 
 from .towns import DRIVE, WALK, edge, write_net
 

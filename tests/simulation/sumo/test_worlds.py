@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import connected_components
 from torchcover import Scenario
 from torchcover.simulation.sumo import Sumo
 from torchcover.simulation.traffic.fleet import REAR_OF
-from torchcover.simulation.traffic.procedural import Procedural
+from torchcover.simulation.traffic.kind import Procedural
 
 from .towns import DRIVE, WALK, drive, edge, fcd, street, together, vehicle, write_net
 

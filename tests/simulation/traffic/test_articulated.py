@@ -6,8 +6,7 @@ import pytest
 from torchcover.geometry import rigid, rotation_from_euler
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.bodies import Vehicle
-from torchcover.simulation.traffic.articulated import DRAWS, rears_of, tractrix
-from torchcover.simulation.traffic.fleet import REAR_OF, Fleet, load_bodies
+from torchcover.simulation.traffic.fleet import DRAWS, REAR_OF, Fleet, load_bodies, rears_of, tractrix
 from torchcover.simulation.world import Actor
 
 from .test_separation import Solids, among

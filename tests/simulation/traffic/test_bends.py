@@ -10,12 +10,21 @@ from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic import Urban
 from torchcover.simulation.traffic.alignment import Alignment, Beside, Territory
 from torchcover.simulation.traffic.city import City
-from torchcover.simulation.traffic.course import APART_M, NEIGHBOURS_M, SMALLEST_RADIUS_M, course
 from torchcover.simulation.traffic.fleet import Fleet, load_bodies
 from torchcover.simulation.traffic.flow import LIMIT_EVERY_M
 from torchcover.simulation.traffic.hills import SQUARE_M, Hills
 from torchcover.simulation.traffic.scenery import slab
-from torchcover.simulation.traffic.streets import BRAKING_MPS2, COMFORTABLE_MPS2, GUTTER_M, Section, plan
+from torchcover.simulation.traffic.streets import (
+    APART_M,
+    BRAKING_MPS2,
+    COMFORTABLE_MPS2,
+    GUTTER_M,
+    NEIGHBOURS_M,
+    SMALLEST_RADIUS_M,
+    Section,
+    course,
+    plan,
+)
 
 RADIUS_M, REACH_M = 20.0, 1500.0
 STATIONS_M = np.arange(-300.0, 1200.0, 0.37)

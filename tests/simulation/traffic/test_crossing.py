@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from torchcover.simulation.traffic.crossing import Footpath, free_for, step_height, walk
+from torchcover.simulation.traffic.assemble import Footpath, free_for, step_height, walk
 
 TIMES_S = np.arange(0.0, 120.0, 0.1)
 PATH = Footpath(np.array([3.0, -8.0]), np.array([3.0, 8.0]), kerb_m=0.5)

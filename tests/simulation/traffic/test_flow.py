@@ -5,17 +5,20 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from torchcover.simulation.traffic.alignment import Polyline, loop
 from torchcover.simulation.traffic.flow import (
     BRAKING_FOR_A_LIGHT_MPS2,
+    CROSS,
+    MAIN,
     QUEUE_SPEED,
     STOP_BEFORE_LINE_M,
     Agent,
+    Gate,
     Lane,
+    Signals,
     Simulation,
 )
 from torchcover.simulation.traffic.idm import Driver, acceleration_in, advance, tightness
-from torchcover.simulation.traffic.roads import Polyline, loop
-from torchcover.simulation.traffic.signals import CROSS, MAIN, Gate, Signals
 
 TIMES_S = np.arange(0.0, 60.0, 0.1)
 CAR = Driver(14.0)

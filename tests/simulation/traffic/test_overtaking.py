@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from torchcover.simulation.traffic.flow import Agent
+from torchcover.simulation.traffic.highway import LANE_CENTRES_M, SideLane
 from torchcover.simulation.traffic.idm import Driver
 from torchcover.simulation.traffic.overtaking import LANES, SIDE_LANE, Change, Overtaking
-from torchcover.simulation.traffic.roadside import LANE_CENTRES_M, SideLane
 
 TIMES_S = np.arange(0.0, 60.0, 0.1)
 CAR, SLOW = Driver(33.0), Driver(23.0)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from torchcover.simulation.traffic.roads import Polyline, loop
+from torchcover.simulation.traffic.alignment import Polyline, loop
 
 
 def circle(radius, corners=720):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from torchcover.simulation.traffic.signals import CROSS, MAIN, Signals
+from torchcover.simulation.traffic.flow import CROSS, MAIN, Signals
 
 TIMES_S = np.arange(0.0, 400.0, 0.05)
 

@@ -1,19 +1,117 @@
-"""The body that stands for a recorded box."""
+"""Bodies for recorded boxes, the ground below recorded tracks, and the sides of streets around them."""
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import shapely
 
 from torchcover.files import reads
-from torchcover.geometry import BoundingBox
+from torchcover.geometry import BoundingBox, fitted
+from torchcover.geometry.arrays import Float64
 from torchcover.recordings.formats.tracks import check_gaps, read_box_tracks
 from torchcover.recordings.objects import Track
 from torchcover.simulation.bodies import Vehicle
+from torchcover.simulation.height_field import CELL_M, MARGIN_M, Plain, Slopes, corners_of, middles_m
 from torchcover.simulation.shapes import Box, Mesh
-from torchcover.simulation.traffic.fleet import CATEGORIES, load_bodies
-from torchcover.simulation.traffic.vehicle_class import VehicleType
+from torchcover.simulation.traffic.assemble import HORIZON_M
+from torchcover.simulation.traffic.fleet import CATEGORIES, VehicleType, load_bodies
+from torchcover.simulation.traffic.frontage import Side, sides_around
 from torchcover.simulation.world import Actor
+
+# Squares a little beyond what is seen are built, so that none ends in sight; bodies are as long as this.
+BEYOND_M = 25.0
+# Somebody who stays where it is counts once in so many metres, however long it was watched.
+STAYS_M = 1.0
+# Wheels are so far apart, as shares of the body; and what lies to the left of a direction.
+WHEELS = 0.6
+LEFT_OF = np.array([[0.0, 1.0], [-1.0, 0.0]])
+SCALES_M = tuple(CELL_M * factor for factor in (16.0, 8.0, 4.0, 2.0, 1.0))
+
+
+def ground_below(places_m: Float64, ego_m: Float64) -> Plain | Slopes:
+    """The ground around the ego's way: plain if everybody stands at one height.
+
+    The (T, 3) places on which the ego stood are believed; of the (N, 3) of others some may be wrong.
+    """
+    margin_m = HORIZON_M + MARGIN_M
+    lower_m, upper_m = ego_m[:, :2].min(axis=0) - margin_m, ego_m[:, :2].max(axis=0) + margin_m
+    # From the first corner, in float64: the places may be of UTM size.
+    places_m = np.concatenate([ego_m, places_m])
+    trusted = np.arange(len(places_m)) < len(ego_m)
+    base_m = float(ego_m[0, 2])
+    if (places_m[:, 2] == base_m).all():
+        return Plain(base_m, lower_m, upper_m)
+    inside = ((places_m[:, :2] > lower_m) & (places_m[:, :2] < upper_m)).all(axis=1)
+    across_m, over_m = places_m[inside, :2] - lower_m, places_m[inside, 2] - base_m
+    rows, columns = corners_of(lower_m, upper_m)
+    field = fitted(across_m, over_m, upper_m - lower_m, SCALES_M, trusted=trusted[inside])
+    corners: Float64 = CELL_M * np.indices((rows, columns))[::-1].reshape(2, -1).T.astype(np.float64)
+    way_m = ego_m[:, :2] if len(ego_m) > 1 else np.repeat(ego_m[:, :2], 2, axis=0)
+    way = shapely.LineString(way_m - lower_m).simplify(0.5)
+    shapely.prepare(way)
+    seen = shapely.dwithin(shapely.points(middles_m(np.zeros(2), rows, columns)), way, HORIZON_M + BEYOND_M)
+    return Slopes(
+        lower_m, base_m + field.heights_m(corners).reshape(rows, columns), seen.reshape(rows - 1, columns - 1)
+    )
+
+
+def thinned(places_m: Float64) -> Float64:
+    """(N, 3) the middle of each stay of (K, 3) places that follow each other."""
+    way_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(places_m[:, :2], axis=0), axis=1))])
+    stay = np.cumsum(np.diff(way_m // STAYS_M, prepend=0.0) > 0)
+    count = np.bincount(stay)
+    sums = [np.bincount(stay, axis) for axis in (places_m - places_m[0]).T]
+    return np.asarray(places_m[0] + np.stack(sums, axis=1) / count[:, None])
+
+
+def stood_on(tracks: Sequence[Float64]) -> Float64:
+    """(N, 3) all the places of some tracks, (K, 3) each, that say something new."""
+    return np.concatenate([np.empty((0, 3)), *map(thinned, tracks)])
+
+
+def tilted(body: Actor, ground: Plain | Slopes) -> Actor:
+    """The body with the slope of the ground below its wheels, if its own was not recorded; people stand upright."""
+    own = body.trajectory
+    if isinstance(ground, Plain) or body.category == "pedestrian" or own.angles_deg[:, 1:].any():
+        return body
+    angles_deg, yaw = own.angles_deg.copy(), np.deg2rad(own.angles_deg[:, 0])
+    ahead, (length, width, _) = np.stack([np.cos(yaw), np.sin(yaw)], axis=1), np.ptp(body.mesh.vertices_m, axis=0)
+    for axis, way, apart_m, sign in ((1, ahead, WHEELS * length, -1), (2, ahead @ LEFT_OF, WHEELS * width, 1)):
+        over_m, under_m = (ground.heights_m(own.positions_m[:, :2] + end * apart_m / 2 * way) for end in (1, -1))
+        angles_deg[:, axis] = sign * np.rad2deg(np.arctan((over_m - under_m) / apart_m))
+    return replace(body, trajectory=replace(own, angles_deg=angles_deg))
+
+
+# From the middle of a track to the kerb; what lies between tracks that are nearer to each other is street, too.
+TO_KERB_M, BETWEEN_M, SIDEWALK_M = 5.0, 12.0, 3.0
+# Nothing stands nearer to where somebody was, and labels tremble by centimetres.
+CLEAR_M, TREMBLE_M = 0.5, 0.3
+
+
+def sides_of(
+    ego: Actor, others: Sequence[Actor], built_share: float, generator: np.random.Generator
+) -> tuple[list[Side], list[shapely.Geometry], list[shapely.Geometry]]:
+    """The sides of what was driven, as far as the ego sees; where nothing may stand at kerbs, and behind sidewalks."""
+    everybody = (ego, *others)
+    places_m = [actor.trajectory.positions_m[:, :2] for actor in everybody]
+    ways = [shapely.LineString(np.concatenate([way_m, way_m[-1:]])).simplify(TREMBLE_M) for way_m in places_m]
+    radius_m = [np.linalg.norm(np.ptp(actor.mesh.vertices_m[:, :2], axis=0)) / 2 + CLEAR_M for actor in everybody]
+    was_m = shapely.buffer(ways, radius_m, quad_segs=4)
+    driven = [
+        way
+        for actor, way in zip(everybody, ways, strict=True)
+        if actor is ego or (actor.category != "pedestrian" and way.length > CLEAR_M)
+    ]
+    street = shapely.union_all(shapely.buffer(driven, TO_KERB_M)).buffer(BETWEEN_M / 2).buffer(-BETWEEN_M / 2)
+    seen = ways[0].buffer(HORIZON_M)
+    sides = sides_around(
+        street, (0.0, SIDEWALK_M), lambda places_m: shapely.contains_xy(seen, *places_m.T), built_share, generator
+    )
+    return sides, [street, *was_m], [street.buffer(SIDEWALK_M - TREMBLE_M), *was_m]
+
 
 # A body is stretched or squeezed to a box by this at most; beyond, the box itself is shown. The boxes of people hold
 # their stride and their arms, which the bodies do not have.

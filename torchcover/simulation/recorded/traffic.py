@@ -17,10 +17,8 @@ from torchcover.recordings.formats.tracks import read_trajectory
 from torchcover.recordings.objects import Ego, RecordedObjects
 from torchcover.simulation.bodies import sound_mesh
 from torchcover.simulation.documents import PathBeside, Pose, builtin_hashes
-from torchcover.simulation.recorded.bodies import Bodies
-from torchcover.simulation.recorded.ground import ground_below, stood_on, tilted
+from torchcover.simulation.recorded.bodies import Bodies, ground_below, sides_of, stood_on, tilted
 from torchcover.simulation.recorded.run import Excerpt, cast_of, excerpt_of, pieces, poses_at_all
-from torchcover.simulation.recorded.sides import sides_of
 from torchcover.simulation.shapes import Mesh, MeshFile
 from torchcover.simulation.traffic.assemble import HORIZON_M
 from torchcover.simulation.traffic.fleet import EGO, load_bodies

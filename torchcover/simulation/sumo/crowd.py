@@ -5,14 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
-from torchcover.files import feed_xml, reads
+from torchcover.files import feed_xml, read_pieces, reads
 from torchcover.simulation.sumo.floating import Recorded, SumoTrack
 from torchcover.simulation.sumo.motion import RoadUser
+from torchcover.simulation.sumo.network import pair_attributes
 from torchcover.simulation.traffic.assemble import HORIZON_M
-from torchcover.simulation.traffic.fleet import CATEGORIES, EGO, Fleet
-from torchcover.simulation.traffic.vehicle_class import VehicleType
-
-PIECE_BYTES = 1 << 18
+from torchcover.simulation.traffic.fleet import CATEGORIES, EGO, Fleet, VehicleType
 
 # What SUMO takes for the length of a type that has none.
 USUAL_LENGTH_M = {
@@ -48,7 +46,7 @@ def read_types(path: Path) -> dict[str, VehicleType]:
     found: dict[str, VehicleType] = {}
 
     def start(name: str, names_and_values: list[str]) -> None:
-        attributes = dict(zip(names_and_values[::2], names_and_values[1::2], strict=True))
+        attributes = pair_attributes(names_and_values)
         if name == "vType" and "id" in attributes:
             vehicle_class = attributes.get("vClass", "passenger")
             length_m = float(attributes.get("length", USUAL_LENGTH_M.get(vehicle_class, CAR_LENGTH_M)))
@@ -56,8 +54,7 @@ def read_types(path: Path) -> dict[str, VehicleType]:
                 raise ValueError(f"type {attributes['id']!r}: a positive length is needed; got {length_m:g}")
             found[attributes["id"]] = VehicleType(vehicle_class, length_m)
 
-    with path.open("rb") as file:
-        feed_xml(iter(lambda: file.read(PIECE_BYTES), b""), start)
+    feed_xml(read_pieces(path), start)
     return found
 
 

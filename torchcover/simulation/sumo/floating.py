@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchcover.files import feed_xml, reads
+from torchcover.files import feed_xml, read_pieces, reads
 from torchcover.geometry.arrays import Float64
 
 ATTRIBUTES = "id,x,y,z,angle,slope,type"
@@ -16,7 +16,6 @@ ATTRIBUTES = "id,x,y,z,angle,slope,type"
 # between, or was moved by the simulation.
 MAX_STEPS = 1.5
 FASTEST_MPS = 90.0
-PIECE_BYTES = 1 << 18
 TIME_SLACK_S = 1e-6
 # Largest longitude and latitude.
 DEGREES = (180.0, 90.0)
@@ -167,8 +166,7 @@ def record(pieces: Iterable[bytes], window: TimeWindow) -> Recorded:
 @reads("floating car data of SUMO")
 def read_floating(path: Path, window: TimeWindow) -> Recorded:
     """Read it from a file; see `record`."""
-    with path.open("rb") as file:
-        recorded = record(iter(lambda: file.read(PIECE_BYTES), b""), window)
+    recorded = record(read_pieces(path), window)
     if not np.isfinite(recorded.last_s):
         raise ValueError("floating car data of SUMO with at least one <timestep> is needed")
     return recorded

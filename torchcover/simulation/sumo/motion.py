@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.simulation.sumo.floating import TIME_SLACK_S, SumoTrack
-from torchcover.simulation.traffic.articulated import DRAWS, rears_of, together, tractrix
+from torchcover.simulation.traffic.fleet import DRAWS, rears_of, together, tractrix
 
 # Bodies have a pose this often, and places are means over so much time before and after.
 FINE_S, SMOOTH_S = 0.1, 1.0

@@ -12,18 +12,15 @@ from pydantic import Field, model_validator
 from torchcover.geometry.arrays import Bools, Float64
 from torchcover.simulation.documents import PathBeside
 from torchcover.simulation.sumo.crowd import crowd, read_types
-from torchcover.simulation.sumo.demand import EGO_TYPE, write_routes
 from torchcover.simulation.sumo.floating import Recorded, TimeWindow, read_floating, record
-from torchcover.simulation.sumo.ground import Pavement, decks, ground_of
+from torchcover.simulation.sumo.ground import Pavement, Placing, decks, ground_of, park
 from torchcover.simulation.sumo.motion import motions, possible
-from torchcover.simulation.sumo.network import SAME_PLACE_M, read_network
-from torchcover.simulation.sumo.placing import Placing, park
+from torchcover.simulation.sumo.network import OFF_STREET_M, SAME_PLACE_M, Vicinity, read_network
 from torchcover.simulation.sumo.simulating import from_opendrive, home, simulate
-from torchcover.simulation.sumo.streets import DrawnStreets
-from torchcover.simulation.sumo.vicinity import OFF_STREET_M, Vicinity
+from torchcover.simulation.sumo.streets import EGO_TYPE, DrawnStreets, write_routes
 from torchcover.simulation.traffic.fleet import EGO, Fleet
 from torchcover.simulation.traffic.frontage import Side, Times, sides_around, stand
-from torchcover.simulation.traffic.procedural import Built, Procedural
+from torchcover.simulation.traffic.kind import Built, Procedural
 from torchcover.simulation.traffic.scenery import Scenery, few
 
 # Nothing stands nearer to a lane than this; furniture and houses keep off by more, so that no crown hangs over it.

@@ -12,9 +12,8 @@ from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.alignment import SAMPLE_EVERY_M, Alignment, Territory
 from torchcover.simulation.traffic.fleet import Fleet
 from torchcover.simulation.traffic.frontage import Side, Times, Zone, stand
-from torchcover.simulation.traffic.hills import Hills
+from torchcover.simulation.traffic.hills import PIECE_M, Bounds, BuildingSite, Hills
 from torchcover.simulation.traffic.scenery import Scenery, few, ground, plateau
-from torchcover.simulation.traffic.site import PIECE_M, Bounds, BuildingSite
 from torchcover.simulation.traffic.streets import LONGEST_HALF_M, Streets
 
 BLOCK_DEPTH_M = 95.0

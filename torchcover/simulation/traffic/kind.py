@@ -1,13 +1,18 @@
-"""What a scenario asks of its traffic, be it made or recorded."""
+"""Traffic of a scenario, recorded or generated, and the base of all kinds that are generated from a seed."""
 
 from abc import abstractmethod
-from typing import Annotated, ClassVar
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar
 
+import numpy as np
 from pydantic import Field
 
-from torchcover.simulation.documents import Document
+from torchcover.geometry.arrays import Float64
+from torchcover.simulation.documents import Document, builtin_hashes
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.world import World
+from torchcover.simulation.traffic.fleet import Fleet, load_bodies
+from torchcover.simulation.traffic.scenery import Scenery
+from torchcover.simulation.world import Actor, World, steps_of
 
 MIN_TIME_STEP_S = 0.01
 
@@ -40,3 +45,60 @@ class Traffic(Document):
     @abstractmethod
     def world(self, seed: int, ego: Mesh | None = None) -> World:
         """Build the world; the same for the same seed of whatever is drawn, and ego, the built-in SUV if not given."""
+
+
+# Streets are as long as the ego's way: what moves on them grows with the square of the duration.
+MAX_DURATION_S = 3600.0
+# To a kilometre of a lane; more have no room.
+MostVehicles = Annotated[float, Field(ge=0.0, le=200.0)]
+MostPeople = Annotated[float, Field(ge=0.0, le=1000.0)]
+# What rests, the ego, and who else moves.
+Built = tuple[Scenery, Actor, tuple[Actor, ...]]
+
+
+class Procedural(Traffic):
+    """Traffic that is made from parameters and a seed.
+
+    Args:
+        duration_s: Length of the run.
+        time_step_s: Time between two frames.
+    """
+
+    repeats: ClassVar[bool] = False
+
+    duration_s: Annotated[float, Field(gt=0.0, le=MAX_DURATION_S)] = 60.0
+
+    def world(self, seed: int, ego: Mesh | None = None, bodies: Mapping[str, Mesh] | None = None) -> World:
+        """Build the world; the same for the same seed and meshes, of the ego and of each kind in `CATEGORIES`.
+
+        Those that are not given are built in. Without hills the ground is z = 0; nobody ever overlaps anybody, and the
+        ego is followed closely enough for sensors of up to 250 m range.
+        """
+        generator = np.random.default_rng(seed)
+        fleet = Fleet(load_bodies() if bodies is None else bodies, ego, generator)
+        steps = max(1, int(np.ceil(self.duration_s / self.time_step_s - 1e-9)))
+        times_s = self.time_step_s * np.arange(steps + 1, dtype=np.float64)
+        scenery, driver, others = self._build(fleet, times_s, generator)
+        return World(
+            static=scenery.static,
+            ego=driver,
+            actors=others,
+            time_step_s=self.time_step_s,
+            duration_s=self.duration_s,
+            parked=tuple(fleet.parked),
+            ground=scenery.ground,
+            left_out=fleet.left_out,
+        )
+
+    def content(self) -> dict[str, Any]:
+        """Its keys, and the vehicles that may be in it."""
+        return {**super().content(), "vehicles": builtin_hashes("vehicles")}
+
+    @property
+    def steps(self) -> int:
+        """Number of instants."""
+        return steps_of(self.duration_s, self.time_step_s)
+
+    @abstractmethod
+    def _build(self, fleet: Fleet, times_s: Float64, generator: np.random.Generator) -> Built:
+        """What rests, the ego, and who else moves, at (T,) times from 0 to the end, T >= 2."""

@@ -8,16 +8,24 @@ from pydantic import Field
 
 from torchcover.geometry.arrays import Float64
 from torchcover.simulation.traffic.alignment import Beside, Territory
-from torchcover.simulation.traffic.assemble import HORIZON_M, Paths, actors, come_near, ego_actor, paths
+from torchcover.simulation.traffic.assemble import (
+    HORIZON_M,
+    Footpath,
+    Paths,
+    actors,
+    come_near,
+    ego_actor,
+    paths,
+    step_height,
+    walk,
+)
 from torchcover.simulation.traffic.city import City
-from torchcover.simulation.traffic.crossing import Footpath, step_height, walk
 from torchcover.simulation.traffic.fleet import CATEGORIES, CYCLING, EGO, WALKING, Fleet
-from torchcover.simulation.traffic.flow import Agent, Flow, Lane, Simulation, check_crowd
+from torchcover.simulation.traffic.flow import CROSS, MAIN, Agent, Flow, Lane, Simulation, check_crowd
 from torchcover.simulation.traffic.frontage import Times
 from torchcover.simulation.traffic.hills import Hills
 from torchcover.simulation.traffic.idm import Driver
-from torchcover.simulation.traffic.procedural import Built, MostPeople, MostVehicles, Procedural
-from torchcover.simulation.traffic.signals import CROSS, MAIN
+from torchcover.simulation.traffic.kind import Built, MostPeople, MostVehicles, Procedural
 from torchcover.simulation.traffic.streets import FOOTPATHS_M, WAITING_BEHIND_KERB_M, Section, Streets, plan
 
 WARM_UP_S = 20.0
