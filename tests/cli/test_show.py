@@ -107,7 +107,29 @@ def test_a_robot_of_urdf_becomes_a_vehicle_and_a_rig_that_can_be_shown(torchcove
     code, printed, _ = torchcover("robot", urdf, "--out", tmp_path / "none")
     assert code == 0
     assert "no rig, for it has no sensor in a tag of Gazebo" in printed
-    assert torchcover("robot", urdf, "--package", "bot")[0] == 2
+    code, _, error = torchcover("robot", urdf, "--package", "bot")
+    assert (code, error.count("\n"), "--package bot: NAME=VALUE is needed" in error) == (2, 1, True)
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    ("<robot name='a'><link", "not readable as a URDF"),
+    ("<robot name='a'/>", "a <robot> with links is needed"),
+    ("<robot name='a'><link name='b'/></robot>", "no link has a visual or collision geometry"),
+    ("<robot name='a'><link name='b'><visual><geometry><mesh filename='no.stl'/></geometry></visual></link></robot>",
+     "1 of 1 meshes are missing: no.stl"),
+    ("<robot name='a'><link name='b'><visual><geometry><box size='1 nan 1'/></geometry></visual></link></robot>",
+     "box size: 3 numbers needed"),
+    ("<robot name='a'><link name='b'/><joint name='j'><parent link='b'/><child link='c'/></joint></robot>",
+     "joint 'j' is about 'c', which is no link"),
+])  # fmt: skip
+def test_a_robot_that_cannot_be_used_ends_in_one_line_and_exit_code_2(torchcover, tmp_path, text, message):
+    path = tmp_path / "bad.urdf"
+    path.write_text(text)
+    code, printed, error = torchcover("robot", path, "--out", tmp_path / "bot")
+    assert (code, printed, error.count("\n")) == (2, "", 1)
+    assert error.startswith(f"torchcover: {path}: ")
+    assert message in error
+    assert not (tmp_path / "bot").exists()
 
 
 def test_a_roadside_rig_can_be_shown(torchcover, tmp_path):

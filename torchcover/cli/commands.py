@@ -108,7 +108,7 @@ def rig(
     from torchcover.files import as_yaml
     from torchcover.simulation import rig_document
 
-    models = dict(_pair(text) for text in lidar or ())
+    models = dict(_pair(text, "--lidar", "LIDAR_TOP=velodyne_hdl32e") for text in lidar or ())
     names = [name for of in sensors or () for name in of.split(",")]
     recording = options.open_recording(frames, options.load_recording_settings(assignments))
     document = rig_document(recording, sensors=names or None, models=models, raw_images=raw_images)
@@ -150,7 +150,7 @@ def robot(
     """Make a vehicle and a rig of a robot's URDF: its body, and the sensors of its Gazebo tags."""
     from torchcover.simulation import read_robot
 
-    found = read_robot(urdf, dict(_pair(text) for text in package or ()))
+    found = read_robot(urdf, dict(_pair(text, "--package", "my_robot=src/my_robot") for text in package or ()))
     found.save(out)
     for note in found.notes:
         typer.echo(note)
@@ -179,11 +179,11 @@ def calibrate(
     typer.echo(f"Wrote {out}; simulate with it: torchcover evaluate {out}")
 
 
-def _pair(text: str) -> tuple[str, str]:
-    sensor, equals, model = text.partition("=")
-    if not (sensor and equals and model):
-        raise ValueError(f"--lidar {text}: SENSOR=MODEL is needed, as in LIDAR_TOP=velodyne_hdl32e")
-    return sensor, model
+def _pair(text: str, option: str, example: str) -> tuple[str, str]:
+    name, _, value = text.partition("=")
+    if not (name and value):
+        raise ValueError(f"{option} {text}: NAME=VALUE is needed, as in {example}")
+    return name, value
 
 
 @with_options(of_evaluate("vehicle"))
