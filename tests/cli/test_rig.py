@@ -32,7 +32,7 @@ def test_a_recorded_rig_is_found_again(torchcover, worlds, tmp_path):
 def test_what_rig_refuses(torchcover, worlds, tmp_path):
     for options, told in (
         (("--frames", tmp_path / "none"), "none: no such recording"),
-        (("--frames", tmp_path, "--lidar", "roof"), "--lidar roof: SENSOR=MODEL is needed"),
+        (("--frames", tmp_path, "--lidar", "roof"), "--lidar roof: NAME=VALUE is needed, as in LIDAR_TOP="),
         (("--frames", tmp_path, "--set", "recording.format=bag"), "no such format of recordings; there are"),
     ):
         code, printed, error = torchcover("rig", *options)

@@ -290,12 +290,16 @@ def _find_mesh(name: str, path: Path, packages: Mapping[str, str | Path]) -> Pat
 
 
 def _link_meshes(link: Element, meshes: Mapping[str, tuple[Mesh, float]]) -> list[Mesh]:
-    """The meshes that a link shows, in its frame."""
-    return [
-        _shape_mesh(shape, link.get("name", ""), meshes).moved(read_pose(body.find("origin")))
-        for body in _visuals(link)
-        for shape in body.iterfind("geometry/*")
-    ]
+    """The meshes that a link shows, in its frame. ValueError: a shape that cannot be, such as one of negative size."""
+    name, shown = link.get("name", ""), []
+    for body in _visuals(link):
+        for shape in body.iterfind("geometry/*"):
+            try:
+                mesh = _shape_mesh(shape, name, meshes)
+            except ValidationError as error:
+                raise ValueError(f"link {name!r}: <{shape.tag}>: {explain(error)}") from error
+            shown.append(mesh.moved(read_pose(body.find("origin"))))
+    return shown
 
 
 def _shape_mesh(shape: Element, link: str, meshes: Mapping[str, tuple[Mesh, float]]) -> Mesh:
