@@ -28,7 +28,7 @@ print(json.dumps(seen))
     "module",
     [
         "torchcover.cameras.camera",
-        "torchcover.contrib.perception_entropy",
+        "torchcover.contrib.ratio_metrics",
     ],
 )
 def test_whoever_needs_them_has_made_the_first_calls_with_one_number_each(module):

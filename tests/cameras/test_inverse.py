@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 from torchcover.cameras import Camera, inverse
+from torchcover.cameras.inverse import find_region, make_start_table
 from torchcover.cameras.models import build_lens
-from torchcover.cameras.start import make_start_table
-from torchcover.cameras.valid_region import find_region
 
 
 def grid(camera):

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from torchcover.cameras.unified import DoubleSphereChart, ExtendedChart, SphereChart
+from torchcover.cameras.models import DoubleSphereChart, ExtendedChart, SphereChart
 
 CHARTS = [
     *(SphereChart(xi) for xi in (0.0, 0.3, 1.0, 1.0 + 1e-9, 1.2, 1.5, 3.0)),

@@ -22,7 +22,7 @@ from torchcover.contrib import (
     field_of_view,
     metric_names,
 )
-from torchcover.contrib.perception_entropy import entropy, late_fusion, standard_deviation
+from torchcover.contrib.ratio_metrics import entropy, late_fusion, standard_deviation
 from torchcover.simulation import CameraSensor, Lidar, Pose
 from torchcover.simulation.shapes import Box
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from torchcover.contrib import MSog
-from torchcover.contrib.region_voxels import REGION as PUBLISHED_REGION
-from torchcover.contrib.voxel_walk import VoxelGrid, crossed_voxels
+from torchcover.contrib.voxels import REGION as PUBLISHED_REGION
+from torchcover.contrib.voxels import VoxelGrid, crossed_voxels
 from torchcover.detection import points_in_boxes
 from torchcover.geometry import BoundingBox
 

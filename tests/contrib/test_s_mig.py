@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from torchcover.contrib import SMig
-from torchcover.contrib.occupancy import binary_entropy, occupancy_of, occupancy_rows
-from torchcover.contrib.voxel_walk import VoxelGrid
+from torchcover.contrib.s_mig import binary_entropy, occupancy_of, occupancy_rows
+from torchcover.contrib.voxels import VoxelGrid
 from torchcover.detection import Boxes
 from torchcover.geometry import BoundingBox
 

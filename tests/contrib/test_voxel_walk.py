@@ -6,7 +6,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from torchcover.contrib.voxel_walk import VoxelGrid, crossed_voxels
+from torchcover.contrib.voxels import VoxelGrid, crossed_voxels
 from torchcover.geometry import BoundingBox
 
 # Sides that are exact in binary, and are not equal in number.
@@ -112,7 +112,7 @@ def test_order_and_division_and_length_of_directions_do_not_matter(monkeypatch):
     parts = crossed_voxels(MIDDLE, origins[:100], directions[:100], ends[:100])
     assert parts is crossed_voxels(MIDDLE, origins[100:], directions[100:], ends[100:], crossed=parts)
     assert np.array_equal(whole, parts)
-    monkeypatch.setattr("torchcover.contrib.voxel_walk.RAYS_AT_ONCE", 7)
+    monkeypatch.setattr("torchcover.contrib.voxels.RAYS_AT_ONCE", 7)
     assert np.array_equal(whole, crossed_voxels(MIDDLE, origins, directions, ends))
 
 

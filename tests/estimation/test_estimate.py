@@ -10,7 +10,7 @@ from scipy import stats
 
 from torchcover.coverage.quantity import RADIUS, detection
 from torchcover.estimation import Estimate
-from torchcover.estimation.student import BLIND_SIDE, interval95
+from torchcover.estimation.errors import BLIND_SIDE, interval95
 
 BOTH = (RADIUS, detection(0.4))
 

@@ -8,7 +8,7 @@ from scipy import special, stats
 
 from torchcover.coverage.quantity import RADIUS, detection
 from torchcover.estimation import Quantity, interval95, student_p, student_t95
-from torchcover.estimation.student import BLIND_SIDE, is_significant
+from torchcover.estimation.errors import BLIND_SIDE, is_significant
 
 SHARE = detection(0.4)
 BLIND = Quantity("blind", "share that is not seen", "share", lower_is_better=True)

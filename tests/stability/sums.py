@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from torchcover.estimation import Estimate, Quantity
-from torchcover.estimation.jackknife import jackknife_error
+from torchcover.estimation.errors import jackknife_error
 from torchcover.metrics.blocks import SumsInBlocks, added_up
 from torchcover.neighbors import packets
 

@@ -11,13 +11,11 @@ from torch import Tensor
 
 from torchcover.cameras import calibration
 from torchcover.cameras.calibration import Calibration
-from torchcover.cameras.depth import count_unusable, usable
+from torchcover.cameras.depth import DepthKind, Selection, check_depth, count_unusable, scale_rays, select, usable
 from torchcover.cameras.inverse import ANSWERED
 from torchcover.cameras.lens import Scalar, as_vector
 from torchcover.cameras.models import check_image, check_model
-from torchcover.cameras.optics import Optics
-from torchcover.cameras.ray_table import RayTable
-from torchcover.cameras.unprojection import DepthKind, Selection, check_depth, scale_rays, select
+from torchcover.cameras.optics import Optics, RayTable
 from torchcover.devices import through_cpu
 from torchcover.geometry import check_rigid, invert, transform_tensor
 from torchcover.geometry.rigid import Matrix

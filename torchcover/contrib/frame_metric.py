@@ -1,23 +1,194 @@
-"""The base of the metrics that others published: frames in, numbers out."""
+"""The base of the metrics that others published: frames in, numbers out; what several need of a frame is found once."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 from torch import Tensor
 
-from torchcover.contrib.sights import Sights
+from torchcover.coverage import BevGrid
+from torchcover.coverage.grid import Bins
+from torchcover.coverage.quantity import MEASURED_WITHIN_M
+from torchcover.detection import Boxes, points_in_boxes
+from torchcover.detection.inside import Inside
 from torchcover.devices import has_float64
 from torchcover.estimation import MIN_BLOCKS, Estimate, Number, Quantity
 from torchcover.frames import Frame
 from torchcover.metrics import MergeableMetric, SumsInBlocks, figure_of
-from torchcover.neighbors import check_tensor
+from torchcover.neighbors import check_cloud, check_tensor, nearest
+from torchcover.neighbors.choice import backend_of_several
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+CATEGORIES = ("car", "truck", "bus", "cyclist", "motorcycle", "pedestrian")
+RANGE_BORDERS_M = (20.0, 40.0, 80.0)
+
+
+class ObjectStrata:
+    """All objects up to the last border, those of each category, and those in each bin of range, [lo, hi).
+
+    An object's range is the distance of its centre from the vehicle's origin, over ground.
+
+    `categories`: names; objects of others are among all of them only; `range_borders_m`: ascending, positive; what is
+    farther than the last does not count. ValueError: a category that is named twice, borders out of order or none.
+
+    Example:
+        >>> ObjectStrata(("car",), (20.0, 40.0)).names
+        ('', ':car', ':0-20m', ':20-40m')
+    """
+
+    def __init__(self, categories: Sequence[str], range_borders_m: Sequence[float]) -> None:
+        self.categories = tuple(categories)
+        self.range_borders_m = tuple(float(border) for border in range_borders_m)
+        if len(set(self.categories)) < len(self.categories):
+            raise ValueError(f"categories: each may be given once; got {', '.join(self.categories)}")
+        if not self.range_borders_m or not all(low < high for low, high in pairwise((0.0, *self.range_borders_m))):
+            raise ValueError(f"range_borders_m: ascending numbers > 0 are needed; got {self.range_borders_m}")
+
+    @property
+    def meaning(self) -> dict[str, object]:
+        """What sums over them depend on."""
+        return {"categories": self.categories, "range_borders_m": self.range_borders_m}
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What is appended to the name of a number; nothing for all objects."""
+        bins = [f":{low:g}-{high:g}m" for low, high in pairwise((0.0, *self.range_borders_m))]
+        return ("", *(f":{category}" for category in self.categories), *bins)
+
+    def members(self, boxes: Boxes) -> Tensor:
+        """(strata, K) float64: 1 where an object is one of them."""
+        device = boxes.yaw_rad.device
+        of_category = [[category == name for category in boxes.categories] for name in self.categories]
+        category = torch.tensor(of_category, dtype=torch.float64, device=device).view(len(self.categories), len(boxes))
+        range_m = torch.linalg.vector_norm(boxes.centre_m[:, :2].double(), dim=1)
+        borders = torch.tensor(self.range_borders_m, dtype=torch.float64, device=device)
+        bins = torch.nn.functional.one_hot(torch.bucketize(range_m, borders, right=True), len(borders) + 1).T.double()
+        near = 1.0 - bins[-1]
+        return torch.cat([near[None], category * near, bins[:-1]])
+
+
+Found = TypeVar("Found")
+
+NO_BOXES = (
+    "{}: the frame has no boxes, and the metric is about objects: SimulatedFrames(..., boxes=True) makes them, a "
+    "recording has them if its format does; else use dataclasses.replace(frame, boxes=...)"
+)
+
+
+class Sights:
+    """Remembers what was found in the last frame. Metrics of a run, of all its rigs, share one; a copy starts anew.
+
+    Example:
+        >>> frame = Frame({"rig": torch.zeros(1, 3)}, torch.tensor([[0.3, 0.0, 0.0], [3.0, 0.0, 0.0]]), 0, "a")
+        >>> Sights().distance(frame, "rig", 0.4)
+        tensor([0.3000,    inf])
+    """
+
+    def __init__(self) -> None:
+        self._frame: Frame | None = None
+        self._found: dict[tuple[Any, ...], Any] = {}
+        self._of_all: tuple[tuple[Any, ...], Any] | None = None
+        # Whether a metric asks for single sensors: then the rig as a whole takes no search of its own.
+        self.by_sensor = False
+
+    def __reduce__(self) -> tuple[type["Sights"], tuple[()], dict[str, bool]]:
+        return Sights, (), {"by_sensor": self.by_sensor}
+
+    def distance(self, frame: Frame, rig: str, within_m: float) -> Tensor:
+        """(M,) metres from each reference point to the nearest point of the rig; infinite where none is within reach.
+
+        Points that were measured farther off than that are none.
+        """
+        if self.by_sensor:
+            return self.of_sensors(frame, rig, within_m).amin(dim=0)
+        return self.once(
+            frame, ("rig", rig, within_m), lambda: _search(frame, frame.cloud_of(rig, within_m=within_m), within_m)
+        )
+
+    def of_sensors(self, frame: Frame, rig: str, within_m: float) -> Tensor:
+        """(S, M) the same for each sensor of the rig.
+
+        Raises:
+            ValueError: Which points are of which sensor is unknown.
+        """
+
+        def search() -> Tensor:
+            clouds = list(frame.clouds_by_sensor(rig, within_m=within_m).values())
+            backend = backend_of_several(frame.reference, clouds)
+            return torch.stack([_search(frame, cloud, within_m, backend) for cloud in clouds])
+
+        return self.once(frame, ("sensors", rig, within_m), search)
+
+    def boxes(self, frame: Frame) -> Boxes:
+        """The objects of the frame.
+
+        Raises:
+            ValueError: The frame has none; the message says how to get them.
+        """
+        if frame.boxes is None:
+            raise ValueError(NO_BOXES.format(f"frame {frame.name!r}"))
+        return frame.boxes
+
+    def reference_in_boxes(self, frame: Frame) -> Inside:
+        """Which reference points lie in which objects."""
+        return self.once(frame, ("boxes",), lambda: points_in_boxes(frame.reference, self.boxes(frame)))
+
+    def members(self, frame: Frame, strata: ObjectStrata) -> Tensor:
+        """(strata, K) float64: 1 where an object is one of them."""
+        what = ("strata", *strata.meaning.values())
+        return self.once(frame, what, lambda: strata.members(self.boxes(frame)))
+
+    def hits(self, frame: Frame, rig: str) -> Tensor:
+        """(K,) int64 how many points of the rig lie in each object."""
+        boxes = self.boxes(frame)
+        if rig in boxes.hits:
+            return boxes.hits[rig]
+        points = frame.cloud_of(rig, within_m=MEASURED_WITHIN_M)
+        return self.once(frame, ("hits", rig), lambda: count_in_boxes(points, boxes))
+
+    def bins(self, frame: Frame, grid: BevGrid) -> Bins:
+        """In which cells of a grid the reference points are."""
+        return self.once(frame, ("bins", grid), lambda: grid.bins(frame.reference, frame.heights_in(grid.band_frame)))
+
+    def once(self, frame: Frame, what: tuple[Any, ...], find: Callable[[], Found]) -> Found:
+        """Whatever is to be found in a frame; looked for when it is first asked for."""
+        if frame is not self._frame:
+            self._frame, self._found = frame, {}
+        if what not in self._found:
+            self._found[what] = find()
+        found: Found = self._found[what]
+        return found
+
+    def after_all(self, what: tuple[Any, ...], find: Callable[[], Found]) -> Found:
+        """Whatever is to be found from what all frames left; remembered until something else is asked for."""
+        if self._of_all is None or self._of_all[0] != what:
+            self._of_all = what, find()
+        found: Found = self._of_all[1]
+        return found
+
+
+def rig_of(frame: Frame, rig: str | None) -> str:
+    """The name of the rig; of the only one if none is given. ValueError: there is no such rig, or there are several."""
+    frame.cloud_of(rig)
+    return next(iter(frame.clouds)) if rig is None else rig
+
+
+def count_in_boxes(cloud: Tensor, boxes: Boxes) -> Tensor:
+    """(K,) int64 how many points lie in each of K boxes."""
+    return torch.bincount(points_in_boxes(cloud, boxes).box, minlength=len(boxes))
+
+
+def _search(frame: Frame, cloud: Tensor, within_m: float, backend: str = "auto") -> Tensor:
+    check_cloud(frame.reference, "reference")
+    check_cloud(cloud, "sensor")
+    return nearest(frame.reference, cloud, max_distance=within_m, backend=backend).distance
+
 
 # As many as `evaluate` keeps of the coverage, so that both can be drawn again together.
 BLOCKS = 16

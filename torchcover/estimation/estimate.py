@@ -10,9 +10,16 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchcover.estimation.jackknife import MIN_BLOCKS, ROUND_OFF, jackknife_error, pseudo_values
-from torchcover.estimation.quantity import Quantity
-from torchcover.estimation.student import interval95, is_significant, student_p
+from torchcover.estimation.errors import (
+    MIN_BLOCKS,
+    ROUND_OFF,
+    Quantity,
+    interval95,
+    is_significant,
+    jackknife_error,
+    pseudo_values,
+    student_p,
+)
 
 
 class Number(NamedTuple):

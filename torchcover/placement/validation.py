@@ -11,7 +11,7 @@ import torch
 from torchcover.coverage.grid import PAPER_HEIGHTS
 from torchcover.coverage.quantity import detection
 from torchcover.estimation import Difference, Estimate, Quantity
-from torchcover.estimation.jackknife import ROUND_OFF
+from torchcover.estimation.errors import ROUND_OFF
 from torchcover.evaluation.target_survey import free_space
 from torchcover.placement.common_frames import CommonFrames
 from torchcover.placement.host_vehicle import NOT_WORSE

@@ -27,7 +27,7 @@ class Mount(BaseModel):
     def matrix(self) -> "Matrix":
         """The (4, 4) transform."""
         from torchcover.geometry import rigid, rotation_from_euler  # `--help` needs no NumPy
-        from torchcover.geometry.angles import warn_of_radians
+        from torchcover.geometry.rigid import warn_of_radians
 
         warn_of_radians({name: getattr(self, name) for name in ("yaw_deg", "pitch_deg", "roll_deg")})
         rotation = rotation_from_euler(self.yaw_deg, self.pitch_deg, self.roll_deg)
