@@ -4,7 +4,7 @@ import subprocess
 import sys
 
 from benchmarks import table
-from tests.stability import choosing, faces, ground, lenses, metric, motion, poses, rays, returns, search, sums
+from tests.stability import faces, ground, lenses, metric, motion, poses, rays, returns, search, sums
 from tests.stability.case import CPU_SEARCHES
 
 ROOMS = {
@@ -16,9 +16,8 @@ ROOMS = {
     "Lenses": lenses,
     "Poses": poses,
     "Returns": returns,
-    "Sums, mixtures and order": sums,
+    "Sums and mixtures": sums,
     "Motion and encounters": motion,
-    "Search and choices": choosing,
 }
 SEARCHING = ("Nearest neighbours", "Bins and sums")
 # In a process of its own, so that the peak of the memory is the case's.

@@ -152,11 +152,3 @@ def test_shown_directions_are_looked_at_by_their_pixels(camera, directions):
     assert shown[visible].all()
     assert valid.all()
     torch.testing.assert_close(rays, directions[shown], rtol=0, atol=1e-7)
-
-
-def test_a_mirrored_lens_mirrors_the_image(make_camera):
-    rays, valid = make_camera("fisheye 220").rays(dtype=torch.float64)
-    assert torch.equal(valid, valid.flip(0).flip(1))
-    torch.testing.assert_close(
-        rays[valid], (rays.flip(0).flip(1) * torch.tensor([-1, -1, 1]))[valid], rtol=0, atol=1e-15
-    )

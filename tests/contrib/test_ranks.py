@@ -44,22 +44,9 @@ def test_two_rigs_have_no_relation_and_equal_ones_have_none(own, of_scipy, serie
     assert math.isnan(own(np.array(series[0], dtype=float), np.array(series[1], dtype=float)))
 
 
-@STATISTICS
-def test_any_monotone_scale_gives_the_same_and_a_sign_turns_it(own, of_scipy):
-    one, other = np.random.default_rng(1).normal(size=(2, 7))
-    assert own(np.exp(3 * one), other**3) == pytest.approx(own(one, other), abs=1e-15)
-    assert own(-one, other) == pytest.approx(-own(one, other), abs=1e-15)
-    assert own(one, one) == pytest.approx(1.0, abs=1e-15)
-
-
 def test_infinite_values_are_the_largest_not_unknown():
     assert kendall_tau_b([1.0, 2.0, math.inf], [1.0, 2.0, 3.0]) == pytest.approx(1.0)
     assert rank_values([math.inf, 1.0, math.inf]).tolist() == [2.5, 1.0, 2.5]
-
-
-def test_rank_values_are_scipys():
-    values = np.random.default_rng(2).integers(0, 4, (5, 8)).astype(float)
-    np.testing.assert_array_equal(rank_values(values), stats.rankdata(values, axis=1))
 
 
 def test_the_p_of_one_series_is_that_of_all_permutations():
@@ -67,13 +54,6 @@ def test_the_p_of_one_series_is_that_of_all_permutations():
     found = abs(stats.spearmanr(one, other).statistic)
     expected = np.mean([abs(stats.spearmanr(one, order).statistic) >= found - 1e-9 for order in permutations(other)])
     assert check_best_correlation(one, other).p == pytest.approx(expected, abs=1e-15)
-
-
-def test_the_best_of_many_series_is_good_by_chance():
-    generator = np.random.default_rng(3)
-    target, many = np.arange(6.0), generator.normal(size=(40, 6))
-    best = min(check_best_correlation(one, target).p for one in many)
-    assert check_best_correlation(many, target).p > 4 * best
 
 
 def test_sampled_permutations_are_repeatable_and_p_is_never_0():

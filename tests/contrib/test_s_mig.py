@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchcover.contrib import SMig
-from torchcover.contrib.s_mig import binary_entropy, occupancy_of, occupancy_rows
+from torchcover.contrib.s_mig import occupancy_of, occupancy_rows
 from torchcover.contrib.voxels import VoxelGrid
 from torchcover.detection import Boxes
 from torchcover.geometry import BoundingBox
@@ -28,10 +28,6 @@ def s_mig(sensors, frames, **options):
 
 def value(metric, name=":car"):
     return next(number for number in metric.compute() if number.quantity.key.endswith(name))
-
-
-def test_entropy_of_known_probabilities():
-    assert binary_entropy(np.array([0.5, 0.1, 0.0, 1.0])) == pytest.approx([0.693147, 0.325083, 0, 0], abs=5e-7)
 
 
 def test_what_is_always_there_says_nothing_and_half_of_the_time_a_bit_a_voxel():
@@ -133,12 +129,6 @@ def test_boxes_that_overlap_count_once_and_beside_each_other_share_no_voxel():
         assert occupied(standing) == 2 * 2 * math.ceil(tenths / 5)
 
 
-def test_a_box_that_leaves_the_region_counts_as_far_as_it_is_within():
-    over = (10.0, 0.0, 1.0, 4.0, 2.0, 2.0, 0.0)  # x from 8 to 12
-    number = value(s_mig([beam(z_m=1.0)], [frame(0, boxes(over)), frame(1, NONE)]))
-    assert number.value == pytest.approx(-4 * math.log(2))
-
-
 def test_errors_over_worlds_are_the_jackknife_by_hand_and_none_below_eight():
     generator = np.random.default_rng(1)
     sensors = [beam(z_m=1.0, columns=40), beam("low", z_m=0.3, columns=40)]
@@ -190,13 +180,6 @@ def test_with_occlusion_it_is_the_mean_over_frames_of_the_entropy_on_their_way()
         for index in range(4)
     ]
     assert together == pytest.approx(sum(alone))
-
-
-def test_finer_voxels_make_it_larger_about_as_their_number_grows():
-    half = [frame(0, boxes(AHEAD)), frame(1, NONE)]
-    coarse, fine = (value(s_mig([beam(z_m=1.0)], half, voxel_m=voxel_m)) for voxel_m in (0.5, 0.1))
-    assert fine.value == pytest.approx(5 * coarse.value)
-    assert fine.quantity.key == "s_mig_0.1m:car"
 
 
 def test_the_published_rig_crosses_as_many_voxels_as_were_counted_before():

@@ -11,7 +11,6 @@ from matplotlib.figure import Figure
 
 from torchcover.geometry import rigid, rotation_from_euler
 from torchcover.report import ActorMark, SensorView, StandingFaces, draw_depths, draw_rig, draw_scene
-from torchcover.report.overlay import COLOURS
 from torchcover.report.scene import PATH, REFERENCE, SENSOR, SKY
 
 VERTICES = np.array([[x, y, z] for x in (-2.0, 2.0) for y in (-1.0, 1.0) for z in (0.0, 1.5)])
@@ -54,13 +53,6 @@ def test_a_sensor_sees_within_its_angles_however_it_is_turned():
     outside = [direction(90, -51), direction(90, -9), direction(0, -20), direction(-90, -20)]
     assert left_down.sees(np.array(inside)).all()
     assert not left_down.sees(np.array(outside)).any()
-
-
-@pytest.mark.parametrize("yaw", [-170.0, -90.0, 0.0, 33.0, 180.0])
-def test_place_and_direction_are_those_of_the_pose(yaw):
-    sensor = view(yaw=yaw, pitch=20.0, at=(1.0, -2.0, 3.0))
-    assert (sensor.x_m, sensor.y_m, sensor.position_m[2]) == (1.0, -2.0, 3.0)
-    assert sensor.yaw_deg == pytest.approx(yaw)
 
 
 @pytest.mark.parametrize(
@@ -220,10 +212,6 @@ def test_clouds_are_drawn_the_rig_over_the_reference():
     assert picture.at(0, 22.0, 5.0) == pytest.approx(to_rgb(REFERENCE), abs=0.02)
     entries = [text.get_text() for text in picture.figure.axes[0].get_legend().get_texts()]
     assert entries[:2] == ["reference points (4,000)", "points of the rig (2,000)"]
-
-
-def test_colours_of_sensors_differ():
-    assert len(set(COLOURS)) == len(COLOURS)
 
 
 def depths(images, **options) -> Picture:

@@ -96,12 +96,6 @@ def test_the_surface_adds_the_numbers_over_known_cells_and_no_other_column(table
     assert set(header(table)) - set(header(known)) == more
 
 
-def test_known_cells_have_no_square_metres(trio, regions):
-    table = CoverageTable.of(trio, regions)
-    assert {(row["measure"], row["visible_m2"]) for row in records(table)} == {("known", None)}
-    assert all("known cells\n(%)" in part.headings for part in parts_of(table))
-
-
 @pytest.mark.parametrize("name", ["text", "markdown"])
 def test_readers_are_told_which_measure_it_is(name, table, trio, regions):
     surface, known = RENDERERS[name](table), RENDERERS[name](CoverageTable.of(trio, regions))
@@ -138,11 +132,3 @@ def test_maps_are_those_of_the_measure_and_name_what_is_unknown():
 
 def test_the_bands_of_loggers_are_those_of_the_measure():
     assert [name for name, _ in band_figures(two_cells())] == ["radius_area_m", "detection_area_0.4m"]
-
-
-@pytest.mark.usefixtures("blank_maps")
-def test_differences_are_those_of_the_measure(surface_pair):
-    names = [name for name, _ in map_figures(surface_pair)]
-    assert len(names) == 2 * 2 * 2
-    assert all("_area_" in name for name in names)
-    assert "difference_radius_area_m_ground_many_minus_few" in names

@@ -71,12 +71,6 @@ def test_an_unknown_number_is_called_unknown():
     assert "nan" not in text.lower()
 
 
-def test_a_blind_step_without_limit_is_called_infinite():
-    coverage = metric()
-    coverage.update(torch.zeros(0, 3), ORIGIN)
-    assert cells_of(text_of(coverage.compute(), NEAR), "near")[2] == "infinite"
-
-
 def test_units_cell_size_steps_and_bands_are_told():
     text = text_of(one_cell_known(), NEAR)
     head = text[: text.index("near")]
@@ -103,14 +97,6 @@ def test_a_reference_that_lies_elsewhere_is_doubted():
     assert "9 of 10 reference points lie outside the grid: left out. Is the ground at z = 0" in text_of(
         coverage.compute(), NEAR
     )
-
-
-def test_without_trouble_none_is_told():
-    coverage = metric()
-    everywhere = torch.cartesian_prod(torch.arange(4) + 0.5, torch.arange(2) + 0.5, torch.zeros(1))
-    coverage.update(ORIGIN, everywhere)
-    text = text_of(coverage.compute(), NEAR)
-    assert not any(words in text for words in (" of 1 step", "reference point", "known cells only"))
 
 
 def test_without_regions_the_table_says_so():
@@ -151,13 +137,6 @@ def test_a_region_that_one_block_alone_has_probed_has_a_number_without_error():
     assert "No interval where too few blocks have probed the region, or all say the same." in text
 
 
-def test_an_infinite_number_has_no_error():
-    coverage = metric(blocks=16)
-    for index in range(16):
-        coverage.update(ORIGIN if index else torch.zeros(0, 3), ORIGIN, place_in_time=index)
-    assert cells_of(text_of(coverage.compute(), NEAR), "near")[2] == "infinite"
-
-
 @pytest.mark.parametrize(("steps", "blocks", "needed"), [(1, "1 block", 11), (7, "7 blocks", 9)])
 def test_too_few_steps_for_an_error_are_told_once_and_never_as_0(steps, blocks, needed):
     text = text_of(over_steps(steps), NEAR)
@@ -174,46 +153,10 @@ def test_without_blocks_nothing_is_said_about_errors():
 # Several rigs
 
 
-def test_the_table_marks_with_a_sign_that_needs_no_colours(trio, regions):
-    text = printed({"few": trio["few"], "many": trio["many"]}, regions).split("Difference to")[0]
-    radius, detection = text.split("Detection within 0.4 m (%)")
-    for part in (radius, detection):
-        lines = [line for line in part.splitlines() if "near" in line]
-        assert len(lines) == 2
-        for line in lines:
-            _, _, _, few, many, known, _ = (cell.strip() for cell in line.split("│"))
-            assert not few.startswith("*")
-            assert many.startswith("* ")
-            assert float(known) == pytest.approx(100, abs=60)
-
-
-def test_the_unknown_is_not_marked(pair, regions):
-    unknown = [line for line in printed(pair, regions).splitlines() if "unknown" in line and "behind" in line]
-    assert len(unknown) == 4
-    assert not any("*" in line for line in unknown)
-
-
 def test_notes_about_one_rig_name_it(blind, regions):
     text = re.sub(r"\s+", " ", printed(blind, regions))
     assert "[blind]: 1 of 1 steps had no sensor point" in text
     assert "seeing:" not in text
-
-
-def test_differences_have_a_part_of_their_own_and_what_is_no_chance_is_marked(trio, regions):
-    text = printed(trio, regions)
-    parts = re.split(
-        r"Difference to few: (?:mean blind spot radius \(m\)|detection within 0.4 m \(percentage points\))", text
-    )
-    assert len(parts) == 3
-    for part, sign in zip(parts[1:], "-+", strict=True):
-        for line in [line for line in part.splitlines() if "│ near " in line]:
-            _, _, _, other, many, _, _ = (cell.strip() for cell in line.split("│"))
-            assert re.fullmatch(r"(! )?[+-][\d.]+  \[[+-]?[\d.]+, [+-]?[\d.]+\]", other)
-            assert re.fullmatch(rf"! \{sign}[\d.]+  \[\{sign}[\d.]+, \{sign}[\d.]+\]", many)
-        unknown = [line for line in part.splitlines() if "│ behind" in line]
-        assert len(unknown) == 2
-        assert all(line.count("unknown") == 2 and "!" not in line for line in unknown)
-    assert "of 20 rows without a difference, one is marked" in re.sub(r"\s+", " ", text)
 
 
 def test_from_too_few_steps_no_difference_is_called_significant(trios, regions):

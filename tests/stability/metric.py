@@ -306,8 +306,6 @@ CASES = [
          "floor(x / 0.1)", partial(on_borders_by_quotients, torch.float32)),
     Case("float16 points in 0.1 m cells", "fractions", "of 997 wrong", 0, partial(coarse_points, torch.float16),
          "floor(x / 0.1) in float16", partial(coarse_points_by_quotients, torch.float16)),
-    Case("bfloat16 points in 0.1 m cells", "fractions", "of 997 wrong", 0, partial(coarse_points, torch.bfloat16),
-         "floor(x / 0.1) in bfloat16", partial(coarse_points_by_quotients, torch.bfloat16)),
     Case("points on borders of height bands", "by hand", "of 10 wrong", 0, bands,
          "float32 comparisons", bands_in_float32),
     Case("region borders on cell centres", "by hand", "of 76 wrong", 0, region_cells,

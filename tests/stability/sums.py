@@ -1,4 +1,4 @@
-"""Sums of touched cells, mixtures of worlds and the sort along a curve, at the extremes."""
+"""Sums of touched cells and mixtures of worlds, at the extremes."""
 
 from functools import lru_cache, partial
 from math import fsum
@@ -8,10 +8,9 @@ import torch
 
 from torchcover.estimation import Estimate, Quantity
 from torchcover.estimation.errors import jackknife_error
-from torchcover.metrics.blocks import SumsInBlocks, added_up
-from torchcover.neighbors import packets
+from torchcover.metrics.blocks import added_up
 
-from .case import LIBRARIES, Case, find_spec, most, relative
+from .case import Case, most, relative
 
 ROWS = 1_000_000
 LARGEST_KEY = 2**53
@@ -67,55 +66,14 @@ def keys_in_float32():
     return added_up(torch.cat([rows[:, :1].float().double(), rows[:, 1:]], dim=1), 1)
 
 
-PAIRED_CELLS = 3 * 2**20 + 1
-
-
-@lru_cache
-def block_keys():
-    """(N,) the first and last cells of blocks, up to keys of 2^53."""
-    last = (LARGEST_KEY // PAIRED_CELLS) & ~1
-    blocks = np.concatenate([np.arange(20), last - 1 - np.arange(20)])
-    return np.unique(blocks[:, None] * PAIRED_CELLS + np.array([0, 1, PAIRED_CELLS - 1]))
-
-
-def unlike_pairs(found):
-    expected = {key // (2 * PAIRED_CELLS) * PAIRED_CELLS + key % PAIRED_CELLS for key in block_keys().tolist()}
-    return len(expected ^ {int(key) for key in found.tolist()})
-
-
-class Blocks(SumsInBlocks):
-    """A table of sums alone."""
-
-    def update(self):
-        """Of nothing."""
-
-    compute = update
-
-
-def pairs():
-    metric = Blocks(8, {})
-    metric.add_touched_sums("sums", PAIRED_CELLS, 1)
-    keys = torch.from_numpy(block_keys()).double()
-    state = {name: getattr(metric, name) for name in ("block_steps", "fine_steps", "block_length")}
-    state["sums"] = torch.stack([keys, torch.ones_like(keys)], dim=1)
-    metric._pair_up(state)
-    return unlike_pairs(state["sums"][:, 0])
-
-
-def pairs_in_float32():
-    keys = torch.from_numpy(block_keys()).float()
-    cells = float(PAIRED_CELLS)
-    return unlike_pairs((torch.floor(keys / (2 * cells)) * cells + torch.remainder(keys, cells)).unique())
-
-
 # Mixtures
 
 
 @lru_cache
 def strata(scales):
-    """Means over 16 worlds each, of numbers of these scales; 0 is 3 m in each world."""
+    """Means over 16 worlds each, of numbers of these scales."""
     metres = np.random.default_rng(2).uniform(1.0, 2.0, (len(scales), 16))
-    return np.where(np.array(scales)[:, None] == 0, 3.0, metres * np.array(scales)[:, None])
+    return metres * np.array(scales)[:, None]
 
 
 def mixture(weights, scales):
@@ -135,7 +93,6 @@ def longdouble_error(weights, scales):
 
 
 TINY = (TINY_WEIGHT, 1 - TINY_WEIGHT), (1e12, 1.0)
-EXACT = (0.25, 0.75), (1.0, 0.0)
 SMALL = (0.5, 0.5), (1e-85, 1e-85)
 
 
@@ -169,44 +126,6 @@ def freedom_by_fourth_powers(case):
 # The sort along a curve
 
 
-@lru_cache
-def clouds():
-    generator = np.random.default_rng(3)
-    anywhere = generator.uniform(-1.0, 1.0, (3000, 3))
-    line = anywhere[:, :1] * [1.0, 2.0, 3.0]
-    crowd = np.concatenate([anywhere * 1e-3, np.full((1, 3), 1e38)])
-    clouds = np.ones((3000, 3)), line, anywhere * 1e-40, anywhere * 1e38, crowd
-    return [cloud.astype(np.float32) for cloud in clouds]
-
-
-def cells_on_the_curve(cloud):
-    """(N,) int64 Morton keys, bit by bit."""
-    extent = (cloud.max(axis=0) - cloud.min(axis=0)).max()
-    with np.errstate(over="ignore"):
-        scale = np.float32(packets.AXIS_CELLS - 1) / extent if extent > 0 else np.float32(0.0)
-    cells = ((cloud - cloud.min(axis=0)) * (scale if scale <= packets.HUGE else np.float32(0.0))).astype(np.int64)
-    return sum((cells[:, axis] >> bit & 1) << (3 * bit + axis) for bit in range(11) for axis in range(3))
-
-
-def stable_order(keys_of, cloud):
-    """A stable sort, and again within cells that hold a crowd."""
-    keys = keys_of(cloud)
-    order = np.argsort(keys, kind="stable")
-    for key, count in zip(*np.unique(keys, return_counts=True), strict=True):
-        if packets.CROWD < count < len(cloud):
-            crowd = order[keys[order] == key]
-            order[keys[order] == key] = crowd[stable_order(keys_of, cloud[crowd])]
-    return order
-
-
-def out_of_place(sort):
-    return sum(int((sort(cloud) != stable_order(cells_on_the_curve, cloud)).sum()) for cloud in clouds())
-
-
-def float32_keys(cloud):
-    return cells_on_the_curve(cloud).astype(np.float32)
-
-
 def jackknife(error_of):
     """Of 512 blocks of 1 to 1000 steps that differ by a millionth of what they say."""
     generator = np.random.default_rng(8)
@@ -231,24 +150,12 @@ CASES = [
     Case("sums and maxima of cells with keys up to 2^53", "a dense float64 array", "of 800 wrong", 0,
          lambda: unlike_dense(added_up(torch.from_numpy(extreme_rows()), 1)),
          "float32 keys", lambda: unlike_dense(keys_in_float32())),
-    Case("blocks added up in pairs, keys up to 2^53", "whole numbers", "of 60 wrong", 0, pairs,
-         "float32 keys", pairs_in_float32),
     Case("error of 512 blocks that differ by 1e-6", "longdouble", "relative", 1e-7, partial(jackknife, jackknife_error),
          "float32", partial(jackknife, jackknife_in_float32)),
     Case("error of a mixture with weights of 1e-12 and 1", "longdouble", "relative", 1e-12,
          partial(error_of_a_mixture, TINY), "weights not squared", partial(error_without_squares, TINY)),
     Case("degrees of freedom of the same", "longdouble", "freedom", 0, partial(freedom, TINY),
          "worlds less strata", partial(freedom_of_all_worlds, TINY)),
-    Case("error of a mixture, one stratum exact", "longdouble", "relative", 1e-12,
-         partial(error_of_a_mixture, EXACT), "weights not squared", partial(error_without_squares, EXACT)),
-    Case("degrees of freedom, one stratum exact", "longdouble", "freedom", 0, partial(freedom, EXACT),
-         "worlds less strata", partial(freedom_of_all_worlds, EXACT)),
     Case("degrees of freedom of numbers of 1e-85", "longdouble", "freedom", 0, partial(freedom, SMALL),
          "squares of variances", partial(freedom_by_fourth_powers, SMALL)),
 ]  # fmt: skip
-if find_spec(LIBRARIES["packets"]):
-    CASES.append(
-        Case("points equal, on a line, of 1e-40, of 1e38, and a crowd with one at 1e38", "a stable sort",
-             "of 15,001 wrong", 0, lambda: out_of_place(packets.along_the_curve),
-             "float32 keys", lambda: out_of_place(partial(stable_order, float32_keys)))
-    )  # fmt: skip

@@ -7,7 +7,7 @@ import torch
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.shapes import Mesh
 
-from . import choosing, faces, ground, lenses, metric, motion, poses, rays, returns, search, sums
+from . import faces, ground, lenses, metric, motion, poses, rays, returns, search, sums
 from .case import CPU_SEARCHES, CUDA_SEARCHES
 
 
@@ -15,7 +15,7 @@ def cases_of(*rooms):
     return [case for room in rooms for case in room.CASES if not case.benchmark_only]
 
 
-BY_THEMSELVES = (rays, faces, ground, lenses, poses, returns, sums, motion, choosing)
+BY_THEMSELVES = (rays, faces, ground, lenses, poses, returns, sums, motion)
 
 
 def each(cases):
