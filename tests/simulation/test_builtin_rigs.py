@@ -105,8 +105,6 @@ def test_a_rig_says_where_its_numbers_come_from_and_names_its_sensors(name):
     rig = Rig.load(name)
     assert rig.name == name
     assert any(word in rig.description for word in ("/", "assumption"))
-    names = [sensor.name for sensor in rig.sensors]
-    assert len(set(names)) == len(names)
 
 
 @pytest.mark.parametrize("name", RIGS)
@@ -171,13 +169,7 @@ def test_the_placements_of_place3ds_tables_have_the_lidar_of_its_tables():
             assert "no mAP has been published" in Rig.load(name).description
 
 
-def test_tilted_placements_look_down_on_their_own_side():
-    for rig in ("hu2022_line_roll", "hu2022_pyramid_roll"):
-        for sensor in Rig.load(rig).sensors:
-            matrix = sensor.mount.matrix()
-            outwards = np.array([0.0, np.sign(matrix[1, 3]), 0.0])
-            if sensor.mount.roll_deg:
-                assert (matrix[:3, :3] @ outwards)[2] < -0.25
+def test_the_pitched_placement_looks_down():
     front = Rig.load("hu2022_pyramid_pitch").sensors[1].mount.matrix()
     assert looks(front)[1] == pytest.approx(np.rad2deg(-0.09), abs=1e-3)
 

@@ -99,9 +99,3 @@ def test_frames_say_which_vehicle_it_was_and_are_others_on_another():
     # What a rig names and what does not carry it change no frame, nor what a checkpoint is of.
     named = SimulatedFrames(scenario, rig("sedan"), steps=1, reference_sensor=SMALL, vehicle="van")
     assert named.content == frames[1].content
-
-
-def test_a_sensor_inside_an_ego_that_is_not_its_own_is_told_so():
-    frames = SimulatedFrames("courtyard", "nuscenes_cameras", steps=1, reference_sensor=SMALL, vehicle="suv")
-    with pytest.raises(ValueError, match=r"inside the ego of 'courtyard', suv, .*\(--vehicle renault_zoe\)"):
-        frames[0]

@@ -92,22 +92,18 @@ def test_what_a_sensor_says_itself_wins():
     assert len(lidar.rows_deg()) == 16
 
 
-def test_evenly_spaced_rows_replace_a_models_table_and_its_offsets():
-    lidar = sensor(model="hesai_pandar64", channels=3, vertical_fov_deg=(-10, 10))
-    assert lidar.rows_deg().tolist() == [-10, 0, 10]
-    assert lidar.azimuth_offsets_deg is None
-
-
-def test_a_table_replaces_a_models_rows_and_its_offsets():
-    for model in ("hesai_pandar64", "innovusion_falcon"):
-        lidar = sensor(model=model, elevations_deg=(1, -1))
-        assert lidar.rows_deg().tolist() == [1, -1]
-        assert lidar.azimuth_offsets_deg is None
-
-
-def test_the_number_of_evenly_spaced_rows_can_change_alone():
-    lidar = sensor(model="innovusion_falcon", channels=3)
-    assert lidar.rows_deg().tolist() == [-12.5, 0, 12.5]
+@pytest.mark.parametrize(
+    ("model", "keys", "rows_deg"),
+    [
+        ("hesai_pandar64", {"channels": 3, "vertical_fov_deg": (-10, 10)}, [-10, 0, 10]),
+        ("hesai_pandar64", {"elevations_deg": (1, -1)}, [1, -1]),
+        ("innovusion_falcon", {"elevations_deg": (1, -1)}, [1, -1]),
+        ("innovusion_falcon", {"channels": 3}, [-12.5, 0, 12.5]),
+    ],
+)
+def test_rows_of_a_sensor_replace_those_of_its_model_and_their_offsets(model, keys, rows_deg):
+    lidar = sensor(model=model, **keys)
+    assert (lidar.rows_deg().tolist(), lidar.azimuth_offsets_deg) == (rows_deg, None)
 
 
 def test_offsets_can_be_left_out():
@@ -161,9 +157,3 @@ def test_a_wrong_model_file_is_named(tmp_path):
     (tmp_path / "own.yaml").write_text("{name: own, elevations_deg: [95], horizontal_fov_deg: 90, columns: 4}")
     with pytest.raises(ValueError, match=r"sensors\.0: .*own\.yaml: max_range_m: Field req.*; elevations_deg\.0: .*90"):
         read(tmp_path, "model: own.yaml")
-
-
-def test_noise_and_dropout_are_off_unless_asked_for():
-    for name in PUBLISHED:
-        model = LidarModel.load(name)
-        assert (model.range_noise_m, model.dropout) == (0.0, 0.0)

@@ -10,7 +10,6 @@ import trimesh
 from torchcover.simulation import builtin_names
 from torchcover.simulation.bodies import Vehicle, VehicleShape, mount_regions_of
 from torchcover.simulation.mount_regions import SEEN_FROM, MountRegion, Skin
-from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.shapes import Box, Mesh
 
 ROBOT = Path(__file__).parents[2] / "examples" / "robot" / "robot.yaml"
@@ -58,19 +57,6 @@ def test_a_region_is_one_patch_that_looks_to_its_side(name):
         for along in (0, 1):
             steps_m = np.diff(places_m, axis=along)
             assert (np.abs(steps_m[..., axis]) < np.linalg.norm(np.delete(steps_m, axis, axis=2), axis=2) + 1e-9).all()
-
-
-@pytest.mark.parametrize("name", ["suv", "truck"])
-def test_rays_of_the_caster_end_at_the_same_places(name):
-    vehicle, skin = loaded(name)
-    caster = RayCaster([skin.mesh])
-    for region in vehicle.mount_regions.values():
-        axis, sign = SEEN_FROM[region.seen_from]
-        place_m = region.on(skin, 0.3, 0.7).place_m
-        origin_m, direction = place_m.copy(), np.zeros((3, 1), dtype=np.float32)
-        origin_m[axis], direction[axis] = sign * 20.0, -sign
-        hits = caster.cast(origin_m, direction, np.array([np.inf], dtype=np.float32))
-        assert hits.range_m[0] == pytest.approx(abs(origin_m[axis] - place_m[axis]), abs=1e-5)
 
 
 @pytest.mark.parametrize("name", VEHICLES)

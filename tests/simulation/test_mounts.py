@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from torchcover.simulation import Lidar, PaperReference, Pose, Rig, Scenario, Simulator
-from torchcover.simulation.instant import Instant
 from torchcover.simulation.rig import with_ego
 from torchcover.simulation.scene import Scene
 
@@ -82,18 +81,6 @@ def test_a_sensor_on_the_skin_of_the_ego_is_where_it_may_be(tmp_path, speed_mps)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert len(simulator(tmp_path, {"z_m": 1.0}, speed_mps=speed_mps, bodies=[BAR]).step(0).clouds["mine"]) > 0
-
-
-@pytest.mark.parametrize(("speed_mps", "times"), [(0.0, 1), (2.0, 3)])
-def test_mounts_are_asked_once_where_nothing_moves(tmp_path, speed_mps, times, monkeypatch):
-    asked, buried = [], Instant.buried
-    monkeypatch.setattr(
-        Instant, "buried", lambda self, place_m: asked.append(tuple(place_m.tolist())) or buried(self, place_m)
-    )
-    watched = simulator(tmp_path, {"z_m": 1.6}, speed_mps=speed_mps)
-    for step in range(3):
-        watched.step(step)
-    assert asked.count((0.0, 0.0, 1.6)) == times
 
 
 @pytest.mark.parametrize("moving", [False, True])

@@ -149,7 +149,7 @@ def test_an_object_that_turns_only_its_inner_side_to_a_place_hides_itself():
     mesh = Box(type="box", size_m=(20.0, 20.0, 20.0)).mesh()
     place_m = np.array([1.0, 2.0, 3.0])
     away = Bounds(np.full((1, 3), 90.0), np.full((1, 3), 99.0))
-    patches = Patches.of(mesh)
+    patches = Patches.cut(mesh)
     strata = SurfaceStrata(patches._replace(of_object=np.zeros_like(patches.of_object)), away)
     drawn = strata.draw(place_m, 5.0, np.random.default_rng(0), on_objects=50)
     assert drawn.of_object.tolist() == [0] * 50
@@ -159,11 +159,11 @@ def test_an_object_that_turns_only_its_inner_side_to_a_place_hides_itself():
 
 
 def test_an_object_of_any_size_is_cut_whole():
-    huge = Patches.of(Plane(type="plane", size_m=(1e6, 10.0)).mesh())
+    huge = Patches.cut(Plane(type="plane", size_m=(1e6, 10.0)).mesh())
     assert len(huge.outward) < 10_000
     assert np.linalg.norm(huge.normals_m2.astype(np.float64), axis=0).sum() / 2 == pytest.approx(1e7, rel=1e-5)
     assert max(np.abs(huge.first_m).max(), np.abs(huge.second_m).max()) <= 1e6 / 64
-    car = Patches.of(Box(type="box", size_m=(18.0, 2.5, 4.0)).mesh())
+    car = Patches.cut(Box(type="box", size_m=(18.0, 2.5, 4.0)).mesh())
     assert max(np.linalg.norm(edges, axis=0).max() for edges in (car.first_m, car.second_m)) <= 4.0
 
 

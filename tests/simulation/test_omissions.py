@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from torchcover.simulation import PaperReference, Rig, Scenario, Simulator
-from torchcover.simulation.instant import Instant
 from torchcover.simulation.scene import Scene
 
 
@@ -60,20 +59,6 @@ def test_a_change_of_one_step_does_not_reach_the_next():
     kept = first.copy()
     first[:] = 0.0
     np.testing.assert_array_equal(used.step(1).clouds["r"], kept)
-
-
-def test_the_rig_is_scanned_once_where_nothing_moves_and_the_reference_at_every_step(monkeypatch):
-    ranges, original = [], Instant.scan
-
-    def scan(self, pose, tiles, **options):
-        ranges.append("mounted" if "own_m" in options else "reference")
-        return original(self, pose, tiles, **options)
-
-    monkeypatch.setattr(Instant, "scan", scan)
-    used = simulator("courtyard")
-    for index in range(4):
-        used.step(index)
-    assert sorted(ranges) == ["mounted"] + 4 * ["reference"]
 
 
 def test_bodies_out_of_range_change_nothing(monkeypatch):

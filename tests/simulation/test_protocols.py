@@ -22,7 +22,6 @@ from torchcover.simulation import (
     RegionsOfInterest,
     Scenario,
     Simulator,
-    builtin_names,
     into_tiles,
     position_in_shell,
     vertical_fov_deg,
@@ -113,12 +112,6 @@ def reference_sensor(request, monkeypatch):
     made = REFERENCE_SENSORS[request.param].from_rays(ASKED, 900)
     assert made.name == request.param
     return made
-
-
-def test_a_sensor_says_who_and_where_it_is_and_how_far_it_sees(sensor):
-    assert sensor.name == "a"
-    np.testing.assert_allclose(sensor.mount.matrix()[:3, 3], [2.6, 0.0, 1.0])
-    assert {key: getattr(sensor, key) for key in RANGES} == RANGES
 
 
 def test_a_sensors_directions_are_of_length_one_or_none(sensor):
@@ -216,6 +209,7 @@ def test_a_sensor_is_simulated(sensor):
     )
     frame = frames[0]
     assert frame.counts["sensor_rays"] == (~np.isnan(exact.directions()[0])).sum()
+    assert sensor.rays == exact.directions()[0].size
     ranges_m = (frame.sensor.double() - torch.tensor([2.6, 0.0, 1.0])).norm(dim=1)
     assert 0 < len(ranges_m) <= frame.counts["sensor_rays"]
     assert ranges_m.max() <= exact.max_range_m
@@ -250,11 +244,6 @@ def test_what_is_no_sensor_is_refused_with_the_kinds_there_are(content):
     kinds = " or a ".join(map(repr, SENSORS))
     with pytest.raises(ValueError, match=rf"sensors\.0\n.*type: a sensor is a {kinds}; got"):
         Rig.model_validate({"name": "r", "sensors": [content]})
-
-
-@pytest.mark.parametrize("name", builtin_names("rigs"))
-def test_every_sensor_of_the_built_in_rigs_is_of_a_registered_kind(name):
-    assert {type(sensor) for sensor in Rig.load(name).sensors} <= set(SENSORS.values())
 
 
 @pytest.mark.parametrize("sensor", [PaperReference(8, 8), DownReference(8)], ids=["paper", "down"])

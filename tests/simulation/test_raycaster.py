@@ -11,7 +11,6 @@ import torch
 from torchcover.geometry import rigid, rotation_from_euler
 from torchcover.simulation import raycaster
 from torchcover.simulation.raycaster import RayCaster
-from torchcover.simulation.rays import unit_directions
 from torchcover.simulation.shapes import Box, Ellipsoid, Frustum, Mesh, Plane
 
 HERE = np.zeros(3)
@@ -70,15 +69,6 @@ def slow_hits(mesh, origin, directions):
     return nearest
 
 
-def test_rays_onto_a_plane_end_where_geometry_says():
-    elevation = np.linspace(-89.0, -1.0, 45)
-    directions = unit_directions(elevation[:, None], np.linspace(0, 350, 36)[None]).reshape(3, -1).astype(np.float32)
-    caster = RayCaster([Plane(type="plane", size_m=(1000, 1000)).mesh()])
-    hits = caster.cast(np.array([1.0, 2.0, 1.7]), directions, endless(directions))
-    assert (hits.body == 0).all()
-    np.testing.assert_allclose(hits.range_m, np.repeat(1.7 / np.sin(np.deg2rad(-elevation)), 36), rtol=2e-5)
-
-
 def test_agrees_with_a_slow_intersection_in_float64():
     mesh, directions = random_mesh(200), random_directions(600)
     hits = RayCaster([mesh]).cast(HERE, directions, endless(directions))
@@ -89,19 +79,6 @@ def test_agrees_with_a_slow_intersection_in_float64():
     both = np.isfinite(hits.range_m) & np.isfinite(expected)
     assert (np.abs(hits.range_m[both] - expected[both]) < 1e-4).mean() > 0.995
     assert 0.2 < both.mean() < 1.0
-
-
-def test_what_is_struck_knows_how_steeply():
-    mesh, directions = random_mesh(200), random_directions(600)
-    caster = RayCaster([mesh])
-    hits = caster.cast(HERE, directions, endless(directions))
-    met = hits.body >= 0
-    struck = caster.struck(hits.body[met], hits.triangle[met], directions[:, met])
-    first, second, third = mesh.vertices_m[mesh.faces[hits.triangle[met]]].swapaxes(0, 1)
-    normals = np.cross(second - first, third - first)
-    expected = np.abs((normals * directions[:, met].T).sum(axis=1)) / np.linalg.norm(normals, axis=1)
-    np.testing.assert_allclose(struck.cos_incidence, expected, atol=1e-4)
-    assert 0.2 < met.mean() < 1.0
 
 
 def test_no_ray_slips_out_of_a_closed_box_through_its_edges():
@@ -216,13 +193,6 @@ def test_a_place_on_a_face_up_to_the_rounding_of_doubles_is_on_it():
     ground, down = Plane(type="plane", size_m=(100, 100)).mesh(), np.array([[0.0], [0.0], [-1.0]], dtype=np.float32)
     hits = RayCaster([ground]).cast(np.array([1.0, 2.0, 1e-15]), down, endless(down))
     assert hits.body == [-1]
-
-
-def test_hits_name_their_body():
-    directions = np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0]], dtype=np.float32).T
-    hits = RayCaster([box_at(5.0), box_at(0.0, 7.0)]).cast(HERE, directions, endless(directions))
-    assert hits.body.tolist() == [0, 1, -1]
-    np.testing.assert_allclose(hits.range_m, [4.5, 6.5, np.inf], rtol=1e-6)
 
 
 @pytest.mark.parametrize(("limit", "body", "range_m"), [(4.4, -1, 4.4), (4.6, 0, 4.5), (np.inf, 0, 4.5)])

@@ -114,29 +114,6 @@ def test_the_same_world_far_out_gives_the_same_points(ego_moves):
     np.testing.assert_allclose(as_set(there.points), as_set(here.points), atol=1e-3)
 
 
-def test_the_result_does_not_depend_on_threads():
-    one, many = scan(world()), scan(world(), threads=5)
-    np.testing.assert_array_equal(one.points, many.points)
-    assert one.self_hits == many.self_hits
-
-
-def test_bodies_that_are_out_of_reach_change_nothing():
-    made = world()
-    scene = Scene(made)
-    near, far = scene.at(0, within_m=50.0), scene.at(0, within_m=3.0)
-    assert len(near.moving) == 1
-    assert len(far.moving) == 0
-    seen = near.scan(ABOVE, SPHERE, max_range_m=3.0)
-    np.testing.assert_array_equal(seen.points, far.scan(ABOVE, SPHERE, max_range_m=3.0).points)
-
-
-@pytest.mark.parametrize(("far", "seen"), [(20, True), (9.4, False), (9.6, True)])
-def test_range_limits(far, seen):
-    ahead = into_tiles(np.array([1.0, 0.0, 0.0]).reshape(3, 1, 1))
-    points = Scene(world()).at(0).scan(ABOVE, ahead, max_range_m=far).points
-    assert len(points) == seen
-
-
 def test_a_scenario_places_its_ego_and_bodies():
     made = scenario({"x_m": 30.0, "yaw_deg": 90.0}).world()
     scene = Scene(made)
@@ -152,13 +129,6 @@ def test_an_actor_in_the_ego_is_an_error_that_names_actor_and_time():
     scene.at(3)
     with pytest.raises(ValueError, match=r"actor 'truck' overlaps the ego at t = 5 s"):
         scene.at(5)
-
-
-def test_a_place_inside_the_ego_is_found():
-    scene = Scene(world())
-    assert scene.encloses(np.array([1.0, 0.5, 0.5]))
-    assert not scene.encloses(np.array([0.0, 0.0, 1.1]))
-    assert not scene.encloses(np.array([2.1, 0.0, 0.5]))
 
 
 @pytest.mark.parametrize("moving", [False, True])

@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from torchcover.geometry import BoundingBox
 from torchcover.simulation import Lidar, PaperReference
@@ -46,14 +44,6 @@ def test_a_table_of_rows_with_offsets_is_taken_as_it_is():
     elevation, azimuth = angles(table.directions())
     np.testing.assert_allclose(elevation, [5, -3, 1], atol=1e-12)
     np.testing.assert_allclose(azimuth, [0, 2, -4], atol=1e-12)
-
-
-@settings(max_examples=30, deadline=None)
-@given(st.integers(1, 40), st.integers(1, 40), st.floats(0.1, 360))
-def test_directions_have_length_one(channels, columns, fov):
-    directions = lidar(channels=channels, columns=columns, horizontal_fov_deg=fov).directions()
-    assert directions.shape == (3, channels, columns)
-    np.testing.assert_allclose(np.linalg.norm(directions, axis=0), 1.0, atol=1e-15)
 
 
 def test_the_reference_sensor_covers_the_lower_hemisphere_evenly_in_angle():

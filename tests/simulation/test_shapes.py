@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from torchcover.simulation import Rig, SimulatedFrames, bodies, builtin_names
-from torchcover.simulation.bodies import Body, Vehicle, VehicleShape, in_vehicle_frame, mover_mesh
+from torchcover.simulation.bodies import Body, Vehicle, VehicleShape, mover_mesh
 from torchcover.simulation.documents import Pose
 from torchcover.simulation.scenario import Mover
-from torchcover.simulation.shapes import Box, Cylinder, Ellipsoid, Frustum, MeshFile, Plane
+from torchcover.simulation.shapes import Box, Cylinder, Ellipsoid, Frustum, MeshFile
 
 TETRAHEDRON = """ply
 format ascii 1.0
@@ -75,29 +75,11 @@ def test_an_ellipsoid_has_its_size_and_its_corners_lie_on_the_surface():
     np.testing.assert_allclose(np.linalg.norm(on_sphere, axis=1), 1.0, rtol=1e-12)
 
 
-def test_a_cylinder_needs_three_sides():
-    with pytest.raises(ValueError, match="greater than or equal to 3"):
-        Cylinder(type="cylinder", radius_m=1, height_m=1, sides=2)
-
-
-def test_a_plane_is_flat_and_centred():
-    mesh = Plane(type="plane", size_m=(4, 2)).mesh()
-    np.testing.assert_array_equal(mesh.vertices_m.min(0), [-2, -1, 0])
-    np.testing.assert_array_equal(mesh.vertices_m.max(0), [2, 1, 0])
-
-
 def test_a_body_has_one_copy_for_each_pose():
     body = Body(name="b", shape=Box(type="box", size_m=(1, 1, 1)), poses=(Pose(x_m=5), Pose(y_m=-3, z_m=2)))
     first, second = body.meshes()
     np.testing.assert_allclose(first.vertices_m.mean(0), [5, 0, 0.5])
     np.testing.assert_allclose(second.vertices_m.mean(0), [0, -3, 2.5])
-
-
-def test_mesh_files_are_scaled_to_metres(tmp_path):
-    path = tmp_path / "t.ply"
-    path.write_text(TETRAHEDRON)
-    mesh = MeshFile(type="mesh", path=path, metres_per_unit=0.001).mesh()
-    assert signed_volume(mesh) == pytest.approx(1 / 6)
 
 
 @pytest.mark.parametrize(
@@ -114,27 +96,6 @@ def test_unusable_mesh_files_are_named(tmp_path, content, message):
     path.write_text(content)
     with pytest.raises(ValueError, match=rf"bad\.ply: .*{message}"):
         MeshFile(type="mesh", path=path).mesh()
-
-
-def test_a_missing_mesh_file_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"none\.stl: no such file; a mesh is needed"):
-        MeshFile(type="mesh", path=tmp_path / "none.stl").mesh()
-
-
-def test_a_vehicle_frame_lies_on_the_ground_under_the_centre():
-    moved = Box(type="box", size_m=(4, 2, 1)).mesh().moved(Pose(x_m=7, y_m=-2, z_m=3).matrix())
-    mesh = in_vehicle_frame(moved)
-    np.testing.assert_allclose(mesh.vertices_m.min(0), [-2, -1, 0], atol=1e-12)
-    np.testing.assert_allclose(mesh.vertices_m.max(0), [2, 1, 1], atol=1e-12)
-
-
-def test_the_built_in_vehicle_has_the_size_of_the_papers_ego_and_closed_parts():
-    mesh = VehicleShape(type="vehicle", vehicle="suv").mesh()
-    np.testing.assert_allclose(np.ptp(mesh.vertices_m, axis=0), [4.90, 1.94, 1.63], atol=1e-9)
-    for part in Vehicle.load("suv").parts:
-        for copy in part.meshes():
-            assert signed_volume(copy) > 0
-            assert edge_counts(copy)[2]
 
 
 def ply_of(mesh, faces=slice(None)):

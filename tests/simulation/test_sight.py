@@ -96,15 +96,6 @@ def test_a_scan_is_made_again_only_where_something_moves(monkeypatch):
         assert len(scans) == expected
 
 
-def test_rays_that_the_ego_ends_are_not_cast_at_it():
-    scene = Scene(world())
-    instant = scene.at(0)
-    assert (
-        MountedSensor(LIDAR, scene, LIDAR.max_range_m).scan(instant, EXACT).body_casts
-        < afresh(instant).body_casts - 500
-    )
-
-
 def test_the_ego_is_at_its_own_place_to_the_last_bit():
     """Coordinates of UTM size: a pose and its inverse make the identity only nearly."""
     made = world(origin_m=UTM)

@@ -1,6 +1,5 @@
 """What has no room is refused before it is made, with its size."""
 
-import numpy as np
 import pytest
 
 from torchcover.geometry.trajectory import Trajectory
@@ -65,17 +64,6 @@ def test_the_limit_of_a_container_counts(tmp_path, monkeypatch):
 def test_no_number_is_larger_than_there_can_be(make, message):
     with pytest.raises(ValueError, match=message):
         make()
-
-
-def test_sensors_know_how_many_rays_they_have():
-    sensors = [
-        Lidar(name="a", channels=4, columns=9, **SPACED),
-        Lidar(name="b", model="velodyne_vlp16", max_range_m=9),
-        CameraSensor(name="c", width=13, height=8, fov_deg=90, stride=3, max_range_m=9),
-    ]
-    for sensor in sensors:
-        assert sensor.rays == np.prod(sensor.directions().shape[1:])
-    assert PaperReference(rows=3, columns=4).rays == 12
 
 
 @pytest.mark.parametrize("stride", [16, 40])

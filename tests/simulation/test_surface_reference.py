@@ -11,7 +11,7 @@ from torch.utils.data import DataLoader
 
 from torchcover import nearest
 from torchcover.data import SimulatedFrames, collate_frames
-from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, SurfaceReference, patches
+from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, SurfaceReference
 
 from .small_worlds import AHEAD, ALL_HEIGHTS, EGO, FLOOR, agrees, box, scenario, sums
 
@@ -189,21 +189,11 @@ def test_threads_workers_and_pickling_change_nothing():
     loaded = [frame for batch in batches for frame in batch.frames]
     for frame, *others in zip(one, three, loaded, strict=True):
         for other in others:
+            assert torch.equal(frame.sensor, other.sensor)
             assert torch.equal(frame.reference, other.reference)
             assert torch.equal(frame.reference_weights, other.reference_weights)
             assert torch.equal(frame.boxes.drawn_points, other.boxes.drawn_points)
             assert frame.counts == other.counts
-
-
-def test_the_surface_is_cut_once_a_world(monkeypatch):
-    cuts, cut = [], patches._cut
-    monkeypatch.setattr(patches, "_cut", lambda *given: cuts.append(given) or cut(*given))
-    simulator = Simulator(Scenario.load("courtyard"), {}, SurfaceReference((AHEAD,), rays=100))
-    simulator.step(0)
-    once = len(cuts)
-    simulator.step(1)
-    simulator.with_reference_sensor(SurfaceReference((AHEAD,), rays=200)).step(2)
-    assert len(cuts) == once > 0
 
 
 @pytest.mark.parametrize(

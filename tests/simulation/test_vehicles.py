@@ -81,11 +81,6 @@ def test_a_vehicle_stands_on_the_ground_in_the_middle_of_its_box(name):
 
 
 @pytest.mark.parametrize("name", SIZES_M)
-def test_the_description_states_the_height(name):
-    assert f"{SIZES_M[name][2]:.2f} m" in load(name).description
-
-
-@pytest.mark.parametrize("name", SIZES_M)
 def test_every_part_is_closed_and_faces_outwards(name):
     for part in load(name).parts:
         for mesh in part.meshes():
@@ -103,11 +98,6 @@ def test_left_and_right_are_mirror_images(name):
         rounded = {tuple(corner) for corner in (np.round(corners, 6) + 0.0).tolist()}
         mirrored = {tuple(corner) for corner in (np.round(corners * [1, -1, 1], 6) + 0.0).tolist()}
         assert rounded == mirrored, part.name
-
-
-@pytest.mark.parametrize("name", SIZES_M)
-def test_few_faces_are_enough(name):
-    assert len(load(name).mesh().faces) < (400 if name in CARS else 600)
 
 
 @pytest.mark.parametrize("name", WITH_WHEELS)

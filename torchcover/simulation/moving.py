@@ -51,7 +51,7 @@ class Solid:
     @cached_property
     def patches(self) -> Patches:
         """All of its surface, cut small."""
-        return Patches.of(self.mesh)
+        return Patches.cut(self.mesh)
 
 
 class Solids:

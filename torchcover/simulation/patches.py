@@ -139,11 +139,6 @@ class Patches(NamedTuple):
     face: Int32
 
     @classmethod
-    def of(cls, mesh: Mesh) -> Self:
-        """Those of all of a mesh, of no object; faces without an area are left out."""
-        return cls.cut(mesh)
-
-    @classmethod
     def cut(
         cls,
         mesh: Mesh,

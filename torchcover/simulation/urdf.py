@@ -210,7 +210,9 @@ def _link_poses(
         children[parent].append(child)
     roots = [name for name in links if name not in above]
     if len(roots) > 1:
-        raise ValueError(f"links {_named(roots)} hang on no other: one is needed that all others hang on")
+        raise ValueError(
+            f"links {_list_first([*map(repr, roots)])} hang on no other: one is needed that all others hang on"
+        )
     poses: dict[str, Float64] = {}
     waiting = roots
     while waiting:
@@ -223,12 +225,13 @@ def _link_poses(
             poses[name] = np.eye(4)
         waiting += children[name]
     if ring := [name for name in links if name not in poses]:
-        raise ValueError(f"links {_named(ring)} hang on each other in a ring: a tree is needed")
+        raise ValueError(f"links {_list_first([*map(repr, ring)])} hang on each other in a ring: a tree is needed")
     return poses
 
 
-def _named(names: Sequence[str]) -> str:
-    return ", ".join(map(repr, names[:MAX_NAMED])) + f" and {len(names) - MAX_NAMED} more" * (len(names) > MAX_NAMED)
+def _list_first(words: Sequence[str]) -> str:
+    """Join the first few words, and say how many more there are."""
+    return ", ".join(words[:MAX_NAMED]) + f" and {len(words) - MAX_NAMED} more" * (len(words) > MAX_NAMED)
 
 
 def _note_limits(joints: Mapping[str, Element], positions: Mapping[str, float]) -> list[str]:
@@ -246,10 +249,7 @@ def _note_limits(joints: Mapping[str, Element], positions: Mapping[str, float]) 
             outside.append(f"{name!r} at {positions[name]:g} {unit} ({lower:g} to {upper:g})")
     if not outside:
         return []
-    more = f" and {len(outside) - MAX_NAMED} more" * (len(outside) > MAX_NAMED)
-    return [
-        f"Joints outside of their limits: {', '.join(outside[:MAX_NAMED])}{more}; the body is drawn as if they could."
-    ]
+    return [f"Joints outside of their limits: {_list_first(outside)}; the body is drawn as if they could."]
 
 
 def _visuals(link: Element) -> list[Element]:
@@ -267,10 +267,9 @@ def _read_meshes(
     elements = [mesh for link in links.values() for body in _visuals(link) for mesh in body.iterfind("geometry/mesh")]
     files = {name: _find_mesh(name, path, packages) for name in {mesh.get("filename", ""): None for mesh in elements}}
     if missing := [name for name, file in files.items() if file is None]:
-        listed = ", ".join(missing[:MAX_NAMED]) + f" and {len(missing) - MAX_NAMED} more" * (len(missing) > MAX_NAMED)
         raise ValueError(
-            f"{len(missing)} of {len(files)} meshes are missing: {listed}. Name the folder of a ROS package: "
-            "--package NAME=FOLDER"
+            f"{len(missing)} of {len(files)} meshes are missing: {_list_first(missing)}. Name the folder of a ROS "
+            "package: --package NAME=FOLDER"
         )
     return {
         name: (MeshFile(type="mesh", path=file).mesh(), _unit(file)) for name, file in files.items() if file is not None

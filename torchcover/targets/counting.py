@@ -266,7 +266,11 @@ def count(
                 # No bodies of the scene: their numbers say so.
                 placed = Moving.placed([target.solid] * len(poses), standing_there, np.full(len(poses), -1))
                 met = [meetings(placed, *sensor) for sensor in zip(mounted, farthest_m, strict=True)]
-                on_ground = _OnGround.of(surface, placed, mounted, met, threshold_m)
+                near = [
+                    surface.near(_in_target(sensor, some_met, standing_there), threshold_m)
+                    for sensor, some_met in zip(mounted, met, strict=True)
+                ]
+                on_ground = _OnGround(placed, met, near)
             cut = Step(step.sensors, z_m, step.free[some], step.visible[:, some])
             _count_step(sums, on_ground, mounted, beams, cut, hits, threshold_m)
         return sums
@@ -302,16 +306,6 @@ class _OnGround(NamedTuple):
     placed: Moving
     met: Sequence[Met]
     near: Sequence[NDArray[np.uint8]]
-
-    @classmethod
-    def of(
-        cls, surface: Surface, placed: Moving, mounted: Sequence[MountedSensor], met: Sequence[Met], threshold_m: float
-    ) -> Self:
-        near = [
-            surface.near(_in_target(sensor, one, placed.vehicle_T_part), threshold_m)
-            for sensor, one in zip(mounted, met, strict=True)
-        ]
-        return cls(placed, met, near)
 
 
 def _count_step(
