@@ -23,7 +23,7 @@ from torchcover.cameras import Camera, read_depth
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric
 from torchcover.data import read_cloud
 from torchcover.evaluation.checkpoint import read_header, read_state, write_checkpoint
-from torchcover.files import read_feather, read_json_table
+from torchcover.files import read_json_table
 from torchcover.recordings.formats import frame_files, read_objects
 from torchcover.recordings.formats.carla import read_carla_sensors
 from torchcover.recordings.formats.folder import read_folder_settings
@@ -37,6 +37,7 @@ from torchcover.recordings.formats.kitti import (
 from torchcover.recordings.formats.kitti_raw import read_tracklets
 from torchcover.recordings.formats.ros import RosBag
 from torchcover.recordings.formats.tracks import read_trajectory
+from torchcover.recordings.isolated_readers import read_feather
 from torchcover.simulation import Rig, Scenario
 from torchcover.simulation.recorded.bodies import read_boxes
 from torchcover.simulation.shapes import MeshFile

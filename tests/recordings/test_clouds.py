@@ -11,8 +11,9 @@ import lzf
 import numpy as np
 import pytest
 
-from torchcover.files import BadFileError, laz_points
+from torchcover.files import BadFileError
 from torchcover.recordings.clouds import READERS, read_cloud, split_name
+from torchcover.recordings.isolated_readers import laz_points
 
 CLOUD = np.array([[1.5, -2.25, 0.125], [-3.0, 4.0, 5.5], [70.0, 0.5, -1.75]], dtype=np.float32)
 UTM = np.array([[513248.123, 5403655.456, 260.389], [513414.844, 5403760.001, 337.601]])

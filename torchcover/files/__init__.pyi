@@ -31,10 +31,7 @@ from .documents import read_pieces as read_pieces
 from .documents import road_user_classes as road_user_classes
 from .isolated import apart as apart
 from .isolated import exr_image as exr_image
-from .isolated import laz_points as laz_points
-from .isolated import lzf_block as lzf_block
 from .isolated import png_image as png_image
-from .isolated import read_feather as read_feather
 from .notebooks import brief as brief
 from .notebooks import data_frame as data_frame
 from .notebooks import data_set as data_set

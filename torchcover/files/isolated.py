@@ -1,28 +1,29 @@
 """Libraries that are not Python read in a process of their own: a damaged file ends that one, and not the run.
 
 The process is a plain one that imports no torch, reads file after file for as long as its parent lives, and has limits
-of memory, time and open files for each. What goes through the pipes is JSON and the bytes of arrays.
+of memory, time and open files for each. What goes through the connection is JSON and the bytes of arrays.
 """
 
 import atexit
 import json
 import os
-import select
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from functools import wraps
 from importlib import import_module
 from inspect import unwrap
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import IO, Any, Concatenate, ParamSpec
+from typing import Any, Concatenate, ParamSpec
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.files.bad_file import LIBRARIES_GB, VARIABLE, BadFileError, check_memory, most_gb, reads
+from torchcover.files.bad_file import LIBRARIES_GB, VARIABLE, BadFileError, check_memory, most_gb
 from torchcover.files.processes import end_with_parent, is_stopped, limit, reporting_stopped, used_bytes
 
 Arguments = ParamSpec("Arguments")
@@ -33,8 +34,6 @@ Reader = Callable[Concatenate[Path, Arguments], Arrays]
 MOST_S = 60.0
 BYTES_PER_S = 1e6
 KNOWN_ERRORS = {kind.__name__: kind for kind in (BadFileError, ValueError, MemoryError, ImportError, FileNotFoundError)}
-# As much as a scan has: or both wait for each other, again and again.
-PIPE_BYTES = 1 << 20
 # The same modules as here, whatever folder this one was started in.
 PROGRAM = "import sys; sys.path[:] = {path!r}; from torchcover.files.isolated import serve; serve()"
 
@@ -67,28 +66,26 @@ class _Process:
 
     def __init__(self) -> None:
         self.lock = threading.Lock()
-        self._popen = subprocess.Popen(
-            [sys.executable, "-c", PROGRAM.format(path=sys.path)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,  # where OpenEXR says what is wrong
-            env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
-            preexec_fn=end_with_parent(),  # noqa: PLW1509  (it calls prctl only)
-            pipesize=PIPE_BYTES,
-        )
+        self._connection, other = Pipe()
+        with other:
+            self._popen = subprocess.Popen(
+                [sys.executable, "-c", PROGRAM.format(path=sys.path)],
+                stdin=other.fileno(),
+                stdout=subprocess.DEVNULL,  # a library that prints must not answer
+                stderr=subprocess.DEVNULL,  # where OpenEXR says what is wrong
+                env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+                preexec_fn=end_with_parent(),  # noqa: PLW1509  (it calls prctl only)
+            )
 
     def is_alive(self) -> bool:
         return self._popen.poll() is None
 
     def ask(self, request: list[Any], limit_s: float) -> Arrays:
-        requests, answers = self._popen.stdin, self._popen.stdout
-        assert requests is not None
-        assert answers is not None
         with self.lock, reporting_stopped([self._popen.pid], "the process that reads files"):
             try:
-                _send(requests, request)
-                answer, arrays = _received(answers, limit_s)
-            except (BrokenPipeError, EOFError, TimeoutError) as error:
+                self._connection.send_bytes(json.dumps(request).encode())
+                answer, arrays = _receive(self._connection, limit_s)
+            except (ConnectionError, EOFError, TimeoutError) as error:
                 late, stopped = isinstance(error, TimeoutError), is_stopped(self._popen.pid)
                 self.end()
                 if stopped:
@@ -107,11 +104,20 @@ class _Process:
 
     def end(self) -> None:
         self._popen.kill()
-        for pipe in (self._popen.stdin, self._popen.stdout):
-            with suppress(BrokenPipeError):
-                assert pipe is not None
-                pipe.close()
+        self._connection.close()
         self._popen.wait()
+
+
+def _receive(connection: Connection, limit_s: float) -> tuple[list[str] | None, Arrays]:
+    if not connection.poll(limit_s):
+        raise TimeoutError
+    error, listed = json.loads(connection.recv_bytes())
+    arrays = {name: np.empty(shape, dtype) for name, dtype, shape in listed}
+    with open(connection.fileno(), "rb", closefd=False) as pipe:
+        for array in arrays.values():
+            if pipe.readinto(array.reshape(-1).view(np.uint8).data) < array.nbytes:
+                raise EOFError
+    return error, arrays
 
 
 _processes: dict[int, _Process] = {}
@@ -130,32 +136,27 @@ def _own_process() -> _Process:
 
 def serve() -> None:
     """What the process does: answer until nobody asks."""
-    requests, answers = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # a library that prints must not answer
+    connection = Connection(0)
     with suppress(EOFError):
         while True:
-            allowed_gb, module, name, path, *args = _received_json(requests)
+            allowed_gb, module, name, path, *args = json.loads(connection.recv_bytes())
             os.environ.pop(VARIABLE, None)
             os.environ |= {} if allowed_gb is None else {VARIABLE: allowed_gb}
             limit(most_gb())
+            error, arrays = None, Arrays()
             try:
                 read = unwrap(getattr(import_module(module), name))  # or it would ask another process
                 arrays = {key: _plain(array) for key, array in read(Path(path), *args).items()}
                 check_memory(sum(array.nbytes for array in arrays.values()))
-            except Exception as error:
-                known = next((kind.__name__ for kind in type(error).__mro__ if kind.__name__ in KNOWN_ERRORS), "")
-                told = str(error) if known else f"{type(error).__name__}: {error}"
-                if isinstance(error, ModuleNotFoundError):  # which no reader has met with words of its own
-                    told = f"{path}: {error.name} is needed to read it: pip install {error.name}"
-                _send(answers, [[known, told], []])
-            else:
-                _send(answers, [None, [[key, array.dtype.str, array.shape] for key, array in arrays.items()]])
+            except Exception as raised:
+                error, arrays = _describe(raised, path), {}
+            listed = [[key, array.dtype.str, array.shape] for key, array in arrays.items()]
+            connection.send_bytes(json.dumps([error, listed]).encode())
+            with open(connection.fileno(), "wb", closefd=False) as pipe:
                 for array in arrays.values():
-                    answers.write(array.reshape(-1).view(np.uint8).data)
-                answers.flush()
-                del arrays
+                    pipe.write(array.reshape(-1).view(np.uint8).data)
+            del arrays
             if used_bytes() > LIBRARIES_GB * 1e9:  # or what is kept of one file would add to the next one's
-                os.dup2(answers.fileno(), 1)
                 os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
 
 
@@ -164,65 +165,12 @@ def _plain(array: NDArray[Any]) -> NDArray[Any]:
     return np.ascontiguousarray(array.astype(str) if array.dtype.hasobject else array)
 
 
-def _send(pipe: IO[bytes], message: object) -> None:
-    data = json.dumps(message).encode()
-    pipe.write(len(data).to_bytes(8, "little") + data)
-    pipe.flush()
-
-
-def _received(pipe: IO[bytes], limit_s: float) -> tuple[list[str] | None, Arrays]:
-    if not select.select([pipe], [], [], limit_s)[0]:
-        raise TimeoutError
-    error, listed = _received_json(pipe)
-    arrays = {}
-    for name, dtype, shape in listed:
-        arrays[name] = np.empty(shape, dtype)
-        _fill(pipe, arrays[name].reshape(-1).view(np.uint8).data)
-    return error, arrays
-
-
-def _received_json(pipe: IO[bytes]) -> Any:  # noqa: ANN401
-    return json.loads(_whole(pipe, int.from_bytes(_whole(pipe, 8), "little")))
-
-
-def _whole(pipe: IO[bytes], size: int) -> bytearray:
-    data = bytearray(size)
-    _fill(pipe, memoryview(data))
-    return data
-
-
-def _fill(pipe: IO[bytes], room: memoryview) -> None:
-    while room:
-        count = pipe.readinto(room)  # type: ignore[attr-defined]
-        if not count:
-            raise EOFError
-        room = room[count:]
-
-
-@reads("a feather table")
-@apart
-def read_feather(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Read columns of a feather table.
-
-    Returns name -> numbers, or text. BadFileError: no such table, a column that is missing or has holes, or no rows.
-    ImportError: pyarrow is not installed.
-    """
-    try:
-        from pyarrow import feather
-    except ImportError as error:
-        raise ImportError(f"{path}: a feather table needs pyarrow: pip install 'torchcover[av2]'") from error
-    check_memory(4 * path.stat().st_size)
-    table = feather.read_table(path)
-    table.validate(full=True)  # pyarrow believes the lengths and places in the file, and reads there
-    missing = [name for name in names if name not in table.column_names]
-    if missing:
-        raise ValueError(f"the columns {', '.join(names)} are needed; {', '.join(missing)} are missing")
-    if table.num_rows == 0:
-        raise ValueError("a table without rows")
-    holes = [name for name in names if table.column(name).null_count]
-    if holes:
-        raise ValueError(f"the columns {', '.join(holes)} have holes")
-    return {name: table.column(name).to_numpy() for name in names}
+def _describe(error: Exception, path: str) -> list[str]:
+    """Name the type of an error, if it is one of `KNOWN_ERRORS`, and its message."""
+    if isinstance(error, ModuleNotFoundError):  # which no reader has met with words of its own
+        return ["ImportError", f"{path}: {error.name} is needed to read it: pip install {error.name}"]
+    known = next((kind.__name__ for kind in type(error).__mro__ if kind.__name__ in KNOWN_ERRORS), "")
+    return [known, str(error) if known else f"{type(error).__name__}: {error}"]
 
 
 @apart
@@ -250,21 +198,6 @@ def exr_image(path: Path, bytes_per_pixel: int) -> dict[str, NDArray[Any]]:
 
 
 @apart
-def laz_points(path: Path, points: int) -> dict[str, NDArray[Any]]:
-    """(N, 3) int32 `xyz` as they are written in a LAZ file, of so many points."""
-    try:
-        import laspy
-        import lazrs  # noqa: F401  (which laspy decompresses with)
-    except ImportError as error:
-        raise ImportError(f"{path}: LAZ needs laspy: pip install 'torchcover[las]'") from error
-    with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False) as reader:
-        found = reader.read_points(points)
-    if len(found) != points:
-        raise ValueError(f"the header claims {points} points; {len(found)} are there")
-    return {"xyz": np.column_stack([found.X, found.Y, found.Z])}
-
-
-@apart
 def png_image(path: Path) -> dict[str, NDArray[Any]]:
     """Read the `pixels` of a PNG image, whose header was checked before."""
     from PIL import Image
@@ -274,16 +207,3 @@ def png_image(path: Path) -> dict[str, NDArray[Any]]:
             return {"pixels": np.asarray(image)}
     except (OSError, SyntaxError) as error:  # the latter is Pillow's for chunks that do not hold together
         raise ValueError(f"truncated or damaged: {error}") from error
-
-
-@apart
-def lzf_block(path: Path, start: int, compressed_bytes: int, plain_bytes: int) -> dict[str, NDArray[Any]]:
-    """Decompress the block of a file that begins at the byte `start`, into `plain` (plain_bytes,) uint8."""
-    import lzf
-
-    with path.open("rb") as file:
-        file.seek(start)
-        plain = lzf.decompress(file.read(compressed_bytes), plain_bytes)
-    if plain is None or len(plain) != plain_bytes:
-        raise ValueError(f"the compressed block does not grow to the {plain_bytes} bytes that it claims")
-    return {"plain": np.frombuffer(plain, np.uint8)}

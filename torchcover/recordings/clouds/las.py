@@ -11,7 +11,8 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.files import check_memory, laz_points
+from torchcover.files import check_memory
+from torchcover.recordings.isolated_readers import laz_points
 
 HEADER_BYTES, HEADER_BYTES_1_4 = 227, 375
 COMPRESSED = 0x80  # of the point format

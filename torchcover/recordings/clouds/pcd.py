@@ -10,9 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from torchcover.files import check_memory, lzf_block
+from torchcover.files import check_memory
 from torchcover.recordings.clouds.arrays import Points, check_rest
 from torchcover.recordings.clouds.text import AXES, parse_rows, read_lines
+from torchcover.recordings.isolated_readers import lzf_block
 
 # The real ones have about 300 bytes; this bounds the search for the DATA line in a file that is no PCD.
 MAX_HEADER_BYTES = 65536

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from torchcover.cameras.calibration import Calibration
 from torchcover.detection.boxes import Boxes
-from torchcover.files import naming, read_feather, road_user_classes
+from torchcover.files import naming, road_user_classes
 from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_quaternion
 from torchcover.geometry.rigid import Matrix
 from torchcover.geometry.trajectory import Trajectory
+from torchcover.recordings.isolated_readers import read_feather
 from torchcover.recordings.objects import Ego, RecordedObjects, Seen, SeenObjects, by_name, track_of
 from torchcover.recordings.recording import Layout, Scan, SensorCalibrations, check_times, warn_of_missing_poses
 

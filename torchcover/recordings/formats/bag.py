@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.files import naming, parse_yaml, read_short_text, reads
-from torchcover.recordings.bag_files import (
+from torchcover.recordings.clouds.arrays import Points
+from torchcover.recordings.isolated_readers import (
     METADATA,
     ROS1_SUFFIX,
     find_ros1_files,
@@ -19,7 +20,6 @@ from torchcover.recordings.bag_files import (
     read_bag_messages,
     read_header_stamps,
 )
-from torchcover.recordings.clouds.arrays import Points
 from torchcover.recordings.recording import NO_RETURN_M
 
 # Of so many messages the stamps are read, if those were recorded equally late to this time, and so regularly.

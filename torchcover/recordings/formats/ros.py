@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from torchcover.files import naming
 from torchcover.geometry import invert
 from torchcover.geometry.rigid import Matrix
-from torchcover.recordings.bag_files import METADATA, find_ros1_files
 from torchcover.recordings.formats.bag import (
     PARAMS,
     POINT_TIMES,
@@ -30,6 +29,7 @@ from torchcover.recordings.formats.ros_poses import (
     mounted_transforms,
     vehicle_poses,
 )
+from torchcover.recordings.isolated_readers import METADATA, find_ros1_files
 from torchcover.recordings.recording import NO_RETURN_M, Layout, Scan, SensorCalibrations, check_times
 
 CLOUD = "sensor_msgs/msg/PointCloud2"

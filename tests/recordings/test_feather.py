@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from torchcover.files import BadFileError, read_feather
+from torchcover.files import BadFileError
+from torchcover.recordings.isolated_readers import read_feather
 
 pa = pytest.importorskip("pyarrow")
 

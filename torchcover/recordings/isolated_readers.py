@@ -1,7 +1,7 @@
-"""Bags of ROS 1 and 2 read by rosbags, in a process of their own: nothing that loads torch may be imported here."""
+"""Readers of libraries that are not Python, in a process of their own: nothing that loads torch is imported here."""
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
 from operator import itemgetter
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.files import apart, check_memory, check_regular, naming
+from torchcover.files import apart, check_memory, check_regular, naming, reads
 from torchcover.files.bad_file import MAX_REASON_CHARS
 
 ROS1_SUFFIX = ".bag"
@@ -227,3 +227,57 @@ def _read_mcap_index(file: Any, channel: int, offset: int) -> NDArray[np.int64]:
         raise ValueError(f"the index of its messages leads to something else at byte {offset}")
     check_memory(size_bytes)
     return np.frombuffer(file.read(size_bytes), MCAP_INDEX_ENTRY)["time_ns"].astype(np.int64)
+
+
+@reads("a feather table")
+@apart
+def read_feather(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
+    """Read columns of a feather table.
+
+    Returns name -> numbers, or text. BadFileError: no such table, a column that is missing or has holes, or no rows.
+    ImportError: pyarrow is not installed.
+    """
+    try:
+        from pyarrow import feather
+    except ImportError as error:
+        raise ImportError(f"{path}: a feather table needs pyarrow: pip install 'torchcover[av2]'") from error
+    check_memory(4 * path.stat().st_size)
+    table = feather.read_table(path)
+    table.validate(full=True)  # pyarrow believes the lengths and places in the file, and reads there
+    missing = [name for name in names if name not in table.column_names]
+    if missing:
+        raise ValueError(f"the columns {', '.join(names)} are needed; {', '.join(missing)} are missing")
+    if table.num_rows == 0:
+        raise ValueError("a table without rows")
+    holes = [name for name in names if table.column(name).null_count]
+    if holes:
+        raise ValueError(f"the columns {', '.join(holes)} have holes")
+    return {name: table.column(name).to_numpy() for name in names}
+
+
+@apart
+def laz_points(path: Path, points: int) -> dict[str, NDArray[Any]]:
+    """(N, 3) int32 `xyz` as they are written in a LAZ file, of so many points."""
+    try:
+        import laspy
+        import lazrs  # noqa: F401  (which laspy decompresses with)
+    except ImportError as error:
+        raise ImportError(f"{path}: LAZ needs laspy: pip install 'torchcover[las]'") from error
+    with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False) as reader:
+        found = reader.read_points(points)
+    if len(found) != points:
+        raise ValueError(f"the header claims {points} points; {len(found)} are there")
+    return {"xyz": np.column_stack([found.X, found.Y, found.Z])}
+
+
+@apart
+def lzf_block(path: Path, start: int, compressed_bytes: int, plain_bytes: int) -> dict[str, NDArray[Any]]:
+    """Decompress the block of a file that begins at the byte `start`, into `plain` (plain_bytes,) uint8."""
+    import lzf
+
+    with path.open("rb") as file:
+        file.seek(start)
+        plain = lzf.decompress(file.read(compressed_bytes), plain_bytes)
+    if plain is None or len(plain) != plain_bytes:
+        raise ValueError(f"the compressed block does not grow to the {plain_bytes} bytes that it claims")
+    return {"plain": np.frombuffer(plain, np.uint8)}
