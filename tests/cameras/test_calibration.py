@@ -50,13 +50,6 @@ def test_ros(tmp_path, theirs, ours, coefficients):
     assert (camera.name, camera.model, camera.coefficients.tolist()) == ("head", ours, coefficients)
 
 
-def test_ros_message(tmp_path):
-    (tmp_path / "info.yaml").write_text(ROS_MESSAGE)
-    camera = Camera.from_ros(tmp_path / "info.yaml")
-    check_matrix(camera)
-    assert camera.coefficients.tolist() == [-0.2, 0.1, 0.0, 0.001, 0.02]
-
-
 def ros_region(x_offset, y_offset, width, height, binning):
     roi = f"roi: {{x_offset: {x_offset}, y_offset: {y_offset}, width: {width}, height: {height}, do_rectify: false}}\n"
     return f"binning_x: {binning}\nbinning_y: {binning}\n{roi}"

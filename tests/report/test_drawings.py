@@ -129,12 +129,6 @@ def test_a_sensor_that_looks_sideways_is_marked_though_it_has_no_fan():
     assert labels.count("2") == 1
 
 
-def test_a_short_range_is_drawn_as_it_is():
-    picture = rig(view(range_m=1.0))
-    assert picture.tinted(0, 2.8, 0.2)
-    assert not picture.tinted(0, 3.3, 0.2)
-
-
 def test_every_sensor_is_named_with_its_angles_and_nothing_is_clipped():
     sensors = [view(yaw=30.0 * k, name=f"${k} a sensor with a long name") for k in range(9)]
     picture = rig(*sensors, title="A title that is longer than the paper is wide " * 3, subtitle="small")

@@ -1,4 +1,4 @@
-"""Lenses at their folds and rims."""
+"""Lenses at their folds, and beyond 90 degrees."""
 
 from functools import lru_cache, partial
 
@@ -109,79 +109,6 @@ def fisheye_angles_kornia():
     return most(np.arctan2(plane[:, 0].numpy(), 1.0) - off_axis)
 
 
-def z_depth_sideways():
-    """Points that pixels at 90 degrees and beyond become when their depth is along the axis."""
-    camera = Camera(2400, 1, FOCAL_PX, FOCAL_PX, -10.0, 0.0, "kannala_brandt", FISHEYE)
-    sideways = camera.rays()[0][..., 2] <= 0
-    points = camera.unproject(torch.where(sideways, 5.0, 0.0))
-    return len(points) if sideways.any() else np.inf
-
-
-def z_depth_by_division():
-    camera = Camera(2400, 1, FOCAL_PX, FOCAL_PX, -10.0, 0.0, "kannala_brandt", FISHEYE)
-    rays, _ = camera.rays()
-    points = rays * (5.0 / rays[..., 2:])
-    return int((points.isfinite().all(dim=-1) & (rays[..., 2] <= 0)).sum())
-
-
-# Model -> coefficients, and radius of the image at which it folds.
-RIMS = {
-    "eucm": ([0.6, 1.1], (1.1 * 0.2) ** -0.5),
-    "double_sphere": ([-0.2, 0.6], 0.2**-0.5),
-    "mei": ([1.5], 1.25**-0.5),
-}
-
-
-@lru_cache
-def at_the_rim(model):
-    """Pixels from the rim of the image inwards, by roundings and then more, all around."""
-    inwards = np.append(np.geomspace(4e-16, 1e-2, 50), 0.5)
-    azimuth = np.linspace(0.1, 6.2, 20)[:, None]
-    radius = FOCAL_PX * RIMS[model][1] * (1 - inwards)
-    return torch.from_numpy(np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth)], axis=-1).reshape(-1, 2))
-
-
-def rim():
-    """Distance from pixels to where their rays are seen; infinite if one has no ray or is not shown."""
-    errors = []
-    for model, (coefficients, _) in RIMS.items():
-        camera, pixels = Camera(100, 100, FOCAL_PX, FOCAL_PX, 0.0, 0.0, model, coefficients), at_the_rim(model)
-        errors.append(most((camera.project(camera.rays(pixels)[0])[0] - pixels).numpy()))
-    return max(errors)
-
-
-def rim_in_float32():
-    """EUCM's closed form."""
-    (alpha, beta), _ = RIMS["eucm"]
-    pixels = at_the_rim("eucm")
-    a, b = (pixels / FOCAL_PX).float().unbind(1)
-    s = beta * (a * a + b * b)
-    z = (1 - alpha * alpha * s) / (alpha * torch.sqrt(1 - (2 * alpha - 1) * s) + 1 - alpha)
-    below = alpha * torch.sqrt(beta * (a * a + b * b) + z * z) + (1 - alpha) * z
-    return most((FOCAL_PX * torch.stack((a / below, b / below), 1) - pixels).numpy())
-
-
-def double_sphere_hidden(shown):
-    """Directions up to 0.001 degrees before the image of a double sphere folds, that are said not to be seen."""
-    (xi, alpha), _ = RIMS["double_sphere"]
-    off_axis = np.deg2rad(np.linspace(0.0, 180.0, 180_001))
-    second = xi + np.cos(off_axis)
-    radius = np.sin(off_axis) / (alpha * np.hypot(np.sin(off_axis), second) + (1 - alpha) * second)
-    off_axis = off_axis[: np.argmax(np.diff(radius) < 0)]
-    return int((~shown(np.stack([np.sin(off_axis), 0 * off_axis, np.cos(off_axis)], axis=1), xi, alpha)).sum())
-
-
-def projected(points, *coefficients):
-    camera = Camera(100, 100, FOCAL_PX, FOCAL_PX, 0.0, 0.0, "double_sphere", coefficients)
-    return camera.project(torch.from_numpy(points))[0].isfinite().all(dim=1).numpy()
-
-
-def by_the_paper(points, xi, alpha):
-    """z > -w2 |p| as Usenko et al. 2018 give it."""
-    w1 = (1 - alpha) / alpha
-    return points[:, 2] > -(w1 + xi) / np.sqrt(2 * w1 * xi + xi * xi + 1)
-
-
 def folds(name, model, naive_way, naive_fails):
     """The cases of one lens with a fold."""
     return [
@@ -201,10 +128,4 @@ CASES = [
     *folds("Kannala-Brandt", "kannala_brandt", "kornia", False),
     Case("fisheye at 90 degrees off its axis and beyond", "longdouble", "rad", 1e-11, fisheye_angles,
          "kornia", fisheye_angles_kornia),
-    Case("z-depth at 90 degrees and beyond", "no point", "points made", 0, z_depth_sideways,
-         "ray times depth / z", z_depth_by_division),
-    Case("unified models at their rim", "closed form, and back", "px", 1e-9, rim, "EUCM in float32", rim_in_float32),
-    Case("double sphere up to its fold", "every one is seen", "of 123,237 hidden", 0,
-         partial(double_sphere_hidden, projected), "the limit of its paper",
-         partial(double_sphere_hidden, by_the_paper)),
 ]  # fmt: skip
