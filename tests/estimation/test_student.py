@@ -55,17 +55,6 @@ def test_ends_are_students_t_on_a_scale_without_bounds(quantity, is_difference, 
         assert found == pytest.approx(twin(value, error, freedom, quantity, is_difference), rel=1e-4)
 
 
-def test_intervals_are_mirrored_and_scaled_with_their_numbers():
-    low, high = interval95(0.3, 0.05, 10, BLIND)
-    seen_low, seen_high = interval95(0.7, 0.05, 10, SHARE)
-    assert (low, high) == pytest.approx((1 - seen_high, 1 - seen_low), rel=1e-12)
-    metres, feet = (interval95(scale * 2.0, scale * 0.3, 10, RADIUS) for scale in (1.0, 3.2808))
-    assert feet == pytest.approx([3.2808 * end for end in metres], rel=1e-12)
-    for quantity in (RADIUS, SHARE):
-        ends, mirrored = (interval95(sign * 0.2, 0.05, 10, quantity, is_difference=True) for sign in (1, -1))
-        assert mirrored == pytest.approx((-ends[1], -ends[0]), rel=1e-12)
-
-
 def test_a_difference_is_significant_just_where_its_interval_does_not_hold_0():
     for quantity in (RADIUS, SHARE):
         for value in np.linspace(-0.3, 0.3, 61).tolist():

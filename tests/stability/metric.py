@@ -70,14 +70,6 @@ def seen_once(search):
     return most(found.radius.flatten().cpu().numpy() - [0.25, 0.75]) if right else np.inf
 
 
-def few_and_many(search):
-    """A step with one point at 0.8 m, and a step with a thousand at 0.2 m: the mean of means is 0.5 m."""
-    metric = search.metric(row_of_cells(1))
-    for count, radius_m in ((1, 0.8), (1000, 0.2)):
-        metric.update(search.cloud([0.5, 0.5, 0.0]), search.cloud([[0.5, 0.5, radius_m]] * count))
-    return most(metric.compute().radius.item() - (float(np.float32(0.8)) + float(np.float32(0.2))) / 2)
-
-
 @lru_cache
 def crowd(count):
     heights = np.random.default_rng(1).uniform(0.0, 1.0, count).astype(np.float32)
@@ -296,8 +288,6 @@ CASES = [
     crowded(200_000),
     Case("a cell seen once in 4096 steps", "closed form", "m", 0.0, seen_once,
          "divided by all steps", lambda: 0.75 - 0.75 / 4096),
-    Case("1 point in one step, 1,000 in another", "closed form", "m", 1e-15, few_and_many,
-         "mean over all points", lambda: 0.5 - (0.8 + 1000 * 0.2) / 1001),
     Case("points on borders of 0.1 m cells, float64", "fractions", "of 123 wrong", 0,
          partial(on_borders, torch.float64),
          "floor(x / 0.1)", partial(on_borders_by_quotients, torch.float64)),
