@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from torchcover.cameras import decode_carla, read_depth
-from torchcover.files import BadFileError, exr_image
+from torchcover.cameras.isolated_images import exr_image
+from torchcover.files import BadFileError
 
 
 def encode_carla(metres, order):

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch.utils.tensorboard import SummaryWriter
 
-from torchcover.files import data_frame
+from torchcover.notebooks import data_frame
 from torchcover.training import log_result
 
 

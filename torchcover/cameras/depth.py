@@ -13,7 +13,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchcover.files import DEFLATE_MAX_RATIO, NpyHeader, check_memory, exr_image, png_image, read_npy, reads
+from torchcover.cameras.isolated_images import exr_image, png_image
+from torchcover.files import DEFLATE_MAX_RATIO, NpyHeader, check_memory, read_npy, reads
 
 CARLA_FAR_M = 1000.0
 _CARLA_FULL_CODE = 2**24 - 1

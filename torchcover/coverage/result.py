@@ -23,7 +23,8 @@ from torchcover.coverage.region_sums import PlaceNumbers, PlaceSums
 from torchcover.coverage.regions import Places, Region, check_regions, regions_within, shown_places
 from torchcover.coverage.summary import RegionSummary, summarise
 from torchcover.estimation import Estimate, Quantity
-from torchcover.files import data_frame, data_set, small_html, write_atomically
+from torchcover.files import write_atomically
+from torchcover.notebooks import data_frame, data_set, small_html
 
 if TYPE_CHECKING:
     import pandas

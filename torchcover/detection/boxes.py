@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from torchcover.devices import move
-from torchcover.files import brief
 from torchcover.geometry.arrays import Float64
 from torchcover.geometry.rigid import Matrix, transform
 from torchcover.neighbors import check_tensor
+from torchcover.notebooks import brief
 
 # The middles of what labels of KITTI call fully visible, partly and largely occluded, which has no numbers for them: by
 # the borders of nuScenes, whose second and third level are one here.

@@ -10,8 +10,8 @@ from torch import Tensor
 from torchcover.detection.boxes import Boxes, check_boxes
 from torchcover.detection.inside import points_in_boxes
 from torchcover.devices import has_float64, move
-from torchcover.files import brief
 from torchcover.neighbors import blind_spot_radius, check_cloud, check_weights
+from torchcover.notebooks import brief
 
 # The sides of a box that face this height above the vehicle's origin can be seen; so many points across each.
 SEEN_FROM_M, SIDE_POINTS = 1.7, 12

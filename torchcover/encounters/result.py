@@ -15,7 +15,8 @@ from torchcover.encounters.criterion import Criterion
 from torchcover.encounters.sighting import Sighting
 from torchcover.encounters.traffic import WHO, Approach
 from torchcover.estimation import Estimate, Number, Quantity
-from torchcover.files import csv_text, data_frame, small_html
+from torchcover.files import csv_text
+from torchcover.notebooks import data_frame, small_html
 from torchcover.report import PageTable, Words, draw_encounters, json_record, percent
 
 if TYPE_CHECKING:

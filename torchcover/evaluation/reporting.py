@@ -26,7 +26,8 @@ from torchcover.evaluation.target_survey import (
     target_verdict,
 )
 from torchcover.evaluation.task import AnyRig, AnyScenario, distinct_names, loaded, simulation
-from torchcover.files import AtomicOutput, small_html
+from torchcover.files import AtomicOutput
+from torchcover.notebooks import small_html
 from torchcover.report import Page, escaped, file_stems, on_range, page_html, ranges_of, too_few
 from torchcover.simulation import Rig
 from torchcover.simulation.scenario import Mover

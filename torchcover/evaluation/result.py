@@ -27,7 +27,8 @@ from torchcover.evaluation.result_page import (
 )
 from torchcover.evaluation.settings import FILES, wanted_files
 from torchcover.evaluation.target_error import TargetError, outcome
-from torchcover.files import AtomicOutput, data_frame, small_html
+from torchcover.files import AtomicOutput
+from torchcover.notebooks import data_frame, small_html
 from torchcover.report import (
     RENDERERS,
     CoverageTable,

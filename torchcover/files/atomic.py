@@ -135,16 +135,8 @@ def matches_entry(path: Path, entry: Mapping[str, Any]) -> bool:
 
 def find_changed(folder: Path, files: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """Find the listed files that are missing, no regular files, or of another size."""
-    changed = []
-    for name, entry in files.items():
-        try:
-            status = (folder / name).stat()
-        except OSError:
-            changed.append(name)
-            continue
-        if not stat.S_ISREG(status.st_mode) or status.st_size != entry["bytes"]:
-            changed.append(name)
-    return changed
+    sizes = {name: os.path.getsize(folder / name) if os.path.isfile(folder / name) else None for name in files}
+    return [name for name, size_bytes in sizes.items() if size_bytes != files[name]["bytes"]]
 
 
 def check_listed(path: Path) -> None:

@@ -1,10 +1,9 @@
 """The door of the readers: what is refused unread, the memory a file may take, and the one error that leaves it."""
 
-import math
 import os
 import stat
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import wraps
 from pathlib import Path
 from typing import Concatenate, ParamSpec, TypeVar
@@ -15,6 +14,8 @@ from torchcover.files.atomic import check_listed
 
 Arguments = ParamSpec("Arguments")
 Content = TypeVar("Content")
+Reader = Callable[Concatenate[Path, Arguments], Content]
+Door = Callable[Concatenate[str | os.PathLike[str], Arguments], Content]
 
 common_link_roots: list[Path] = []  # folders that links in any recording may lead to
 _link_roots: dict[Path, list[Path]] = {}  # folders that links in each recording may lead to
@@ -39,12 +40,7 @@ class BadFileError(ValueError):
     """
 
 
-def reads(
-    content: str,
-) -> Callable[
-    [Callable[Concatenate[Path, Arguments], Content]],
-    Callable[Concatenate[str | os.PathLike[str], Arguments], Content],
-]:
+def reads(content: str) -> Callable[[Reader[Arguments, Content]], Door[Arguments, Content]]:
     """Make a function the door through which one kind of file is read.
 
     The function gets the path of a regular file that is not empty. It says what is wrong as a ValueError that does not
@@ -73,9 +69,7 @@ def reads(
         7.5
     """
 
-    def decorate(
-        read: Callable[Concatenate[Path, Arguments], Content],
-    ) -> Callable[Concatenate[str | os.PathLike[str], Arguments], Content]:
+    def decorate(read: Reader[Arguments, Content]) -> Door[Arguments, Content]:
         @wraps(read)
         def door(path: str | os.PathLike[str], *args: Arguments.args, **kwargs: Arguments.kwargs) -> Content:
             path = Path(path)
@@ -124,10 +118,8 @@ def find_link_roots(recording: Path) -> list[Path]:
 
 def _check_links(path: Path) -> None:
     for recording, roots in _link_roots.items():
-        if not path.absolute().is_relative_to(recording):
-            continue
         target = path.resolve()
-        if not any(target.is_relative_to(root) for root in roots):
+        if path.absolute().is_relative_to(recording) and not any(target.is_relative_to(root) for root in roots):
             raise ValueError(
                 f"a link to {target}, outside of the recording; to read it: torchcover --allow-links FOLDER ..."
             )
@@ -179,14 +171,11 @@ def said_gb(variable: str, usual_gb: float) -> float:
 
     ValueError: it is no number of at least 0.
     """
-    given = os.environ.get(variable)
-    try:
-        said = usual_gb if given is None else float(given)
-    except ValueError:
-        said = math.nan
-    if not said >= 0:
-        raise ValueError(f"the environment variable {variable} has to be a number of gigabytes; got {given!r}")
-    return said
+    given = os.environ.get(variable, usual_gb)
+    with suppress(ValueError):
+        if (limit_gb := float(given)) >= 0:
+            return limit_gb
+    raise ValueError(f"the environment variable {variable} has to be a number of gigabytes; got {given!r}")
 
 
 def decode(data: bytes) -> str:

@@ -1,12 +1,11 @@
 """YAML and XML without their traps: every key once, numbers that look like numbers, no entities, and an end."""
 
 import re
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar, NoReturn
+from typing import Any, ClassVar
 from xml.etree import ElementTree
-from xml.parsers import expat
 
 import yaml
 from yaml.constructor import ConstructorError
@@ -68,11 +67,8 @@ def parse_yaml_stream(text: str) -> list[Any]:
     Raises:
         ValueError: As `parse_yaml`.
     """
-    return [document for document in _parse(text, _documents) if document is not None]
-
-
-def _documents(text: str, loader_class: type["_Loader"]) -> list[Any]:
-    return list(yaml.load_all(text, loader_class))
+    documents = _parse(text, lambda text, loader: list(yaml.load_all(text, loader)))
+    return [document for document in documents if document is not None]
 
 
 def builtin_folder(kind: str) -> Path:
@@ -203,7 +199,6 @@ def _quoted(value: Any) -> str:  # noqa: ANN401
 
 # A tree of elements takes about so many times the bytes of its text.
 TREE_PER_BYTE = 20
-PIECE_BYTES = 1 << 18
 
 
 def parse_xml(path: Path) -> ElementTree.Element:
@@ -216,39 +211,3 @@ def parse_xml(path: Path) -> ElementTree.Element:
     if "<!ENTITY" in text:
         raise ValueError("an XML file without entities is needed")
     return ElementTree.fromstring(text)  # which resolves nothing that lies outside
-
-
-def read_pieces(path: Path) -> Iterator[bytes]:
-    """Yield a file in pieces of 256 KiB, for `feed_xml`."""
-    with path.open("rb") as file:
-        yield from iter(lambda: file.read(PIECE_BYTES), b"")
-
-
-def feed_xml(
-    pieces: Iterable[bytes], start: Callable[[str, list[str]], None], end: Callable[[str], None] | None = None
-) -> None:
-    """Read XML that may be of any length, one tag after the other; nothing of it is kept.
-
-    `start`: called with the name of each element, and with the names and values of its attributes in turn; what it
-    raises ends the reading. `end`: called with the name at its end. ValueError: not XML, or it declares entities.
-
-    Example:
-        >>> feed_xml([b"<a x='1'", b"><b/></a>"], lambda name, attributes: print(name, attributes))
-        a ['x', '1']
-        b []
-    """
-
-    def refuse(*_: object) -> NoReturn:
-        raise ValueError("an XML file without entities is needed")
-
-    parser = expat.ParserCreate()
-    parser.ordered_attributes = True
-    parser.EntityDeclHandler = refuse
-    parser.StartElementHandler = start
-    parser.EndElementHandler = end
-    try:
-        for piece in pieces:
-            parser.Parse(piece)
-        parser.Parse(b"", True)
-    except expat.ExpatError as error:
-        raise ValueError(f"not XML ({error})") from error

@@ -68,7 +68,7 @@ class _Process:
         self.lock = threading.Lock()
         self._connection, other = Pipe()
         with other:
-            self._popen = subprocess.Popen(
+            self.popen = subprocess.Popen(
                 [sys.executable, "-c", PROGRAM.format(path=sys.path)],
                 stdin=other.fileno(),
                 stdout=subprocess.DEVNULL,  # a library that prints must not answer
@@ -77,21 +77,17 @@ class _Process:
                 preexec_fn=end_with_parent(),  # noqa: PLW1509  (it calls prctl only)
             )
 
-    def is_alive(self) -> bool:
-        return self._popen.poll() is None
-
     def ask(self, request: list[Any], limit_s: float) -> Arrays:
-        with self.lock, reporting_stopped([self._popen.pid], "the process that reads files"):
+        with self.lock, reporting_stopped([self.popen.pid], "the process that reads files"):
             try:
                 self._connection.send_bytes(json.dumps(request).encode())
                 answer, arrays = _receive(self._connection, limit_s)
             except (ConnectionError, EOFError, TimeoutError) as error:
-                late, stopped = isinstance(error, TimeoutError), is_stopped(self._popen.pid)
+                late, stopped = isinstance(error, TimeoutError), is_stopped(self.popen.pid)
                 self.end()
                 if stopped:
-                    raise ValueError(
-                        f"the process that reads it was stopped for {limit_s:.0f} s; read it again"
-                    ) from error
+                    reason = f"the process that reads it was stopped for {limit_s:.0f} s; read it again"
+                    raise ValueError(reason) from error
                 ended = f"it took more than {limit_s:.0f} s" if late else "the library that reads it crashed"
                 raise ValueError(f"{ended}; the file is damaged, or not what its name says") from error
             except BaseException:  # such as Ctrl-C: an answer that nobody waits for must not be the next one's
@@ -103,9 +99,9 @@ class _Process:
         return arrays
 
     def end(self) -> None:
-        self._popen.kill()
+        self.popen.kill()
         self._connection.close()
-        self._popen.wait()
+        self.popen.wait()
 
 
 def _receive(connection: Connection, limit_s: float) -> tuple[list[str] | None, Arrays]:
@@ -128,7 +124,7 @@ def _own_process() -> _Process:
     """That of this process: a forked one, such as a worker of a DataLoader, has its own."""
     with _starting:
         found = _processes.get(os.getpid())
-        if found is None or not found.is_alive():
+        if found is None or found.popen.poll() is not None:
             _processes[os.getpid()] = found = _Process()
             atexit.register(found.end)
         return found
@@ -146,7 +142,8 @@ def serve() -> None:
             error, arrays = None, Arrays()
             try:
                 read = unwrap(getattr(import_module(module), name))  # or it would ask another process
-                arrays = {key: _plain(array) for key, array in read(Path(path), *args).items()}
+                for key, array in read(Path(path), *args).items():
+                    arrays[key] = np.ascontiguousarray(array.astype(str) if array.dtype.hasobject else array)
                 check_memory(sum(array.nbytes for array in arrays.values()))
             except Exception as raised:
                 error, arrays = _describe(raised, path), {}
@@ -160,50 +157,9 @@ def serve() -> None:
                 os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
 
 
-def _plain(array: NDArray[Any]) -> NDArray[Any]:
-    """Of numbers or text, in one piece."""
-    return np.ascontiguousarray(array.astype(str) if array.dtype.hasobject else array)
-
-
 def _describe(error: Exception, path: str) -> list[str]:
     """Name the type of an error, if it is one of `KNOWN_ERRORS`, and its message."""
     if isinstance(error, ModuleNotFoundError):  # which no reader has met with words of its own
         return ["ImportError", f"{path}: {error.name} is needed to read it: pip install {error.name}"]
     known = next((kind.__name__ for kind in type(error).__mro__ if kind.__name__ in KNOWN_ERRORS), "")
     return [known, str(error) if known else f"{type(error).__name__}: {error}"]
-
-
-@apart
-def exr_image(path: Path, bytes_per_pixel: int) -> dict[str, NDArray[Any]]:
-    """(H, W) `pixels` of an EXR image with one channel, each of which may take so much memory."""
-    try:
-        import OpenEXR  # type: ignore[import-not-found, unused-ignore]
-    except ImportError as error:
-        raise ImportError(f"{path}: reading EXR needs the package OpenEXR: pip install 'torchcover[exr]'") from error
-    # The header alone first: with the pixels, memory is reserved for as many as it claims.
-    with OpenEXR.File(str(path), header_only=True) as file:
-        headers = [file.header(part) for part in range(len(file.parts))]
-        channels = [channel.name for header in headers for channel in header["channels"]]
-        if len(channels) != 1:
-            raise ValueError(f"a depth EXR has one channel; got {', '.join(channels)[:80] or 'none'}")
-        low, high = headers[0]["dataWindow"]
-        width, height = (int(last) - int(first) + 1 for first, last in zip(low, high, strict=True))
-    check_memory(width * height * bytes_per_pixel)
-    with OpenEXR.File(str(path)) as file:
-        # It prints what is wrong with the pixels, and leaves them out.
-        values = [np.array(channel.pixels) for part in file.parts for channel in part.channels.values()]
-    if len(values) != 1 or values[0].shape != (height, width):
-        raise ValueError(f"truncated or damaged: {width}x{height} pixels are claimed and cannot be read")
-    return {"pixels": values[0]}
-
-
-@apart
-def png_image(path: Path) -> dict[str, NDArray[Any]]:
-    """Read the `pixels` of a PNG image, whose header was checked before."""
-    from PIL import Image
-
-    try:
-        with Image.open(path, formats=["PNG"]) as image:
-            return {"pixels": np.asarray(image)}
-    except (OSError, SyntaxError) as error:  # the latter is Pillow's for chunks that do not hold together
-        raise ValueError(f"truncated or damaged: {error}") from error

@@ -8,7 +8,7 @@ import re
 import warnings
 import zipfile
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -44,9 +44,7 @@ def as_cell(value: object) -> object:
         >>> as_cell("=1+1"), as_cell(-1.5)
         ("'=1+1", -1.5)
     """
-    if not isinstance(value, str):
-        return value
-    return f"{QUOTE * _is_formula(value)}{shown(value)}"
+    return f"{QUOTE * _is_formula(value)}{shown(value)}" if isinstance(value, str) else value
 
 
 def of_cell(text: str) -> str:
@@ -126,12 +124,10 @@ def _check_names(names: Sequence[str], needed: Sequence[str], optional: Sequence
 
 
 def _finite(name: str, words: Sequence[str], lines: Sequence[int]) -> NDArray[np.float64]:
-    try:
+    with suppress(ValueError):
         values = np.array(words, dtype=np.float64)
         if np.isfinite(values).all():
             return values
-    except ValueError:
-        pass
     line, word = next((line, word) for line, word in zip(lines, words, strict=True) if not _is_finite(word))
     raise ValueError(f"line {line}: {name}: a finite number is needed; got {word[:80]!r}")
 
@@ -175,10 +171,7 @@ def read_json_table(path: Path) -> JsonTable:
 DEFLATE_MAX_RATIO = 1032
 # How often its compressed size a member can have.
 MAX_RATIOS = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: DEFLATE_MAX_RATIO}
-_HEADER_READERS = {
-    (1, 0): np.lib.format.read_array_header_1_0,
-    (2, 0): np.lib.format.read_array_header_2_0,
-}
+_HEADER_READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
 class NpyHeader(NamedTuple):
@@ -284,7 +277,7 @@ def _load(open_stream: Callable[[], IO[bytes]], size_bytes: int, check: Callable
     if claimed_bytes != data_bytes:
         raise ValueError(f"the header claims {shape} {dtype} = {claimed_bytes} bytes; {data_bytes} bytes follow it")
     check_memory(2 * claimed_bytes)  # whoever takes some columns copies them
-    with open_stream() as stream, _quiet():
+    with open_stream() as stream, warnings.catch_warnings(action="ignore"):
         array: NDArray[Any] = np.lib.format.read_array(stream, allow_pickle=False)
     return array
 
@@ -295,16 +288,9 @@ def _npy_header(stream: IO[bytes]) -> NpyHeader:
         version = np.lib.format.read_magic(stream)
         if version not in _HEADER_READERS:
             raise ValueError(f"version {version[0]}.{version[1]} of the format")
-        with _quiet():
+        # NumPy warns of headers that Python 2 wrote (they read well), and Python of doubtful literals in them.
+        with warnings.catch_warnings(action="ignore"):
             shape, _, dtype = _HEADER_READERS[version](stream)
     except Exception as error:
         raise ValueError(f"not a readable .npy header ({error})") from error
     return NpyHeader(shape, dtype)
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Silence NumPy on headers that Python 2 wrote (they read well) and Python on doubtful literals in them."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchcover.coverage.grid import BandFrame
 from torchcover.detection.boxes import Boxes
 from torchcover.devices import move
-from torchcover.files import brief
+from torchcover.notebooks import brief
 
 
 class Measured(NamedTuple):

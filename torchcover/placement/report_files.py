@@ -16,8 +16,9 @@ from torchcover.evaluation import sensor_views
 from torchcover.evaluation.progress import held_back
 from torchcover.evaluation.result_page import rig_document, words_of
 from torchcover.evaluation.settings import FILES, wanted_files
-from torchcover.files import AtomicOutput, csv_text, data_frame, small_html
+from torchcover.files import AtomicOutput, csv_text
 from torchcover.geometry.arrays import Float64
+from torchcover.notebooks import data_frame, small_html
 from torchcover.placement.validation import replace_nan
 from torchcover.report import Page, PagePicture, PageRig, PageTable, page_html
 from torchcover.simulation import Rig

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.coverage import BevGrid
-from torchcover.files import data_set, small_html
 from torchcover.geometry import BoundingBox
 from torchcover.geometry.arrays import Bools, Float64, Int64
+from torchcover.notebooks import data_set, small_html
 from torchcover.report import draw_targets, percent
 from torchcover.targets.placing import SIDES, Heading, Raster, from_outline_m, side_of
 

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from torchcover.files import feed_xml, read_pieces, reads
+from torchcover.files import reads
 from torchcover.simulation.sumo.floating import Recorded, SumoTrack
 from torchcover.simulation.sumo.motion import RoadUser
-from torchcover.simulation.sumo.network import pair_attributes
+from torchcover.simulation.sumo.network import feed_xml, pair_attributes, read_pieces
 from torchcover.simulation.traffic.assemble import HORIZON_M
 from torchcover.simulation.traffic.fleet import CATEGORIES, EGO, Fleet, VehicleType
 

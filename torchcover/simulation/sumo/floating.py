@@ -8,8 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchcover.files import feed_xml, read_pieces, reads
+from torchcover.files import reads
 from torchcover.geometry.arrays import Float64
+from torchcover.simulation.sumo.network import feed_xml, read_pieces
 
 ATTRIBUTES = "id,x,y,z,angle,slope,type"
 # Who is not heard of for longer than this many usual steps, or moves faster than this from one to the next, is gone in

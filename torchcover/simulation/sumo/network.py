@@ -1,18 +1,20 @@
 """Road networks of SUMO: lanes, junctions, connections, and the part of a network near the way of the ego."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, NoReturn
+from xml.parsers import expat
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from torchcover.files import check_memory, feed_xml, read_pieces, reads
+from torchcover.files import check_memory, reads
 from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.simulation.traffic.assemble import HORIZON_M
 
+PIECE_BYTES = 1 << 18
 # Of lanes without a width, as SUMO has it.
 LANE_WIDTH_M = 3.2
 # Nobody is afraid of lanes that are wider; a number beyond is a mistake.
@@ -341,3 +343,39 @@ def _lines(lines_m: Sequence[Float64]) -> NDArray[np.object_]:
 def _polygon(outline_m: Float64) -> shapely.Geometry:
     """What an outline encloses, also one that crosses itself."""
     return shapely.make_valid(shapely.Polygon(outline_m[:, :2]))
+
+
+def read_pieces(path: Path) -> Iterator[bytes]:
+    """Yield a file in pieces of 256 KiB, for `feed_xml`."""
+    with path.open("rb") as file:
+        yield from iter(lambda: file.read(PIECE_BYTES), b"")
+
+
+def feed_xml(
+    pieces: Iterable[bytes], start: Callable[[str, list[str]], None], end: Callable[[str], None] | None = None
+) -> None:
+    """Read XML that may be of any length, one tag after the other; nothing of it is kept.
+
+    `start`: called with the name of each element, and with the names and values of its attributes in turn; what it
+    raises ends the reading. `end`: called with the name at its end. ValueError: not XML, or it declares entities.
+
+    Example:
+        >>> feed_xml([b"<a x='1'", b"><b/></a>"], lambda name, attributes: print(name, attributes))
+        a ['x', '1']
+        b []
+    """
+
+    def refuse(*_: object) -> NoReturn:
+        raise ValueError("an XML file without entities is needed")
+
+    parser = expat.ParserCreate()
+    parser.ordered_attributes = True
+    parser.EntityDeclHandler = refuse
+    parser.StartElementHandler = start
+    parser.EndElementHandler = end
+    try:
+        for piece in pieces:
+            parser.Parse(piece)
+        parser.Parse(b"", True)
+    except expat.ExpatError as error:
+        raise ValueError(f"not XML ({error})") from error

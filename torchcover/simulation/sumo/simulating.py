@@ -18,9 +18,10 @@ from typing import IO, Literal
 from xml.etree import ElementTree
 from xml.sax.saxutils import quoteattr
 
-from torchcover.files import end_with_parent, feed_xml, most_gb, parse_xml, read_pieces, reads, reporting_stopped
+from torchcover.files import end_with_parent, most_gb, parse_xml, reads, reporting_stopped
 from torchcover.files.bad_file import VARIABLE
 from torchcover.simulation.sumo.floating import ATTRIBUTES
+from torchcover.simulation.sumo.network import feed_xml, read_pieces
 from torchcover.simulation.traffic.assemble import HORIZON_M
 
 # The elements of a network and of traffic demand. SUMO would take detectors, calibrators, rerouters, timed events and

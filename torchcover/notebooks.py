@@ -9,7 +9,7 @@ from io import BytesIO
 from reprlib import Repr
 from typing import TYPE_CHECKING, Any
 
-from torchcover.files.tables import shown
+from torchcover.files import shown
 
 if TYPE_CHECKING:
     import pandas
