@@ -208,7 +208,7 @@ def test_a_pose_that_jumps_ends_the_window():
 @pytest.mark.parametrize("steps", [1, 2])
 def test_a_drive_of_hardly_any_sweeps(steps):
     drive = Drive(steps=steps, labelled=False)
-    frames = RecordedFrames(drive, rigs={"left": ("left",)}, reference=AccumulatedReference(2.0))
+    frames = RecordedFrames(drive, rigs={"left": ("left",)}, reference=AccumulatedReference(2.0, min_motion_m=1.0))
     wall_m = np.concatenate([standing(drive, 0), moving(drive, 0)])
     assert distances_m(frames[0].reference, wall_m).max() < 0.3  # one sweep alone tells no velocity
     assert distances_m(standing(drive, 0), frames[0].reference).max() < 0.1
@@ -223,7 +223,7 @@ class Standing(Drive):
 
 def test_a_vehicle_that_stands_sees_what_moves_move():
     drive = Standing(steps=12, labelled=False)
-    frame = RecordedFrames(drive, reference=AccumulatedReference(10.0, voxel_m=0.05))[6]
+    frame = RecordedFrames(drive, reference=AccumulatedReference(10.0, voxel_m=0.05, min_motion_m=0.0))[6]
     here_m = np.concatenate([standing(drive, 6), moving(drive, 6)])
     assert distances_m(frame.reference, here_m).max() < 0.5
     assert distances_m(standing(drive, 6), frame.reference).max() < 1e-3

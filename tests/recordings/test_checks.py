@@ -1,7 +1,8 @@
 """Each check reports its fault, and none reports a recording without faults."""
 
 import re
-from dataclasses import dataclass
+import warnings
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -178,18 +179,58 @@ def test_a_run_warns_before_it_begins():
     assert [warning.filename for warning in caught] == [__file__]
 
 
-def test_a_vehicle_that_stands_is_no_judge_of_its_own_sensors():
-    def doubts(way_m, sensors=None, steps=30):
-        drive = Drive(steps=steps, labelled=False)
-        drive.rigs = {"one": ("right",)}
-        place = drive.world_T_vehicle
-        drive.world_T_vehicle = lambda index: rigid(np.eye(3), place(index)[:3, 3] * way_m / 1.5)
-        told = RecordedFrames(drive, reference=AccumulatedReference(2.0, sensors=sensors)).doubts()
-        return [doubt for doubt in told if "the vehicle stands" in doubt]
+class Striped(Drive):
+    """A sensor that sees stripes of a wall, 3 m of each 6 m; the drive stands for `standing` instants, then it moves."""
 
-    (told,) = doubts(0.0)
-    assert "stands in 5 of 5 windows" in told
-    assert doubts(0.01)
-    assert not doubts(1.5)
-    assert not doubts(0.0, sensors=("left",))  # another one judges
-    assert not doubts(0.0, steps=2)  # too short a time to say so
+    standing = 0
+
+    def __post_init__(self):
+        super().__post_init__()
+        self.wall_m[:, 1] = 4.01
+        self.back_m, self.rigs, self.labelled = np.empty((0, 3)), {"one": ("right",)}, False
+
+    def world_T_vehicle(self, index):
+        return rigid(np.eye(3), [0.5 * max(0, index - self.standing), 0.0, 0.0])
+
+    def scan(self, sensor, index):
+        scan = super().scan(sensor, index)
+        points_m = transform(scan.vehicle_T_sensor, scan.points_m)
+        return replace(scan, points_m=scan.points_m[points_m[:, 0] % 6.0 < 3.0])
+
+    def share_near_stripes(self, index):
+        """The share of the wall 0 to 20 m ahead whose middle is within 0.4 m of a point of the scan."""
+        wall_m = transform(invert(self.world_T_vehicle(index)), self.wall_m)
+        wall_m = wall_m[(wall_m[:, 0] >= 0) & (wall_m[:, 0] < 20)]
+        seen = self.scan("right", index)
+        apart_m = np.linalg.norm(wall_m[:, None] - transform(seen.vehicle_T_sensor, seen.points_m), axis=2)
+        return (apart_m.min(axis=1) < 0.4).mean()
+
+
+def test_a_vehicle_that_stands_still_has_no_reference_of_its_own():
+    def measure(drive, **options):
+        frames = RecordedFrames(drive, reference=AccumulatedReference(2.0, **options))
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            result = torchcover.evaluate(frames=frames, cell_m=2.0)
+        told = [str(warning.message) for warning in caught if "the vehicle moves less" in str(warning.message)]
+        return result.coverage.scalars()["detection_0.4m/20m/obstacle"], result.run.counts["reference_standing"], told
+
+    drive = Striped(steps=30)
+    right = np.mean([drive.share_near_stripes(index) for index in range(30)])
+    moving, standing, told = measure(drive)
+    assert abs(moving - right) < 0.03 < 1 - right
+    assert (standing, told) == (0, [])
+
+    drive.standing = 30
+    value, standing, told = measure(drive)
+    assert np.isnan(value)
+    assert standing == 30
+    assert "less than 2 m within 2 s in 30 of 30 frames, so there is no coverage" in told[0]
+    assert measure(drive, sensors=("left",))[1:] == (0, [])  # another sensor is the reference
+
+    drive = Striped(steps=60)
+    drive.standing = 30
+    value, standing, told = measure(drive)
+    assert abs(value - right) < 0.03
+    assert 20 <= standing < 30  # some windows reach into the drive
+    assert f"in {standing} of 60 frames, which count nowhere" in told[0]

@@ -34,7 +34,8 @@ class RecordedFrames(FrameDataset):
 
     Points that are not finite, never came back (they lie in the sensor) or lie on the vehicle itself are in neither
     cloud; `Frame.counts` says how many (`sensor_nonfinite`, `reference_no_return`, ...). An empty sensor cloud is a
-    blind step; an empty reference cloud is an error, for nothing was measured.
+    blind step; an empty reference cloud is an error, for nothing was measured, unless the vehicle stands still in the
+    window of an `AccumulatedReference`: such a frame says nothing, and `Frame.counts` has `reference_standing`.
 
     Args:
         recording: A recording, or the path of one; see `open_recording`.
@@ -134,15 +135,18 @@ class RecordedFrames(FrameDataset):
         return False
 
     def has_heights(self) -> bool:
-        """Whether the first frame that can be read has any, recorded or above ground that was found."""
+        """Whether the first frame with a reference that can be read has any, recorded or above ground that was found."""
         for position in range(len(self) if self._has_heights is None else 0):
+            if self._is_standing(position):
+                continue
             try:
                 heights_m = self[position].reference_heights_m
             except BadFrameError:
                 continue  # whoever measures it will say so
             self._has_heights = heights_m is not None and bool(heights_m.isfinite().any())
             break
-        return bool(self._has_heights)
+        self._has_heights = bool(self._has_heights)
+        return self._has_heights
 
     def doubts(self, steps: int | None = None) -> Sequence[str]:
         """Faults of the recording with their remedies, as `torchcover.recordings.checks` finds them."""
@@ -253,6 +257,13 @@ class RecordedFrames(FrameDataset):
         first = dict(zip(reversed(places), reversed(windows.tolist()), strict=True))  # of an instant that is seen again
         _, ranks = np.unique([first[place] for place in places], return_inverse=True)
         return [int(rank) for rank in ranks]
+
+    def _is_standing(self, position: int) -> bool:
+        """Return whether the vehicle stands still in the window of a frame, which has no reference points then."""
+        reference, instant = self.reference, self.recording.frames[position]
+        return isinstance(reference, AccumulatedReference) and reference.is_standing(
+            self.recording, instant, self._judged
+        )
 
     def _read(self, sensor: str, instant: int) -> InVehicle:
         return in_vehicle(self.recording.scan(sensor, instant), self.recording.body)

