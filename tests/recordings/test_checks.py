@@ -180,7 +180,7 @@ def test_a_run_warns_before_it_begins():
 
 
 class Striped(Drive):
-    """A sensor that sees stripes of a wall, 3 m of each 6 m; the drive stands for `standing` instants, then it moves."""
+    """A sensor that sees stripes of a wall, 3 m of each 6 m; the vehicle stands for `standing` instants, then moves."""
 
     standing = 0
 

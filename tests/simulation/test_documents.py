@@ -7,6 +7,7 @@ import pytest
 
 from torchcover import Rig, Scenario
 from torchcover.cameras.calibration import read_opencv, read_ros
+from torchcover.recordings.formats import read_objects
 from torchcover.recordings.formats.folder import read_folder_settings
 from torchcover.recordings.settings import Mount
 from torchcover.simulation import Lidar, LidarModel, Pose, builtin_names
@@ -228,6 +229,34 @@ def test_an_unknown_name_gets_the_nearest_and_no_list(name):
     with pytest.raises(FileNotFoundError, match=r"neither a \.yaml file nor one of the built-in rigs; is '") as caught:
         Rig.load(name)
     assert len(str(caught.value)) < 250
+
+
+@pytest.mark.parametrize(
+    ("load", "name", "told"),
+    [
+        (Scenario.load, "cut_in.xosc", "one of the scenarios is a .yaml file; OpenSCENARIO is not read"),
+        (Scenario.load, "road.xodr", r"name it in a scenario, traffic: \{type: sumo, net"),
+        (Scenario.load, "town.net.xml", "a network of SUMO by traffic"),
+        (Vehicle.load, "car.FBX", "export it as GLB"),
+        (Vehicle.load, "car.usdz", "export it as GLB"),
+        (Vehicle.load, "car.stp", "CAD: export it as GLB"),
+        (Vehicle.load, "car.glb", r"shape: \{type: mesh"),
+        (Rig.load, "model.sdf", "convert SDF into a URDF"),
+        (Rig.load, "robot.urdf", "`torchcover robot` reads a URDF"),
+        (read_objects, "cut_in.xosc", "OpenSCENARIO is not read.*; recorded tracks are"),
+    ],
+)
+def test_a_file_of_another_format_is_refused_with_the_conversion_that_helps(tmp_path, load, name, told):
+    (tmp_path / name).write_text("<OpenSCENARIO/>")
+    with pytest.raises(ValueError, match=f"{name}: .*{told}"):
+        load(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", ["map.osm", "cut_in.xosc"])
+def test_a_network_of_another_format_is_refused_with_the_conversion_that_helps(tmp_path, name):
+    scenario = f"{{name: s, traffic: {{type: sumo, net: {name}, fcd: fcd.xml}}}}"
+    with pytest.raises(ValueError, match=r"a network is a \.net\.xml or \.xodr file; Open"):
+        Scenario.load(write(tmp_path, scenario)).world()
 
 
 def test_a_quaternion_and_angles_describe_the_same_pose():

@@ -135,7 +135,7 @@ class RecordedFrames(FrameDataset):
         return False
 
     def has_heights(self) -> bool:
-        """Whether the first frame with a reference that can be read has any, recorded or above ground that was found."""
+        """Whether the first frame that can be read and has a reference has any, recorded or above a ground model."""
         for position in range(len(self) if self._has_heights is None else 0):
             if self._is_standing(position):
                 continue

@@ -23,7 +23,7 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails
 
-from torchcover.files import BadFileError, parse_yaml, read_short_text, reads
+from torchcover.files import BadFileError, find_remedy, parse_yaml, read_short_text, reads
 from torchcover.geometry import rigid, rotation_from_euler, rotation_from_quaternion
 from torchcover.geometry.arrays import Float64
 from torchcover.geometry.rigid import warn_of_radians
@@ -367,11 +367,14 @@ def nearest(name: str, known: Sequence[str]) -> str:
 def found(kind: str, path_or_name: str | Path) -> Path:
     """Where a document is: a path that ends in .yaml or .yml, or a built-in one of a kind by its name.
 
-    FileNotFoundError: no built-in one of this name; the message says the nearest.
+    FileNotFoundError: no built-in one of this name; the message says the nearest. BadFileError: a file of another
+    format; the message says how to use it.
     """
     path = Path(path_or_name)
     if is_file_name(path):
         return path
+    if remedy := find_remedy(path):
+        raise BadFileError(f"{path}: one of the {kind} is a .yaml file; {remedy}")
     builtin = builtin_folder(kind) / f"{path_or_name}.yaml"
     if path.name != str(path_or_name) or not builtin.is_file():
         kinds = [other for other in ("rigs", "scenarios", "vehicles", "encounters", "requirements") if other != kind]

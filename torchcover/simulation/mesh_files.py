@@ -13,7 +13,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.files import apart, check_memory, check_regular
+from torchcover.files import apart, check_memory, check_regular, find_remedy
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -154,8 +154,7 @@ def mesh_arrays(path: Path) -> dict[str, NDArray[Any]]:
         package = PACKAGES.get(module, module)
         raise ImportError(f"{path}: {path.suffix} needs {module}: pip install {package}") from error
     except NotImplementedError as error:
-        is_robot = path.suffix.lower() in (".urdf", ".xacro", ".sdf")
-        remedy = "`torchcover robot` reads a URDF" if is_robot else "export it as GLB, OBJ, PLY or STL, as by Blender"
+        remedy = find_remedy(path) or "export it as GLB, OBJ, PLY or STL, as by Blender"
         raise ValueError(f"{path.suffix or 'a file without a suffix'} is no mesh that can be read; {remedy}") from error
     except Exception as error:  # trimesh raises whatever the reader of the format raises
         raise ValueError(f"trimesh cannot read it as a mesh ({error})") from error

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import ValidationError
 from scipy.spatial import cKDTree
 
-from torchcover.files import AtomicOutput, as_yaml, parse_xml, reads
+from torchcover.files import AtomicOutput, as_yaml, find_remedy, parse_xml, reads
 from torchcover.geometry import BoundingBox, rigid, rotation_from_quaternion
 from torchcover.geometry.arrays import Float64
 from torchcover.simulation.bodies import merge
@@ -114,7 +114,7 @@ def read_robot(path: Path, packages: Mapping[str, str | Path] | None = None) -> 
     if any("xacro" in element.tag for element in root.iter()):
         raise ValueError(f"it is xacro, which has to be expanded first: xacro {path.name} > {path.stem}_expanded.urdf")
     if root.tag != "robot" or root.find("link") is None:
-        remedy = "; use the URDF that the SDF was made from, or convert it, as by sdformat_urdf" * (root.tag == "sdf")
+        remedy = f"; {find_remedy('robot.sdf')}" * (root.tag == "sdf")
         raise ValueError(f"a <robot> with links is needed; got <{root.tag}>{remedy}")
     links, joints = _by_name(root, "link"), _by_name(root, "joint")
     positions = _joint_positions(joints)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-from torchcover.files import RECORDING, allow_links, find_changed
+from torchcover.files import RECORDING, allow_links, find_changed, find_remedy
 from torchcover.recordings.corrected import correct_recording
 from torchcover.recordings.formats import argoverse2, nuscenes
 from torchcover.recordings.formats.argoverse2 import Argoverse2
@@ -188,7 +188,8 @@ def read_objects(path: str | os.PathLike[str], scene: str | None = None) -> Reco
     for recording_format in FORMATS.values():
         if recording_format.recognises(path):
             return objects_of(open_recording(path))
+    remedy = f"{find_remedy(path)}; " * bool(find_remedy(path))
     raise ValueError(
-        f"{path}: recorded tracks are {'; '.join(OBJECT_FORMATS)}; or a recording with poses and boxes "
+        f"{path}: {remedy}recorded tracks are {'; '.join(OBJECT_FORMATS)}; or a recording with poses and boxes "
         f"({', '.join(FORMATS)})"
     )

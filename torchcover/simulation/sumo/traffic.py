@@ -9,6 +9,7 @@ import numpy as np
 import shapely
 from pydantic import Field, model_validator
 
+from torchcover.files import BadFileError, find_remedy
 from torchcover.geometry.arrays import Bools, Float64
 from torchcover.simulation.documents import PathBeside
 from torchcover.simulation.sumo.crowd import crowd, read_types
@@ -155,6 +156,8 @@ class Sumo(Procedural):
         if self.net is None:
             assert self.random is not None  # checked in _check_sources
             return self.random.build(folder, generator)
+        if self.net.suffix not in (".xml", ".xodr") and (remedy := find_remedy(self.net)):
+            raise BadFileError(f"{self.net}: a network is a .net.xml or .xodr file; {remedy}")
         if self.net.suffix != ".xodr":
             return self.net
         return from_opendrive(self.net, folder, leave_out_links=self.leave_out_links)
