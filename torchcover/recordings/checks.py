@@ -234,11 +234,10 @@ def check_standing_vehicle(
         )
     frames = list(recording.frames)[:num_frames]
     standing = sum(reference.is_standing(recording, frame, judged) for frame in frames)
+    absent = "so there is no coverage" if standing == len(frames) else "which count nowhere"
     still = (
         f"the vehicle moves less than {reference.min_motion_m:g} m within {reference.window_s:g} s in {standing} of "
-    )
-    still += f"{len(frames)} frames, " + (
-        "so there is no coverage" if standing == len(frames) else "which count nowhere"
+        f"{len(frames)} frames, {absent}"
     )
     if duration_s < reference.window_s / 2:
         return (
