@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from torchcover.files import BadFileError
+from torchcover.recordings import RecordingSettings, open_recording
 from torchcover.recordings.clouds import READERS, read_cloud, split_name
 from torchcover.recordings.isolated_readers import laz_points
 
@@ -112,6 +113,20 @@ def test_las_files_in_feet_are_converted_with_a_warning(tmp_path, las, meters):
     with pytest.warns(UserWarning, match=r"converted to meters, as the file says: .* give no recording.units"):
         cloud = read_cloud(store(tmp_path, suffix, las))
     np.testing.assert_allclose(cloud, CLOUD * meters, rtol=1e-12)
+
+
+@pytest.mark.filterwarnings("ignore:LAS coordinates are converted")
+def test_las_files_that_say_feet_are_converted_once(tmp_path):
+    (tmp_path / "sensor").mkdir()
+    (tmp_path / "reference").mkdir()
+    settings = RecordingSettings(units="ft")
+    for folder in ("sensor", "reference"):
+        (tmp_path / folder / "a.las").write_bytes(las_in(""))
+    cloud = open_recording(tmp_path, settings).scan("sensor", 0).points_m
+    np.testing.assert_allclose(cloud, CLOUD * FEET)  # the file says no unit
+    (tmp_path / "sensor" / "a.las").write_bytes(las_in(STATE_PLANE))
+    with pytest.raises(ValueError, match=r"a\.las: it is converted to meters, .* leave out recording\.units=ft"):
+        open_recording(tmp_path, settings).scan("sensor", 0)
 
 
 def test_las_files_in_meters_are_as_they_are_and_degrees_are_refused(tmp_path):

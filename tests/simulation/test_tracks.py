@@ -1,6 +1,7 @@
 """Trajectories and recorded actors from files, good and bad."""
 
 import re
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -28,6 +29,32 @@ def test_a_csv_is_read_in_any_order_of_columns_whatever_else_is_in_it(tmp_path):
     pose = read_trajectory(path).at(0.5)
     np.testing.assert_allclose(pose[:3, 3], [1, 2, 3])
     np.testing.assert_allclose(pose[:3, :3], rotation_from_euler(90, 20, 10), atol=1e-12)
+
+
+@pytest.mark.parametrize("unit", ["rad", "deg"])
+def test_headings_that_look_like_radians_are_reported(tmp_path, unit):
+    """A bend to the left, backwards, and parked cars; degrees of the same drives are no cause for a warning."""
+    turn = np.linspace(0.0, 1.2, 30)
+    for way, place in ((turn, 1.0), (turn + np.pi, -1.0)):
+        x_m, y_m = place * 20 * np.sin(turn), place * 20 * (1 - np.cos(turn))
+        yaw = (way if place > 0 else way - np.pi) * (1 if unit == "rad" else 180 / np.pi)
+        rows = [f"{0.1 * k:.1f},{x_m[k]:.4f},{y_m[k]:.4f},0,0,0,{yaw[k]:.4f}" for k in range(30)]
+        boxes = [f"{0.1 * k:.1f},a,car,{x_m[k]:.4f},{y_m[k]:.4f},0,4,2,1.5,{yaw[k]:.4f}" for k in range(30)]
+        parked = f"0,a,car,5,5,0,4,2,1.5,{1.5708 if unit == 'rad' else 90}"
+        for read, text, told in (
+            (read_trajectory, HEADER + "\n".join(rows), "yaw: up to .* along the way as radians only"),
+            (read_boxes, BOXES + "\n".join(boxes), "yaw: up to .* along the way as radians only"),
+            (read_boxes, BOXES + parked, "yaw: 1.5708 looks like 90 degrees in radians"),
+        ):
+            with pytest.warns(UserWarning, match=told) if unit == "rad" else nullcontext():
+                read(write(tmp_path, text))
+
+
+def test_small_headings_in_degrees_are_not_reported(tmp_path):
+    """A straight street to the north-east by east, whose headings jitter by a degree."""
+    noise = np.random.default_rng(0).normal(0.0, 1.0, 200)
+    rows = [f"{0.1 * k:.1f},{k},{0.05 * k:.3f},0,0,0,{2.86 + noise[k].clip(-3, 3):.4f}" for k in range(200)]
+    read_trajectory(write(tmp_path, HEADER + "\n".join(rows)))
 
 
 def test_poses_are_read(tmp_path):

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 
 from torchcover import geometry
 from torchcover.geometry.rigid import Matrix
+from torchcover.recordings.clouds.las import read_las_scale
 from torchcover.recordings.recording import Recording, Scan
 from torchcover.recordings.settings import RecordingSettings
 
@@ -27,9 +29,12 @@ class Corrected:
         return getattr(self.recording, name)
 
     def scan(self, sensor: str, index: int) -> Scan:
-        """What the recording has, put right."""
+        """What the recording has, put right. ValueError: a LAS file says its unit, and a unit is set, too."""
         scan, columns = self.recording.scan(sensor, index), ["xyz".index(axis) for axis in self.settings.axes]
-        return replace(scan, points_m=scan.points_m[:, columns] * METRES[self.settings.units])
+        unit, path = self.settings.units, Path(scan.source)
+        if unit != "m" and path.suffix.lower() in (".las", ".laz") and (read_las_scale(path) != 1.0).any():
+            raise ValueError(f"{path}: it is converted to meters, as the file says; leave out recording.units={unit}")
+        return replace(scan, points_m=scan.points_m[:, columns] * METRES[unit])
 
     def world_T_vehicle(self, index: int) -> Matrix | None:
         """Where the vehicle was, put right."""

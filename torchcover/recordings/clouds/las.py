@@ -162,14 +162,24 @@ class _Header(NamedTuple):
     later_records: tuple[int, int]
 
 
+def read_las_scale(path: Path) -> NDArray[np.float64]:
+    """Read how many meters a unit of x, y and z is, as a LAS or LAZ file says: (3,), 1 where it says nothing."""
+    with path.open("rb") as file:
+        return _read_scale(file, _header(file.read(HEADER_BYTES_1_4), path.stat().st_size))
+
+
+def _read_scale(file: BinaryIO, header: _Header) -> NDArray[np.float64]:
+    contents = _read_projection(file, *header.records, struct.Struct("<H16sHH32s"))
+    contents |= _read_projection(file, *header.later_records, struct.Struct("<H16sHQ32s"))
+    return _choose_scale(contents)
+
+
 def read_las(path: Path) -> NDArray[np.float64]:
     """Read x y z of a LAS or LAZ file in meters, its scales, offsets and units applied."""
     size_bytes = path.stat().st_size
     with path.open("rb") as file:
         header = _header(file.read(HEADER_BYTES_1_4), size_bytes)
-        contents = _read_projection(file, *header.records, struct.Struct("<H16sHH32s"))
-        contents |= _read_projection(file, *header.later_records, struct.Struct("<H16sHQ32s"))
-        meters = _choose_scale(contents)
+        meters = _read_scale(file, header)
         check_memory(header.points * (header.record_bytes + COORDINATE_BYTES))
         if header.compressed:
             _check_chunks(file, header, size_bytes)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from torchcover.files import NpyHeader, parse_xml, read_csv, read_npz, reads
 from torchcover.geometry import check_rigid, rigid, rotation_from_euler
-from torchcover.geometry.rigid import Matrix
+from torchcover.geometry.rigid import Matrix, warn_of_radians
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings.objects import Ego, RecordedObjects, Track, checked_size, class_of, moving
 from torchcover.recordings.recording import check_seconds
@@ -21,6 +21,10 @@ TRAJECTORY_COLUMNS = ("t", "x", "y", "z", "roll", "pitch", "yaw")
 BOX_COLUMNS = ("t", "x", "y", "z", "length", "width", "height", "yaw")
 # A step this many times longer than the usual one means that poses are missing.
 MAX_STEP = 5.0
+# Shorter steps in meters have no direction.
+MIN_STEP_M = 0.05
+# Mean sine of the angle between headings and ways, from which headings are wrong.
+MIN_OFF = 0.05
 
 
 @reads("a trajectory")
@@ -58,6 +62,7 @@ def _tracks(path: Path) -> Iterator[Track]:
     own: dict[str, list[int]] = {}
     for row, name in enumerate(table.words["id"]):
         own.setdefault(name, []).append(row)
+    _check_degrees("yaw", [(rows[of, 1:3], rows[of, 7]) for of in own.values()])
     for name, of in own.items():
         numbers, category = rows[of], table.words["category"][of[0]]
         length, width, height = checked_size(name, numbers[0, 4:7])
@@ -69,7 +74,38 @@ def _tracks(path: Path) -> Iterator[Track]:
 def _read_csv(path: Path) -> Trajectory:
     numbers = _columns(read_csv(path, TRAJECTORY_COLUMNS, optional=None).numbers, TRAJECTORY_COLUMNS)
     time_s, position_m, (roll, pitch, yaw) = numbers[:, 0], numbers[:, 1:4], numbers[:, 4:].T
+    _check_degrees("yaw", [(position_m[:, :2], yaw)])
     return Trajectory.from_arrays(time_s, position_m, np.stack([yaw, pitch, roll], axis=1))
+
+
+def _check_degrees(column: str, drives: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]) -> None:
+    """Warn of headings in degrees that look like radians.
+
+    Args:
+        column: Name of the column of headings.
+        drives: (K, 2) positions in meters and (K,) headings of each object.
+
+    Warns:
+        UserWarning: Headings lie along the ways as radians only, or headings that never change are round in radians.
+    """
+    ways_rad, headings, constant = [], [], set()
+    for position_m, heading in drives:
+        step_m = np.diff(position_m, axis=0)
+        moves = np.linalg.norm(step_m, axis=1) > MIN_STEP_M
+        ways_rad.append(np.arctan2(step_m[moves, 1], step_m[moves, 0]))
+        headings.append(heading[:-1][moves])
+        if np.ptp(heading) == 0:
+            constant.add(float(heading[0]))
+    if max(np.abs(heading).max() for _, heading in drives) > 2 * np.pi + 0.01:
+        return
+    warn_of_radians({column: sorted(constant)})
+    way_rad, heading = np.concatenate(ways_rad), np.concatenate(headings)
+    if len(way_rad):
+        off, off_deg = (np.abs(np.sin(way_rad - angle)).mean() for angle in (heading, np.deg2rad(heading)))
+        if off_deg > MIN_OFF and off < off_deg / 5:
+            largest = f"{np.abs(heading).max():.4g}"
+            words = f"{column}: up to {largest}, and along the way as radians only; angles are in degrees here"
+            warnings.warn(words, stacklevel=2)
 
 
 def _columns(numbers: Mapping[str, NDArray[np.float64]], names: Sequence[str]) -> NDArray[np.float64]:
