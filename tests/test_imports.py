@@ -118,21 +118,17 @@ def test_what_only_tells_imports_nothing_heavy():
 
 def test_a_run_imports_what_it_needs_only(loaded):
     """Of distorted lenses, meshes from files, frameworks and their loggers it may need nothing."""
-    assert "torchmetrics" in loaded["run"]
     optional = {"kornia", "trimesh", "networkx", "lightning", "tensorboard", "mmengine", "pandas", "OpenEXR"}
     assert not loaded["run"] & optional
 
 
-def test_a_run_loads_of_scipy_next_to_nothing_which_stays_there_for_others():
-    code = (
-        "import sys; from torchcover.evaluation import evaluate\n"
-        "print('scipy.signal' in sys.modules, 'torchmetrics' in sys.modules)\n"
-        # As another package may ask that torchmetrics loads in the meantime.
-        "from torchcover.metrics.lean import _StandIn; sys.modules['scipy.signal'] = _StandIn('scipy.signal')\n"
-        "from scipy.signal import convolve; import scipy.signal.windows\n"
-        "print(len(convolve([1, 2], [1, 2])), type(sys.modules['scipy.signal']).__name__)"
-    )
-    assert python(code).split() == ["False", "True", "3", "module"]
+def test_the_command_line_never_loads_torchmetrics(tmp_path):
+    """Which takes as much processor time as torch does."""
+    options = "--set metrics=object_coverage,k_cover --redundancy --steps 2 --rays 512 --set cell_m=1"
+    run = f"evaluate front_roof_32 {options} --out {tmp_path}/result"
+    loaded = set(python(ASKED, run).splitlines()[-1].split())
+    assert "torchcover.coverage.sums" in loaded
+    assert not loaded & {"torchmetrics", "scipy.signal"}
 
 
 def test_every_public_name_is_there():

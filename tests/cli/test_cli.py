@@ -412,7 +412,7 @@ def test_out_of_memory_on_a_gpu_ends_in_one_line_and_keeps_what_was_measured(
         return nearest(*arguments, **options)
 
     calls = count()
-    monkeypatch.setattr("torchcover.coverage.metric.nearest", search)
+    monkeypatch.setattr("torchcover.coverage.sums.nearest", search)
     code, _, complaints = torchcover("evaluate", "--frames", recording, "--set", "cell_m=4", "--out", tmp_path / "out")
     assert code == 2
     assert complaints.splitlines()[-1].startswith("torchcover: there is not enough memory (")

@@ -10,7 +10,7 @@ from torchmetrics import MetricCollection
 from torchmetrics.wrappers import MetricTracker
 
 from torchcover import BevGrid, CoverageMetric, Region, nearest
-from torchcover.coverage import CoverageNumber, metric
+from torchcover.coverage import CoverageNumber, sums
 
 GRID = BevGrid(x=(0.0, 8.0), y=(-2.0, 2.0), cell=1.0, heights={"low": (-1.0, 0.5), "high": (0.5, 2.0)})
 NEAR, FAR = Region("near", (0.0, 4.0), (-2.0, 2.0)), Region("far", (4.0, 8.0), (-2.0, 2.0))
@@ -66,7 +66,7 @@ def test_the_tracker_finds_the_best_in_the_direction_of_the_number(name):
 
 def test_in_a_collection_every_number_has_its_direction_and_each_step_is_measured_once(monkeypatch):
     searched = []
-    monkeypatch.setattr(metric, "nearest", lambda *a, **o: (searched.append(1), nearest(*a, **o))[1])
+    monkeypatch.setattr(sums, "nearest", lambda *a, **o: (searched.append(1), nearest(*a, **o))[1])
     tracker = MetricTracker(MetricCollection(numbers()))
     truths = []
     for epoch, points in enumerate((5, 400, 40)):

@@ -12,6 +12,7 @@ from torchmetrics import Metric
 from torchcover import BevGrid, CoverageMetric, Region
 from torchcover.contrib import (
     FalseVisible,
+    FrameMetric,
     KCover,
     MSog,
     ObjectCoverage,
@@ -23,6 +24,7 @@ from torchcover.coverage import AGGREGATIONS, StepQuantiles
 from torchcover.data import Frame
 from torchcover.detection import Boxes, RecallByVisibility
 from torchcover.geometry import BoundingBox
+from torchcover.metrics import MergeableMetric
 from torchcover.simulation import Lidar, Pose
 
 Step = Mapping[str, Any]
@@ -222,7 +224,13 @@ OF_VOXELS = {
 }
 
 
-def of_frames(kind: Callable[..., Metric], usual: Step, changes: Mapping[str, Step]) -> Case:
+def as_metric(kind: type[FrameMetric]) -> type[Metric]:
+    """The metric of torchmetrics over sums that have none of their own; found by name, as pickle needs it."""
+    name = f"{kind.__name__}Metric"
+    return globals().setdefault(name, type(name, (MergeableMetric, kind), {"__module__": __name__}))
+
+
+def of_frames(kind: type[FrameMetric], usual: Step, changes: Mapping[str, Step]) -> Case:
     nothing = Frame(
         {"rig": torch.zeros(0, 3)},
         torch.zeros(0, 3),
@@ -233,7 +241,7 @@ def of_frames(kind: Callable[..., Metric], usual: Step, changes: Mapping[str, St
         sensor_points={"rig": {"front": 0, "rear": 0}},
     )
     return Case(
-        lambda **changed: kind(**{**usual, **changed}),
+        lambda **changed: as_metric(kind)(**{**usual, **changed}),
         [frame_step(index) for index in range(0, 24, 3)],  # blocks are paired up
         {"frame": nothing},
         {**changes, "rig": {"rig": "rig"}},

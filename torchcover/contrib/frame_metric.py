@@ -17,7 +17,7 @@ from torchcover.detection.inside import Inside
 from torchcover.devices import has_float64
 from torchcover.estimation import MIN_BLOCKS, Estimate, Number, Quantity
 from torchcover.frames import Frame
-from torchcover.metrics import MergeableMetric, SumsInBlocks, figure_of
+from torchcover.metrics import MergeableSums, SumsInBlocks, figure_of
 from torchcover.neighbors import check_cloud, check_tensor, nearest
 from torchcover.neighbors.choice import backend_of_several
 
@@ -194,16 +194,16 @@ def _search(frame: Frame, cloud: Tensor, within_m: float, backend: str = "auto")
 BLOCKS = 16
 
 
-class FrameMetric(MergeableMetric):
+class FrameMetric(MergeableSums):
     """A metric of one rig that is fed with frames: an observer of `torchcover.evaluation`, as it is.
 
     A metric says in `_add_frame` what a frame adds, and in `_found` what all of them say.
 
     Args:
-        meaning: What the sums depend on, as in `MergeableMetric`.
+        meaning: What the sums depend on, as in `MergeableSums`.
         rig: Whose clouds; those of the only rig if not given.
         sights: What metrics of a run share; its own if not given.
-        kwargs: For `torchmetrics.Metric`.
+        kwargs: For the next base.
     """
 
     def __init__(
@@ -212,7 +212,7 @@ class FrameMetric(MergeableMetric):
         *,
         rig: str | None = None,
         sights: Sights | None = None,
-        **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
+        **kwargs: Any,  # noqa: ANN401  (of `FrameMetric`)
     ) -> None:
         super().__init__({**meaning, "rig": rig}, **kwargs)
         self.rig = rig
@@ -306,7 +306,7 @@ class WorldRatios(SumsInBlocks, FrameMetric):
     Args:
         ratios: What they are, as from `said`.
         meaning: What the sums depend on.
-        kwargs: `rig` and `sights` of `FrameMetric`, and those of `torchmetrics.Metric`.
+        kwargs: `rig` and `sights` of `FrameMetric`.
     """
 
     base: Tensor

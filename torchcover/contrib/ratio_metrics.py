@@ -41,7 +41,7 @@ class ObjectCoverage(WorldRatios):
         hits: Numbers of points, n.
         categories: Those that have numbers of their own.
         range_borders_m: Borders between bins of range; farther objects do not count.
-        kwargs: `rig` and `sights` of `FrameMetric`, and those of `torchmetrics.Metric`.
+        kwargs: `rig` and `sights` of `FrameMetric`.
 
     Raises:
         ValueError: A threshold that is negative, n below 1, categories or borders that make no sense. From `update`:
@@ -63,7 +63,7 @@ class ObjectCoverage(WorldRatios):
         hits: Sequence[int] = HITS,
         categories: Sequence[str] = CATEGORIES,
         range_borders_m: Sequence[float] = RANGE_BORDERS_M,
-        **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
+        **kwargs: Any,  # noqa: ANN401  (of `FrameMetric`)
     ) -> None:
         if not 0 <= threshold_m < float("inf"):
             raise ValueError(f"threshold_m: a finite distance >= 0 in metres is needed; got {threshold_m}")
@@ -138,7 +138,7 @@ class PerceptionEntropy(WorldRatios):
         sensors: The rig's sensors; if not given, or without a camera, all points are taken for those of LiDARs.
         categories: Those that have numbers of their own.
         range_borders_m: Borders between bins of range; farther objects do not count.
-        kwargs: `rig` and `sights` of `FrameMetric`, and those of `torchmetrics.Metric`.
+        kwargs: `rig` and `sights` of `FrameMetric`.
 
     Raises:
         ValueError: From `update`: a frame without boxes; of a rig with cameras, if it is unknown which points are of
@@ -158,7 +158,7 @@ class PerceptionEntropy(WorldRatios):
         sensors: Sequence[Sensor] = (),
         categories: Sequence[str] = CATEGORIES,
         range_borders_m: Sequence[float] = RANGE_BORDERS_M,
-        **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
+        **kwargs: Any,  # noqa: ANN401  (of `FrameMetric`)
     ) -> None:
         cameras = {sensor.name: sensor.counts_as for sensor in sensors if isinstance(sensor, CameraSensor)}
         strata = ObjectStrata(categories, range_borders_m)
@@ -205,7 +205,7 @@ class KCover(WorldRatios):
         threshold_m: Distance within which a point counts as seen.
         at_least: Numbers of sensors, k; more than the rig has are covered nowhere.
         square_metres: Whether the share is one of square metres, which frames are then to have; else one of points.
-        kwargs: `rig` and `sights` of `FrameMetric`, and those of `torchmetrics.Metric`.
+        kwargs: `rig` and `sights` of `FrameMetric`.
 
     Raises:
         ValueError: k below 1, a threshold that is negative, regions that the grid does not hold. From `update`: points
@@ -229,7 +229,7 @@ class KCover(WorldRatios):
         at_least: Sequence[int] = AT_LEAST,
         *,
         square_metres: bool = True,
-        **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
+        **kwargs: Any,  # noqa: ANN401  (of `FrameMetric`)
     ) -> None:
         if not 0 <= threshold_m < float("inf"):
             raise ValueError(f"threshold_m: a finite distance >= 0 in metres is needed; got {threshold_m}")
@@ -291,7 +291,7 @@ class PointDensity(WorldRatios):
         grid: Where points count: its extent, its height bands, and the cells of the uniformity. The ground below a
             point is that below the reference point which, seen from above, is next to it.
         regions: Those that have numbers of their own.
-        kwargs: `rig` and `sights` of `FrameMetric`, and those of `torchmetrics.Metric`.
+        kwargs: `rig` and `sights` of `FrameMetric`.
 
     Raises:
         ValueError: Regions that the grid does not hold.
@@ -308,7 +308,7 @@ class PointDensity(WorldRatios):
         self,
         grid: BevGrid,
         regions: Sequence[Region],
-        **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
+        **kwargs: Any,  # noqa: ANN401  (of `FrameMetric`)
     ) -> None:
         check_regions(regions, grid)
         names = ["", *(f":{region.name}" for region in regions)]

@@ -61,7 +61,7 @@ class MSog(SumsInBlocks, FrameMetric):
         voxel_m: Side of a voxel; the paper does not print its own.
         region: What the voxels fill, 60 x 40 x 4 m as of S-MIG if not given.
         category: Of the boxes that have a label of their own.
-        kwargs: `rig` and `sights` of `FrameMetric`, and those of `torchmetrics.Metric`.
+        kwargs: `rig` and `sights` of `FrameMetric`.
 
     Raises:
         ValueError: No sensor, voxels that do not divide the region or do not fit into the memory. From `update`: a
@@ -88,7 +88,7 @@ class MSog(SumsInBlocks, FrameMetric):
         voxel_m: float = 0.5,
         region: BoundingBox = REGION,
         category: str = "car",
-        **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
+        **kwargs: Any,  # noqa: ANN401  (of `FrameMetric`)
     ) -> None:
         check_sensors(sensors)
         grid = checked_grid(region, voxel_m, BLOCKS * LABELS * 8)
@@ -169,7 +169,7 @@ class FalseVisible(WorldRatios):
         grid: Extent and height bands; its cells are made `cell_m` long.
         threshold_m: Distance within which a point counts as seen.
         cell_m: Side of the cells.
-        kwargs: `rig` and `sights` of `FrameMetric`, and those of `torchmetrics.Metric`.
+        kwargs: `rig` and `sights` of `FrameMetric`.
 
     Raises:
         ValueError: No sensors: of a recording, name the rig or give its file; a threshold that is negative.
@@ -190,7 +190,7 @@ class FalseVisible(WorldRatios):
         grid: BevGrid,
         threshold_m: float = 0.4,
         cell_m: float = 1.0,
-        **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
+        **kwargs: Any,  # noqa: ANN401  (of `FrameMetric`)
     ) -> None:
         if not sensors:
             raise ValueError(

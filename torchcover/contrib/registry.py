@@ -39,7 +39,6 @@ class Setup:
         square_metres: Whether frames have the square metres of their reference points.
         threshold_m: Distance within which a point counts as seen.
         sights: What metrics of the same run share, so that each frame is searched once.
-        sync_on_compute: As in `torchmetrics.Metric`.
     """
 
     rig: str | None = None
@@ -50,12 +49,11 @@ class Setup:
     square_metres: bool = True
     threshold_m: float = 0.4
     sights: Sights = field(default_factory=Sights)
-    sync_on_compute: bool = True
 
     @property
     def of_frames(self) -> dict[str, Any]:
         """The arguments that metrics of what frames show have in common."""
-        return {"rig": self.rig, "sights": self.sights, "sync_on_compute": self.sync_on_compute}
+        return {"rig": self.rig, "sights": self.sights}
 
 
 @dataclass(frozen=True)
@@ -190,7 +188,6 @@ def build_metrics(task: Task[FrameSource], settings: Settings) -> RunMetrics:
             square_metres=task.frames.square_metres,
             threshold_m=threshold_m,
             sights=sights,
-            sync_on_compute=False,
         )
         for name, metrics in by_rig.items():
             metrics[rig] = PUBLISHED[name].make(setup).to(settings.device)

@@ -232,7 +232,7 @@ class SMig(FrameMetric):
         region: What the voxels fill, the published 60 x 40 x 4 m if not given.
         categories: Each has its own occupancy and number. The number of all is their sum.
         occlusion: Whether rays end at what they hit.
-        kwargs: `rig` and `sights` of `FrameMetric`, and those of `torchmetrics.Metric`.
+        kwargs: `rig` and `sights` of `FrameMetric`.
 
     Raises:
         ValueError: No sensor, no category or one twice, voxels that do not divide the region or do not fit into the
@@ -261,7 +261,7 @@ class SMig(FrameMetric):
         categories: Sequence[str] = CATEGORIES,
         *,
         occlusion: bool = False,
-        **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
+        **kwargs: Any,  # noqa: ANN401  (of `FrameMetric`)
     ) -> None:
         check_sensors(sensors)
         if not categories or len(set(categories)) < len(categories):

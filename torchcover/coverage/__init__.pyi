@@ -30,3 +30,4 @@ from .regions import shown_places as shown_places
 from .result import Coverage as Coverage
 from .summary import RegionRedundancy as RegionRedundancy
 from .summary import RegionSummary as RegionSummary
+from .sums import CoverageSums as CoverageSums

@@ -1,38 +1,14 @@
-"""The coverage metric: clouds in, sums over the cells that were touched, coverage out."""
+"""The coverage metric: the sums of coverage as a metric of torchmetrics."""
 
-import math
 import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-import torch
-from torch import Tensor
-
-from torchcover.coverage.aggregations import Aggregation, MeanOfMeans, VisibleArea
-from torchcover.coverage.blocks import BlockSums, KnownCells
-from torchcover.coverage.columns import CellSums, Columns
-from torchcover.coverage.grid import BevGrid
-from torchcover.coverage.measures import Measure
 from torchcover.coverage.plotting import draw_coverage
-from torchcover.coverage.quantity import MEASURED_WITHIN_M
-from torchcover.coverage.redundancy import Redundancy, SensorFailures
-from torchcover.coverage.region_sums import PlaceSums, numbers_of_places
-from torchcover.coverage.regions import Places, Region, check_regions, regions_within
 from torchcover.coverage.result import Coverage
-from torchcover.coverage.steps import (
-    CheckedStep,
-    Clouds,
-    SensorClouds,
-    StepSums,
-    as_list,
-    check_parameters,
-    checked_steps,
-)
-from torchcover.devices import map_tensors, with_float64
-from torchcover.estimation import Estimate
-from torchcover.metrics import SumsInBlocks, TouchedSums, added_up, figure_of
-from torchcover.metrics.blocks import FINER
-from torchcover.neighbors import nearest
+from torchcover.coverage.steps import Clouds, SensorClouds, as_list
+from torchcover.coverage.sums import CoverageSums
+from torchcover.metrics import MergeableMetric, figure_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -44,113 +20,23 @@ MOST_OUTSIDE = 0.9
 MIN_POINTS = 1000
 
 
-class CoverageMetric(SumsInBlocks):
-    """Blind spot radius and detection over a grid, as a mean over steps of means over reference points.
+class CoverageMetric(MergeableMetric, CoverageSums):
+    """`CoverageSums` as a metric of torchmetrics: added up over ranks when `compute` is called.
 
-        radius[h, y, x]    = E_t[ E_q in cell [ r(q) ] ]
-        detection[h, y, x] = E_t[ E_q in cell [ 1(r(q) <= threshold) ] ]
-
-    with r(q) from `torchcover.blind_spot_radius`; a step counts in a cell only if it had a reference point there
-    (Uecker & Zöllner 2024). The state is a few sums for each cell and region that a step has touched: two metrics over
-    different steps merge exactly (`merge_state`), and ranks are added up when `compute` is called. Steps are added up
-    in the order in which they come; in another one, or in parts, the last bits may differ, as of any sum of floats.
-
-    With `blocks` the sums are kept in as many blocks of contiguous steps, and the result has standard errors: steps
-    that follow each other are alike, blocks that are longer than the likeness lasts are independent.
-
-    Args:
-        grid: Cells and height bands; its `band_frame` decides whether `update` needs heights above the ground.
-        thresholds: Radii in metres up to which a point counts as detected, each of them finite, >= 0 and at most
-            `max_radius`.
-        max_radius: Saturation of r in metres. An empty sensor cloud gives r = `max_radius`: with the default,
-            infinity, such a step makes the radius of its cells infinite.
-        blocks: 1 for no errors, or an even number from 8 on, half of which at least are in use at the end of a long
-            run.
-        aggregations: Others than the mean of means, from `torchcover.coverage`: `Maximum()`, `PooledMean()`,
-            `Quantiles(levels)`, `StepQuantiles(levels)`, or a class of one's own; at most one of each. Each gives maps,
-            and numbers of `regions`.
-        regions: What the result gives numbers for; the paper's `forward_regions()` that fit the grid if not given. By
-            area, a reference point belongs to a region by its own place, so that cells decide about maps only.
-        sensors: Names of the rig's sensors, for `Coverage.redundancy`: then `update` takes a cloud for each by its
-            name, and what the rig is without each of them is known as well.
-        radii: Whether radii are asked for. Without, they are NaN, and the search ends at the largest threshold: the
-            clouds may lack points that are farther from any reference point.
-        square_metres: Whether there is to be an estimate by area too; then every step needs the square metres of its
-            reference points, as `SurfaceReference` gives them.
-        backend: Nearest-neighbour search, as in `torchcover.nearest`.
-        memory_mb: As in `torchcover.nearest`.
-        kwargs: For `torchmetrics.Metric` (`sync_on_compute`, `dist_sync_fn`, ...).
-
-    Raises:
-        ValueError: A threshold that is negative, not finite, over `max_radius`, or given twice; a `max_radius` that is
-            not positive; a number of blocks that is neither 1 nor even and 8 or more; two aggregations of one kind; a
-            region beyond the grid, or without a cell centre.
+    It takes what these take, and arguments of `torchmetrics.Metric` (`sync_on_compute`, `dist_sync_fn`, ...).
 
     Example:
+        >>> import torch
+        >>> from torchcover import BevGrid
         >>> metric = CoverageMetric(BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)}))
         >>> metric.update(sensor=torch.zeros(1, 3), reference=torch.tensor([[0.3, 0.0, 0.0], [0.5, 0.0, 0.0]]))
         >>> metric.compute().radius
         tensor([[[0.4000,    nan]]], dtype=torch.float64)
     """
 
-    cells = TouchedSums()
-    places = TouchedSums()
-    empty_sensor_steps: Tensor
-    empty_reference_steps: Tensor
-    saturated_points: Tensor
-    inside_points: Tensor
-    outside_points: Tensor
-    no_ground_points: Tensor
-
-    def __init__(
-        self,
-        grid: BevGrid,
-        thresholds: Sequence[float] = (0.4,),
-        *,
-        max_radius: float = math.inf,
-        blocks: int = 1,
-        aggregations: Sequence[Aggregation] = (),
-        regions: Sequence[Region] | None = None,
-        sensors: Sequence[str] = (),
-        radii: bool = True,
-        square_metres: bool = False,
-        backend: str = "auto",
-        memory_mb: float = 256.0,
-        **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
-    ) -> None:
-        check_parameters(thresholds, max_radius, aggregations)
-        if not radii and (aggregations or sensors or not thresholds):
-            raise ValueError("radii: aggregations and sensors need them, and without there has to be a threshold")
-        regions = regions_within(grid) if regions is None else tuple(regions)
-        check_regions(regions, grid)
-        thresholds, max_radius = tuple(float(threshold) for threshold in thresholds), float(max_radius)
-        meaning = {
-            "grid": grid,
-            "thresholds": thresholds,
-            "max_radius": max_radius,
-            "blocks": blocks,
-            "aggregations": tuple(aggregations),
-            "square_metres": square_metres,
-            **({"sensors": tuple(sensors)} if sensors else {}),
-            **({} if radii else {"radii": radii}),
-            **({"regions": regions} if square_metres or aggregations else {}),
-        }
-        super().__init__(blocks, meaning, **kwargs)
-        self.grid, self.thresholds, self.max_radius = grid, thresholds, max_radius
-        self.regions, self.sensors, self.square_metres = regions, tuple(sensors), square_metres
-        self.radii, self.backend, self.memory_mb = radii, backend, memory_mb
-        over_area = [VisibleArea(thresholds)] if square_metres else []
-        self._of_grid: tuple[Aggregation, ...] = (MeanOfMeans(thresholds), *over_area, *aggregations)
-        self._failures = SensorFailures(self.sensors, thresholds, square_metres) if sensors else None
-        self.aggregations: tuple[Aggregation, ...] = (*self._of_grid, *([self._failures] if self._failures else []))
-        self._aggregated, self._columns = tuple(aggregations), Columns(self.aggregations)
+    def __init__(self, *args: Any, **kwargs: Any) -> None:  # noqa: ANN401  (of `CoverageSums`)
+        super().__init__(*args, **kwargs)
         self._is_updated, self._warnings = False, set[str]()
-        self._places = Places(regions if square_metres or aggregations else (), grid)
-        shape: dict[str, Any] = {"columns": self._columns.count, "maxima": self._columns.maxima}
-        self.add_touched_sums("cells", grid.cells, **shape)
-        self.add_touched_sums("places", self._places.count, **shape, fine=True)
-        for name in Coverage.COUNTS[1:]:  # but for the steps
-            self.add_sum(name, (), torch.int64)
 
     def update(
         self,
@@ -162,35 +48,13 @@ class CoverageMetric(SumsInBlocks):
         place_in_time: int | Sequence[int] | None = None,
         error: Clouds | None = None,
     ) -> None:
-        """Add one step, or one step for each entry of two lists.
+        """Add steps as `CoverageSums.update` does, which says what it takes and refuses.
 
-        Args:
-            sensor: (N, 3) points of the rig in the vehicle frame in metres, where they truly are if that is known, or a
-                list of them. N = 0: a blind step. Of a metric with `sensors`: name of the sensor -> its points, or a
-                list of such dicts.
-            reference: (M, 3) points of the reference sensor in the same frame, or a list of the same length. M = 0:
-                the step says nothing.
-            weights: (M,) square metres that each reference point stands for (`frame.reference_weights`), or a list of
-                the same length: what it weighs in the mean over its cell in its step, and in the estimate by area. Not
-                given: all weigh the same.
-            height: (M,) height of each reference point above the local ground (`frame.reference_heights_m`), or a list
-                of the same length, for a grid whose `band_frame` is "ground", and no other. NaN, where there is no
-                ground at or below a point: it is in no band, and counted.
-            place_in_time: Number of the step, 10^15 at most, or a list of them (`frame.place_in_time`); it decides
-                about the block, so that steps of one number, as of an instant that is seen again, share one. Not
-                given: counted on from the steps so far.
-            error: (N,) by how many metres each point of the rig was measured off its place, along its ray, those of
-                several sensors one after the other, or a list of them. A point covers nothing at thresholds below that,
-                and counts for radii up to `MEASURED_WITHIN_M`, 0.4. Not given: none is off.
-
-        Raises:
-            ValueError: Lists of different length, a shape other than (N, 3), NaN or infinite coordinates; weights,
-                heights, places in time or errors as `torchcover.coverage.steps.checked_steps` refuses them.
-            TypeError: A cloud is not a floating-point tensor, a place in time not a whole number.
+        Warns:
+            UserWarning: Once, of square metres that the metric does not average over.
         """
         given = {"weights": weights, "height": height, "place_in_time": place_in_time, "error": error}
-        for sums in self.sums_of(sensor, reference, **given):
-            self.add(sums)
+        CoverageSums.update(self, sensor, reference, **given)  # type: ignore[arg-type]  # each of its own type
         self._is_updated = True
         if weights is not None and len(weights) and not self.square_metres:
             self._warn_once(
@@ -199,11 +63,6 @@ class CoverageMetric(SumsInBlocks):
                 "over area, too",
             )
 
-    def _warn_once(self, subject: str, message: str) -> None:
-        if subject not in self._warnings:
-            self._warnings.add(subject)
-            warnings.warn(f"{subject}: {message}", stacklevel=3)
-
     def forward(self, sensor: SensorClouds, reference: Clouds, **given: Any) -> Coverage:  # noqa: ANN401
         """Add steps as `update` does, which takes the same, and return the coverage of these steps alone."""
         if given.get("place_in_time") is None:  # torchmetrics adds steps to an empty state: counting would start at 0
@@ -211,88 +70,11 @@ class CoverageMetric(SumsInBlocks):
             given["place_in_time"] = [int(self.steps) + step for step in steps]
         return super().forward(sensor, reference, **given)  # type: ignore[no-any-return]
 
-    def sums_of(self, sensor: SensorClouds, reference: Clouds, **given: Any) -> list[StepSums]:  # noqa: ANN401
-        """What `update` adds for each step: the same in any process, where the metric has the same parameters.
-
-        It takes and refuses what `update` does.
-        """
-        given = dict.fromkeys(("weights", "height", "place_in_time", "error")) | given
-        sensor, reference, given = map_tensors((sensor, reference, given), with_float64)
-        parameters: dict[str, Any] = {name: getattr(self, name) for name in ("grid", "thresholds", "square_metres")}
-        parameters |= {"names": self.sensors, "first": int(self.steps)}
-        return list(map(self._sums_of, checked_steps(sensor, reference, **given, **parameters)))
-
-    @torch.no_grad()  # torchmetrics enables gradients in `forward`; the sums would hold on to every step's graph
-    def _sums_of(self, step: CheckedStep) -> StepSums:
-        _, _, reference, weights, height, place_in_time = step
-        inside, of, cell = self.grid.bins(reference, height)
-        # Only the reference may be cropped: the nearest sensor point may lie outside the grid.
-        of_sensors = self._distances(reference[inside], step)
-        distance = of_sensors[0].amin(dim=0)
-        values, points = self._values([one[:, of] for one in of_sensors]), reference[inside[of]]
-        weights = None if weights is None else weights.to(reference.device)[inside[of]]
-        place, point = self._places.of_points(points, cell)
-        counts = {
-            "steps": 1,
-            "empty_sensor_steps": int(step.is_blind),
-            "empty_reference_steps": int(len(reference) == 0),
-            "saturated_points": int((distance >= self.max_radius).sum()) if self.radii else 0,
-            "inside_points": len(distance),
-            "outside_points": len(reference) - len(distance),
-            "no_ground_points": 0 if height is None else int(height.isnan().sum()),
-        }
-        return StepSums(
-            place_in_time,
-            counts,
-            self._columns.of_step(cell, values, weights),
-            self._columns.of_step(place, values[:, point], None if weights is None else weights[point]),
-        )
-
-    def add(self, sums: StepSums) -> None:
-        """Add a step that `sums_of` a metric of the same parameters has measured."""
-        block, fine = self._block_of(sums.place_in_time), self._fine_block_of(sums.place_in_time)
-        self.add_touched("cells", block, sums.cells)
-        self.add_touched("places", fine, sums.places)
-        for name, count in sums.counts.items():
-            getattr(self, name).add_(count)
-        self._follow_steps()
-
-    def _distances(self, reference: Tensor, step: CheckedStep) -> list[Tensor]:
-        """(S, M) metres to the nearest point of each sensor that counts for the radius, then those for each threshold.
-
-        Each point is searched in once, beside those that the same thresholds take: most are off by less than any.
-        """
-        found: dict[float, Tensor] = {}
-        beyond_m, distance = -math.inf, None
-        for within_m in sorted({MEASURED_WITHIN_M, *self.thresholds}):
-            for_radii = self.radii and within_m <= MEASURED_WITHIN_M
-            reach_m = self.max_radius if for_radii else max(self.thresholds)
-            some = step.measured(beyond_m, within_m)
-            if distance is None or any(map(len, some)):
-                how: dict[str, Any] = {"backend": self.backend, "memory_mb": self.memory_mb, "max_distance": reach_m}
-                each = torch.stack([nearest(reference, one.to(reference.device), **how).distance for one in some])
-                distance = each if distance is None else torch.minimum(distance, each)
-            found[within_m], beyond_m = distance, within_m
-        return [found[within_m] for within_m in (MEASURED_WITHIN_M, *self.thresholds)]
-
-    def _values(self, of_sensors: Sequence[Tensor]) -> Tensor:
-        """(V, N) float64 values of points, from what `_distances` found."""
-        distance, *of_thresholds = (one.amin(dim=0) for one in of_sensors)
-        # Before saturation: a point with nothing within `max_radius` is not detected at a threshold of `max_radius`.
-        pairs = zip(of_thresholds, self.thresholds, strict=True)
-        detected = [(near <= threshold).double() for near, threshold in pairs]
-        radius = distance.clamp(max=distance.new_tensor(self.max_radius)).double()
-        radius = radius if self.radii else torch.full_like(radius, math.nan)
-        values = torch.stack([radius, *detected])
-        if self._failures:
-            values = torch.cat([values, self._failures.values(of_sensors, self.max_radius)])
-        return values
-
     def compute(self) -> Coverage:
         """The coverage so far. Cells that no reference point ever probed are NaN with count 0.
 
         Warns:
-            UserWarning: Nearly all reference points that `update` was given are outside the grid, or in no band.
+            UserWarning: Once, if nearly all reference points that `update` was given are in no cell.
         """
         inside, outside = int(self.inside_points), int(self.outside_points)
         if self._is_updated and outside > MOST_OUTSIDE * max(inside + outside, MIN_POINTS):
@@ -301,69 +83,12 @@ class CoverageMetric(SumsInBlocks):
                 f"{outside:,} of {inside + outside:,} points lie outside the grid or in no height band; are the clouds "
                 "in the vehicle frame (z = 0 on the ground), not that of a sensor?",
             )
-        cells, table = self.grid.cells, self.cells
-        whole = added_up(torch.cat([table[:, :1] % cells, table[:, 1:]], dim=1), self._columns.maxima)
-        at, sums = whole[:, 0].long(), self._columns.read(whole[:, 1:].T)
+        return CoverageSums.compute(self)
 
-        known = KnownCells(self.grid.shape, at, sums.probed_steps.long(), sums.points.long())
-        failures = sums.layers(self._failures, self.max_radius) if self._failures else []
-        in_blocks = self._columns.read(table[:, 1:].T)
-        listed = self.block_steps.clone(), (self.blocks, *self.grid.shape), table[:, 0].long()
-        mean, area = (in_blocks.of.get(kind.name, {}) for kind in (MeanOfMeans, VisibleArea))
-        return Coverage(
-            grid=self.grid,
-            thresholds=self.thresholds,
-            max_radius=self.max_radius,
-            known=known,
-            layers=[layer for one in self._of_grid for layer in sums.layers(one, self.max_radius)],
-            blocks=BlockSums(*listed, in_blocks.probed_steps.long(), mean["sums"]) if self.blocks > 1 else None,
-            area=BlockSums(*listed, area["m2"], area["sums"]) if area else None,
-            counts={name: int(getattr(self, name)) for name in Coverage.COUNTS},
-            regions=self.regions,
-            places=self._by_area(),
-            aggregated=numbers_of_places(self._in_places(fine=False), self._aggregated, self.max_radius)
-            if self._aggregated and self._places.count
-            else None,
-            redundancy=Redundancy(self.sensors, known, {one.quantity.key: one for one in failures})
-            if failures
-            else None,
-        )
-
-    def _in_places(self, *, fine: bool) -> CellSums:
-        """The sums of (..., B, P) places in blocks, the fine ones or the others."""
-        together = 1 if fine else min(int(self.block_length), FINER)  # so many fine blocks are one
-        blocks, count = self.fine_blocks if fine else self.blocks, self._places.count
-        key, columns = self.places.split_with_sizes([1, self._columns.count], dim=1)
-        key = key.div(together * count, rounding_mode="floor") * count + key % count
-        rows = added_up(torch.cat([key, columns], dim=1), self._columns.maxima)
-        sums = columns.new_zeros(self._columns.count, blocks * count)
-        sums[self._columns.count - self._columns.maxima :] = -math.inf
-        sums[:, rows[:, 0].long()] = rows[:, 1:].T
-        return self._columns.read(sums.view(-1, blocks, count))
-
-    def _by_area(self) -> PlaceSums | None:
-        if not (self.square_metres and self._places.count):
-            return None
-        sums = self._in_places(fine=True).of
-        own = [sums[kind.name]["sums"] for kind in (VisibleArea, SensorFailures) if kind.name in sums]
-        return PlaceSums(self.fine_steps.clone(), sums[VisibleArea.name]["m2"], torch.cat(own).movedim(0, 1))
-
-    def estimates(self, places: Sequence[tuple[Region, str]], measure: Measure) -> list[Estimate]:
-        """The numbers of regions in bands so far: those of `compute().estimate`, but no maps are made for them.
-
-        Args:
-            places: Regions within the grid, each with the name of a band.
-            measure: What the numbers are means over, as there.
-
-        Raises:
-            ValueError: As there.
-        """
-        sums, numbers = self._by_area(), [self._places.number_of(*place) for place in places]
-        if measure == "area" and sums and None not in numbers:
-            quantities = MeanOfMeans(self.thresholds).quantities
-            return [sums.estimate(quantities, number) for number in numbers if number is not None]
-        coverage = self.compute()
-        return [coverage.estimate(region, height, measure) for region, height in places]
+    def _warn_once(self, subject: str, message: str) -> None:
+        if subject not in self._warnings:
+            self._warnings.add(subject)
+            warnings.warn(f"{subject}: {message}", stacklevel=3)
 
     def plot(
         self,

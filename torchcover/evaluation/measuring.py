@@ -7,7 +7,7 @@ from contextlib import ExitStack, nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 
-from torchcover.coverage import CoverageMetric
+from torchcover.coverage import CoverageSums
 from torchcover.evaluation.checkpoint import Checkpoint, Journal
 from torchcover.evaluation.cores import usual_workers
 from torchcover.evaluation.observers import AnyObserver, CoverageObserver
@@ -211,7 +211,7 @@ def _states(coverage: Observers, others: Observers, watch: TargetWatch | None) -
 
 def metric_of(
     settings: Settings, asked: Asked, sensors: Sequence[str] = (), *, square_metres: bool, blocks: int = BLOCKS
-) -> CoverageMetric:
+) -> CoverageSums:
     """An empty metric of what `evaluate` is to measure, with the names of the sensors for redundancy.
 
     ValueError: an estimate by area is wanted, and there are no square metres; a device that cannot be used; a threshold
@@ -223,7 +223,7 @@ def metric_of(
             "simulation gives; leave it out for means over the known cells"
         )
     device, grid = usable_device(settings.device), asked.grid
-    metric = CoverageMetric(
+    metric = CoverageSums(
         grid,
         settings.thresholds_m,
         max_radius=grid.diagonal_m,
@@ -233,7 +233,6 @@ def metric_of(
         sensors=sensors,
         radii=not settings.only_detection,
         square_metres=square_metres and settings.estimate != "known",
-        sync_on_compute=False,  # within a process group of the caller's, whose other processes know of no such metric
     )
     check_fits(f"maps of {grid.cells:,} cells", BYTES_A_CELL * grid.cells, "use larger cells, or a smaller grid")
     return metric.to(device)

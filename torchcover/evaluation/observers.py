@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, Self, TypeVar, runtime_checkable
 
-from torchcover.coverage import Coverage, CoverageMetric
+from torchcover.coverage import Coverage, CoverageSums
 from torchcover.coverage.steps import StepSums
 from torchcover.frames import Frame
 
@@ -55,7 +55,7 @@ class Observer(Protocol[ResultT]):
 
 
 class CoverageObserver:
-    """Coverage of one rig: feeds frames to a `CoverageMetric`.
+    """Coverage of one rig: feeds frames to a `CoverageSums`.
 
     Args:
         metric: Where the sums are.
@@ -64,13 +64,13 @@ class CoverageObserver:
     Example:
         >>> import torch
         >>> from torchcover import BevGrid
-        >>> observer = CoverageObserver(CoverageMetric(BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0)))
+        >>> observer = CoverageObserver(CoverageSums(BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0)))
         >>> observer.update(Frame({"rig": torch.zeros(1, 3)}, torch.tensor([[0.5, 0.0, 0.0]]), index=0, name="a"))
         >>> observer.compute().radius[0].tolist()
         [[0.5, nan]]
     """
 
-    def __init__(self, metric: CoverageMetric, rig: str | None = None) -> None:
+    def __init__(self, metric: CoverageSums, rig: str | None = None) -> None:
         self.metric = metric
         self.rig = rig
 
@@ -84,7 +84,7 @@ class CoverageObserver:
         It is small, and the same in every process, so that frames are measured where they are made.
 
         Raises:
-            ValueError: As `CoverageMetric.update`, several rigs and none was named, or reference points without the
+            ValueError: As `CoverageSums.update`, several rigs and none was named, or reference points without the
                 square metres or the heights that the metric wants, or it is unknown which points are of which sensor
                 and it wants that.
         """
@@ -119,7 +119,7 @@ class CoverageObserver:
             ValueError: Of a metric with other parameters.
         """
         self.metric.reset()
-        self.metric.merge_state(dict(state_dict))
+        self.metric.merge_state(state_dict)
 
     def merge_state(self, other: "CoverageObserver") -> None:
         """Add the frames of another one of the same rig.

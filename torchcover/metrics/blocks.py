@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from torchcover.estimation import MIN_BLOCKS
-from torchcover.metrics.lean import gather_all_tensors
-from torchcover.metrics.mergeable import MergeableMetric
+from torchcover.metrics.sums import MergeableSums
 
 # What takes little room is kept in so many times as many blocks.
 FINER = 16
@@ -103,7 +102,7 @@ def _of_parts(tables: Sequence[Tensor], maxima: int) -> Tensor:
     return merged(_of_parts(tables[:half], maxima), _of_parts(tables[half:], maxima), maxima)
 
 
-class SumsInBlocks(MergeableMetric):
+class SumsInBlocks(MergeableSums):
     """Sums in as many blocks of contiguous steps, or worlds.
 
     Blocks start with one step each; whenever a step comes that is past the last one, neighbours are added up in pairs
@@ -114,7 +113,7 @@ class SumsInBlocks(MergeableMetric):
 
     Args:
         blocks: 1 for no errors, or an even number from 8 on: at least half as many are in use at the end of a long run.
-        args: For the next base, `MergeableMetric` or another.
+        args: For the next base, `MergeableSums` or another.
         kwargs: Likewise.
 
     Raises:
@@ -136,7 +135,7 @@ class SumsInBlocks(MergeableMetric):
         self.rows_of: dict[str, Rows] = {}
         self.add_block_sum("block_steps", (), torch.int64)
         self.add_block_sum("fine_steps", (), torch.int64, fine=True)
-        self.add_state("block_length", torch.tensor(1, device="cpu"), dist_reduce_fx="max")
+        self.define_state("block_length", torch.tensor(1, device="cpu"), "max")
 
     def add_block_sum(
         self, name: str, shape: tuple[int, ...], dtype: torch.dtype = torch.float64, *, fine: bool = False
@@ -203,9 +202,9 @@ class SumsInBlocks(MergeableMetric):
         while int(self.block_length) < int(incoming["block_length"]):
             self._pair_up_own()
 
-    def _align_ranks(self, dist_sync_fn: Callable[..., Any] = gather_all_tensors, process_group: Any = None) -> None:  # noqa: ANN401
-        lengths = dist_sync_fn(self.block_length, group=process_group or self.process_group)
-        while int(self.block_length) < max(map(int, lengths)):
+    def _align_ranks(self, gather: Callable[[Tensor], Sequence[Tensor]]) -> None:
+        longest = max(map(int, gather(self.block_length)))
+        while int(self.block_length) < longest:
             self._pair_up_own()
 
     def _copied(self, states: Mapping[str, Tensor]) -> dict[str, Any]:

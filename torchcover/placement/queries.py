@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Self
 import torch
 from torch import Tensor
 
-from torchcover.coverage import AGGREGATIONS, Aggregation, BevGrid, CoverageMetric, MeanOfMeans, Measure, Region
+from torchcover.coverage import AGGREGATIONS, Aggregation, BevGrid, CoverageSums, MeanOfMeans, Measure, Region
 from torchcover.coverage.grid import PAPER_HEIGHTS
 from torchcover.coverage.quantity import RADIUS, detection, without
 from torchcover.estimation import Estimate
@@ -141,10 +141,10 @@ class Queries(NamedTuple):
             if "area" in observers and not failures:  # which has the means over known cells, too
                 observers[measure] = observers["area"]
                 continue
-            coverage = CoverageMetric(
+            coverage = CoverageSums(
                 self.grid, self.thresholds_m, max_radius=self.max_radius_m, blocks=BLOCKS, regions=regions,
                 aggregations=self.aggregations, sensors=_names(rig) if failures else (),
-                square_metres=measure == "area", sync_on_compute=False,
+                square_metres=measure == "area",
             )  # fmt: skip
             observers[measure] = CoverageObserver(coverage, rig.name)
         return observers

@@ -209,11 +209,8 @@ class ReturnFit(NamedTuple):
 
 def fit_returns(rays: GroundRays, road: Material) -> ReturnFit:
     """The likeliest range at 10 % and spread. The rays of a cell meet one spot, and count as one."""
-    try:
-        from scipy.optimize import minimize, minimize_scalar
-        from scipy.special import log_ndtr
-    except ModuleNotFoundError as error:
-        raise ImportError("calibrate: scipy is needed: pip install 'torchcover[calibrate]'") from error
+    from scipy.optimize import minimize, minimize_scalar
+    from scipy.special import log_ndtr
 
     at_one_metre = log_excess(rays.range_m, rays.cos_incidence, road.share, road.incidence_exponent, 1.0)
     returned = rays.returned / rays.rays
