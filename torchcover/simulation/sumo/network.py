@@ -58,7 +58,6 @@ class Network(NamedTuple):
     lanes: tuple[NetworkLane, ...]
     junctions: tuple[Float64, ...]
     connections: tuple[tuple[int, int], ...]
-    left_hand: bool
 
     def follow(self, vehicle_class: str) -> dict[str, tuple[str, ...]]:
         """Of each edge that vehicles of a class may use, the names of those on which they may go on from there."""
@@ -95,7 +94,6 @@ def _read(path: Path) -> Network:
         lanes=lanes,
         junctions=tuple(collector.junctions),
         connections=tuple((one, other) for one, other in joined if one is not None and other is not None),
-        left_hand=collector.left_hand,
     )
 
 
@@ -111,14 +109,7 @@ class _Collector:
         self.lanes: dict[LaneName, NetworkLane] = {}
         self.junctions: list[Float64] = []
         self.connections: list[tuple[LaneName, LaneName]] = []
-        self.left_hand = False
         self._edge: Attributes = {}
-        self._keep = {
-            "edge": self._begin_edge,
-            "lane": self._lane,
-            "junction": self._junction,
-            "connection": self._join,
-        }
         self._began = False
 
     def start(self, name: str, attributes: list[str]) -> None:
@@ -127,26 +118,22 @@ class _Collector:
             if name != "net":
                 raise ValueError(f"a network of SUMO begins with <net>; got <{name}>")
             self._began = True
-            self.left_hand = pair_attributes(attributes).get("lefthand") in ("true", "1")
-        elif name in self._keep:
-            self._keep[name](pair_attributes(attributes))
+        elif name in ("edge", "lane", "junction", "connection"):
+            self._keep(name, pair_attributes(attributes))
 
-    def _begin_edge(self, edge: Attributes) -> None:
-        self._edge = edge
-
-    def _lane(self, item: Attributes) -> None:
-        lane = _lane(self._edge, item)
-        if lane is not None:
-            self.lanes[lane.edge, item.get("index", "")] = lane
-
-    def _junction(self, item: Attributes) -> None:
-        outline_m = _places(item.get("shape", ""))
-        if item.get("type") != "internal" and len(outline_m) >= 3:
-            self.junctions.append(outline_m)
-
-    def _join(self, item: Attributes) -> None:
-        names = [item.get(key, "") for key in ("from", "fromLane", "to", "toLane")]
-        self.connections.append(((names[0], names[1]), (names[2], names[3])))
+    def _keep(self, name: str, item: Attributes) -> None:
+        if name == "edge":
+            self._edge = item
+        elif name == "lane":
+            if lane := _lane(self._edge, item):
+                self.lanes[lane.edge, item.get("index", "")] = lane
+        elif name == "connection":
+            source, source_lane, target, target_lane = (item.get(k, "") for k in ("from", "fromLane", "to", "toLane"))
+            self.connections.append(((source, source_lane), (target, target_lane)))
+        else:
+            outline_m = _places(item.get("shape", ""))
+            if item.get("type") != "internal" and len(outline_m) >= 3:
+                self.junctions.append(outline_m)
 
 
 def pair_attributes(attributes: list[str]) -> Attributes:
@@ -226,17 +213,21 @@ OFF_STREET_M = 10.0
 
 
 class Vicinity:
-    """A piece of a network, near the ego's (T, 2) way, of whose places `origin_m` (2,) was subtracted in float64."""
+    """A piece of a network, near the ego's (T, 2) way, of whose places `origin_m` (2,) was subtracted in float64.
+
+    `samples_m` are (N, 3) places along all lanes, and `of_lane` (N,) the numbers of their lanes.
+    """
 
     def __init__(self, network: Network, way_m: Float64, origin_m: Float64) -> None:
         self.way = shapely.LineString(way_m if len(way_m) > 1 else np.repeat(way_m, 2, axis=0)).simplify(WAY_WITHIN_M)
         shapely.prepare(self.way)
         self.lower_m, self.upper_m = way_m.min(axis=0) - HORIZON_M, way_m.max(axis=0) + HORIZON_M
-        self.left_hand = network.left_hand
         shift_m = np.array([*origin_m, 0.0])
         near = self._near([lane.line_m for lane in network.lanes], shift_m)
         lanes = (network.lanes[number] for number in near.tolist())
         self.lanes = tuple(lane._replace(line_m=lane.line_m - shift_m) for lane in lanes)
+        lines = shapely.segmentize(_lines([lane.line_m for lane in self.lanes]), SAMPLE_M)
+        self.samples_m, self.of_lane = shapely.get_coordinates(lines, include_z=True, return_index=True)
         near = self._near(network.junctions, shift_m)
         self.junctions = tuple(network.junctions[number] - shift_m for number in near.tolist())
 
@@ -267,11 +258,7 @@ class Vicinity:
     def surfaces(self, *uses: Use) -> NDArray[np.object_]:
         """The polygons in plan of all lanes of some uses that lie on the ground."""
         lanes = [lane for k, lane in enumerate(self.lanes) if lane.use in uses and k not in self.decks]
-        along = [lane for lane in lanes if lane.use != "corner"]
-        lines = _lines([lane.line_m[:, :2] for lane in along])
-        found = shapely.buffer(lines, [lane.width_m / 2 for lane in along], cap_style="flat", join_style="mitre")
-        corners = [_polygon(lane.line_m) for lane in lanes if lane.use == "corner"]
-        return np.concatenate([found, np.array(corners, dtype=object)])
+        return _outlines(lanes, [lane.line_m for lane in lanes if lane.use == "corner"])
 
     @cached_property
     def decks(self) -> frozenset[int]:
@@ -286,12 +273,8 @@ class Vicinity:
     @cached_property
     def covered(self) -> NDArray[np.object_]:
         """The polygons in plan of all that is street, be it on a bridge or not."""
-        along = [lane for lane in self.lanes if lane.use != "corner"]
-        lines = _lines([lane.line_m[:, :2] for lane in along])
-        found = shapely.buffer(lines, [lane.width_m / 2 for lane in along], cap_style="flat", join_style="mitre")
-        outlines_m = [*self.junctions, *(lane.line_m for lane in self.lanes if lane.use == "corner")]
-        outlines = np.array([_polygon(outline_m) for outline_m in outlines_m], dtype=object)
-        return np.concatenate([found, outlines, self.medians])
+        corners = (lane.line_m for lane in self.lanes if lane.use == "corner")
+        return np.concatenate([_outlines(self.lanes, [*self.junctions, *corners]), self.medians])
 
     @cached_property
     def medians(self) -> NDArray[np.object_]:
@@ -304,22 +287,6 @@ class Vicinity:
         outlines = shapely.get_exterior_ring(pieces)
         shared = shapely.intersection(outlines, shapely.buffer(driven, ALONGSIDE_M))
         return np.asarray(pieces[shapely.length(shared) > ENCLOSED * shapely.length(outlines)])
-
-    @cached_property
-    def samples_m(self) -> Float64:
-        """(N, 3) places along all lanes."""
-        return self._samples[0]
-
-    @cached_property
-    def of_lane(self) -> Int64:
-        """(N,) to which lane each sample belongs."""
-        return self._samples[1]
-
-    @cached_property
-    def _samples(self) -> tuple[Float64, Int64]:
-        lines = shapely.segmentize(_lines([lane.line_m for lane in self.lanes]), SAMPLE_M)
-        places_m, of_lane = shapely.get_coordinates(lines, include_z=True, return_index=True)
-        return places_m, of_lane
 
     @cached_property
     def on_deck(self) -> Bools:
@@ -338,6 +305,14 @@ def _lines(lines_m: Sequence[Float64]) -> NDArray[np.object_]:
     count = [len(line) for line in lines_m]
     of_line = np.repeat(np.arange(len(count)), count)
     return np.asarray(shapely.linestrings(np.concatenate(lines_m), indices=of_line))
+
+
+def _outlines(lanes: Sequence[NetworkLane], areas_m: Sequence[Float64]) -> NDArray[np.object_]:
+    """The polygons in plan of lanes but corners, and of areas by their outlines."""
+    along = [lane for lane in lanes if lane.use != "corner"]
+    lines = _lines([lane.line_m[:, :2] for lane in along])
+    found = shapely.buffer(lines, [lane.width_m / 2 for lane in along], cap_style="flat", join_style="mitre")
+    return np.concatenate([found, np.array([_polygon(area_m) for area_m in areas_m], dtype=object)])
 
 
 def _polygon(outline_m: Float64) -> shapely.Geometry:

@@ -157,11 +157,16 @@ def output_of(program: str, *options: str | Path, cpu_s: float = math.inf, write
         )
         assert process.stdout is not None  # as asked for
         assert process.stderr is not None
-        messages = _LastBytes(process.stderr)
+        last = bytearray()
+        messages = Thread(target=_keep_last, args=(process.stderr, last), daemon=True)
         messages.start()
         try:
             with closing(process.stdout):
-                while piece := _read_piece(process, program):
+                while True:
+                    with reporting_stopped([process.pid], f"SUMO's {program}"):
+                        piece = process.stdout.read(PIECE_BYTES)
+                    if not piece:
+                        break
                     yield piece
             ended = process.wait()
         finally:
@@ -173,30 +178,18 @@ def output_of(program: str, *options: str | Path, cpu_s: float = math.inf, write
         if ended == -signal.SIGXFSZ:
             raise ValueError(f"SUMO's {program} tried to write a file, which what it reads must not make it do")
         if ended:
-            told = _errors(messages.last.decode("utf-8", "replace").splitlines())
+            told = _errors(last.decode("utf-8", "replace").splitlines())
             if "bad_alloc" in told:
                 told += f"; it may take {most_gb():g} GB: take a piece of the network, or set {VARIABLE} to more"
             raise ValueError(f"SUMO's {program} fails: {told}")
 
 
-def _read_piece(process: subprocess.Popen[bytes], program: str) -> bytes:
-    assert process.stdout is not None  # as asked for
-    with reporting_stopped([process.pid], f"SUMO's {program}"):
-        return process.stdout.read(PIECE_BYTES)
-
-
-class _LastBytes(Thread):
-    """Empties a pipe of messages, however many there are, and keeps the last of them."""
-
-    def __init__(self, pipe: IO[bytes]) -> None:
-        super().__init__(daemon=True)
-        self.last = b""
-        self._pipe = pipe
-
-    def run(self) -> None:
-        with self._pipe:
-            while piece := self._pipe.read(KEPT_MESSAGE_BYTES):
-                self.last = (self.last + piece)[-KEPT_MESSAGE_BYTES:]
+def _keep_last(pipe: IO[bytes], last: bytearray) -> None:
+    """Empty a pipe of messages, however many there are, and keep the last of them."""
+    with pipe:
+        while piece := pipe.read(KEPT_MESSAGE_BYTES):
+            last += piece
+            del last[:-KEPT_MESSAGE_BYTES]
 
 
 def _errors(lines: Sequence[str]) -> str:

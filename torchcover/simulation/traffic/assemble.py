@@ -123,6 +123,12 @@ class Paths(NamedTuple):
     kinds: tuple[str, ...]
     fronts: tuple[int, ...] = ()
 
+    @classmethod
+    def of_each(cls, bodies: Sequence[tuple[Float64, Float64, str]]) -> "Paths":
+        """Those of bodies with (T, 3) positions, (T,) headings in degrees and a kind each."""
+        positions_m, yaw_deg, kinds = zip(*bodies, strict=True)
+        return cls(np.stack(positions_m, axis=1), np.stack(yaw_deg, axis=1), kinds)
+
     def with_rears(self, start: Sequence[float] | None = None) -> "Paths":
         """And all that these bodies draw along, with headings in radians at first; straight behind if not given."""
         fronts = tuple(number for number, kind in enumerate(self.kinds) if kind in DRAWS)

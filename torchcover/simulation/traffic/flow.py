@@ -155,9 +155,7 @@ class Simulation:
         self.place_m = np.array([agent.place_m for agent in agents], dtype=np.float64)
         length = np.array([agent.length_m for agent in agents], dtype=np.float64)
         lane = np.array([agent.lane for agent in agents])
-        self._driver = Driver(
-            *(np.array([getattr(a.driver, name) for a in agents], np.float64) for name in Driver.__dataclass_fields__)
-        )
+        self._driver = Driver.together([agent.driver for agent in agents])
         self._leader, self._lap = _leaders(lanes, lane, self.place_m)
         self._half_m, self._leaders_half_m = length / 2, length[self._leader] / 2
         self._between_middles_m = (length + length[self._leader]) / 2
@@ -268,14 +266,11 @@ class _Limits:
     """What N agents may drive, on the lanes with these numbers, (N,)."""
 
     def __init__(self, lanes: Sequence[Lane], lane: Int64) -> None:
-        # The first is of all lanes without limits.
-        tables = [np.array([np.inf]), *(each.limits_mps for each in lanes if each.limits_mps is not None)]
-        number = np.cumsum([each.limits_mps is not None for each in lanes])
-        of_lane = np.where([each.limits_mps is not None for each in lanes], number, 0)
+        tables = [np.array([np.inf]) if each.limits_mps is None else each.limits_mps for each in lanes]
         first = np.cumsum([0, *(len(table) for table in tables)])
-        self._none = len(tables) == 1
+        self._none = all(each.limits_mps is None for each in lanes)
         self._table = np.concatenate(tables)
-        self._first, self._last = first[of_lane][lane], first[of_lane + 1][lane] - 1
+        self._first, self._last = first[lane], first[lane + 1] - 1
 
     def at(self, place_m: Float64, desired_mps: Quantity) -> Quantity:
         """(N,) what they want to drive at (N,) places, if that is allowed there."""

@@ -4,6 +4,7 @@ Treiber, Hennecke and Helbing, "Congested traffic states in empirical observatio
 Physical Review E 62 (2000). People on foot queue by the same law with other numbers.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -41,6 +42,13 @@ class Driver:
         # There are thousands in a world.
         if not (desired > 0.0 if isinstance(desired, float) else np.all(np.asarray(desired) > 0.0)):
             raise ValueError(f"a driver needs a desired speed above 0 m/s; got {self.desired_speed_mps}")
+
+    @classmethod
+    def together(cls, drivers: Sequence["Driver"]) -> "Driver":
+        """N drivers as one, with arrays (N,)."""
+        return cls(
+            *(np.array([getattr(one, name) for one in drivers], np.float64) for name in cls.__dataclass_fields__)
+        )
 
     @cached_property
     def _braking_mps2(self) -> Quantity:

@@ -79,9 +79,7 @@ class Overtaking:
         self.lane = np.array([agent.lane for agent in agents], dtype=np.int64)
         self.changes: list[Change] = []
         self._length_m = np.array([agent.length_m for agent in agents], dtype=np.float64)
-        self._driver = Driver(
-            *(np.array([getattr(a.driver, name) for a in agents], np.float64) for name in Driver.__dataclass_fields__)
-        )
+        self._driver = Driver.together([agent.driver for agent in agents])
         self._heavy, self._exits, self._side_m, self._climb = heavy, exits, side_m, climb
         self._laden = np.array([number for number, a in enumerate(agents) if KIND_OF.get(a.kind) in LADEN], np.int64)
         # Places of the other direction are those of the first with the sign turned, and slopes, too.

@@ -50,21 +50,10 @@ TROLLEY_SHARE = 0.3
 class Lot:
     """Draws a parking lot about the origin, with its aisles along x."""
 
-    def __init__(
-        self,
-        fleet: Fleet,
-        parked_share: float,
-        crossings: int,
-        built_share: float,
-        roadside: Times,
-        generator: np.random.Generator,
-    ) -> None:
-        self._fleet = fleet
-        self._parked_share = parked_share
-        self._built_share = built_share
-        self._roadside = roadside
-        self._generator = generator
-        self._empty = {side: set(generator.choice(STALLS, size=crossings, replace=False).tolist()) for side in (1, -1)}
+    def __init__(self, options: "Parking", fleet: Fleet, generator: np.random.Generator) -> None:
+        self._options, self._fleet, self._generator = options, fleet, generator
+        count = options.crossings
+        self._empty = {side: set(generator.choice(STALLS, size=count, replace=False).tolist()) for side in (1, -1)}
 
     @property
     def crossings(self) -> list[tuple[int, float]]:
@@ -86,17 +75,16 @@ class Lot:
         around, market = self._surroundings()
         level, kerbs = ground((-300.0, -300.0), (300.0, 300.0)), few(islands)
 
-        def level_m(places_m: Float64) -> Float64:
-            return np.zeros(len(places_m))
-
-        sides = sides_around(LOT_M, AROUND_M, lambda _: np.array(True), self._built_share, self._generator)
+        sides = sides_around(LOT_M, AROUND_M, lambda _: np.array(True), self._options.built_share, self._generator)
         taken = [LOT_M, market.buffer(CROWN_M)]
-        stood = stand(sides, taken, taken, (), level_m, self._roadside, self._generator)
+        stood = stand(
+            sides, taken, taken, (), lambda places_m: np.zeros(len(places_m)), self._options.roadside, self._generator
+        )
         return Scenery((level, *few(low, self._bollards()), *kerbs, *few(trees, around, *stood)), (0, 3))
 
     def _occupant(self, x: float, head_y: float, inwards: int) -> list[Mesh]:
         """Park a car in a stall, nose or tail first; or return a trolley that somebody left there; or nothing."""
-        if self._generator.random() < self._parked_share:
+        if self._generator.random() < self._options.parked_share:
             kind = self._fleet.draw_kind(PARKED)
             y = head_y + inwards * (NOSE_OFF_HEAD_M + self._fleet.length_m(kind) / 2)
             yaw = self._generator.choice((90.0, -90.0)) + self._generator.uniform(-1.5, 1.5)
@@ -187,7 +175,7 @@ class Parking(Procedural):
         agents = self._traffic(lanes[0].line.length_m, fleet, generator)
         flow = Simulation(lanes, agents, Signals.none()).run(times_s, WARM_UP_S)
         driving = paths(lanes, agents, flow.place_m)
-        lot = Lot(fleet, self.parked_share, self.crossings, self.built_share, self.roadside, generator)
+        lot = Lot(self, fleet, generator)
         driver = ego_actor(times_s, driving, flow, 0, fleet.meshes[EGO], generator)
         walking = _people(lot, driving, times_s, fleet, generator)
         others = actors(times_s, [driving, walking], driver, fleet)
@@ -208,8 +196,7 @@ class Parking(Procedural):
 def _people(lot: Lot, driving: Paths, times_s: Float64, fleet: Fleet, generator: np.random.Generator) -> Paths:
     """People who cross the aisles between parked cars, and people on the walkways."""
     step_s = float(times_s[1] - times_s[0])
-    positions, yaws, kinds = [], [], []
-    half = STALLS_M / 2
+    found, half = [], STALLS_M / 2
     along = [Footpath(np.array([-half, y]), np.array([half, y])) for y in WALKWAYS_M]
     for path, crosses in [*((p, True) for p in _across_aisles(lot)), *((p, False) for p in along)]:
         kind = fleet.draw_kind({"adult": 4.0, "child": 1.0})
@@ -218,11 +205,8 @@ def _people(lot: Lot, driving: Paths, times_s: Float64, fleet: Fleet, generator:
         if crosses:  # when no car is on the piece of the aisle that is crossed
             distance = np.linalg.norm(driving.positions_m[..., :2] - (path.start_m + path.end_m) / 2, axis=2)
             may_go = free_for((distance < KEEP_AWAY_M).any(axis=1), takes_s, step_s)
-        position, yaw = walk(path, may_go, takes_s, times_s, fleet.length_m(kind) / 2, generator)
-        positions.append(position)
-        yaws.append(yaw)
-        kinds.append(kind)
-    return Paths(np.stack(positions, axis=1), np.stack(yaws, axis=1), tuple(kinds))
+        found.append((*walk(path, may_go, takes_s, times_s, fleet.length_m(kind) / 2, generator), kind))
+    return Paths.of_each(found)
 
 
 def _across_aisles(lot: Lot) -> list[Footpath]:

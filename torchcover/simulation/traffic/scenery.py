@@ -100,7 +100,7 @@ def box(centre_m: ArrayLike, size_m: ArrayLike, bottom_m: float = 0.0, yaw_deg: 
     """A box about a point (x, y), turned."""
     length, width, height = np.asarray(size_m, dtype=np.float64)
     shape = block((-length / 2, length / 2), (-width / 2, width / 2), (bottom_m, bottom_m + height))
-    return placed(shape, [*np.asarray(centre_m), yaw_deg])
+    return shape.moved(rigid(rotation_from_euler(yaw_deg, 0.0, 0.0), [*np.asarray(centre_m), 0.0]))
 
 
 def post(centre_m: ArrayLike, radius_m: float, bottom_m: float, height_m: float) -> Mesh:
@@ -116,12 +116,6 @@ def tree(centre_m: ArrayLike, bottom_m: float, clear_m: float, height_m: float, 
     levels = bottom_m + clear_m + np.array([0.0, 0.3, 0.65, 1.0]) * (height_m - clear_m)
     crown = prism(outlines, levels.tolist()).made_of("vegetation")
     return [post(centre, 0.15, bottom_m, clear_m).made_of("wood"), crown]
-
-
-def placed(mesh: Mesh, pose: ArrayLike, height_m: float = 0.0) -> Mesh:
-    """A mesh at a pose x, y in metres and yaw in degrees."""
-    x, y, yaw_deg = np.asarray(pose, dtype=np.float64)
-    return mesh.moved(rigid(rotation_from_euler(yaw_deg, 0.0, 0.0), [x, y, height_m]))
 
 
 def few(*kinds: Sequence[Mesh]) -> tuple[Mesh, ...]:

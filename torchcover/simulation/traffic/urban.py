@@ -231,7 +231,7 @@ def _crossers(
     generator: np.random.Generator,
 ) -> Paths:
     """People who go to and fro across the main street, on both crossings of each junction with lights in sight."""
-    positions, yaws, kinds = [], [], []
+    found = []
     wait_m = streets.kerb_m + WAITING_BEHIND_KERB_M
     walks = 2 * wait_m / float(WALKING.desired_speed_mps)
     green = streets.signals.green_left_s(times_s)[..., CROSS]
@@ -244,8 +244,6 @@ def _crossers(
                 kind = fleet.draw_kind({"adult": 5.0, "child": 1.0})
                 ends = streets.main.poses(x, np.array([-wait_m, wait_m]))[:, :2]
                 path = Footpath(ends[0], ends[1], WAITING_BEHIND_KERB_M)
-                position, yaw = walk(path, may_go[:, index], walks, times_s, fleet.length_m(kind) / 2, generator)
-                positions.append(position)
-                yaws.append(yaw)
-                kinds.append(kind)
-    return Paths(np.stack(positions, axis=1), np.stack(yaws, axis=1), tuple(kinds))
+                walked = walk(path, may_go[:, index], walks, times_s, fleet.length_m(kind) / 2, generator)
+                found.append((*walked, kind))
+    return Paths.of_each(found)
