@@ -1,9 +1,11 @@
 """SUMO at work: streets and traffic that are drawn, OpenDRIVE, and what it refuses."""
 
+import hashlib
 import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,6 +23,7 @@ from torchcover.simulation.traffic.fleet import KIND_OF, Fleet, load_bodies
 
 from .towns import XODR, street, write_net
 
+ROOT = Path(__file__).parents[3]
 LITTLE = {"traffic_per_km": 2.0, "people_per_km": 1.0, "buses_per_km": 0.2, "cyclists_per_km": 0.5}
 
 ROUTES = """<routes><vType id="car" length="5"/>{more}<vehicle id="{name}" type="car" depart="1" departSpeed="10">
@@ -31,36 +34,21 @@ def drawn(network="grid", **options):
     return Sumo(random={"network": network, **LITTLE, **options}, duration_s=2.0, time_step_s=0.5)
 
 
-# Prints a fingerprint of all numbers of a world.
-FINGERPRINT = """
-import hashlib
 def fingerprint(world):
     parts = [mesh.vertices_m for mesh in world.static]
     for actor in (world.ego, *world.objects):
         parts += [actor.trajectory.positions_m, actor.trajectory.angles_deg, actor.trajectory.times_s]
     return hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest()
-"""
-IN_A_PROCESS = (
-    FINGERPRINT
-    + """
-import sys
-from torchcover.simulation.sumo import Sumo
-print(fingerprint(Sumo.model_validate_json(sys.argv[1]).world(7)))
-"""
-)
 
 
 def test_a_seed_gives_one_world_in_every_process():
-    traffic = drawn()
-    here = {}
-    exec(FINGERPRINT, here)
+    program = "from tests.simulation.sumo.test_drawn import *; print(fingerprint(drawn().world(7)))"
     environment = {**os.environ, "PYTHONHASHSEED": "12345"}
-    document = traffic.model_dump_json(exclude_unset=True)
     there = subprocess.run(
-        [sys.executable, "-c", IN_A_PROCESS, document], env=environment, capture_output=True, text=True, check=True
+        [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True, cwd=ROOT
     )
-    world = traffic.world(7)
-    assert there.stdout.strip() == here["fingerprint"](world)
+    world = drawn().world(7)
+    assert there.stdout.strip() == fingerprint(world)
     assert len(world.objects) > 20
 
 
@@ -259,25 +247,25 @@ def test_pictures_and_notes_of_scenarios_change_nothing(road, tmp_path):
     assert len(world.ego.trajectory.times_s)
 
 
-def test_a_program_that_reads_given_files_writes_none_and_talks_without_end(tmp_path, monkeypatch):
-    (tmp_path / "bin").mkdir()
-    program = tmp_path / "bin" / "sumo"
-    program.write_text(f"#!/bin/sh\nhead -c 3000000 /dev/zero >&2; echo x > {tmp_path}/new || kill -XFSZ $$")
+@pytest.mark.parametrize(
+    ("script", "message"),
+    [
+        ("head -c 3000000 /dev/zero >&2; echo x > {new} || kill -XFSZ $$", "SUMO's sumo tried to write a file"),
+        (
+            "echo 'Error: std::bad_alloc while parsing' >&2; : > {new}; exit 1",
+            r"bad_alloc while parsing; it may take 3 GB: .* TORCHCOVER_MAX_FILE_GB to",
+        ),
+    ],
+)
+def test_a_program_writes_no_files_talks_without_end_and_may_run_out_of_memory(script, message, tmp_path, monkeypatch):
+    program, new = tmp_path / "bin" / "sumo", tmp_path / "new"
+    program.parent.mkdir()
+    program.write_text(f"#!/bin/sh\n{script.format(new=new)}")
     program.chmod(0o700)
     monkeypatch.setattr(simulating, "home", lambda: tmp_path)
-    with pytest.raises(ValueError, match="SUMO's sumo tried to write a file"):
+    with pytest.raises(ValueError, match=message):
         list(simulating.output_of("sumo"))
-    assert (tmp_path / "new").read_text() == ""
-
-
-def test_a_network_that_takes_more_memory_than_it_may_says_what_to_do(tmp_path, monkeypatch):
-    (tmp_path / "bin").mkdir()
-    program = tmp_path / "bin" / "sumo"
-    program.write_text("#!/bin/sh\necho 'Error: std::bad_alloc while parsing' >&2\nexit 1\n")
-    program.chmod(0o700)
-    monkeypatch.setattr(simulating, "home", lambda: tmp_path)
-    with pytest.raises(ValueError, match=r"bad_alloc while parsing; it may take 3 GB: .* TORCHCOVER_MAX_FILE_GB to"):
-        simulating.run("sumo")
+    assert new.read_text() == ""
 
 
 def test_a_simulation_that_is_over_before_the_run_begins_is_refused(tmp_path):

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 import shapely
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
+from tests.simulation.traffic.test_separation import pieces
 from torchcover import Scenario
 from torchcover.simulation.sumo import Sumo
 from torchcover.simulation.traffic.fleet import REAR_OF
@@ -151,27 +150,15 @@ def test_what_stands_beside_streets_keeps_off_them_and_off_houses(tmp_path):
     north = edge("north", ("", 3.5, [(100, -200, 0), (100, 200, 0)]))
     world = made(tmp_path, street(), north, built_share=0.3, ego_id="ego").world(0)
     houses, others = world.static[2:]
-    standing = [piece for piece in others_of(others) if piece[:, 2].min() < 0.1]
+    standing = [shapely.Polygon(outline) for outline, low_m, _ in pieces(others) if low_m < 0.1]
     assert len(standing) > 100
-    around = shapely.STRtree([shapely.MultiPoint(piece[:, :2]).convex_hull for piece in standing])
+    around = shapely.STRtree(standing)
     streets = [shapely.box(-47.0, -3.75, 353.0, 1.75), shapely.box(51.25, -200.0, 54.75, 200.0)]
     assert len(around.query([*streets, *shapely.polygons(corners_of(houses))], predicate="intersects")[0]) == 0
 
 
 def corners_of(houses):
     return houses.vertices_m.reshape(-1, 8, 3)[:, :4, :2]
-
-
-def others_of(mesh):
-    """The corners of each connected piece."""
-    return [mesh.vertices_m[np.unique(piece)] for piece in pieces_of(mesh)]
-
-
-def pieces_of(mesh):
-    graph = coo_array((np.ones(len(mesh.faces)), mesh.faces[:, :2].T), shape=(len(mesh.vertices_m),) * 2)
-    labels = connected_components(graph, directed=False)[1][mesh.faces[:, 0]]
-    order = np.argsort(labels, kind="stable")
-    return np.split(mesh.faces[order], np.flatnonzero(np.diff(labels[order])) + 1)
 
 
 def test_a_narrow_gap_between_carriageways_is_a_median_and_a_wide_one_is_not(tmp_path):

@@ -6,7 +6,6 @@ import shapely
 import trimesh
 
 from torchcover.simulation.raycaster import RayCaster
-from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic import Urban
 from torchcover.simulation.traffic.alignment import Alignment, Beside, Territory
 from torchcover.simulation.traffic.city import City
@@ -259,20 +258,3 @@ def test_open_country_has_no_houses():
     w = Urban(duration_s=2.0, built_share=0.0, hills_m=0.0).world(1)
     assert len(w.static) == 3
     assert max(mesh.vertices_m[:, 2].max() for mesh in w.static) < 12.0
-
-
-@pytest.mark.parametrize("kind", ["hilly", "motorway"])
-def test_rays_always_hit_the_hills(kind, world):
-    w = world(kind, 0)
-    generator = np.random.default_rng(0)
-    for time_s in (0.0, w.duration_s):
-        pose = w.ego.trajectory.at(time_s)
-        yaw = np.arctan2(pose[1, 0], pose[0, 0])
-        ahead, left = generator.uniform(-60.0, 160.0, 20_000), generator.uniform(-40.0, 40.0, 20_000)
-        offset = np.stack([np.cos(yaw) * ahead - np.sin(yaw) * left, np.sin(yaw) * ahead + np.cos(yaw) * left])
-        to_ground = np.concatenate([offset, np.full((1, 20_000), -100.0)])
-        directions = (to_ground / np.linalg.norm(to_ground, axis=0)).astype(np.float32)
-        static = [Mesh(mesh.vertices_m - pose[:3, 3], mesh.faces) for mesh in w.static]
-        limit = np.full(20_000, 1000.0, dtype=np.float32)
-        assert (RayCaster(static).cast(np.array([0.0, 0.0, 100.0]), directions, limit).body >= 0).all()
-        assert (RayCaster(static[:1]).cast(np.array([0.0, 0.0, 100.0]), directions, limit).body == 0).all()

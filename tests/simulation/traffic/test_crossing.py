@@ -30,12 +30,6 @@ def test_some_do_cross():
     assert all(np.ptp(position[:, 1]) == pytest.approx(16.0) for position in walks)
 
 
-def test_who_may_not_go_stays():
-    position, _ = walk(PATH, np.zeros(1200, bool), 12.0, TIMES_S, 0.2, np.random.default_rng(0))
-    assert np.ptp(position, axis=0).max() == 0.0
-    assert position[0, 2] == 0.15
-
-
 def test_feet_are_up_until_the_whole_body_is_past_the_kerb():
     beyond = np.array([-3.0, 0.0, 0.29, 0.3, 0.375, 0.45, 5.0])
     np.testing.assert_allclose(step_height(beyond, 0.3), [0.15, 0.15, 0.15, 0.15, 0.075, 0.0, 0.0], atol=1e-12)

@@ -1,4 +1,4 @@
-"""Agents on lanes: queues, lights, junctions."""
+"""Agents on lanes: lines, queues, lights, junctions."""
 
 from itertools import pairwise
 
@@ -41,23 +41,6 @@ def test_a_queue_keeps_its_order_and_never_touches():
     np.testing.assert_allclose(flow.speed_mps[-1], [5, 5, 5, 9, 9], rtol=0.05)
 
 
-def test_lanes_do_not_see_each_other():
-    alone = run([Lane(LONG)], [car(0, 10.0)])
-    beside = run([Lane(LONG), Lane(LONG)], [car(0, 10.0), car(1, 20.0, Driver(2.0))])
-    np.testing.assert_array_equal(alone.place_m[:, 0], beside.place_m[:, 0])
-
-
-def test_stops_at_red_before_the_line_and_goes_at_green():
-    lanes = [Lane(LONG, (Gate(200.0, 225.0, 0, MAIN),))]
-    # Main green ends after 5 s and comes back after 5 + 6 + 18 + 6 = 35 s.
-    flow = run(lanes, [car(0, 20.0)], green_s=(5.0, 18.0))
-    front = flow.place_m[:, 0] + 2.5
-    waiting = (TIMES_S > 28.0) & (TIMES_S < 35.0)
-    assert (front[waiting] <= 200.0).all()
-    assert front[waiting].min() > 198.0
-    assert front[-1] > 225.0
-
-
 def test_who_cannot_stop_goes_on_and_is_through_before_the_others_get_green():
     for start in np.linspace(60.0, 200.0, 71):
         lanes = [Lane(LONG, (Gate(200.0, 225.0, 0, MAIN),))]
@@ -92,24 +75,8 @@ def test_who_is_slow_to_cross_needs_green_to_be_left():
     gate = Gate(20.0, 40.0, 0, MAIN, green_needed_s=15.0)
     walker = Driver(1.4, 0.4, 0.5, 1.0, 1.5)
     flow = run([Lane(LONG, (gate,))], [car(0, 5.0, walker)], green_s=(20.0, 5.0))
-    front = flow.place_m[:, 0] + 2.5
-    entered = TIMES_S[np.argmax(front > 20.0)]
-    assert entered > 37.0
-    assert entered < 40.0
-
-
-def test_on_a_loop_the_first_follows_the_last():
-    line = loop(84.0, 18.0, 6.0)
-    agents = [car(0, place, Driver(speed)) for place, speed in [(0.0, 2.0), (10.0, 8.0), (60.0, 4.0)]]
-    flow = run([Lane(line)], agents, times_s=np.arange(0.0, 200.0, 0.1))
-    gaps = np.diff(np.column_stack([flow.place_m, flow.place_m[:, :1] + line.length_m]), axis=1) - 5.0
-    assert gaps.min() > 0.5
-    np.testing.assert_allclose(flow.speed_mps[-1], 2.0, rtol=0.02)
-
-
-def test_alone_on_a_loop_one_has_a_free_road():
-    flow = run([Lane(loop(84.0, 18.0, 6.0))], [car(0, 0.0, Driver(3.0))])
-    assert flow.speed_mps[-1, 0] == pytest.approx(3.0, rel=0.02)
+    entered = TIMES_S[np.argmax(flow.place_m[:, 0] + 2.5 > 20.0)]
+    assert 37.0 < entered < 40.0
 
 
 def test_a_coarse_time_step_gives_the_same_run():
@@ -191,3 +158,64 @@ def test_all_together_are_that_many_single_ones():
     np.testing.assert_allclose(together.place_m, twin(lanes, agents, lights, times_s), atol=1e-6)
     held_up = (together.speed_mps == 0.0).any(axis=0)
     assert 2 < held_up.sum() < len(agents)
+
+
+def test_green_is_exclusive_and_clearing_times_lie_between():
+    signals, times_s = Signals(np.array([0.0, 17.3, -211.0])), np.arange(0.0, 400.0, 0.05)
+    left = signals.green_left_s(times_s)
+    green = left > 0
+    assert not (green[..., MAIN] & green[..., CROSS]).any()
+    assert green[..., MAIN].any()
+    for junction in range(3):
+        for phase in (MAIN, CROSS):
+            ends = times_s[1:][green[:-1, junction, phase] & ~green[1:, junction, phase]]
+            starts = times_s[1:][~green[:-1, junction, 1 - phase] & green[1:, junction, 1 - phase]]
+            waits = [(starts[starts > end] - end).min() for end in ends if (starts > end).any()]
+            assert len(waits) > 3
+            np.testing.assert_allclose(waits, signals.amber_s + signals.clear_s, atol=0.11)
+
+
+def test_the_green_left_counts_down_to_the_change():
+    signals = Signals(np.zeros(1), green_s=(20.0, 10.0), amber_s=3.0, clear_s=2.0)
+    assert signals.cycle_s == 40.0
+    np.testing.assert_allclose(signals.green_left_s(0.0)[0], [20.0, -np.inf])
+    np.testing.assert_allclose(signals.green_left_s(19.0)[0, MAIN], 1.0)
+    assert (signals.green_left_s(24.9)[0] < 0).all()
+    np.testing.assert_allclose(signals.green_left_s(25.0)[0, CROSS], 10.0)
+    np.testing.assert_allclose(signals.green_left_s(34.0 + 5 * 40.0)[0, CROSS], 1.0)
+
+
+def circle(radius, corners=720):
+    angle = np.linspace(0, 2 * np.pi, corners + 1)
+    return Polyline(radius * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+
+
+@pytest.mark.parametrize("place", [-30.0, 0.0, 12.5, 100.0, 130.0])
+def test_a_straight_line_goes_on_beyond_its_ends(place):
+    yaw = np.deg2rad(30.0)
+    ends_m = np.array([1.0, 2.0]) + np.array([[0.0], [100.0]]) * [np.cos(yaw), np.sin(yaw)]
+    x, y, yaw_deg = Polyline(ends_m).poses(place)
+    np.testing.assert_allclose([x, y], [1 + place * np.cos(yaw), 2 + place * np.sin(yaw)])
+    assert yaw_deg == pytest.approx(30.0)
+
+
+def test_poses_on_a_circle():
+    place = np.linspace(1.0, 300.0, 57)
+    poses = circle(50.0).poses(place)
+    angle = place / 50.0
+    np.testing.assert_allclose(poses[:, :2], 50 * np.stack([np.cos(angle), np.sin(angle)], axis=1), atol=0.01)
+    np.testing.assert_allclose(poses[:, 2], np.rad2deg(angle) + 90, atol=0.05)
+
+
+def test_a_loop_closes_without_a_jump_and_repeats():
+    line = loop(80.0, 20.0, 6.0)
+    assert line.length_m == pytest.approx(2 * (80 + 20) - 8 * 6 + 2 * np.pi * 6, rel=1e-3)
+    place = np.arange(-30.0, line.length_m + 30.0, 0.1)
+    poses = line.poses(place)
+    assert np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1).max() < 0.1001
+    turn = (np.diff(poses[:, 2]) + 180) % 360 - 180
+    assert turn.min() >= -1e-9
+    assert turn.max() < 2.0
+    np.testing.assert_allclose(line.poses(place + line.length_m)[:, :2], poses[:, :2], atol=1e-9)
+    assert np.abs(poses[:, 0]).max() == pytest.approx(40.0)
+    assert np.abs(poses[:, 1]).max() == pytest.approx(10.0)
