@@ -1,5 +1,7 @@
 """The inverse of the lens: what it answers reproduces the pixel, and what has an answer is answered."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -9,6 +11,7 @@ from scipy.optimize import brentq
 
 from torchcover.cameras import Camera, inverse
 from torchcover.cameras.inverse import find_region, make_start_table
+from torchcover.cameras.models import build_lens
 
 
 def grid(camera):
@@ -130,6 +133,50 @@ def test_every_point_of_the_valid_region_is_found_again(radial, tangential, k3, 
     table = make_start_table(distortion, np.inf, 1e3)
     _, _, status = inverse.solve(distortion, region, table, at.u, at.v, (500.0, 500.0))
     assert (status == inverse.ANSWERED).all()
+
+
+@pytest.mark.parametrize("name", RADIAL)
+def test_the_radii_at_which_the_image_turns_back_are_known(name):
+    distortion = build_lens(*RADIAL[name], trainable=False).distortion
+    scan = np.linspace(0.0, 3.0, 30_001)
+    with np.errstate(all="ignore"):
+        turns = scan[1:-1][np.diff(np.sign(np.diff(distortion.radial(scan)))) != 0]
+    assert (len(turns) > 0) == (name != "k1 0.6")
+    for turn in turns:
+        assert np.abs(distortion.critical_radii() - turn).min() < 2 * scan[1]
+
+
+class Drawn:
+    """A distortion by formulas: of the radius and azimuth of a drawn point those of its image, and a determinant."""
+
+    def __init__(self, image, determinant, *, symmetric):
+        self.image, self.determinant, self.symmetric = image, determinant, symmetric
+
+    def critical_radii(self):
+        return np.empty(0)
+
+    def linearise(self, a, b):
+        drawn = np.hypot(a, b)
+        radius, azimuth = self.image(drawn, np.arctan2(b, a))
+        u, v = radius * np.cos(azimuth), radius * np.sin(azimuth)
+        return SimpleNamespace(u=u, v=v, determinant=self.determinant(drawn))
+
+
+def test_where_a_determinant_is_no_number_the_region_has_ended():
+    lens = Drawn(
+        lambda radius, azimuth: (radius, azimuth), lambda radius: np.where(radius < 0.7, 1.0, np.nan), symmetric=True
+    )
+    assert find_region(lens, 2.0).edge.values == pytest.approx([0.7], abs=1e-12)
+
+
+def test_an_edge_whose_image_turns_back_is_within_reach():
+    def image(radius, azimuth):
+        return radius * (1 + 0.5 * np.cos(7 * azimuth)), azimuth + 0.8 * np.sin(3 * azimuth)
+
+    lens = Drawn(image, lambda radius: 1.0 + 0.0 * radius, symmetric=False)
+    region, azimuth = find_region(lens, 2.0), np.linspace(-np.pi, np.pi, 997)
+    at = lens.linearise(2 * np.cos(azimuth), 2 * np.sin(azimuth))
+    assert region.reach.holds(np.hypot(at.u, at.v) * (1 - 1e-3), at.u, at.v).all()
 
 
 def test_of_two_images_the_one_nearer_the_axis_is_chosen(make_camera):

@@ -49,6 +49,16 @@ def test_three_labels_of_one_voxel_by_hand():
     assert m_sog([AHEAD], always).value == 0.0
 
 
+def test_points_vote_and_a_draw_is_the_category():
+    # The voxel from 1.5 to 2 m holds the front of the box only down to 1.6.
+    short = boxes((2.1, 0.0, 1.0, 1.0, 1.0, 2.0, 0.0))
+    in_it, beside_it = [1.9, 0.25, 0.75], [1.51, 0.25, 0.75]
+    metric = MSog([AHEAD], voxel_m=0.5, region=REGION)
+    for index, points in enumerate(([in_it, beside_it], [in_it, beside_it, beside_it], [beside_it])):
+        metric.update(frame(index, short, reference=seen(*points)))
+    assert metric.labelled.sum(dim=(0, 2)).tolist() == [1, 2]
+
+
 def test_it_is_that_of_a_slow_twin_and_its_error_the_jackknife_by_hand():
     generator = np.random.default_rng(7)
     sensors, frames = [beam(z_m=1.0, columns=24), beam("low", z_m=0.3, x_m=1.0, columns=9)], []

@@ -71,3 +71,13 @@ SQUARE_M = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 def test_squares_that_touch_slide_or_hardly_move(offset_m, velocity_mps, expected_s):
     found_s = contact_s(SQUARE_M, SQUARE_M + offset_m, np.array(velocity_mps, dtype=float))
     assert found_s == pytest.approx(expected_s, rel=1e-6)
+
+
+def test_contact_far_from_the_origin_is_the_same_to_the_last_bit():
+    tilted_m, away_m, velocity_mps = (
+        np.array([[5, 1], [-1, 5], [-5, -1], [1, -5]]) / 4,
+        [8.0, 4.0],
+        np.array([-1, -0.5]),
+    )
+    far_m = tilted_m + np.array([2.0**50, -(2.0**50)])  # where numbers are 0.25 m apart
+    assert contact_s(far_m, far_m + away_m, velocity_mps) == contact_s(tilted_m, tilted_m + away_m, velocity_mps)
