@@ -1,5 +1,6 @@
 """What an interactive session shows of objects: short words, a small picture, their rows as a frame of data."""
 
+import re
 from base64 import b64encode
 from collections.abc import Iterable, Mapping
 from dataclasses import fields
@@ -53,6 +54,16 @@ def _is_some(value: object) -> bool:
     return not isinstance(value, str | tuple | list | Mapping) or len(value) > 0
 
 
+def code_words_html(text: str) -> str:
+    """Mark words between backticks in escaped text as code.
+
+    Example:
+        >>> code_words_html("more `--steps`")
+        'more <code>--steps</code>'
+    """
+    return re.sub(r"`([^`]+)`", r"<code>\1</code>", text)
+
+
 def small_html(sentences: Iterable[str], figure: "Figure | None" = None) -> str:
     """What a notebook shows of a result, and no other file: sentences, the first as a heading, a picture below them.
 
@@ -60,7 +71,7 @@ def small_html(sentences: Iterable[str], figure: "Figure | None" = None) -> str:
         >>> small_html(["<b>", "seen"])
         '<p><strong>&lt;b&gt;</strong></p><p>seen</p>'
     """
-    first, *others = (escape(shown(sentence)) for sentence in sentences)
+    first, *others = (code_words_html(escape(shown(sentence))) for sentence in sentences)
     parts = [f"<strong>{first}</strong>", *others]
     if figure is not None:
         png = BytesIO()

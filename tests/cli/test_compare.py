@@ -2,11 +2,15 @@
 
 import csv
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from torchcover import Coverage
+from torchcover.evaluation import Result
+from torchcover.evaluation import compare as compare_saved
+from torchcover.evaluation.settings import FILES
 from torchcover.simulation import REFERENCE_SENSORS
 
 QUICK = ("--set", "cell_m=4", "--set", "probe=none")
@@ -228,3 +232,22 @@ def test_a_mistake_ends_in_one_line_and_exit_code_2(torchcover, arguments, messa
     assert error.startswith("torchcover: ")
     assert error.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_pages_and_maps_of_many_rigs_are_announced_and_refused_where_they_do_not_fit(torchcover, worlds, monkeypatch):
+    code, _, error, out = compare(torchcover, worlds, "low", "both", out="few")
+    assert (code, "page and maps" in error) == (0, False)
+    few = compare_saved(sorted((out / "coverage").glob("*.npz")))
+    many = replace(few, coverages={str(number): few.coverages["low"] for number in range(200)})
+    assert many.estimate_pictures(FILES) == pytest.approx(100 * np.array(few.estimate_pictures(FILES)))
+    assert many.estimate_pictures(["numbers"]) == (0.0, 0.0)
+    assert "page and maps of 200 rigs take about" in many.announce_pictures("maps,page")
+    assert many.announce_pictures("numbers") == ""
+    for needed_bytes, expected in ((3e9, 0), (1e18, 2)):
+        monkeypatch.setattr(Result, "estimate_pictures", lambda *_, needed_bytes=needed_bytes: (needed_bytes, 120.0))
+        code, _, error, out = compare(torchcover, worlds, "low", "both", out=str(expected))
+        assert code == expected
+        assert f"page and maps of 2 rigs take about {needed_bytes / 1e9:.2g} GB of memory and 2 min" in error
+        assert (out / "coverage" / "low.npz").exists()
+        assert (out / "report.html").exists() == (expected == 0)
+    assert "leave the others out by `--files numbers`" in error

@@ -17,7 +17,7 @@ from torchcover import BevGrid, CoverageMetric, Scenario, evaluate
 from torchcover.data import BadFrameError, ChosenRigs, SimulatedFrames
 from torchcover.evaluation import CoverageObserver, observe, pipeline
 from torchcover.evaluation.pipeline import MOST_TOGETHER, MeasuredFrames, made_together
-from torchcover.evaluation.progress import showing_wait, terminable
+from torchcover.evaluation.progress import Progress, showing_wait, terminable
 from torchcover.frames import worlds_of
 from torchcover.simulation import PaperReference
 
@@ -474,3 +474,18 @@ def test_a_wait_without_steps_is_shown_on_a_terminal(capsys, monkeypatch, shown)
     with showing_wait("preparing the scene", shown=shown):
         pass
     assert ("preparing the scene" in capsys.readouterr().err) == shown
+
+
+def test_rates_count_the_start_and_are_means_over_rounds_of_all_workers(monkeypatch):
+    """Four workers start in 8 s; then each round gives four steps at once, every 4 s: a step a second."""
+    now_s = 0.0
+    monkeypatch.setattr("torchcover.evaluation.progress.time.monotonic", lambda: now_s)
+    bar, rates = Progress(100, "run", shown=True, workers=4), []
+    for step in range(60):
+        now_s = 8.0 + 4.0 * (step // 4)
+        bar.advance(100)
+        rates.append(float(bar._rich.tasks[0].fields["rate"].split()[0]))
+    assert rates[0] == pytest.approx(1 / 8, abs=0.01)
+    assert max(rates) < 1.35
+    assert min(rates[30:]) > 0.75
+    assert bar._rich.tasks[0].fields["left"].startswith("0:00:")

@@ -15,6 +15,7 @@ import torch
 
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric
 from torchcover.coverage.quantity import RADIUS
+from torchcover.files import small_html
 from torchcover.report import (
     Line,
     Page,
@@ -394,3 +395,14 @@ def test_cells_taken_together_have_their_mean_by_weight_and_the_page_says_so():
     assert np.isnan(coarse.values[:, 350:]).all()
     assert "errors of single cells are left out; some maps show 2 x 2 cells as one" in notes[-1]
     assert re.search(r"show \d x \d cells as one, so that", page_html(Page("rig", "lead", maps=noisy(1))))
+
+
+def test_words_between_backticks_are_code():
+    told = "Add `--steps`; 5 % of <b> are `a<b`."
+    page = Page("rig", "lead", verdict=("First `x`.", told), tables=[PageTable("", ("a",), [], notes=[told])])
+    text = page_html(page).partition("<script")[0]
+    assert text.count("Add <code>--steps</code>") == 2
+    assert text.count("<code>a&lt;b</code>") == 2
+    assert "First <code>x</code>." in text
+    assert "`" not in text.partition("</style>")[2]
+    assert small_html([told]).count("<code>") == 2

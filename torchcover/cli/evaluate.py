@@ -258,6 +258,9 @@ def finish(
     from torchcover.report import file_stems
 
     if ranks is None or ranks.rank == 0:
+        for world in result.worlds.values() if isinstance(result, MixedResult) else [result]:
+            if announcement := world.announce_pictures(files):
+                typer.echo(f"torchcover: {announcement}", err=True)
         written = result.save(out, files=files)
         print_result(result, written, out, explain=explain)
         if log is not None and not isinstance(result, MixedResult):

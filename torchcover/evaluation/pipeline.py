@@ -180,7 +180,7 @@ def observe(
     run.reached = until is not None and run.steps > 0 and until.is_reached(run.steps)
     share = most if ranks is None else -(-most // ranks.size)
     try:
-        with _threads_beside(workers), Progress(share, title, done=run.steps, shown=progress) as bar:
+        with _threads_beside(workers), Progress(share, title, done=run.steps, shown=progress, workers=workers) as bar:
             tasks = made_together(() if run.reached else todo, world_of if workers > 1 else int)
             apart = MeasuredFrames(frames, observers, device)
             for seen in _each(apart, tasks, workers, run, skip_bad_frames=skip_bad_frames):

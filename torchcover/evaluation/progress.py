@@ -1,10 +1,13 @@
 """Who waits for a run: a bar that says how far it is, and signals that end it, never within a frame."""
 
+import math
 import signal
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from datetime import timedelta
 from types import FrameType
 from typing import Self
 
@@ -26,10 +29,13 @@ class Progress:
         title: What stands before it.
         done: Steps that are done before.
         shown: Whether anybody sees it.
+        workers: Processes that make the steps, whose first ones arrive together.
     """
 
-    def __init__(self, steps: int, title: str, *, done: int = 0, shown: bool) -> None:
+    def __init__(self, steps: int, title: str, *, done: int = 0, shown: bool, workers: int = 0) -> None:
         self._rich = None
+        # The rate is a mean over several rounds of all workers; before those, since the run began.
+        self._times_s = deque([time.monotonic()], maxlen=1 + max(20, 4 * workers))
         if not shown:
             return
         # rich takes 0.1 s to import, which nobody should wait for who wants no bar.
@@ -43,11 +49,10 @@ class Progress:
             progress.MofNCompleteColumn(),
             progress.TextColumn("{task.fields[rate]}"),
             progress.TextColumn("{task.fields[words]}", markup=False),
-            progress.TimeRemainingColumn(),
-            progress.TextColumn("left"),
+            progress.TextColumn("{task.fields[left]}"),
             console=Terminal(stderr=True),
         )
-        self._task = self._rich.add_task(title, total=steps, completed=done, rate="", words="")
+        self._task = self._rich.add_task(title, total=steps, completed=done, rate="", words="", left="")
 
     def __enter__(self) -> Self:
         if self._rich:
@@ -66,10 +71,12 @@ class Progress:
             words: How good its numbers are, if anybody looks.
         """
         if self._rich:
+            self._times_s.append(time.monotonic())
+            rate = (len(self._times_s) - 1) / max(self._times_s[-1] - self._times_s[0], 1e-9)
             self._rich.advance(self._task)
-            speed = self._rich.tasks[0].speed
-            rate = f"{speed:.2f} steps/s" if speed else ""
-            self._rich.update(self._task, total=expected_steps, rate=rate, words=words)
+            seconds = max(0.0, expected_steps - self._rich.tasks[0].completed) / rate
+            left = f"{timedelta(seconds=math.ceil(seconds))} left"
+            self._rich.update(self._task, total=expected_steps, rate=f"{rate:.2f} steps/s", words=words, left=left)
 
 
 @contextmanager
@@ -87,10 +94,12 @@ def showing_wait(title: str, *, shown: bool) -> Iterator[None]:
 
     from torchcover.report import Terminal
 
+    terminal = Terminal(stderr=True)
+    if not terminal.is_terminal:  # rich would print an empty line
+        yield
+        return
     columns = progress.TextColumn("{task.description}", markup=False), progress.SpinnerColumn()
-    with progress.Progress(
-        *columns, progress.TimeElapsedColumn(), console=Terminal(stderr=True), transient=True
-    ) as line:
+    with progress.Progress(*columns, progress.TimeElapsedColumn(), console=terminal, transient=True) as line:
         line.add_task(title, total=None)
         yield
 

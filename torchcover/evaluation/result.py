@@ -1,5 +1,6 @@
 """What an evaluation gives: numbers, maps and files of one rig or several. All that `report` is asked for is here."""
 
+import math
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
@@ -42,9 +43,11 @@ from torchcover.report import (
     table_dict,
     verdict,
 )
+from torchcover.report.map_subjects import quantities_shown
 from torchcover.report.records import records_of
 from torchcover.report.remarks import decisive
 from torchcover.simulation import Sensor
+from torchcover.simulation.memory import check_fits
 
 if TYPE_CHECKING:
     import pandas
@@ -53,6 +56,25 @@ if TYPE_CHECKING:
 REFUSED_SHARE = 0.2
 # What `summary.json` says of how the run went.
 RUN_KEYS = ("seconds", "complete", "frame_counts", "skipped_frames", "left_out")
+
+
+@dataclass(frozen=True)
+class PictureCosts:
+    """What the page and the maps of a result take; measured with 1 to 16 rigs on the usual grid.
+
+    Args:
+        bytes_per_cell: Memory of a cell of a rig, whatever is drawn.
+        bytes_per_value: Memory of a cell of a rig for each quantity: its value and its error.
+        seconds_per_panel: Time to draw one map; a rig has three in each height band for each quantity.
+        least_s: Shorter times are not announced.
+        least_bytes: Less memory is not announced.
+    """
+
+    bytes_per_cell: int = 40
+    bytes_per_value: int = 20
+    seconds_per_panel: float = 0.1
+    least_s: float = 60.0
+    least_bytes: float = 2e9
 
 
 class MetricReport(Protocol):
@@ -275,8 +297,32 @@ class Result:
             written.publish(summary)
         return written.paths
 
+    def estimate_pictures(self, wanted: Container[str], costs: PictureCosts = PictureCosts()) -> tuple[float, float]:
+        """Estimate the memory in bytes and the time in seconds that the page and the maps take, if they are wanted."""
+        first, rigs = self._first, len(self.coverages)
+        quantities, cells = len(quantities_shown(first)), first.grid.cells
+        needed_bytes = float(rigs * cells * (costs.bytes_per_cell + costs.bytes_per_value * quantities))
+        seconds = 3 * costs.seconds_per_panel * rigs * quantities * len(first.grid.heights) * ("maps" in wanted)
+        return needed_bytes * ("maps" in wanted or "page" in wanted), seconds
+
+    def announce_pictures(self, files: str | Iterable[str], costs: PictureCosts = PictureCosts()) -> str:
+        """Say what the page and the maps of many rigs will take; no words where that is little."""
+        needed_bytes, seconds = self.estimate_pictures(wanted_files(files), costs)
+        if needed_bytes < costs.least_bytes and seconds < costs.least_s:
+            return ""
+        return (
+            f"page and maps of {len(self.coverages)} rigs take about {needed_bytes / 1e9:.2g} GB of memory and "
+            f"{math.ceil(seconds / 60)} min, after the numbers are saved; `--files numbers` leaves them out"
+        )
+
     def add_pictures(self, files: AtomicOutput, wanted: Container[str], folder: str = "") -> None:
-        """Write the page and the maps, if they are wanted; `folder` is a prefix that ends with a slash."""
+        """Write the page and the maps, if they are wanted; `folder` is a prefix that ends with a slash.
+
+        ValueError: there is not enough memory for them.
+        """
+        advice = "the numbers are saved; leave the others out by `--files numbers`, or compare fewer rigs"
+        needed_bytes, _ = self.estimate_pictures(wanted)
+        check_fits(f"page and maps of {len(self.coverages)} rigs", needed_bytes, advice)
         if "page" in wanted:
             files.add_text(f"{folder}report.html", page_html(self.page))
         for stem, figure in self.maps() if "maps" in wanted else ():

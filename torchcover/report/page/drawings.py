@@ -7,6 +7,7 @@ from itertools import groupby
 
 import numpy as np
 
+from torchcover.files.notebooks import code_words_html
 from torchcover.report.layout import PageTable, Words
 from torchcover.report.overlay import SensorView, sensor_colour
 from torchcover.report.page.content import Array, PagePlan, PageRange
@@ -22,8 +23,8 @@ SEEN_BY = "not seen", "by one sensor only", "by two or more"
 
 
 def words_html(words: str) -> str:
-    """A sentence, in which no number is parted from its per cent sign."""
-    return escape(words).replace(" %", "&nbsp;%")
+    """A sentence in HTML: no break before a per cent sign, and words between backticks as code."""
+    return code_words_html(escape(words).replace(" %", "&nbsp;%"))
 
 
 def ranges_of(table: CoverageTable) -> list[PageRange]:

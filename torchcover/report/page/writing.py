@@ -163,7 +163,7 @@ def _picture(picture: PagePicture) -> str:
 
 
 def _notes(notes: Sequence[str]) -> str:
-    items = "".join(f"<li>{escape(note)}</li>" for note in notes)
+    items = "".join(f"<li>{words_html(note)}</li>" for note in notes)
     return f'<ul class="notes">{items}</ul>' if notes else ""
 
 
