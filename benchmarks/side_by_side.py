@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).parents[1]
-# `CHECKOUT` is the folder of the checkout that runs, `RECORDING` and `DRIVE` are made here once for both.
+# `CHECKOUT` is the folder of the checkout that runs, `RECORDING` is made here, `DRIVE` by each checkout.
 RUNS = {
     "courtyard": "evaluate front_roof_128 --scenario courtyard --steps 9",
     "paper_pattern": "evaluate front_grille_128 --steps 2 --reference paper --rays 65536",
@@ -104,14 +104,16 @@ def main():
     tolerances = {key: float(value) for key, value in (pair.split("=") for pair in options.tolerance)}
     unexpected = 0
     with tempfile.TemporaryDirectory() as folder:
-        inputs = {"RECORDING": f"{folder}/recording", "DRIVE": f"{folder}/drive"}
-        write_recording(Path(inputs["RECORDING"]))
-        drive = "record kitti --scenario urban --steps 40 --every-s 0.1"
-        run(options.old.resolve(), [*drive.split(), "--out", inputs["DRIVE"]], folder)
+        write_recording(Path(folder, "recording"))
+        checkouts = {"old": options.old.resolve(), "new": options.new.resolve()}
+        for side, checkout in checkouts.items():  # each in its own format
+            drive = "record kitti --scenario urban --steps 40 --every-s 0.1"
+            run(checkout, [*drive.split(), "--out", f"{folder}/{side}/drive"], folder)
         for name in options.runs:
             results = []
-            for side, checkout in (("old", options.old.resolve()), ("new", options.new.resolve())):
-                places = {**inputs, "CHECKOUT": str(checkout)}
+            for side, checkout in checkouts.items():
+                places = {"RECORDING": f"{folder}/recording", "DRIVE": f"{folder}/{side}/drive"}
+                places["CHECKOUT"] = str(checkout)
                 if name in SOURCES:
                     results.append(hash_frames(checkout, substitute(SOURCES[name], places), folder))
                 else:
