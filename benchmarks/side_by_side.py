@@ -54,8 +54,8 @@ RUNS = {
     "rig": "rig --frames DRIVE",
 }
 SOURCES = {
-    "simulated_frames": "data.SimulatedFrames('kitti', 'urban')",
-    "frames_of_rigs": "data.SimulatedFrames(['front_roof_32', 'nuscenes_cameras'], 'courtyard')",
+    "simulated_frames": "data.SimulatedFrames('urban', rigs={'kitti': 'kitti'}, steps=4)",
+    "frames_of_rigs": "data.SimulatedFrames('courtyard', rigs={'a': 'front_roof_32', 'b': 'nuscenes_cameras'}, steps=4)",
     "recorded_frames": "data.RecordedFrames('RECORDING')",
     "accumulated_frames": "data.RecordedFrames('DRIVE', reference=data.AccumulatedReference(1.0))",
 }
@@ -161,11 +161,13 @@ def run(checkout, arguments, folder):
 def run_and_read(name, checkout, words, out, folder):
     """Run one command; the values of everything that it writes, or prints if it writes nothing, by key."""
     if name == "rig":
-        return {"printed": run(checkout, words, folder)}
+        return {"printed": run(checkout, words, folder).replace(str(out.parent), "")}
     run(checkout, [*words, "--out", str(out)], folder)
     if name.startswith(("record_", "world")) or name == "record":
         paths = sorted(path for path in out.rglob("*") if path.is_file())
-        return {str(path.relative_to(out)): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
+        contents = {str(path.relative_to(out)): path.read_bytes() for path in paths}
+        side = str(out.parent).encode()
+        return {name: hashlib.sha256(content.replace(side, b"")).hexdigest() for name, content in contents.items()}
     values = {key: value for key, value in flatten(read_summary(out)) if is_number_of_rig(key)}
     for path in sorted(out.rglob("*.npz")):
         with np.load(path) as arrays:
