@@ -55,7 +55,7 @@ RUNS = {
 }
 SOURCES = {
     "simulated_frames": "data.SimulatedFrames('urban', rigs={'kitti': 'kitti'}, steps=4)",
-    "frames_of_rigs": "data.SimulatedFrames('courtyard', rigs={'a': 'front_roof_32', 'b': 'nuscenes_cameras'}, steps=4)",
+    "frames_of_rigs": "data.SimulatedFrames('courtyard', rigs={'a': 'kitti', 'b': 'waymo'}, steps=4, vehicle='suv')",
     "recorded_frames": "data.RecordedFrames('RECORDING')",
     "accumulated_frames": "data.RecordedFrames('DRIVE', reference=data.AccumulatedReference(1.0))",
 }
