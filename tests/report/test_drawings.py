@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from torchcover.geometry import rigid, rotation_from_euler
 from torchcover.report import ActorMark, SensorView, StandingFaces, draw_depths, draw_rig, draw_scene
+from torchcover.report.page.drawings import rig_drawing, sensor_table
 from torchcover.report.scene import PATH, REFERENCE, SENSOR, SKY
 
 VERTICES = np.array([[x, y, z] for x in (-2.0, 2.0) for y in (-1.0, 1.0) for z in (0.0, 1.5)])
@@ -261,3 +262,18 @@ def test_images_without_a_range_of_depths_are_drawn_too(image):
 def test_what_is_no_image_is_refused(images, message):
     with pytest.raises(ValueError, match=message):
         draw_depths(images, title="t")
+
+
+@pytest.mark.parametrize(("pitch_deg", "roll_deg"), [(90.0, 0.0), (0.0, 90.0)])
+def test_a_tilted_lidar_is_drawn_with_its_true_field_of_view(pitch_deg, roll_deg):
+    """On its side, it sees as far as its range along its plane, and across it no farther than its elevations allow."""
+    pose = rigid(rotation_from_euler(0.0, pitch_deg, roll_deg), (1.0, 2.0, 1.5))
+    view = SensorView("tilted", pose, 360.0, (-15.0, 15.0), 50.0)
+    extent_m = np.abs(view.outline_m(10.0) - (1.0, 2.0)).max(axis=0)
+    along, across = (1, 0) if pitch_deg else (0, 1)
+    assert extent_m[along] == pytest.approx(10.0, rel=1e-3)
+    assert extent_m[across] == pytest.approx(10.0 * np.sin(np.deg2rad(15.0)), rel=0.02)
+    ((_, _, turned, *_),) = sensor_table([view]).rows
+    assert turned.text == f"0.0, {pitch_deg:.1f}, {roll_deg:.1f}"
+    assert "<polygon" in rig_drawing([view], None, 0)
+    assert "<circle" in rig_drawing([SensorView("level", np.eye(4), 360.0, (-15.0, 15.0), 50.0)], None, 0)

@@ -15,7 +15,7 @@ import torch
 
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric
 from torchcover.coverage.quantity import RADIUS
-from torchcover.files import small_html
+from torchcover.notebooks import small_html
 from torchcover.report import (
     Line,
     Page,

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
-from matplotlib.patches import FancyArrowPatch, Polygon, Wedge
+from matplotlib.patches import FancyArrowPatch, Polygon
 from matplotlib.patheffects import AbstractPathEffect, withStroke
 from numpy.typing import NDArray
 
@@ -86,6 +86,32 @@ class SensorView:
         """Its direction: 0 is forward, positive turns left."""
         return float(euler_from_rotation(self.vehicle_T_sensor[:3, :3])[0])
 
+    @property
+    def tilt_deg(self) -> tuple[float, float]:
+        """Its pitch and roll."""
+        _, pitch_deg, roll_deg = euler_from_rotation(self.vehicle_T_sensor[:3, :3])
+        return float(pitch_deg), float(roll_deg)
+
+    def outline_m(self, reach_m: float, points: int = 361) -> NDArray[np.float64]:
+        """(K, 2) outline x, y of the field of view from above, up to a reach or its range.
+
+        Of a tilted sensor, how far a direction from above goes follows from the most level ray in it that is in the
+        field of view.
+        """
+        length_m, position_m = min(reach_m, self.range_m), self.position_m[:2]
+        if np.allclose(self.tilt_deg, 0.0):
+            half_deg = self.horizontal_fov_deg / 2
+            angles = np.deg2rad(np.linspace(self.yaw_deg - half_deg, self.yaw_deg + half_deg, points))
+            arc_m = position_m + length_m * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+            return arc_m if self.horizontal_fov_deg == 360 else np.vstack([arc_m, position_m])
+        angles = np.deg2rad(np.linspace(self.yaw_deg - 180, self.yaw_deg + 180, points))[:, None]
+        elevations = np.deg2rad(np.linspace(-90.0, 90.0, 361))[None]
+        level, up = np.cos(elevations), np.sin(elevations) + 0.0 * angles
+        rays = np.stack([level * np.cos(angles), level * np.sin(angles), up], axis=-1)
+        seen = self.sees(rays.reshape(-1, 3)).reshape(rays.shape[:2])
+        lengths_m = length_m * np.where(seen, level, 0.0).max(axis=1, keepdims=True)
+        return np.asarray(position_m + lengths_m * np.hstack([np.cos(angles), np.sin(angles)]))
+
     def sees(self, directions: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Which of (N, 3) directions in the vehicle frame lie in the field of view."""
         x, y, z = (directions @ self.vehicle_T_sensor[:3, :3]).T
@@ -152,13 +178,11 @@ def draw_places(sheet: Sheet, sensors: Sequence[SensorView]) -> list[Artist]:
 
 
 def _draw_view(sheet: Sheet, sensor: SensorView) -> None:
-    start, half = (sensor.x_m, sensor.y_m), sensor.horizontal_fov_deg / 2
+    start = sensor.x_m, sensor.y_m
     furthest = max(math.dist(start, corner) for corner in product(sheet.axes.get_xlim(), sheet.axes.get_ylim()))
-    wedge = Wedge(
-        start,
-        min(sensor.range_m, 2 * furthest),  # infinity cannot be drawn; beyond the map all ranges look the same
-        sensor.yaw_deg - half,
-        sensor.yaw_deg + half,
+    # Infinity cannot be drawn; beyond the map all ranges look the same.
+    wedge = Polygon(
+        sensor.outline_m(2 * furthest),
         fill=False,
         edgecolor="black",
         linewidth=0.8,

@@ -159,7 +159,6 @@ NUMBER_SHARE = 0.09
 HIGHEST_RANGES_IN = 4.5
 # What a range without limit is drawn with.
 UNLIMITED_M = 300.0
-ARC_POINTS = 241
 GROUND_M = -0.4
 
 
@@ -182,7 +181,7 @@ def draw_rig(
     x, y, top_m, around_m = _around(vertices_m, sensors)
     beyond_m = float(np.hypot(x[1] - x[0], y[1] - y[0]))
     ranges_m = [min(sensor.range_m, UNLIMITED_M) for sensor in sensors]
-    wide = [_sector(sensor, range_m) for sensor, range_m in zip(sensors, ranges_m, strict=True)]
+    wide = [sensor.outline_m(range_m) for sensor, range_m in zip(sensors, ranges_m, strict=True)]
     views = [(x, y), (x, (GROUND_M, top_m)), _bounds_of_ranges([vertices_m[:, :2], *wide])]
     figure, (above, side, ranges) = stack_views(views, width_in=WIDTH_IN)
     for axes, seen_from in ((above, "above"), (side, "right"), (ranges, "above")):
@@ -191,11 +190,11 @@ def draw_rig(
     for at, sensor in enumerate(sensors):
         near_m, place = min(ranges_m[at], beyond_m), sensor.position_m
         number_m = around_m * (FIRST_NUMBER + NUMBER_STEP * (at % NUMBER_PLACES))
-        _draw_sensor(above, at, place[:2], [_sector(sensor, near_m)], [_along(_sector(sensor, number_m))])
+        _draw_sensor(above, at, place[:2], [sensor.outline_m(near_m)], [_along(sensor.outline_m(number_m))])
         fans, ends = _fans(sensor, near_m), [_along(fan) for fan in _fans(sensor, number_m)]
         _draw_sensor(side, at, place[[0, 2]], fans, ends)
         inwards = 1.0 - NUMBER_SHARE * (at % NUMBER_PLACES)
-        _draw_sensor(ranges, at, place[:2], [wide[at]], [_along(_sector(sensor, inwards * ranges_m[at]))])
+        _draw_sensor(ranges, at, place[:2], [wide[at]], [_along(sensor.outline_m(inwards * ranges_m[at]))])
     for axes in (above, ranges):
         axes.set_ylabel("y left (m)")
     above.tick_params(labelbottom=False)
@@ -231,15 +230,6 @@ def _bounds_of_ranges(polygons: Sequence[Points]) -> tuple[Bounds, Bounds]:
 def _along(outline: Points) -> Points:
     """The middle of an arc, where its number stands."""
     return np.asarray(outline[len(outline) // 2])
-
-
-def _sector(sensor: SensorView, reach_m: float) -> Points:
-    """(K, 2) outline of the horizontal field of view: its arc last to first, and its corner if it has one."""
-    half = sensor.horizontal_fov_deg / 2
-    angles = np.deg2rad(np.linspace(sensor.yaw_deg - half, sensor.yaw_deg + half, ARC_POINTS))
-    length_m = min(reach_m, sensor.range_m)
-    arc = sensor.position_m[:2] + length_m * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    return arc if sensor.horizontal_fov_deg == 360 else np.vstack([arc, sensor.position_m[:2]])
 
 
 def _fans(sensor: SensorView, reach_m: float) -> list[Points]:

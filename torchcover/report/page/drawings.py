@@ -7,7 +7,7 @@ from itertools import groupby
 
 import numpy as np
 
-from torchcover.files.notebooks import code_words_html
+from torchcover.notebooks import code_words_html
 from torchcover.report.layout import PageTable, Words
 from torchcover.report.overlay import SensorView, sensor_colour
 from torchcover.report.page.content import Array, PagePlan, PageRange
@@ -146,12 +146,13 @@ def rig_drawing(sensors: Sequence[SensorView], ego_outline_m: Array | None, numb
 
 def sensor_table(sensors: Sequence[SensorView]) -> PageTable:
     """Where each sensor is, whereto it looks, and how far."""
-    headings = ("sensor", "x, y, z (m)", "yaw (°)", "wide (°)", "high (°)", "range (m)")
+    headings = ("sensor", "x, y, z (m)", "yaw, pitch, roll (°)", "wide (°)", "high (°)", "range (m)")
     rows = []
     for at, view in enumerate(sensors):
         place = ", ".join(f"{value:.2f}" for value in view.position_m)
         low, high = view.vertical_fov_deg
-        each = f"{view.yaw_deg:.1f}", f"{view.horizontal_fov_deg:.1f}", f"{low:.1f} to {high:.1f}", f"{view.range_m:g}"
+        turned = ", ".join(f"{round(angle, 1) + 0.0:.1f}" for angle in (view.yaw_deg, *view.tilt_deg))
+        each = turned, f"{view.horizontal_fov_deg:.1f}", f"{low:.1f} to {high:.1f}", f"{view.range_m:g}"
         rows.append(tuple(map(Words, (f"{at + 1}  {view.name}", place, *each))))
     return PageTable("", headings, rows)
 
@@ -166,6 +167,9 @@ def _field(name: str, colour: str, view: SensorView, reach: float) -> str:
     stops = "".join(f'<stop offset="{at}" stop-color="{colour}" stop-opacity="{0.5 - 0.5 * at}"/>' for at in (0, 1))
     circle = f'cx="{x:.3f}" cy="{y:.3f}" r="{reach:.3f}"'
     fade = f'<radialGradient id="{name}" gradientUnits="userSpaceOnUse" {circle}>{stops}</radialGradient>'
+    if not np.allclose(view.tilt_deg, 0.0):
+        corners = " ".join(f"{x:.3f},{-y:.3f}" for x, y in view.outline_m(reach))
+        return f'{fade}<polygon points="{corners}" fill="url(#{name})" stroke="{colour}" {DASHED}/>'
     if view.horizontal_fov_deg >= 360:
         return f'{fade}<circle {circle} fill="url(#{name})"/>'
     yaw, half = math.radians(view.yaw_deg), math.radians(view.horizontal_fov_deg / 2)
