@@ -57,15 +57,12 @@ class Recorder(Protocol):
 
     def __init__(self, add: Add, setup: RecordingSetup, /) -> None:
         """Begin one. ValueError: a rig that the layout cannot hold."""
-        ...
 
     def write(self, step: RecordedStep, /) -> Sequence[Any]:
         """Write the files of a step; returns what `finish` has to know of it, as JSON takes it."""
-        ...
 
     def finish(self, steps: Sequence[Sequence[Any]], /) -> None:
         """Write the files that are about all steps, of each of which `write` said this."""
-        ...
 
 
 # What is so near to the ground is the ground that the vehicle stands on.

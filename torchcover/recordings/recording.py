@@ -119,47 +119,38 @@ class Recording(Protocol):
     @property
     def path(self) -> Path:
         """Where it is."""
-        ...
 
     @property
     def names(self) -> Sequence[str]:
         """What a user calls the instants; so many there are."""
-        ...
 
     @property
     def frames(self) -> Sequence[int]:
         """Numbers of the instants that are meant to be looked at, ascending; the others serve a reference only."""
-        ...
 
     @property
     def times_s(self) -> NDArray[np.float64] | None:
         """(F,) when they were, ascending; None if unknown."""
-        ...
 
     @property
     def sensors(self) -> Sequence[str]:
         """Names of the sensors that belong to the vehicle."""
-        ...
 
     @property
     def rigs(self) -> Mapping[str, Sequence[str]]:
         """Name of each rig -> its sensors, unless others are asked for."""
-        ...
 
     @property
     def reference_sensors(self) -> Sequence[str]:
         """Sensors that were recorded to be the reference; empty where there was none."""
-        ...
 
     @property
     def square_metres(self) -> bool:
         """Whether the scans of the reference sensors have weights, the square metres that their points stand for."""
-        ...
 
     @property
     def instants(self) -> Sequence[int] | None:
         """`Frame.place_in_time` of each instant, for standard errors; None: no two of them are known to be alike."""
-        ...
 
     def scan(self, sensor: str, index: int, /) -> Scan:
         """Read what a sensor recorded at an instant.
@@ -168,15 +159,12 @@ class Recording(Protocol):
             OSError: It is not there.
             ValueError: It is not what it is meant to be.
         """
-        ...
 
     def world_T_vehicle(self, index: int, /) -> Matrix | None:
         """(4, 4) where the vehicle was, in a world that does not move; None if unknown."""
-        ...
 
     def boxes(self, index: int, /) -> Boxes | None:
         """The labelled objects of an instant in the vehicle frame; None where it is not labelled."""
-        ...
 
 
 class Layout:
@@ -217,7 +205,6 @@ class CalibratedRecording(Protocol):
             OSError: They are not there.
             ValueError: They are not what they are meant to be.
         """
-        ...
 
 
 @runtime_checkable
@@ -231,7 +218,6 @@ class UndistortedRecording(Protocol):
             OSError: They are not there.
             ValueError: They are not what they are meant to be.
         """
-        ...
 
 
 def warn_of_missing_poses(path: Path, missing: Sequence[str], count: int) -> None:

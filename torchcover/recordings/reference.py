@@ -30,7 +30,6 @@ class Reference(Protocol):
         Raises:
             ValueError: It has not.
         """
-        ...
 
     def cloud(self, recording: Recording, index: int, judged: Collection[str], /) -> InVehicle:
         """The reference cloud of an instant.
@@ -38,15 +37,12 @@ class Reference(Protocol):
         Raises:
             OSError, ValueError: It cannot be read, or has no points.
         """
-        ...
 
     def square_metres(self, recording: Recording, /) -> bool:
         """Whether its points have weights, the square metres that they stand for."""
-        ...
 
     def record(self, recording: Recording, judged: Collection[str], /) -> Mapping[str, object]:
         """For `summary.json`: `sensor`, settings, and `notes`: what the reader of the numbers has to know."""
-        ...
 
 
 class RecordedReference:

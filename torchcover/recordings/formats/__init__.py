@@ -28,15 +28,12 @@ class RecordingFormat(Protocol):
     @property
     def layout(self) -> str:
         """What such a recording looks like, for messages."""
-        ...
 
     def recognises(self, path: Path, /) -> bool:
         """Whether what is at a path that exists is meant to be such a recording."""
-        ...
 
     def __call__(self, path: Path, /) -> Recording:
         """Open it."""
-        ...
 
 
 # So many recordings in a folder are named, or in folders of it.
