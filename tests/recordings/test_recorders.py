@@ -247,6 +247,11 @@ def test_another_recording_is_not_gone_on_with(both, simulated_once, tmp_path):
 def test_a_recording_has_the_frames_that_were_written(tmp_path):
     frames = simulated(FRONT, steps=2)
     write_recording(frames, tmp_path / "training", "kitti")
+    label = tmp_path / "training" / "label_2" / "000000.txt"
+    label.write_text(label.read_text() + "\n")
+    with pytest.warns(UserWarning, match=r"edited since it was recorded: label_2/000000.txt \(missing, or of another"):
+        RecordedFrames(tmp_path)
+    label.write_text(label.read_text()[:-1])
     for path in list(tmp_path.glob("training/*/000001.*")):
         shutil.copy(path, path.with_stem("000009"))
     with pytest.raises(ValueError, match=r"of 2 frames \(recording.json\), and 1 more are there, such as 000009; copy"):

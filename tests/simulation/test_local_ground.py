@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from torchcover.data import RecordedFrames, SimulatedFrames, collate_frames
-from torchcover.frames.augmentation import scale
+from torchcover.frames.transforms import scale
 from torchcover.geometry import rigid, rotation_from_euler
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation import Scenario, Simulator, SurfaceReference

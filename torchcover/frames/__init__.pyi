@@ -1,7 +1,3 @@
-from .augmentation import Augmentation as Augmentation
-from .augmentation import flip as flip
-from .augmentation import rotate as rotate
-from .augmentation import scale as scale
 from .frame import Frame as Frame
 from .frame import FrameBatch as FrameBatch
 from .frame import Measured as Measured
@@ -11,4 +7,8 @@ from .source import ChosenRigs as ChosenRigs
 from .source import FrameDataset as FrameDataset
 from .source import FrameSource as FrameSource
 from .source import worlds_of as worlds_of
-from .visible_targets import VisibleTargets as VisibleTargets
+from .transforms import Augmentation as Augmentation
+from .transforms import VisibleTargets as VisibleTargets
+from .transforms import flip as flip
+from .transforms import rotate as rotate
+from .transforms import scale as scale
