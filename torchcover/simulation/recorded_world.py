@@ -27,13 +27,7 @@ from torchcover.recordings.in_vehicle import within
 from torchcover.recordings.movers import COMPARED_S, WITHIN_M, Moved, movers
 from torchcover.recordings.objects import objects_of
 from torchcover.recordings.recording import Recording
-from torchcover.recordings.reference import (
-    KNOWN_POINTS,
-    ON_GROUND_M,
-    USUAL_BODY,
-    VOTES,
-    AccumulatedReference,
-)
+from torchcover.recordings.reference import KNOWN_POINTS, ON_GROUND_M, USUAL_BODY, VOTES, AccumulatedReference
 from torchcover.recordings.sweeps import MOVES_MPS, first_of_each, voxels
 from torchcover.simulation.height_field import Slopes
 from torchcover.simulation.recorded.run import pieces

@@ -129,8 +129,7 @@ def test_long_vehicles_swing_out_and_none_comes_over_a_kerb(corner):
     (cuts,), (swings,) = (motions([bus], 22.0, ORIGIN, kerbs) for kerbs in (None, corner))
     over = [
         shapely.intersection(
-            shapely.polygons(corners_m(m.poses, np.tile(bus.sizes_m[0], (len(m.poses), 1)))),
-            shapely.union_all(corner),
+            shapely.polygons(corners_m(m.poses, np.tile(bus.sizes_m[0], (len(m.poses), 1)))), shapely.union_all(corner)
         )
         for m in (cuts, swings)
     ]

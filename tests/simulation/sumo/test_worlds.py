@@ -200,10 +200,7 @@ def test_cars_are_parked_in_bays_only(tmp_path):
     ("options", "message"),
     [
         ({"ego_id": "nobody"}, "ego_id: no vehicle 'nobody' up to t = 4 s, where the data end"),
-        (
-            {"ego_id": "ego", "duration_s": 9.0},
-            r"ego_id: 'ego' is not there all the time from t = 0 to 9 s",
-        ),
+        ({"ego_id": "ego", "duration_s": 9.0}, r"ego_id: 'ego' is not there all the time from t = 0 to 9 s"),
         (
             {"ego_id": "ego", "steps": together({t: row for t, row in drive().items() if not 1.1 < t < 2.1})},
             r"it leaves the network, teleports or has a gap after t = 1 s; shorten duration_s to 1",

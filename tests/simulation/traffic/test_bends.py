@@ -191,7 +191,7 @@ def test_beside_streets_there_is_pavement_and_between_pavements_no_bare_ground(s
     triangles_m = pavement.vertices_m[pavement.faces]
     up = np.cross(triangles_m[:, 1] - triangles_m[:, 0], triangles_m[:, 2] - triangles_m[:, 0])[:, 2] > 1e-6
     paved = shapely.union_all(shapely.polygons(triangles_m[up][..., :2])).buffer(0.02)
-    lines = [(streets.main, np.arange(*span_m, 2.0), streets.kerb_m)]
+    lines = [(streets.main, np.arange(*span_m, 2.0), streets.section.kerb_m)]
     for street, lanes in zip(streets.crossing, streets.cross_lanes_each_way, strict=True):
         lines.append((street, np.arange(-150.0, 150.0, 2.0), lanes * streets.section.lane_m + GUTTER_M))
     driven = shapely.union_all([
@@ -200,13 +200,13 @@ def test_beside_streets_there_is_pavement_and_between_pavements_no_bare_ground(s
     ])  # fmt: skip
     assert (streets.course.turns[(streets.junctions_m > seen_m[0]) & (streets.junctions_m < seen_m[1])] != 0).any()
     known = paved.union(driven.buffer(0.3))
-    along_m, left_m = np.meshgrid(np.arange(*seen_m), streets.kerb_m + np.array([0.5, 1.5, 2.8]))
+    along_m, left_m = np.meshgrid(np.arange(*seen_m), streets.section.kerb_m + np.array([0.5, 1.5, 2.8]))
     for side in (1, -1):
         assert shapely.contains_xy(known, streets.main.poses(along_m, side * left_m)[..., :2].reshape(-1, 2)).all()
     # Along the streets that cross it, too.
     for (street, _, half_m), station_m, turn in zip(lines[1:], streets.junctions_m, streets.course.turns, strict=True):
         if not turn and seen_m[0] < station_m < seen_m[1]:
-            away_m, left_m = np.meshgrid(streets.kerb_m + np.arange(0.5, 17.0), half_m + np.array([0.5, 2.8]))
+            away_m, left_m = np.meshgrid(streets.section.kerb_m + np.arange(0.5, 17.0), half_m + np.array([0.5, 2.8]))
             for way, side in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
                 places_m = street.poses(way * away_m, side * left_m)[..., :2]
                 assert shapely.contains_xy(known, places_m.reshape(-1, 2)).all()

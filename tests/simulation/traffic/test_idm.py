@@ -3,13 +3,7 @@
 import numpy as np
 import pytest
 
-from torchcover.simulation.traffic.idm import (
-    HARDEST_BRAKING_MPS2,
-    Driver,
-    acceleration_in,
-    advance,
-    tightness,
-)
+from torchcover.simulation.traffic.idm import HARDEST_BRAKING_MPS2, Driver, acceleration_in, advance, tightness
 
 DRIVER = Driver(desired_speed_mps=30.0, headway_s=1.5, standstill_gap_m=2.0, acceleration_mps2=1.4)
 STEP_S = 0.05

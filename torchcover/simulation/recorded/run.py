@@ -21,25 +21,18 @@ CLOSEST_S = 1e-3
 TOLD = 8
 
 
-class Cast(NamedTuple):
-    """Who is who."""
+class Excerpt(NamedTuple):
+    """What is shown of a recording: `drive` of the ego and all `others`, in its time, from `begin_s` on."""
 
     name: str
     drive: Trajectory
     others: tuple[Track, ...]
+    begin_s: float = 0.0
+    duration_s: float = 0.0
 
 
-class Excerpt(NamedTuple):
-    """What is shown of a recording: `drive` of the ego and all `others`, in its time, from `begin_s` on."""
-
-    begin_s: float
-    duration_s: float
-    drive: Trajectory
-    others: tuple[Track, ...]
-
-
-def cast_of(recording: RecordedObjects, ego_id: str | None, ego_T_vehicle: Matrix | None) -> Cast:
-    """Choose the ego: the track or the recording's own ego of an id, the first of these without one.
+def cast_of(recording: RecordedObjects, ego_id: str | None, ego_T_vehicle: Matrix | None) -> Excerpt:
+    """Choose the ego, and no times yet: the track or the recording's own ego of an id, the first of these without one.
 
     `ego_T_vehicle` is the vehicle frame in that of the poses of its own ego, if not as published.
     """
@@ -48,7 +41,7 @@ def cast_of(recording: RecordedObjects, ego_id: str | None, ego_T_vehicle: Matri
         raise ValueError(f"ego_id: the recording has no ego of its own; name one of its tracks, {_told(recording, '')}")
     own = next(iter(egos.values())) if ego_id is None else egos.get(ego_id)
     if own is not None:
-        return Cast(own.name, _drive(own, ego_T_vehicle), recording.tracks)
+        return Excerpt(own.name, _drive(own, ego_T_vehicle), recording.tracks)
     found = [track for track in recording.tracks if track.name == ego_id]
     if not found:
         raise ValueError(f"ego_id: there is no {ego_id!r} in the recording, but {_told(recording, str(ego_id))}")
@@ -56,10 +49,10 @@ def cast_of(recording: RecordedObjects, ego_id: str | None, ego_T_vehicle: Matri
         raise ValueError(f"ego_T_vehicle: is for an ego without a box; that of {ego_id!r} says where its middle is")
     others = [track for track in recording.tracks if track is not found[0]]
     bodies = [_as_track(ego) for ego in recording.egos]
-    return Cast(found[0].name, found[0].trajectory, (*others, *(body for body in bodies if body is not None)))
+    return Excerpt(found[0].name, found[0].trajectory, (*others, *(body for body in bodies if body is not None)))
 
 
-def excerpt_of(cast: Cast, begin_s: float, duration_s: float | None, max_gap_s: float) -> Excerpt:
+def excerpt_of(cast: Excerpt, begin_s: float, duration_s: float | None, max_gap_s: float) -> Excerpt:
     """Choose the times: those at which the ego and the others are known, or of them what is asked for.
 
     An ego of which one pose is known stands there; that instant alone is shown, unless a duration is given.
@@ -86,10 +79,10 @@ def excerpt_of(cast: Cast, begin_s: float, duration_s: float | None, max_gap_s: 
         )
     begin_s += first_s
     whole = cast.drive if stands else _without_gaps(cast, begin_s, begin_s + duration_s, max_gap_s, first_s)
-    return Excerpt(begin_s, duration_s, whole, cast.others)
+    return cast._replace(drive=whole, begin_s=begin_s, duration_s=duration_s)
 
 
-def _without_gaps(cast: Cast, begin_s: float, end_s: float, max_gap_s: float, first_s: float) -> Trajectory:
+def _without_gaps(cast: Excerpt, begin_s: float, end_s: float, max_gap_s: float, first_s: float) -> Trajectory:
     """The piece of the ego's drive that holds all of a time."""
     found = pieces(cast.drive, max_gap_s)
     for piece in found:

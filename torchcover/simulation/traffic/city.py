@@ -63,7 +63,9 @@ class City(NamedTuple):
 
     def static(self, seen_m: Bounds) -> Scenery:
         """The ground, the blocks, buildings and furniture; cars are parked among them."""
-        main = BuildingSite(self.streets.main, self.territory, self.hills, self.streets.kerb_m + BLOCK_DEPTH_M + 10.0)
+        main = BuildingSite(
+            self.streets.main, self.territory, self.hills, self.streets.section.kerb_m + BLOCK_DEPTH_M + 10.0
+        )
         fronts = [(main, front) for front in self._frontages(seen_m)]
         turns = ~self.streets.has_lights & (np.abs(self.streets.junctions_m - np.mean(seen_m)) < np.ptp(seen_m) / 2)
         fronts += [self._corner(index) for index in np.flatnonzero(turns).tolist()]
@@ -142,7 +144,7 @@ class City(NamedTuple):
         inside_m = -inwards * front.side * sidewalk_m
         if not self.streets.course.turns[index]:
             return face_m[1:], [] if is_built else [_strip(face_m, inside_m)]
-        middle_m, half_m = float(self.streets.junctions_m[index]), float(self.streets.cross_kerbs_m[index])
+        middle_m, half_m = float(self.streets.junctions_m[index]), float(self.streets.course.halves_m[index])
         around_m = site.street.poses(np.linspace(corner_m, middle_m, 17), front.side * front.kerb_m)[:, :2]
         way_m, kerb_m = np.linspace(-half_m, half_m + CORNER_M, 97), float(self.streets.carriageways_m[index])
         line_m = self.streets.crossing[index].poses(-inwards * way_m, 0.0)[:, :2]
@@ -174,7 +176,7 @@ class City(NamedTuple):
 
     def _frontages(self, seen_m: Bounds) -> Iterator[Frontage]:
         """Both sides of the main street from kerb to kerb."""
-        turns, middles, halves = self.streets.course.turns, self.streets.junctions_m, self.streets.cross_kerbs_m
+        turns, middles, halves = self.streets.course.turns, self.streets.junctions_m, self.streets.course.halves_m
         starts, ends = (middles - halves).tolist(), (middles + halves).tolist()
         for west in range(len(turns) - 1):
             for side in (1, -1):
@@ -184,11 +186,11 @@ class City(NamedTuple):
                     east += 1
                 if turns[west] != side and starts[east] > seen_m[0] and ends[west] < seen_m[1]:
                     turns_m = tuple((starts[k], ends[k]) for k in range(west + 1, east))
-                    yield Frontage((ends[west], starts[east]), side, self.streets.kerb_m, turns_m, (west, east))
+                    yield Frontage((ends[west], starts[east]), side, self.streets.section.kerb_m, turns_m, (west, east))
 
     def _corner(self, index: int) -> tuple[BuildingSite, Frontage]:
         """The block between the two streets that meet the main street in a turn."""
-        street, half_m = self.streets.crossing[index], float(self.streets.cross_kerbs_m[index])
+        street, half_m = self.streets.crossing[index], float(self.streets.course.halves_m[index])
         kerb_m = float(self.streets.carriageways_m[index])
         side, middle_m = int(self.streets.course.turns[index]), float(self.streets.junctions_m[index])
         span_m = (-half_m - CORNER_M, half_m + CORNER_M)

@@ -112,20 +112,11 @@ class VehicleType(NamedTuple):
 
 # What each built-in body counts as.
 BODIES = {
-    "suv": "car",
-    "sedan": "car",
-    "hatchback": "car",
-    "pickup": "car",
-    "van": "car",
-    "lorry": "truck",
-    "truck": "truck",
+    **dict.fromkeys(("suv", "sedan", "hatchback", "pickup", "van"), "car"),
+    **dict.fromkeys(("lorry", "truck"), "truck"),
     # It has a box and a category of its own, as in nuScenes.
-    "trailer": "trailer",
-    "bus": "bus",
-    "motorcycle": "motorcycle",
-    "cyclist": "cyclist",
-    "adult": "pedestrian",
-    "child": "pedestrian",
+    **{kind: kind for kind in ("trailer", "bus", "motorcycle", "cyclist")},
+    **dict.fromkeys(("adult", "child"), "pedestrian"),
 }
 # Lengths, widths and heights of others of a kind, as shares of its body's: within the spreads of boxes in recorded
 # logs (docs/measured/streets.md).

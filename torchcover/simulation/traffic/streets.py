@@ -190,16 +190,6 @@ class Streets:
         return self.course.street
 
     @property
-    def kerb_m(self) -> float:
-        """From the middle of the main street to its kerb."""
-        return self.section.kerb_m
-
-    @property
-    def cross_kerbs_m(self) -> Float64:
-        """(J,) from the middle of each cross street to its kerb; of a junction with a turn to its end."""
-        return self.course.halves_m
-
-    @property
     def has_lights(self) -> Bools:
         """(J,) whether somebody crosses the main street there: not where it turns, and others give way."""
         return np.asarray(self.course.turns == 0)
@@ -235,10 +225,10 @@ class Streets:
     def cross_ends_m(self) -> Float64:
         """(J, 2) stations between which a cross street, in all its width, is far from all others of its kind."""
         whole = Territory(self.main, (-self.reach_m, self.reach_m))
-        edges_m = self.junctions_m + np.array([[-1.0], [1.0]]) * (self.cross_kerbs_m + 1.0)
+        edges_m = self.junctions_m + np.array([[-1.0], [1.0]]) * (self.course.halves_m + 1.0)
         ends_m = np.empty((len(self.junctions_m), 2))
         for column, side in enumerate((-1, 1)):
-            reach_m = whole.reaches_m(edges_m.ravel(), side, self.kerb_m, SIGHT_M).reshape(2, -1).min(axis=0)
+            reach_m = whole.reaches_m(edges_m.ravel(), side, self.section.kerb_m, SIGHT_M).reshape(2, -1).min(axis=0)
             ends_m[:, column] = side * (2 * self.reach_m if self.main.is_straight else reach_m - LONGEST_HALF_M)
         return ends_m
 
@@ -254,14 +244,14 @@ class Streets:
 
     def sidewalks(self) -> list[Lane]:
         """Tracks of the people who walk along the main street: each way on both sides."""
-        tracks = [(self.kerb_m + TRACKS_M[0], 1), (self.kerb_m + TRACKS_M[1], -1)]
+        tracks = [(self.section.kerb_m + TRACKS_M[0], 1), (self.section.kerb_m + TRACKS_M[1], -1)]
         return [self._main_lane(side * offset, way, 0.0) for side in (1, -1) for offset, way in tracks]
 
     def cross_lanes(self) -> list[Lane]:
         """The lanes of all cross streets: northbound ones on the east side, southbound ones on the west side."""
         lanes = []
         for index in np.flatnonzero(self.has_lights).tolist():
-            middle, half = self.reach_m, self.kerb_m
+            middle, half = self.reach_m, self.section.kerb_m
             gate = Gate(middle - half - STOP_LINE_M, middle + half + CROSSING_ENDS_M, index, CROSS)
             for way in (1, -1):
                 for lane in range(self.cross_lanes_each_way[index]):
@@ -281,7 +271,7 @@ class Streets:
         gates = []
         for index in np.argsort(way * self.junctions_m):
             if self.has_lights[index]:
-                middle, half = float(line.places_at(self.junctions_m[index])), self.cross_kerbs_m[index]
+                middle, half = float(line.places_at(self.junctions_m[index])), self.course.halves_m[index]
                 enter, leave = middle - half - before, middle + half + behind
                 needed = (leave - enter) / WALKED_METRES_PER_GREEN_SECOND if walks else 0.0
                 gates.append(Gate(float(enter), float(leave), int(index), MAIN, float(needed)))

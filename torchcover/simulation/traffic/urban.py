@@ -210,7 +210,7 @@ def _in_place(
         if of_main and CATEGORIES.get(agents[on_lane[0]].kind) == "pedestrian":
             # In a turn the pavement goes on.
             stop = streets.has_lights
-            middles_m, halves_m = streets.junctions_m[stop][:: line.way], streets.cross_kerbs_m[stop][:: line.way]
+            middles_m, halves_m = streets.junctions_m[stop][:: line.way], streets.course.halves_m[stop][:: line.way]
             places_m = place_m[:, on_lane]
             first_m, last_m = np.sort(line.places_at(middles_m + np.array([[-1.0], [1.0]]) * halves_m), axis=0)
             next_one = np.minimum(np.searchsorted(last_m, np.ascontiguousarray(places_m.T)).T, len(last_m) - 1)
@@ -232,7 +232,7 @@ def _crossers(
 ) -> Paths:
     """People who go to and fro across the main street, on both crossings of each junction with lights in sight."""
     found = []
-    wait_m = streets.kerb_m + WAITING_BEHIND_KERB_M
+    wait_m = streets.section.kerb_m + WAITING_BEHIND_KERB_M
     walks = 2 * wait_m / float(WALKING.desired_speed_mps)
     green = streets.signals.green_left_s(times_s)[..., CROSS]
     may_go = (green + streets.signals.amber_s > walks) & ~flow.occupied[:, :, MAIN]
@@ -240,7 +240,7 @@ def _crossers(
     for index in np.flatnonzero(seen & streets.has_lights):
         for side in (1, -1):
             for offset in FOOTPATHS_M:
-                x = streets.junctions_m[index] + side * (streets.cross_kerbs_m[index] + offset)
+                x = streets.junctions_m[index] + side * (streets.course.halves_m[index] + offset)
                 kind = fleet.draw_kind({"adult": 5.0, "child": 1.0})
                 ends = streets.main.poses(x, np.array([-wait_m, wait_m]))[:, :2]
                 path = Footpath(ends[0], ends[1], WAITING_BEHIND_KERB_M)
