@@ -5,7 +5,7 @@ import pytest
 
 from torchcover.geometry import BoundingBox, rigid, rotation_from_euler
 from torchcover.geometry.trajectory import Trajectory
-from torchcover.simulation import Draws, Lidar, PaperReference, Pose, Scenario
+from torchcover.simulation import PaperReference, Pose, Scenario
 from torchcover.simulation.raycaster import cast_from
 from torchcover.simulation.rays import (
     blocks_towards,
@@ -19,7 +19,6 @@ from torchcover.simulation.rays import (
 )
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.shapes import Box, Plane
-from torchcover.simulation.sight import MountedSensor
 from torchcover.simulation.world import Actor, World
 
 EGO = BoundingBox((-2.45, -0.97, 0.0), (2.45, 0.97, 1.63))
@@ -69,19 +68,6 @@ def test_a_scan_is_that_of_every_ray_cast_at_every_body(scene, step, sensor):
     seen = instant.scan(pose, tiles, max_range_m=150.0)
     assert_same_bits(seen, at_every_body(instant, pose, tiles, 150.0))
     assert seen.body_casts < 0.5 * seen.rays * len(instant.moving)
-
-
-@pytest.mark.parametrize("step", [0, 250])
-def test_a_mounted_sensor_sees_the_same_without_casting_at_the_ego_again(scene, step):
-    lidar = Lidar(name="roof", mount=Pose(x_m=0.45, z_m=1.73, yaw_deg=20), channels=40, vertical_fov_deg=(-60, 10),
-                  horizontal_fov_deg=360, columns=150, max_range_m=90)  # fmt: skip
-    tiles, instant = into_tiles(lidar.directions()), scene.at(step, within_m=90.0)
-    mounted = MountedSensor(lidar, scene, lidar.max_range_m).scan(instant, Draws(None), threads=2)
-    afresh = instant.scan(lidar.mount.matrix(), tiles, max_range_m=90)
-    assert mounted.self_hits > 100
-    assert_same_bits(mounted, (afresh.points, afresh.self_hits))
-    np.testing.assert_array_equal(mounted.ray, afresh.ray)
-    assert mounted.body_casts < afresh.body_casts
 
 
 def test_bodies_of_one_kind_are_cast_at_together_from_a_place_on_one_of_them_too():

@@ -5,7 +5,7 @@ import pytest
 
 from torchcover.geometry import rigid, rotation_from_euler
 from torchcover.geometry.trajectory import Trajectory
-from torchcover.simulation import Pose, Scenario
+from torchcover.simulation import Pose
 from torchcover.simulation.bodies import in_vehicle_frame
 from torchcover.simulation.rays import into_tiles, unit_directions
 from torchcover.simulation.scene import Scene
@@ -19,19 +19,6 @@ UTM = np.array([513_248.37, 5_403_655.81, 312.5])
 
 def box(*size_m):
     return in_vehicle_frame(Box(type="box", size_m=size_m).mesh())
-
-
-def scenario(pose):
-    return Scenario.model_validate(
-        {
-            "name": "s",
-            "ego": {"shape": {"type": "box", "size_m": [4, 2, 1]}, "pose": pose},
-            "bodies": [
-                {"name": "wall", "shape": {"type": "box", "size_m": [1, 20, 4]}, "poses": [{**pose}]},
-                {"name": "ground", "shape": {"type": "plane", "size_m": [200, 200]}, "poses": [{**pose}]},
-            ],
-        }
-    )
 
 
 def world(origin_m=(0, 0, 0), yaw_deg=0.0, moving=True, ego_moves=False):
@@ -81,12 +68,6 @@ def test_a_moving_ego_sees_what_a_resting_one_would_see_there():
     np.testing.assert_allclose(as_set(moving.points), as_set(resting.points), atol=1e-4)
 
 
-def test_the_wall_comes_closer_as_the_ego_drives():
-    for step in (0, 3, 6):
-        points = scan(world(ego_moves=True), step).points
-        assert points[points[:, 2] > 2.0][:, 0].min() == pytest.approx(9.5 - step, abs=1e-4)
-
-
 def test_an_actor_is_where_its_trajectory_says_and_hides_what_lies_behind():
     for step in (0, 1, 2):
         x, y, z = scan(world(), step).points.T
@@ -97,29 +78,12 @@ def test_an_actor_is_where_its_trajectory_says_and_hides_what_lies_behind():
         assert not behind.any()
 
 
-def test_an_actor_that_moves_is_seen_as_one_that_rests():
-    """Two ways through the code, the same geometry."""
-    resting = world(moving=False)
-    moving = world(moving=True)
-    a, b = scan(resting), scan(moving)
-    assert len(a.points) == len(b.points)
-    np.testing.assert_allclose(as_set(a.points), as_set(b.points), atol=1e-4)
-
-
 @pytest.mark.parametrize("ego_moves", [False, True])
 def test_the_same_world_far_out_gives_the_same_points(ego_moves):
     here = scan(world(ego_moves=ego_moves), 2)
     there = scan(world(UTM, 37.0, ego_moves=ego_moves), 2)
     assert len(here.points) == len(there.points)
     np.testing.assert_allclose(as_set(there.points), as_set(here.points), atol=1e-3)
-
-
-def test_a_scenario_places_its_ego_and_bodies():
-    made = scenario({"x_m": 30.0, "yaw_deg": 90.0}).world()
-    scene = Scene(made)
-    assert scene.ego_box.lower_m == (-2.0, -1.0, 0.0)
-    points = scene.at(0).scan(Pose(x_m=-8.0, z_m=1.5).matrix(), SPHERE).points
-    assert points[points[:, 2] > 1.6][:, 0].min() == pytest.approx(-0.5, abs=1e-4)
 
 
 def test_an_actor_in_the_ego_is_an_error_that_names_actor_and_time():
@@ -129,21 +93,3 @@ def test_an_actor_in_the_ego_is_an_error_that_names_actor_and_time():
     scene.at(3)
     with pytest.raises(ValueError, match=r"actor 'truck' overlaps the ego at t = 5 s"):
         scene.at(5)
-
-
-@pytest.mark.parametrize("moving", [False, True])
-def test_a_place_in_the_ground_a_wall_or_a_car_is_buried(moving):
-    instant = Scene(world(moving=moving)).at(0)
-    for buried in ([3, 3, -0.2], [10, 0, 1], [0, 6, 0.5]):
-        assert instant.buried(np.array(buried, dtype=float))
-    for free in ([3, 3, 0.2], [9.3, 0, 1], [0, 5.3, 0.5], [0, 0, 1.2]):
-        assert not instant.buried(np.array(free, dtype=float))
-
-
-def test_bodies_with_faces_turned_inside_out_are_seen_alike():
-    """Rays stop at a face from either side."""
-    made = world()
-    turned = World(
-        tuple(mesh._replace(faces=mesh.faces[:, ::-1]) for mesh in made.static), made.ego, made.actors, 1, 10
-    )
-    np.testing.assert_array_equal(as_set(scan(made).points), as_set(scan(turned).points))

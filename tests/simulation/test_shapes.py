@@ -75,13 +75,6 @@ def test_an_ellipsoid_has_its_size_and_its_corners_lie_on_the_surface():
     np.testing.assert_allclose(np.linalg.norm(on_sphere, axis=1), 1.0, rtol=1e-12)
 
 
-def test_a_body_has_one_copy_for_each_pose():
-    body = Body(name="b", shape=Box(type="box", size_m=(1, 1, 1)), poses=(Pose(x_m=5), Pose(y_m=-3, z_m=2)))
-    first, second = body.meshes()
-    np.testing.assert_allclose(first.vertices_m.mean(0), [5, 0, 0.5])
-    np.testing.assert_allclose(second.vertices_m.mean(0), [0, -3, 2.5])
-
-
 @pytest.mark.parametrize(
     ("content", "message"),
     [

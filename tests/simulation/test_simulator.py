@@ -98,12 +98,3 @@ def test_the_egos_box_is_that_of_a_world_of_the_scenario(name):
     ego = scenario.world(seed=3, episode=1).ego.mesh
     np.testing.assert_array_equal(scenario.ego_mesh().vertices_m, ego.vertices_m)
     assert scenario.ego_box() == BoundingBox.around(ego.vertices_m)
-
-
-@pytest.mark.parametrize("ego", [None, {"shape": {"type": "box", "size_m": [6, 2.5, 3]}}])
-def test_the_egos_box_is_known_without_a_world(ego, monkeypatch):
-    scenario = Scenario.model_validate({**SHORT, "ego": ego})
-    in_scene = Simulator(scenario, {}, SMALL).scene_of(0)[0].ego_box
-    monkeypatch.setattr(Scenario, "world", None)
-    assert scenario.ego_box() == in_scene
-    assert (scenario.ego_box().size_m == (6.0, 2.5, 3.0)) == (ego is not None)

@@ -135,13 +135,6 @@ def test_strata_that_overlap_share_their_points_out(at):
     assert step.reference_weights[inside].max() < step.reference_weights[~inside].min()
 
 
-def test_what_is_out_of_range_is_not_seen(at):
-    at([2.5, 0.0, 1.0])
-    sensor = SurfaceReference((((0.0, 40.0), (-20.0, 20.0)),), rays=4000, places=1, max_range_m=12.0)
-    points = Simulator(scenario(FLOOR), {}, sensor).step(0).reference
-    assert 11.5 < np.linalg.norm(points - [2.5, 0.0, 1.0], axis=1).max() <= 12.0001
-
-
 def test_nothing_to_see_is_no_point_and_no_square_metre(at):
     at([2.5, 0.0, 1.0])
     empty = SurfaceReference((AHEAD,), rays=100, bands_m=((1.0, 2.0), (50.0, 60.0)))
@@ -153,13 +146,6 @@ def test_nothing_to_see_is_no_point_and_no_square_metre(at):
     hidden = Simulator(scenario(box([0.2, 40, 30], x_m=8), FLOOR), {}, behind).step(0)
     assert len(hidden.reference) == 0
     assert hidden.counts["reference_rays"] > 40
-
-
-@pytest.mark.parametrize(("rays", "places"), [(1, 1), (1, 4), (7, 3)])
-def test_one_point_or_one_place_will_do(rays, places):
-    simulator = Simulator(Scenario.load("courtyard"), {}, SurfaceReference((AHEAD,), rays=rays, places=places))
-    counts = [simulator.step(index).counts["reference_rays"] for index in range(40)]
-    assert 0.5 * rays < np.mean(counts) < 2 * rays
 
 
 def test_huge_faces_needles_and_faces_without_area_are_taken_as_they_are(at, tmp_path):
