@@ -81,6 +81,19 @@ def test_agrees_with_a_slow_intersection_in_float64():
     assert 0.2 < both.mean() < 1.0
 
 
+def test_what_is_struck_knows_how_steeply():
+    mesh, directions = random_mesh(200), random_directions(600)
+    caster = RayCaster([mesh])
+    hits = caster.cast(HERE, directions, endless(directions))
+    met = hits.body >= 0
+    struck = caster.struck(hits.body[met], hits.triangle[met], directions[:, met])
+    first, second, third = mesh.vertices_m[mesh.faces[hits.triangle[met]]].swapaxes(0, 1)
+    normals = np.cross(second - first, third - first)
+    expected = np.abs((normals * directions[:, met].T).sum(axis=1)) / np.linalg.norm(normals, axis=1)
+    np.testing.assert_allclose(struck.cos_incidence, expected, atol=1e-4)
+    assert 0.2 < met.mean() < 1.0
+
+
 def test_no_ray_slips_out_of_a_closed_box_through_its_edges():
     box = Box(type="box", size_m=(4.0, 6.0, 3.0)).mesh()
     corners = box.vertices_m[box.faces]

@@ -93,3 +93,12 @@ def test_an_actor_in_the_ego_is_an_error_that_names_actor_and_time():
     scene.at(3)
     with pytest.raises(ValueError, match=r"actor 'truck' overlaps the ego at t = 5 s"):
         scene.at(5)
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_a_place_in_the_ground_a_wall_or_a_car_is_buried(moving):
+    instant = Scene(world(moving=moving)).at(0)
+    for buried in ([3, 3, -0.2], [10, 0, 1], [0, 6, 0.5]):
+        assert instant.buried(np.array(buried, dtype=float))
+    for free in ([3, 3, 0.2], [9.3, 0, 1], [0, 5.3, 0.5], [0, 0, 1.2]):
+        assert not instant.buried(np.array(free, dtype=float))

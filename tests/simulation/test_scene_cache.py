@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 
 from torchcover.files import BadFileError
+from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, scene_cache
-from torchcover.simulation.scene_cache import SceneCache, read_scene
+from torchcover.simulation.scene_cache import SceneCache, encode_scene, read_scene
+from torchcover.simulation.shapes import Box
 from torchcover.simulation.traffic import Highway, Parking, Urban
 from torchcover.simulation.traffic.fleet import load_bodies
+from torchcover.simulation.world import Actor, World
 
 EGO = {"shape": {"type": "box", "size_m": [4, 2, 1.5]}}
 LOT = {"type": "parking", "duration_s": 1.0, "time_step_s": 0.2, "crossings": 0, "parked_share": 0.1}
@@ -70,6 +73,16 @@ def test_a_world_from_disk_is_the_one_that_was_built_and_shares_its_bodies(disk,
     assert {id(actor.mesh) for actor in (again.ego, *again.objects)} <= bodies
     shared = [{id(actor.trajectory.times_s) for actor in world.actors} for world in (first, again)]
     assert len(shared[1]) <= len(shared[0])
+
+
+def test_actors_that_share_a_mesh_share_it_again(tmp_path):
+    mesh, way = Box(type="box", size_m=(4, 2, 1.5)).mesh(), Trajectory.resting([9.0, 0.0, 0.0])
+    ego, *actors = (Actor(name, "car", mesh, way) for name in ("ego", "a", "b"))
+    world = World((), ego, tuple(actors))
+    np.savez(tmp_path / "a.npz", **encode_scene("a", world, {}))
+    again = read_scene(tmp_path / "a.npz", {})
+    assert same(world, again)
+    assert again.ego.mesh is again.actors[0].mesh is again.actors[1].mesh
 
 
 def test_frames_are_the_same_to_the_bit(disk):
