@@ -16,7 +16,6 @@ from .bad_file import check_regular as check_regular
 from .bad_file import common_link_roots as common_link_roots
 from .bad_file import decode as decode
 from .bad_file import find_link_roots as find_link_roots
-from .bad_file import find_remedy as find_remedy
 from .bad_file import most_gb as most_gb
 from .bad_file import naming as naming
 from .bad_file import read_short_text as read_short_text

@@ -23,10 +23,11 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails
 
-from torchcover.files import BadFileError, find_remedy, parse_yaml, read_short_text, reads
+from torchcover.files import BadFileError, parse_yaml, read_short_text, reads
 from torchcover.geometry import rigid, rotation_from_euler, rotation_from_quaternion
 from torchcover.geometry.arrays import Float64
 from torchcover.geometry.rigid import warn_of_radians
+from torchcover.recordings.other_formats import find_remedy
 from torchcover.simulation.builtin import builtin_folder, builtin_names
 
 # Mistakes of one document that a message tells, and characters of what arrived.

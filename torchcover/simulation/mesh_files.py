@@ -13,7 +13,8 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.files import apart, check_memory, check_regular, find_remedy
+from torchcover.files import apart, check_memory, check_regular
+from torchcover.recordings.other_formats import find_remedy
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]

@@ -12,9 +12,10 @@ import numpy as np
 from pydantic import ValidationError
 from scipy.spatial import cKDTree
 
-from torchcover.files import AtomicOutput, as_yaml, find_remedy, parse_xml, reads
+from torchcover.files import AtomicOutput, as_yaml, parse_xml, reads
 from torchcover.geometry import BoundingBox, rigid, rotation_from_quaternion
 from torchcover.geometry.arrays import Float64
+from torchcover.recordings.other_formats import find_remedy
 from torchcover.simulation.bodies import merge
 from torchcover.simulation.documents import explain
 from torchcover.simulation.gazebo_sensors import PlacedSensor, read_numbers, read_pose, read_sensors

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-from torchcover.files import RECORDING, allow_links, find_changed, find_remedy
+from torchcover.files import RECORDING, allow_links, find_changed
 from torchcover.recordings.corrected import correct_recording
 from torchcover.recordings.formats import argoverse2, nuscenes
 from torchcover.recordings.formats.argoverse2 import Argoverse2
@@ -18,6 +18,7 @@ from torchcover.recordings.formats.nuscenes import NuScenes
 from torchcover.recordings.formats.ros import RosBag
 from torchcover.recordings.formats.tracks import read_box_tracks, read_commonroad
 from torchcover.recordings.objects import RecordedObjects, objects_of
+from torchcover.recordings.other_formats import find_remedy
 from torchcover.recordings.recording import Recording, whole_recording
 from torchcover.recordings.settings import RecordingSettings, merge_recording_settings
 

@@ -9,8 +9,9 @@ import numpy as np
 import shapely
 from pydantic import Field, model_validator
 
-from torchcover.files import BadFileError, find_remedy
+from torchcover.files import BadFileError
 from torchcover.geometry.arrays import Bools, Float64
+from torchcover.recordings.other_formats import find_remedy
 from torchcover.simulation.documents import PathBeside
 from torchcover.simulation.sumo.crowd import crowd, read_types
 from torchcover.simulation.sumo.floating import Recorded, TimeWindow, read_floating, record
