@@ -66,21 +66,20 @@ def las_bytes(array, *, compressed=False):
 
 
 def las_in(*records, **options):
-    """A survey whose records say its coordinate system: GeoKeys by key, or WKT."""
-    keys, wkt = dict(record for record in records if isinstance(record, tuple)), [*map(str, records)][-1:]
+    """A survey whose records say its coordinate system: GeoKeys by key, WKT, or both."""
+    keys = dict(record for record in records if isinstance(record, tuple))
+    wkt = [record for record in records if isinstance(record, str)]
     header = laspy.LasHeader(point_format=6, version="1.4") if not keys else laspy.LasHeader(point_format=3)
     header.scales, header.offsets = [2**-8] * 3, [0.0, 1.0, 0.0]
-    if keys:
-        rows = [(1, 1, 0, len(keys)), *((key, 0, 1, value) for key, value in keys.items())]
-        record = laspy.VLR("LASF_Projection", 34735, "", np.array(rows, "<u2").tobytes())
-    else:
-        record = laspy.VLR("LASF_Projection", 2112, "", wkt[0].encode() + b"\0")
+    rows = [(1, 1, 0, len(keys)), *((key, 0, 1, value) for key, value in keys.items())]
+    stored = [laspy.VLR("LASF_Projection", 34735, "", np.array(rows, "<u2").tobytes())] if keys else []
+    stored += [laspy.VLR("LASF_Projection", 2112, "", text.encode() + b"\0") for text in wkt]
     survey = laspy.LasData(header)
     survey.x, survey.y, survey.z = CLOUD.T.astype(np.float64)
     if options.get("extended"):
-        survey.evlrs = laspy.vlrs.vlrlist.VLRList([record])
+        survey.evlrs = laspy.vlrs.vlrlist.VLRList(stored)
     else:
-        survey.vlrs.append(record)
+        survey.vlrs.extend(stored)
     stream = io.BytesIO()
     survey.write(stream, do_compress=options.get("compressed", False))
     return stream.getvalue()
@@ -105,6 +104,7 @@ WKT2 = (
         (las_in(STATE_PLANE, extended=True), (FTUS, FTUS, FTUS)),
         (las_in(f'COMPD_CS["x",{STATE_PLANE},VERT_CS["NAVD88",UNIT["metre",1]]]', compressed=True), (FTUS, FTUS, 1)),
         (las_in(WKT2), (FEET, FEET, 1.0)),
+        (las_in((4099, 9001), STATE_PLANE), (FTUS, FTUS, 1.0)),
     ],
 )
 def test_las_files_in_feet_are_converted_with_a_warning(tmp_path, las, meters):

@@ -204,3 +204,13 @@ def test_a_package_that_is_missing_is_no_damage(tmp_path):
     (tmp_path / "a.step").write_text("ISO-10303-21;")
     with pytest.raises(ImportError, match=r"a\.step: \.step needs cascadio: pip install cascadio"):
         MeshFile(type="mesh", path=tmp_path / "a.step").mesh()
+
+
+@pytest.mark.parametrize(("stated", "side_m"), [("", 2.0), ("<unit name='centimeter' meter='0.01'/>", 0.02)])
+def test_the_unit_of_a_collada_file_is_applied(tmp_path, stated, side_m):
+    text, _ = as_dae([(0, 0), (2, 0), (2, 2), (0, 2)])
+    text = text if isinstance(text, str) else text.decode()
+    path = tmp_path / "m.dae"
+    path.write_text(text.replace("<library_geometries>", f"<asset>{stated}</asset><library_geometries>", 1))
+    size_m = np.ptp(MeshFile(type="mesh", path=path).mesh().vertices_m, axis=0)
+    np.testing.assert_allclose(size_m, [side_m, side_m, 0.0], atol=1e-12)

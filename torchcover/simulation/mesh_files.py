@@ -2,6 +2,7 @@
 
 import gc
 import io
+import math
 import re
 import sys
 from collections.abc import Iterable, Iterator, Sequence
@@ -187,6 +188,7 @@ def _read_parts(path: Path) -> Iterator[tuple[NDArray[np.float64], NDArray[np.in
     data = path.read_bytes()
     if kind == "obj":
         data = _obj_with_triangles(data)
+    unit_m = _read_unit_m(data) if kind == "dae" else 1.0
     scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False, resolver=_parts_of(path))
     for mesh in scene.dump():
         if not isinstance(mesh, trimesh.Trimesh):
@@ -198,7 +200,16 @@ def _read_parts(path: Path) -> Iterator[tuple[NDArray[np.float64], NDArray[np.in
             faces = triangulate(vertices, list(_off_polygons(data.decode("utf-8", "replace"))))
         material = getattr(mesh.visual, "material", None)
         names = str(mesh.metadata.get("name", "")), str(getattr(material, "name", None) or "")
-        yield vertices, faces, names, _is_clear(material)
+        yield vertices * unit_m, faces, names, _is_clear(material)
+
+
+def _read_unit_m(data: bytes) -> float:
+    """Meters of a unit of a COLLADA file, which states it; trimesh ignores it."""
+    stated = re.search(rb"<unit\b[^>]*\bmeter\s*=\s*[\"']([^\"']+)", data[:100_000])
+    unit_m = float(stated[1]) if stated else 1.0
+    if not 0.0 < unit_m < math.inf:
+        raise ValueError(f"its unit of {unit_m:g} m is no positive number")
+    return unit_m
 
 
 def _is_clear(material: object) -> bool:

@@ -199,7 +199,8 @@ class MeshFile(Document):
 
     Args:
         path: The file; relative to the document that names it.
-        metres_per_unit: Scale of the file: 1 for metres, 0.001 for millimetres.
+        metres_per_unit: Scale of the file: 1 for meters, 0.001 for millimeters; COLLADA files state their unit, which
+            is applied before.
         transparent: Objects or materials of the file that all rays pass, such as windows.
     """
 

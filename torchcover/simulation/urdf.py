@@ -1,6 +1,5 @@
 """Robots described in URDF: their bodies, and the sensors that Gazebo would simulate on them."""
 
-import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -257,10 +256,8 @@ def _visuals(link: Element) -> list[Element]:
     return link.findall("visual") or link.findall("collision")
 
 
-def _read_meshes(
-    links: Mapping[str, Element], path: Path, packages: Mapping[str, str | Path]
-) -> dict[str, tuple[Mesh, float]]:
-    """Name of each mesh file -> the mesh and the meters of its unit.
+def _read_meshes(links: Mapping[str, Element], path: Path, packages: Mapping[str, str | Path]) -> dict[str, Mesh]:
+    """Name of each mesh file -> the mesh.
 
     Raises:
         ValueError: Files are missing.
@@ -272,9 +269,7 @@ def _read_meshes(
             f"{len(missing)} of {len(files)} meshes are missing: {_list_first(missing)}. Name the folder of a ROS "
             "package: --package NAME=FOLDER"
         )
-    return {
-        name: (MeshFile(type="mesh", path=file).mesh(), _unit(file)) for name, file in files.items() if file is not None
-    }
+    return {name: MeshFile(type="mesh", path=file).mesh() for name, file in files.items() if file is not None}
 
 
 def _find_mesh(name: str, path: Path, packages: Mapping[str, str | Path]) -> Path | None:
@@ -289,7 +284,7 @@ def _find_mesh(name: str, path: Path, packages: Mapping[str, str | Path]) -> Pat
     return next((candidate for candidate in candidates if within + rest and candidate.is_file()), None)
 
 
-def _link_meshes(link: Element, meshes: Mapping[str, tuple[Mesh, float]]) -> list[Mesh]:
+def _link_meshes(link: Element, meshes: Mapping[str, Mesh]) -> list[Mesh]:
     """The meshes that a link shows, in its frame. ValueError: a shape that cannot be, such as one of negative size."""
     name, shown = link.get("name", ""), []
     for body in _visuals(link):
@@ -302,11 +297,11 @@ def _link_meshes(link: Element, meshes: Mapping[str, tuple[Mesh, float]]) -> lis
     return shown
 
 
-def _shape_mesh(shape: Element, link: str, meshes: Mapping[str, tuple[Mesh, float]]) -> Mesh:
+def _shape_mesh(shape: Element, link: str, meshes: Mapping[str, Mesh]) -> Mesh:
     """The mesh of a geometry, with its origin in its middle."""
     if shape.tag == "mesh":
-        mesh, unit_m = meshes[shape.get("filename", "")]
-        scale = np.array(read_numbers(shape.get("scale", "1 1 1"), 3, "mesh scale")) * unit_m
+        mesh = meshes[shape.get("filename", "")]
+        scale = np.array(read_numbers(shape.get("scale", "1 1 1"), 3, "mesh scale"))
         faces = mesh.faces[:, ::-1] if np.prod(scale) < 0 else mesh.faces  # mirrored, they would face inwards
         return mesh._replace(vertices_m=mesh.vertices_m * scale, faces=faces)
     if shape.tag == "box":
@@ -330,15 +325,6 @@ def _shape_mesh(shape: Element, link: str, meshes: Mapping[str, tuple[Mesh, floa
 
 def _centered(mesh: Mesh, height_m: float) -> Mesh:
     return mesh.moved(rigid(np.eye(3), (0.0, 0.0, -height_m / 2)))
-
-
-def _unit(file: Path) -> float:
-    """Meters of a unit of a COLLADA file, which says it; other formats are in meters."""
-    if file.suffix.lower() != ".dae":
-        return 1.0
-    with file.open("rb") as opened:
-        said = re.search(rb"<unit\b[^>]*\bmeter\s*=\s*[\"']([^\"']+)", opened.read(100_000))
-    return read_numbers(said[1].decode(), 1, f"{file.name}: unit")[0] if said else 1.0
 
 
 def _mounted(sensors: Sequence[PlacedSensor]) -> Sequence[Sensor]:

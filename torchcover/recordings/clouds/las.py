@@ -74,10 +74,13 @@ def _choose_scale(contents: Mapping[int, bytes]) -> NDArray[np.float64]:
     Warns:
         UserWarning: Coordinates are converted, or only a code is given that does not say the unit.
     """
-    units = _units_of_wkt(contents.get(WKT_RECORD, b"")) or _units_of_keys(contents.get(GEO_KEYS_RECORD, b""))
+    keys = _read_keys(contents.get(GEO_KEYS_RECORD, b""))
+    units = _units_of_wkt(contents.get(WKT_RECORD, b"")) or _units_of_keys(keys)
     if units is None:
         return np.ones(3)
     horizontal, vertical = units
+    if vertical is None:
+        vertical = _unit_of_code(keys[VERTICAL_UNIT_KEY]) if VERTICAL_UNIT_KEY in keys else horizontal
     if (horizontal.meters, vertical.meters) != (1.0, 1.0):
         warnings.warn(
             f"LAS coordinates are converted to meters, as the file says: x and y are in {horizontal.name}, z in "
@@ -87,10 +90,14 @@ def _choose_scale(contents: Mapping[int, bytes]) -> NDArray[np.float64]:
     return np.array([horizontal.meters, horizontal.meters, vertical.meters])
 
 
-def _units_of_keys(data: bytes) -> tuple[_Unit, _Unit] | None:
-    """Return the units of x and y, and of z, by GeoKeys; None where they say none."""
+def _read_keys(data: bytes) -> dict[int, int]:
+    """Read the GeoKeys whose values are in the record itself."""
     numbers = np.frombuffer(data[: len(data) // 8 * 8], "<u2").reshape(-1, 4)[1:].tolist()
-    keys = {key: value for key, location, _, value in numbers if location == 0}
+    return {key: value for key, location, _, value in numbers if location == 0}
+
+
+def _units_of_keys(keys: Mapping[int, int]) -> tuple[_Unit, _Unit | None] | None:
+    """Return the unit of x and y, and None for z, by GeoKeys; None where they say none."""
     if keys.get(MODEL_KEY) == GEOGRAPHIC:
         raise ValueError(f"x and y are degrees (GTModelTypeGeoKey 2); {REPROJECT}")
     code = keys.get(CRS_KEY)
@@ -106,7 +113,7 @@ def _units_of_keys(data: bytes) -> tuple[_Unit, _Unit] | None:
                 stacklevel=3,
             )
         horizontal = _Unit("meter", 1.0)
-    return horizontal, _unit_of_code(keys[VERTICAL_UNIT_KEY]) if VERTICAL_UNIT_KEY in keys else horizontal
+    return horizontal, None
 
 
 def _unit_of_code(code: int) -> _Unit:
@@ -116,8 +123,8 @@ def _unit_of_code(code: int) -> _Unit:
     return _Unit(*EPSG_UNITS[code])
 
 
-def _units_of_wkt(data: bytes) -> tuple[_Unit, _Unit] | None:
-    """Return the units of x and y, and of z, by WKT of version 1 or 2; None without any."""
+def _units_of_wkt(data: bytes) -> tuple[_Unit, _Unit | None] | None:
+    """Return the units of x and y, and of z if it is stated, by WKT of version 1 or 2; None without any."""
     text = data.rstrip(b"\0").decode("utf-8", "replace")
     horizontal = vertical = None
     is_geographic = False
@@ -129,7 +136,7 @@ def _units_of_wkt(data: bytes) -> tuple[_Unit, _Unit] | None:
         elif PROJECTED_SYSTEMS & systems and not (GEOGRAPHIC_SYSTEMS | {"CONVERSION"}) & systems:
             horizontal = unit
     if horizontal is not None:
-        return horizontal, vertical or horizontal
+        return horizontal, vertical
     if is_geographic:
         raise ValueError(f"x and y are degrees (its WKT has a geographic coordinate system only); {REPROJECT}")
     return None
