@@ -50,7 +50,7 @@ def operations_of(act, at=None, number=signal.SIGKILL, *, copied=None):
                 os.kill(os.getpid(), number)
             is_copying = True
             if copied and os.path.isdir(copied[0]):
-                shutil.copytree(copied[0], os.path.join(copied[1], str(index)))
+                shutil.copytree(copied[0], os.path.join(copied[1], str(index)), symlinks=True)
             is_copying = False
             os.write(here, b".")
 
