@@ -13,7 +13,8 @@ import pytest
 import torch
 from rich.console import Console
 
-from torchcover import Coverage, CoverageMetric, nearest
+from torchcover import Coverage, nearest
+from torchcover.coverage import CoverageSums
 from torchcover.simulation import REFERENCE_SENSORS, builtin_documents, builtin_names
 
 SKIPPING = ("--set", "skip_bad_frames=true")
@@ -145,8 +146,8 @@ def test_the_weights_of_the_surface_reference_reach_the_metric(torchcover, world
         given.append((len(reference), more["weights"], more["place_in_time"]))
         return sums_of(self, sensor, reference, **more)
 
-    sums_of = CoverageMetric.sums_of
-    monkeypatch.setattr(CoverageMetric, "sums_of", noted)
+    sums_of = CoverageSums.sums_of
+    monkeypatch.setattr(CoverageSums, "sums_of", noted)
     options = [
         "--scenario",
         worlds / "yard.yaml",
@@ -209,9 +210,9 @@ def test_the_mean_over_known_cells_is_the_same_whether_it_heads_the_result_or_no
 
 def test_frames_that_are_skipped_leave_their_place_in_time(torchcover, recording, tmp_path, monkeypatch):
     (recording / "reference" / "f2.npy").write_bytes(b"rubbish")
-    sums_of, given = CoverageMetric.sums_of, []
+    sums_of, given = CoverageSums.sums_of, []
     monkeypatch.setattr(
-        CoverageMetric,
+        CoverageSums,
         "sums_of",
         lambda self, *clouds, **more: given.append(more["place_in_time"]) or sums_of(self, *clouds, **more),
     )
@@ -221,7 +222,7 @@ def test_frames_that_are_skipped_leave_their_place_in_time(torchcover, recording
 
 def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sensor(torchcover, recording, tmp_path):
     _, printed, _ = torchcover("evaluate", "--frames", recording, "--out", tmp_path / "out")
-    assert "Not enough steps for errors: 4 blocks, 8 are needed." in printed
+    assert "Not enough frames for an answer: 4 form 4 blocks of time, intervals need about 9" in printed
     assert "In brackets" not in printed
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert (summary["reference"]["sensor"], summary["target_error"]) == ("recorded", None)

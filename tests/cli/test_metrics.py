@@ -89,6 +89,7 @@ def test_a_run_goes_on_from_its_checkpoint_with_its_metrics(torchcover, worlds):
     assert (out / "metrics.csv").read_text() == (whole / "metrics.csv").read_text()
 
 
+@pytest.mark.filterwarnings("ignore:.*edited since it was recorded")
 def test_a_recording_without_boxes_has_the_metrics_that_need_none(torchcover, worlds):
     torchcover(
         "record", worlds / "both.yaml", "--out", worlds / "drive", "--scenario", worlds / "yard.yaml", "--steps", 2

@@ -11,8 +11,9 @@ import pytest
 import torch
 
 from tests.killing import operations_of
-from torchcover import Coverage, CoverageMetric
+from torchcover import Coverage
 from torchcover.cli import app
+from torchcover.coverage import CoverageSums
 from torchcover.evaluation import progress
 from torchcover.report.maps import draw_side_by_side
 
@@ -51,7 +52,7 @@ def at_update(monkeypatch):
     """Have something done before a rig sees a frame: number 3 is the first rig in the second step."""
 
     def have(number, act):
-        add, calls = CoverageMetric.add, []
+        add, calls = CoverageSums.add, []
 
         def acting(self, sums):
             calls.append(self)
@@ -59,7 +60,7 @@ def at_update(monkeypatch):
                 act()
             add(self, sums)
 
-        monkeypatch.setattr(CoverageMetric, "add", acting)
+        monkeypatch.setattr(CoverageSums, "add", acting)
 
     return have
 

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pydantic import ValidationError
-from torchcover.placement.choice_space import ChoiceSpace
 
 from tests.targets.worlds import drive, lidar, rig, world
 from torchcover.encounters import Criterion
@@ -15,6 +14,7 @@ from torchcover.encounters.encounter import EncounterSet
 from torchcover.evaluation import Readings, Requirements, check, encounter, evaluate, verdicts
 from torchcover.evaluation.requirements import BodyPlaces, TargetRequirement
 from torchcover.geometry import BoundingBox
+from torchcover.placement.selection_space import ChoiceSpace
 from torchcover.placement.space import SearchSpace
 from torchcover.simulation import RegionsOfInterest, Rig, Scenario, builtin_names, documents
 from torchcover.simulation.bodies import Vehicle

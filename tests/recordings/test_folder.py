@@ -186,4 +186,9 @@ def test_a_folder_without_a_reference_needs_poses_to_accumulate_one(tmp_path):
     clouds(tmp_path, sensor=CLOUD)
     with pytest.raises(ValueError, match=r"cannot be accumulated, .* does not say when its scans were made"):
         RecordedFrames(tmp_path)
-    assert len(RecordedFrames(driven(tmp_path))[0].reference) == 2
+    assert len(RecordedFrames(driven(tmp_path))[0].reference) == 0  # a vehicle that stands sees nothing from elsewhere
+    ahead = np.eye(4)
+    ahead[0, 3] = 4.0
+    rows = [["f2", 0.0, *pose_row(np.eye(4))], ["f10", 0.5, *pose_row(ahead)]]
+    table(tmp_path / "poses.csv", ("frame", "time_s", *POSE), rows)
+    assert len(RecordedFrames(tmp_path)[0].reference) > 0
