@@ -2,8 +2,10 @@
 
 import json
 import os
+import sys
 import threading
 from multiprocessing import get_context
+from subprocess import run
 
 import numpy as np
 import pytest
@@ -122,3 +124,8 @@ def test_parts_of_a_mesh_are_looked_at_as_the_mesh_is(tmp_path):
         else:
             with pytest.raises(ValueError, match=words):
                 mesh_arrays(path)
+
+
+@pytest.mark.parametrize("module", ["cameras.isolated_images", "recordings.isolated_readers", "simulation.mesh_files"])
+def test_modules_that_read_in_the_isolated_process_do_not_load_torch(module):
+    run([sys.executable, "-c", f"import sys, torchcover.{module}; sys.exit('torch' in sys.modules)"], check=True)

@@ -1,7 +1,5 @@
 """Cameras: lens models with a checked inverse, depth images to points, calibrations from files."""
 
-from torchcover.cameras.calibration import Calibration, carla_pose
-from torchcover.cameras.camera import Camera
-from torchcover.cameras.depth import decode_carla, read_depth
+import lazy_loader
 
-__all__ = ["Calibration", "Camera", "carla_pose", "decode_carla", "read_depth"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
