@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 WIDTH_PX = 760
+CODE = re.compile(r"`([^`]+)`")
 
 
 class _Brief(Repr):
@@ -54,14 +55,24 @@ def _is_some(value: object) -> bool:
     return not isinstance(value, str | tuple | list | Mapping) or len(value) > 0
 
 
-def code_words_html(text: str) -> str:
-    """Mark words between backticks in escaped text as code.
+def html_of(text: str) -> str:
+    """Escape text for HTML and mark words between backticks as code.
 
     Example:
-        >>> code_words_html("more `--steps`")
-        'more <code>--steps</code>'
+        >>> html_of("more `--steps` <b>")
+        'more <code>--steps</code> &lt;b&gt;'
     """
-    return re.sub(r"`([^`]+)`", r"<code>\1</code>", text)
+    return CODE.sub(r"<code>\1</code>", escape(text))
+
+
+def attribute_of(text: str) -> str:
+    """Escape text for an HTML attribute or title, which holds no markup: backticks around words are dropped.
+
+    Example:
+        >>> attribute_of('more `--steps` "now"')
+        'more --steps &quot;now&quot;'
+    """
+    return CODE.sub(r"\1", escape(text))
 
 
 def small_html(sentences: Iterable[str], figure: "Figure | None" = None) -> str:
@@ -71,13 +82,13 @@ def small_html(sentences: Iterable[str], figure: "Figure | None" = None) -> str:
         >>> small_html(["<b>", "seen"])
         '<p><strong>&lt;b&gt;</strong></p><p>seen</p>'
     """
-    first, *others = (code_words_html(escape(shown(sentence))) for sentence in sentences)
-    parts = [f"<strong>{first}</strong>", *others]
+    first, *others = map(shown, sentences)
+    parts = [f"<strong>{html_of(first)}</strong>", *map(html_of, others)]
     if figure is not None:
         png = BytesIO()
         figure.savefig(png, format="png", dpi=WIDTH_PX / figure.get_size_inches()[0])
         source = f"data:image/png;base64,{b64encode(png.getvalue()).decode()}"
-        parts.append(f'<img src="{source}" alt="{first}" style="max-width: 100%">')
+        parts.append(f'<img src="{source}" alt="{attribute_of(first)}" style="max-width: 100%">')
     return "".join(f"<p>{part}</p>" for part in parts)
 
 

@@ -8,10 +8,12 @@ import re
 import shutil
 import subprocess
 from dataclasses import replace
+from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
 
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric
 from torchcover.coverage.quantity import RADIUS
@@ -397,12 +399,40 @@ def test_cells_taken_together_have_their_mean_by_weight_and_the_page_says_so():
     assert re.search(r"show \d x \d cells as one, so that", page_html(Page("rig", "lead", maps=noisy(1))))
 
 
-def test_words_between_backticks_are_code():
+def test_words_between_backticks_are_code_everywhere():
     told = "Add `--steps`; 5 % of <b> are `a<b`."
-    page = Page("rig", "lead", verdict=("First `x`.", told), tables=[PageTable("", ("a",), [], notes=[told])])
-    text = page_html(page).partition("<script")[0]
-    assert text.count("Add <code>--steps</code>") == 2
-    assert text.count("<code>a&lt;b</code>") == 2
-    assert "First <code>x</code>." in text
+    table = PageTable(told, (told, told), [[Words(told), Words(told)]], notes=[told])
+    parts = {"tables": [table], "more_tables": [table], "pictures": [PagePicture(told, b"png")]}
+    rigs = [PageRig(told, [replace(SENSOR, name=told)], "name: rig")]
+    page = Page(told, told, verdict=(told, told), rigs=rigs, facts={told: {told: told}}, **parts)
+    text = page_html(page).partition('<script type="application/json"')[0]
+    assert text.count("Add <code>--steps</code>; 5&nbsp;% of &lt;b&gt; are <code>a&lt;b</code>.") == 23
+    assert "<title>Add --steps; 5 % of &lt;b&gt; are a&lt;b.</title>" in text
+    assert 'alt="Add --steps; 5 % of &lt;b&gt; are a&lt;b."' in text
     assert "`" not in text.partition("</style>")[2]
-    assert small_html([told]).count("<code>") == 2
+
+
+class ElementNames(HTMLParser):
+    """Names of all elements of a page, and of all of their attributes."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.elements, self.attributes = set(), set()
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.elements.add(tag)
+        self.attributes.update(name for name, _ in attrs)
+
+
+@pytest.mark.parametrize("words", [NASTY, f"`{NASTY}`", '`" onerror="alert(1)`', "`<`/code`><img src=x>`", "``&lt;b``"])
+def test_backticks_do_not_break_escaping(words):
+    def names(words: str) -> ElementNames:
+        table = PageTable(words, (words,), [[Words(words, words)]], notes=[words])
+        parts = {"tables": [table], "pictures": [PagePicture(words, b"")], "facts": {words: {words: words}}}
+        page = Page(words, words, verdict=[words, words], **parts)
+        return ElementNames(page_html(page) + small_html([words, words], Figure(figsize=(1, 1))))
+
+    hostile, harmless = names(words), names("a `b` c")
+    assert hostile.elements <= harmless.elements
+    assert hostile.attributes <= harmless.attributes

@@ -2,12 +2,11 @@
 
 import math
 from collections.abc import Sequence
-from html import escape
 from itertools import groupby
 
 import numpy as np
 
-from torchcover.notebooks import code_words_html
+from torchcover.notebooks import attribute_of, html_of
 from torchcover.report.layout import PageTable, Words
 from torchcover.report.overlay import SensorView, sensor_colour
 from torchcover.report.page.content import Array, PagePlan, PageRange
@@ -24,7 +23,7 @@ SEEN_BY = "not seen", "by one sensor only", "by two or more"
 
 def words_html(words: str) -> str:
     """A sentence in HTML: no break before a per cent sign, and words between backticks as code."""
-    return code_words_html(escape(words).replace(" %", "&nbsp;%"))
+    return html_of(words).replace(" %", "&nbsp;%")
 
 
 def ranges_of(table: CoverageTable) -> list[PageRange]:
@@ -56,7 +55,7 @@ def ranges_html(ranges: Sequence[PageRange]) -> str:
     lines = []
     for one in ranges:
         for at, (rig, number) in enumerate(one.of_rigs.items()):
-            name = f'<th scope="rowgroup" rowspan="{len(one.of_rigs)}">{escape(one.name)}</th>' if at == 0 else ""
+            name = f'<th scope="rowgroup" rowspan="{len(one.of_rigs)}">{words_html(one.name)}</th>' if at == 0 else ""
             marks, words = "", UNKNOWN
             if not math.isnan(number.value):
                 value, words = 100 * number.value, words_html(f"{number_words(number)} %")
@@ -65,7 +64,7 @@ def ranges_html(ranges: Sequence[PageRange]) -> str:
                 ends = f'x1="{100 * number.low:.1f}" x2="{100 * number.high:.1f}"'
                 marks += f'<line {ends} y1="4" y2="4" class="rig{at % 2}"/>'
             drawn = f'<svg viewBox="-3 0 106 8" aria-hidden="true"><path d="M0 8V7H100V8" class="axis"/>{marks}</svg>'
-            lines.append(f'<tr>{name}<th scope="row">{escape(rig)}</th><td>{drawn}</td><td>{words}</td></tr>')
+            lines.append(f'<tr>{name}<th scope="row">{words_html(rig)}</th><td>{drawn}</td><td>{words}</td></tr>')
     table = f'<table class="ranges"><tbody>{"".join(lines)}</tbody></table>'
     return f'<h2>How far: share that is detected</h2><div class="wide">{table}</div>'
 
@@ -76,10 +75,10 @@ def _plan(plan: PagePlan, most_m2: float) -> str:
         width = 100 * loss / most_m2 if most_m2 else 0.0
         bar = f'<svg viewBox="0 0 100 8" preserveAspectRatio="none"><rect width="{width:.1f}" height="8"/></svg>'
         lost = f"+{square_metres(loss)} m²"
-        rows.append(f'<tr><th scope="row">{escape(sensor)}</th><td class="bar">{bar}</td><td>{lost}</td></tr>')
+        rows.append(f'<tr><th scope="row">{words_html(sensor)}</th><td class="bar">{bar}</td><td>{lost}</td></tr>')
     title = f"If one sensor fails, more is not seen within {plan.within_m:g} m"
     losses = f'<table class="losses"><caption>{title}</caption><tbody>{"".join(rows)}</tbody></table>' if rows else ""
-    words = f"<h2>{escape(plan.rig)}</h2><p>{words_html(plan.words)}</p>"
+    words = f"<h2>{words_html(plan.rig)}</h2><p>{words_html(plan.words)}</p>"
     return f'<section class="plan">{words}{_plan_drawing(plan)}{losses}</section>'
 
 
@@ -95,7 +94,7 @@ def _plan_drawing(plan: PagePlan) -> str:
         parts.append(f'<text x="{left - ring_m + 0.06:.2f}" y="0.1">{ring_m:g} m</text>')
     corners = " ".join(f"{x:.2f},{-y:.2f}" for x, y in plan.vehicle_outline_m)
     parts.append(f'<polygon points="{corners}"/><text x="{right - 0.25:.2f}" y="0.1" text-anchor="end">front →</text>')
-    title = escape(f"Where {plan.rig} sees it, from above, forward to the right")
+    title = attribute_of(f"Where {plan.rig} sees it, from above, forward to the right")
     return f'<svg viewBox="{box}" role="img" aria-label="{title}">{"".join(parts)}</svg>'
 
 

@@ -12,6 +12,7 @@ from string import Template
 
 import numpy as np
 
+from torchcover.notebooks import attribute_of
 from torchcover.report.layout import PageTable, Words
 from torchcover.report.page.content import Array, Page, PageMap, PagePicture, PageRig
 from torchcover.report.page.drawings import plans_html, ranges_html, rig_drawing, sensor_table, words_html
@@ -108,8 +109,9 @@ def page_html(page: Page) -> str:
     more = "".join(f"<li>{words_html(words)}</li>" for words in page.verdict[1:])
     more = f'<ul class="more">{more}</ul>' if more else ""
     return Template(_file("page.html")).substitute(
-        title=escape(page.title),
-        lead=escape(page.lead),
+        title=attribute_of(page.title),
+        heading=words_html(page.title),
+        lead=words_html(page.lead),
         verdict="".join(f'<p class="verdict">{words_html(words)}</p>' for words in page.verdict[:1]),
         answer=first + more * bool(first or not maps) + ranges_html(page.ranges),
         more=more * bool(maps and not first),
@@ -146,9 +148,9 @@ def _file(name: str) -> str:
 
 def table_html(table: PageTable) -> str:
     """A table, with its notes below."""
-    caption = f"<caption>{escape(table.title)}</caption>" if table.title else ""
+    caption = f"<caption>{words_html(table.title)}</caption>" if table.title else ""
     kinds = ["" if at < table.words_first else "number" for at in range(len(table.headings))]
-    headings = [escape(heading).replace("_", "_<wbr>").replace("\n", "<br>") for heading in table.headings]
+    headings = [words_html(heading).replace("_", "_<wbr>").replace("\n", "<br>") for heading in table.headings]
     pairs = zip(kinds, headings, strict=True)
     head = "".join(f'<th scope="col" class="{kind}">{heading}</th>' for kind, heading in pairs)
     rows = "\n".join(f"<tr>{''.join(map(_cell, row, kinds))}</tr>" for row in table.rows)
@@ -157,9 +159,9 @@ def table_html(table: PageTable) -> str:
 
 
 def _picture(picture: PagePicture) -> str:
-    title, data = escape(picture.title), base64.b64encode(picture.png).decode()
-    image = f'<img src="data:image/png;base64,{data}" alt="{title}">'
-    return f'<figure class="picture">{image}<figcaption>{title}</figcaption></figure>'
+    title, data = picture.title, base64.b64encode(picture.png).decode()
+    image = f'<img src="data:image/png;base64,{data}" alt="{attribute_of(title)}">'
+    return f'<figure class="picture">{image}<figcaption>{words_html(title)}</figcaption></figure>'
 
 
 def _notes(notes: Sequence[str]) -> str:
@@ -169,19 +171,19 @@ def _notes(notes: Sequence[str]) -> str:
 
 def _cell(cell: Words, kind: str) -> str:
     if not kind:
-        return f'<th scope="row">{escape(cell.text)}</th>'
-    return f'<td class="{kind} {escape(cell.mark)}">{escape(cell.text)}</td>'
+        return f'<th scope="row">{words_html(cell.text)}</th>'
+    return f'<td class="{kind} {attribute_of(cell.mark)}">{words_html(cell.text)}</td>'
 
 
 def _rig(rig: PageRig, ego_outline_m: Array | None, number: int) -> str:
     drawing = rig_drawing(rig.sensors, ego_outline_m, number) if rig.sensors else ""
     table = table_html(sensor_table(rig.sensors)) if rig.sensors else "<p>Its sensors are unknown.</p>"
-    document = f"<details><summary>{escape(rig.name)} as YAML</summary><pre>{escape(rig.document)}</pre></details>"
-    return f'<h3>{escape(rig.name)}</h3><div class="rig"><div>{drawing}</div><div>{table}</div></div>' + (
+    document = f"<details><summary>{words_html(rig.name)} as YAML</summary><pre>{escape(rig.document)}</pre></details>"
+    return f'<h3>{words_html(rig.name)}</h3><div class="rig"><div>{drawing}</div><div>{table}</div></div>' + (
         document if rig.document else ""
     )
 
 
 def _facts(heading: str, facts: Mapping[str, str]) -> str:
-    each = "".join(f"<dt>{escape(name)}</dt><dd>{escape(value)}</dd>" for name, value in facts.items())
-    return f"<h3>{escape(heading)}</h3><dl>{each}</dl>"
+    each = "".join(f"<dt>{words_html(name)}</dt><dd>{words_html(value)}</dd>" for name, value in facts.items())
+    return f"<h3>{words_html(heading)}</h3><dl>{each}</dl>"
