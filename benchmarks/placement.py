@@ -115,13 +115,12 @@ def compare_pairs(rigs=24, worlds=16):
         x_m, z_m, pitch_deg = np.random.default_rng(number).uniform((-0.6, 1.68, -10.0), (0.8, 1.85, 15.0)).tolist()
         mount = roof.mount.model_copy(update={"x_m": x_m, "z_m": z_m, "pitch_deg": pitch_deg})
         each.append(start.model_copy(update={"sensors": (roof.model_copy(update={"mount": mount}),)}))
-    with CommonFrames("urban", objective, worlds=worlds) as frames:
-        began_s = time.process_time()
-        scores = [frames.estimates(rig) for rig in each]
-        score_s = (time.process_time() - began_s) / len(each) / len(frames)
     rows = []
     for measure in ("area", "known"):
-        first, *others = [score[measure] for score in scores]
+        with CommonFrames("urban", objective, worlds=worlds, estimate=measure) as frames:
+            began_s = time.process_time()
+            first, *others = [frames.score(rig).estimate for rig in each]
+            score_s = (time.process_time() - began_s) / len(each) / len(frames)
         paired = np.median([measure_gains(other, first)[1][0] for other in others])
         alone = np.median([float(torch.hypot(other.error, first.error)[0]) for other in others])
         rows.append((measure, f"{100 * alone:.2f}", f"{100 * paired:.2f}", f"{(alone / paired) ** 2:.0f}"))

@@ -47,10 +47,10 @@ class Surface:
     def __len__(self):
         return len(self.world_of)
 
-    def _estimate(self, rig, shift=0.0):
+    def _estimate(self, rig):
         mount = rig.sensors[0].mount
         offset = self.tilt @ np.array([mount.x_m, mount.pitch_deg / 10])
-        share = self.worth(rig)[None] + self.level + offset + shift
+        share = self.worth(rig)[None] + self.level + offset
         share = np.where(self.blind, np.nan, share)
         share = share[:, np.arange(len(self.objectives)) % QUESTIONS]  # what nobody asked for is near or far, too
         found = estimate_of(share, self.world_of)
@@ -60,9 +60,6 @@ class Surface:
     def score(self, rig):
         self.scored.append(rig.name)
         return Score(self._estimate(rig), max(0.0, rig.sensors[0].mount.pitch_deg) / 100)
-
-    def estimates(self, rig):
-        return {"area": self._estimate(rig), "known": self._estimate(rig, shift=-0.1)}
 
     def resampled(self, seed, worlds, more):
         return Surface(seed, worlds, 3, self.worth, self.noise, {**self.objectives, **more}, estimate=self.estimate)

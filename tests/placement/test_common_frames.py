@@ -24,10 +24,10 @@ TWO = rig(lidar(), NOISY, RADAR, name="two")
 
 
 def same(a, b):
-    """Estimates by measure, to the last bit."""
-    for measure in ("area", "known"):
-        for name in ("value", "left_out", "steps"):
-            np.testing.assert_array_equal(getattr(a[measure], name), getattr(b[measure], name))
+    """Two scores, to the last bit."""
+    for name in ("value", "left_out", "steps"):
+        np.testing.assert_array_equal(getattr(a.estimate, name), getattr(b.estimate, name))
+    assert a.self_hit_share == b.self_hit_share
 
 
 @pytest.mark.parametrize("scenario", [LOT, yard(WALL)])
@@ -57,13 +57,14 @@ def test_rays_that_change_no_objective_are_not_cast_and_change_none(monkeypatch)
     some = held(objectives=near, worlds=1, rays=200)
     monkeypatch.setattr(Queries, "within_m", None)
     every = held(objectives=near, worlds=1, rays=200)
-    same(every.estimates(TWO), some.estimates(TWO))
+    same(every.score(TWO), some.score(TWO))
     assert len(next(some.frames(TWO)).sensor) < 0.7 * len(next(every.frames(TWO)).sensor)
 
 
 def test_numbers_are_those_of_evaluate_on_the_same_frames_to_the_last_bit():
     """By area and over known cells, in regions of several objectives, from frames that nobody has cut."""
-    found = held(objectives=OBJECTIVES, worlds=4, per_world=2)
+    held_by = {measure: held(worlds=4, per_world=2, estimate=measure) for measure in ("area", "known")}
+    found = held_by["area"]
     frames = SimulatedFrames(
         found._worlds[0],
         TWO,
@@ -85,8 +86,8 @@ def test_numbers_are_those_of_evaluate_on_the_same_frames_to_the_last_bit():
     regions = {"20m": {"x_m": (0.0, 20.0), "y_m": (-5.0, 5.0)}, "80m": {"x_m": (0.0, 80.0), "y_m": (-20.0, 20.0)}}
     ask = RegionsOfInterest.model_validate({"regions": {**regions, **BAY}})
     result = evaluate(frames=in_order, ask=ask, cell_m=0.5, thresholds_m=(0.2, 0.3))
-    estimates = found.estimates(TWO)
-    for measure, own in estimates.items():
+    for measure, frames_of in held_by.items():
+        own = frames_of.score(TWO).estimate
         for column, objective in enumerate(OBJECTIVES.values()):
             rows = {(row.region, row.height): row for row in result.coverage.summary()}
             numbers = [
@@ -95,23 +96,20 @@ def test_numbers_are_those_of_evaluate_on_the_same_frames_to_the_last_bit():
             ]
             values = torch.tensor([number.value for number in numbers], dtype=torch.float64)
             assert own.value[column] == values.mean()
-    np.testing.assert_array_equal(found.score(TWO).estimate.value, estimates["area"].value)
 
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_it_makes_no_difference_who_holds_the_worlds(frames, workers):
     with held(workers=workers) as elsewhere:
-        same(elsewhere.estimates(TWO), frames.estimates(TWO))
+        same(elsewhere.score(TWO), frames.score(TWO))
         assert all(
-            seen.frame is None for seen in elsewhere._compute(TWO, [0, 3], ("area",))
+            seen.frame is None for seen in elsewhere._compute(TWO, [0, 3], is_measured=True)
         )  # clouds stay where they are
-        one, other = elsewhere.score(rig()), frames.score(rig())
-        np.testing.assert_array_equal(one.estimate.left_out, other.estimate.left_out)
-        assert one.self_hit_share == other.self_hit_share
+        same(elsewhere.score(rig()), frames.score(rig()))
         for held_by in (elsewhere, frames):
             with pytest.raises(ValueError, match="inside the ego of 'lot'"):
-                held_by.estimates(rig(lidar(mount={"z_m": 1.0})))
-        same(elsewhere.estimates(TWO), frames.estimates(TWO))  # nothing is left over of the error
+                held_by.score(rig(lidar(mount={"z_m": 1.0})))
+        same(elsewhere.score(TWO), frames.score(TWO))  # nothing is left over of the error
 
 
 def test_a_world_stays_with_the_process_that_has_built_it(monkeypatch, tmp_path):
@@ -125,7 +123,7 @@ def test_a_world_stays_with_the_process_that_has_built_it(monkeypatch, tmp_path)
     monkeypatch.setattr(HeldFrames, "_build", noted)
     with held(workers=2, worlds=4) as elsewhere:
         for _ in range(2):
-            elsewhere.estimates(rig())
+            elsewhere.score(rig())
         elsewhere.score(TWO)
     world, number, process = zip(*(path.name.split() for path in tmp_path.iterdir()), strict=True)
     assert sorted(map(int, number)) == list(range(8))
@@ -135,11 +133,11 @@ def test_a_world_stays_with_the_process_that_has_built_it(monkeypatch, tmp_path)
 
 
 def test_the_order_of_rigs_makes_no_difference(frames):
-    whole = frames.estimates(TWO)
-    other = frames.estimates(rig())
-    same(frames.estimates(TWO), whole)
-    assert not torch.equal(other["area"].value, whole["area"].value)
-    share = frames.score(TWO).self_hit_share
+    whole = frames.score(TWO)
+    other = frames.score(rig())
+    same(frames.score(TWO), whole)
+    assert not torch.equal(other.estimate.value, whole.estimate.value)
+    share = whole.self_hit_share
     counts = [frame.counts for frame in frames.frames(TWO)]
     assert share == sum(one["self_hits"] for one in counts) / sum(one["rays"] for one in counts)
 
@@ -149,10 +147,10 @@ def test_what_some_worlds_do_not_show_is_about_the_others():
     scenarios = [yard(WALL), yard(name="empty"), LOT]
     found = held(scenarios, obstacles, worlds=1, per_world=1)
     assert [index.world for index in found.indices] == [0, 1, 2]
-    estimate = found.estimates(rig())["area"]
+    estimate = found.score(rig()).estimate
     assert torch.isfinite(estimate.left_out).all()
     assert estimate.left_out[1, 0] == estimate.value[0]  # the empty one has no obstacle
-    nothing = held([yard()], obstacles).estimates(rig())["area"].value
+    nothing = held([yard()], obstacles).score(rig()).estimate.value
     assert torch.isnan(nothing).tolist() == [True, False]
 
 
@@ -191,7 +189,7 @@ def test_what_makes_no_sense_is_said_at_the_door(change, message):
 
 def test_rigs_that_cannot_be(frames):
     with pytest.raises(ValueError, match="below the ground"):
-        frames.estimates(rig(lidar(mount={"x_m": 3.0, "z_m": -1.0})))
+        frames.score(rig(lidar(mount={"x_m": 3.0, "z_m": -1.0})))
 
 
 def test_a_rig_for_another_vehicle_is_refused_unless_the_vehicle_was_said():
@@ -199,8 +197,8 @@ def test_a_rig_for_another_vehicle_is_refused_unless_the_vehicle_was_said():
     near = {"near": Objective(region="20m", band="ground")}
     roof = rig(vehicle="renault_zoe")
     with pytest.raises(ValueError, match="is for the vehicle renault_zoe, and these frames have suv: say which"):
-        held([open_lot], near).estimates(roof)
-    assert len(held([open_lot], near, vehicle="renault_zoe").estimates(roof)["area"].value) == 1
+        held([open_lot], near).score(roof)
+    assert len(held([open_lot], near, vehicle="renault_zoe").score(roof).estimate.value) == 1
 
 
 def test_a_process_that_was_killed_is_told_and_the_others_end_with_the_search():
@@ -210,7 +208,7 @@ def test_a_process_that_was_killed_is_told_and_the_others_end_with_the_search():
     def ask():
         killed.kill()
         killed.join()
-        frames.estimates(rig())
+        frames.score(rig())
 
     with pytest.raises((ChildProcessError, RuntimeError), match=r"was killed|is killed by signal"):  # at any time
         ask()
@@ -224,10 +222,10 @@ def test_threads_make_no_difference(frames):
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(1 if before > 1 else 2)
-        other = frames.estimates(TWO)
+        other = frames.score(TWO)
     finally:
         torch.set_num_threads(before)
-    same(other, frames.estimates(TWO))
+    same(other, frames.score(TWO))
 
 
 def test_a_recording_is_one_world_for_any_seed_and_none_of_it_is_fresh():

@@ -60,7 +60,7 @@ def several():
 
 
 def test_an_objective_is_any_number_of_a_result_and_knows_its_direction(several):
-    one, two = (several.estimates(each)["area"] for each in (rig(), TWO))
+    one, two = (several.score(each).estimate for each in (rig(), TWO))
     value = dict(zip(NUMBERS, two.value.tolist(), strict=True))
     region = several.queries.regions["20m"]
     metric = CoverageMetric(
@@ -88,7 +88,7 @@ def test_an_objective_is_any_number_of_a_result_and_knows_its_direction(several)
     )
     # Of a rig that has no such sensor, none is lost; of one with a single sensor, all.
     assert dict(zip(NUMBERS, one.value.tolist(), strict=True))["detection_0.4m_without_any"] == 0
-    low = several.estimates(rig(lidar("low")))["area"].value.tolist()
+    low = several.score(rig(lidar("low"))).estimate.value.tolist()
     assert low[3] == low[0]
     # Fewer metres and more detection are both a gain of the second sensor.
     gain, error = measure_gains(two, one)
@@ -97,8 +97,8 @@ def test_an_objective_is_any_number_of_a_result_and_knows_its_direction(several)
 
 
 def test_what_a_failure_leaves_is_over_known_cells_where_evaluate_has_it_so(several):
-    estimates = several.estimates(TWO)
-    by_area, by_cells = (dict(zip(NUMBERS, estimates[one].value.tolist(), strict=True)) for one in ("area", "known"))
+    both = several, held(objectives=NUMBERS, estimate="known")
+    by_area, by_cells = (dict(zip(NUMBERS, of.score(TWO).estimate.value.tolist(), strict=True)) for of in both)
     region = several.queries.regions["20m"]
     metric = CoverageMetric(
         several.queries.grid, max_radius=several.queries.max_radius_m, regions=[region], sensors=["top", "low"]
@@ -113,33 +113,25 @@ def test_what_a_failure_leaves_is_over_known_cells_where_evaluate_has_it_so(seve
     assert by_cells["radius_q0.9_m"] == by_area["radius_q0.9_m"]
 
 
-def test_a_search_over_known_cells_scores_what_it_is_tested_by():
-    objectives = {key: NUMBERS[key] for key in ("detection_0.4m", "detection_0.4m_without_any")}
-    found = held(objectives=objectives, estimate="known")
-    last = found.score(TWO).estimate
-    for name in ("value", "left_out", "steps"):
-        np.testing.assert_array_equal(getattr(last, name), getattr(found.estimates(TWO)["known"], name))
-
-
 def test_a_number_without_any_sensor_says_so(several):
-    titles = dict(zip(NUMBERS, (one.title for one in several.estimates(TWO)["area"].quantities), strict=True))
+    titles = dict(zip(NUMBERS, (one.title for one in several.score(TWO).estimate.quantities), strict=True))
     assert titles["detection_0.4m_without_any"] == "detection within 0.4 m, without any one sensor"
     assert titles["detection_0.4m_without_top"] == "detection within 0.4 m, without top"
 
 
-def test_numbers_that_are_by_no_choice_of_estimate_are_the_same_by_both(several):
-    both = several.estimates(TWO)
-    objectives = {"known": Objective(number="known_radius_m", region="20m")}
-    more = held(objectives=objectives).estimates(TWO)
-    for estimates, asked in ((both, NUMBERS), (more, objectives)):
-        pairs = zip(asked.values(), estimates["area"].value, estimates["known"].value, strict=True)
-        for objective, by_area, by_cells in pairs:
-            assert (by_area == by_cells) == (objective.own_estimate != ""), objective.key
-    assert [one.own_estimate for one in objectives.values()] == ["known"]
+def test_numbers_that_are_by_no_choice_of_estimate_are_the_same_by_both():
+    alone = {"known": Objective(number="known_radius_m", region="20m")}
+    for asked in (NUMBERS, alone):
+        by_area, by_cells = (
+            held(objectives=asked, estimate=one).score(TWO).estimate.value for one in ("area", "known")
+        )
+        for objective, area, cells in zip(asked.values(), by_area, by_cells, strict=True):
+            assert (area == cells) == (objective.own_estimate != ""), objective.key
+    assert alone["known"].own_estimate == "known"
 
 
 def test_what_the_second_sensor_loses_without_a_block_is_known_too(several):
-    estimate = several.estimates(TWO)["area"]
+    estimate = several.score(TWO).estimate
     assert estimate.left_out.shape == (3, len(NUMBERS))
     unknown = ~torch.isfinite(estimate.left_out).all(dim=0)
     # Of a largest value no error is known.

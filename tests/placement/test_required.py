@@ -49,18 +49,16 @@ def test_the_number_is_the_share_of_the_places_that_are_seen_well_enough_and_has
     without = held(objectives={"near": Objective(region="20m"), "far": Objective(region="80m")})
     empty, shares = free_space().model_copy(update={"ego": some._worlds[0].ego}), []
     for each in (LEVEL, DOWN):
-        last = some.score(each)
-        both = some.estimates(each)
+        estimate = some.score(each).estimate
         points = survey_places(each, empty, Target.load("child"), np.array(PLACES)).least_points
         assert np.isnan(points[3])
-        for estimate in (last.estimate, *both.values()):
-            assert estimate.value[1] == np.mean(points >= 1)
-            assert (estimate.left_out[:, 1] == estimate.value[1]).all()
-            assert estimate.quantities[1][0] == "child"
-            assert estimate.quantities[1][2:] == ("share", False)
+        assert estimate.value[1] == np.mean(points >= 1)
+        assert (estimate.left_out[:, 1] == estimate.value[1]).all()
+        assert estimate.quantities[1][0] == "child"
+        assert estimate.quantities[1][2:] == ("share", False)
         # The others are what they are without it.
-        assert both["area"].value[[0, 2]].tolist() == without.estimates(each)["area"].value.tolist()
-        shares.append(float(both["area"].value[1]))
+        assert estimate.value[[0, 2]].tolist() == without.score(each).estimate.value.tolist()
+        shares.append(float(estimate.value[1]))
     assert shares[0] < shares[1] <= 0.75
 
 
@@ -76,7 +74,7 @@ def test_of_encounters_those_count_that_are_kept_in_all_phases_on_the_vehicle_of
     required = Requirements.model_validate({"requirements": [asked["requires"]]})
     (verdict,) = check(of_rig, required, vehicle="van").verdicts["small"]
     assert verdict.count == 2
-    assert some.estimates(of_rig)["area"].value.tolist() == [(2 - verdict.failed - verdict.unknown) / 2]
+    assert some.score(of_rig).estimate.value.tolist() == [(2 - verdict.failed - verdict.unknown) / 2]
 
 
 def test_a_search_finds_where_the_child_is_seen_and_resumed_it_finds_the_same(lot, tmp_path):

@@ -61,7 +61,7 @@ def test_what_points_are_worth_is_what_evaluate_says_of_the_rig(objective, measu
         assert worth.sum() == pytest.approx(1.0, rel=1e-12)
         seen = [observe_points(rig(sensor), instants)[0] for sensor in sensors]
         for each in ([0], [1, 2], [0, 1, 2]):
-            expected = float(instants.estimates(rig(*(sensors[one] for one in each)))[measure].value[0])
+            expected = float(instants.score(rig(*(sensors[one] for one in each))).estimate.value[0])
             assert worth[0] @ np.any([seen[one] for one in each], axis=0) == pytest.approx(expected, rel=1e-12)
 
 
@@ -72,7 +72,7 @@ def test_worlds_that_know_nothing_of_a_part_count_for_nothing(measure):
     scenarios = [type(LOT).model_validate(one) for one in (yard, walled)]
     asked = {"a": Objective(region="20m", band="obstacle")}
     with held(scenarios, asked, per_world=1, every_s=0.1, estimate=measure) as two:
-        value = float(two.estimates(rig())[measure].value[0])
+        value = float(two.score(rig()).estimate.value[0])
         assert point_weights(two)[0] @ observe_points(rig(), two)[0] == pytest.approx(value, rel=1e-12)
     with (
         held(scenarios[:1], asked, per_world=1, every_s=0.1) as one,
@@ -88,9 +88,7 @@ def test_the_choice_is_the_rig_with_the_best_score_and_its_files_say_so(folder):
         pairs = [("front", "rear"), ("front", "left"), ("rear", "left")]
         named = {sensor.name: sensor for sensor in space.sensors}
         scores = {
-            pair: float(
-                instants.estimates(space.rig(tuple(named[f"wide_{one}"] for one in pair), "x"))["area"].value[0]
-            )
+            pair: float(instants.score(space.rig(tuple(named[f"wide_{one}"] for one in pair), "x")).estimate.value[0])
             for pair in pairs
         }
     best = max(scores, key=lambda pair: scores[pair])
@@ -124,7 +122,7 @@ def test_what_must_not_be_worse_is_kept_by_the_best_of_several_objectives(folder
         found = choose(space, instants, test_seed=5, fresh_worlds=3)
         kept = found.coverage.values(found.now)[2]
         # The thresholds differ: what a point is worth is a matter of both.
-        values = instants.estimates(found.rig)["area"].value.tolist()
+        values = instants.score(found.rig).estimate.value.tolist()
     assert found.best.values == pytest.approx(values, rel=1e-12)
     assert list(space.numbers) == ["front", "rear", "not worse: left_3m"]
     assert all(one.values[2] >= kept - 2e-6 and "wide_left" in found.names(one.selected) for one in found.found)

@@ -20,7 +20,8 @@ from torchcover.placement import (
     run_search,
 )
 from torchcover.placement.common_frames import WORLDS
-from torchcover.placement.search import JOURNAL, make_common_frames
+from torchcover.placement.plan import make_common_frames
+from torchcover.placement.running import JOURNAL
 from torchcover.report import Terminal, print_whole
 from torchcover.simulation.documents import read_mapping
 

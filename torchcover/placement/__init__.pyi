@@ -1,11 +1,11 @@
 from .common_frames import CommonFrames as CommonFrames
 from .objective import Objective as Objective
+from .plan import OptimizerParams as OptimizerParams
+from .plan import SearchPlan as SearchPlan
 from .result import SearchResult as SearchResult
 from .running import run_search as run_search
 from .search import Evaluation as Evaluation
-from .search import OptimizerParams as OptimizerParams
 from .search import PlacementSearch as PlacementSearch
-from .search import SearchPlan as SearchPlan
 from .selection import SensorChoice as SensorChoice
 from .selection import choose as choose
 from .selection_space import ChoiceSpace as ChoiceSpace

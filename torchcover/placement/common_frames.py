@@ -15,7 +15,7 @@ from torchcover.evaluation.pipeline import FramesOrErrors, MeasuredFrame, batche
 from torchcover.frames import Frame
 from torchcover.placement.host_vehicle import HostVehicle
 from torchcover.placement.objective import Objective
-from torchcover.placement.queries import Queries, RigObservers
+from torchcover.placement.queries import Queries
 from torchcover.simulation import Rig, Scenario, SimulatedFrames, Simulator, with_ego
 from torchcover.simulation.rays import Balls
 from torchcover.simulation.simulated_frames import of_rigs
@@ -55,12 +55,12 @@ class FrameIndex(NamedTuple):
 class FrameRequest(NamedTuple):
     """Request for the frame of a rig, or without one for the reference, with the bytes of its world.
 
-    With `measures` the coverage is summed up where the frame is made, and the frame itself stays there.
+    If it is to be measured, the coverage is summed up where the frame is made, and the frame itself stays there.
     """
 
     rig: Rig | None
     number: int
-    measures: tuple[Measure, ...] = ()
+    is_measured: bool = False
 
 
 class HeldFrames(Dataset[Frame | MeasuredFrame]):
@@ -70,22 +70,26 @@ class HeldFrames(Dataset[Frame | MeasuredFrame]):
     Simulations have no rigs. Only reference points inside the queried regions and bands are kept.
     """
 
-    def __init__(self, simulations: Sequence[SimulatedFrames], indices: Sequence[FrameIndex], queries: Queries) -> None:
-        self._simulations, self._indices, self._queries = simulations, indices, queries
+    def __init__(
+        self,
+        simulations: Sequence[SimulatedFrames],
+        indices: Sequence[FrameIndex],
+        queries: Queries,
+        estimate: Measure,
+    ) -> None:
+        self._simulations, self._indices, self._queries, self._estimate = simulations, indices, queries, estimate
         self._held: dict[int, tuple[Frame, Balls | None]] = {}
         self._rig: Rig | None = None
         self._mounted: dict[int, Simulator] = {}
-        self._observers: dict[tuple[Measure, ...], Mapping[CoverageObserver, Measure]] = {}
+        self._observer: CoverageObserver | None = None
 
     def __getitem__(self, request: FrameRequest) -> Frame | MeasuredFrame:
-        frame, measures = self._frame(request.rig, request.number), request.measures
-        if request.rig is None or not measures:
+        frame = self._frame(request.rig, request.number)
+        if request.rig is None or not request.is_measured:
             return frame
-        if measures not in self._observers:
-            coverage = self._queries.coverage_of(request.rig, measures)
-            self._observers[measures] = {observer: measure for measure, observer in coverage.items()}
-        sums = {measure: observer.sums_of(frame) for observer, measure in self._observers[measures].items()}
-        return MeasuredFrame(None, frame.counts, sums, 0.0)
+        if self._observer is None:
+            self._observer = self._queries.observer_of(request.rig, self._estimate)
+        return MeasuredFrame(None, frame.counts, {self._estimate: self._observer.sums_of(frame)}, 0.0)
 
     def _frame(self, rig: Rig | None, number: int) -> Frame:
         index = self._indices[number]
@@ -120,7 +124,7 @@ class HeldFrames(Dataset[Frame | MeasuredFrame]):
     def _mount(self, rig: Rig, scenario: int) -> Simulator:
         """Return a scenario with the rig, which is kept until another rig comes."""
         if rig != self._rig:
-            self._rig, self._mounted, self._observers = rig, {}, {}
+            self._rig, self._mounted, self._observer = rig, {}, None
         if scenario not in self._mounted:
             self._mounted[scenario] = self._simulations[scenario].simulator.with_rigs({rig.name: rig})
         return self._mounted[scenario]
@@ -207,7 +211,7 @@ class CommonFrames:
         self._batches: list[list[FrameRequest]] = []
         self._processes = min(workers, self.indices[-1].world + 1)
         self._loader = DataLoader(
-            FramesOrErrors(HeldFrames(simulations, self.indices, self.queries)),
+            FramesOrErrors(HeldFrames(simulations, self.indices, self.queries, estimate)),
             batch_sampler=self._batches,
             collate_fn=list,
             num_workers=self._processes,
@@ -260,25 +264,13 @@ class CommonFrames:
         Raises:
             ValueError: A sensor lies inside the vehicle or another body, or below the ground.
         """
-        observers, self_hit_share = self._observe(rig, [self.estimate])
-        return Score(observers.estimate(self.estimate), self_hit_share)
-
-    def estimates(self, rig: Rig) -> dict[Measure, Estimate]:
-        """Return the numbers of a rig on all frames by both averages; ValueError as `score`."""
-        observers, _ = self._observe(rig, MEASURES)
-        return {measure: observers.estimate(measure) for measure in MEASURES}
-
-    def _observe(self, rig: Rig, measures: Sequence[Measure]) -> tuple[RigObservers, float]:
-        observers, rays, self_hits = self._observers_of(rig, measures), 0, 0
-        for measured in self._compute(self._as_requested(rig), range(len(self)), tuple(observers.coverage)):
-            observers.add(measured)
-            rays, self_hits = rays + measured.counts["rays"], self_hits + measured.counts["self_hits"]
-        return observers, self_hits / rays
-
-    def _observers_of(self, rig: Rig, measures: Sequence[Measure]) -> RigObservers:
         required = {name: one for name, one in self.objectives.items() if one.requires}
         kept = {name: one.share_kept(rig, self._worlds[0], self.sensor_model) for name, one in required.items()}
-        return replace(self.queries.numbers_of(rig, measures), kept=kept)
+        observer, rays, self_hits = self.queries.observer_of(rig, self.estimate), 0, 0
+        for measured in self._compute(self._as_requested(rig), range(len(self)), is_measured=True):
+            observer.add(measured.sums[self.estimate])
+            rays, self_hits = rays + measured.counts["rays"], self_hits + measured.counts["self_hits"]
+        return Score(self.queries.estimate(observer.metric, kept), self_hits / rays)
 
     def frames(self, rig: Rig | None = None, numbers: Sequence[int] | None = None) -> Iterator[Frame]:
         """Yield frames of a rig, in order, with the reference points inside the queried regions.
@@ -298,12 +290,12 @@ class CommonFrames:
         self._check_vehicle(rig)
         return rig.sensing("ideal") if self.sensor_model == "ideal" else rig
 
-    def _compute(self, rig: Rig | None, numbers: Sequence[int], measures: tuple[Measure, ...] = ()) -> list[Any]:
+    def _compute(self, rig: Rig | None, numbers: Sequence[int], *, is_measured: bool = False) -> list[Any]:
         shares: list[list[int]] = [[] for _ in range(max(self._processes, 1))]
         for number in numbers:
             shares[self.indices[number].world % len(shares)].append(number)
         # The k-th batch goes to the k-th process, which has built these worlds.
-        self._batches[:] = [[FrameRequest(rig, number, measures) for number in share] for share in shares]
+        self._batches[:] = [[FrameRequest(rig, number, is_measured) for number in share] for share in shares]
         made: dict[int, Frame | MeasuredFrame | ValueError] = {}
         try:
             for share, batch in zip(shares, batches_of(self._loader), strict=True):

@@ -4,7 +4,7 @@ import math
 import re
 import warnings
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from difflib import get_close_matches
 from typing import Any, NamedTuple, Self
 
@@ -17,7 +17,6 @@ from torchcover.coverage.quantity import RADIUS, detection, without
 from torchcover.estimation import Estimate
 from torchcover.evaluation import CoverageObserver
 from torchcover.evaluation.measuring import BLOCKS
-from torchcover.evaluation.pipeline import MeasuredFrame
 from torchcover.geometry.arrays import Float64
 from torchcover.placement.objective import THRESHOLD_M, Objective
 from torchcover.simulation import Areas, RegionsOfInterest, Rig, SurfaceReference
@@ -110,9 +109,8 @@ class Queries(NamedTuple):
         ValueError: such a one; the message has the nearest name.
         """
         queries = self._replace(thresholds_m=self.thresholds_m or (THRESHOLD_M,))
-        numbers = queries.numbers_of(rig)
         with warnings.catch_warnings(action="ignore"):  # that they were fed with nothing
-            of_coverage = [one.key for one in numbers.coverage["area"].compute().every_quantity]
+            of_coverage = [one.key for one in queries.observer_of(rig, "area").compute().every_quantity]
         single = (RADIUS, *map(detection, queries.thresholds_m))
         others = [one.key for kind in AGGREGATIONS for one in kind.parse(kind.example).quantities]
         of_coverage += [one.key for one in (*single, *(without(ANY, each) for each in single))] + others
@@ -124,85 +122,64 @@ class Queries(NamedTuple):
     @property
     def aggregations(self) -> tuple[Aggregation, ...]:
         """Those whose numbers are asked for."""
-        keys = {objective.key for objective in self.objectives.values()}
-        return tuple(one for kind in AGGREGATIONS if (one := kind.of_keys(keys)))
+        return tuple(one for kind in AGGREGATIONS if (one := kind.of_keys(set(self._keys))))
 
-    def numbers_of(self, rig: Rig, measures: Sequence[Measure] = ("area",)) -> "RigObservers":
-        """What observes a rig on its ego, fed with nothing yet, for numbers by these measures."""
-        return RigObservers(self, rig, self.coverage_of(rig, measures))
+    @property
+    def _keys(self) -> list[str]:
+        return [objective.key for objective in self.objectives.values()]
 
-    def coverage_of(self, rig: Rig, measures: Sequence[Measure]) -> dict[Measure, CoverageObserver]:
-        """What observes the coverage of a rig: the same for both measures where that knows both."""
-        keys = [one.key for one in self.objectives.values()]
-        failures = any(map(_of_failures, keys))
-        regions = tuple(self.regions.values())
-        observers: dict[Measure, CoverageObserver] = {}
-        for measure in measures:
-            if "area" in observers and not failures:  # which has the means over known cells, too
-                observers[measure] = observers["area"]
-                continue
-            coverage = CoverageSums(
-                self.grid, self.thresholds_m, max_radius=self.max_radius_m, blocks=BLOCKS, regions=regions,
-                aggregations=self.aggregations, sensors=_names(rig) if failures else (),
-                square_metres=measure == "area",
-            )  # fmt: skip
-            observers[measure] = CoverageObserver(coverage, rig.name)
-        return observers
+    def observer_of(self, rig: Rig, measure: Measure) -> CoverageObserver:
+        """Return an observer of the coverage of a rig, fed with nothing yet, for means by area or over known cells."""
+        coverage = CoverageSums(
+            self.grid,
+            self.thresholds_m,
+            max_radius=self.max_radius_m,
+            blocks=BLOCKS,
+            regions=tuple(self.regions.values()),
+            aggregations=self.aggregations,
+            sensors=tuple(sensor.name for sensor in rig.sensors) if any(map(_of_failures, self._keys)) else (),
+            square_metres=measure == "area",
+        )
+        return CoverageObserver(coverage, rig.name)
 
+    def estimate(self, metric: CoverageSums, kept: Mapping[str, Estimate]) -> Estimate:
+        """Return the objectives, each a quantity under its own name.
 
-@dataclass(frozen=True, eq=False)
-class RigObservers:
-    """Observers of a rig for its objectives: the same as in `evaluate`.
-
-    `coverage` is by what its numbers are means over; one for both where that has both. `kept` are the
-    shares of requirements that are met, the same in every block.
-    """
-
-    queries: Queries
-    rig: Rig
-    coverage: Mapping[Measure, CoverageObserver]
-    kept: Mapping[str, Estimate] = field(default_factory=dict)
-
-    def add(self, seen: MeasuredFrame) -> None:
-        """Add what is left of a frame where it was made and measured: its sums by measure."""
-        for observer, measure in {observer: measure for measure, observer in self.coverage.items()}.items():
-            observer.add(seen.sums[measure])
-
-    def estimate(self, measure: Measure) -> Estimate:
-        """The objectives so far, each a quantity under its own name, by one of the measures that it was made for."""
-        answers = self._answers(measure)
+        Args:
+            metric: That of `observer_of`, with the sums of all frames.
+            kept: Name of an objective that is required of bodies -> share of the requirements that are met, the same in
+                every block.
+        """
+        answers = self._answers(metric)
         steps = max((one.steps for each in answers.values() for one in each), key=len)
         quantities, values, left_out = [], [], []
-        for name in self.queries.names:
-            each = answers.get(name) or [self.kept[name]]
+        for name in self.names:
+            each = answers.get(name) or [kept[name]]
             quantities.append(each[0].quantities[0]._replace(key=name))
             values.append(torch.cat([one.value for one in each]).mean())
             whole = all(len(one.left_out) == len(steps) for one in each)
             unknown = torch.full((len(steps),), math.nan, dtype=torch.float64, device="cpu")
             known = torch.cat([one.left_out for one in each], dim=1).mean(dim=1) if whole else unknown
-            left_out.append(values[-1].expand(len(steps)) if name in self.kept else known)
+            left_out.append(values[-1].expand(len(steps)) if name in kept else known)
         return Estimate(tuple(quantities), torch.stack(values), torch.stack(left_out, dim=1), steps)
 
-    def _answers(self, measure: Measure) -> dict[str, list[Estimate]]:
-        """Name of each objective -> its number in each of its places."""
-        metric, objectives, regions = self.coverage[measure].metric, self.queries.objectives, self.queries.regions
+    def _answers(self, metric: CoverageSums) -> dict[str, list[Estimate]]:
+        """Return for each objective its number in each of its regions and bands."""
         plain = [quantity.key for quantity in MeanOfMeans(metric.thresholds).quantities]
-        places = list(dict.fromkeys(place for one in objectives.values() for place in one.places))
-        if measure == "area" and all(one.key in plain for one in objectives.values()):
-            by_area = metric.estimates([(regions[region], band) for region, band in places], measure)
+        places = list(dict.fromkeys(place for one in self.objectives.values() for place in one.places))
+        if metric.square_metres and all(key in plain for key in self._keys):
+            by_area = metric.estimates([(self.regions[region], band) for region, band in places], "area")
             found = dict(zip(places, by_area, strict=True))
 
             def number(key: str, place: tuple[str, str]) -> Estimate:
-                return _chosen(found[place], key)
+                at = [quantity.key for quantity in found[place].quantities].index(key)
+                return found[place][at : at + 1]
         else:
             coverage = metric.compute()
 
             def number(key: str, place: tuple[str, str]) -> Estimate:
-                if not metric.square_metres:
-                    key = key.removeprefix("known_")
-                elif measure == "known" and key in plain:
-                    key = f"known_{key}"
-                return coverage.estimate_of(key, regions[place[0]], place[1])
+                key = key if metric.square_metres else key.removeprefix("known_")
+                return coverage.estimate_of(key, self.regions[place[0]], place[1])
 
         def answer(key: str, place: tuple[str, str]) -> Estimate:
             alone, sensor = failed.groups() if (failed := FAILURE.match(key)) else (key, "")
@@ -212,17 +189,12 @@ class RigObservers:
                 return replace(worst, quantities=(worst.quantities[0]._replace(title=title),))
             return number(key if sensor in ("", *metric.sensors) else alone, place)  # what is not there cannot fail
 
-        return {name: [answer(one.key, place) for place in one.places] for name, one in objectives.items()}
+        return {name: [answer(one.key, place) for place in one.places] for name, one in self.objectives.items()}
 
 
 def _of_failures(key: str) -> bool:
     """Whether only a metric that is told of the sensors gives the number."""
     return FAILURE.match(key) is not None or not key.startswith(("radius", "detection", "known_"))
-
-
-def _chosen(estimate: Estimate, key: str) -> Estimate:
-    at = [quantity.key for quantity in estimate.quantities].index(key)
-    return estimate[at : at + 1]
 
 
 def _worst(each: Sequence[Estimate]) -> Estimate:
@@ -231,10 +203,6 @@ def _worst(each: Sequence[Estimate]) -> Estimate:
     value, left_out = (torch.stack(parts) for parts in zip(*((one.value, one.left_out) for one in each), strict=True))
     worst: Any = torch.amax if quantity.lower_is_better else torch.amin
     return Estimate(each[0].quantities, worst(value, dim=0), worst(left_out, dim=0), each[0].steps)
-
-
-def _names(rig: Rig) -> tuple[str, ...]:
-    return tuple(sensor.name for sensor in rig.sensors)
 
 
 def _written(region: Region) -> RegionOfInterest:

@@ -49,18 +49,6 @@ class PlacementReport:
     pictures: Callable[[], Iterator[tuple[str, str, Figure]]]
     ego_outline_m: Float64
 
-    def _repr_html_(self) -> str:
-        return small_html([self.title, self.sentence], self.plot())
-
-    def plot(self) -> Figure:
-        """The first of the pictures."""
-        return next(self.pictures())[2]
-
-    def to_dataframe(self) -> "pandas.DataFrame":
-        """The first of the tables that are written as CSV."""
-        headings, *rows = next(iter(self.rows.values()))
-        return data_frame(dict(zip(map(str, headings), row, strict=True)) for row in rows)
-
     def save(self, folder: str | Path, *, files: str | Iterable[str] = FILES) -> list[Path]:
         """Write the files of the command line: first what was found, then the pictures and the page.
 
@@ -121,11 +109,12 @@ class Reported:
         raise NotImplementedError
 
     def _repr_html_(self) -> str:
-        return self.report._repr_html_()
+        report = self.report
+        return small_html([report.title, report.sentence], self.plot())
 
     def plot(self) -> Figure:
         """The first of its pictures: a figure of its own, outside pyplot."""
-        return self.report.plot()
+        return next(self.report.pictures())[2]
 
     def to_dataframe(self) -> "pandas.DataFrame":
         """The rows of its first table: `candidates.csv` of a choice, `evaluations.csv` of a search.
@@ -133,7 +122,8 @@ class Reported:
         Raises:
             ModuleNotFoundError: pandas is not there.
         """
-        return self.report.to_dataframe()
+        headings, *rows = next(iter(self.report.rows.values()))
+        return data_frame(dict(zip(map(str, headings), row, strict=True)) for row in rows)
 
     def save(self, folder: str | Path, *, files: str | Iterable[str] = FILES) -> list[Path]:
         """Write the files of the command line; see `PlacementReport.save`.

@@ -13,7 +13,7 @@ from torchcover.placement.free_sensor import FreeNumber
 from torchcover.placement.report_files import OF_THE_RUN, PlacementReport, Reported
 from torchcover.placement.search import OPTIMIZER, RANDOM, START, Evaluation, PlacementSearch
 from torchcover.placement.validation import HeldOutGain, ValidationTest, describe_gain, format_gain, unit_words
-from torchcover.report import PageTable, Words, draw_fronts, draw_progress, draw_slices, file_stems
+from torchcover.report import PageTable, Words, draw_fronts, draw_progress, file_stems
 from torchcover.report.wording import UNKNOWN, shown_unit
 from torchcover.simulation import Rig
 
@@ -31,7 +31,7 @@ class Finalist:
             objective that the rig is best in.
         evaluation: Its scores in the search.
         rig: The rig.
-        gains: Gains on held-out worlds, by the estimate of the search first; empty if it was not tested.
+        gains: Gains on held-out worlds; empty if it was not tested.
     """
 
     role: str
@@ -292,31 +292,20 @@ class SearchResult(Reported):
         return space.cost_eur(space.start if one.number == 0 else space.rig(one.values, str(one.number)))
 
     def _pictures(self) -> Iterator[tuple[str, str, Figure]]:
-        """Yield stem, description and figure: progress, each objective over each variable, and the front."""
+        """Yield stem, description and figure: progress, and of several objectives the front."""
         search, names = self.search, list(self.search.space.objectives)
         factors = np.array([shown_unit(unit).factor for unit in self.units])
         labels = [f"gain in {name} ({unit_words(unit)})" for name, unit in zip(names, self.units, strict=True)]
         gains = factors * self.gains
-        strategies = np.array([evaluation.strategy for evaluation in search.evaluations])
         best_so_far = np.maximum.accumulate(np.nan_to_num(gains, nan=-np.inf), axis=0)
         lines = {
             label: np.column_stack([np.arange(len(line)), line])
             for label, line in zip(labels, best_so_far.T, strict=True)
         }
         yield "progress", "The best so far over the candidates", draw_progress(lines, title=search.space.name)
-        groups = {name: strategies == name for name in (OPTIMIZER, RANDOM)}
-        for at, label in enumerate(labels):
-            points = {}
-            for variable in search.space.variables:
-                values = [evaluation.values.get(variable.name) for evaluation in search.evaluations]
-                points[variable.name] = {
-                    name: ([values[k] for k in np.flatnonzero(group)], gains[group, at])
-                    for name, group in groups.items()
-                }
-            stem = "objective" if len(names) == 1 else f"objective_{at + 1}"
-            description = f"Gain in {names[at]} over each variable"
-            yield stem, description, draw_slices(points, label=label, title=search.space.name)
         if len(names) > 1:
+            strategies = np.array([evaluation.strategy for evaluation in search.evaluations])
+            groups = {name: strategies == name for name in (OPTIMIZER, RANDOM)}
             is_on_front = np.isin(np.arange(len(gains)), search.best_of())
             every = {name: gains[group] for name, group in groups.items()}
             fronts = {name: gains[group & is_on_front] for name, group in groups.items()}

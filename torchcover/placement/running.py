@@ -1,4 +1,4 @@
-"""A placement search from its start to the test on held-out worlds, within its budget."""
+"""A placement search from its start to the test on held-out worlds, within its budget, with its journal."""
 
 import math
 import time
@@ -6,15 +6,24 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
-from torchcover.evaluation.progress import Progress
-from torchcover.files import lock_folder
+from torchcover.evaluation.checkpoint import differences
+from torchcover.evaluation.progress import Progress, held_back
+from torchcover.files import BadFileError, check_memory, lock_folder, reads
+from torchcover.placement.plan import distributions_of, import_optuna, run_quietly
 from torchcover.placement.result import Finalist, SearchResult
-from torchcover.placement.search import JOURNAL, RANDOM, START, PlacementSearch, SearchJournal
+from torchcover.placement.search import RANDOM, START, Evaluation, PlacementSearch
 from torchcover.placement.validation import ValidationTest, format_gain, validate
+
+if TYPE_CHECKING:
+    from optuna.trial import FrozenTrial
+
+JOURNAL = "search.journal"
+STUDY = "placement"
 
 Clock = Callable[[], float]
 
@@ -117,7 +126,7 @@ class _Budget:
 
 
 def _spend(
-    search: PlacementSearch, budget: _Budget, journal: SearchJournal | None, advance: Callable[[int, str], Any]
+    search: PlacementSearch, budget: _Budget, journal: "SearchJournal | None", advance: Callable[[int, str], Any]
 ) -> None:
     search.until_s = budget.until_s
     if journal is not None:
@@ -174,3 +183,106 @@ def _validate(search: PlacementSearch, finalists: list[Finalist]) -> tuple[list[
         return finalists, None, str(error)
     tested = [replace(finalist, gains=test.gains.get(finalist.role, ())) for finalist in finalists]
     return tested, test, ""
+
+
+class SearchJournal:
+    """The evaluations of a search in a file: an Optuna study in a journal of JSON lines, one for each evaluation.
+
+    Args:
+        path: The file, in a folder that no other search writes to.
+        search: The search that it belongs to.
+    """
+
+    def __init__(self, path: Path, search: PlacementSearch) -> None:
+        self.path = path
+        self._search = search
+        self._written = 0
+        self._study: Any = None
+        settings = search.plan.settings(search.space)
+        self._settings = {name: str(value) for name, value in settings.items()}
+
+    def resume(self) -> None:
+        """Load the evaluations of the file, if there is one.
+
+        Raises:
+            ValueError: It belongs to another search.
+            BadFileError: It is damaged, or the start has another score today.
+        """
+        if not self.path.exists():
+            return
+        search = self._search
+        self._study, evaluations, settings = load_study(self.path)
+        if other := differences(self._settings, settings):
+            raise ValueError(
+                f"{self.path}: the journal of another search: {other}; resume with the settings of that search, or "
+                "choose another folder"
+            )
+        earlier = evaluations[0].estimate
+        today = search.frames.score(search.space.start).estimate
+        if earlier is None or not torch.equal(today.value, earlier.value):
+            raise BadFileError(
+                f"{self.path}: the start has another score today: the version of a package, or a file that the space "
+                "names, has changed; begin anew, without --resume"
+            )
+        drop_torn_line(self.path)
+        search.evaluations[:] = evaluations
+        self._written = len(evaluations)
+
+    def write(self) -> None:
+        """Append all evaluations that are not in the file yet."""
+        with held_back():
+            if self._study is None:
+                self.path.unlink(missing_ok=True)
+                self._study = self._create()
+            for evaluation in self._search.evaluations[self._written :]:
+                self._study.add_trial(self._trial(evaluation))
+                self._written += 1
+
+    def _create(self) -> Any:  # noqa: ANN401  (a study of Optuna)
+        optuna = import_optuna()
+        directions = ["maximize"] * len(self._search.space.objectives)
+        make = optuna.create_study
+        study = run_quietly(optuna, lambda: make(storage=_storage(self.path), study_name=STUDY, directions=directions))
+        study.set_user_attr("settings", self._settings)
+        return study
+
+    def _trial(self, evaluation: Evaluation) -> "FrozenTrial":
+        optuna, spans = import_optuna(), distributions_of(self._search.space)
+        values = dict(evaluation.values)
+        gains = self._search.gains[evaluation.number].tolist()
+        state = optuna.trial.TrialState.COMPLETE
+        if math.isnan(gains[0]):
+            state, gains = optuna.trial.TrialState.FAIL, None
+        known = {name: spans[name] for name in values}
+        attributes = {"evaluation": evaluation.record()}
+        trial: FrozenTrial = optuna.create_trial(
+            params=values, distributions=known, values=gains, state=state, user_attrs=attributes
+        )
+        return trial
+
+
+def _storage(path: Path) -> Any:  # noqa: ANN401  (a storage of Optuna)
+    journal = import_optuna().storages.journal
+    return import_optuna().storages.JournalStorage(journal.JournalFileBackend(str(path)))
+
+
+def drop_torn_line(path: Path) -> None:
+    """Cut off what a process was writing when it was ended: a last line without a line break."""
+    with path.open("r+b") as file:
+        file.truncate(file.read().rfind(b"\n") + 1)
+
+
+@reads("the journal of a placement search")
+def load_study(path: Path) -> tuple[Any, list[Evaluation], dict[str, str]]:
+    """Return the study in a journal, its evaluations and its settings. Only JSON is read; no code is executed."""
+    check_memory(4 * path.stat().st_size)
+    optuna = import_optuna()
+    study = run_quietly(optuna, lambda: optuna.load_study(storage=_storage(path), study_name=STUDY))
+    settings = study.user_attrs["settings"]
+    records = [trial.user_attrs["evaluation"] for trial in study.trials]
+    evaluations = [Evaluation.from_record(record) for record in records]
+    if not evaluations or [evaluation.number for evaluation in evaluations] != list(range(len(evaluations))):
+        raise ValueError("its evaluations are not numbered from 0 on")
+    if not all(isinstance(value, str) for value in settings.values()):
+        raise ValueError("its settings are not texts")
+    return study, evaluations, settings

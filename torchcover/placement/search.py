@@ -1,141 +1,29 @@
-"""Placement search with Optuna: candidates are proposed, scored on common frames, and kept in a journal."""
+"""Placement search with Optuna: candidates are proposed, scored on common frames, and compared with the start."""
 
-import json
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from hashlib import sha256
 from itertools import product
-from pathlib import Path
-from types import ModuleType
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import Any, Self
 
 import numpy as np
 import torch
 
-from torchcover import __version__
-from torchcover.coverage import Measure
 from torchcover.estimation import Estimate, Quantity
-from torchcover.evaluation.checkpoint import differences
-from torchcover.evaluation.progress import held_back
-from torchcover.files import BadFileError, check_memory, reads
 from torchcover.geometry.arrays import Bools, Float64
-from torchcover.placement.common_frames import EVERY_S, FRAMES_PER_WORLD, MEASURES, RAYS, WORLDS, CommonFrames, Score
+from torchcover.placement.common_frames import CommonFrames, Score
 from torchcover.placement.free_sensor import FreeChoice, Value
-from torchcover.placement.host_vehicle import VehicleSpace
 from torchcover.placement.objective import check_requirements
+from torchcover.placement.plan import SearchPlan, import_optuna, propose_by_model
 from torchcover.placement.space import SearchSpace
 from torchcover.simulation import Rig
-from torchcover.simulation.regions_of_interest import DEFAULT_BAND_FRAME
-
-if TYPE_CHECKING:
-    from optuna.trial import FrozenTrial
 
 START = "start"
 OPTIMIZER = "optimizer"
 RANDOM = "random"
-JOURNAL = "search.journal"
-STUDY = "placement"
 ROUNDING = 1e-9  # relative; smaller shortfalls are rounding errors
-
-MakeFrames = Callable[[SearchSpace, "SearchPlan", int, int], CommonFrames]
-
-
-@dataclass(frozen=True)
-class OptimizerParams:
-    """Parameters of the optimizer, a Gaussian process with log expected improvement (Optuna's GPSampler).
-
-    Args:
-        startup: Number of random candidates before the first model.
-        control_every: Every so many candidates one more is random: a control of the optimizer, which learns from it.
-        max_combinations: A space of choices alone with at most so many rigs is searched without repetition.
-    """
-
-    startup: int = 5
-    control_every: int = 3
-    max_combinations: int = 4096
-
-
-def make_common_frames(space: VehicleSpace, plan: "SearchPlan", seed: int, worlds: int) -> CommonFrames:
-    """Return frames of the scenarios of a space, for a seed and a number of worlds."""
-    names = ("per_world", "every_s", "rays", "estimate", "sensor_model", "workers")
-    settings: dict[str, Any] = {name: getattr(plan, name) for name in names}
-    return CommonFrames(space.scenarios, space.numbers, worlds=worlds, seed=seed, **settings)
-
-
-@dataclass(frozen=True)
-class SearchPlan:
-    """Budget, worlds and seeds of a placement search.
-
-    Args:
-        evaluations: Number of candidates after the start; or
-        budget_s: seconds for the whole search with its frames and the test on held-out worlds. One of both is needed.
-        seed: Seed of the worlds that candidates are scored in and of the candidates; held-out worlds have the next.
-        estimate: Average of a score: "area", the visible surface, or "known", the mean of the observed cells.
-        sensor_model: "ideal" or "real"; if not given, real where the rig's range limits are known.
-        worlds: Worlds of each scenario to search in.
-        fresh_worlds: Held-out worlds of each scenario to test in.
-        per_world: Frames of each world.
-        every_s: Time between them in seconds.
-        rays: Approximate number of reference rays of each frame.
-        workers: Processes that score; 0 scores in this one. Results do not depend on it.
-        optimizer: Parameters of the optimizer.
-        make_frames: Factory of the frames.
-
-    Raises:
-        ValueError: Values out of range.
-    """
-
-    evaluations: int | None = None
-    budget_s: float | None = None
-    seed: int = 0
-    estimate: Measure = "area"
-    sensor_model: Literal["ideal", "real"] | None = None
-    worlds: int = WORLDS
-    fresh_worlds: int = 16
-    per_world: int = FRAMES_PER_WORLD
-    every_s: float = EVERY_S
-    rays: int = RAYS
-    workers: int = 0
-    optimizer: OptimizerParams = OptimizerParams()
-    make_frames: MakeFrames = make_common_frames
-
-    def __post_init__(self) -> None:
-        if (self.evaluations is None) == (self.budget_s is None):
-            given = "neither" if self.evaluations is None else "both"
-            raise ValueError(f"budget: seconds or a number of evaluations is needed; got {given}")
-        if self.evaluations is not None and self.evaluations < 1:
-            raise ValueError(f"evaluations: 1 or more is needed; got {self.evaluations}")
-        if self.budget_s is not None and not self.budget_s > 0:
-            raise ValueError(f"budget: more than 0 s is needed; got {self.budget_s:g}")
-        if self.estimate not in MEASURES:
-            raise ValueError(f"estimate: one of {', '.join(MEASURES)} is needed; got {self.estimate!r}")
-
-    @property
-    def seed_of_test(self) -> int:
-        """Seed of the held-out worlds, which differs from that of the search."""
-        return self.seed + 1
-
-    def settings(self, space: SearchSpace) -> dict[str, Any]:
-        """Return everything that decides which candidates are proposed, for JSON.
-
-        Raises:
-            ValueError: The sensor model is "real", and no sensor of the start has known range limits.
-        """
-        content = {"space": space.content(), "scenarios": [scenario.content() for scenario in space.scenarios]}
-        text = json.dumps(content, sort_keys=True, default=str)
-        return {
-            "torchcover": __version__,
-            "space": space.name,
-            "space_sha256": sha256(text.encode()).hexdigest(),
-            "optimizer": str(self.optimizer),
-            "estimate": self.estimate,
-            "sensor_model": space.start.sensing(self.sensor_model).sensor_model,
-            "band_frame": DEFAULT_BAND_FRAME,
-            **{name: getattr(self, name) for name in ("seed", "worlds", "per_world", "every_s", "rays")},
-        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -488,159 +376,3 @@ def find_non_dominated(values: Float64) -> Bools:
     is_as_good = np.all(values[:, None] >= values[None], axis=2)
     is_better = np.any(values[:, None] > values[None], axis=2)
     return np.asarray(~(is_as_good & is_better).any(axis=0), dtype=bool)
-
-
-def import_optuna() -> ModuleType:
-    """Return the package Optuna. ImportError: it is not installed."""
-    try:
-        import optuna
-    except ImportError as error:
-        raise ImportError("a placement search needs Optuna: pip install 'torchcover[search]'") from error
-    module: ModuleType = optuna
-    return module
-
-
-def propose_by_model(
-    space: SearchSpace, trials: list[tuple[dict[str, Value], list[float], dict[str, float]]], seed: int
-) -> dict[str, Value]:
-    """Return the values with the largest expected improvement, by a Gaussian process of all candidates so far.
-
-    Args:
-        space: Its variables and objectives.
-        trials: Values, gains, and constraints, of which each is met if it is not above 0.
-        seed: Seed of the optimization.
-    """
-    optuna = import_optuna()
-    spans = _distributions(space)
-    sampler = optuna.samplers.GPSampler(seed=seed, n_startup_trials=1, warn_independent_sampling=False)
-    directions = ["maximize"] * len(trials[0][1])
-    study = _quietly(optuna, lambda: optuna.create_study(directions=directions, sampler=sampler))
-    study.add_trials(
-        optuna.create_trial(params=values, distributions=spans, values=gains, constraints=constraints or None)
-        for values, gains, constraints in trials
-    )
-    return dict(_quietly(optuna, lambda: study.ask(spans)).params)
-
-
-def _distributions(space: SearchSpace) -> dict[str, Any]:
-    kinds = import_optuna().distributions
-    return {
-        variable.name: kinds.CategoricalDistribution(variable.options)
-        if isinstance(variable, FreeChoice)
-        else kinds.FloatDistribution(variable.low, variable.high)
-        for variable in space.variables
-    }
-
-
-def _quietly(optuna: ModuleType, action: Callable[[], Any]) -> Any:  # noqa: ANN401  (objects of Optuna)
-    """Do something without Optuna's messages: new studies, and its missing optional package greenlet."""
-    level = optuna.logging.get_verbosity()
-    optuna.logging.set_verbosity(optuna.logging.ERROR)
-    try:
-        with np.errstate(all="ignore"):  # of acquisition values that are 0 nearly everywhere
-            return action()
-    finally:
-        optuna.logging.set_verbosity(level)
-
-
-class SearchJournal:
-    """The evaluations of a search in a file: an Optuna study in a journal of JSON lines, one for each evaluation.
-
-    Args:
-        path: The file, in a folder that no other search writes to.
-        search: The search that it belongs to.
-    """
-
-    def __init__(self, path: Path, search: PlacementSearch) -> None:
-        self.path = path
-        self._search = search
-        self._written = 0
-        self._study: Any = None
-        settings = search.plan.settings(search.space)
-        self._settings = {name: str(value) for name, value in settings.items()}
-
-    def resume(self) -> None:
-        """Load the evaluations of the file, if there is one.
-
-        Raises:
-            ValueError: It belongs to another search.
-            BadFileError: It is damaged, or the start has another score today.
-        """
-        if not self.path.exists():
-            return
-        search = self._search
-        self._study, evaluations, settings = load_study(self.path)
-        if other := differences(self._settings, settings):
-            raise ValueError(
-                f"{self.path}: the journal of another search: {other}; resume with the settings of that search, or "
-                "choose another folder"
-            )
-        earlier = evaluations[0].estimate
-        today = search.frames.score(search.space.start).estimate
-        if earlier is None or not torch.equal(today.value, earlier.value):
-            raise BadFileError(
-                f"{self.path}: the start has another score today: the version of a package, or a file that the space "
-                "names, has changed; begin anew, without --resume"
-            )
-        drop_torn_line(self.path)
-        search.evaluations[:] = evaluations
-        self._written = len(evaluations)
-
-    def write(self) -> None:
-        """Append all evaluations that are not in the file yet."""
-        with held_back():
-            if self._study is None:
-                self.path.unlink(missing_ok=True)
-                self._study = self._create()
-            for evaluation in self._search.evaluations[self._written :]:
-                self._study.add_trial(self._trial(evaluation))
-                self._written += 1
-
-    def _create(self) -> Any:  # noqa: ANN401  (a study of Optuna)
-        optuna = import_optuna()
-        directions = ["maximize"] * len(self._search.space.objectives)
-        make = optuna.create_study
-        study = _quietly(optuna, lambda: make(storage=_storage(self.path), study_name=STUDY, directions=directions))
-        study.set_user_attr("settings", self._settings)
-        return study
-
-    def _trial(self, evaluation: Evaluation) -> "FrozenTrial":
-        optuna, spans = import_optuna(), _distributions(self._search.space)
-        values = dict(evaluation.values)
-        gains = self._search.gains[evaluation.number].tolist()
-        state = optuna.trial.TrialState.COMPLETE
-        if math.isnan(gains[0]):
-            state, gains = optuna.trial.TrialState.FAIL, None
-        known = {name: spans[name] for name in values}
-        attributes = {"evaluation": evaluation.record()}
-        trial: FrozenTrial = optuna.create_trial(
-            params=values, distributions=known, values=gains, state=state, user_attrs=attributes
-        )
-        return trial
-
-
-def _storage(path: Path) -> Any:  # noqa: ANN401  (a storage of Optuna)
-    journal = import_optuna().storages.journal
-    return import_optuna().storages.JournalStorage(journal.JournalFileBackend(str(path)))
-
-
-def drop_torn_line(path: Path) -> None:
-    """Cut off what a process was writing when it was ended: a last line without a line break."""
-    with path.open("r+b") as file:
-        file.truncate(file.read().rfind(b"\n") + 1)
-
-
-@reads("the journal of a placement search")
-def load_study(path: Path) -> tuple[Any, list[Evaluation], dict[str, str]]:
-    """Return the study in a journal, its evaluations and its settings. Only JSON is read; no code is executed."""
-    check_memory(4 * path.stat().st_size)
-    optuna = import_optuna()
-    study = _quietly(optuna, lambda: optuna.load_study(storage=_storage(path), study_name=STUDY))
-    settings = study.user_attrs["settings"]
-    records = [trial.user_attrs["evaluation"] for trial in study.trials]
-    evaluations = [Evaluation.from_record(record) for record in records]
-    if not evaluations or [evaluation.number for evaluation in evaluations] != list(range(len(evaluations))):
-        raise ValueError("its evaluations are not numbered from 0 on")
-    if not all(isinstance(value, str) for value in settings.values()):
-        raise ValueError("its settings are not texts")
-    return study, evaluations, settings

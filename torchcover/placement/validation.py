@@ -109,7 +109,7 @@ class ValidationTest(NamedTuple):
     """Result of `validate`.
 
     Args:
-        gains: Name of a finalist -> improvements, by the estimate of the search, then by the other one.
+        gains: Name of a finalist -> improvements of all numbers of the search.
         changes: Side effects of the first finalist, significant deteriorations first.
     """
 
@@ -162,23 +162,21 @@ def validate(
     first = next(iter(winners))
     others, parts = _others(searched.objectives, failures=max(len(start.sensors), len(winners[first].sensors)) > 1)
     with closing(searched.resampled(test_seed, worlds, others)) as fresh:
-        start_by_test = fresh.estimates(start)
-        by_test = {name: fresh.estimates(winner) for name, winner in winners.items()}
-    start_by_search = searched.estimates(start)
-    own = {objective: asked.own_estimate for objective, asked in searched.objectives.items()}
-    gains = {}
+        start_by_test = fresh.score(start).estimate
+        by_test = {
+            name: _differences(fresh.score(winner).estimate, start_by_test, searched.objectives)
+            for name, winner in winners.items()
+        }
+    start_by_search = searched.score(start).estimate
+    gains, found = {}, by_test[first]
     for name, winner in winners.items():
-        by_search = searched.estimates(winner)
+        in_search = searched.score(winner).estimate.differences(start_by_search)
         gains[name] = tuple(
-            HeldOutGain(objective, own[objective] or estimate, test, in_search[objective].gain)
-            for estimate in sorted(start_by_search, key=lambda one: one != searched.estimate)
-            for in_search in [by_search[estimate].differences(start_by_search[estimate])]
-            for objective, test in _differences(
-                by_test[name][estimate], start_by_test[estimate], searched.objectives
-            ).items()
-            if objective in own and (estimate == searched.estimate or not own[objective])
+            HeldOutGain(
+                objective, asked.own_estimate or searched.estimate, by_test[name][objective], in_search[objective].gain
+            )
+            for objective, asked in searched.objectives.items()
         )
-    found = _differences(by_test[first][searched.estimate], start_by_test[searched.estimate], searched.objectives)
     tests = {name: test for name, test in found.items() if name in others or name.startswith(NOT_WORSE)}
     tests |= _of_targets(winners[first], start, searched)
     shares: dict[str, dict[str, float]] = {name: {} for name in tests}

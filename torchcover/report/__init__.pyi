@@ -3,7 +3,6 @@ from .charts import draw_choice as draw_choice
 from .charts import draw_encounters as draw_encounters
 from .charts import draw_fronts as draw_fronts
 from .charts import draw_progress as draw_progress
-from .charts import draw_slices as draw_slices
 from .charts import draw_work_precision as draw_work_precision
 from .colours import ColourScale as ColourScale
 from .colours import difference_scale as difference_scale

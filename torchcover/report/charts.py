@@ -58,7 +58,6 @@ Float64 = NDArray[np.float64]
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
 MARKERS = "osD^vP*X"
 BEST = "#000000"
-COLUMNS = 3
 BOUND = "#999999"
 
 
@@ -77,37 +76,6 @@ def draw_progress(lines: Mapping[str, Float64], *, title: str) -> Figure:
     axes.set(xlabel="candidates", ylabel="best so far")
     axes.grid(visible=True, alpha=0.2)
     axes.legend(frameon=False)
-    return figure
-
-
-def draw_slices(points: Mapping[str, Mapping[str, tuple[Sequence[Any], Float64]]], *, label: str, title: str) -> Figure:
-    """Draw the gains of candidates over each variable.
-
-    Args:
-        points: Name of a variable -> strategy -> values, numbers or options, and their gains.
-        label: Label of the upright axis, with its unit.
-        title: Name of the search space.
-    """
-    rows = -(-len(points) // COLUMNS)
-    figure, grid = _sheet(rows, min(len(points), COLUMNS), title)
-    views = [axes for row in grid for axes in row]
-    for axes, (variable, groups) in zip(views, points.items(), strict=False):
-        options = sorted(
-            {str(value) for values, _ in groups.values() for value in values if not isinstance(value, float)}
-        )
-        for at, (name, (values, gains)) in enumerate(groups.items()):
-            x = [options.index(str(value)) if options else value for value in values]
-            axes.plot(x, gains, linestyle="none", marker=MARKERS[at], markersize=4, color=COLOURS[at], label=name)
-        if options:
-            axes.set_xticks(range(len(options)), options, rotation=20, ha="right", parse_math=False)
-        axes.axhline(0.0, color="grey", linewidth=0.8, linestyle=":", label="start")
-        axes.set_xlabel(variable, parse_math=False)
-        axes.grid(visible=True, alpha=0.2)
-    for axes in views[len(points) :]:
-        axes.set_axis_off()
-    for row in grid:
-        row[0].set_ylabel(label)
-    figure.legend(*grid[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
     return figure
 
 
