@@ -264,6 +264,22 @@ def test_what_is_no_image_is_refused(images, message):
         draw_depths(images, title="t")
 
 
+@pytest.mark.parametrize(
+    ("pitch", "high", "height_m", "reach_m"),
+    [
+        (0.0, (-30.0, 10.0), 2.0, 99.0),
+        (0.0, (-60.0, -45.0), 2.0, 2.0),  # its most level ray ends on the ground
+        (0.0, (-60.0, -45.0), 0.0, 70.0),  # the frame lies in the sensor: nothing is known of the ground
+        (90.0, (-45.0, 45.0), 2.0, 2.0),  # looks down
+        (-90.0, (-45.0, 45.0), 2.0, 70.0),  # looks up
+        (45.0, (-15.0, 15.0), 2.0, 2.0 / np.tan(np.deg2rad(30.0))),
+    ],
+)
+def test_a_field_of_view_from_above_ends_on_the_ground(pitch, high, height_m, reach_m):
+    sensor = view(pitch=pitch, at=(1.0, 0.0, height_m), wide=2.0, high=high)
+    assert np.linalg.norm(sensor.outline_m(1e4) - (1.0, 0.0), axis=1).max() == pytest.approx(reach_m, rel=0.01)
+
+
 @pytest.mark.parametrize(("pitch_deg", "roll_deg"), [(90.0, 0.0), (0.0, 90.0)])
 def test_a_tilted_lidar_is_drawn_with_its_true_field_of_view(pitch_deg, roll_deg):
     """On its side, it sees as far as its range along its plane, and across it no farther than its elevations allow."""

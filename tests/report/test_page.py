@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric
 from torchcover.coverage.quantity import RADIUS
+from torchcover.geometry import rigid, rotation_from_euler
 from torchcover.notebooks import small_html
 from torchcover.report import (
     Line,
@@ -274,6 +275,44 @@ def test_a_wide_table_fits_the_paper_and_breaks_no_short_heading(tmp_path):
     dom, console = browsed(text, tmp_path / "page.html", script)
     assert console == []
     assert "<title>true,1</title>" in dom
+
+
+def test_the_map_draws_the_true_field_of_view_of_a_tilted_sensor(named, tmp_path):
+    """Points of all lines and arcs, in metres, of a LiDAR on its side, a camera that looks down, and a level LiDAR."""
+    if CHROMIUM is None:
+        pytest.skip("no Chromium here: nobody looks at the page")
+    script = """
+      opened.then((page) => {
+        const drawn = [[], [], []], pen = CanvasRenderingContext2D.prototype, { lineTo, arc } = pen;
+        let sensor = 0;
+        pen.lineTo = function (x, y) { drawn[sensor].push(page.view.toMetres(x, y)); lineTo.call(this, x, y); };
+        pen.arc = function (x, y, r, ...angles) {
+          for (const at of [0, 1, 2, 3].map((k) => (k * Math.PI) / 2)) {
+            if (r > 3.5) drawn[sensor].push(page.view.toMetres(x + r * Math.cos(at), y + r * Math.sin(at)));
+          }
+          arc.call(this, x, y, r, ...angles);
+        };
+        const context = page.view.canvas.getContext("2d");
+        for (; sensor < 3; sensor++) page.view.drawSensor(context, page.content.rigs[0].sensors[sensor], 1, true);
+        const pre = document.createElement("pre");
+        pre.id = "found";
+        pre.textContent = JSON.stringify(drawn);
+        document.body.append(pre);
+      });
+    """
+    poses = [rigid(rotation_from_euler(0.0, pitch, 0.0), (1.0, -1.0, 2.0)) for pitch in (90.0, 90.0, 0.0)]
+    fields = (360.0, (-15.0, 15.0), 50.0), (60.0, (-20.0, 20.0), 50.0), (360.0, (-15.0, 15.0), 50.0)
+    sensors = [SensorView("tilted", pose, *field) for pose, field in zip(poses, fields, strict=True)]
+    page = page_of({"rig": named["many"]}, rigs=[PageRig("rig", sensors)])
+    dom, console = browsed(page_html(page), tmp_path / "page.html", script)
+    found = re.search(r'<pre id="found">(.*?)</pre>', dom, re.DOTALL)
+    assert found, console
+    sizes_m = [np.abs(np.array(points) - (1.0, -1.0)).max(axis=0).tolist() for points in json.loads(found[1])]
+    twenty, thirty = np.deg2rad([20.0, 30.0])
+    down_m = [2.0 * np.tan(twenty) / np.cos(thirty), 2.0 * np.tan(thirty)]
+    assert sizes_m[0] == pytest.approx([50.0 * np.sin(np.deg2rad(15.0)), 50.0], rel=0.02)
+    assert sizes_m[1] == pytest.approx(down_m, rel=0.03)
+    assert sizes_m[2] == pytest.approx([50.0, 50.0])
 
 
 def test_two_fingers_zoom_and_pointers_that_are_lost_let_go(seen):

@@ -93,24 +93,48 @@ class SensorView:
         return float(pitch_deg), float(roll_deg)
 
     def outline_m(self, reach_m: float, points: int = 361) -> NDArray[np.float64]:
-        """(K, 2) outline x, y of the field of view from above, up to a reach or its range.
+        """Trace the field of view from above, up to a reach, the range of the sensor, or the ground at z = 0.
 
-        Of a tilted sensor, how far a direction from above goes follows from the most level ray in it that is in the
-        field of view.
+        In each direction from above the ray decides that goes farthest. There is no ground below a sensor with z <= 0:
+        such a frame has its origin in a sensor.
+
+        Args:
+            reach_m: Longest ray in meters.
+            points: Number of directions.
+
+        Returns:
+            (K, 2) corners x, y in the vehicle frame in meters.
         """
-        length_m, position_m = min(reach_m, self.range_m), self.position_m[:2]
-        if np.allclose(self.tilt_deg, 0.0):
+        position_m = self.position_m[:2]
+        if not self.is_tilted:
             half_deg = self.horizontal_fov_deg / 2
             angles = np.deg2rad(np.linspace(self.yaw_deg - half_deg, self.yaw_deg + half_deg, points))
-            arc_m = position_m + length_m * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+            radius_m = self.level_reach_m(reach_m)
+            arc_m = position_m + radius_m * np.stack([np.cos(angles), np.sin(angles)], axis=1)
             return arc_m if self.horizontal_fov_deg == 360 else np.vstack([arc_m, position_m])
         angles = np.deg2rad(np.linspace(self.yaw_deg - 180, self.yaw_deg + 180, points))[:, None]
-        elevations = np.deg2rad(np.linspace(-90.0, 90.0, 361))[None]
+        elevations = np.deg2rad(np.linspace(-90.0, 90.0, 1441))[None]  # near the horizon, 0.125 degrees are meters
         level, up = np.cos(elevations), np.sin(elevations) + 0.0 * angles
         rays = np.stack([level * np.cos(angles), level * np.sin(angles), up], axis=-1)
         seen = self.sees(rays.reshape(-1, 3)).reshape(rays.shape[:2])
-        lengths_m = length_m * np.where(seen, level, 0.0).max(axis=1, keepdims=True)
+        lengths_m = np.where(seen, self._horizontal_m(elevations, reach_m), 0.0).max(axis=1, keepdims=True)
         return np.asarray(position_m + lengths_m * np.hstack([np.cos(angles), np.sin(angles)]))
+
+    @property
+    def is_tilted(self) -> bool:
+        """Whether its pitch or roll differs from zero."""
+        return not np.allclose(self.tilt_deg, 0.0)
+
+    def level_reach_m(self, reach_m: float) -> float:
+        """Horizontal length in meters of the most level ray of a sensor that is not tilted, up to a reach."""
+        most_level_deg = np.clip(0.0, *self.vertical_fov_deg)
+        return float(self._horizontal_m(np.deg2rad(most_level_deg), reach_m))
+
+    def _horizontal_m(self, elevations: NDArray[np.float64], reach_m: float) -> NDArray[np.float64]:
+        """Horizontal lengths in meters of rays of some elevations in radians, which end on the ground at z = 0."""
+        height_m = self.position_m[2] if self.position_m[2] > 0 else math.inf
+        to_ground_m = np.where(elevations < 0, height_m / np.maximum(-np.sin(elevations), 1e-9), math.inf)
+        return np.asarray(np.minimum(to_ground_m, min(reach_m, self.range_m)) * np.cos(elevations))
 
     def sees(self, directions: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Which of (N, 3) directions in the vehicle frame lie in the field of view."""

@@ -166,9 +166,11 @@ def _field(name: str, colour: str, view: SensorView, reach: float) -> str:
     stops = "".join(f'<stop offset="{at}" stop-color="{colour}" stop-opacity="{0.5 - 0.5 * at}"/>' for at in (0, 1))
     circle = f'cx="{x:.3f}" cy="{y:.3f}" r="{reach:.3f}"'
     fade = f'<radialGradient id="{name}" gradientUnits="userSpaceOnUse" {circle}>{stops}</radialGradient>'
-    if not np.allclose(view.tilt_deg, 0.0):
+    if view.is_tilted:
         corners = " ".join(f"{x:.3f},{-y:.3f}" for x, y in view.outline_m(reach))
         return f'{fade}<polygon points="{corners}" fill="url(#{name})" stroke="{colour}" {DASHED}/>'
+    reach = view.level_reach_m(reach)
+    circle = f'cx="{x:.3f}" cy="{y:.3f}" r="{reach:.3f}"'
     if view.horizontal_fov_deg >= 360:
         return f'{fade}<circle {circle} fill="url(#{name})"/>'
     yaw, half = math.radians(view.yaw_deg), math.radians(view.horizontal_fov_deg / 2)

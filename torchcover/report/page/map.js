@@ -110,13 +110,9 @@ class MapView {
   }
 
   drawSensor(pen, sensor, number, fields) {
-    const [x, y] = this.toPixel(sensor.x, sensor.y), yaw = (sensor.yaw * Math.PI) / 180;
+    const [x, y] = this.toPixel(sensor.x, sensor.y);
     if (fields) {
-      const half = (sensor.wide * Math.PI) / 360, reach = Math.min(sensor.range, 2000) / this.metres;
-      pen.beginPath();
-      if (sensor.wide < 360) pen.moveTo(x, y);
-      pen.arc(x, y, reach, -yaw - half, -yaw + half);
-      if (sensor.wide < 360) pen.closePath();
+      this.pathOfField(pen, sensor);
       pen.strokeStyle = "white"; pen.lineWidth = 3; pen.stroke();
       pen.strokeStyle = "black"; pen.lineWidth = 1; pen.setLineDash([6, 4]); pen.stroke(); pen.setLineDash([]);
     }
@@ -128,6 +124,17 @@ class MapView {
     pen.font = "11px sans-serif"; pen.textAlign = "left"; pen.textBaseline = "middle";
     pen.strokeStyle = "white"; pen.lineWidth = 3; pen.strokeText(String(number), x + 6, y);
     pen.fillStyle = "black"; pen.fillText(String(number), x + 6, y);
+  }
+
+  // The field of view from above: the outline of a tilted sensor, otherwise an arc.
+  pathOfField(pen, sensor) {
+    if (sensor.outline) return this.path(pen, [...sensor.outline, sensor.outline[0]]);
+    const [x, y] = this.toPixel(sensor.x, sensor.y), yaw = (sensor.yaw * Math.PI) / 180;
+    const half = (sensor.wide * Math.PI) / 360;
+    pen.beginPath();
+    if (sensor.wide < 360) pen.moveTo(x, y);
+    pen.arc(x, y, sensor.range / this.metres, -yaw - half, -yaw + half);
+    if (sensor.wide < 360) pen.closePath();
   }
 
   drawProbe(pen, [x, y], raster) {

@@ -108,7 +108,9 @@ def encoded(values: NDArray[np.float64], bits: int) -> tuple[NDArray[np.uint16],
 NEAR, NEAR_LENGTHS = "near the ego", 2.0
 BESIDE = "beside the ego"
 # JSON knows no infinity; beyond every map all ranges are alike.
-FARTHEST_M = 1e6
+FARTHEST_M = 2000.0
+# Corners of the field of view of a tilted sensor: one every 2 degrees.
+OUTLINE_POINTS = 181
 
 
 def map_content(page: Page, cells: CellBytes) -> dict[str, Any]:
@@ -220,5 +222,8 @@ def _lut(name: str) -> str:
 
 
 def _sensor(view: SensorView) -> dict[str, Any]:
-    reach = min(float(view.range_m), FARTHEST_M)
-    return {"x": view.x_m, "y": view.y_m, "yaw": view.yaw_deg, "wide": view.horizontal_fov_deg, "range": reach}
+    """A sensor with its field of view from above: an arc, or the outline of a tilted sensor."""
+    place = {"x": view.x_m, "y": view.y_m}
+    if view.is_tilted:
+        return {**place, "outline": _points(view.outline_m(FARTHEST_M, points=OUTLINE_POINTS).round(2))}
+    return {**place, "yaw": view.yaw_deg, "wide": view.horizontal_fov_deg, "range": view.level_reach_m(FARTHEST_M)}
