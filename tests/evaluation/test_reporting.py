@@ -37,7 +37,7 @@ def found():
 
 def test_the_first_sentence_is_the_share_of_places_near_the_vehicle(found):
     words = found.verdict[0]
-    assert words.startswith("A child of 1.10 m is seen at ")
+    assert words.startswith("A child of 1.10 m is seen (5 points or more) at ")
     for rig, seen in found.targets.items():
         near = seen.free & (seen.distance_m <= NEAR_M)
         share = (near & (seen.least_points >= seen.hits)).sum() / near.sum()
@@ -148,5 +148,5 @@ def test_rigs_high_above_see_nothing_beside_the_vehicle_and_say_so():
     assert (
         report(high, "courtyard", steps=8, workers=0)
         .verdict[0]
-        .endswith("seen at 0 % of the places within 2 m by high.")
+        .endswith("seen (5 points or more) at 0 % of the places within 2 m by high.")
     )

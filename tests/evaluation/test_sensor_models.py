@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 
 from torchcover.evaluation import evaluate
+from torchcover.report import page_html
 from torchcover.simulation import Lidar, Rig, Weather
 
 RIG = Rig.model_validate(
@@ -106,3 +107,25 @@ def test_what_cannot_be_is_told(given, told):
 
 def test_a_model_says_as_much_of_its_lidars_as_a_rig():
     assert Lidar.model_validate({"name": "a", "model": "velodyne_vlp32c"}).range_at_10_percent_m == 115.0
+
+
+def test_results_name_cameras_with_perfect_depth_and_different_scan_periods():
+    camera = {"type": "camera", "mount": {"x_m": 2.0, "z_m": 1.5}, "width": 32, "height": 24, "max_range_m": 60.0}
+    camera |= {"name": "front", "fov_deg": 90.0}
+    cameras = {
+        "exact": {},
+        "stereo": {"stereo": {"baseline_m": 0.1, "subpixel_px": 0.2}},
+        "rolling": {"scan": {"period_s": 0.03}},
+    }
+    rigs = [Rig.model_validate({"name": name, "sensors": [{**camera, **more}]}) for name, more in cameras.items()]
+    alone = evaluate(rigs[1], "courtyard", **SETTINGS)
+    assert not any("depth" in note or "Scan" in note for note in alone.record["notes"])
+    result = evaluate(rigs, "courtyard", **SETTINGS)
+    depth = "Perfect depth is assumed for cameras of exact (front); rolling (front)"
+    scans = "Scan periods differ: exact at once, stereo at once, rolling 0.03 s. Motion during the scan"
+    page = page_html(result.page).partition('<script type="application/json"')[0]
+    for words in (depth, scans):
+        assert any(words in note for note in result.record["notes"])
+        assert words in " ".join(str(result).split())
+        assert words in page
+    assert any(scans in sentence for sentence in result.verdict)

@@ -32,7 +32,7 @@ def with_bodies(table, shares, best=None, places=30):
 
 def test_of_one_rig_the_farthest_region_ahead_is_told_with_its_interval(trio):
     (sentence,) = verdict(CoverageTable.of({"few": trio["few"]}, AHEAD))
-    assert sentence.startswith("Detected to 12 m ahead: of the ground ")
+    assert sentence.startswith("Detected to 12 m ahead (a point within 0.4 m): of 120 observed cells of ground ")
     table = CoverageTable.of({"few": trio["few"]}, AHEAD)
     rows = [row for row in table.rows["few"] if row.region is AHEAD[1]]
     told = [int(number) for number in re.findall(r"(\d+) % \[(?:\d+), (?:\d+)\]", sentence)]
@@ -42,9 +42,11 @@ def test_of_one_rig_the_farthest_region_ahead_is_told_with_its_interval(trio):
 def test_of_several_only_who_leads_by_more_than_chance_is_told(trio):
     table = CoverageTable.of({name: trio[name] for name in ("few", "many")}, AHEAD)
     (sentence,) = verdict(table)
-    assert re.search(r"of the ground many \d+ %, few \d+ %; of obstacles many \d+ %, few \d+ %", sentence)
+    assert re.search(
+        r"ground many \d+ %, few \d+ %; of 120 observed cells of obstacles many \d+ %, few \d+ %", sentence
+    )
     (sentence,) = verdict(CoverageTable.of({name: trio[name] for name in ("few", "other")}, AHEAD))
-    assert sentence == "No rig detects more than the others to 12 m ahead beyond chance."
+    assert sentence == "No rig detects more than the others to 12 m ahead (a point within 0.4 m) beyond chance."
 
 
 def test_without_errors_nothing_is_told(pair, blind, trios, regions):
@@ -78,16 +80,18 @@ def test_the_advised_number_of_frames_gives_intervals(points, frames):
     for row in table_of(advised).rows["one"]:
         number = row.summary.numbers[table.means[1].key]
         assert math.isnan(number.low) == math.isnan(number.value) == (row.region is AHEAD[2])
+    visible_m2 = next(row.summary.visible_m2 for row in table_of(advised).rows["one"] if row.region is AHEAD[1])
+    assert f"(a point within 0.4 m): of {visible_m2:,.1f} m² of visible ground" in verdict(table_of(advised))[0]
     short = replace(table, block_ends=(3, 6, 7))
     assert verdict(short)[0].endswith("and this source has 3 in all.")
 
 
 @pytest.mark.parametrize(("shares", "best", "sentence"), [
-    ({"many": 0.997}, None, "Free places within 3 m where a child is seen: in front 99 % ["),
-    ({"many": 0.0}, None, "Free places within 3 m where a child is seen: in front 0 %."),
-    ({"many": 1.0}, None, "Free places within 3 m where a child is seen: in front 100 %."),
-    ({"few": 0.004, "many": 1.0}, "many", "where a child is seen: in front many 100 %, few 1 %."),
-    ({"few": 0.5, "many": 0.6}, None, "Of the places within 3 m where a child is seen, no rig has more than"),
+    ({"many": 0.997}, None, "Free places within 3 m where a child is seen (detection within 0.4 m): in front 99 % ["),
+    ({"many": 0.0}, None, "Free places within 3 m where a child is seen (detection within 0.4 m): in front 0 %."),
+    ({"many": 1.0}, None, "Free places within 3 m where a child is seen (detection within 0.4 m): in front 100 %."),
+    ({"few": 0.004, "many": 1.0}, "many", "a child is seen (detection within 0.4 m): in front many 100 %, few 1 %."),
+    ({"few": 0.5, "many": 0.6}, None, "where a child is seen (detection within 0.4 m), no rig has more than"),
 ])  # fmt: skip
 def test_bodies_come_first(trio, shares, best, sentence):
     table = with_bodies(CoverageTable.of({name: trio[name] for name in shares}, AHEAD), shares, best)
@@ -99,4 +103,4 @@ def test_few_places_that_all_say_the_same_are_no_answer(trio):
     table = CoverageTable.of({"many": trio["many"]}, AHEAD)
     for places, told in ((29, False), (30, True)):
         words = " ".join(verdict(with_bodies(table, {"many": 1.0}, places=places)))
-        assert ("where a child is seen: in front 100 %" in words) == told
+        assert ("where a child is seen (detection within 0.4 m): in front 100 %" in words) == told

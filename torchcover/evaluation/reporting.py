@@ -195,7 +195,7 @@ def report(
     Example:
         >>> found = report("front_roof_128", "courtyard", steps=8)
         >>> print(found.verdict[0])
-        A child of 1.10 m is seen at 35 % of the places within 2 m by front_roof_128.
+        A child of 1.10 m is seen (5 points or more) at 35 % of the places within 2 m by front_roof_128.
     """
     start_s = time.monotonic()
     given = [rigs] if isinstance(rigs, str | Path | Rig) else list(rigs)

@@ -7,6 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -46,8 +47,9 @@ from torchcover.report import (
 from torchcover.report.map_subjects import quantities_shown
 from torchcover.report.records import records_of
 from torchcover.report.remarks import decisive
-from torchcover.simulation import Sensor
+from torchcover.simulation import CameraSensor, Sensor
 from torchcover.simulation.memory import check_fits
+from torchcover.simulation.sensor import ScanTimes
 
 if TYPE_CHECKING:
     import pandas
@@ -162,7 +164,7 @@ class Result:
     @property
     def verdict(self) -> tuple[str, ...]:
         """The answer in sentences, the first of which says most; none tells what may be chance."""
-        return (*verdict(self.table), *self.mixed_models)
+        return (*verdict(self.table), *self.mixed_models, *scan_period_words(self.sensors))
 
     @property
     def mixed_models(self) -> list[str]:
@@ -201,6 +203,7 @@ class Result:
             "target_error": self._outcome[0],
             "measure": self.table.measure,
             "verdict": list(self.verdict),
+            "notes": list(self.table.notes),
             **table_dict(self.table),
             **({} if self.metrics is None else {"metrics": self.metrics.record}),
         }
@@ -370,7 +373,7 @@ class Result:
         record, told = self._reference_used, [self.cut_short] if self.cut_short else []
         told += [f"Vehicle: {self.vehicle}."] if self.vehicle else []
         told += sensor_model_words(self.source.get("sensor_model")) + weather_words(self.source.get("weather"))
-        told += self._on_bodies
+        told += perfect_depth_words(self.sensors) + scan_period_words(self.sensors) + self._on_bodies
         if record is None:
             return told
         if "every_s" not in record:
@@ -457,6 +460,70 @@ def sensor_model_words(of_rigs: object) -> list[str]:
         (model,) = set(of_rigs.values())
         return [f"Sensor model: {model}, {means[model]}."]
     return [f"Sensor models: {', '.join(f'{rig} {model}' for rig, model in of_rigs.items())}: differences are of both."]
+
+
+def perfect_depth_words(sensors: Mapping[str, Sequence[Sensor]]) -> list[str]:
+    """Name the cameras whose depth counts as exact, since no error of it is given.
+
+    Args:
+        sensors: Sensors by the name of the rig.
+
+    Returns:
+        One sentence, or none.
+
+    Example:
+        >>> from torchcover.simulation import CameraSensor
+        >>> front = CameraSensor(name="front", width=64, height=48, fov_deg=90, max_range_m=100)
+        >>> perfect_depth_words({"van": [front]})[0][:54]
+        'Perfect depth is assumed for cameras of van (front): a'
+        >>> perfect_depth_words({"van": [front.model_copy(update={"range_noise_share": 0.02})]})
+        []
+    """
+    cameras = {
+        rig: [one.name for one in of_rig if isinstance(one, CameraSensor) and not np.any(one.noise_m(np.ones(1)))]
+        for rig, of_rig in sensors.items()
+    }
+    exact = [f"{rig} ({', '.join(names)})" for rig, names in cameras.items() if names]
+    if not exact:
+        return []
+    advice = "add `stereo` or `range_noise_share`"
+    return [
+        f"Perfect depth is assumed for cameras of {'; '.join(exact)}: a pixel measures its range exactly; {advice}."
+    ]
+
+
+def scan_period_words(sensors: Mapping[str, Sequence[Sensor]]) -> list[str]:
+    """Warn of a comparison of rigs whose sensors take different times for a scan.
+
+    Args:
+        sensors: Sensors by the name of the rig.
+
+    Returns:
+        One sentence, or none where all rigs scan alike.
+
+    Example:
+        >>> from torchcover.simulation import CameraSensor
+        >>> camera = CameraSensor(name="front", width=64, height=48, fov_deg=90, max_range_m=100)
+        >>> rolling = CameraSensor(**camera.model_dump() | {"scan": {"period_s": 0.05}})
+        >>> scan_period_words({"global": [camera], "rolling": [rolling]})[0][:58]
+        'Scan periods differ: global at once, rolling 0.05 s. Motio'
+    """
+    known = {rig: of_rig for rig, of_rig in sensors.items() if of_rig}
+    periods_s = {rig: sorted({_scan_period_s(sensor) for sensor in of_rig}) for rig, of_rig in known.items()}
+    if len({tuple(of_rig) for of_rig in periods_s.values()}) < 2:
+        return []
+    words = {
+        rig: " and ".join(f"{period_s:g} s" if period_s else "at once" for period_s in of_rig)
+        for rig, of_rig in periods_s.items()
+    }
+    listed = ", ".join(f"{rig} {period}" for rig, period in words.items())
+    return [f"Scan periods differ: {listed}. Motion during the scan changes numbers of the near field."]
+
+
+def _scan_period_s(sensor: Sensor) -> float:
+    """Time from the first to the last ray; 0 where all are cast at once."""
+    timing: ScanTimes | None = getattr(sensor, "scan", None)
+    return timing.period_s if timing else 0.0
 
 
 def weather_words(of_rigs: object) -> list[str]:

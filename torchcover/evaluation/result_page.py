@@ -20,7 +20,7 @@ from torchcover.simulation import CameraSensor, Sensor, vertical_fov_deg
 # What decides about the numbers, with this package.
 PACKAGES = ("torch", "numpy", "embreex", "trimesh", "pykdtree", "kornia")
 OF_THE_RUN = ("torchcover", "seconds", "complete", "device", "skipped_frames")
-ELSEWHERE = ("verdict", "rows", "worlds", "metrics", "counts", "frame_counts", "left_out", "rig", "rigs")
+ELSEWHERE = ("verdict", "notes", "rows", "worlds", "metrics", "counts", "frame_counts", "left_out", "rig", "rigs")
 # What it is, how often it was left out, and of how many; the counts are those of the frames, added up.
 COUNTED = (
     ("moving bodies out of every sensor's range: not placed", "moving_bodies_out_of_range", "moving_bodies"),

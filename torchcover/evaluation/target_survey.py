@@ -203,7 +203,8 @@ def target_verdict(seen: Mapping[str, TargetMap]) -> tuple[str, ...]:
     first = seen[known[0]]
     height = f", {first.target_bottom_m:.2f} m above the ground," if first.target_bottom_m else ""
     body = f"{body_words(first.target)} of {first.target_size_m[2]:.2f} m{height}"
-    told = [f"{capitalised(body)} is seen at {most} % of the places within {NEAR_M:g} m by {best}"]
+    seen_words = f"is seen ({first.hits} points or more)"
+    told = [f"{capitalised(body)} {seen_words} at {most} % of the places within {NEAR_M:g} m by {best}"]
     told += [f"at {share} % by {rigs}" for share, rigs in others]
     return (f"{', '.join(told)}.", *(_on_loss(rig, seen[rig]) for rig in known))
 

@@ -15,6 +15,7 @@ from torchcover.report.wording import (
     difference_words,
     number_words,
     span,
+    square_metres,
     steps_and_cell,
     value_words,
 )
@@ -243,7 +244,7 @@ def _of_rig(table: CoverageTable, rig: str) -> list[str]:
 
 # The range that is told is that of the region ahead that reaches farthest, but no farther than this.
 RANGE_M = 80.0
-BANDS = {"ground": "the ground", "obstacle": "obstacles"}
+BANDS = {"ground": "ground", "obstacle": "obstacles"}
 # Of so many places that all say the same, at least nine in ten say it anywhere, with 95 % confidence: 0.9**30 < 0.05.
 LEAST_AGREED = 30
 SIDES = {"front_3m": "in front", "rear_3m": "behind", "left_3m": "on the left", "right_3m": "on the right"}
@@ -298,7 +299,8 @@ def on_near_field(table: CoverageTable) -> str:
         for side, of in of_sides.items()
     }
     known = [f"{side} {words}" for side, words in told.items() if words]
-    seen = f"{body_words(body)} is seen"
+    criterion = table.body_quantities[0].title.removeprefix("free places with ")
+    seen = f"{body_words(body)} is seen ({criterion})"
     if known:
         return f"Free places within 3 m where {seen}: {'; '.join(known)}."
     unknown = all(math.isnan(row.summary.numbers[key].error) for of in of_sides.values() for row in of)
@@ -311,13 +313,34 @@ def on_range(table: CoverageTable) -> str:
     region = ahead(table)
     if region is None or not table.thresholds or not table.has_intervals:
         return ""
-    key, where = decisive(table).key, f"to {region.x[1]:g} m ahead"
+    key, where = decisive(table).key, f"to {region.x[1]:g} m ahead ({detected_words(table)})"
     bands = [of for of in table.places if of[0].region is region]
-    told = {BANDS.get(of[0].summary.height, of[0].summary.height): _told(of, key, enough=True) for of in bands}
+    told = {surface_words(table, of[0]): _told(of, key, enough=True) for of in bands}
     known = [f"of {band} {words}" for band, words in told.items() if words]
     if known:
         return f"Detected {where}: {'; '.join(known)}."
     return f"No rig detects more than the others {where} beyond chance." * (len(table.rigs) > 1)
+
+
+def detected_words(table: CoverageTable) -> str:
+    """Describe the criterion of detection: how near a point of the rig must be."""
+    return f"a point within {table.thresholds[0]:g} m"
+
+
+def surface_words(table: CoverageTable, row: Row) -> str:
+    """Describe the surface to which the numbers of a row refer: visible square meters, or observed cells.
+
+    Args:
+        table: Table of the row.
+        row: One region and height band.
+
+    Returns:
+        Words such as "512.3 m² of visible ground".
+    """
+    surface = BANDS.get(row.summary.height, row.summary.height)
+    if table.measure == "area":
+        return f"{square_metres(row.summary.visible_m2)} m² of visible {surface}"
+    return f"{row.summary.known_cells:,} observed cells of {surface}"
 
 
 def ahead(table: CoverageTable) -> Region | None:

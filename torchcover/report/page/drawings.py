@@ -10,9 +10,9 @@ from torchcover.notebooks import attribute_of, html_of
 from torchcover.report.layout import PageTable, Words
 from torchcover.report.overlay import SensorView, sensor_colour
 from torchcover.report.page.content import Array, PagePlan, PageRange
-from torchcover.report.remarks import BANDS, decisive
+from torchcover.report.remarks import decisive, detected_words, surface_words
 from torchcover.report.table import CoverageTable
-from torchcover.report.wording import UNKNOWN, capitalised, number_words, square_metres
+from torchcover.report.wording import UNKNOWN, number_words, square_metres
 
 # Of the plan, beyond which nothing is drawn; lines are so far from the vehicle.
 REACH_M = 3.4
@@ -31,7 +31,7 @@ def ranges_of(table: CoverageTable) -> list[PageRange]:
     key = decisive(table).key
     return [
         PageRange(
-            f"{capitalised(BANDS.get(rows[0].summary.height, rows[0].summary.height))}, to {rows[0].region.x[1]:g} m",
+            f"{surface_words(table, rows[0])} to {rows[0].region.x[1]:g} m: {detected_words(table)}",
             {row.rig: row.summary.numbers[key] for row in rows},
         )
         for rows in table.places
