@@ -9,6 +9,7 @@ import torch
 
 from torchcover.coverage import BevGrid, CoverageMetric, Region
 from torchcover.report import CoverageTable, verdict
+from torchcover.report.remarks import single_point_of_failure
 from torchcover.report.table import Row
 
 AHEAD = (Region("near", (0.0, 4.0), (-5.0, 5.0)), Region("far", (0.0, 12.0), (-5.0, 5.0)),
@@ -104,3 +105,22 @@ def test_few_places_that_all_say_the_same_are_no_answer(trio):
     for places, told in ((29, False), (30, True)):
         words = " ".join(verdict(with_bodies(table, {"many": 1.0}, places=places)))
         assert ("where a child is seen (detection within 0.4 m): in front 100 %" in words) == told
+
+
+@pytest.mark.parametrize(("alone", "blocks", "sentence"), [
+    (lambda index: 30 + index % 2, 16, "Single point of failure: roof; without it detection within 0.01 m is "),
+    (lambda index: 5 + index % 2, 16, "No single point of failure: no sensor's failure costs 10 % or more"),
+    (lambda index: 40 * (index < 3), 16, "No single point of failure: no sensor's failure costs 10 % or more"),
+    (lambda index: 30 + index % 2, 4, "Most is lost without roof: detection within 0.01 m is "),
+])  # fmt: skip
+def test_a_single_point_of_failure_costs_a_tenth_or_more_beyond_chance(alone, blocks, sentence):
+    """So many of 100 points does the roof see alone; sixty others are seen by both sensors."""
+    grid = BevGrid(x=(-8.0, 12.0), y=(-5.0, 5.0), cell=1.0)
+    metric = CoverageMetric(grid, (0.01,), blocks=16, regions=AHEAD[:1], square_metres=True, sensors=("roof", "rear"))
+    for index in range(blocks):
+        reference = torch.rand(100, 3, generator=torch.Generator().manual_seed(index)) * torch.tensor([4.0, 4.0, 0.2])
+        seen = {"roof": reference[: 60 + alone(index)], "rear": reference[:60]}
+        metric.update(seen, reference, weights=torch.full((100,), 0.1), place_in_time=index)
+    table = CoverageTable.of({"rig": metric.compute()}, AHEAD[:1])
+    assert single_point_of_failure(table, "rig").startswith(sentence)
+    assert any(words.startswith(sentence) for words in verdict(table))

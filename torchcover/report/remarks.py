@@ -97,11 +97,12 @@ def single_point_of_failure(table: CoverageTable, rig: str, params: FailureParam
     if len(sensors_of(rows)) == 1:
         return f"Its only sensor is {sensors_of(rows)[0]}: without it nothing is seen."
     large = [row for row in rows if _lost_share(row, quantity) >= params.least_share]
+    large = [row for row in large if _is_significant(row, quantity) is not False]
     real = [row for row in large if _is_significant(row, quantity)]
     worst = max(real or large, key=lambda row: _loss(row.summary.redundancy, quantity), default=None)
     if worst is None or (redundancy := worst.summary.redundancy) is None or redundancy.indispensable is None:
-        least = f"{params.least_share:.0%}"
-        return f"No single point of failure: no sensor's failure costs {least} or more of any number that is known."
+        least = f"{100 * params.least_share:g} %"
+        return f"No single point of failure: no sensor's failure costs {least} or more of any number beyond chance."
     sensor = redundancy.indispensable
     before, after = worst.summary.numbers[quantity.key].value, redundancy.without[sensor][quantity.key].value
     whole, rest = (value_words(value, quantity.unit) for value in (before, after))
@@ -119,11 +120,12 @@ def _lost_share(row: Row, quantity: Quantity) -> float:
     return loss / whole if loss > 0 and whole > 0 else 0.0
 
 
-def _is_significant(row: Row, quantity: Quantity) -> bool:
+def _is_significant(row: Row, quantity: Quantity) -> bool | None:
+    """Whether the loss with the sensor with which most is lost is more than chance; None if that is unknown."""
     redundancy = row.summary.redundancy
     if redundancy is None or redundancy.indispensable is None:
-        return False
-    return bool(redundancy.change[redundancy.indispensable][quantity.key].significant)
+        return None
+    return redundancy.change[redundancy.indispensable][quantity.key].significant
 
 
 def _loss(redundancy: RegionRedundancy | None, quantity: Quantity) -> float:
