@@ -10,6 +10,7 @@ import trimesh
 from torch.utils.data import DataLoader
 
 from torchcover import nearest
+from torchcover.coverage import BevGrid, CoverageMetric
 from torchcover.data import SimulatedFrames, collate_frames
 from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, SurfaceReference
 
@@ -40,6 +41,37 @@ def test_a_floor_with_a_hole(at, tmp_path):
     sensor = SurfaceReference((AHEAD,), rays=400, places=1, bands_m=ALL_HEIGHTS)
     agrees(sums(scenario(floor), sensor), 200.0 - 4.0)
     agrees(sums(scenario(floor), sensor, along_x), 200.0 * 14.0 - 4.0 * 11.0)
+
+
+@pytest.mark.parametrize(
+    ("pit", "m2"),
+    [
+        (rectangle((10, 12), (-1, 1), -1.5), 4.0),
+        ((np.array(rectangle((-1.5, 0), (-1, 1)))[..., [2, 1, 0]] + [11.99, 0, 0]).tolist(), 3.0),  # a wall of the pit
+        (rectangle((10, 12), (-1, 1), 1.0), 4.0),  # a cover above it
+    ],
+)
+def test_surface_without_ground_below_it_is_counted_and_changes_no_number(at, tmp_path, pit, m2):
+    parts = [((-50, 10), (-50, 50)), ((12, 50), (-50, 50)), ((10, 12), (-50, -1)), ((10, 12), (1, 50))]
+    floor = sheet_file(tmp_path, [triangle for part in parts for triangle in rectangle(*part)])
+    at([11.0, 0.0, 2.0])
+    sensor = SurfaceReference((AHEAD,), rays=2000, places=2, bands_m=ALL_HEIGHTS)
+    simulator = Simulator(scenario(floor, sheet_file(tmp_path, pit, "pit.ply")), {}, sensor)
+    seen = [simulator.step(index) for index in range(20)]
+    in_no_band = [np.isnan(step.reference_heights_m) for step in seen]
+    pairs = list(zip(seen, in_no_band, strict=True))
+    agrees(np.array([step.reference_weights[mask].astype(np.float64).sum() for step, mask in pairs]), m2, within=0.05)
+    metric = CoverageMetric(
+        BevGrid(x=AHEAD[0], y=AHEAD[1], cell=1.0, heights={"all": (-3.0, 3.0)}, band_frame="ground")
+    )
+    for step in seen:
+        clouds = torch.zeros(1, 3), torch.from_numpy(step.reference)
+        metric.update(*clouds, height=torch.from_numpy(step.reference_heights_m))
+    assert metric.compute().counts["no_ground_points"] == sum(map(int, map(np.sum, in_no_band))) > 0
+    without = Simulator(scenario(floor), {}, sensor)
+    if m2 == 4.0 and pit[0][0][2] < 0:  # nothing of the floor is hidden, and no number of the floor is drawn otherwise
+        for index, (step, mask) in enumerate(pairs):
+            assert np.array_equal(step.reference[~mask], without.step(index).reference)
 
 
 @pytest.mark.parametrize("turned", [False, True])

@@ -67,7 +67,7 @@ class Scene:
         scenery = self._scenery()
         self._static = RayCaster(resting + scenery, device)
         self._faces = sum(len(mesh.faces) for mesh in resting + scenery)
-        self._surfaces: dict[tuple[float, ...], SceneSurface] = {}
+        self._surfaces: dict[tuple[float | str, ...], SceneSurface] = {}
         self._instants: dict[tuple[int, float], Instant] = {}
 
     def _scenery(self) -> list[Mesh]:
@@ -125,6 +125,17 @@ class Scene:
                 None if heights_m is None else self._above_ground(*heights_m),
                 self.coincident,
             )
+        return self._surfaces[box]
+
+    def surface_without_ground(self, lower_m: Matrix, upper_m: Matrix) -> SceneSurface:
+        """Cut the scenery that has no ground at or below it, as `surface` does, such as a pit that is no ground."""
+        box = (*lower_m.tolist(), *upper_m.tolist(), "without ground")
+        if box not in self._surfaces:
+            ego, step_s = self.world.ego, self.world.time_step_s
+            poses = ego.trajectory.at_each(step_s * np.arange(self.world.steps, dtype=np.float64))
+            bounds = bounds_along(invert(self._world_T_local) @ poses, Bounds(lower_m[None], upper_m[None]))
+            above, scenery = self._above_ground(-np.inf, np.inf)._replace(is_below=True), self._scenery()
+            self._surfaces[box] = SceneSurface(scenery, [], {}, {}, bounds, self._outward, above, self.coincident)
         return self._surfaces[box]
 
     @cached_property

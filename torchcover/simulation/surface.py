@@ -46,7 +46,8 @@ class AboveGround(NamedTuple):
 
     `squares` of the ground; `squares_T_static` (4, 4) from the frame of what never moves to theirs; for each mesh that
     never moves (F,) which of its faces are `ground`, and which look `down` and are seen from below only; `lowest_m` and
-    `highest_m` of all heights that are wanted.
+    `highest_m` of all heights that are wanted. With `is_below`, surfaces without ground at or below them are wanted
+    instead, such as those of a pit that is no ground; their heights are 0.
     """
 
     squares: GroundSquares
@@ -55,6 +56,7 @@ class AboveGround(NamedTuple):
     down: Sequence[Bools]
     lowest_m: float
     highest_m: float
+    is_below: bool = False
 
     def of_scenery(self, number: int) -> Callable[[Float64, Int64], tuple[Float32, Bools]]:
         """From triangles of a mesh that never moves and their faces to (2, N) heights, and (N,) whether any is wanted.
@@ -72,9 +74,11 @@ class AboveGround(NamedTuple):
                 of_others_m = triangles_m if len(others) == len(face) else triangles_m.take(others, axis=2)
                 corners_m = self.squares_T_static[:3, :3] @ of_others_m + self.squares_T_static[:3, 3:]
                 heights_m[:, others] = others_m = self.squares.heights_m(corners_m)
+                if self.is_below:
+                    return np.zeros_like(heights_m), _scattered(others_m[1] < -TOLERANCE_M, others, len(face))
                 least_m = np.maximum(self.lowest_m, np.where(is_down[face[others]], ON_GROUND_M, 0.0))
                 wanted[others] = (others_m[1] > least_m) & (others_m[0] <= self.highest_m)
-            return heights_m, wanted
+            return heights_m, wanted & (not self.is_below)
 
         return heights
 
@@ -162,6 +166,7 @@ class SceneSurface:
         radii_m = moving.radius_m[:, None]
         meets = boxes.meet(moving.centre_m - radii_m, moving.centre_m + radii_m)
         meets |= np.linalg.norm(moving.centre_m, axis=1) - moving.radius_m <= objects_within_m
+        meets &= np.isin(moving.body, list(self._moving))
         bodies = np.flatnonzero(meets & (moving.body != instant.ego))
         placed = [self._moving[number] for number in moving.body[bodies].tolist()]
         of_moving = placed_each(placed, moving.vehicle_T_part[bodies])
@@ -170,6 +175,13 @@ class SceneSurface:
             corners_m = moving.corners_m[bodies]
             of_moving = self._above.of_objects(of_moving, instant.static_T_vehicle, corners_m, count)
         return Patches.joined([*near, of_moving])
+
+
+def _scattered(mask: Bools, numbers: Int64, count: int) -> Bools:
+    """(count,) mask that is false but at (N,) numbers."""
+    whole = np.zeros(count, dtype=bool)
+    whole[numbers] = mask
+    return whole
 
 
 def placed_each(kinds: Sequence[tuple[Patches, int]], destination_T_source: Float64) -> Patches:

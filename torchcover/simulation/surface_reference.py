@@ -48,6 +48,15 @@ class SurfacePoints(NamedTuple):
         some = type(self)._make(part[which] for part in turned)
         return some._replace(face=some.face.T)
 
+    def joined(self, others: Self) -> Self:
+        """These and others, one after the other."""
+        rows = max(len(self.face), len(others.face))
+        faces = [np.full((rows, len(part.points_m)), -1, dtype=np.int32) for part in (self, others)]
+        for face, part in zip(faces, (self, others), strict=True):
+            face[: len(part.face)] = part.face
+        pairs = zip(self[:-1], others[:-1], strict=True)
+        return type(self)(*map(np.concatenate, pairs), face=np.concatenate(faces, axis=1))
+
 
 class Stratum(NamedTuple):
     """The patches that may meet one box: numbers, whole areas, and about what lies within, judged by their own boxes.
@@ -112,6 +121,9 @@ class SurfaceStrata:
         heights_m = self._heights_of(points_m, patch)
         placed_m = points_m[0], points_m[1], heights_m
         inside = np.stack([_inside(placed_m, low, high) for low, high in zip(*self._boxes, strict=True)])
+        # Points of the areas that have no ground below are in no band: the metric counts them.
+        no_ground = np.isnan(heights_m)
+        inside[:, no_ground] = self._in_areas(points_m[:2, no_ground])
         kept = np.ones(len(patch), dtype=bool)
         kept[: len(number)] = inside[number, np.arange(len(number))]
         patch, of_object = patch[kept], self._patches.of_object[patch[kept]]
@@ -125,6 +137,11 @@ class SurfaceStrata:
             of_object,
             self._patches.face.take(patch, axis=1),
         )
+
+    def _in_areas(self, places_m: Float32) -> Bools:
+        """(boxes, K) which boxes (2, K) places lie in, whatever their height."""
+        boxes = zip(self._boxes.lower_m[:, :2], self._boxes.upper_m[:, :2], strict=True)
+        return np.stack([_inside(places_m, low, high) for low, high in boxes])
 
     def _heights_of(self, points_m: Float32, patch: Int64) -> Float32:
         """(K,) what the third bounds of the boxes are about, of (3, K) points on the patches."""
@@ -145,7 +162,7 @@ class SurfaceStrata:
         return np.asarray(taken.corner_m + a * taken.first_m + b * taken.second_m)
 
 
-def _inside(placed_m: Sequence[Float32], low: Float64, high: Float64) -> Bools:
+def _inside(placed_m: Sequence[Float32] | Float32, low: Float64, high: Float64) -> Bools:
     inside = np.ones(len(placed_m[0]), dtype=bool)
     for along_m, least_m, most_m in zip(placed_m, low, high, strict=True):
         inside &= (along_m >= least_m) & (along_m < most_m)
@@ -342,11 +359,17 @@ class SurfaceReference:
         within_m = self.max_range_m + farthest_m if self.object_points else -math.inf
         patches = surface.near(instant, around, within_m)
         strata = SurfaceStrata(patches, boxes, heights_m)
+        pits = self._pits(surroundings, around) if self.band_frame == "ground" else None
         above_m = max(ABOVE_M, ABOVE_SHARE * float(np.abs(instant.static_T_vehicle[:3, 3]).max()))
         on_objects, looks = math.ceil(self.object_points / self.places), []
         each = self.rays / (self.places * len(self.areas) * len(self.bands_m))
         for place_m in places_m:
             found = strata.draw(place_m, each, surroundings.generator, on_objects=on_objects)
+            if pits is not None:
+                # Numbers of their own, so that those of the bands do not depend on pits.
+                generator = np.random.Generator(surroundings.generator.bit_generator.jumped())
+                of_pits = pits.draw(place_m, each, generator)
+                found = found.joined(of_pits._replace(heights_m=np.full_like(of_pits.heights_m, np.nan)))
             found = _uncovered(found, surroundings)
             near = np.linalg.norm(found.points_m - place_m, axis=1) <= self.max_range_m
             found = found if near.all() else found.some(near)
@@ -354,6 +377,13 @@ class SurfaceReference:
             looks.append((found, sight(instant, place_m, targets_m, threads=surroundings.threads)))
         objects = len(surroundings.scene.world.objects)
         return self._gathered(looks, objects, redrawn=sum(redrawn for _, redrawn in drawn))
+
+    def _pits(self, surroundings: Surroundings, around: Bounds) -> SurfaceStrata | None:
+        """Prepare the surface that has no ground at or below it, a stratum for each area, if there is any."""
+        lower_m, upper_m = around.lower_m.min(axis=0), around.upper_m.max(axis=0)
+        surface = surroundings.scene.surface_without_ground(lower_m, upper_m)
+        patches = surface.near(surroundings.instant, around)
+        return SurfaceStrata(patches, around) if len(patches.outward) else None
 
     def _at_any_height(self, boxes: Bounds, ego: BoundingBox) -> Bounds:
         """The same areas, as far up and down in the vehicle frame as a point can be seen from a place."""
