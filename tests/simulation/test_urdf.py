@@ -192,11 +192,15 @@ def test_lens_distortion_and_noise_of_a_camera_are_applied(robot_of):
     assert "c: cy is counted from the top of the image; Gazebo Classic 10 counts from below." in robot.notes
 
 
-def test_a_resolution_below_one_ray_leaves_one(robot_of):
+@pytest.mark.parametrize(("samples", "resolution", "channels"), [(1, 0.1, 1), (4, 0.5, 2), (3, 2, 6), (3, 1, 3)])
+def test_a_resolution_counts_as_in_gazebo_classic_and_is_named(robot_of, samples, resolution, channels):
     lidar = LIDAR.format("l", "", 1.0).replace(
-        "<samples>3</samples>", "<samples>1</samples><resolution>0.1</resolution>"
+        "<samples>3</samples>", f"<samples>{samples}</samples><resolution>{resolution}</resolution>"
     )
-    assert robot_of(CHASSIS, on("base", lidar)).sensors[0]["channels"] == 1
+    robot = robot_of(CHASSIS, on("base", lidar))
+    assert robot.sensors[0]["channels"] == channels
+    note = f"Gazebo (gz-sim) ignores <resolution> and has {samples}."
+    assert any(note in words for words in robot.notes) == (resolution != 1)
 
 
 def test_settings_that_are_not_applied_are_named(robot_of):

@@ -146,8 +146,8 @@ def _read_lidar(
     block = next((block for tag in ("lidar", "ray") if (block := sensor.find(tag)) is not None), None)
     if block is None:
         raise ValueError(f"{what}: <lidar> or <ray> is missing")
-    columns = _read_samples(block, "horizontal", what)
-    rows = _read_samples(block, "vertical", what, usual=1.0)
+    columns = _read_samples(block, "horizontal", what, notes)
+    rows = _read_samples(block, "vertical", what, notes, usual=1.0)
     left, right = (_read_number(block, f"scan/horizontal/{end}_angle", what) for end in ("min", "max"))
     low, high = (_read_number(block, f"scan/vertical/{end}_angle", what, 0.0) for end in ("min", "max"))
     spread_deg = math.degrees(right - left) * columns / max(columns - 1, 1)
@@ -167,11 +167,15 @@ def _read_lidar(
     yield keys, frames[""] @ sensor_T_middle
 
 
-def _read_samples(block: Element, axis: str, what: str, usual: float | None = None) -> int:
-    """Read the number of rays along an axis: its samples times its resolution, one at least."""
+def _read_samples(block: Element, axis: str, what: str, notes: list[str], usual: float | None = None) -> int:
+    """Read the number of rays along an axis: its samples times its resolution, as in Gazebo Classic, one at least."""
     samples = _read_number(block, f"scan/{axis}/samples", what, usual)
-    samples *= _read_number(block, f"scan/{axis}/resolution", what, 1.0)
-    return max(round(samples), int(samples > 0))
+    resolution = _read_number(block, f"scan/{axis}/resolution", what, 1.0)
+    rays = max(round(samples * resolution), int(samples * resolution > 0))
+    if resolution != 1.0:
+        otherwise = f"Gazebo (gz-sim) ignores <resolution> and has {samples:g}"
+        notes.append(f"{what}: {rays} {axis} rays, samples times <resolution>, as in Gazebo Classic; {otherwise}.")
+    return rays
 
 
 def _read_cameras(

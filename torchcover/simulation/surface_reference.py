@@ -48,14 +48,20 @@ class SurfacePoints(NamedTuple):
         some = type(self)._make(part[which] for part in turned)
         return some._replace(face=some.face.T)
 
-    def joined(self, others: Self) -> Self:
+    def joined(self, others: "SurfacePoints") -> "SurfacePoints":
         """These and others, one after the other."""
         rows = max(len(self.face), len(others.face))
         faces = [np.full((rows, len(part.points_m)), -1, dtype=np.int32) for part in (self, others)]
         for face, part in zip(faces, (self, others), strict=True):
             face[: len(part.face)] = part.face
-        pairs = zip(self[:-1], others[:-1], strict=True)
-        return type(self)(*map(np.concatenate, pairs), face=np.concatenate(faces, axis=1))
+        return SurfacePoints(
+            np.concatenate([self.points_m, others.points_m]),
+            np.concatenate([self.heights_m, others.heights_m]),
+            np.concatenate([self.normals, others.normals]),
+            np.concatenate([self.per_m2, others.per_m2]),
+            np.concatenate([self.of_object, others.of_object]),
+            np.concatenate(faces, axis=1),
+        )
 
 
 class Stratum(NamedTuple):
@@ -367,8 +373,7 @@ class SurfaceReference:
             found = strata.draw(place_m, each, surroundings.generator, on_objects=on_objects)
             if pits is not None:
                 # Numbers of their own, so that those of the bands do not depend on pits.
-                generator = np.random.Generator(surroundings.generator.bit_generator.jumped())
-                of_pits = pits.draw(place_m, each, generator)
+                of_pits = pits.draw(place_m, each, *surroundings.generator.spawn(1))
                 found = found.joined(of_pits._replace(heights_m=np.full_like(of_pits.heights_m, np.nan)))
             found = _uncovered(found, surroundings)
             near = np.linalg.norm(found.points_m - place_m, axis=1) <= self.max_range_m
