@@ -45,7 +45,7 @@ candidates:
   small:
     sensor: {type: lidar, channels: 8, vertical_fov_deg: [-30, 0], horizontal_fov_deg: 180, columns: 9, max_range_m: 9}
     places: {front: {x_m: 2.1, z_m: 1.0}, rear: {x_m: -2.1, z_m: 1.0, yaw_deg: 180}, roof: {z_m: 2.0}}
-choose: {at_most: 2}
+choose: {max_sensors: 2}
 cost: {small: 1}
 objectives: {near: {detection: 1.0, band: ground, region: 20m}}
 """
@@ -118,7 +118,7 @@ def run(command, out, *options):
         makes = lambda space, plan, seed, worlds: Surface(seed, worlds, plan.per_world)  # noqa: E731
         search_run.SearchPlan = partial(SearchPlan, make_frames=makes)
     if command is not REAL:  # drawing takes most of the time
-        result.map_figures = lambda *_, **__: [("map1", Figure((1, 1)))]
+        result.plot_maps = lambda *_, **__: [("map1", Figure((1, 1)))]
     try:
         app.main()
     except SystemExit as end:
@@ -157,7 +157,7 @@ def killed_recording(command):
 def frames_of(recording):
     """How many frames are read; None where a reader finds no recording, or is told that it is a part."""
     try:
-        return len(open_recording(recording).names)
+        return len(open_recording(recording).frame_names)
     except (ValueError, OSError):
         return None
 

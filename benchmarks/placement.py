@@ -14,16 +14,16 @@ import torch
 
 from benchmarks import table
 from torchcover.placement import (
-    ChoiceSpace,
     CommonFrames,
     Objective,
     OptimizerParams,
     PlacementSearch,
     SearchSpace,
+    SelectionSpace,
     run_search,
 )
-from torchcover.placement.search import measure_gains
-from torchcover.placement.selection import observe_points, point_weights
+from torchcover.placement.search import compute_improvements
+from torchcover.placement.selection import compute_point_weights, observe_points
 from torchcover.placement.selection_solver import CandidateCoverage, SelectionLimits, select_sensors
 from torchcover.simulation import Rig
 
@@ -59,7 +59,7 @@ SPACES = {
             "left": {**SIDE, "y_m": (0.1, 0.7), "yaw_deg": (-45.0, 120.0)},
             "right": {**SIDE, "y_m": (-0.7, -0.1), "yaw_deg": (-120.0, 45.0)},
         },
-        "constraints": {"min_distance_m": 0.4, "max_self_hits": 0.35},
+        "constraints": {"min_distance_m": 0.4, "max_self_hit_share": 0.35},
         "objectives": {"sides": {"region": NEAR}},
     },
     "one of 3 mount regions, pose on it": {
@@ -68,18 +68,18 @@ SPACES = {
             "left": {"region": ("fender_left", "mirror_left", "roof"), "height_m": (0.05, 0.3),
                      "yaw_deg": (-90.0, 90.0), "pitch_deg": (-10.0, 40.0)}
         },
-        "constraints": {"max_self_hits": 0.6},
+        "constraints": {"max_self_hit_share": 0.6},
         "objectives": {"sides": {"region": ("left_3m", "front_3m")}},
     },
 }  # fmt: skip
-STRATEGIES = {"optimizer": OptimizerParams(), "random": OptimizerParams(startup=0, control_every=1)}
+STRATEGIES = {"optimizer": OptimizerParams(), "random": OptimizerParams(num_startup_candidates=0, random_interval=1)}
 
 
 def search_gains(name, seeds, evaluations):
     """Best gain of each strategy for each seed, (strategies, seeds), on the same frames."""
     torch.set_num_threads(1)
     space = SearchSpace.model_validate({"name": "space", "scenario": "parking", **SPACES[name]})
-    frames = CommonFrames(space.scenarios, space.numbers, **FRAMES)
+    frames = CommonFrames(space.scenarios, space.scored_objectives, **FRAMES)
     gains = np.zeros((len(STRATEGIES), seeds))
     for row, params in zip(gains, STRATEGIES.values(), strict=True):
         for seed in range(seeds):
@@ -88,7 +88,7 @@ def search_gains(name, seeds, evaluations):
             )
             while (candidate := search.ask()) is not None:
                 search.evaluate(candidate)
-            row[seed] = 100 * np.nanmax(search.gains)
+            row[seed] = 100 * np.nanmax(search.improvements)
     return gains
 
 
@@ -117,11 +117,11 @@ def compare_pairs(rigs=24, worlds=16):
         each.append(start.model_copy(update={"sensors": (roof.model_copy(update={"mount": mount}),)}))
     rows = []
     for measure in ("area", "known"):
-        with CommonFrames("urban", objective, worlds=worlds, estimate=measure) as frames:
+        with CommonFrames("urban", objective, num_scenes=worlds, average=measure) as frames:
             began_s = time.process_time()
             first, *others = [frames.score(rig).estimate for rig in each]
             score_s = (time.process_time() - began_s) / len(each) / len(frames)
-        paired = np.median([measure_gains(other, first)[1][0] for other in others])
+        paired = np.median([compute_improvements(other, first)[1][0] for other in others])
         alone = np.median([float(torch.hypot(other.error, first.error)[0]) for other in others])
         rows.append((measure, f"{100 * alone:.2f}", f"{100 * paired:.2f}", f"{(alone / paired) ** 2:.0f}"))
     table(("average", "unpaired (points)", "paired (points)", "fewer worlds by"), rows)
@@ -139,23 +139,23 @@ CHOICE = {
     "vehicle": "suv",
     "candidates": {"wide": {"sensor": WIDE, "grid": GRID},
                    "narrow": {"sensor": NARROW, "grid": GRID | {"yaw_deg": [-20.0, 20.0]}}},
-    "choose": {"at_most": 8, "max_cost_eur": 9000, "min_distance_m": 0.2},
+    "choose": {"max_sensors": 8, "max_cost_eur": 9000, "min_distance_m": 0.2},
     "cost": {"wide": 2500, "narrow": 900, "mount": 100},
     "objectives": {"around": {"region": [*NEAR, "20m"]}},
 }  # fmt: skip
 
 
 def time_selections():
-    space = ChoiceSpace.model_validate(CHOICE)
-    with CommonFrames(space.scenarios, space.numbers, worlds=4, per_world=2, rays=8192) as frames:
+    space = SelectionSpace.model_validate(CHOICE)
+    with CommonFrames(space.scenarios, space.scored_objectives, num_scenes=4, frames_per_scene=2, rays=8192) as frames:
         rigs = [Rig(name=one.name, vehicle="suv", sensors=(one,)) for one in space.sensors]
-        observed, weights = [observe_points(rig, frames)[0] for rig in rigs], point_weights(frames)
+        observed, weights = [observe_points(rig, frames)[0] for rig in rigs], compute_point_weights(frames)
     rows = []
     for count in (40, len(observed)):
         some = np.random.default_rng(0).permutation(len(observed))[:count].tolist()
         base = np.zeros(weights.shape[1], dtype=bool)
         coverage = CandidateCoverage.from_points(weights, [observed[one] for one in some], base)
-        limits = space.limits(some)
+        limits = space.build_limits(some)
         free = [SelectionLimits(size, compatible=limits.compatible) for size in (8, 4)]
         for what, each in zip(("8 for 9,000 EUR", "8", "4"), (limits, *free), strict=True):
             began_s = time.process_time()
@@ -185,9 +185,9 @@ def count_false_alarms(searches):
     given = {"evaluations": 6, "worlds": 2, "fresh_worlds": 8, "rays": 4096}
     results = [run_search(PlacementSearch(space, seed=2 * seed, **given)) for seed in range(searches)]
     tests = [result.test for result in results if result.test is not None]
-    worse = sum(any(change.is_worse for change in test.changes) for test in tests)
-    gained = sum(result.best.gains[0].test.significant for result in results if result.best.gains)
-    numbers = max((len(test.changes) for test in tests), default=0)
+    worse = sum(any(change.is_worse for change in test.side_effects) for test in tests)
+    gained = sum(result.best.improvements[0].difference.significant for result in results if result.best.improvements)
+    numbers = max((len(test.side_effects) for test in tests), default=0)
     table(("searches", "tested", "numbers each", "report worse", "report a gain or loss"),
           [(len(results), len(tests), numbers, worse, gained)])  # fmt: skip
 

@@ -31,7 +31,7 @@ from torchcover.data import (
 )
 from torchcover.detection import points_in_boxes
 from torchcover.geometry import invert, rigid, rotation_from_euler, transform
-from torchcover.recordings.movers import COMPARED_S, WITHIN_M, movers
+from torchcover.recordings.movers import COMPARED_S, WITHIN_M, find_moving_clusters
 from torchcover.simulation import Lidar, PaperReference, Rig, Scenario
 
 EVERY_S = 0.1
@@ -78,7 +78,7 @@ class SimulatedDrive:
 
     reference_sensors = ()
     square_metres = False
-    instants = None
+    block_indices = None
     path = Path("simulated")
 
     def __init__(self, sweeps, instant, window_s, *, labelled=True):
@@ -88,28 +88,28 @@ class SimulatedDrive:
         self._poses = [scene.world.ego.trajectory.at(step * scene.world.time_step_s) for scene, step in scenes]
         self.sensors = tuple(sweeps.rigs)
         self.rigs = {"judged": ("judged",)}
-        self.names = [sweep.name for sweep in self._sweeps]
-        self.frames = [reach]
-        self.times_s = EVERY_S * np.arange(len(self.names))
+        self.frame_names = [sweep.name for sweep in self._sweeps]
+        self.key_frames = [reach]
+        self.times_s = EVERY_S * np.arange(len(self.frame_names))
         self.labelled, self.imperfect = labelled, False
-        self.body = sweeps.scenario.ego_box()
+        self.ego_box = sweeps.scenario.ego_box()
 
-    def scan(self, sensor, index):
+    def read_scan(self, sensor, index):
         mount = MOUNTS[sensor]
         points_m = transform(invert(mount), self._sweeps[index].clouds[sensor].numpy().astype(np.float64))
         if self.imperfect:
             range_m = np.linalg.norm(points_m, axis=1, keepdims=True)
             points_m *= 1 + np.random.default_rng(index).normal(0, NOISE_M, range_m.shape) / range_m
-        return Scan(points_m, mount, self.names[index])
+        return Scan(points_m, mount, self.frame_names[index])
 
-    def world_T_vehicle(self, index):
+    def get_world_T_vehicle(self, index):
         if not self.imperfect:
             return self._poses[index]
         random = np.random.default_rng(index)
         off = rigid(rotation_from_euler(*random.normal(0, POSE_ERROR_DEG, 3)), random.normal(0, POSE_ERROR_M, 3))
         return self._poses[index] @ off
 
-    def boxes(self, index):
+    def read_boxes(self, index):
         return self.true_boxes(index) if self.labelled else None
 
     def true_boxes(self, index):
@@ -209,7 +209,7 @@ def found_movers(recording, reference, frame):
         if abs(since_s) <= COMPARED_S:
             loose_m.append(own_m[np.linalg.norm(own_m[:, :2], axis=1) < WITHIN_M])
             apart_s.append(since_s)
-    found = movers(loose_m, np.array(apart_s))
+    found = find_moving_clusters(loose_m, np.array(apart_s))
     places_m = torch.from_numpy(np.concatenate([np.empty((0, 3)), *(of.points_m for of in found)])).float()
     whose = np.repeat(np.arange(len(found)), [len(of.points_m) for of in found])
     boxes = recording.true_boxes(instant)

@@ -33,7 +33,7 @@ WATCHED = {
     "torchcover.coverage.sums:CoverageSums.sums_of": SUMS,
     "torchcover.coverage.sums:CoverageSums.add": SUMS,
     "torchcover.targets.probing:Probes.sums_of": BODIES,
-    "torchcover.report.maps:draw_side_by_side": MAPS,
+    "torchcover.report.maps:plot_side_by_side": MAPS,
     "torchcover.files.atomic:AtomicOutput.add_figure": MAPS,
     "torchcover.evaluation.result:Result.save": FILES,
 }

@@ -17,7 +17,7 @@ from benchmarks import table
 from torchcover import BevGrid, CoverageMetric
 from torchcover.data import SimulatedFrames, open_recording
 from torchcover.geometry import invert, transform
-from torchcover.recordings.in_vehicle import in_vehicle
+from torchcover.recordings.in_vehicle import transform_to_vehicle
 from torchcover.simulation import Lidar, Material, PaperReference, Rig, Scenario, Simulator
 from torchcover.simulation.recorded_returns import HALF_LANES_M, fit_returns, ground_rays, road_profile
 from torchcover.simulation.returns import log_excess, return_probability
@@ -247,8 +247,10 @@ def main():
             if not isinstance(lidar, Lidar):
                 continue
             recorded = lidar.name if lidar.name in recording.sensors else recording.sensors[0]
-            scans = (recording.scan(recorded, index) for index in recording.frames)
-            sweeps = [as_cast(in_vehicle(one, recording.body).points_m.astype(float), lidar) for one in scans]
+            scans = (recording.read_scan(recorded, index) for index in recording.key_frames)
+            sweeps = [
+                as_cast(transform_to_vehicle(one, recording.ego_box).points_m.astype(float), lidar) for one in scans
+            ]
             label = f"{Path(folder).name} {lidar.name}"
             rows = curves[label] = by_range(ground_rays(sweeps, lidar), lidar, road)
             returns += [
@@ -265,7 +267,7 @@ def main():
             cones += [(label, f"{np.median([one[at] for one in real]):.1f} / {model[at]:.1f}", at) for at in DIRECTIONS]
             closed = blocked(np.concatenate(sweeps), lidar, len(sweeps))
             cones.append((label, f"{closed} / {blocked(simulated[lidar.name].points, lidar, 1)}", "blocked (degrees)"))
-            if any(recording.boxes(index) is not None for index in recording.frames):
+            if any(recording.read_boxes(index) is not None for index in recording.key_frames):
                 vehicles += on_vehicles(sweeps, recording, lidar)
     print(
         "P(return) from road: real, modelled from the other half of the azimuths, modelled as built in; ideal is 1.\n"

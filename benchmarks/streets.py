@@ -16,8 +16,8 @@ from benchmarks import table
 from torchcover.data import open_recording, read_cloud, read_objects
 from torchcover.geometry import BoundingBox, transform
 from torchcover.geometry.trajectory import Trajectory
-from torchcover.recordings.ground_model import GroundModel, low_surfaces
-from torchcover.recordings.in_vehicle import in_vehicle
+from torchcover.recordings.ground_model import GroundModel, extract_low_surfaces
+from torchcover.recordings.in_vehicle import transform_to_vehicle
 from torchcover.recordings.recording import Scan
 from torchcover.simulation import PaperReference, Rig, Scenario, Simulator
 from torchcover.simulation.returns import material_number
@@ -305,10 +305,12 @@ def sight(points_m):
     points_m = np.asarray(points_m, dtype=np.float64)
     points_m = points_m[np.hypot(*points_m.T[:2]) > OWN_M]
     low_m = points_m[np.hypot(*points_m.T[:2]) < 10.0, 2]
-    ground = GroundModel.below([low_surfaces(points_m, np.zeros(3))], np.array([0.0, 0.0, np.quantile(low_m, 0.1)]))
+    ground = GroundModel.from_surfaces(
+        [extract_low_surfaces(points_m, np.zeros(3))], np.array([0.0, 0.0, np.quantile(low_m, 0.1)])
+    )
     if ground is None:
         raise ValueError("no ground is seen around the vehicle")
-    height_m, range_m = ground.heights_m(points_m), np.hypot(*points_m.T[:2])
+    height_m, range_m = ground.compute_heights_m(points_m), np.hypot(*points_m.T[:2])
     azimuth_deg = np.rad2deg(np.arctan2(points_m[:, 1], points_m[:, 0])) % 360.0
     found = {}
     for name, (low, high) in BANDS_M.items():
@@ -344,13 +346,18 @@ def simulated(world, rig, runs=RUNS, seed=0):
 def recorded(path):
     """`sight` of a sweep in a file, or of all those of a recording."""
     if Path(path).is_file():
-        return [sight(in_vehicle(Scan(np.asarray(read_cloud(path))[:, :3], None, str(path))).points_m)]
+        return [sight(transform_to_vehicle(Scan(np.asarray(read_cloud(path))[:, :3], None, str(path))).points_m)]
     recording = open_recording(path)
     return [
         sight(
-            np.concatenate([in_vehicle(recording.scan(name, k), recording.body).points_m for name in recording.sensors])
+            np.concatenate(
+                [
+                    transform_to_vehicle(recording.read_scan(name, k), recording.ego_box).points_m
+                    for name in recording.sensors
+                ]
+            )
         )
-        for k in recording.frames
+        for k in recording.key_frames
     ]
 
 

@@ -18,7 +18,7 @@ from rich.console import Console
 from torchcover import BevGrid, CoverageMetric, Region, Rig
 from torchcover.data import SimulatedFrames
 from torchcover.evaluation import CoverageObserver, observe
-from torchcover.report import CoverageTable, map_figures, print_table, write_figures
+from torchcover.report import CoverageTable, plot_maps, print_table, write_figures
 from torchcover.simulation import CameraSensor, PaperReference
 
 GOPRO = {
@@ -92,8 +92,8 @@ def main():
     observe(frames, observers.values(), progress=True)
     coverages = {name: observer.compute() for name, observer in observers.items()}
     console = Console()
-    print_table(CoverageTable.of(coverages, REGIONS), console)
-    pictures = write_figures(map_figures(coverages), options.out)
+    print_table(CoverageTable.from_coverages(coverages, REGIONS), console)
+    pictures = write_figures(plot_maps(coverages), options.out)
     console.print(f"Wrote {len(pictures)} maps to {options.out}")
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 
 from torchcover import BevGrid, CoverageMetric, Region
-from torchcover.cameras import Camera, carla_pose, read_depth
+from torchcover.cameras import Camera, convert_carla_pose, read_depth
 
 YAWS_DEG = {"front": 0.0, "right": 90.0, "rear": 180.0, "left": 270.0}
 REGION = Region("20 m around", (-20.0, 20.0), (-20.0, 20.0))
@@ -23,7 +23,7 @@ def clouds_of(images, fov_deg, location_m):
     for (name, yaw_deg), path in zip(YAWS_DEG.items(), images, strict=True):
         depth = read_depth(path)  # z-depth in metres; the sky is infinite and makes no points
         height, width = depth.shape
-        pose = carla_pose(location_m, yaw_deg=yaw_deg)  # CARLA's left-handed axes to the vehicle's
+        pose = convert_carla_pose(location_m, yaw_deg=yaw_deg)  # CARLA's left-handed axes to the vehicle's
         camera = Camera.from_fov(width, height, fov_deg, vehicle_T_camera=pose, name=name)
         clouds[name] = camera.to_vehicle(camera.unproject(depth))
     return clouds

@@ -33,7 +33,7 @@ from torch.utils.data import DataLoader
 from torchcover import BevGrid, CoverageMetric, Region
 from torchcover.data import Augmentation, SimulatedFrames, VisibleTargets, collate_frames
 from torchcover.detection import RecallByVisibility, box_visibility, match
-from torchcover.report import number_words
+from torchcover.report import format_number
 from torchcover.simulation import PaperReference, SurfaceReference
 from torchcover.training import CoverageCallback
 
@@ -392,7 +392,7 @@ def report(results, console):
     for rig, (module, coverage) in results.items():
         curve = module.counts.overall()
         numbers = [line.numbers["detection_0.4m"] for line in coverage.summary(REGIONS)]
-        seen = map(number_words, numbers)
+        seen = map(format_number, numbers)
         shares = [f"{ratio.value[row, 0]:.3f}" for ratio in (curve.recall, curve.precision)]
         table.add_row(rig, f"{average_precision(module.counts):.3f}", *seen, *shares)
     console.print(table)

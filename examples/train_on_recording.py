@@ -98,7 +98,7 @@ def main():
     if options.recording is None and not recording.exists():
         console.print(f"simulating a small recording: {recording}")
         write_small_recording(recording)
-    frames = RecordedFrames(recording, reference=AccumulatedReference(options.window), ground=False)
+    frames = RecordedFrames(recording, reference=AccumulatedReference(options.window), use_ground_model=False)
     console.print(*frames.reference_record["notes"], sep="\n")
     rig, training_frames, validation_frames = read(frames)
     metric = coverage_metric(square_metres=False)

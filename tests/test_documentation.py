@@ -23,7 +23,7 @@ from torchcover.cli.app import app
 from torchcover.data import RegionsOfInterest, SimulatedFrames, collate_frames
 from torchcover.encounters import EncounterSet
 from torchcover.evaluation import Requirements
-from torchcover.placement import ChoiceSpace, SearchSpace
+from torchcover.placement import SearchSpace, SelectionSpace
 from torchcover.recordings.formats import FORMATS
 from torchcover.recordings.formats.folder import read_folder_settings
 from torchcover.simulation import Rig, Scenario
@@ -153,7 +153,7 @@ READERS = (
     Requirements.load,
     EncounterSet.load,
     SearchSpace.load,
-    ChoiceSpace.load,
+    SelectionSpace.load,
     read_folder_settings,
 )
 

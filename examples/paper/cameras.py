@@ -7,7 +7,7 @@ from examples.paper.four_views import draw_four_views
 from examples.paper.measuring import Measurement
 from torchcover import BevGrid, Region
 from torchcover.evaluation import sensor_views
-from torchcover.report import RENDERERS, CoverageTable, map_figures, print_table, write_figures
+from torchcover.report import RENDERERS, CoverageTable, plot_maps, print_table, write_figures
 
 RIG = "three_cameras"
 GRID = BevGrid(x=(-40.0, 40.0), y=(-40.0, 40.0), cell=0.25)
@@ -28,10 +28,10 @@ def run(options):
     views = sensor_views(measurement.frames.sensors[RIG])
     texts = []
     for (_, measure), coverage in coverages.items():
-        table = CoverageTable.of({RIG: coverage}, REGIONS)
+        table = CoverageTable.from_coverages({RIG: coverage}, REGIONS)
         print_table(table, Console())
         texts.append(RENDERERS["markdown"](table))
-        figures = map_figures({RIG: coverage}, ego_outline_m=measurement.frames.ego_outline_m, sensors={RIG: views})
+        figures = plot_maps({RIG: coverage}, ego_outline_m=measurement.frames.ego_outline_m, sensors={RIG: views})
         write_figures(figures, out / "maps" / measure)
         coverage.save(out / f"{RIG}_{measure}.npz")
     (out / "table.md").write_text("\n".join(texts), encoding="utf-8")

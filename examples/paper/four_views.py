@@ -9,23 +9,23 @@ from matplotlib.patches import Patch, Wedge
 from torchcover.coverage.quantity import RADIUS
 from torchcover.report.colours import (
     NEVER_PROBED,
-    ColourScale,
-    cell_entries,
-    draw_cells,
-    draw_colour_bar,
-    scale_of,
+    ColorScale,
+    build_cell_legend,
+    build_color_scale,
+    plot_cells,
+    plot_color_bar,
 )
-from torchcover.report.overlay import draw_ego, draw_sensors, sensor_colour
+from torchcover.report.overlay import get_sensor_color, plot_ego, plot_sensors
 from torchcover.report.sheet import (
     HEADING_POINTS,
+    create_sheets,
+    find_lower_left,
     fit_paper,
-    lay_out,
-    lower_left,
     write_heading,
     write_legend,
     write_title,
 )
-from torchcover.report.wording import span, steps_and_cell
+from torchcover.report.wording import format_height_band, format_resolution
 
 # A few cells beside the bumper hold most of the points.
 ROBUST_PERCENTILES = (1, 99.5)
@@ -44,23 +44,23 @@ def draw_four_views(radius, points, grid, *, steps, title, ego_outline_m, sensor
         ego_outline_m: (K, 2) corners x, y of the ego in the vehicle frame in metres.
         sensors: The rig.
     """
-    sectors, histogram, *maps = _with_a_bar_for_each_row(lay_out(grid, 2 + len(grid.heights)))
+    sectors, histogram, *maps = _with_a_bar_for_each_row(create_sheets(grid, 2 + len(grid.heights)))
     entries = _draw_sectors(sectors, sensors)
     write_heading(sectors.axes, "fields of view, as if nothing were in the way")
     entries += _draw_histogram(histogram, points.double().cpu().numpy() / steps)
     write_heading(histogram.axes, "points of the rig in each cell")
-    scale = scale_of(RADIUS, radius)
+    scale = build_color_scale(RADIUS, radius)
     together = radius.cpu().double().numpy()
     for sheet, values, name in zip(maps, together, grid.heights, strict=True):
-        draw_colour_bar(sheet, draw_cells(sheet.axes, values, scale), together, scale)
-        write_heading(sheet.axes, f"blind spot radius, {name}: {span(grid, name)}")
-    entries += cell_entries(together, NEVER_PROBED)
+        plot_color_bar(sheet, plot_cells(sheet.axes, values, scale), together, scale)
+        write_heading(sheet.axes, f"blind spot radius, {name}: {format_height_band(grid, name)}")
+    entries += build_cell_legend(together, NEVER_PROBED)
     for sheet in (histogram, *maps):
-        entries += draw_sensors(sheet, sensors, named=False)
+        entries += plot_sensors(sheet, sensors, show_names=False)
     for sheet in (sectors, histogram, *maps):
-        entries += draw_ego(sheet.axes, ego_outline_m)
-    write_title(sectors.axes, title, steps_and_cell(steps, grid), lift_points=HEADING_POINTS)
-    write_legend(lower_left(sheet.axes for sheet in maps), entries, sectors.legend_columns)
+        entries += plot_ego(sheet.axes, ego_outline_m)
+    write_title(sectors.axes, title, format_resolution(steps, grid), lift_points=HEADING_POINTS)
+    write_legend(find_lower_left(sheet.axes for sheet in maps), entries, sectors.legend_columns)
     fit_paper(sectors.figure)
     return sectors.figure
 
@@ -78,7 +78,7 @@ def _draw_sectors(sheet, sensors):
     """Fill the horizontal field of view of each sensor: all that geometry alone says."""
     entries = []
     for at, sensor in enumerate(sensors):
-        style = {"facecolor": (sensor_colour(at), 0.3), "edgecolor": sensor_colour(at)}
+        style = {"facecolor": (get_sensor_color(at), 0.3), "edgecolor": get_sensor_color(at)}
         # Infinity cannot be drawn; so far beyond the map all ranges look the same.
         reach_m = min(sensor.range_m, 4 * math.hypot(*sheet.axes.get_xlim(), *sheet.axes.get_ylim()))
         ends_deg = (sensor.yaw_deg + side * sensor.horizontal_fov_deg / 2 for side in (-1, 1))
@@ -91,9 +91,9 @@ def _draw_histogram(sheet, per_step):
     empty = per_step == 0
     low, high = np.percentile(per_step[~empty], ROBUST_PERCENTILES) if not empty.all() else (1.0, 10.0)
     high = max(float(high), 1.01 * float(low))
-    scale = ColourScale("points in a cell", "mean of the steps", "viridis", float(low), high, logarithmic=True)
+    scale = ColorScale("points in a cell", "mean of the steps", "viridis", float(low), high, logarithmic=True)
     shown = np.where(empty, np.nan, per_step)
-    draw_colour_bar(sheet, draw_cells(sheet.axes, shown, scale), shown, scale)
+    plot_color_bar(sheet, plot_cells(sheet.axes, shown, scale), shown, scale)
     # Known, unlike a cell of the other maps that is not coloured: no point, for whatever reason.
     sheet.axes.patch.set(facecolor=NO_POINT, hatch="")
     return (

@@ -8,7 +8,7 @@ from examples.paper.pieces import check_conditions, load_merged, save_piece
 from examples.paper.published import LIDARS
 from torchcover import BevGrid, Region, forward_regions
 from torchcover.evaluation import sensor_views
-from torchcover.report import map_figures, write_figures
+from torchcover.report import plot_maps, write_figures
 
 MEASURES = ("known", "area")
 # Pieces are of one run if these options agree; there may be more pieces, or fewer.
@@ -40,7 +40,7 @@ def run(options):
     for rigs in sets.values():
         coverages = {rigs[lidar]: load_merged(pieces, rigs[lidar], "known") for lidar in MAPPED}
         sensors = {rig: sensor_views(measurement.frames.sensors[rig]) for rig in coverages}
-        figures = map_figures(coverages, ego_outline_m=measurement.frames.ego_outline_m, sensors=sensors)
+        figures = plot_maps(coverages, ego_outline_m=measurement.frames.ego_outline_m, sensors=sensors)
         write_figures(figures, options.out / "maps" / "_".join(coverages).replace("/", "-"))
 
 

@@ -54,7 +54,7 @@ IMAGE = torch.ones(6, 8)
     ],
 )
 def test_a_depth_image_that_does_not_fit(depth, options, error, message):
-    for method in (Camera(**PLAIN).unproject, Camera(**PLAIN).count_dropped):
+    for method in (Camera(**PLAIN).unproject, Camera(**PLAIN).count_excluded):
         with pytest.raises(error, match=message):
             method(depth, **options)
 
@@ -67,7 +67,7 @@ def test_points_that_are_none(points):
 
 def test_pixels_that_are_none():
     with pytest.raises(ValueError, match=r"pixels are floats \(..., 2\)"):
-        Camera(**PLAIN).rays(torch.ones(3))
+        Camera(**PLAIN).compute_rays(torch.ones(3))
 
 
 @pytest.mark.parametrize(

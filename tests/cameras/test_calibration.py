@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchcover.cameras import Camera, carla_pose
+from torchcover.cameras import Camera, convert_carla_pose
 from torchcover.files import BadFileError
 from torchcover.geometry import invert, rotation_from_euler, transform
 
@@ -293,7 +293,7 @@ def test_a_matrix(tmp_path):
 def test_the_field_of_view_runs_from_edge_to_edge():
     camera = Camera.from_fov(500, 420, 110.0)
     edges = torch.tensor([[-0.5, 209.5], [499.5, 209.5]], dtype=torch.float64)
-    left, right = camera.rays(edges)[0]
+    left, right = camera.compute_rays(edges)[0]
     assert torch.rad2deg(torch.arccos(left @ right)).item() == pytest.approx(110.0, abs=1e-12)
 
 
@@ -319,6 +319,6 @@ def test_carlas_pose_is_carlas_own_matrix_with_y_turned_over(angles):
     in_camera = np.random.default_rng(0).uniform(-5.0, 5.0, (20, 3))  # x right, y down, z forward
     in_carla = np.c_[in_camera[:, 2], in_camera[:, 0], -in_camera[:, 1]]  # x forward, y right, z up
     expected = transform(carla_matrix(location, pitch, yaw, roll), in_carla) * [1.0, -1.0, 1.0]
-    pose = carla_pose(location, pitch_deg=pitch, yaw_deg=yaw, roll_deg=roll)
+    pose = convert_carla_pose(location, pitch_deg=pitch, yaw_deg=yaw, roll_deg=roll)
     np.testing.assert_allclose(transform(pose, in_camera), expected, atol=1e-12)
     np.testing.assert_allclose(pose @ invert(pose), np.eye(4), atol=1e-12)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from torchcover.cameras import decode_carla, read_depth
-from torchcover.cameras.isolated_images import exr_image
+from torchcover.cameras.isolated_images import read_exr_image
 from torchcover.files import BadFileError
 
 
@@ -79,7 +79,7 @@ def test_exr_without_its_package(tmp_path, monkeypatch):
     (tmp_path / "depth.exr").write_bytes(b"v/1")
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(ImportError, match=r"torchcover\[exr\]"):
-        unwrap(exr_image)(tmp_path / "depth.exr", 1)
+        unwrap(read_exr_image)(tmp_path / "depth.exr", 1)
 
 
 def png_header(width, height, bits=8, colour=6):

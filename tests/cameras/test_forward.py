@@ -63,7 +63,7 @@ def test_kornia_drops_the_polynomial_near_the_axis_and_we_do_not():
 def test_the_solvers_formula_is_kornias(count):
     distortion = make("brown_conrady", BROWN_CONRADY[:count])._optics._solver.distortion
     a, b = np.random.default_rng(1).uniform(-0.8, 0.8, (2, 500))
-    at = distortion.linearise(a, b)
+    at = distortion.linearize(a, b)
     u, v = distortion.distort(torch.from_numpy(a), torch.from_numpy(b))
     np.testing.assert_allclose((at.u, at.v), (u.numpy(), v.numpy()), rtol=0, atol=1e-14)
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 from torchcover.cameras import Camera, inverse
-from torchcover.cameras.inverse import find_region, make_start_table
+from torchcover.cameras.inverse import build_start_table, find_valid_region
 from torchcover.cameras.models import build_lens
 
 
@@ -49,7 +49,7 @@ def test_single_pixels_equal_the_table(camera):
 def test_float32_rays_hold_a_thousandth_of_a_pixel_at_4k():
     camera = Camera(3840, 2160, 1900.0, 1900.0, 1925.0, 1070.0, "brown_conrady", [-0.16, -0.02, 1e-4, 5e-4, 0.04])
     pixels = grid(camera)[::40, ::40].float()
-    rays, valid = camera.rays(pixels)
+    rays, valid = camera.compute_rays(pixels)
     assert rays.dtype == torch.float32
     assert valid.all()
     assert (camera.project(rays.reshape(-1, 3))[0] - pixels.reshape(-1, 2)).abs().max() <= 1e-3
@@ -91,14 +91,14 @@ def test_a_bracketing_solver_finds_nothing_that_newton_misses(name):
     camera = Camera(100, 100, 100.0, 100.0, 0.0, 0.0, model, coefficients)
     lens = camera._optics._solver
     columns = torch.linspace(0.0, 220.0, 111, dtype=torch.float64)
-    rays, valid = camera.rays(torch.stack((columns, torch.zeros_like(columns)), dim=1))
-    a, b, _ = lens.chart.draw(*rays.unbind(1))
+    rays, valid = camera.compute_rays(torch.stack((columns, torch.zeros_like(columns)), dim=1))
+    a, b, _ = lens.chart.project(*rays.unbind(1))
     for column, found, answered in zip(columns.tolist(), a.tolist(), valid.tolist(), strict=True):
-        truth = bracketed(lens.distortion.radial, column / 100.0, lens.chart.limit)
+        truth = bracketed(lens.distortion.distort_radius, column / 100.0, lens.chart.limit)
         assert answered == (truth is not None), column
         if answered:
             # near the fold the radius is known to the square root of what the pixel is
-            assert abs(lens.distortion.radial(found) - column / 100.0) < 1e-11
+            assert abs(lens.distortion.distort_radius(found) - column / 100.0) < 1e-11
             assert found == pytest.approx(truth, abs=1e-5)
     assert b[valid].abs().max() == 0.0
 
@@ -123,27 +123,27 @@ def test_every_point_of_the_valid_region_is_found_again(radial, tangential, k3, 
     distortion = camera._optics._solver.distortion
     if distortion is None:
         return
-    region = find_region(distortion, np.inf)
+    region = find_valid_region(distortion, np.inf)
     generator = np.random.default_rng(seed)
     azimuth = generator.uniform(-np.pi, np.pi, 300)
-    edge = np.minimum(region.edge(np.cos(azimuth), np.sin(azimuth)), 3.0)
+    edge = np.minimum(region.edge_radius(np.cos(azimuth), np.sin(azimuth)), 3.0)
     radius = edge * np.sqrt(generator.uniform(0.0, 0.98, 300))
     a, b = radius * np.cos(azimuth), radius * np.sin(azimuth)
-    at = distortion.linearise(a, b)
-    table = make_start_table(distortion, np.inf, 1e3)
+    at = distortion.linearize(a, b)
+    table = build_start_table(distortion, np.inf, 1e3)
     _, _, status = inverse.solve(distortion, region, table, at.u, at.v, (500.0, 500.0))
     assert (status == inverse.ANSWERED).all()
 
 
 @pytest.mark.parametrize("name", RADIAL)
 def test_the_radii_at_which_the_image_turns_back_are_known(name):
-    distortion = build_lens(*RADIAL[name], trainable=False).distortion
+    distortion = build_lens(*RADIAL[name], is_trainable=False).distortion
     scan = np.linspace(0.0, 3.0, 30_001)
     with np.errstate(all="ignore"):
-        turns = scan[1:-1][np.diff(np.sign(np.diff(distortion.radial(scan)))) != 0]
+        turns = scan[1:-1][np.diff(np.sign(np.diff(distortion.distort_radius(scan)))) != 0]
     assert (len(turns) > 0) == (name != "k1 0.6")
     for turn in turns:
-        assert np.abs(distortion.critical_radii() - turn).min() < 2 * scan[1]
+        assert np.abs(distortion.find_critical_radii() - turn).min() < 2 * scan[1]
 
 
 class Drawn:
@@ -166,7 +166,7 @@ def test_where_a_determinant_is_no_number_the_region_has_ended():
     lens = Drawn(
         lambda radius, azimuth: (radius, azimuth), lambda radius: np.where(radius < 0.7, 1.0, np.nan), symmetric=True
     )
-    assert find_region(lens, 2.0).edge.values == pytest.approx([0.7], abs=1e-12)
+    assert find_valid_region(lens, 2.0).edge_radius.values == pytest.approx([0.7], abs=1e-12)
 
 
 def test_an_edge_whose_image_turns_back_is_within_reach():
@@ -174,9 +174,9 @@ def test_an_edge_whose_image_turns_back_is_within_reach():
         return radius * (1 + 0.5 * np.cos(7 * azimuth)), azimuth + 0.8 * np.sin(3 * azimuth)
 
     lens = Drawn(image, lambda radius: 1.0 + 0.0 * radius, symmetric=False)
-    region, azimuth = find_region(lens, 2.0), np.linspace(-np.pi, np.pi, 997)
+    region, azimuth = find_valid_region(lens, 2.0), np.linspace(-np.pi, np.pi, 997)
     at = lens.linearise(2 * np.cos(azimuth), 2 * np.sin(azimuth))
-    assert region.reach.holds(np.hypot(at.u, at.v) * (1 - 1e-3), at.u, at.v).all()
+    assert region.max_distorted_radius.contains(np.hypot(at.u, at.v) * (1 - 1e-3), at.u, at.v).all()
 
 
 def test_of_two_images_the_one_nearer_the_axis_is_chosen(make_camera):
@@ -208,7 +208,7 @@ def test_a_fisheye_sees_behind_itself_and_a_pinhole_does_not(make_camera):
 def test_where_kornia_diverges_the_answer_is_right():
     # kornia issue 4285: k1 = 0.5, off by 288 px
     camera = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, "brown_conrady", [0.5, 0.0, 0.0, 0.0])
-    rays, valid = camera.rays(grid(camera)[::16, ::16])
+    rays, valid = camera.compute_rays(grid(camera)[::16, ::16])
     assert valid.all()
     assert (camera.project(rays.reshape(-1, 3))[0] - grid(camera)[::16, ::16].reshape(-1, 2)).abs().max() <= 1e-9
 

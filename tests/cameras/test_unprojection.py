@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchcover.cameras import Camera, carla_pose
+from torchcover.cameras import Camera, convert_carla_pose
 from torchcover.geometry import transform
 
 INF, NAN = float("inf"), float("nan")
@@ -61,8 +61,8 @@ def test_a_bad_depth_is_counted_and_never_a_point(reason, kind):
     camera = Camera.from_fov(6, 4, 90.0)
     depth = torch.full((4, 6), 2.0)
     depth[1, 2] = depth[3, 5] = BAD[reason]
-    assert len(camera.unproject(depth, kind, max_depth=50.0)) == 22
-    counts = camera.count_dropped(depth, kind, max_depth=50.0)
+    assert len(camera.unproject(depth, kind, max_depth_m=50.0)) == 22
+    counts = camera.count_excluded(depth, kind, max_depth_m=50.0)
     assert {name: count for name, count in counts.items() if count} == {f"depth_{reason}": 2}
 
 
@@ -95,14 +95,14 @@ def test_the_cloud_has_the_dtype_of_the_depth(make_camera, dtype):
 
 def test_a_pickled_camera_is_small_and_the_same():
     camera = Camera(320, 240, 200.0, 200.0, 159.5, 119.5, "brown_conrady", [-0.28, 0.07, 2e-4, 2e-5])
-    table = camera.rays()[0]
+    table = camera.compute_rays()[0]
     payload = pickle.dumps(camera)
     assert len(payload) < table.nbytes / 2
     assert torch.equal(pickle.loads(payload).rays()[0], table)
 
 
 def test_points_move_between_camera_and_vehicle():
-    pose = carla_pose([1.5, 0.2, 2.8], pitch_deg=-10.0, yaw_deg=30.0)
+    pose = convert_carla_pose([1.5, 0.2, 2.8], pitch_deg=-10.0, yaw_deg=30.0)
     camera = Camera.from_fov(6, 4, 90.0, vehicle_T_camera=pose)
     points = camera.unproject(torch.full((4, 6), 3.0, dtype=torch.float64))
     moved = camera.to_vehicle(points)

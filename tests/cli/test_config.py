@@ -31,7 +31,7 @@ def test_an_option_wins_over_set_which_wins_over_the_file_and_both_are_recorded(
     path.write_text("rays: 1\ncell_m: 1.0\nseed: 1\nrecording: {units: mm, lag_s: 0.2}\n")
     config, record = load_config(path, ["rays=2", "cell_m=2", "recording.units=cm"], {"rays": 3})
     assert (config.rays, config.cell_m, config.seed) == (3, 2.0, 1)
-    assert (config.recording.units, config.recording.lag_s) == ("cm", 0.2)
+    assert (config.recording.units, config.recording.time_offset_s) == ("cm", 0.2)
     assert record["file"] == str(path)
     assert record["settings"]["rays"] == 1
     assert record["replaced"]["rays"] == {"file": 1, "option": 3}
@@ -99,8 +99,8 @@ def test_a_recording_says_how_to_read_it_and_settings_win(tmp_path):
     plain = open_recording(recording)
     assert plain.settings.words == "--set recording.units=cm"
     assert (
-        open_recording(recording, RecordingSettings(units="m")).scan("sensor", 0).points_m.tolist()
-        == (100 * plain.scan("sensor", 0).points_m).tolist()
+        open_recording(recording, RecordingSettings(units="m")).read_scan("sensor", 0).points_m.tolist()
+        == (100 * plain.read_scan("sensor", 0).points_m).tolist()
     )
     (recording / "recording.yaml").write_text("unit: cm\n")
     with pytest.raises(BadFileError, match=r"recording\.yaml: .*unit: unknown key"):

@@ -18,7 +18,7 @@ from torchcover.simulation import Rig, Scenario, builtin_names
 def drawn(monkeypatch):
     """What was drawn: the arguments of the last call."""
     calls: dict = {}
-    for name in ("draw_rig", "draw_vehicle", "draw_scene", "draw_depths"):
+    for name in ("plot_rig", "plot_vehicle", "plot_scene", "plot_depth_images"):
         draw = getattr(scene_pictures, name)
         monkeypatch.setattr(
             scene_pictures,
@@ -229,7 +229,7 @@ def test_every_built_in_rig_has_fields_of_view_within_bounds(name):
         assert -90 <= low < high <= 90
         assert 0 < sensor.horizontal_fov_deg <= 360
         forward = sensor.vehicle_T_sensor[:3, :3] @ [1.0, 0.0, np.tan(np.deg2rad((low + high) / 2))]
-        assert sensor.sees(forward[None]).all()
+        assert sensor.mask_directions(forward[None]).all()
 
 
 @pytest.mark.parametrize(

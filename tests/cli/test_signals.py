@@ -15,7 +15,7 @@ from torchcover import Coverage
 from torchcover.cli import app
 from torchcover.coverage import CoverageSums
 from torchcover.evaluation import progress
-from torchcover.report.maps import draw_side_by_side
+from torchcover.report.maps import plot_side_by_side
 
 DRAW = "torchcover.report.maps.draw_side_by_side"
 
@@ -105,7 +105,7 @@ def test_one_that_is_sent_again_changes_nothing(torchcover, worlds, at_update, m
     """To the process and to its group, by the system and by the shell."""
     monkeypatch.setattr(progress, "TOGETHER_S", 600.0)  # on a machine that is as slow as it likes
     at_update(3, lambda: send(number, times=2))
-    monkeypatch.setattr(DRAW, lambda *given, **more: (send(number), draw_side_by_side(*given, **more))[1])
+    monkeypatch.setattr(DRAW, lambda *given, **more: (send(number), plot_side_by_side(*given, **more))[1])
     code, _, complaints = torchcover(*arguments(worlds))
     assert code == 128 + number
     assert complaints.count("torchcover:") == 1

@@ -263,7 +263,7 @@ def test_an_aggregation_of_ones_own_has_a_map_numbers_errors_and_a_place_in_ever
     number = found.summary()[0].numbers["blind_share"]
     assert (number.value, number.error) == pytest.approx((float(expected.value), float(expected.error)), rel=1e-12)
     assert found.layers["blind_share"].values.shape == FOUR.shape
-    table = CoverageTable.of({"rig": found}, [NEAR])
+    table = CoverageTable.from_coverages({"rig": found}, [NEAR])
     assert table.rows["rig"][0].summary.numbers["blind_share"] == number
     for written in ("text", "csv", "json", "markdown"):
         assert "blind_share" in RENDERERS[written](table) or "nothing is near" in " ".join(
@@ -295,7 +295,7 @@ def test_what_is_known_of_means_only_is_told_of_means_only():
     )
     for sensor, reference, weights in random_steps(4):
         metric.update({"a": sensor}, reference, weights=weights)
-    table = CoverageTable.of({"rig": metric.compute()}, [NEAR])
+    table = CoverageTable.from_coverages({"rig": metric.compute()}, [NEAR])
     columns = RENDERERS["csv"](table).splitlines()[0].split(",")
     assert {"blind_share", "blind_share_error", "known_radius_m", "radius_m_without_a"} < set(columns)
     assert not {"known_blind_share", "blind_share_without_a"} & set(columns)

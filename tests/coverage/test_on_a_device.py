@@ -159,7 +159,7 @@ def test_devices_without_float64_get_what_the_cpu_computes():
             *grid.bins(reference), grid.points_by_column(reference), region.contains(*reference[:, :2].T),
             *points_in_boxes(reference, boxes), seen.share, seen.reference_points, bev_iou(boxes.rows, boxes.rows),
             turned.reference, turned.boxes.rows, *camera.project(reference), camera.unproject(depth),
-            *camera.rays(reference[:, :2]), camera.z_to_distance(depth), camera.to_vehicle(reference),
+            *camera.compute_rays(reference[:, :2]), camera.convert_z_to_distance(depth), camera.to_vehicle(reference),
         ]  # fmt: skip
 
     def measure(sensor, reference, weights, boxes):

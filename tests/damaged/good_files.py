@@ -278,9 +278,9 @@ def recording_files(folder):
 def bag(path):
     """Read all of a bag."""
     recording = RosBag(path)
-    for index in recording.frames:
+    for index in recording.key_frames:
         for sensor in recording.sensors:
-            recording.scan(sensor, index)
+            recording.read_scan(sensor, index)
 
 
 KITTI_LABEL = b"Car 0.00 0 1.5 100 100 200 200 1.5 1.6 3.9 1.0 1.6 20.0 1.5\n" * 3
@@ -351,7 +351,7 @@ def kinds(folder):
         Kind("sensor.json", SENSORS, nuscenes, (("calibrated_sensor.json", CALIBRATED),)),
         Kind("calibrated_sensor.json", CALIBRATED, nuscenes, (("sensor.json", SENSORS),)),
         Kind("frames.yaml", POSES, read_folder_settings),
-        Kind("poses.csv", DRIVEN, lambda path: frame_files.PoseTable(path, ("f1", "f2"), timed=True)),
+        Kind("poses.csv", DRIVEN, lambda path: frame_files.PoseTable(path, ("f1", "f2"), has_times=True)),
         Kind("sensors.json", CARLA, read_carla_sensors),
         Kind("labels.csv", LABELS, frame_files.read_boxes),
         Kind("coverage.npz", coverage(folder), Coverage.load),

@@ -264,20 +264,20 @@ def test_a_recording_of_a_world_says_the_same(scenario, tmp_path):
 class Closing(SyntheticDrive):
     """At 15 m/s behind a car with 5 m/s, on which there are points from the ninth instant on."""
 
-    def world_T_vehicle(self, index):
+    def get_world_T_vehicle(self, index):
         return rigid(np.eye(3), [1.5 * index, 0.0, 0.0])
 
     def world_T_car(self, index):
         return rigid(np.eye(3), [50.0 + 0.5 * index, 0.0, 0.75])
 
-    def scan(self, sensor, index):
+    def read_scan(self, sensor, index):
         back_m, self.back_m = self.back_m, self.back_m[: None if index >= 8 else 0]
-        found = super().scan(sensor, index)
+        found = super().read_scan(sensor, index)
         self.back_m = back_m
         return found
 
-    def boxes(self, index):
-        box = super().boxes(index)
+    def read_boxes(self, index):
+        box = super().read_boxes(index)
         return Boxes.from_rows(box.rows, ids=box.ids, categories=("car",))
 
 
@@ -285,7 +285,7 @@ class Closing(SyntheticDrive):
 def test_real_road_users_are_first_hit_as_their_layout_says(layout, tmp_path):
     recording = open_recording(LAYOUTS[layout](Closing(steps=15), tmp_path))
     (one,) = met_in_recording(recording).sightings
-    gap_m = 50.0 - CAR_SIZE_M[0] / 2 - recording.body.upper_m[0]
+    gap_m = 50.0 - CAR_SIZE_M[0] / 2 - recording.ego_box.upper_m[0]
     assert one.encounter.name == "cars and vans"
     assert one.encounter.ttc_s[0] == pytest.approx((gap_m - one.encounter.step) / 10, abs=0.02)
     assert one.ttc_s[0] == pytest.approx((gap_m - 10) / 10, abs=0.02)
@@ -298,8 +298,8 @@ def test_parked_vehicles_are_not_met_and_people_who_stand_are(category, met):
         def world_T_car(self, index):
             return rigid(np.eye(3), [68.0 + 0.1 * (index % 2), 0.0, 0.75])
 
-        def boxes(self, index):
-            box = super().boxes(index)
+        def read_boxes(self, index):
+            box = super().read_boxes(index)
             return Boxes.from_rows(box.rows, ids=box.ids, categories=(category,))
 
     found = met_in_recording(Standing(steps=15, body=BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))))

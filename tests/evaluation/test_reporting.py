@@ -11,7 +11,7 @@ import pytest
 from torchcover.encounters import EncounterSet
 from torchcover.evaluation import Requirements, report
 from torchcover.evaluation.target_survey import NEAR_M, plan_of, target_verdict
-from torchcover.report import page_html
+from torchcover.report import render_page
 from torchcover.simulation import Rig
 
 NASTY = "<b>&amp;roof</b>"
@@ -76,11 +76,11 @@ def test_sensors_that_cells_cannot_tell_apart_are_named_together():
 def test_a_plan_tells_by_how_many_sensors_each_place_is_seen(found):
     for seen in found.targets.values():
         plan = plan_of(seen)
-        assert ((plan.seen_by == -1) == ~seen.free).all()
-        assert ((plan.seen_by > 0) == seen.enough).all()
-        assert ((plan.seen_by > 1) == (seen.enough & (seen.least_sensors >= 2))).all()
+        assert ((plan.sensor_counts == -1) == ~seen.free).all()
+        assert ((plan.sensor_counts > 0) == seen.enough).all()
+        assert ((plan.sensor_counts > 1) == (seen.enough & (seen.least_sensors >= 2))).all()
         near = seen.free & (seen.distance_m <= NEAR_M)
-        assert f"{(near & (plan.seen_by == 0)).sum():,} of {near.sum():,} places" in plan.words
+        assert f"{(near & (plan.sensor_counts == 0)).sum():,} of {near.sum():,} places" in plan.title
 
 
 def test_what_was_asked_too_is_told(found):
@@ -89,7 +89,7 @@ def test_what_was_asked_too_is_told(found):
 
 
 def test_the_page_answers_before_anything_else_and_names_are_text(found, tmp_path):
-    text = page_html(found.page)
+    text = render_page(found.page)
     assert NASTY not in text
     assert text.index("A child of 1.10 m is seen") < text.index("<svg") < text.index('id="maps"')
     assert text.count('class="plan"') == 2
@@ -104,16 +104,16 @@ def test_the_page_answers_before_anything_else_and_names_are_text(found, tmp_pat
 def test_areas_of_the_plan_are_those_of_its_cells(found):
     """Rectangles of a colour have the area of its cells."""
     seen = found.targets["one"]
-    text = page_html(found.page)
+    text = render_page(found.page)
     for number in range(2):
         drawn = re.search(rf'<path class="seen{number}" d="([^"]*)"', text)[1]
         m2 = sum(float(w) * float(h) for w, h in re.findall(r"h(-?[\d.]+)v([\d.]+)", drawn))
-        assert m2 == pytest.approx((plan_of(seen).seen_by == number).sum() * 0.04)
+        assert m2 == pytest.approx((plan_of(seen).sensor_counts == number).sum() * 0.04)
 
 
 def test_a_budget_ends_the_traffic_once_it_has_intervals():
     found = report(ONE, "courtyard", steps=64, budget_s=0.01, workers=0)
-    assert found.result.table.first.counts["steps"] == 8
+    assert found.result.table.first_conditions.counts["steps"] == 8
     assert found.verdict[-1] == "The budget was over after 8 of 64 steps of traffic."
     assert not found.record["complete"]
 
@@ -129,7 +129,7 @@ def test_where_no_place_is_free_nothing_is_claimed(found):
     nowhere = replace(seen, state=np.full_like(seen.state, 2))
     assert math.isnan(nowhere.share_seen(NEAR_M))
     assert target_verdict({"one": nowhere}) == ("No place within 2 m is free: what is seen there is unknown.",)
-    assert "Not seen at 0 of 0 places" in plan_of(nowhere).words
+    assert "Not seen at 0 of 0 places" in plan_of(nowhere).title
 
 
 @pytest.mark.parametrize(("given", "words"), [

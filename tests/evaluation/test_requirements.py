@@ -14,7 +14,7 @@ from torchcover.encounters.encounter import EncounterSet
 from torchcover.evaluation import Readings, Requirements, check, encounter, evaluate, verdicts
 from torchcover.evaluation.requirements import BodyPlaces, TargetRequirement
 from torchcover.geometry import BoundingBox
-from torchcover.placement.selection_space import ChoiceSpace
+from torchcover.placement.selection_space import SelectionSpace
 from torchcover.placement.space import SearchSpace
 from torchcover.simulation import RegionsOfInterest, Rig, Scenario, builtin_names, documents
 from torchcover.simulation.bodies import Vehicle
@@ -375,7 +375,7 @@ def test_a_file_of_another_kind_is_called_what_it_is(tmp_path, needed, given):
 
 def test_the_keys_of_kinds_are_those_of_their_documents():
     for kind, (document, _) in KINDS.items():
-        of_kind = (document, ChoiceSpace) if document is SearchSpace else (document,)
+        of_kind = (document, SelectionSpace) if document is SearchSpace else (document,)
         known = {name for one in of_kind for name in one.model_fields} - {"name", "description"}
         assert document.kind == kind
         assert set(" ".join(documents.KINDS[kind]).split()) == known

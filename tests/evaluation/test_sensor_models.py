@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from torchcover.evaluation import evaluate
-from torchcover.report import page_html
+from torchcover.report import render_page
 from torchcover.simulation import Lidar, Rig, Weather
 
 RIG = Rig.model_validate(
@@ -123,7 +123,7 @@ def test_results_name_cameras_with_perfect_depth_and_different_scan_periods():
     result = evaluate(rigs, "courtyard", **SETTINGS)
     depth = "Perfect depth is assumed for cameras of exact (front); rolling (front)"
     scans = "Scan periods differ: exact at once, stereo at once, rolling 0.03 s. Motion during the scan"
-    page = page_html(result.page).partition('<script type="application/json"')[0]
+    page = render_page(result.page).partition('<script type="application/json"')[0]
     for words in (depth, scans):
         assert any(words in note for note in result.record["notes"])
         assert words in " ".join(str(result).split())

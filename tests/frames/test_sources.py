@@ -112,7 +112,7 @@ def test_another_format_is_a_class_and_a_line(tmp_path, monkeypatch):
             super().__init__(path.with_suffix(""))
 
         @classmethod
-        def recognises(cls, path):
+        def can_read(cls, path):
             return path.suffix == ".one"
 
     monkeypatch.setitem(FORMATS, "one", Single)

@@ -27,25 +27,25 @@ class Surface:
     def __init__(
         self,
         seed=0,
-        worlds=6,
-        per_world=3,
+        num_scenes=6,
+        frames_per_scene=3,
         worth=near_far,
         noise=0.002,
         objectives=NEAR,
         blind=False,
-        estimate="area",
+        average="area",
     ):
         draws = np.random.default_rng([seed, 99])
         self.seed, self.worth, self.noise, self.blind = seed, worth, noise, blind
-        self.objectives, self.estimate = dict(objectives), estimate
-        self.world_of = np.repeat(np.arange(worlds), per_world)
-        self.level = draws.normal(0.0, 0.1, (len(self.world_of), QUESTIONS))
-        self.tilt = draws.normal(0.0, noise, (len(self.world_of), QUESTIONS, 2))
+        self.objectives, self.average = dict(objectives), average
+        self.scene_ids = np.repeat(np.arange(num_scenes), frames_per_scene)
+        self.level = draws.normal(0.0, 0.1, (len(self.scene_ids), QUESTIONS))
+        self.tilt = draws.normal(0.0, noise, (len(self.scene_ids), QUESTIONS, 2))
         self.scored, self.closed = [], False
         self.scenarios = (Scenario.load("courtyard"),)
 
     def __len__(self):
-        return len(self.world_of)
+        return len(self.scene_ids)
 
     def _estimate(self, rig):
         mount = rig.sensors[0].mount
@@ -53,7 +53,7 @@ class Surface:
         share = self.worth(rig)[None] + self.level + offset
         share = np.where(self.blind, np.nan, share)
         share = share[:, np.arange(len(self.objectives)) % QUESTIONS]  # what nobody asked for is near or far, too
-        found = estimate_of(share, self.world_of)
+        found = estimate_of(share, self.scene_ids)
         named = [one._replace(key=name) for one, name in zip(found.quantities, self.objectives, strict=True)]
         return type(found)(tuple(named), found.value, found.left_out, found.steps)
 
@@ -61,8 +61,10 @@ class Surface:
         self.scored.append(rig.name)
         return Score(self._estimate(rig), max(0.0, rig.sensors[0].mount.pitch_deg) / 100)
 
-    def resampled(self, seed, worlds, more):
-        return Surface(seed, worlds, 3, self.worth, self.noise, {**self.objectives, **more}, estimate=self.estimate)
+    def resample(self, seed, num_scenes, extra_objectives):
+        return Surface(
+            seed, num_scenes, 3, self.worth, self.noise, {**self.objectives, **extra_objectives}, average=self.average
+        )
 
     def close(self):
         self.closed = True
@@ -85,7 +87,7 @@ def plan(**settings):
     worth = settings.pop("worth", near_far)
     blind = settings.pop("blind", False)
     makes = lambda space, plan, seed, worlds: Surface(  # noqa: E731
-        seed, worlds, plan.per_world, worth, objectives=space.numbers, blind=blind, estimate=plan.estimate
+        seed, worlds, plan.per_world, worth, objectives=space.numbers, blind=blind, average=plan.estimate
     )
     budget = {} if "budget_s" in settings else {"evaluations": 20}
     return SearchPlan(**{**budget, "make_frames": makes, **settings})

@@ -11,7 +11,7 @@ import torch
 from tests.placement.worlds import BAY, FLOOR, LOT, OBJECTIVES, WALL, held, lidar, rig, yard
 from torchcover.evaluation import evaluate
 from torchcover.placement import Objective
-from torchcover.placement.common_frames import HeldFrames
+from torchcover.placement.common_frames import CachedFrames
 from torchcover.placement.queries import Queries
 from torchcover.simulation import RegionsOfInterest, Scenario, SimulatedFrames, Simulator, SurfaceReference
 
@@ -46,19 +46,19 @@ def test_another_rig_sees_what_it_would_see_in_frames_of_its_own(scenario):
 def test_ideal_sensors_have_a_point_for_every_hit():
     short = rig(lidar(range_at_10_percent_m=5.0))
     ideal, real = held(worlds=1, sensor_model="ideal"), held(worlds=1)
-    points = [[len(frame.sensor) for frame in of.frames(short)] for of in (ideal, real)]
-    assert points[0] == [len(frame.sensor) for frame in real.frames(rig(name=short.name))]
+    points = [[len(frame.sensor) for frame in of.iterate_frames(short)] for of in (ideal, real)]
+    assert points[0] == [len(frame.sensor) for frame in real.iterate_frames(rig(name=short.name))]
     assert points[1][0] < points[0][0]
-    assert ideal.resampled(1, 1, {}).sensor_model == "ideal"
+    assert ideal.resample(1, 1, {}).sensor_model == "ideal"
 
 
 def test_rays_that_change_no_objective_are_not_cast_and_change_none(monkeypatch):
-    near = {"near": Objective(detection=0.2, band="ground", region={"ahead": {"x_m": (3, 8), "y_m": (-2, 2)}})}
+    near = {"near": Objective(threshold_m=0.2, band="ground", region={"ahead": {"x_m": (3, 8), "y_m": (-2, 2)}})}
     some = held(objectives=near, worlds=1, rays=200)
     monkeypatch.setattr(Queries, "within_m", None)
     every = held(objectives=near, worlds=1, rays=200)
     same(every.score(TWO), some.score(TWO))
-    assert len(next(some.frames(TWO)).sensor) < 0.7 * len(next(every.frames(TWO)).sensor)
+    assert len(next(some.iterate_frames(TWO)).sensor) < 0.7 * len(next(every.iterate_frames(TWO)).sensor)
 
 
 def test_numbers_are_those_of_evaluate_on_the_same_frames_to_the_last_bit():
@@ -68,11 +68,11 @@ def test_numbers_are_those_of_evaluate_on_the_same_frames_to_the_last_bit():
     frames = SimulatedFrames(
         found._worlds[0],
         TWO,
-        steps=max(index.step for index in found.indices) + 1,
+        steps=max(index.frame_index for index in found.indices) + 1,
         every_s=0.4,
-        reference_sensor=found.queries.reference_sensor(1024),
+        reference_sensor=found.queries.build_reference_sensor(1024),
     )
-    steps = [index.step for index in found.indices]
+    steps = [index.frame_index for index in found.indices]
     assert len(steps) == 8
 
     class InOrder(SimulatedFrames):
@@ -92,7 +92,7 @@ def test_numbers_are_those_of_evaluate_on_the_same_frames_to_the_last_bit():
             rows = {(row.region, row.height): row for row in result.coverage.summary()}
             numbers = [
                 (rows[place].numbers if measure == "area" else rows[place].known)[objective.key]
-                for place in objective.places
+                for place in objective.region_bands
             ]
             values = torch.tensor([number.value for number in numbers], dtype=torch.float64)
             assert own.value[column] == values.mean()
@@ -114,13 +114,13 @@ def test_it_makes_no_difference_who_holds_the_worlds(frames, workers):
 
 def test_a_world_stays_with_the_process_that_has_built_it(monkeypatch, tmp_path):
     """The k-th batch of a DataLoader is for its k-th worker."""
-    built = HeldFrames._build
+    built = CachedFrames._build
 
     def noted(self, index, number):
         (tmp_path / f"{index.world} {number} {os.getpid()}").touch()
         return built(self, index, number)
 
-    monkeypatch.setattr(HeldFrames, "_build", noted)
+    monkeypatch.setattr(CachedFrames, "_build", noted)
     with held(workers=2, worlds=4) as elsewhere:
         for _ in range(2):
             elsewhere.score(rig())
@@ -146,7 +146,7 @@ def test_what_some_worlds_do_not_show_is_about_the_others():
     obstacles = {"ahead": Objective(region="20m", band="obstacle"), "ground": Objective(region="20m", band="ground")}
     scenarios = [yard(WALL), yard(name="empty"), LOT]
     found = held(scenarios, obstacles, worlds=1, per_world=1)
-    assert [index.world for index in found.indices] == [0, 1, 2]
+    assert [index.scene_id for index in found.indices] == [0, 1, 2]
     estimate = found.score(rig()).estimate
     assert torch.isfinite(estimate.left_out).all()
     assert estimate.left_out[1, 0] == estimate.value[0]  # the empty one has no obstacle
@@ -156,8 +156,10 @@ def test_what_some_worlds_do_not_show_is_about_the_others():
 
 def test_a_world_without_traffic_shows_each_instant_once():
     found = held([yard(WALL)], per_world=4)
-    assert [index.world for index in found.indices] == [0] * 4
-    assert len({float(frame.reference_weights.sum()) for frame in found.frames()}) == 4  # draws of the reference
+    assert [index.scene_id for index in found.indices] == [0] * 4
+    assert (
+        len({float(frame.reference_weights.sum()) for frame in found.iterate_frames()}) == 4
+    )  # draws of the reference
 
 
 @pytest.mark.parametrize(
@@ -230,6 +232,6 @@ def test_threads_make_no_difference(frames):
 
 def test_a_recording_is_one_world_for_any_seed_and_none_of_it_is_fresh():
     with held(["tracks_table"], {"near": Objective(region="20m", band="ground")}, worlds=3, every_s=0.5) as recorded:
-        assert [index.world for index in recorded.indices] == [0, 0]
+        assert [index.scene_id for index in recorded.indices] == [0, 0]
         with pytest.raises(ValueError, match="one whose worlds are drawn is needed; 'tracks_table' is the same"):
-            recorded.resampled(9, 3, {})
+            recorded.resample(9, 3, {})

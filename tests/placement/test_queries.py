@@ -10,7 +10,7 @@ from torchcover.estimation import Estimate
 from torchcover.evaluation import CoverageObserver
 from torchcover.placement import Objective
 from torchcover.placement.queries import Queries
-from torchcover.placement.search import measure_gains
+from torchcover.placement.search import compute_improvements
 
 OUTLINE_M = np.array([[-2.0, -1.0], [2.0, -1.0], [2.0, 1.0], [-2.0, 1.0]])
 LANE = {"lane": {"x_m": [-7.3, -2.0], "y_m": [-1.2, 1.6]}}
@@ -19,7 +19,9 @@ TWO = rig(lidar(), lidar("low", mount={"x_m": 2.2, "z_m": 0.6}), name="two")
 
 def test_the_points_that_are_kept_are_those_in_the_regions_and_in_their_cells():
     near = Objective(region="20m", band="obstacle"), Objective(region="20m")
-    asked = Queries.around(OUTLINE_M, {"a": near[0], "b": Objective(region=LANE, detection=0.1), "c": near[1]})
+    asked = Queries.from_objectives(
+        OUTLINE_M, {"a": near[0], "b": Objective(region=LANE, threshold_m=0.1), "c": near[1]}
+    )
     assert asked.thresholds_m == (0.1, 0.4)
     assert asked.max_radius_m == 0.4
     # Cells of half a metre that the lane touches.
@@ -29,7 +31,7 @@ def test_the_points_that_are_kept_are_those_in_the_regions_and_in_their_cells():
     points = generator.uniform([-50, -45, -1], [30, 45, 3], (40_000, 3)).astype(np.float32)
     # Bands are over the ground, which is 5 m below the vehicle there.
     height = torch.from_numpy(points[:, 2].copy())
-    kept = asked.contains(torch.from_numpy(points - np.float32([0, 0, 5])), height).numpy()
+    kept = asked.mask_points(torch.from_numpy(points - np.float32([0, 0, 5])), height).numpy()
     # The lane, and the cells whose centres lie in it.
     lane = [((-7.3, -2.0), (-1.2, 1.6), (-0.5, 2)), ((-7.5, -2.0), (-1.0, 1.5), (-0.5, 2))]
     boxes = [((0, 20), (-5, 5), (-0.5, 2)), *lane]
@@ -91,7 +93,7 @@ def test_an_objective_is_any_number_of_a_result_and_knows_its_direction(several)
     low = several.score(rig(lidar("low"))).estimate.value.tolist()
     assert low[3] == low[0]
     # Fewer metres and more detection are both a gain of the second sensor.
-    gain, error = measure_gains(two, one)
+    gain, error = compute_improvements(two, one)
     assert (gain > 0).all()
     assert (error[[0, 1]] > 0).all()
 
@@ -126,8 +128,8 @@ def test_numbers_that_are_by_no_choice_of_estimate_are_the_same_by_both():
             held(objectives=asked, estimate=one).score(TWO).estimate.value for one in ("area", "known")
         )
         for objective, area, cells in zip(asked.values(), by_area, by_cells, strict=True):
-            assert (area == cells) == (objective.own_estimate != ""), objective.key
-    assert alone["known"].own_estimate == "known"
+            assert (area == cells) == (objective.fixed_average != ""), objective.key
+    assert alone["known"].fixed_average == "known"
 
 
 def test_what_the_second_sensor_loses_without_a_block_is_known_too(several):
@@ -152,7 +154,7 @@ def test_what_the_second_sensor_loses_without_a_block_is_known_too(several):
     ],
 )
 def test_a_number_that_no_result_has_is_refused_with_the_nearest(given, near):
-    asked = Queries.around(OUTLINE_M, {"odd": Objective(number=given, region="20m")})
+    asked = Queries.from_objectives(OUTLINE_M, {"odd": Objective(number=given, region="20m")})
     with pytest.raises(ValueError, match=f"objective 'odd': no result has a number '{given}'; near is '{near}'"):
         asked.check(TWO)
 

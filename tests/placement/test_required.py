@@ -40,7 +40,14 @@ def searched(lot, out=None, *, objectives=None, resume=False, evaluations=8, **c
         "name": "nose", "start": LEVEL, "scenario": lot,
         "free": {"top": {"pitch_deg": (0.0, 30.0)}}, "objectives": objectives or {"child": child()}, **changes,
     }  # fmt: skip
-    plan = SearchPlan(evaluations=evaluations, worlds=3, per_world=2, every_s=0.4, fresh_worlds=2, rays=512)
+    plan = SearchPlan(
+        num_evaluations=evaluations,
+        num_scenes=3,
+        frames_per_scene=2,
+        frame_interval_s=0.4,
+        num_held_out_scenes=2,
+        rays=512,
+    )
     return run_search(PlacementSearch(SearchSpace.model_validate(content), plan), out, resume=resume)
 
 
@@ -84,10 +91,15 @@ def test_a_search_finds_where_the_child_is_seen_and_resumed_it_finds_the_same(lo
     assert values[0] == values[1]
     start, best = (one.estimate.value[0] for one in (found.search.evaluations[0], found.best.evaluation))
     assert (start, best) == (0.0, 0.75)
-    assert found.sentence.startswith("child: gained +75.0 points in any world, optimism +0.00. ")
-    (gain,) = found.best.gains
-    assert (gain.estimate, gain.test.p, gain.test.error, gain.test.significant) == ("-", 0.0, 0.0, True)
-    assert gain.test.value == gain.search_gain == best - start
+    assert found.summary.startswith("child: gained +75.0 points in any world, optimism +0.00. ")
+    (gain,) = found.best.improvements
+    assert (gain.average, gain.difference.p, gain.difference.error, gain.difference.significant) == (
+        "-",
+        0.0,
+        0.0,
+        True,
+    )
+    assert gain.difference.value == gain.search_improvement == best - start
     resumed.save(tmp_path)
     record = json.loads((tmp_path / "search.json").read_text())["found"][0]
     assert record["gains"]["child"]["-"]["p"] == 0.0
@@ -98,19 +110,19 @@ def test_what_must_not_be_worse_for_a_child_is_kept_and_changes_by_no_chance(lot
     level = {"requires": {"target": "adult", "at": {"points_m": [[20.0, 0.0]]}, "points": 1}}
     objectives = {"near": {"region": ("front_3m", "20m"), "band": "ground"}}
     free, kept = (searched(lot, objectives=objectives, evaluations=16, not_worse=worse) for worse in ((), (level,)))
-    (name,) = kept.search.space.numbers.keys() - {"near"}
+    (name,) = kept.search.space.scored_objectives.keys() - {"near"}
     assert kept.search.evaluations[0].estimate.value.tolist()[1] == 1.0
     assert free.best.evaluation.values["top.pitch_deg"] > 8 > kept.best.evaluation.values["top.pitch_deg"]
-    (row,) = (one for one in kept.test.changes if one.what == name)
-    assert (row.p, row.test.value, row.test.error) == (1.0, 0.0, 0.0)
+    (row,) = (one for one in kept.test.side_effects if one.name == name)
+    assert (row.p_value, row.difference.value, row.difference.error) == (1.0, 0.0, 0.0)
 
 
 def test_where_nothing_is_ever_seen_nothing_is_unknown(lot, tmp_path):
     never = child(points=10**6)
     found = searched(lot, objectives={"near": {"region": "20m"}, "never": never}, evaluations=6)
-    assert not np.isnan(found.gains).any()
-    assert (found.gains[:, 1] == 0).all()
-    assert "never: no gain is shown: 0 points in any world" in found.sentence
+    assert not np.isnan(found.improvements).any()
+    assert (found.improvements[:, 1] == 0).all()
+    assert "never: no gain is shown: 0 points in any world" in found.summary
     alone = searched(lot, objectives={"never": never}, evaluations=6)
     assert alone.best.is_start
     alone.save(tmp_path)

@@ -14,7 +14,7 @@ from torchcover.placement import OptimizerParams, PlacementSearch, SearchPlan, S
 from torchcover.placement.running import JOURNAL
 from torchcover.simulation import Rig
 
-RANDOM_ONLY = OptimizerParams(startup=0, control_every=1)
+RANDOM_ONLY = OptimizerParams(num_startup_candidates=0, random_interval=1)
 
 
 def searched(out=None, *, of=None, resume=False, **settings):
@@ -47,7 +47,7 @@ def test_the_start_comes_first_and_random_candidates_are_a_control_of_the_optimi
     assert [each.number for each in evaluations] == list(range(25))
     strategies = [each.strategy for each in evaluations]
     assert strategies[:7] == ["start", *["random"] * 6]
-    assert result.counts == {"optimizer": 12, "random": 12}
+    assert result.strategy_counts == {"optimizer": 12, "random": 12}
     assert result.search.frames.closed
     assert len(set(map(str, (each.values for each in evaluations)))) == 25
 
@@ -65,15 +65,17 @@ def test_the_optimizer_is_better_than_random_candidates_and_so_it_is_on_held_out
     result, random = searched(evaluations=20, seed=seed), searched(evaluations=20, seed=seed, optimizer=RANDOM_ONLY)
     best, control = result.finalists
     assert abs(best.evaluation.values["roof.pitch_deg"] - 4) < 1.5
-    (gain,) = best.gains
-    assert gain.estimate == "area"
-    assert gain.t > 4
-    assert gain.test.blocks == 16
-    assert gain.optimism == gain.search_gain - gain.test.gain
-    assert gain.search_gain >= max(control.gains[0].search_gain, np.nanmax(random.search.gains))
-    assert result.sentence.startswith("near: gained ")
-    assert "The best of 10 random candidates: near: gained" in result.sentence
-    assert random.counts == {"optimizer": 0, "random": 20}
+    (gain,) = best.improvements
+    assert gain.average == "area"
+    assert gain.t_statistic > 4
+    assert gain.difference.blocks == 16
+    assert gain.optimism == gain.search_improvement - gain.difference.gain
+    assert gain.search_improvement >= max(
+        control.improvements[0].search_improvement, np.nanmax(random.search.improvements)
+    )
+    assert result.summary.startswith("near: gained ")
+    assert "The best of 10 random candidates: near: gained" in result.summary
+    assert random.strategy_counts == {"optimizer": 0, "random": 20}
 
 
 def test_what_must_not_be_worse_is_kept():
@@ -84,14 +86,14 @@ def test_what_must_not_be_worse_is_kept():
     search = kept.search
     start, best = search.evaluations[0].estimate.value, kept.best.evaluation.estimate.value
     assert (best >= start).all()
-    assert [gain.objective for gain in kept.best.gains] == ["near", "not worse: 80m"]
+    assert [gain.objective for gain in kept.best.improvements] == ["near", "not worse: 80m"]
     for each in search.evaluations:
-        assert bool(search.shortfalls(each)) == bool(each.estimate.value[1] < start[1] - 1e-9)
+        assert bool(search.find_shortfalls(each)) == bool(each.estimate.value[1] < start[1] - 1e-9)
     keeps = {name: [] for name in ("start", "random", "optimizer")}
     for each in search.evaluations:
-        keeps[each.strategy].append(not search.shortfalls(each))
+        keeps[each.strategy].append(not search.find_shortfalls(each))
     assert np.mean(keeps["optimizer"]) > np.mean(keeps["random"])
-    assert "No candidate keeps" not in kept.sentence
+    assert "No candidate keeps" not in kept.summary
 
 
 def required(*bounds, **target):
@@ -104,14 +106,14 @@ def test_what_no_candidate_keeps_ends_with_the_least_shortfall():
     """The second number of a surface likes the nose up, and is 0.4 at most."""
     result = searched(of=space(requirements=required({"least": 0.5})), evaluations=24)
     search = result.search
-    missing = [sum(search.shortfalls(each).values()) for each in search.evaluations]
+    missing = [sum(search.find_shortfalls(each).values()) for each in search.evaluations]
     best = missing[result.best.evaluation.number]
     assert missing[0] > best == min(missing) > 0
     assert result.best.evaluation.values["roof.pitch_deg"] < -1
-    (name,) = search.shortfalls(result.best.evaluation)
+    (name,) = search.find_shortfalls(result.best.evaluation)
     assert name == "required: 20m, ground, detection_0.4m >= 0.5"
-    assert f"keeps all that must be kept; this one misses the least: {best:.2%} of {name}." in result.sentence
-    assert f"{best:.2%} of {name}" in [row[-1] for row in result.report.rows["evaluations.csv"]]
+    assert f"keeps all that must be kept; this one misses the least: {best:.2%} of {name}." in result.summary
+    assert f"{best:.2%} of {name}" in [row[-1] for row in result.report.csv_tables["evaluations.csv"]]
 
 
 def needing(pitch_deg):
@@ -165,8 +167,8 @@ def test_numbers_that_ended_on_their_bounds_are_named():
         return np.full(2, 0.5 + 0.1 * mount.x_m - 1e-3 * (mount.pitch_deg - 3) ** 2)
 
     result = searched(evaluations=20, worth=only_x)
-    assert "On the bounds of their ranges ended roof.x_m (0.8):" in result.sentence
-    assert "ended roof.pitch" not in result.sentence
+    assert "On the bounds of their ranges ended roof.x_m (0.8):" in result.summary
+    assert "ended roof.pitch" not in result.summary
 
 
 @pytest.mark.parametrize("objectives", [("near",), ("near", "far")])
@@ -309,10 +311,10 @@ def only_the_start(rig):
 
 def test_where_no_candidate_is_possible_the_start_stays_and_the_words_say_so():
     result = searched(evaluations=8, worth=only_the_start)
-    assert [each.infeasible for each in result.search.evaluations] == ["", *["inside the wall"] * 8]
+    assert [each.infeasible_reason for each in result.search.evaluations] == ["", *["inside the wall"] * 8]
     assert result.best.is_start
     assert result.rig == result.search.space.start
-    assert result.sentence == "None of 8 candidates is possible, the last for this reason: inside the wall."
+    assert result.summary == "None of 8 candidates is possible, the last for this reason: inside the wall."
 
 
 def test_impossible_rigs_are_avoided_after_some_of_them():
@@ -325,8 +327,8 @@ def test_impossible_rigs_are_avoided_after_some_of_them():
 
     search = searched(evaluations=24, worth=worth).search
     modeled = [each for each in search.evaluations if each.strategy == "optimizer"]
-    assert np.mean([not each.infeasible for each in modeled[-6:]]) > 0.5
-    assert 0 <= search.evaluations[search.best_of()[0]].values["roof.x_m"] < 0.15
+    assert np.mean([not each.infeasible_reason for each in modeled[-6:]]) > 0.5
+    assert 0 <= search.evaluations[search.find_best()[0]].values["roof.x_m"] < 0.15
 
 
 def tilted():
@@ -339,21 +341,21 @@ def tilted():
 
 def test_a_start_that_is_impossible_is_compared_with_but_does_not_win():
     with pytest.warns(UserWarning, match="'tilted' is none of the space"):
-        of = space(constraints={"max_self_hits": 0.2}, start=tilted())
+        of = space(constraints={"max_self_hit_share": 0.2}, start=tilted())
     result = searched(of=of, evaluations=12)
     start = result.search.evaluations[0]
-    assert start.infeasible == "30.0% of its rays end on the vehicle; max_self_hits is 20.0%"
+    assert start.infeasible_reason == "30.0% of its rays end on the vehicle; max_self_hit_share is 20.0%"
     assert not result.best.is_start
     assert result.best.evaluation.values["roof.pitch_deg"] <= 20
 
 
 def test_too_many_rays_on_the_vehicle_are_infeasible():
-    search = searched(of=space(constraints={"max_self_hits": 0.05}), evaluations=12).search
-    refused = [each for each in search.evaluations if each.infeasible]
+    search = searched(of=space(constraints={"max_self_hit_share": 0.05}), evaluations=12).search
+    refused = [each for each in search.evaluations if each.infeasible_reason]
     assert {each.number for each in refused} == {
         each.number for each in search.evaluations if each.values["roof.pitch_deg"] > 5
     }
-    assert "of its rays end on the vehicle; max_self_hits is 5.0%" in refused[0].infeasible
+    assert "of its rays end on the vehicle; max_self_hit_share is 5.0%" in refused[0].infeasible_reason
 
 
 def test_an_objective_that_is_unknown_is_refused():
@@ -363,22 +365,22 @@ def test_an_objective_that_is_unknown_is_refused():
 
 def test_noise_alone_and_one_world_are_not_called_a_gain():
     result = searched(evaluations=12, worth=lambda rig: np.array([0.5, 0.5]), seed=4)
-    assert "gained" not in result.sentence
-    assert result.best.gains[0].test.significant is False
-    assert result.best.gains[0].optimism > 0
-    assert "no gain is shown" in searched(evaluations=6, worlds=1, fresh_worlds=1).sentence
+    assert "gained" not in result.summary
+    assert result.best.improvements[0].difference.significant is False
+    assert result.best.improvements[0].optimism > 0
+    assert "no gain is shown" in searched(evaluations=6, worlds=1, fresh_worlds=1).summary
 
 
 def test_of_several_objectives_the_ends_of_the_front_and_a_compromise_are_tested():
     result = searched(of=space(objectives=("near", "far")), evaluations=24)
     assert [each.role for each in result.finalists] == ["compromise", "near", "far"]
-    gains = {each.role: result.gains[each.evaluation.number] for each in result.finalists}
-    assert gains["near"][0] == result.gains[:, 0].max()
-    assert gains["far"][1] == result.gains[:, 1].max()
-    front = result.search.best_of()
+    gains = {each.role: result.improvements[each.evaluation.number] for each in result.finalists}
+    assert gains["near"][0] == result.improvements[:, 0].max()
+    assert gains["far"][1] == result.improvements[:, 1].max()
+    front = result.search.find_best()
     pitches = [result.search.evaluations[at].values["roof.pitch_deg"] for at in front]
     assert min(pitches) < 0 < max(pitches)
-    assert f"Of the front's {len(front)} rigs, " in result.sentence
+    assert f"Of the front's {len(front)} rigs, " in result.summary
 
 
 def test_asking_and_telling_is_what_a_run_does():
@@ -390,7 +392,7 @@ def test_asking_and_telling_is_what_a_run_does():
     search = PlacementSearch(space(), plan(evaluations=2))
     start = search.ask()
     with pytest.raises(ValueError, match="the start, front_roof_32, cannot be scored: no"):
-        search.refuse(start, "no")
+        search.reject(start, "no")
     search.tell(start, search.frames.score(start.rig))
     with pytest.raises(ValueError, match="candidate 1 is to be told next; got candidate 0"):
         search.tell(start, search.frames.score(start.rig))
@@ -420,5 +422,5 @@ def test_a_real_search_does_not_depend_on_the_number_of_workers(tmp_path):
     small = {"worlds": 3, "fresh_worlds": 3, "per_world": 2, "every_s": 0.4, "rays": 512}
     results = [run_search(PlacementSearch(of, evaluations=3, workers=workers, **small)) for workers in (0, 1)]
     assert contents(results[0].search) == contents(results[1].search)
-    assert results[0].sentence == results[1].sentence
+    assert results[0].summary == results[1].summary
     assert 0 < results[0].search.evaluations[0].estimate.value[0] < 1

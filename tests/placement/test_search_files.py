@@ -12,8 +12,8 @@ from torchcover.coverage.quantity import RADIUS, detection
 from torchcover.estimation import Difference
 from torchcover.placement import PlacementSearch, run_search
 from torchcover.placement.running import JOURNAL
-from torchcover.placement.validation import HeldOutGain, describe_gain
-from torchcover.report.page.drawings import words_html
+from torchcover.placement.validation import HeldOutImprovement, describe_improvement
+from torchcover.report.page.drawings import render_text_html
 from torchcover.simulation import Rig
 
 
@@ -75,7 +75,7 @@ def test_the_record_has_seeds_gains_and_counts(one):
     assert record["band_frame"] == "ground"
     assert (record["seed"], record["test_seed"]) == (0, 1)
     gain = record["found"][0]["gains"]["near"]["area"]
-    assert gain["optimism"] == pytest.approx(gain["search_gain"] - gain["gain"])
+    assert gain["optimism"] == pytest.approx(gain["search_improvement"] - gain["gain"])
     assert record["candidates"] == result.counts
 
 
@@ -83,8 +83,8 @@ def test_the_page_shows_the_gains_the_rigs_and_the_pictures(one):
     result, folder, _ = one
     page = (folder / "report.html").read_text()
     first, *others = re.split(r"(?<=[.]) (?=[A-Z])", result.sentence)
-    assert f'<p class="verdict">{words_html(first)}</p>' in page
-    assert all(f"<li>{words_html(words)}</li>" in page for words in others)
+    assert f'<p class="verdict">{render_text_html(first)}</p>' in page
+    assert all(f"<li>{render_text_html(words)}</li>" in page for words in others)
     assert page.count("data:image/png;base64,") == 1
     assert "start: front_roof_32" in page
     assert "best: roof_best" in page
@@ -95,7 +95,7 @@ def test_of_several_objectives_there_are_rigs_of_the_ends_and_a_front(tmp_path):
     result = run_search(PlacementSearch(space(objectives=("near", "far")), plan(evaluations=16)))
     names = {path.name for path in result.save(tmp_path)}
     assert names >= {"best.yaml", "best_near.yaml", "best_far.yaml", "pareto.png"}
-    assert [int(row["number"]) for row in rows(tmp_path / "pareto.csv")] == result.search.best_of()
+    assert [int(row["number"]) for row in rows(tmp_path / "pareto.csv")] == result.search.find_best()
 
 
 def test_where_nothing_can_be_there_are_files_all_the_same(tmp_path):
@@ -116,7 +116,9 @@ DETECTION = detection(0.4)
 
 def gain(mean, error, significant, worlds=16, quantity=DETECTION):
     ends = mean - 2 * error, mean + 2 * error
-    return HeldOutGain("near", "area", Difference(quantity, mean, error, *ends, significant, 0.1, worlds, 9), 0.04)
+    return HeldOutImprovement(
+        "near", "area", Difference(quantity, mean, error, *ends, significant, 0.1, worlds, 9), 0.04
+    )
 
 
 @pytest.mark.parametrize(
@@ -141,9 +143,9 @@ def gain(mean, error, significant, worlds=16, quantity=DETECTION):
     ],
 )
 def test_only_what_is_told_from_chance_is_called_a_gain(found, words):
-    assert describe_gain(found) == words
+    assert describe_improvement(found) == words
     if np.isfinite(found.test.value):
-        assert describe_gain(found, optimism=True).startswith(f"{words}, optimism ")
+        assert describe_improvement(found, optimism=True).startswith(f"{words}, optimism ")
 
 
 def test_a_number_that_is_by_no_choice_of_estimate_has_one_row(tmp_path):
@@ -159,7 +161,7 @@ def test_a_number_that_is_by_no_choice_of_estimate_has_one_row(tmp_path):
             "near": ["known"],
             "largest": ["-"],
         }
-    assert result.sentence.count("near: ") == result.sentence.count("largest: ") == 1
+    assert result.summary.count("near: ") == result.summary.count("largest: ") == 1
     said = [tuple(cell.text for cell in row[:3]) for row in result.report.tables[0].rows]
     assert len(said) == len(set(said))
     assert {each[1:] for each in said} == {

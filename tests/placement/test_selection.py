@@ -10,8 +10,8 @@ import yaml
 
 from tests.placement.worlds import BAY, EGO, FLOOR, LOT, WALL, held, lidar, rig
 from torchcover import Rig
-from torchcover.placement import ChoiceSpace, Objective, choose
-from torchcover.placement.selection import observe_points, point_weights
+from torchcover.placement import Objective, SelectionSpace, run_selection
+from torchcover.placement.selection import compute_point_weights, observe_points
 
 SENSOR = {"type": "lidar", "channels": 16, "vertical_fov_deg": [-40, 2], "columns": 91, "horizontal_fov_deg": 180,
           "max_range_m": 60}  # fmt: skip
@@ -25,7 +25,7 @@ SPACE = {
     "name": "ends",
     "scenario": "lot.yaml",
     "candidates": {"wide": {"sensor": SENSOR, "places": PLACES}},
-    "choose": {"at_most": 2},
+    "choose": {"max_sensors": 2},
     "objectives": {"around": {"band": "ground", "region": ["front_3m", "rear_3m"]}},
 }
 
@@ -41,10 +41,10 @@ def folder(tmp_path_factory):
 def loaded(folder, **changes):
     path = folder / "space.yaml"
     path.write_text(yaml.safe_dump({**SPACE, **changes}))
-    return ChoiceSpace.load(path)
+    return SelectionSpace.load(path)
 
 
-CHOSEN_BY = [Objective(detection=0.3, region=["80m", "20m"]), Objective(region=BAY, band="ground")]
+CHOSEN_BY = [Objective(threshold_m=0.3, region=["80m", "20m"]), Objective(region=BAY, band="ground")]
 
 
 @pytest.mark.parametrize("measure", ["area", "known"])
@@ -57,7 +57,7 @@ def test_what_points_are_worth_is_what_evaluate_says_of_the_rig(objective, measu
         lidar("c"),
     ]
     with held(objectives={"a": objective}, estimate=measure) as instants:
-        worth = point_weights(instants)
+        worth = compute_point_weights(instants)
         assert worth.sum() == pytest.approx(1.0, rel=1e-12)
         seen = [observe_points(rig(sensor), instants)[0] for sensor in sensors]
         for each in ([0], [1, 2], [0, 1, 2]):
@@ -73,34 +73,36 @@ def test_worlds_that_know_nothing_of_a_part_count_for_nothing(measure):
     asked = {"a": Objective(region="20m", band="obstacle")}
     with held(scenarios, asked, per_world=1, every_s=0.1, estimate=measure) as two:
         value = float(two.score(rig()).estimate.value[0])
-        assert point_weights(two)[0] @ observe_points(rig(), two)[0] == pytest.approx(value, rel=1e-12)
+        assert compute_point_weights(two)[0] @ observe_points(rig(), two)[0] == pytest.approx(value, rel=1e-12)
     with (
         held(scenarios[:1], asked, per_world=1, every_s=0.1) as one,
         pytest.raises(ValueError, match="no frame shows any surface of obstacle in 20m"),
     ):
-        point_weights(one)
+        compute_point_weights(one)
 
 
 def test_the_choice_is_the_rig_with_the_best_score_and_its_files_say_so(folder):
     space = loaded(folder, now=["wide_left"])
-    with held(space.scenarios, space.numbers, worlds=2) as instants:
-        found = choose(space, instants, test_seed=5, fresh_worlds=3)
+    with held(space.scenarios, space.scored_objectives, worlds=2) as instants:
+        found = run_selection(space, instants, test_seed=5, num_held_out_scenes=3)
         pairs = [("front", "rear"), ("front", "left"), ("rear", "left")]
         named = {sensor.name: sensor for sensor in space.sensors}
         scores = {
-            pair: float(instants.score(space.rig(tuple(named[f"wide_{one}"] for one in pair), "x")).estimate.value[0])
+            pair: float(
+                instants.score(space.build_rig(tuple(named[f"wide_{one}"] for one in pair), "x")).estimate.value[0]
+            )
             for pair in pairs
         }
     best = max(scores, key=lambda pair: scores[pair])
-    assert set(found.names(found.best.selected)) == {f"wide_{one}" for one in best}
+    assert set(found.get_sensor_names(found.best.selected)) == {f"wide_{one}" for one in best}
     assert found.best.values[0] == pytest.approx(scores[best], rel=1e-12)
     assert found.numbers["around"].value == scores[best]
-    assert f"{100 * found.numbers['around'].value:.2f} %" in found.sentence
+    assert f"{100 * found.numbers['around'].value:.2f} %" in found.summary
     assert found.best.is_proven
-    assert list(found.refused) == ["wide_inside"]
-    assert found.gains[0].test.blocks == 3
-    assert found.gains[0].search_gain == pytest.approx(
-        found.best.values[0] - found.coverage.values(found.now)[0], rel=1e-6
+    assert list(found.excluded) == ["wide_inside"]
+    assert found.improvements[0].difference.blocks == 3
+    assert found.improvements[0].search_improvement == pytest.approx(
+        found.best.values[0] - found.coverage.compute_values(found.baseline)[0], rel=1e-6
     )
     written = {path.name for path in found.save(folder / "out")}
     assert written == {
@@ -108,55 +110,61 @@ def test_the_choice_is_the_rig_with_the_best_score_and_its_files_say_so(folder):
     }  # fmt: skip
     assert Rig.load(folder / "out" / "best.yaml").sensors == found.rig.sensors
     rows = list(csv.DictReader((folder / "out" / "candidates.csv").read_text().splitlines()))
-    assert [row["name"] for row in rows if row["chosen"] == "True"] == sorted(found.names(found.best.selected))
+    assert [row["name"] for row in rows if row["chosen"] == "True"] == sorted(
+        found.get_sensor_names(found.best.selected)
+    )
     assert "inside" in rows[-1]["why_not"]
     assert found.to_dataframe()["name"].tolist() == [row["name"] for row in rows]
-    assert found.sentence in repr(found)
+    assert found.summary in repr(found)
     assert json.loads((folder / "out" / "search.json").read_text())["found"][0]["proven"] is True
 
 
 def test_what_must_not_be_worse_is_kept_by_the_best_of_several_objectives(folder):
     objectives = {side: {"band": "ground", "region": f"{side}_3m", "detection": 0.3} for side in ("front", "rear")}
     space = loaded(folder, objectives=objectives, now=["wide_left"], not_worse=["left_3m"])
-    with held(space.scenarios, space.numbers, worlds=2) as instants:
-        found = choose(space, instants, test_seed=5, fresh_worlds=3)
-        kept = found.coverage.values(found.now)[2]
+    with held(space.scenarios, space.scored_objectives, worlds=2) as instants:
+        found = run_selection(space, instants, test_seed=5, num_held_out_scenes=3)
+        kept = found.coverage.compute_values(found.baseline)[2]
         # The thresholds differ: what a point is worth is a matter of both.
         values = instants.score(found.rig).estimate.value.tolist()
     assert found.best.values == pytest.approx(values, rel=1e-12)
-    assert list(space.numbers) == ["front", "rear", "not worse: left_3m"]
-    assert all(one.values[2] >= kept - 2e-6 and "wide_left" in found.names(one.selected) for one in found.found)
-    assert [one.values[at] for at, one in enumerate(found.found[1:])] == [
-        max(one.values[at] for one in found.found) for at in range(2)
+    assert list(space.scored_objectives) == ["front", "rear", "not worse: left_3m"]
+    assert all(
+        one.values[2] >= kept - 2e-6 and "wide_left" in found.get_sensor_names(one.selected) for one in found.selections
+    )
+    assert [one.values[at] for at, one in enumerate(found.selections[1:])] == [
+        max(one.values[at] for one in found.selections) for at in range(2)
     ]
-    assert "between the best of front, rear" in found.sentence
+    assert "between the best of front, rear" in found.summary
     written = {path.name for path in found.save(folder / "several", files=["numbers"])}
     assert {"best.yaml", "best_front.yaml", "best_rear.yaml"} < written
 
 
 def test_where_no_choice_keeps_what_is_there_the_least_bad_says_by_how_much(folder):
-    space = loaded(folder, choose={"at_most": 1}, now=["wide_front", "wide_rear"], not_worse=["front_3m", "rear_3m"])
-    with held(space.scenarios, space.numbers, worlds=1) as instants:
-        found = choose(space, instants, test_seed=5, fresh_worlds=1)
-        each = {at: found.coverage.values([at])[1:] for at in range(len(found.sensors))}
-        kept = found.coverage.values(found.now)[1:]
+    space = loaded(
+        folder, choose={"max_sensors": 1}, now=["wide_front", "wide_rear"], not_worse=["front_3m", "rear_3m"]
+    )
+    with held(space.scenarios, space.scored_objectives, worlds=1) as instants:
+        found = run_selection(space, instants, test_seed=5, num_held_out_scenes=1)
+        each = {at: found.coverage.compute_values([at])[1:] for at in range(len(found.sensors))}
+        kept = found.coverage.compute_values(found.baseline)[1:]
     short = {at: (kept - values).clip(0).sum() for at, values in each.items()}
     assert found.best.shortfall == pytest.approx(min(short.values()))
     assert found.best.shortfall > 0.01
     assert short[found.best.selected[0]] == min(short.values())
     lost = kept - each[found.best.selected[0]]
-    names = [name for name in space.numbers if name not in space.objectives]
+    names = [name for name in space.scored_objectives if name not in space.objectives]
     told = [f"{100 * lack:.2f} points of {name}" for lack, name in zip(lost, names, strict=True) if lack > 1e-6]
-    assert f"keeps all that must be kept, and this one lacks the least: {'; '.join(told)}" in found.sentence
+    assert f"keeps all that must be kept, and this one lacks the least: {'; '.join(told)}" in found.summary
 
 
 def test_a_candidate_with_too_many_rays_on_the_vehicle_is_refused(folder):
     low = {"front": PLACES["front"], "flat": {"z_m": 1.51}}
-    candidates, limits = {"wide": {"sensor": SENSOR, "places": low}}, {"at_most": 1, "max_self_hits": 0.4}
+    candidates, limits = {"wide": {"sensor": SENSOR, "places": low}}, {"max_sensors": 1, "max_self_hit_share": 0.4}
     space = loaded(folder, candidates=candidates, choose=limits)
-    with held(space.scenarios, space.numbers, worlds=1) as instants:
-        found = choose(space, instants, test_seed=5, fresh_worlds=1)
-    assert "of its rays end on the vehicle; max_self_hits is 40.0%" in found.refused["wide_flat"]
+    with held(space.scenarios, space.scored_objectives, worlds=1) as instants:
+        found = run_selection(space, instants, test_seed=5, num_held_out_scenes=1)
+    assert "of its rays end on the vehicle; max_self_hit_share is 40.0%" in found.excluded["wide_flat"]
 
 
 def test_places_all_over_a_region_lie_on_its_skin(tmp_path):
@@ -175,7 +183,7 @@ def test_places_all_over_a_region_lie_on_its_skin(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"choose": {}}, "at_most, max_cost_eur: one of the two is needed"),
+        ({"choose": {}}, "max_sensors, max_cost_eur: one of the two is needed"),
         ({"choose": {"max_cost_eur": 500}}, "cost: no price of wide"),
         ({"choose": {"max_cost_eur": 500}, "cost": {"wide": 600}}, "500, but the cheapest candidate costs 600"),
         ({"cost": {"narrow": 1}}, "cost: narrow: no group of candidates"),
@@ -208,35 +216,35 @@ def test_what_cannot_be_chosen_is_refused_in_one_line(folder, changes, message):
 def test_candidates_that_are_all_inside_are_refused(folder):
     space = loaded(folder, candidates={"wide": {"sensor": SENSOR, "places": {"a": {"z_m": 0.7}}}})
     with (
-        held(space.scenarios, space.numbers, worlds=1) as instants,
+        held(space.scenarios, space.scored_objectives, worlds=1) as instants,
         pytest.raises(ValueError, match=r"none of 1 can be there; of wide_a: .* inside the ego"),
     ):
-        choose(space, instants, test_seed=5, fresh_worlds=1)
+        run_selection(space, instants, test_seed=5, num_held_out_scenes=1)
 
 
 def test_candidates_that_see_nothing_that_counts_are_refused(folder):
     up = {**SENSOR, "vertical_fov_deg": [60, 80]}
     space = loaded(folder, candidates={"wide": {"sensor": up, "places": PLACES}})
     with (
-        held(space.scenarios, space.numbers, worlds=1) as instants,
+        held(space.scenarios, space.scored_objectives, worlds=1) as instants,
         pytest.raises(ValueError, match="none of the 3 that can be there adds anything"),
     ):
-        choose(space, instants, test_seed=5, fresh_worlds=1)
+        run_selection(space, instants, test_seed=5, num_held_out_scenes=1)
 
 
 def test_of_few_fresh_worlds_there_is_no_error_and_no_gain_is_shown(folder):
     space = loaded(folder, now=["wide_left"])
-    with held(space.scenarios, space.numbers, worlds=1) as instants:
-        found = choose(space, instants, test_seed=5, fresh_worlds=1)
-    assert "no gain is shown" in found.sentence
-    assert "nan" not in found.sentence
+    with held(space.scenarios, space.scored_objectives, worlds=1) as instants:
+        found = run_selection(space, instants, test_seed=5, num_held_out_scenes=1)
+    assert "no gain is shown" in found.summary
+    assert "nan" not in found.summary
     found.save(folder / "few")
     assert json.loads((folder / "few" / "search.json").read_text())["fresh"]["around, area"]["error"] is None
 
 
 def test_the_example_has_money_for_two_but_not_for_two_wide_ones():
-    space = ChoiceSpace.load(Path(__file__).parents[2] / "examples" / "placement" / "robot_corners.yaml")
-    limits = space.limits(list(range(12)))
+    space = SelectionSpace.load(Path(__file__).parents[2] / "examples" / "placement" / "robot_corners.yaml")
+    limits = space.build_limits(list(range(12)))
     assert len(space.sensors) == 12
-    assert limits.allow([0], 7)
-    assert not limits.allow([0], 1)
+    assert limits.can_add([0], 7)
+    assert not limits.can_add([0], 1)

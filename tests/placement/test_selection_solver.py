@@ -62,9 +62,11 @@ def test_points_that_the_same_candidates_see_are_one_group_and_values_stay():
     candidates, seen, worth = some(0)
     assert len(np.unique(candidates.observes, axis=0)) == len(candidates.observes) < POINTS
     for chosen in ((), (3,), (0, 4, 7), tuple(range(COUNT))):
-        np.testing.assert_allclose(candidates.values(chosen), slow_values(seen, worth, chosen), rtol=1e-12)
-    lost = candidates.losses((1, 2, 6))
-    np.testing.assert_allclose(lost[1], candidates.values((1, 2, 6)) - candidates.values((1, 6)), rtol=1e-12)
+        np.testing.assert_allclose(candidates.compute_values(chosen), slow_values(seen, worth, chosen), rtol=1e-12)
+    lost = candidates.compute_failure_effects((1, 2, 6))
+    np.testing.assert_allclose(
+        lost[1], candidates.compute_values((1, 2, 6)) - candidates.compute_values((1, 6)), rtol=1e-12
+    )
 
 
 @pytest.mark.parametrize("kind", LIMITS)
@@ -74,13 +76,13 @@ def test_the_choice_is_the_best_of_all_and_the_cheapest_of_equal_ones(kind, seed
     limits = LIMITS[kind](np.random.default_rng(seed))
     each = {chosen: slow_values(seen, worth, chosen)[0] for chosen in all_allowed(limits)}
     most = max(each.values())
-    cheapest = min((limits.price(one), len(one)) for one, value in each.items() if value > most - 1e-9)
+    cheapest = min((limits.compute_price_eur(one), len(one)) for one, value in each.items() if value > most - 1e-9)
     found = select_sensors(candidates, limits)
     assert found.is_proven
     assert found.shortfall == 0
     assert found.values[0] == pytest.approx(most, abs=2e-6)
     np.testing.assert_allclose(found.values, slow_values(seen, worth, found.selected), rtol=1e-12)
-    assert (limits.price(found.selected), len(found.selected)) == cheapest
+    assert (limits.compute_price_eur(found.selected), len(found.selected)) == cheapest
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -88,7 +90,7 @@ def test_what_must_not_be_less_is_kept_or_lacks_the_least(seed):
     candidates, seen, worth = some(seed)
     generator = np.random.default_rng(seed)
     least = np.append(-np.inf, generator.uniform(0.3, 0.9, 2))
-    limits = SelectionLimits(3, list(prices(generator)), 500.0, minimum=least)
+    limits = SelectionLimits(3, list(prices(generator)), 500.0, min_values=least)
     value = {}
     for chosen in all_allowed(limits):
         values = slow_values(seen, worth, chosen)
@@ -135,5 +137,5 @@ def test_random_choices_keep_to_the_limits_and_leave_no_room():
     assert len({one.selected for one in drawn}) > 10
     for one in drawn:
         assert one.values == pytest.approx(slow_values(seen, worth, one.selected).tolist())
-        assert limits.price(one.selected) <= 400
-        assert not any(limits.allow(one.selected, other) for other in range(COUNT))
+        assert limits.compute_price_eur(one.selected) <= 400
+        assert not any(limits.can_add(one.selected, other) for other in range(COUNT))

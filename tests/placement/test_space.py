@@ -56,7 +56,7 @@ def place(sensor):
 def test_rigs_of_the_examples_come_back_from_their_files(path, tmp_path):
     searched = SearchSpace.load(path)
     for values in drawn(searched, 1):
-        rig = searched.rig(values, "found")
+        rig = searched.build_rig(values, "found")
         rig.save(tmp_path / "found.yaml")
         assert Rig.load(tmp_path / "found.yaml") == rig
         assert searched.name in rig.description
@@ -68,7 +68,7 @@ def test_what_is_not_free_stays_and_what_is_lies_within_its_bounds():
     searched = space({"left": {"x_m": (-1.0, 0.0), "pitch_deg": (-10.0, 10.0), "roll_deg": 3.0}})
     assert [variable.name for variable in searched.variables] == ["left.x_m", "left.pitch_deg"]
     for values in drawn(searched):
-        left, right = searched.rig(values, "found").sensors
+        left, right = searched.build_rig(values, "found").sensors
         assert right == PAIR.sensors[1]
         x_m, pitch_deg = values["left.x_m"], values["left.pitch_deg"]
         assert left == lidar("left", x_m=x_m, y_m=0.5, z_m=1.8, pitch_deg=pitch_deg, roll_deg=3.0)
@@ -79,17 +79,19 @@ def test_what_is_not_free_stays_and_what_is_lies_within_its_bounds():
 def test_the_start_is_the_rig_of_its_own_values():
     free = {"left": {"x_m": (-1.0, 0.0), "z_above_body_m": (0.1, 0.3), "yaw_deg": (-90.0, 90.0)}}
     searched = space({**free, "right": {"mirror_of": "left"}}, constraints={"symmetric": True})
-    values = searched.start_values()
+    values = searched.get_start_values()
     assert values.keys() == {variable.name for variable in searched.variables}
-    assert searched.rig(values, "same").sensors == PAIR.sensors
-    assert searched.violations(PAIR) == ()
+    assert searched.build_rig(values, "same").sensors == PAIR.sensors
+    assert searched.find_violations(PAIR) == ()
 
 
 def test_a_sensor_with_a_quaternion_keeps_it_until_an_angle_is_free():
     half = np.sqrt(0.5)
     start = PAIR.model_copy(update={"sensors": (lidar("left", z_m=1.8, quaternion_wxyz=(half, 0.0, 0.0, half)),)})
-    moved = space({"left": {"x_m": (-1.0, 0.0)}}, start).rig({"left.x_m": -0.5}, "moved").sensors[0]
-    turned = space({"left": {"pitch_deg": (-10.0, 10.0)}}, start).rig({"left.pitch_deg": 5.0}, "turned").sensors[0]
+    moved = space({"left": {"x_m": (-1.0, 0.0)}}, start).build_rig({"left.x_m": -0.5}, "moved").sensors[0]
+    turned = (
+        space({"left": {"pitch_deg": (-10.0, 10.0)}}, start).build_rig({"left.pitch_deg": 5.0}, "turned").sensors[0]
+    )
     assert moved.mount == Pose(x_m=-0.5, z_m=1.8, quaternion_wxyz=(half, 0.0, 0.0, half))
     assert turned.mount == Pose(z_m=1.8, yaw_deg=90.0, pitch_deg=5.0)
 
@@ -101,7 +103,7 @@ def test_a_pair_is_symmetric_whatever_its_values():
     searched = space({"left": free, "right": {"mirror_of": "left"}}, third, constraints={"symmetric": True})
     counts = set()
     for values in drawn(searched, 12):
-        *pair, middle = searched.rig(values, "found").sensors
+        *pair, middle = searched.build_rig(values, "found").sensors
         assert middle == third.sensors[2]
         counts.add(len(pair))
         assert bool(pair) == values["left.present"]
@@ -110,7 +112,7 @@ def test_a_pair_is_symmetric_whatever_its_values():
             assert right == pytest.approx(MIRROR @ left @ MIRROR, abs=1e-7)
             assert [sensor.name for sensor in pair] == ["left", "right"]
             assert {sensor.model for sensor in pair} == {values["left.model"]}
-        assert searched.violations(searched.rig(values, "found")) == ()
+        assert searched.find_violations(searched.build_rig(values, "found")) == ()
     assert counts == {0, 2}
 
 
@@ -119,7 +121,7 @@ def test_a_height_above_the_body_is_that():
     body = searched.scenarios[0].ego_mesh()
     triangles = body.vertices_m[body.faces]
     for values in drawn(searched):
-        at = place(searched.rig(values, "found").sensors[0])
+        at = place(searched.build_rig(values, "found").sensors[0])
         below = at - [0.0, 0.0, values["left.z_above_body_m"]]
         nearest = trimesh.triangles.closest_point(triangles, np.broadcast_to(below, (len(triangles), 3)))
         assert np.linalg.norm(nearest - below, axis=1).min() < 1e-6
@@ -131,14 +133,14 @@ def test_a_place_on_a_region_is_as_far_from_the_skin_as_its_height():
     body, faced = searched.scenarios[0].ego_mesh(), {"rear_bumper": 180.0, "fender_left": 90.0, "mirror_right": -90.0}
     triangles, seen = body.vertices_m[body.faces], set()
     for values in drawn(searched, 40):
-        sensor = searched.rig(values, "found").sensors[0]
+        sensor = searched.build_rig(values, "found").sensors[0]
         nearest = trimesh.triangles.closest_point(triangles, np.broadcast_to(place(sensor), (len(triangles), 3)))
         assert np.linalg.norm(nearest - place(sensor), axis=1).min() == pytest.approx(values["left.height_m"], abs=2e-6)
         assert sensor.mount.yaw_deg == pytest.approx(faced.get(values["left.region"], 0.0) + values["left.yaw_deg"])
         assert (sensor.mount.pitch_deg, sensor.mount.roll_deg) == (0.0, 0.0)
         seen.add(values["left.region"])
     assert seen == set(regions)
-    assert searched.start_values() == {}
+    assert searched.get_start_values() == {}
 
 
 def test_a_model_brings_its_whole_pattern():
@@ -146,9 +148,9 @@ def test_a_model_brings_its_whole_pattern():
     start = PAIR.model_copy(update={"sensors": (Lidar.model_validate(keys | HIGH),)})
     searched = space({"left": {"model": ("velodyne_vlp16", "velodyne_vlp32c")}}, start)
     for model in ("velodyne_vlp16", "velodyne_vlp32c"):
-        sensor = searched.rig({"left.model": model}, "found").sensors[0]
+        sensor = searched.build_rig({"left.model": model}, "found").sensors[0]
         assert sensor == Lidar.model_validate({"name": "left", "mount": start.sensors[0].mount, "model": model})
-    assert searched.start_values() == {"left.model": "velodyne_vlp16"}
+    assert searched.get_start_values() == {"left.model": "velodyne_vlp16"}
 
 
 def test_a_rig_costs_its_models_and_its_mounts():
@@ -159,14 +161,16 @@ def test_a_rig_costs_its_models_and_its_mounts():
     start = Rig(name="start", sensors=(Lidar.model_validate({"name": "left", "model": "velodyne_vlp16"} | HIGH), RIGHT))
     searched = space({"left": free}, start, cost=cost)
     prices = {
-        (model, there): searched.cost_eur(searched.rig({"left.model": model, "left.present": there}, "found"))
+        (model, there): searched.compute_cost_eur(
+            searched.build_rig({"left.model": model, "left.present": there}, "found")
+        )
         for model in ("velodyne_vlp16", "velodyne_vlp32c")
         for there in (True, False)
     }
     assert prices["velodyne_vlp16", True] == 3000.0 + 500.0 + 200.0
     assert prices["velodyne_vlp32c", True] == 9000.0 + 500.0 + 200.0
     assert prices["velodyne_vlp32c", False] == 500.0 + 100.0
-    assert space({"left": {"x_m": (-1.0, 0.0)}}).cost_eur(PAIR) is None
+    assert space({"left": {"x_m": (-1.0, 0.0)}}).compute_cost_eur(PAIR) is None
 
 
 def test_what_a_rig_cannot_be_is_told():
@@ -181,15 +185,17 @@ def test_what_a_rig_cannot_be_is_told():
         )
     free = space({"left": keys}, constraints={"min_distance_m": 0.3})
     inside, buried, close = (
-        free.rig({"left.y_m": y_m, "left.z_m": z_m}, "bad") for y_m, z_m in ((0.5, 1.0), (0.5, -0.5), (-0.3, 1.8))
+        free.build_rig({"left.y_m": y_m, "left.z_m": z_m}, "bad") for y_m, z_m in ((0.5, 1.0), (0.5, -0.5), (-0.3, 1.8))
     )
-    assert free.violations(inside) == ("left at [-0.5, 0.5, 1.0] m is inside the vehicle's body",)
-    assert free.violations(buried) == ("left at [-0.5, 0.5, -0.5] m is not above the ground",)
-    assert free.violations(close) == ("left and right are 0.200 m apart; min_distance_m is 0.3",)
-    assert searched.violations(PAIR) == ("it costs 2000 EUR; max_cost_eur is 1500",)
+    assert free.find_violations(inside) == ("left at [-0.5, 0.5, 1.0] m is inside the vehicle's body",)
+    assert free.find_violations(buried) == ("left at [-0.5, 0.5, -0.5] m is not above the ground",)
+    assert free.find_violations(close) == ("left and right are 0.200 m apart; min_distance_m is 0.3",)
+    assert searched.find_violations(PAIR) == ("it costs 2000 EUR; max_cost_eur is 1500",)
     lone = space({"left": {"pitch_deg": (-5.0, 5.0)}, "right": {"mirror_of": "left"}}, constraints={"symmetric": True})
     one = PAIR.model_copy(update={"sensors": PAIR.sensors[:1]})
-    assert lone.violations(one) == ("left has no mirror image on the other side of the vehicle; symmetric is true",)
+    assert lone.find_violations(one) == (
+        "left has no mirror image on the other side of the vehicle; symmetric is true",
+    )
 
 
 def test_values_that_make_no_rig_are_refused():
@@ -203,7 +209,7 @@ def test_values_that_make_no_rig_are_refused():
         ({"left.yaw_deg": 5.0}, r"missing or unknown: left\.yaw_deg"),
     ):
         with pytest.raises(ValueError, match=message):
-            searched.rig(values | changed, "none")
+            searched.build_rig(values | changed, "none")
 
 
 MISTAKES = [
@@ -288,16 +294,16 @@ def test_scenarios_with_different_egos_need_a_vehicle(tmp_path):
 def test_a_start_outside_of_the_space_is_told_and_has_no_values_there():
     with pytest.warns(UserWarning, match=r"'pair' is none of the space \(left\.x_m is -0\.5\)"):
         searched = space({"left": {"x_m": (0.0, 0.1), "yaw_deg": (-5.0, 5.0)}})
-    assert searched.start_values() == {"left.yaw_deg": 0.0}
+    assert searched.get_start_values() == {"left.yaw_deg": 0.0}
 
 
 def test_a_space_can_be_sent_to_another_process():
     searched = space({"left": {"region": "roof"}})
-    assert searched.violations(PAIR) == ()
+    assert searched.find_violations(PAIR) == ()
     again = pickle.loads(pickle.dumps(searched))
     assert again == searched
     values = next(drawn(searched))
-    assert again.rig(values, "found") == searched.rig(values, "found")
+    assert again.rig(values, "found") == searched.build_rig(values, "found")
 
 
 def test_a_rig_is_written_with_what_it_names_by_file(tmp_path):

@@ -6,7 +6,7 @@ from scipy import stats
 
 from tests.placement.worlds import estimate_of, held, lidar, rig, yard
 from torchcover.placement import Objective, validation
-from torchcover.placement.search import find_non_dominated, measure_gains
+from torchcover.placement.search import compute_improvements, find_non_dominated
 from torchcover.placement.validation import SideEffect, _others, adjust_holm, validate
 
 WORLDS, PER_WORLD = 6, 3
@@ -17,7 +17,7 @@ def test_gains_are_those_of_a_paired_t_test_and_have_the_direction_of_the_number
     generator = np.random.default_rng(0)
     one, other = generator.normal(size=(2, 18, 2))
     lower = {"lower_is_better": ["o1"]}
-    gain, error = measure_gains(estimate_of(one, WORLD, **lower), estimate_of(other, WORLD, **lower))
+    gain, error = compute_improvements(estimate_of(one, WORLD, **lower), estimate_of(other, WORLD, **lower))
     of_worlds = (one - other).reshape(6, 3, 2).mean(axis=1)
     expected = stats.ttest_1samp(of_worlds, 0.0)
     np.testing.assert_allclose(gain, of_worlds.mean(axis=0) * [1, -1])
@@ -35,7 +35,7 @@ def test_the_pareto_front_is_what_no_other_candidate_dominates_in_any_order(seed
 
 def test_two_worlds_have_no_error_however_many_frames():
     values = np.random.default_rng(0).normal(size=12)
-    gain, error = measure_gains(estimate_of(values, [0, 1] * 6), estimate_of(np.zeros(12), [0, 1] * 6))
+    gain, error = compute_improvements(estimate_of(values, [0, 1] * 6), estimate_of(np.zeros(12), [0, 1] * 6))
     assert np.isnan(error[0])
     assert gain[0] == pytest.approx(values.mean())
 
@@ -45,7 +45,7 @@ def test_pairing_takes_out_what_a_world_does_to_all():
     city = generator.normal(0, 0.07, (400, 1))
     own = generator.normal([0.5, 0.51], 0.009, (400, 2))
     one, other = (city + own[:, :1])[:, 0], (city + own[:, 1:])[:, 0]
-    _, error = measure_gains(estimate_of(other, range(400)), estimate_of(one, range(400)))
+    _, error = compute_improvements(estimate_of(other, range(400)), estimate_of(one, range(400)))
     unpaired = np.sqrt((one.var(ddof=1) + other.var(ddof=1)) / 400)
     assert (unpaired / error[0]) ** 2 > 30
 
@@ -55,36 +55,36 @@ def test_a_number_that_is_by_no_choice_of_estimate_is_tested_once():
     keys = {"near": "radius_m", "largest": "radius_maximum_m", "cells": "known_radius_m"}
     objectives = {name: Objective(number=key, region="20m") for name, key in keys.items()}
     with held(objectives=objectives, estimate="known", worlds=2) as searched:
-        found = validate({"higher": high}, low, searched, test_seed=1, worlds=2).gains["higher"]
+        found = validate({"higher": high}, low, searched, test_seed=1, num_scenes=2).improvements["higher"]
     said = [("near", "known"), ("largest", "-"), ("cells", "known")]
-    assert [(gain.objective, gain.estimate) for gain in found] == said
+    assert [(gain.objective, gain.average) for gain in found] == said
 
 
 def test_the_fresh_test_is_about_other_worlds_and_says_what_was_optimism(frames):
     low, high = rig(lidar(mount={"z_m": 1.6}), name="low"), rig(lidar(mount={"z_m": 2.4}), name="high")
-    test = validate({"higher": high}, low, frames, test_seed=1, worlds=8)
-    found, others = test.gains["higher"], _others(frames.objectives, failures=False)[0]
+    test = validate({"higher": high}, low, frames, test_seed=1, num_scenes=8)
+    found, others = test.improvements["higher"], _others(frames.objectives, failures=False)[0]
     anew = held(seed=1, worlds=8, objectives={**frames.objectives, **others})
-    assert [(gain.objective, gain.estimate) for gain in found] == [(name, "area") for name in ("near", "far", "bay")]
+    assert [(gain.objective, gain.average) for gain in found] == [(name, "area") for name in ("near", "far", "bay")]
     by_test, by_search = ([of.score(one).estimate for one in (high, low)] for of in (anew, frames))
     expected, in_search = by_test[0].differences(by_test[1]), by_search[0].minus(by_search[1])
     for column, gain in enumerate(found):
-        np.testing.assert_equal(gain.test, expected[gain.objective])
-        assert gain.search_gain == float(in_search.value[column])
-        np.testing.assert_equal(gain.optimism, gain.search_gain - expected[gain.objective].value)
-    assert found[1].test.p < 0.5
-    assert {change.what for change in test.changes} == others.keys()
+        np.testing.assert_equal(gain.difference, expected[gain.objective])
+        assert gain.search_improvement == float(in_search.value[column])
+        np.testing.assert_equal(gain.optimism, gain.search_improvement - expected[gain.objective].value)
+    assert found[1].difference.p < 0.5
+    assert {change.name for change in test.side_effects} == others.keys()
     # What a gain is made of sums up to it, whatever else the parts are; a loss has no share of a gain.
     for name in ("near", "far", "bay"):
-        shares = [change.shares[name] for change in test.changes if name in change.shares]
+        shares = [change.objective_shares[name] for change in test.side_effects if name in change.objective_shares]
         assert len(shares) == len(frames.objectives[name].places)
         assert sum(shares) == pytest.approx(1)
-    lost = validate({"lower": low}, high, frames, test_seed=1, worlds=2)
-    assert not any(change.shares for change in lost.changes)
+    lost = validate({"lower": low}, high, frames, test_seed=1, num_scenes=2)
+    assert not any(change.objective_shares for change in lost.side_effects)
     with pytest.raises(ValueError, match="seed: another one than that of these worlds is needed; got 0 for both"):
         frames.resampled(0, 4, {})
     with pytest.raises(ValueError, match="one whose worlds are drawn is needed; 'yard' is the same for any seed"):
-        held([yard()], {"far": frames.objectives["far"]}).resampled(1, 4, {})
+        held([yard()], {"far": frames.objectives["far"]}).resample(1, 4, {})
 
 
 def test_of_twenty_searches_that_change_nothing_at_most_one_says_that_something_got_worse():

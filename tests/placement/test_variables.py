@@ -10,20 +10,20 @@ from torchcover.placement.free_sensor import FreeChoice, FreeNumber
 def test_a_number_lies_within_its_bounds_and_has_few_digits(low, high):
     number = FreeNumber("roof.x_m", low, high)
     for share in [0.0, 1.0, *np.random.default_rng(0).random(200).tolist()]:
-        value = number.at(share)
+        value = number.get_value(share)
         assert low <= value <= high
-        assert number.rounded(value) == value
+        assert number.round_value(value) == value
         assert float(f"{value:.6f}") == value or value in (low, high)
         assert (value - low) / (high - low) == pytest.approx(share, abs=1e-6 / (high - low))
-    assert number.rounded(high + 1e-9) == high
+    assert number.round_value(high + 1e-9) == high
 
 
 @pytest.mark.parametrize("options", [("a", "b"), ("a", "b", "c"), (True, False)])
 def test_options_have_equal_shares(options):
     choice = FreeChoice("roof.model", options)
-    sampled = [choice.at(share) for share in (np.arange(3000) + 0.5) / 3000]
+    sampled = [choice.get_value(share) for share in (np.arange(3000) + 0.5) / 3000]
     assert [sampled.count(option) for option in options] == [3000 / len(options)] * len(options)
-    assert choice.at(1.0) == options[-1]
+    assert choice.get_value(1.0) == options[-1]
 
 
 @pytest.mark.parametrize(

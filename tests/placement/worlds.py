@@ -21,9 +21,9 @@ LOT = Scenario.model_validate(
 )
 BAY = {"bay": {"polygon_m": [[2.5, -4.0], [9.0, -4.0], [9.0, 5.0]]}}
 OBJECTIVES = {
-    "near": Objective(detection=0.3, region="20m"),
-    "far": Objective(detection=0.2, region=["80m", "20m"], band="ground"),
-    "bay": Objective(detection=0.3, region=BAY, band=["obstacle", "ground"]),
+    "near": Objective(threshold_m=0.3, region="20m"),
+    "far": Objective(threshold_m=0.2, region=["80m", "20m"], band="ground"),
+    "bay": Objective(threshold_m=0.3, region=BAY, band=["obstacle", "ground"]),
 }
 
 

@@ -24,16 +24,16 @@ class Drive:
     labelled: bool = True
     named: bool = True
     origin_m: tuple = (0.0, 0.0, 0.0)
-    body: BoundingBox | None = None
+    ego_box: BoundingBox | None = None
     sensors = ("left", "right")
     reference_sensors = ()
     square_metres = False
-    instants = None
+    block_indices = None
     path = Path("drive")
 
     def __post_init__(self):
-        self.names = [f"f{step}" for step in range(self.steps)]
-        self.frames = range(self.steps)
+        self.frame_names = [f"f{step}" for step in range(self.steps)]
+        self.key_frames = range(self.steps)
         self.times_s = 0.1 * np.arange(self.steps)
         self.rigs = {"both": self.sensors}
         x, z = np.meshgrid(np.arange(-20.0, 40.0, 0.5) + 0.01, np.arange(0.11, 3.0, 0.5))
@@ -41,7 +41,7 @@ class Drive:
         y, z = np.meshgrid(np.arange(-0.88, 1.0, 0.2), np.arange(-0.58, 0.7, 0.2))
         self.back_m = np.stack([np.full(y.size, -1.98), y.ravel(), z.ravel()], axis=1)  # in the frame of its box
 
-    def world_T_vehicle(self, index):
+    def get_world_T_vehicle(self, index):
         return rigid(rotation_from_euler(10.0 * index, 0.0, 0.0), self.origin_m + np.array([1.5 * index, 0.0, 0.0]))
 
     def world_T_car(self, index):
@@ -51,19 +51,19 @@ class Drive:
     def vehicle_T_sensor(self, sensor):
         return rigid(rotation_from_euler(0.0, 3.0, 0.0), [0.5, 0.3 if sensor == "left" else -0.3, 1.7])
 
-    def scan(self, sensor, index):
-        seen_m = transform(invert(self.world_T_vehicle(index)), self.wall_m)
+    def read_scan(self, sensor, index):
+        seen_m = transform(invert(self.get_world_T_vehicle(index)), self.wall_m)
         if sensor == "left":
             seen_m = seen_m[seen_m[:, 0] < 0]
         else:
-            vehicle_T_car = invert(self.world_T_vehicle(index)) @ self.world_T_car(index)
+            vehicle_T_car = invert(self.get_world_T_vehicle(index)) @ self.world_T_car(index)
             seen_m = np.concatenate([seen_m, transform(vehicle_T_car, self.back_m)])
         return Scan(transform(invert(self.vehicle_T_sensor(sensor)), seen_m), self.vehicle_T_sensor(sensor), sensor)
 
-    def boxes(self, index):
+    def read_boxes(self, index):
         if not self.labelled:
             return None
-        vehicle_T_car = invert(self.world_T_vehicle(index)) @ self.world_T_car(index)
+        vehicle_T_car = invert(self.get_world_T_vehicle(index)) @ self.world_T_car(index)
         yaw = np.arctan2(vehicle_T_car[1, 0], vehicle_T_car[0, 0])
         row = torch.tensor([[*vehicle_T_car[:3, 3], *CAR_SIZE_M, yaw]], dtype=torch.float32)
         return Boxes.from_rows(row, ids=("car",) if self.named else ("",))

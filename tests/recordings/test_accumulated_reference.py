@@ -42,8 +42,8 @@ def test_every_point_is_where_its_surface_is_at_the_instant(origin_m, index):
 class TightlyDrawn(Drive):
     """The boxes end 8 cm before the surfaces."""
 
-    def boxes(self, index):
-        rows = super().boxes(index).rows
+    def read_boxes(self, index):
+        rows = super().read_boxes(index).rows
         rows[:, 3:5] -= 0.2
         return Boxes.from_rows(rows, ids=("car",))
 
@@ -57,9 +57,9 @@ def test_what_sticks_out_of_its_box_moves_with_it():
 class Parked(Drive):
     """A part of the wall is labelled, too."""
 
-    def boxes(self, index):
-        moving, size_m = super().boxes(index), (6.0, 1.0, 3.2)
-        vehicle_T_parked = invert(self.world_T_vehicle(index)) @ rigid(np.eye(3), [10.0, 5.0, 1.5])
+    def read_boxes(self, index):
+        moving, size_m = super().read_boxes(index), (6.0, 1.0, 3.2)
+        vehicle_T_parked = invert(self.get_world_T_vehicle(index)) @ rigid(np.eye(3), [10.0, 5.0, 1.5])
         yaw = np.arctan2(vehicle_T_parked[1, 0], vehicle_T_parked[0, 0])
         row = torch.tensor([[*vehicle_T_parked[:3, 3], *size_m, yaw]], dtype=torch.float32)
         return Boxes.from_rows(torch.cat([moving.rows, row]), ids=("car", "parked"))
@@ -99,8 +99,8 @@ class Slim(Drive):
         super().__post_init__()
         self.back_m = np.array([[-0.22, 0.12, 0.22], [-0.22, -0.12, 0.32], [-0.22, 0.02, 0.62]])
 
-    def boxes(self, index):
-        rows = super().boxes(index).rows
+    def read_boxes(self, index):
+        rows = super().read_boxes(index).rows
         rows[:, 3:6] = torch.tensor([0.5, 0.6, 1.5])
         return Boxes.from_rows(rows, ids=("walker",))
 
@@ -147,7 +147,7 @@ def test_a_frame_does_not_depend_on_those_read_before():
     copied = [pickle.loads(pickle.dumps(one))[index].reference for index in range(5)]
     for others in zip(forward, backward, fresh, copied, strict=True):
         assert all(torch.equal(others[0], other) for other in others[1:])
-    assert len(one.reference.sweeps._kept) <= 2 * 5
+    assert len(one.reference.sweep_window._kept) <= 2 * 5
 
 
 def test_one_reference_serves_several_recordings():
@@ -160,12 +160,12 @@ def test_one_reference_serves_several_recordings():
 
 def test_where_the_vehicle_stands_is_no_reference():
     body = BoundingBox((-30.0, -30.0, 0.0), (30.0, 30.0, 1.0))
-    frame = RecordedFrames(Drive(body=body), reference=AccumulatedReference(10.0))[2]
+    frame = RecordedFrames(Drive(ego_box=body), reference=AccumulatedReference(10.0))[2]
     beside = (frame.reference[:, :2].abs() >= 30.0).any(dim=1)
     assert (frame.reference[~beside, 2] >= 1.0).all()
     assert 0 < beside.sum() < len(beside)
     assert frame.counts["reference_own_vehicle"] > 0 < frame.counts["sensor_own_vehicle"]
-    nothing = Drive(body=BoundingBox((-90.0, -90.0, -9.0), (90.0, 90.0, 9.0)))
+    nothing = Drive(ego_box=BoundingBox((-90.0, -90.0, -9.0), (90.0, 90.0, 9.0)))
     with pytest.raises(ValueError, match=r"no reference point is left of the scans within 5 s of this instant"):
         RecordedFrames(nothing, reference=AccumulatedReference(10.0))[2]
 
@@ -176,7 +176,7 @@ def test_what_a_recording_does_not_say_is_named():
     with pytest.raises(ValueError, match=r"cannot be accumulated, .* does not say when its scans were made"):
         RecordedFrames(drive)
     drive = Drive()
-    drive.world_T_vehicle = lambda index: None
+    drive.get_world_T_vehicle = lambda index: None
     with pytest.raises(ValueError, match="does not say where the vehicle was"):
         RecordedFrames(drive)
     with pytest.raises(ValueError, match=r"no sensor roof; it has left, right"):
@@ -197,8 +197,8 @@ def test_what_is_left_out_is_counted_and_points_have_square_metres():
 
 def test_a_pose_that_jumps_ends_the_window():
     drive = Drive(steps=20)
-    places = Drive(steps=20).world_T_vehicle
-    drive.world_T_vehicle = lambda index: rigid(np.eye(3), [5.0 * (index >= 8), 0.0, 0.0]) @ places(index)
+    places = Drive(steps=20).get_world_T_vehicle
+    drive.get_world_T_vehicle = lambda index: rigid(np.eye(3), [5.0 * (index >= 8), 0.0, 0.0]) @ places(index)
     frames = RecordedFrames(drive, reference=AccumulatedReference(10.0))
     assert frames[9].counts["reference_sweeps"] == 2 * 11
     assert frames[9].counts["reference_sweeps_skipped"] == 2 * 8
@@ -217,8 +217,8 @@ def test_a_drive_of_hardly_any_sweeps(steps):
 class Standing(Drive):
     """The vehicle stands all the time."""
 
-    def world_T_vehicle(self, index):
-        return super().world_T_vehicle(0)
+    def get_world_T_vehicle(self, index):
+        return super().get_world_T_vehicle(0)
 
 
 def test_a_vehicle_that_stands_sees_what_moves_move():
@@ -234,7 +234,7 @@ def test_memory_does_not_grow_with_the_drive():
     frames = RecordedFrames(drive, reference=AccumulatedReference(0.4))
     for index in range(0, 60, 20):
         _ = frames[index]
-    sweeps = frames.reference.sweeps
+    sweeps = frames.reference.sweep_window
     kept = 2 * (2 * 12 + 1)
     assert len(sweeps._kept) <= kept
     assert len(sweeps._votes._counted) <= kept
@@ -248,7 +248,7 @@ def test_one_bad_sweep_costs_its_own_frame():
         return scan(sensor, index)
 
     drive = Drive(steps=6)
-    scan, drive.scan = drive.scan, gone
+    scan, drive.read_scan = drive.read_scan, gone
     frames = RecordedFrames(drive, reference=AccumulatedReference(1.0))
     with pytest.raises(BadFrameError, match=r"^f2: f2.bin: truncated; it is in the window of f0 .*skip_bad_frames"):
         frames[0]
@@ -270,9 +270,9 @@ def test_labels_that_cannot_be_read_cost_their_own_sweep():
         return boxes(index)
 
     drive = Drive(steps=12)
-    boxes, drive.boxes = drive.boxes, gone
+    boxes, drive.read_boxes = drive.read_boxes, gone
     frames = RecordedFrames(drive, reference=AccumulatedReference(0.2))
-    frames.leave_out_bad_sweeps()
+    frames.skip_unreadable_sweeps()
     for index in (0, 1, 11):  # whose boxes half a second before or after are not to be had
         assert frames[index].counts.get("reference_sweeps_skipped", 0) == 0
     assert frames[5].counts["reference_sweeps_skipped"] == 2

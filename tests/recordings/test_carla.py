@@ -62,7 +62,7 @@ def recorded(folder, *, reference=True, ids=("roof",)):
 def test_clouds_are_where_the_world_is(tmp_path):
     frames = RecordedFrames(recorded(tmp_path))
     assert isinstance(frames.recording, Carla)
-    assert (frames.names, frames.rigs) == (("8", "10"), ("carla",))
+    assert (frames.frame_names, frames.rigs) == (("8", "10"), ("carla",))
     for frame in frames:
         np.testing.assert_allclose(frame.sensor, WORLD, atol=1e-5)
         assert distances_m(frame.reference, WORLD).max() < 1e-5
@@ -76,7 +76,7 @@ def test_poses_are_turned_as_the_clouds_are(tmp_path):
     assert recording.times_s.tolist() == [0.0, 0.5]
     for index, row in enumerate(rows[::-1]):
         expected = mirrored(transform(carla_matrix(*row[2:]), mirrored(WORLD)))
-        np.testing.assert_allclose(transform(recording.world_T_vehicle(index), WORLD), expected, atol=1e-12)
+        np.testing.assert_allclose(transform(recording.get_world_T_vehicle(index), WORLD), expected, atol=1e-12)
     assert len(RecordedFrames(recording)[0].reference) > 10  # of the other frame
 
 
@@ -97,14 +97,14 @@ def turning(folder, rotation_frequency, ticks_s=(0.0, 0.05, 0.1, 0.15, 0.2)):
 
 def test_parts_of_a_turn_are_joined_where_the_world_stands_still(tmp_path):
     recording = open_recording(turning(tmp_path, 10.0))
-    assert (recording.names, recording.times_s.tolist()) == (("1", "3"), [0.05, 0.15])  # the fifth makes no turn
+    assert (recording.frame_names, recording.times_s.tolist()) == (("1", "3"), [0.05, 0.15])  # the fifth makes no turn
     for index, last in enumerate((1, 3)):
-        scan = recording.scan("roof", index)
+        scan = recording.read_scan("roof", index)
         assert scan.vehicle_T_sensor is None
         # Nose to the right: the world's x is the vehicle's left. The earlier part is 2 m further back.
         expected = [[0.0, -10.0 - last, 0.5], [1, 0, 0.5], [0.0, -10.0 - (last - 1) - 2.0, 0.5], [1, 0, 0.5]]
         np.testing.assert_allclose(scan.points_m, expected, atol=1e-12)
-        np.testing.assert_allclose(recording.world_T_vehicle(index)[:3, 3], [2.0 * last, 0.0, 0.0], atol=1e-12)
+        np.testing.assert_allclose(recording.get_world_T_vehicle(index)[:3, 3], [2.0 * last, 0.0, 0.0], atol=1e-12)
     frames = RecordedFrames(recording, reference=AccumulatedReference(1.0))
     assert len(frames[0].sensor) == 2
     assert frames[0].counts["sensor_own_vehicle"] == 2
@@ -114,7 +114,7 @@ def test_parts_of_a_turn_are_joined_where_the_world_stands_still(tmp_path):
     ("turns", "names"), [(20.0, "01234"), (19.9, "01234"), (7.0, "2"), (4.0, "4"), (50.0, "01234")]
 )
 def test_an_instant_is_as_many_frames_as_make_a_turn(tmp_path, turns, names):
-    assert "".join(open_recording(turning(tmp_path, turns)).names) == names
+    assert "".join(open_recording(turning(tmp_path, turns)).frame_names) == names
 
 
 def test_too_few_frames_for_a_turn(tmp_path):
@@ -151,7 +151,7 @@ def test_pixels_of_a_depth_camera_are_where_carla_has_them(tmp_path):
     codes = np.random.default_rng(1).integers(10_000, 2_000_000, (3, 4))
     codes[0, 1], codes[2, 2] = 2**24 - 1, 0  # sky, and nothing at all
     recording = open_recording(photographed(tmp_path, codes))
-    (seen,) = [transform(scan.vehicle_T_sensor, scan.points_m) for scan in [recording.scan("head", 0)]]
+    (seen,) = [transform(scan.vehicle_T_sensor, scan.points_m) for scan in [recording.read_scan("head", 0)]]
     focal = 4 / (2 * np.tan(np.deg2rad(80) / 2))
     expected = []
     for (row, column), code in np.ndenumerate(codes):
@@ -165,7 +165,7 @@ def test_pixels_of_a_depth_camera_are_where_carla_has_them(tmp_path):
 def test_a_camera_that_does_not_fit_its_image_is_told(tmp_path):
     photographed(tmp_path, np.ones((5, 4), int))
     with pytest.raises(BadFileError, match=r"head.000\.png: .*depth must be \(3, 4\)"):
-        open_recording(tmp_path).scan("head", 0)
+        open_recording(tmp_path).read_scan("head", 0)
     photographed(tmp_path / "other", np.ones((3, 4), int), fov=None)
     with pytest.raises(ValueError, match=r"sensors\.json: .*a camera needs width .* and fov, in degrees"):
         open_recording(tmp_path / "other")
@@ -183,7 +183,7 @@ def test_objects_are_where_they_are_seen_from_the_vehicle(tmp_path):
     row = ["17", "walker", 4.0, 10.0, 1.0, 0.0, 0.0, 90.0, 0.3, 0.2, 0.9]
     for tick in range(5):
         table(tmp_path / "boxes" / f"{tick}.csv", (*CARLA_BOX, "velocity_x", "velocity_y"), [[*row, 3.0, 0.5]])
-    boxes = open_recording(tmp_path).boxes(1)  # the vehicle is at x = 2, its nose to the right
+    boxes = open_recording(tmp_path).read_boxes(1)  # the vehicle is at x = 2, its nose to the right
     torch.testing.assert_close(boxes.rows, torch.tensor([[10.0, 2.0, 1.0, 0.6, 0.4, 1.8, 0.0]]), atol=1e-6, rtol=0)
     torch.testing.assert_close(boxes.velocity_mps, torch.tensor([[0.5, 3.0]]), atol=1e-6, rtol=0)
     assert (boxes.ids, boxes.categories) == (("17",), ("walker",))
@@ -200,7 +200,7 @@ def test_an_object_without_a_size_costs_no_other(tmp_path):
     for tick in range(5):
         table(tmp_path / "boxes" / f"{tick}.csv", CARLA_BOX, rows)
     with pytest.warns(UserWarning, match=r"without a size are left out: 1 of 2 .* 17 \(bike\): .* extent_y 0"):
-        assert open_recording(tmp_path).boxes(1).ids == ("18",)
+        assert open_recording(tmp_path).read_boxes(1).ids == ("18",)
 
 
 @pytest.mark.parametrize(

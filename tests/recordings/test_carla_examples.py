@@ -231,9 +231,9 @@ def test_what_the_recorder_writes_is_read_with_the_numbers_of_the_world(recorder
     assert references[0].attributes["points_per_second"] == str(8 * 8 * 20)
 
     recording = open_recording(out)
-    assert (recording.names, recording.sensors) == (("000000", "000001", "000002"), ("roof", "right"))
+    assert (recording.frame_names, recording.sensors) == (("000000", "000001", "000002"), ("roof", "right"))
     np.testing.assert_allclose(recording.times_s, [5.1, 5.2, 5.3])
-    assert recording.body.size_m == pytest.approx((4.6, 2.0, 1.45))
+    assert recording.ego_box.size_m == pytest.approx((4.6, 2.0, 1.45))
     roof, right = (RecordedFrames(recording, rigs={name: [name]}) for name in ("roof", "right"))
     places_m = []
     for index in range(3):
@@ -246,13 +246,13 @@ def test_what_the_recorder_writes_is_read_with_the_numbers_of_the_world(recorder
         heights = right[index].sensor[:, 2]
         assert len(heights) > 100
         assert heights.abs().max() < 0.01  # the ground, of pixels that look down by a degree and more
-        (box,) = recording.boxes(index).rows
-        assert recording.boxes(index).categories == ("vehicle.audi.tt",)
+        (box,) = recording.read_boxes(index).rows
+        assert recording.read_boxes(index).categories == ("vehicle.audi.tt",)
         centre = transform(np.array(world.other.pose.get_matrix()), np.array([[0.1, 0.05, 0.75]]))
         expected = mirrored(transform(invert(world_T_actor), centre)) + UNDER_THE_MIDDLE_M
         np.testing.assert_allclose(box[:3], expected[0], atol=1e-5)
         np.testing.assert_allclose(box[3:], [4.6, 2.0, 1.5, np.deg2rad(-30 + 10 + 4.0 * ticks)], atol=1e-5)
-        places_m.append(recording.scan("reference", index).vehicle_T_sensor[:3, 3])
+        places_m.append(recording.read_scan("reference", index).vehicle_T_sensor[:3, 3])
     assert np.linalg.norm(np.diff(places_m, axis=0), axis=1).min() > 0.01  # another place every time
     outside = np.abs(places_m) - [2.3, 1.0, 1.5]
     assert ((outside > 0).any(axis=1) & (outside < 0.5).all(axis=1)).all()  # in the shell around the box

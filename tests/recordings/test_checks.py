@@ -36,21 +36,21 @@ class Street:
     slope: tuple = (0.03, -0.02)
     step_s: float = 0.1
     steps: int = 6
-    body: BoundingBox | None = None
+    ego_box: BoundingBox | None = None
     bumps_m: float = 0.03
     path = Path("street")
     sensors = ("lidar",)
     reference_sensors = ("reference",)
     square_metres = False
-    instants = None
+    block_indices = None
 
     def __post_init__(self):
-        self.names = [f"f{step}" for step in range(self.steps)]
-        self.frames = range(self.steps)
+        self.frame_names = [f"f{step}" for step in range(self.steps)]
+        self.key_frames = range(self.steps)
         self.times_s = self.step_s * np.arange(self.steps)
         self.rigs = {"one": ("lidar",)}
 
-    def scan(self, sensor, index):
+    def read_scan(self, sensor, index):
         seed = index if self.same else [index, sensor == "lidar"]
         generator = np.random.default_rng(seed)
         x, y = generator.uniform(-40, 40, (2, 20_000))
@@ -60,7 +60,7 @@ class Street:
         beneath_m = generator.uniform([-20, -20, -6], [20, 20, -2], (60, 3))  # what a mirror shows
         sides_m = [
             (generator.uniform(-0.5, 0.5, (40, 3)) * [1, 0, 0.9] + [0, 0.5, 0]) * SIZE_M + row[:3].numpy()
-            for row in self.boxes(index).rows
+            for row in self.read_boxes(index).rows
         ]
         points_m = np.concatenate([ground_m, wall_m, beneath_m, *sides_m])
         if self.halved and sensor == "lidar":
@@ -69,14 +69,14 @@ class Street:
             points_m = points_m * [1.0, -1.0, 1.0]
         return Scan(transform(invert(MOUNT), points_m), MOUNT if self.mount is None else self.mount, sensor)
 
-    def world_T_vehicle(self, index):
+    def get_world_T_vehicle(self, index):
         return rigid(rotation_from_euler(30.0 + 4.0 * index + self.turned_deg, 0.0, 0.0), self._place_m(index))
 
     def _place_m(self, index):
         yaw = np.deg2rad(30.0 + 4.0 * np.arange(index))
         return np.array([513_248.0 + 1.5 * np.cos(yaw).sum(), 5_403_655.0 + 1.5 * np.sin(yaw).sum(), 260.0])
 
-    def boxes(self, index):
+    def read_boxes(self, index):
         x, y = torch.tensor([-15.0, -5.0, 8.0, 16.0]), torch.full((4,), -5.0)
         if self.both_sides:  # cars on both sides
             x, y = x.repeat(2), torch.cat([y, -y])
@@ -143,9 +143,9 @@ def test_a_drive_far_shorter_than_the_window(steps, lasts):
 
 def test_a_sensor_that_was_off_for_a_while():
     street = Street()
-    scan = street.scan
+    scan = street.read_scan
     off = Scan(np.empty((0, 3)), MOUNT, "off")
-    street.scan = lambda sensor, index: off if sensor == "lidar" and index >= 3 else scan(sensor, index)
+    street.read_scan = lambda sensor, index: off if sensor == "lidar" and index >= 3 else scan(sensor, index)
     (doubt,) = doubts(street)
     assert "lidar has no point in 2 of 5 frames" in doubt
 
@@ -165,10 +165,10 @@ def test_ground_is_what_is_connected_below_the_vehicle():
 
 def test_a_frame_that_cannot_be_read_is_not_looked_at():
     street = Street(mount=np.eye(4))
-    scan = street.scan
-    street.scan = lambda sensor, index: scan(sensor, index) if index == 5 else Path("gone").read_bytes()
+    scan = street.read_scan
+    street.read_scan = lambda sensor, index: scan(sensor, index) if index == 5 else Path("gone").read_bytes()
     assert len(doubts(street)) == 1
-    street.scan = lambda sensor, index: Path("gone").read_bytes()
+    street.read_scan = lambda sensor, index: Path("gone").read_bytes()
     assert doubts(street) == []
 
 
@@ -189,19 +189,19 @@ class Striped(Drive):
         self.wall_m[:, 1] = 4.01
         self.back_m, self.rigs, self.labelled = np.empty((0, 3)), {"one": ("right",)}, False
 
-    def world_T_vehicle(self, index):
+    def get_world_T_vehicle(self, index):
         return rigid(np.eye(3), [0.5 * max(0, index - self.standing), 0.0, 0.0])
 
-    def scan(self, sensor, index):
-        scan = super().scan(sensor, index)
+    def read_scan(self, sensor, index):
+        scan = super().read_scan(sensor, index)
         points_m = transform(scan.vehicle_T_sensor, scan.points_m)
         return replace(scan, points_m=scan.points_m[points_m[:, 0] % 6.0 < 3.0])
 
     def share_near_stripes(self, index):
         """The share of the wall 0 to 20 m ahead whose middle is within 0.4 m of a point of the scan."""
-        wall_m = transform(invert(self.world_T_vehicle(index)), self.wall_m)
+        wall_m = transform(invert(self.get_world_T_vehicle(index)), self.wall_m)
         wall_m = wall_m[(wall_m[:, 0] >= 0) & (wall_m[:, 0] < 20)]
-        seen = self.scan("right", index)
+        seen = self.read_scan("right", index)
         apart_m = np.linalg.norm(wall_m[:, None] - transform(seen.vehicle_T_sensor, seen.points_m), axis=2)
         return (apart_m.min(axis=1) < 0.4).mean()
 

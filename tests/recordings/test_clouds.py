@@ -13,7 +13,7 @@ import pytest
 from torchcover.files import BadFileError
 from torchcover.recordings import RecordingSettings, open_recording
 from torchcover.recordings.clouds import READERS, read_cloud
-from torchcover.recordings.isolated_readers import laz_points
+from torchcover.recordings.isolated_readers import read_laz_points
 
 CLOUD = np.array([[1.5, -2.25, 0.125], [-3.0, 4.0, 5.5], [70.0, 0.5, -1.75]], dtype=np.float32)
 UTM = np.array([[513248.123, 5403655.456, 260.389], [513414.844, 5403760.001, 337.601]])
@@ -121,11 +121,11 @@ def test_las_files_that_say_feet_are_converted_once(tmp_path):
     settings = RecordingSettings(units="ft")
     for folder in ("sensor", "reference"):
         (tmp_path / folder / "a.las").write_bytes(las_in(""))
-    cloud = open_recording(tmp_path, settings).scan("sensor", 0).points_m
+    cloud = open_recording(tmp_path, settings).read_scan("sensor", 0).points_m
     np.testing.assert_allclose(cloud, CLOUD * FEET)  # the file says no unit
     (tmp_path / "sensor" / "a.las").write_bytes(las_in(STATE_PLANE))
     with pytest.raises(ValueError, match=r"a\.las: it is converted to meters, .* leave out recording\.units=ft"):
-        open_recording(tmp_path, settings).scan("sensor", 0)
+        open_recording(tmp_path, settings).read_scan("sensor", 0)
 
 
 @pytest.mark.parametrize("compressed", [False, True])
@@ -364,7 +364,7 @@ def test_ply_finds_the_vertices_among_other_elements(tmp_path, data):
 def test_a_compressed_survey_without_its_package_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "laspy", None)
     with pytest.raises(ImportError, match=r"cloud\.laz: LAZ needs laspy: pip install 'torchcover\[las\]'"):
-        unwrap(laz_points)(store(tmp_path, *FORMATS["laz"]), 3)
+        unwrap(read_laz_points)(store(tmp_path, *FORMATS["laz"]), 3)
     np.testing.assert_array_equal(read_cloud(store(tmp_path, *FORMATS["las"])), CLOUD)
 
 

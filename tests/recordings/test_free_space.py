@@ -6,8 +6,8 @@ import pytest
 from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_euler
 from torchcover.recordings import free_space
 from torchcover.recordings import movers as moved
-from torchcover.recordings.free_space import RangeImage, Votes, seen_share, square_metres
-from torchcover.recordings.movers import movers
+from torchcover.recordings.free_space import FreeSpaceCounter, RangeImage, estimate_visible_share, square_metres
+from torchcover.recordings.movers import find_moving_clusters
 
 CAR = BoundingBox((-2.4, -0.95, 0.0), (2.4, 0.95, 1.7))
 
@@ -25,7 +25,7 @@ def votes_of(image, points_m):
 
 
 def test_what_lies_before_a_wall_is_refuted_up_to_the_tolerance():
-    image = RangeImage.of(upright(20.0), np.eye(4))
+    image = RangeImage.from_points(upright(20.0), np.eye(4))
     free_m = (20.0 - 0.4) / 1.12
     places_m = [[free_m - 0.05, 0.0, 0.0], [free_m + 0.05, 0.0, 0.0], [19.9, 0.0, 0.0], [25.0, 0.0, 0.0]]
     # Behind, beside and above where nothing came back: nobody knows.
@@ -35,7 +35,7 @@ def test_what_lies_before_a_wall_is_refuted_up_to_the_tolerance():
 def test_a_ray_that_passes_an_edge_refutes_nothing_beside_it():
     near_m = upright(8.0, half_m=1.0, step_m=0.02)
     near_m = near_m[near_m[:, 1] < 0]
-    image = RangeImage.of(np.concatenate([near_m, upright(30.0, half_m=15.0, high_m=6.0)]), np.eye(4))
+    image = RangeImage.from_points(np.concatenate([near_m, upright(30.0, half_m=15.0, high_m=6.0)]), np.eye(4))
     one_bin_m = 8.0 * np.deg2rad(0.2)
     assert votes_of(image, [[8.0, -0.5, 0.0], [8.0, 0.9 * one_bin_m, 0.0], [8.0, 4 * one_bin_m, 0.0]]) == [0, 0, 1]
 
@@ -47,7 +47,7 @@ def test_flat_ground_is_never_refuted(rows_deg):
     )
     range_m = 1.8 / -np.sin(elevation).ravel()
     sensor_m = np.stack([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
-    image = RangeImage.of(sensor_m.reshape(3, -1).T * range_m[:, None], np.eye(4))
+    image = RangeImage.from_points(sensor_m.reshape(3, -1).T * range_m[:, None], np.eye(4))
     x_m, y_m = np.random.default_rng(0).uniform(-60.0, 60.0, (2, 3000))
     votes = votes_of(image, np.stack([x_m, y_m, np.full(3000, -1.8)], axis=1))
     assert sum(votes) < 0.002 * len(votes)
@@ -58,21 +58,21 @@ def test_flat_ground_is_never_refuted(rows_deg):
 def test_votes_do_not_depend_on_the_way_to_an_instant():
     generator = np.random.default_rng(0)
     scans = {("a", k): generator.uniform(-20.0, 20.0, (500, 3)) for k in range(6)}
-    images = {key: RangeImage.of(generator.normal(0.0, 30.0, (4000, 3)), np.eye(4)) for key in scans}
+    images = {key: RangeImage.from_points(generator.normal(0.0, 30.0, (4000, 3)), np.eye(4)) for key in scans}
 
     def window(first, last):
         return [{key: of[key] for key in of if first <= key[1] < last} for of in (scans, images)]
 
-    sliding = Votes()
+    sliding = FreeSpaceCounter()
     for first in (0, 1, 2, 1, 2, 3):
-        counted = sliding.of(*window(first, first + 3))
-    fresh = Votes().of(*window(3, 6))
+        counted = sliding.update(*window(first, first + 3))
+    fresh = FreeSpaceCounter().update(*window(3, 6))
     assert counted.keys() == fresh.keys()
     for key, votes in fresh.items():
         np.testing.assert_array_equal(counted[key], votes)
         others = [np.zeros(500, np.int16) for _ in range(3)]
         for k, own in enumerate(others):
-            images["a", 3 + k].vote(scans[key], own)
+            images["a", 3 + k].add_votes(scans[key], own)
         np.testing.assert_array_equal(votes, sum(others))
     assert max(votes.max() for votes in fresh.values()) > 1
 
@@ -85,16 +85,16 @@ def test_loops_do_what_arrays_do():
     points_m = generator.normal(0.0, 20.0, (5000, 3))
     points_m[:3] = [[0.0, 0.0, 0.0], [0.0, 0.0, 5.0], [-5.0, -0.0, 0.0]]
     sensor_T_local = invert(rigid(rotation_from_euler(20.0, 3.0, -2.0), [1.0, 2.0, 0.5]))
-    image = RangeImage.of(generator.normal(0.0, 30.0, (40_000, 3)), sensor_T_local)
+    image = RangeImage.from_points(generator.normal(0.0, 30.0, (40_000, 3)), sensor_T_local)
     one, other = np.zeros((2, 5000), np.int16)
-    for kernel, votes in ((loops.vote_by_loop, one), (free_space.vote_by_arrays, other)):
+    for kernel, votes in ((loops.count_votes_by_loop, one), (free_space.count_votes_by_arrays, other)):
         kernel(points_m, *image, votes, 2)
     np.testing.assert_array_equal(one, other)
     assert 0 < one.sum() < 2 * len(one)
 
     hidden = np.zeros((2, 5000), np.bool_)
     reach_m = np.array([np.inf, 70.0, 30.0, 10.0])
-    for kernel, of in zip((loops.hide_by_loop, free_space.hide_by_arrays), hidden, strict=True):
+    for kernel, of in zip((loops.mark_hidden_by_loop, free_space.mark_hidden_by_arrays), hidden, strict=True):
         kernel(
             points_m,
             np.array([0.1, 3.2, 0.3]),
@@ -109,7 +109,7 @@ def test_loops_do_what_arrays_do():
     filled = generator.integers(0, 3, (3, 40, 50)).astype(np.uint8)
     tried = generator.uniform(-30.0, 30.0, (200, 2))
     overlaps = np.zeros((2, 200))
-    for kernel, of in zip((loops.overlap_by_loop, moved.overlap_by_arrays), overlaps, strict=True):
+    for kernel, of in zip((loops.compute_overlap_by_loop, moved.compute_overlap_by_arrays), overlaps, strict=True):
         kernel(np.ascontiguousarray(points_m[:80, :2] % 12.0), np.array([-0.1, 0.1, 0.2]), filled, 0.3, tried, of)
     np.testing.assert_allclose(*overlaps, rtol=1e-12)
     assert np.ptp(overlaps[0]) > 0.1
@@ -120,14 +120,14 @@ def test_what_a_wall_or_the_vehicle_hides_is_not_seen():
     behind_m = [[9.0, 0.0, 1.0], [30.0, 5.0, 1.0]]
     beside_m, above_m, close_m = [[9.0, 12.0, 1.0], [9.0, 0.0, 9.0]], [[0.0, 30.0, 1.0]], [[6.3, 0.0, 1.0]]
     points_m = np.concatenate([wall_m, behind_m, beside_m, above_m, close_m])
-    share = seen_share(points_m, CAR, 0.1, 3)
+    share = estimate_visible_share(points_m, CAR, 0.1, 3)
     assert share[: len(wall_m)].max() > 0.8  # one place is behind the vehicle
     assert share[-6:-4].tolist() == [0.0, 0.0]
     assert share[-4:-2].min() > 0.5
     assert share[-1] > 0.0  # within the tolerance it is the wall
     ground_m = np.array([[0.0, 1.2, 0.0], [0.0, -1.2, 0.0]])  # from the other side, the vehicle is in between
-    assert 0.0 < seen_share(ground_m, CAR, 0.1, 3).mean() < 0.9
-    np.testing.assert_array_equal(share, seen_share(points_m, CAR, 0.1, 3))
+    assert 0.0 < estimate_visible_share(ground_m, CAR, 0.1, 3).mean() < 0.9
+    np.testing.assert_array_equal(share, estimate_visible_share(points_m, CAR, 0.1, 3))
 
 
 def test_square_metres_add_up_to_the_surface():
@@ -152,7 +152,7 @@ def test_a_mover_is_put_back_where_it_is(velocity_mps):
         scans_m.append(
             np.concatenate([own + np.array([*velocity_mps, 0.0]) * time_s + np.array([30.0, 8.0, 0.0]), clutter])
         )
-    found = max(movers(scans_m, times_s), key=lambda one: len(one.points_m))
+    found = max(find_moving_clusters(scans_m, times_s), key=lambda one: len(one.points_m))
     assert np.linalg.norm(found.velocity_mps - velocity_mps) < 0.5
     apart_m = np.linalg.norm((found.points_m - [30.0, 8.0, 0.0])[:, None] - box_m, axis=2).min(axis=1)
     assert np.median(apart_m) < 0.1
@@ -163,12 +163,12 @@ def test_a_mover_is_put_back_where_it_is(velocity_mps):
         parts = [
             scan_m[half == one] for one in (True, False, None) for scan_m, half in zip(scans_m, halves, strict=True)
         ]
-        same = max(movers(parts, np.tile(times_s, 3)), key=lambda one: len(one.points_m))
+        same = max(find_moving_clusters(parts, np.tile(times_s, 3)), key=lambda one: len(one.points_m))
         np.testing.assert_array_equal(same.velocity_mps, found.velocity_mps)
         assert len(same.points_m) == len(found.points_m)
 
 
 def test_nothing_moves_where_there_is_nothing():
-    assert movers([], np.empty(0)) == []
-    assert movers([np.empty((0, 3))] * 3, np.array([-0.1, 0.1, 0.2])) == []
-    assert movers([np.zeros((9, 3)), np.empty((0, 3))], np.array([-0.1, 0.1])) == []
+    assert find_moving_clusters([], np.empty(0)) == []
+    assert find_moving_clusters([np.empty((0, 3))] * 3, np.array([-0.1, 0.1, 0.2])) == []
+    assert find_moving_clusters([np.zeros((9, 3)), np.empty((0, 3))], np.array([-0.1, 0.1])) == []

@@ -9,7 +9,7 @@ import torchcover
 from tests.recordings.drives import CAR_SIZE_M, Drive
 from torchcover.data import AccumulatedReference, RecordedFrames
 from torchcover.geometry import invert, rigid, rotation_from_euler, transform
-from torchcover.recordings.ground_model import CELL_M, GroundModel, low_surfaces
+from torchcover.recordings.ground_model import CELL_M, GroundModel, extract_low_surfaces
 
 NOISE_M = 0.03
 HERE_M = np.zeros(3)
@@ -54,7 +54,7 @@ def cut(points_m, *, x=(-np.inf, np.inf), y=(-np.inf, np.inf)):
 
 
 def ground_of(*parts, place_m=HERE_M):
-    return GroundModel.below([low_surfaces(part, place_m) for part in parts], place_m)
+    return GroundModel.from_surfaces([extract_low_surfaces(part, place_m) for part in parts], place_m)
 
 
 def rms_m(ground, heights, within_m=38.0):
@@ -87,7 +87,7 @@ def test_what_stands_and_what_hangs_is_no_ground():
     wall = upright([(-38.0, 20.0), (38.0, 20.0)], 0.0, 9.0, 6000)
     ground = ground_of(np.concatenate([cut(road, y=(20.0, np.inf)), *cars, crown, wall]))
     for what in (*cars, crown, wall):
-        np.testing.assert_allclose(ground.heights_m(what), what[:, 2], atol=0.05)
+        np.testing.assert_allclose(ground.compute_heights_m(what), what[:, 2], atol=0.05)
 
 
 def test_a_few_reflections_below_the_road_do_not_lower_it():
@@ -95,26 +95,28 @@ def test_a_few_reflections_below_the_road_do_not_lower_it():
     below[:800] = below[800:] + np.array([0.05, 0.05, -0.05])  # in pairs
     ground = ground_of(np.concatenate([seen(level), below]))
     assert rms_m(ground, level)[0] < 0.01
-    assert (ground.heights_m(below) < -1.5).all()
+    assert (ground.compute_heights_m(below) < -1.5).all()
 
 
 def test_a_lorry_without_a_foot_far_away_is_unknown_and_not_ground():
     far = upright([(70.0, -1.2), (70.0, 1.2)], 1.0, 3.5, 60)
     ground = ground_of(np.concatenate([seen(level), far]))
-    assert np.isnan(ground.heights_m(far)).all()
+    assert np.isnan(ground.compute_heights_m(far)).all()
     near = far - [25.0, 0.0, 0.0]  # 5 m behind what was seen
-    np.testing.assert_allclose(ground_of(np.concatenate([seen(level), near])).heights_m(near), near[:, 2], atol=0.1)
+    np.testing.assert_allclose(
+        ground_of(np.concatenate([seen(level), near])).compute_heights_m(near), near[:, 2], atol=0.1
+    )
 
 
 def test_of_two_roads_above_each_other_it_is_that_of_the_vehicle():
     road = seen(level)
     deck = seen(level, 6000, 40.0, seed=2) * [1.0, 0.12, 1.0] + [0.0, 0.0, 5.5]  # 10 m wide
     under = ground_of(road, deck, place_m=np.array([0.0, 0.0, 0.0]))
-    np.testing.assert_allclose(under.heights_m(deck), 5.5, atol=0.15)
+    np.testing.assert_allclose(under.compute_heights_m(deck), 5.5, atol=0.15)
     # From above nobody sees what is below the deck, nor next to it behind the parapet.
     above = ground_of(cut(road, y=(-7.0, 7.0)), deck, place_m=np.array([0.0, 0.0, 5.5]))
-    np.testing.assert_allclose(above.heights_m(deck), 0.0, atol=0.15)
-    off_m = above.heights_m(road)
+    np.testing.assert_allclose(above.compute_heights_m(deck), 0.0, atol=0.15)
+    off_m = above.compute_heights_m(road)
     assert np.isnan(off_m[np.abs(road[:, 1]) > 17.0]).all()
     np.testing.assert_allclose(off_m[np.isfinite(off_m)], -5.5, atol=0.5)
 
@@ -124,7 +126,7 @@ def test_beyond_what_was_seen_nothing_is_known():
     holed = road[np.hypot(*(road[:, :2] - [5.0, 20.0]).T) > 16.0]
     ground = ground_of(holed)
     places_m = np.array([[5.0, 20.0, 1.0], [5.0, 7.0, 1.0], [-30.0, 0.0, 1.0], [70.0, 0.0, 1.0], [0.0, -999.0, 1.0]])
-    found_m = ground.heights_m(places_m)
+    found_m = ground.compute_heights_m(places_m)
     assert np.isnan(found_m).tolist() == [True, False, False, True, True]
     np.testing.assert_allclose(found_m[1:3], 1.0, atol=0.05)
 
@@ -143,24 +145,24 @@ def test_points_without_a_place_say_nothing():
     road = seen(hills)
     bad = np.array([[np.nan, 0.0, 0.0], [0.0, 0.0, np.inf], [1.0, 1.0, -np.inf]])
     places_m = seen(hills, 100, seed=7)
-    expected_m = ground_of(road).heights_m(places_m)
-    np.testing.assert_array_equal(ground_of(np.concatenate([road, bad])).heights_m(places_m), expected_m)
-    assert np.isnan(ground_of(road).heights_m(np.array([[np.nan, 0.0, 0.0], [0.0, 0.0, np.nan]]))).all()
+    expected_m = ground_of(road).compute_heights_m(places_m)
+    np.testing.assert_array_equal(ground_of(np.concatenate([road, bad])).compute_heights_m(places_m), expected_m)
+    assert np.isnan(ground_of(road).compute_heights_m(np.array([[np.nan, 0.0, 0.0], [0.0, 0.0, np.nan]]))).all()
 
 
 def test_neither_the_order_of_points_nor_of_sweeps_matters():
     one, two, places_m = seen(hills, seed=1), seen(kerbs, 3000, seed=2), seen(hills, 300, seed=3)
-    expected_m = ground_of(one, two).heights_m(places_m)
+    expected_m = ground_of(one, two).compute_heights_m(places_m)
     turned = np.random.default_rng(0).permutation(one)
-    np.testing.assert_allclose(ground_of(two, turned).heights_m(places_m), expected_m, atol=2e-6)
+    np.testing.assert_allclose(ground_of(two, turned).compute_heights_m(places_m), expected_m, atol=2e-6)
 
 
 def test_large_coordinates_change_nothing():
     road, places_m = seen(hills), seen(hills, 300, seed=3)
-    expected_m = ground_of(road).heights_m(places_m)
+    expected_m = ground_of(road).compute_heights_m(places_m)
     shift_m = np.array([4096 * CELL_M, -8192 * CELL_M, 512.0])
     shifted = ground_of(road + shift_m, place_m=shift_m)
-    np.testing.assert_allclose(shifted.heights_m(places_m + shift_m), expected_m, atol=1e-8)
+    np.testing.assert_allclose(shifted.compute_heights_m(places_m + shift_m), expected_m, atol=1e-8)
 
 
 class Road(Drive):
@@ -168,13 +170,13 @@ class Road(Drive):
 
     tilt_deg = (0.0, 0.0)
 
-    def world_T_vehicle(self, index):
-        return super().world_T_vehicle(index) @ rigid(rotation_from_euler(0.0, *self.tilt_deg), np.zeros(3))
+    def get_world_T_vehicle(self, index):
+        return super().get_world_T_vehicle(index) @ rigid(rotation_from_euler(0.0, *self.tilt_deg), np.zeros(3))
 
-    def scan(self, sensor, index):
-        scan = super().scan(sensor, index)
+    def read_scan(self, sensor, index):
+        scan = super().read_scan(sensor, index)
         road_m = seen(rises, 12_000, 30.0, seed=index) + self.origin_m
-        road_m = transform(invert(self.world_T_vehicle(index) @ scan.vehicle_T_sensor), road_m)
+        road_m = transform(invert(self.get_world_T_vehicle(index) @ scan.vehicle_T_sensor), road_m)
         return replace(scan, points_m=np.concatenate([scan.points_m, road_m]))
 
 
@@ -190,7 +192,7 @@ def test_heights_of_a_drive_are_those_of_its_world_however_the_vehicle_leans(til
     frames = RecordedFrames(road, reference=AccumulatedReference(10.0))
     assert frames.has_heights()
     frame = frames[1]
-    placed_m = transform(road.world_T_vehicle(1), frame.reference.numpy().astype(np.float64)) - origin_m
+    placed_m = transform(road.get_world_T_vehicle(1), frame.reference.numpy().astype(np.float64)) - origin_m
     expected_m = placed_m[:, 2] - rises(placed_m[:, 0], placed_m[:, 1])
     found_m = frame.reference_heights_m.numpy()
     assert found_m.dtype == np.float32
@@ -221,7 +223,7 @@ def test_without_times_the_ground_is_that_of_the_instant():
     road.times_s = None
     frames = RecordedFrames(road, rigs={"left": ("left",)}, reference=AccumulatedReference(0.0))
     frame = frames[1]
-    placed_m = transform(road.world_T_vehicle(1), frame.reference.numpy().astype(np.float64))
+    placed_m = transform(road.get_world_T_vehicle(1), frame.reference.numpy().astype(np.float64))
     off_m = frame.reference_heights_m.numpy() - (placed_m[:, 2] - rises(placed_m[:, 0], placed_m[:, 1]))
     assert np.sqrt(np.nanmean(off_m**2)) < 0.03
 
@@ -232,7 +234,7 @@ def test_without_ground_bands_are_over_the_vehicle_and_the_result_says_so():
     assert result.coverage.band_frame == "vehicle"
     assert "Ground: none was found near the vehicle" in " ".join(result.table.notes)
     assert RecordedFrames(Drive())[0].reference_heights_m.isnan().all()
-    assert RecordedFrames(Road(steps=2), ground=False)[0].reference_heights_m is None
+    assert RecordedFrames(Road(steps=2), use_ground_model=False)[0].reference_heights_m is None
 
 
 def test_with_ground_bands_are_over_it():

@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 from torchcover import BevGrid, CoverageMetric
 from torchcover.data import RecordedFrames, Scan
 from torchcover.geometry import BoundingBox, rigid, rotation_from_euler
-from torchcover.recordings.in_vehicle import in_vehicle
+from torchcover.recordings.in_vehicle import transform_to_vehicle
 
 MOUNT = rigid(rotation_from_euler(1.0, -0.5, 0.2), [0.943, 0.02, 1.84])
 GRID = BevGrid(x=(-20.0, 20.0), y=(-15.0, 15.0), cell=0.5)
@@ -67,8 +67,8 @@ def test_numbers_are_those_of_an_independent_computation(tmp_path):
 def test_weights_stay_with_their_points_where_own_ones_are_left_out():
     points_m = np.random.default_rng(0).uniform(-4, 4, (9000, 3))
     scan = Scan(points_m, None, "", weights=np.arange(9000.0))
-    kept = in_vehicle(scan, BoundingBox((-2, -1, 0), (2, 1, 2)))
+    kept = transform_to_vehicle(scan, BoundingBox((-2, -1, 0), (2, 1, 2)))
     own = ((points_m > [-2, -1, 0]) & (points_m < [2, 1, 2])).all(axis=1)
-    assert kept.dropped["own_vehicle"] == own.sum() > 100
+    assert kept.excluded_counts["own_vehicle"] == own.sum() > 100
     np.testing.assert_array_equal(kept.points_m, points_m[~own].astype(np.float32))
     np.testing.assert_array_equal(kept.weights, np.flatnonzero(~own))

@@ -97,7 +97,7 @@ def test_tables_that_do_not_hold_together_are_bad_files(tmp_path, table, change,
     change(rows[0])
     path.write_text(json.dumps(rows))
     with pytest.raises(BadFileError, match=named) as told:
-        open_recording(root).boxes(0)
+        open_recording(root).read_boxes(0)
     assert str(root) in str(told.value)
 
 
@@ -126,7 +126,7 @@ def test_frame_numbers_of_kitti_identify_tracklets_and_times(tmp_path, stamps, g
     partial = open_recording(path)
     np.testing.assert_allclose(partial.times_s, whole.times_s[left] - whole.times_s[left[0]], atol=1e-6)
     for index, number in enumerate(left):
-        torch.testing.assert_close(partial.boxes(index).rows, whole.boxes(number).rows)
+        torch.testing.assert_close(partial.read_boxes(index).rows, whole.read_boxes(number).rows)
 
 
 def remove_second_pose(layout, path):
@@ -148,14 +148,14 @@ def test_a_missing_pose_costs_its_sweep_only(layout, tmp_path):
     remove_second_pose(layout, path)
     with pytest.warns(UserWarning, match=r"1 of 4 sweeps are left out, for there is no pose .* first is "):
         partial = open_recording(path)
-    assert list(partial.names) == [whole.names[index] for index in (0, 2, 3)]
+    assert list(partial.frame_names) == [whole.frame_names[index] for index in (0, 2, 3)]
     np.testing.assert_allclose(partial.times_s, whole.times_s[[0, 2, 3]], atol=1e-6)
     for index, number in enumerate((0, 2, 3)):
-        np.testing.assert_allclose(partial.world_T_vehicle(index), whole.world_T_vehicle(number))
+        np.testing.assert_allclose(partial.get_world_T_vehicle(index), whole.get_world_T_vehicle(number))
         np.testing.assert_array_equal(
-            partial.scan(whole.sensors[0], index).points_m, whole.scan(whole.sensors[0], number).points_m
+            partial.read_scan(whole.sensors[0], index).points_m, whole.read_scan(whole.sensors[0], number).points_m
         )
-        torch.testing.assert_close(partial.boxes(index).rows, whole.boxes(number).rows)
+        torch.testing.assert_close(partial.read_boxes(index).rows, whole.read_boxes(number).rows)
 
 
 def test_kitti_scans_and_poses_of_other_times_are_refused(tmp_path):

@@ -25,9 +25,9 @@ from torchcover.recordings.corrected import correct_recording
 from torchcover.recordings.pose_checks import (
     check_frozen_poses,
     check_pose_conventions,
-    check_pose_jumps,
-    find_lag,
-    read_stretches,
+    check_pose_discontinuities,
+    find_time_offset,
+    read_pose_segments,
 )
 
 MOUNT = rigid(rotation_from_euler(2.0, 1.0, -1.0), [0.5, 0.1, 1.73])
@@ -48,12 +48,12 @@ class Yard:
     sensors = ("lidar",)
     reference_sensors = ()
     square_metres = False
-    instants = None
-    body = None
+    block_indices = None
+    ego_box = None
 
     def __post_init__(self):
-        self.names = [f"f{step}" for step in range(self.steps)]
-        self.frames = range(self.steps)
+        self.frame_names = [f"f{step}" for step in range(self.steps)]
+        self.key_frames = range(self.steps)
         self.times_s = 0.1 * np.arange(self.steps)
         self.rigs = {"one": self.sensors}
         random = np.random.default_rng(3)
@@ -67,7 +67,7 @@ class Yard:
         place_m = AWAY_M + np.array([0.9, 0.4, 0.02]) * way_m
         return rigid(rotation_from_euler(turn_deg, 0.3 * way_m, 0.0), place_m)
 
-    def scan(self, sensor, index):
+    def read_scan(self, sensor, index):
         index = 0 if self.fault == "same" else index
         random = np.random.default_rng(index)
         crate = random.integers(len(self.crates_m), size=SIDES)
@@ -83,7 +83,7 @@ class Yard:
             seen_m = seen_m[:, [1, 0, 2]]
         return Scan(seen_m * {"mm": 1000.0, "cm": 100.0}.get(self.fault, 1.0), MOUNT, sensor)
 
-    def world_T_vehicle(self, index):
+    def get_world_T_vehicle(self, index):
         late = {"late": index - 1, "held": index // 2 * 2, "stuck": 0}
         pose = self.true(late.get(self.fault, index))
         if self.pose_noise:
@@ -97,17 +97,17 @@ class Yard:
             return rigid(pose[:3, :3], pose[[1, 0, 2], 3])
         return invert(pose) if self.fault == "inverse" else pose
 
-    def boxes(self, index):
+    def read_boxes(self, index):
         return Boxes.from_rows(torch.zeros((0, 7))) if self.fault == "unlabelled" else None
 
 
 def doubts(yard):
-    stretches = list(read_stretches(yard, len(yard.frames)))
+    stretches = list(read_pose_segments(yard, len(yard.frames)))
     return check_frozen_poses(stretches) or check_pose_conventions(yard, stretches, "lidar") or ""
 
 
 def jumped(yard):
-    return check_pose_jumps(yard, list(read_stretches(yard, len(yard.frames))))
+    return check_pose_discontinuities(yard, list(read_pose_segments(yard, len(yard.frames))))
 
 
 @pytest.mark.parametrize(
@@ -142,15 +142,15 @@ def test_what_would_mend_a_fault_is_named_and_mends_it(fault):
     name, value = MENDED[fault].removeprefix("--set recording.").split("=")
     corrections = RecordingSettings(**{name: float(value) if name == "lag_s" else value})
     mended = correct_recording(Yard(fault), corrections)
-    assert corrections.words in (MENDED[fault], "--set recording.lag_s=0.1")
+    assert corrections.command_line_options in (MENDED[fault], "--set recording.lag_s=0.1")
     assert not doubts(mended)
     off = [invert(Yard().true(step)) @ pickle.loads(pickle.dumps(mended)).world_T_vehicle(step) for step in range(10)]
     # The last poses, and those between two, are not there: where the vehicle went on evenly they would be right.
     exact = fault not in ("late", "held")
     assert max(np.linalg.norm(each[:3, 3]) for each in off) < (1e-9 if exact else 0.05)
     assert max(np.abs(euler_from_rotation(each[:3, :3])).max() for each in off) < (1e-9 if exact else 0.5)
-    points_m = transform(MOUNT, mended.scan("lidar", 3).points_m)
-    assert np.abs(points_m - transform(MOUNT, Yard().scan("lidar", 3).points_m)).max() < 1e-9
+    points_m = transform(MOUNT, mended.read_scan("lidar", 3).points_m)
+    assert np.abs(points_m - transform(MOUNT, Yard().read_scan("lidar", 3).points_m)).max() < 1e-9
 
 
 @pytest.mark.parametrize(
@@ -179,7 +179,7 @@ def test_clouds_in_feet_are_read_as_asked():
         drive.sensors,
         RecordedFrames(correct_recording(drive, RecordingSettings(units="ft"))).recording,
     )
-    np.testing.assert_allclose(feet.scan(sensor, 0).points_m, 0.3048 * drive.scan(sensor, 0).points_m)
+    np.testing.assert_allclose(feet.read_scan(sensor, 0).points_m, 0.3048 * drive.read_scan(sensor, 0).points_m)
 
 
 def test_labels_of_which_none_fits():
@@ -190,8 +190,8 @@ def test_labels_of_which_none_fits():
 @pytest.mark.parametrize(("jump_m", "turn_deg"), [((0.8, 0.4, 0.0), 0.0), ((0.0, 0.0, 0.0), 4.0)])
 def test_poses_that_jump_are_told_and_no_scans_are_compared_across(jump_m, turn_deg):
     class Jumping(Yard):
-        def world_T_vehicle(self, index):
-            pose = super().world_T_vehicle(index)
+        def get_world_T_vehicle(self, index):
+            pose = super().get_world_T_vehicle(index)
             if index < 6:
                 return pose
             return rigid(np.eye(3), jump_m) @ pose @ rigid(rotation_from_euler(turn_deg, 0.0, 0.0), np.zeros(3))
@@ -204,13 +204,13 @@ def test_poses_that_jump_are_told_and_no_scans_are_compared_across(jump_m, turn_
 
 def test_lags_that_are_none():
     with pytest.raises(ValueError, match="at most 1 s"):
-        RecordingSettings(lag_s=3.0)
+        RecordingSettings(time_offset_s=3.0)
     untimed = Yard()
     untimed.times_s = None
     with pytest.raises(ValueError, match=r"yard: --set recording.lag_s=0\.1 needs the times"):
-        correct_recording(untimed, RecordingSettings(lag_s=0.1)).world_T_vehicle(0)
+        correct_recording(untimed, RecordingSettings(time_offset_s=0.1)).get_world_T_vehicle(0)
     assert correct_recording(untimed, RecordingSettings()) is untimed
-    assert RecordingSettings(units="mm").words == "--set recording.units=mm"
+    assert RecordingSettings(units="mm").command_line_options == "--set recording.units=mm"
 
 
 def test_poses_with_noise_are_not_late():
@@ -223,5 +223,5 @@ def test_poses_with_noise_are_not_late():
         def match(self, settings):
             return 0.7 + 0.2 * np.exp(-(((settings.lag_s - self.better_s) / self.width_s) ** 2))
 
-    assert find_lag([Noisy(0.1, 0.2)]) == (pytest.approx(0.1), pytest.approx(0.9))
-    assert find_lag([Noisy(0.1, 0.2), Noisy(-0.2, 0.03)]) == (0.0, 0.0)
+    assert find_time_offset([Noisy(0.1, 0.2)]) == (pytest.approx(0.1), pytest.approx(0.9))
+    assert find_time_offset([Noisy(0.1, 0.2), Noisy(-0.2, 0.03)]) == (0.0, 0.0)

@@ -42,9 +42,9 @@ def write_poses(folder, **vehicle_T):
 def test_frames_come_in_natural_order_with_their_names(tmp_path):
     names = ["frame10", "frame2", "frame2b", "1_left10", "1_left9", "frame", "Frame1"]
     frames = RecordedFrames(record(tmp_path, names))
-    assert frames.names == ("1_left9", "1_left10", "Frame1", "frame", "frame2", "frame2b", "frame10")
+    assert frames.frame_names == ("1_left9", "1_left10", "Frame1", "frame", "frame2", "frame2b", "frame10")
     assert len(frames) == 7
-    assert [(frame.index, frame.name) for frame in frames] == list(enumerate(frames.names))
+    assert [(frame.index, frame.name) for frame in frames] == list(enumerate(frames.frame_names))
 
 
 def test_a_frame_is_two_float32_clouds_with_counts(tmp_path):
@@ -246,7 +246,7 @@ def test_several_rigs_share_a_reference_and_have_a_pose_each(tmp_path):
     nowhere = np.array([[np.nan, 0, 0], [1.0, 2.0, 3.0]])
     frames = RecordedFrames(record_rigs(tmp_path, rig10=CLOUD, rig2=nowhere))
     assert frames.rigs == ("rig2", "rig10")
-    assert frames.names == ("f2", "f10")
+    assert frames.frame_names == ("f2", "f10")
     assert frames[0].clouds["rig10"].tolist() == CLOUD.tolist()
     assert {name: count for name, count in frames[1].counts.items() if count} == {"sensor_nonfinite": 1}
     turned = rigid(rotation_from_euler(90.0, 0.0, 0.0), [1.0, 0.0, 0.0])

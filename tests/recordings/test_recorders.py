@@ -86,11 +86,11 @@ def test_poses_are_those_of_the_ego_and_cities_are_far_apart_in_time(both, tmp_p
     for index in range(3):
         scene, step = both.simulator.scene_of(index)
         expected = scene.world.ego.trajectory.at(step * scene.world.time_step_s)
-        np.testing.assert_allclose(recording.world_T_vehicle(index), expected, atol=1e-12)
-    apart_s, cities = np.diff(recording.times_s), np.diff(recording.instants)
+        np.testing.assert_allclose(recording.get_world_T_vehicle(index), expected, atol=1e-12)
+    apart_s, cities = np.diff(recording.times_s), np.diff(recording.block_indices)
     assert set(cities) == {0, 1}
     np.testing.assert_allclose(apart_s, 45.0 + 1000.0 * cities)
-    body, ego = recording.body, both.scenario.ego_box()
+    body, ego = recording.ego_box, both.scenario.ego_box()
     assert (body.upper_m, body.lower_m[:2]) == (ego.upper_m, ego.lower_m[:2])
 
 
@@ -106,7 +106,7 @@ def test_kittis_layout_is_read_as_kittis(tmp_path):
     frames = simulated(FRONT, steps=1)
     write_recording(frames, tmp_path / "training", "kitti")
     again = RecordedFrames(tmp_path)
-    assert (again.rigs, again.names) == (("kitti",), ("000000",))
+    assert (again.rigs, again.frame_names) == (("kitti",), ("000000",))
     written, read = frames[0], again[0]
     # What is drawn in KITTI's own car the reader takes for that car.
     points = written.landed().numpy().astype(np.float64)
@@ -222,7 +222,7 @@ def test_a_part_of_a_recording_is_never_read_and_gone_on_with(both, simulated_on
     write_recording(both, tmp_path / "part", layout, resume=True)  # there is nothing left to do
     assert simulated_once == [0, 1, 2]
     assert texts(tmp_path / "part") == texts(tmp_path / "whole")
-    assert len(open_recording(tmp_path / "part").names) == 3
+    assert len(open_recording(tmp_path / "part").frame_names) == 3
 
 
 def anything(recorder, add, setup, init=KittiRecorder.__init__):
@@ -264,7 +264,7 @@ def test_a_recording_has_the_frames_that_were_written(tmp_path):
     with pytest.raises(BadFileError, match=r"recording.json: a list of files with their sizes, and the names"):
         RecordedFrames(tmp_path)
     (tmp_path / "training" / "recording.json").unlink()  # as if another tool had written it
-    assert len(open_recording(tmp_path).names) == 2
+    assert len(open_recording(tmp_path).frame_names) == 2
 
 
 def test_a_kill_at_any_file_operation_costs_a_frame_at_most(tmp_path, monkeypatch):
@@ -283,7 +283,7 @@ def test_a_kill_at_any_file_operation_costs_a_frame_at_most(tmp_path, monkeypatc
                 open_recording(folder)
             kept.add(len(manifest.get("steps", ())))
         with contextlib.suppress(ValueError, FileNotFoundError):  # of nothing that is known: it had not begun
-            assert len(open_recording(folder).names) == 2
+            assert len(open_recording(folder).frame_names) == 2
         write_recording(frames, folder, resume=True)
         assert texts(folder) == texts(whole)
     assert kept == {0, 1, 2}

@@ -16,7 +16,7 @@ from torchcover.files import BadFileError
 from torchcover.geometry import invert, rigid, rotation_from_euler, transform
 from torchcover.recordings.formats.bag import Bag
 from torchcover.recordings.formats.ros import RosBag
-from torchcover.recordings.in_vehicle import in_vehicle
+from torchcover.recordings.in_vehicle import transform_to_vehicle
 
 CORNERS_M = np.array([[5.0, 1.0, 0.5], [8.0, -2.0, 0.25], [-4.0, 0.5, 1.0], [6.0, 6.0, 2.0]])
 FAR_CORNERS_M = CORNERS_M + np.array([1e5, -4e5, 0.0])
@@ -63,26 +63,26 @@ def test_a_cloud_may_have_gaps_rows_and_big_ends(tmp_path, kind, order):
     def organised(time_ns):
         return cloud(columns, time_ns, "lidar", height=2, gap=3, end=5, order=order)
 
-    scan = RosBag(bag(tmp_path / "a", MOUNTED + clouds(organised))).scan("lidar", 0)
+    scan = RosBag(bag(tmp_path / "a", MOUNTED + clouds(organised))).read_scan("lidar", 0)
     stored_m = np.stack([columns[axis] for axis in "xyz"], axis=1)
     np.testing.assert_array_equal(scan.points_m, stored_m)
     assert scan.points_m.dtype == np.dtype(kind)
-    seen = in_vehicle(scan)
-    assert seen.dropped == {"nonfinite": 1, "no_return": 1}
+    seen = transform_to_vehicle(scan)
+    assert seen.excluded_counts == {"nonfinite": 1, "no_return": 1}
     np.testing.assert_allclose(seen.points_m, transform(mount, stored_m[[0, 1, 2, 4]]), atol=1e-6)
 
 
 @pytest.mark.parametrize(("height", "row_step"), [(1, 0), (1, 36), (1, 10**6), (2, 12)])
 def test_a_cloud_without_gaps_needs_no_row_step(tmp_path, height, row_step):
     path = other(tmp_path / "a", height=height, width=4 // height, row_step=row_step)
-    np.testing.assert_array_equal(RosBag(path).scan("lidar", 1).points_m, CORNERS_M.astype("f4"))
+    np.testing.assert_array_equal(RosBag(path).read_scan("lidar", 1).points_m, CORNERS_M.astype("f4"))
 
 
 @pytest.mark.parametrize("ending", ["-wal", "-journal"])
 def test_messages_beside_a_database_are_not_lost(tmp_path, ending):
     path = bag(tmp_path / "a", MOUNTED + clouds(), "sqlite3")
     (path / f"a.db3{ending}").touch()
-    assert len(RosBag(path).names) == 2
+    assert len(RosBag(path).frame_names) == 2
     (path / f"a.db3{ending}").write_bytes(b"more")
     for opened in (path, path / "a.db3"):
         with pytest.raises(BadFileError, match=rf"in a.db3{ending} only, .* `sqlite3 a.db3 'PRAGMA quick_check'`"):
@@ -141,7 +141,7 @@ def test_times_of_points_in_no_unit_are_refused_with_the_setting(tmp_path, store
         BadFileError, match=r"lidar: .*'t'.* no unit of s, ms, us, ns .* --set recording\.point_times=UNIT \(s, ms"
     ):
         RosBag(path)
-    assert RosBag(path, point_times="none").scan("lidar", 1).offsets_s is None
+    assert RosBag(path, point_times="none").read_scan("lidar", 1).offsets_s is None
     with pytest.raises(ValueError, match="point_times: one of s, ms, us, ns, turn, none is needed; got 'h'"):
         RosBag(path, point_times="h")
 
@@ -153,7 +153,7 @@ def test_times_of_points_over_a_part_of_a_turn_are_said(tmp_path):
     path = bag(tmp_path / "a", MOUNTED + driven() + clouds(timed, 3))
     with pytest.warns(UserWarning, match="25% of the 0.1 s between scans; they are read as ns"):
         recording = RosBag(path)
-    np.testing.assert_allclose(recording.scan("lidar", 1).offsets_s, [0, 0.01, 0.02, 0.025])
+    np.testing.assert_allclose(recording.read_scan("lidar", 1).offsets_s, [0, 0.01, 0.02, 0.025])
 
 
 def check_points_are_moved(tmp_path, field, stored):
@@ -170,9 +170,9 @@ def check_points_are_moved(tmp_path, field, stored):
 
     recording = RosBag(bag(tmp_path / "a", MOUNTED + driven() + clouds(measured, 3)))
     for index in range(3):
-        scan = recording.scan("lidar", index)
+        scan = recording.read_scan("lidar", index)
         assert (scan.points_m[7] == 0).all()  # what never came back is still at the sensor
-        there_m = transform(recording.world_T_vehicle(index) @ scan.vehicle_T_sensor, scan.points_m)
+        there_m = transform(recording.get_world_T_vehicle(index) @ scan.vehicle_T_sensor, scan.points_m)
         np.testing.assert_allclose(np.delete(there_m, 7, axis=0), np.delete(world_m, 7, axis=0), atol=1e-3)
 
 
@@ -185,9 +185,9 @@ def test_clouds_of_other_times_are_moved_to_the_instant(tmp_path):
     recording = RosBag(bag(tmp_path / "a", MOUNTED + driven() + clouds(count=3) + second))
     assert recording.sensors == ("lidar", "b")
     frame = RecordedFrames(recording)[2]
-    others_m = transform(invert(recording.world_T_vehicle(2)), FAR_CORNERS_M)
+    others_m = transform(invert(recording.get_world_T_vehicle(2)), FAR_CORNERS_M)
     np.testing.assert_allclose(frame.sensor.numpy()[4:], others_m, atol=1e-3)
-    np.testing.assert_allclose(recording.world_T_vehicle(2), pose_at(0.2), atol=1e-9)
+    np.testing.assert_allclose(recording.get_world_T_vehicle(2), pose_at(0.2), atol=1e-9)
     chosen = RecordedFrames(recording, rigs={"b": ("b",)})[2]
     np.testing.assert_array_equal(chosen.sensor, frame.sensor[4:])
 
@@ -200,7 +200,7 @@ def test_odometry_may_be_that_of_another_frame(tmp_path):
         for k in range(2)
     ]
     recording = RosBag(bag(tmp_path / "a", mounted + measured + clouds()))
-    np.testing.assert_allclose(recording.world_T_vehicle(1), pose_at(0.1), atol=1e-9)
+    np.testing.assert_allclose(recording.get_world_T_vehicle(1), pose_at(0.1), atol=1e-9)
 
 
 def test_a_tree_leads_to_the_frame_that_never_jumps(tmp_path):
@@ -210,7 +210,7 @@ def test_a_tree_leads_to_the_frame_that_never_jumps(tmp_path):
     mounted = [static(link("base_link", "lidar", mount), link("footprint", "base_link", raised))]
     moved = [("/tf", T0_NS + k * STEP_NS, tree(jump[k], here[k])) for k in range(2)]
     recording = RosBag(bag(tmp_path / "a", mounted + moved + clouds()))
-    np.testing.assert_allclose(recording.world_T_vehicle(1), pose_at(0.1) @ raised, atol=1e-9)
+    np.testing.assert_allclose(recording.get_world_T_vehicle(1), pose_at(0.1) @ raised, atol=1e-9)
 
 
 def test_scans_beyond_the_poses_are_left_out(tmp_path):
@@ -219,7 +219,7 @@ def test_scans_beyond_the_poses_are_left_out(tmp_path):
     recording = RosBag(bag(tmp_path / "a", MOUNTED + late + clouds(count=20)))
     # 0.5 to 0.79 s, and what a vehicle does within 0.15 s more.
     assert recording.times_s.tolist() == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4, 0.5])
-    assert recording.names[0] == str(T0_NS + 4 * STEP_NS)
+    assert recording.frame_names[0] == str(T0_NS + 4 * STEP_NS)
 
 
 def test_what_was_chosen_is_said(tmp_path):
@@ -236,7 +236,7 @@ def test_what_was_chosen_is_said(tmp_path):
         "poses are taken from /odom (odometry of base_link), not from /goal (poses)",
     ]
     recording = RosBag(bag(tmp_path / "b", MOUNTED + clouds()), vehicle_frame="lidar")
-    np.testing.assert_allclose(recording.scan("lidar", 0).vehicle_T_sensor, np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(recording.read_scan("lidar", 0).vehicle_T_sensor, np.eye(4), atol=1e-12)
 
 
 raised = rigid(np.eye(3), [0.0, 0.0, 0.2])
@@ -247,10 +247,10 @@ def test_the_frame_on_the_ground_is_the_vehicles(tmp_path):
     path = bag(tmp_path / "a", mounted + driven() + clouds())
     with pytest.warns(UserWarning, match="base_footprint is taken for the vehicle's frame, not base_link"):
         recording = RosBag(path)
-    np.testing.assert_allclose(recording.scan("lidar", 0).vehicle_T_sensor, raised @ mount, atol=1e-12)
-    np.testing.assert_allclose(recording.world_T_vehicle(1), pose_at(0.1) @ invert(raised), atol=1e-9)
+    np.testing.assert_allclose(recording.read_scan("lidar", 0).vehicle_T_sensor, raised @ mount, atol=1e-12)
+    np.testing.assert_allclose(recording.get_world_T_vehicle(1), pose_at(0.1) @ invert(raised), atol=1e-9)
     asked = RosBag(path, vehicle_frame="base_link")
-    np.testing.assert_allclose(asked.scan("lidar", 0).vehicle_T_sensor, mount, atol=1e-12)
+    np.testing.assert_allclose(asked.read_scan("lidar", 0).vehicle_T_sensor, mount, atol=1e-12)
 
 
 def moved_tree(k, *links):
@@ -276,8 +276,8 @@ def test_mounts_may_come_with_what_moves(tmp_path, write):
     path = write(tmp_path / "a", moved + clouds(count=3) + head)
     with pytest.warns(UserWarning, match=r"left out, .* the frame of /head"):
         recording = RosBag(path)
-    np.testing.assert_allclose(recording.scan("lidar", 0).vehicle_T_sensor, raised @ mount, atol=1e-9)
-    np.testing.assert_allclose(recording.world_T_vehicle(2), pose_at(0.2), atol=1e-6)
+    np.testing.assert_allclose(recording.read_scan("lidar", 0).vehicle_T_sensor, raised @ mount, atol=1e-9)
+    np.testing.assert_allclose(recording.get_world_T_vehicle(2), pose_at(0.2), atol=1e-6)
 
 
 def test_mounts_may_be_told(tmp_path):
@@ -298,13 +298,15 @@ def test_mounts_may_be_told(tmp_path):
         RosBag(path)
     recording = RosBag(path, mounts={"lidar": mount})
     assert recording.sensors == ("b", "lidar")
-    np.testing.assert_allclose(recording.scan("lidar", 0).vehicle_T_sensor, mount, atol=1e-12)
-    np.testing.assert_allclose(recording.scan("b", 0).vehicle_T_sensor, mount @ invert(raised) @ beside, atol=1e-12)
-    np.testing.assert_allclose(recording.world_T_vehicle(2), pose_at(0.2), atol=1e-9)
+    np.testing.assert_allclose(recording.read_scan("lidar", 0).vehicle_T_sensor, mount, atol=1e-12)
+    np.testing.assert_allclose(
+        recording.read_scan("b", 0).vehicle_T_sensor, mount @ invert(raised) @ beside, atol=1e-12
+    )
+    np.testing.assert_allclose(recording.get_world_T_vehicle(2), pose_at(0.2), atol=1e-9)
     told = RosBag(path, mounts={"lidar": mount, "b": raised})
-    np.testing.assert_allclose(told.scan("b", 0).vehicle_T_sensor, raised, atol=1e-9)
+    np.testing.assert_allclose(told.read_scan("b", 0).vehicle_T_sensor, raised, atol=1e-9)
     alone = RosBag(bag(tmp_path / "b", clouds()), mounts={"lidar": mount})
-    np.testing.assert_allclose(alone.scan("lidar", 0).vehicle_T_sensor, mount, atol=1e-12)
+    np.testing.assert_allclose(alone.read_scan("lidar", 0).vehicle_T_sensor, mount, atol=1e-12)
     with pytest.raises(BadFileError, match=r"mount of roof: there are clouds of b, lidar"):
         RosBag(path, mounts={"roof": mount})
 
@@ -314,7 +316,7 @@ def test_files_of_ros_1_are_parts_of_one_bag(tmp_path):
     bags.bag1(tmp_path / "drive" / "lidar.bag", MOUNTED + clouds(count=3))
     bags.bag1(tmp_path / "drive" / "poses.bag", driven())
     recording = open_recording(tmp_path / "drive")
-    np.testing.assert_allclose(recording.world_T_vehicle(2), pose_at(0.2), atol=1e-9)
+    np.testing.assert_allclose(recording.get_world_T_vehicle(2), pose_at(0.2), atol=1e-9)
     whole = (tmp_path / "drive" / "lidar.bag").read_bytes()
     (tmp_path / "drive" / "lidar.bag").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(BadFileError, match=r"rosbag reindex lidar\.bag"):
@@ -325,7 +327,7 @@ def test_files_of_ros_1_are_parts_of_one_bag(tmp_path):
 def test_to_open_a_bag_reads_few_clouds(tmp_path, monkeypatch, storage):
     path = bag(tmp_path / "a", MOUNTED + driven(250) + clouds(count=200), storage)
     read = []
-    messages = Bag.messages
+    messages = Bag.read_messages
 
     def counted(self, topic, *times):
         found = messages(self, topic, *times)
@@ -334,10 +336,10 @@ def test_to_open_a_bag_reads_few_clouds(tmp_path, monkeypatch, storage):
 
     monkeypatch.setattr(Bag, "messages", counted)
     recording = RosBag(path)
-    assert len(recording.names) == 27  # 2.49 s of poses
+    assert len(recording.frame_names) == 27  # 2.49 s of poses
     # The first for its frame; those within 1 s of the first pose and of the last for their stamps.
     assert read.count("/lidar") <= 1 + 11 + 20
-    assert len(RosBag(next(path.glob("a.*"))).names) == 27  # the file alone
+    assert len(RosBag(next(path.glob("a.*"))).frame_names) == 27  # the file alone
 
 
 def other(path, **changes):
@@ -380,7 +382,7 @@ XYZ = (("x", 0, 7), ("y", 4, 7))
 def test_clouds_that_lie_about_themselves(tmp_path, changes, told):
     recording = RosBag(other(tmp_path / "a", **changes))
     with pytest.raises(BadFileError, match=told):
-        recording.scan("lidar", 0)
+        recording.read_scan("lidar", 0)
 
 
 LOOP = link("a", "lidar", mount), link("b", "a", mount), link("a", "b", mount)
@@ -440,7 +442,7 @@ def test_poses_in_two_frames_are_not_mixed(tmp_path, odom_every, map_every):
     with pytest.warns(UserWarning, match=r"from /tf \(base_link in odom\), not from /tf \(base_link in map\)"):
         recording = RosBag(path)
     for index in range(5):
-        np.testing.assert_allclose(recording.world_T_vehicle(index), pose_at(0.1 * index), atol=1e-6)
+        np.testing.assert_allclose(recording.get_world_T_vehicle(index), pose_at(0.1 * index), atol=1e-6)
 
 
 def test_a_second_way_to_the_same_frame_is_told(tmp_path):
@@ -455,7 +457,7 @@ def test_a_second_way_to_the_same_frame_is_told(tmp_path):
     with pytest.warns(UserWarning, match="map -> (odometry|matcher): not used, since poses are taken on another way"):
         recording = RosBag(bag(tmp_path / "a", MOUNTED + messages + clouds(count=5)))
     off_m = np.diff(
-        [recording.world_T_vehicle(index)[:3, 3] - pose_at(0.1 * index)[:3, 3] for index in range(5)], axis=0
+        [recording.get_world_T_vehicle(index)[:3, 3] - pose_at(0.1 * index)[:3, 3] for index in range(5)], axis=0
     )
     np.testing.assert_allclose(off_m, 0.0, atol=1e-6)
 
@@ -485,7 +487,7 @@ def test_a_frame_that_is_mounted_twice_is_told(tmp_path):
         else:
             recording = RosBag(path)  # a second tree, which says nothing of the vehicle
         expected = other_mount if name == "twice" else mount
-        np.testing.assert_allclose(recording.scan("lidar", 0).vehicle_T_sensor, expected, atol=1e-12)
+        np.testing.assert_allclose(recording.read_scan("lidar", 0).vehicle_T_sensor, expected, atol=1e-12)
 
 
 def test_the_frame_of_the_poses_may_lie_above_the_ground(tmp_path):
@@ -493,14 +495,14 @@ def test_the_frame_of_the_poses_may_lie_above_the_ground(tmp_path):
     moved = [moved_tree(k) for k in range(8)]
     with pytest.warns(UserWarning, match="base_footprint is taken"):
         recording = RosBag(bag(tmp_path / "a", mounted + moved + clouds(count=3)))
-    np.testing.assert_allclose(recording.world_T_vehicle(2), pose_at(0.2) @ invert(raised), atol=1e-6)
+    np.testing.assert_allclose(recording.get_world_T_vehicle(2), pose_at(0.2) @ invert(raised), atol=1e-6)
 
 
 def test_a_static_transform_that_moves_is_told(tmp_path):
     both = [static(link("odom", "base_link", mount), link("base_link", "lidar", mount))]
     with pytest.warns(UserWarning, match="odom -> base_link: sent as static and as moving transforms"):
         recording = RosBag(bag(tmp_path / "a", both + [moved_tree(k) for k in range(8)] + clouds(count=3)))
-    np.testing.assert_allclose(recording.world_T_vehicle(2), pose_at(0.2), atol=1e-6)
+    np.testing.assert_allclose(recording.get_world_T_vehicle(2), pose_at(0.2), atol=1e-6)
 
 
 @pytest.mark.parametrize("count", [5, 90])
@@ -512,14 +514,14 @@ def test_stamps_are_the_times(tmp_path, count, slowness):
     with pytest.warns(UserWarning, match="scans of lidar were recorded 0 to .* s after their stamps, which are used"):
         recording = RosBag(bag(tmp_path / "a", sorted(slow, key=lambda one: one[1])))
     np.testing.assert_allclose(recording.times_s, 0.1 * np.arange(count), atol=1e-9)
-    np.testing.assert_allclose(recording.world_T_vehicle(4), pose_at(0.4), atol=1e-6)
+    np.testing.assert_allclose(recording.get_world_T_vehicle(4), pose_at(0.4), atol=1e-6)
 
 
 def test_scans_are_paired_by_their_stamps(tmp_path):
     second = [("/b", time_ns + 80_000_000, message) for _, time_ns, message in clouds(count=9)]  # recorded late
     recording = RosBag(bag(tmp_path / "a", [*MOUNTED, *driven(), *clouds(count=5), *second]))
     for sensor in ("b", "lidar"):
-        assert recording.scan(sensor, 3).offsets_s is None
+        assert recording.read_scan(sensor, 3).offsets_s is None
     assert recording._stamped_ns["b"].tolist() == recording._stamped_ns["lidar"].tolist()
 
 
@@ -535,9 +537,9 @@ def test_a_gap_in_the_poses_is_not_bridged(tmp_path):
         *[("/odom", T0_NS + 15 * STEP_NS + k, odometry(mount, T0_NS + 15 * STEP_NS + k)) for k in range(2)],
     ]
     recording = RosBag(bag(tmp_path / "a", MOUNTED + hole + clouds(count=15)))
-    recording.scan("lidar", 1)
+    recording.read_scan("lidar", 1)
     with pytest.raises(BadFileError, match=r"the poses before and after .* are 1.49 s apart; .* record more often"):
-        recording.scan("lidar", 6)
+        recording.read_scan("lidar", 6)
 
 
 def test_a_sensor_that_pauses_is_missing_there(tmp_path):
@@ -547,9 +549,9 @@ def test_a_sensor_that_pauses_is_missing_there(tmp_path):
         if not 3 <= (time_ns - T0_NS) // STEP_NS <= 4
     ]
     recording = RosBag(bag(tmp_path / "a", MOUNTED + clouds(count=9) + paused))
-    recording.scan("b", 2)
+    recording.read_scan("b", 2)
     with pytest.raises(BadFileError, match=r"the scan of b nearest to .* is 0.100 s off"):
-        recording.scan("b", 3)
+        recording.read_scan("b", 3)
 
 
 @pytest.mark.parametrize(
@@ -614,7 +616,7 @@ def test_bags_stay_compressed_and_bounded(tmp_path, monkeypatch, storage, compre
             return bags.bag1(tmp_path / f"{name}.bag", MOUNTED + clouds(), compression)
         return bag(tmp_path / name, MOUNTED + clouds(), storage, compression)
 
-    assert len(RosBag(write("good")).scan("lidar", 1).points_m) == 4
+    assert len(RosBag(write("good")).read_scan("lidar", 1).points_m) == 4
     if compression == "BZ2":  # which takes long to grow
         return
     bomb = compress_zeros(lz4.frame.LZ4FrameCompressor() if storage == "ros1" else zstd.ZstdCompressor())
@@ -632,7 +634,7 @@ def test_messages_are_bounded_by_what_they_become(tmp_path, monkeypatch):
     recording = RosBag(bag(tmp_path / "a", MOUNTED + clouds(lambda t: cloud(points(np.zeros((9000, 3))), t, "lidar"))))
     monkeypatch.setenv("TORCHCOVER_MAX_FILE_GB", "0.002")
     with pytest.raises(BadFileError, match=r"reading it takes 0.00216 GB of memory, more than the 0.002 GB"):
-        recording.scan("lidar", 0)
+        recording.read_scan("lidar", 0)
 
 
 def test_pipes_are_no_bags(tmp_path):

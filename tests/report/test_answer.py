@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from torchcover.estimation import Number, Quantity
-from torchcover.report import PageRange
-from torchcover.report.page.drawings import plans_html, ranges_html
+from torchcover.report import DetectionShares
+from torchcover.report.page.drawings import render_detection_shares, render_target_maps
 
 # Machado, Oliveira and Fernandes 2009, severity 1: of linear red, green and blue.
 SEEING = {
@@ -42,7 +42,7 @@ def test_colours_of_plans_are_told_apart_by_all_eyes(eyes):
 
 def test_a_share_is_where_its_number_is_and_an_unknown_one_nowhere():
     known, unknown = Number(SHARE, 0.42, 0.01, 0.4, 0.44), Number(SHARE, float("nan"))
-    text = ranges_html([PageRange("<b>", {"a": known, "<i>": unknown})])
+    text = render_detection_shares([DetectionShares("<b>", {"a": known, "<i>": unknown})])
     assert '<line x1="40.0" x2="44.0"' in text
     assert '<circle cx="42.0"' in text
     assert text.count("<circle") == 1
@@ -53,4 +53,4 @@ def test_a_share_is_where_its_number_is_and_an_unknown_one_nowhere():
 
 
 def test_nothing_is_shown_of_nothing():
-    assert plans_html(()) == ranges_html(()) == ""
+    assert render_target_maps(()) == render_detection_shares(()) == ""

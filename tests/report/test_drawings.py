@@ -10,8 +10,8 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from torchcover.geometry import rigid, rotation_from_euler
-from torchcover.report import ActorMark, SensorView, StandingFaces, draw_depths, draw_rig, draw_scene
-from torchcover.report.page.drawings import rig_drawing, sensor_table
+from torchcover.report import ActorMark, SensorView, StaticFaces, plot_depth_images, plot_rig, plot_scene
+from torchcover.report.page.drawings import build_sensor_table, render_rig
 from torchcover.report.scene import PATH, REFERENCE, SENSOR, SKY
 
 VERTICES = np.array([[x, y, z] for x in (-2.0, 2.0) for y in (-1.0, 1.0) for z in (0.0, 1.5)])
@@ -41,7 +41,7 @@ class Picture:
 
 
 def rig(*sensors, **options) -> Picture:
-    return Picture(draw_rig(VERTICES, FACES, sensors, title=options.pop("title", "Rig"), **options))
+    return Picture(plot_rig(VERTICES, FACES, sensors, title=options.pop("title", "Rig"), **options))
 
 
 def test_a_sensor_sees_within_its_angles_however_it_is_turned():
@@ -52,8 +52,8 @@ def test_a_sensor_sees_within_its_angles_however_it_is_turned():
     left_down = view(yaw=90.0, pitch=20.0)
     inside = [direction(90, -20), direction(90, -49), direction(90, -11), direction(60, -20)]
     outside = [direction(90, -51), direction(90, -9), direction(0, -20), direction(-90, -20)]
-    assert left_down.sees(np.array(inside)).all()
-    assert not left_down.sees(np.array(outside)).any()
+    assert left_down.mask_directions(np.array(inside)).all()
+    assert not left_down.mask_directions(np.array(outside)).any()
 
 
 @pytest.mark.parametrize(
@@ -115,7 +115,7 @@ def test_a_full_turn_is_a_fan_to_the_front_and_one_to_the_rear():
 
 def test_the_numbers_of_many_sensors_stand_on_the_paper_however_short_the_vehicle():
     sensors = [view(yaw, at=(0.0, 0.0, 0.5), name=f"s{yaw}") for yaw in np.linspace(0, 2 * np.pi, 8, endpoint=False)]
-    figure = draw_rig(0.2 * VERTICES, FACES, sensors, title="Robot")
+    figure = plot_rig(0.2 * VERTICES, FACES, sensors, title="Robot")
     axes = figure.axes[0]
     (x0, x1), (y0, y1) = axes.get_xlim(), axes.get_ylim()
     numbers_m = {text.get_text(): text.get_position() for text in axes.texts if text.get_text().isdigit()}
@@ -156,7 +156,7 @@ def box(x: float, y: float) -> np.ndarray:
 
 def scene(**options) -> Picture:
     nothing = np.zeros((0, 3), dtype=np.float32)
-    bare = StandingFaces(np.zeros((0, 3, 2)), np.zeros(0))
+    bare = StaticFaces(np.zeros((0, 3, 2)), np.zeros(0))
     given = {
         "standing": bare,
         "ego_outline_m": box(0, 0),
@@ -165,12 +165,12 @@ def scene(**options) -> Picture:
         "reference": nothing,
         "title": "Scene",
     }
-    return Picture(draw_scene((-20.0, 30.0), (-10.0, 10.0), **(given | options)))
+    return Picture(plot_scene((-20.0, 30.0), (-10.0, 10.0), **(given | options)))
 
 
 def test_what_stands_is_drawn_the_darker_the_higher_and_the_ground_is_not():
     squares = [(box(x, 5)[:3], height) for x, height in ((10, 0.0), (15, 0.3), (20, 8.0))]
-    standing = StandingFaces(np.array([corners for corners, _ in squares]), np.array([height for _, height in squares]))
+    standing = StaticFaces(np.array([corners for corners, _ in squares]), np.array([height for _, height in squares]))
     picture = scene(standing=standing)
     ground, kerb, house = (picture.at(0, x + 1, 4.6).mean() for x in (10, 15, 20))
     assert ground == 1.0
@@ -210,7 +210,7 @@ def test_clouds_are_drawn_the_rig_over_the_reference():
 
 
 def depths(images, **options) -> Picture:
-    return Picture(draw_depths(images, title=options.pop("title", "Depths"), **options))
+    return Picture(plot_depth_images(images, title=options.pop("title", "Depths"), **options))
 
 
 def test_a_depth_image_stands_upright_and_shows_what_has_no_depth():
@@ -261,7 +261,7 @@ def test_images_without_a_range_of_depths_are_drawn_too(image):
 )
 def test_what_is_no_image_is_refused(images, message):
     with pytest.raises(ValueError, match=message):
-        draw_depths(images, title="t")
+        plot_depth_images(images, title="t")
 
 
 @pytest.mark.parametrize(
@@ -277,7 +277,7 @@ def test_what_is_no_image_is_refused(images, message):
 )
 def test_a_field_of_view_from_above_ends_on_the_ground(pitch, high, height_m, reach_m):
     sensor = view(pitch=pitch, at=(1.0, 0.0, height_m), wide=2.0, high=high)
-    assert np.linalg.norm(sensor.outline_m(1e4) - (1.0, 0.0), axis=1).max() == pytest.approx(reach_m, rel=0.01)
+    assert np.linalg.norm(sensor.compute_outline_m(1e4) - (1.0, 0.0), axis=1).max() == pytest.approx(reach_m, rel=0.01)
 
 
 @pytest.mark.parametrize(("pitch_deg", "roll_deg"), [(90.0, 0.0), (0.0, 90.0)])
@@ -285,11 +285,11 @@ def test_a_tilted_lidar_is_drawn_with_its_true_field_of_view(pitch_deg, roll_deg
     """On its side, it sees as far as its range along its plane, and across it no farther than its elevations allow."""
     pose = rigid(rotation_from_euler(0.0, pitch_deg, roll_deg), (1.0, 2.0, 1.5))
     view = SensorView("tilted", pose, 360.0, (-15.0, 15.0), 50.0)
-    extent_m = np.abs(view.outline_m(10.0) - (1.0, 2.0)).max(axis=0)
+    extent_m = np.abs(view.compute_outline_m(10.0) - (1.0, 2.0)).max(axis=0)
     along, across = (1, 0) if pitch_deg else (0, 1)
     assert extent_m[along] == pytest.approx(10.0, rel=1e-3)
     assert extent_m[across] == pytest.approx(10.0 * np.sin(np.deg2rad(15.0)), rel=0.02)
-    ((_, _, turned, *_),) = sensor_table([view]).rows
+    ((_, _, turned, *_),) = build_sensor_table([view]).rows
     assert turned.text == f"0.0, {pitch_deg:.1f}, {roll_deg:.1f}"
-    assert "<polygon" in rig_drawing([view], None, 0)
-    assert "<circle" in rig_drawing([SensorView("level", np.eye(4), 360.0, (-15.0, 15.0), 50.0)], None, 0)
+    assert "<polygon" in render_rig([view], None, 0)
+    assert "<circle" in render_rig([SensorView("level", np.eye(4), 360.0, (-15.0, 15.0), 50.0)], None, 0)

@@ -15,7 +15,7 @@ from torchcover.coverage import AGGREGATIONS, Aggregation, BevGrid, Coverage, Co
 from torchcover.coverage.aggregations import State
 from torchcover.coverage.quantity import RADIUS, detection
 from torchcover.estimation import Quantity
-from torchcover.report import SensorView, band_figures, difference_scale, map_figures, write_figures
+from torchcover.report import SensorView, build_difference_scale, plot_band_maps, plot_maps, write_figures
 
 SQUARE = BevGrid(x=(-20.0, 20.0), y=(-10.0, 10.0), cell=1.0)
 SMALL = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)})
@@ -38,7 +38,7 @@ def blocked(steps: int) -> Coverage:
 
 
 def names(coverages: dict[str, Coverage], **options) -> list[str]:
-    return [name for name, _ in map_figures(coverages, **options)]
+    return [name for name, _ in plot_maps(coverages, **options)]
 
 
 def words(figure: Figure) -> list[str]:
@@ -64,7 +64,7 @@ def colours(figure: Figure) -> np.ndarray:
 def test_there_is_a_figure_for_each_quantity_and_band(tmp_path):
     coverage = coverage_of(SQUARE, thresholds=(1.0,))
     keys = ("radius_m", "detection_1m")
-    paths = write_figures(map_figures({"a": coverage}, ego_outline_m=EGO), tmp_path / "new" / "maps")
+    paths = write_figures(plot_maps({"a": coverage}, ego_outline_m=EGO), tmp_path / "new" / "maps")
     stems = [name for key in keys for name in (*(f"{key}_{band}" for band in BANDS), f"near_{key}")]
     assert [path.stem for path in paths] == stems
     assert sorted(paths) == sorted((tmp_path / "new" / "maps").iterdir())
@@ -77,7 +77,7 @@ def test_there_is_a_figure_for_each_quantity_and_band(tmp_path):
 def test_maps_show_what_was_asked_for_and_is_known_and_the_ego():
     metric = CoverageMetric(SQUARE, regions=[Region("ahead", (0.0, 20.0), (-10.0, 10.0))])
     metric.update(torch.zeros(1, 3), torch.tensor([[x, y, 0.0] for x in (-15.5, 9.5) for y in (-3.5, 4.5)]))
-    figures = dict(map_figures({"a": metric.compute()}, ego_outline_m=EGO))
+    figures = dict(plot_maps({"a": metric.compute()}, ego_outline_m=EGO))
     for name in ("radius_m_ground", "radius_m_obstacle"):
         axes = figures[name].axes[0]
         assert axes.get_xlim() == (-3.0, 10.0)  # a metre behind the ego; as far as any band is known
@@ -91,7 +91,7 @@ def test_maps_show_what_was_asked_for_and_is_known_and_the_ego():
 def test_the_near_field_is_two_lengths_of_the_ego_to_scale_and_nothing_lies_over_it():
     sensors = {"a": [SensorView("roof", np.eye(4), 90.0, (-10.0, 10.0), 8.0)]}
     coverage = blocked(16)
-    near = dict(map_figures({"a": coverage}, ego_outline_m=EGO, sensors=sensors))["near_radius_m"]
+    near = dict(plot_maps({"a": coverage}, ego_outline_m=EGO, sensors=sensors))["near_radius_m"]
     *views, _ = near.axes
     assert [view.get_xlim() for view in views] == [(-10.0, 10.0)] * 2
     assert [view.get_ylim() for view in views] == [(-9.0, 9.0)] * 2
@@ -135,7 +135,7 @@ class Emptiness(Aggregation):
 
 def test_a_quantity_of_ones_own_is_drawn_without_being_known():
     coverage = coverage_of(SMALL, thresholds=(), aggregations=(Emptiness(),))
-    figure = dict(map_figures({"a": coverage}))["emptiness_all"]
+    figure = dict(plot_maps({"a": coverage}))["emptiness_all"]
     assert words(figure)[0] == "Share of emptiness, all"
     assert (figure.axes[1].get_ylabel(), figure.axes[1].get_ylim()) == ("share of emptiness (%)", (0.0, 100.0))
     assert "difference_emptiness_all_b_minus_a" in names({"a": coverage, "b": coverage})
@@ -145,7 +145,7 @@ def test_the_bands_of_a_quantity_share_their_colours():
     grid = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0, heights={"low": (0.0, 1.0), "high": (9.0, 11.0)})
     metric = CoverageMetric(grid, thresholds=())
     metric.update(torch.zeros(1, 3), torch.tensor([[0.5, 0.5, 0.5], [0.5, 0.5, 10.0]]))
-    low, high = (colours(figure)[400, 400] for _, figure in map_figures({"a": metric.compute()}))
+    low, high = (colours(figure)[400, 400] for _, figure in plot_maps({"a": metric.compute()}))
     assert np.abs(low - high).max() > 0.5
 
 
@@ -154,14 +154,14 @@ def test_any_band_name_becomes_a_file_in_the_folder_and_no_two_share_one(tmp_pat
     bands = ["../up", "a/b", "a\\b", "A b", "a_b_3", "$x$", "long" * 99, "Höhe", "\n"]
     heights = {name: (float(at), at + 1.0) for at, name in enumerate(bands)}
     grid = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights=heights)
-    paths = write_figures(map_figures({"a": coverage_of(grid, thresholds=())}), tmp_path / "maps")
+    paths = write_figures(plot_maps({"a": coverage_of(grid, thresholds=())}), tmp_path / "maps")
     assert len({path.name.lower() for path in paths}) == len(bands)
     assert sorted(tmp_path.rglob("*.png")) == sorted(paths)
     assert all(path.parent == tmp_path / "maps" for path in paths)
 
 
 def test_the_title_names_quantity_band_cell_and_steps():
-    figures = dict(map_figures({"a": coverage_of(SQUARE, thresholds=())}))
+    figures = dict(plot_maps({"a": coverage_of(SQUARE, thresholds=())}))
     expected = ["Mean blind spot radius, obstacle", "z 0.5 to 2 m; 1 step, cells of 1 m"]
     assert words(figures["radius_m_obstacle"]) == expected
 
@@ -169,12 +169,12 @@ def test_the_title_names_quantity_band_cell_and_steps():
 def test_the_sensors_of_the_rig_are_named():
     sensor = SensorView("the lidar", np.eye(4), 90.0, (-9.0, 9.0), 5.0)
     coverage = coverage_of(SQUARE, thresholds=())
-    _, figure = next(map_figures({"a": coverage}, sensors={"a": [sensor], "another": []}, ego_outline_m=EGO))
+    _, figure = next(plot_maps({"a": coverage}, sensors={"a": [sensor], "another": []}, ego_outline_m=EGO))
     assert {"the lidar", "ego"} <= set(legend(figure))
 
 
 def test_the_bands_of_a_quantity_lie_side_by_side_for_loggers():
-    figures = dict(band_figures(coverage_of(SQUARE)))
+    figures = dict(plot_band_maps(coverage_of(SQUARE)))
     assert list(figures) == ["radius_m", "detection_0.4m"]
     headings = [axes.texts[0].get_text() for axes in figures["radius_m"].axes[:2]]
     assert headings == ["ground, z -0.5 to 0.5 m", "obstacle, z 0.5 to 2 m"]
@@ -186,7 +186,7 @@ def test_the_bands_of_a_quantity_lie_side_by_side_for_loggers():
 @pytest.mark.usefixtures("blank_maps")
 def test_there_is_a_difference_for_each_rig_but_the_first(pair, measure, points, tmp_path):
     three = {**pair, "a/b": measure(points(40, 5))}
-    paths = write_figures(map_figures(three, ego_outline_m=EGO), tmp_path)
+    paths = write_figures(plot_maps(three, ego_outline_m=EGO), tmp_path)
     places = [f"{key}_{band}" for key in ("radius_m", "detection_0.4m") for band in BANDS]
     expected = [f"{place}.png" for place in places]
     expected += [f"difference_{place}_{rig}_minus_few.png" for place in places for rig in ("many", "a_b")]
@@ -198,7 +198,7 @@ def test_a_worse_place_is_red_and_a_better_one_blue_whatever_is_measured(measure
     """The second rig sees at the front left only, the first at the rear right only."""
     front_left, rear_right = torch.tensor([[11.0, 4.0, 0.0]]), torch.tensor([[-4.0, -4.0, 0.0]])
     rigs = {"first": measure(rear_right, thresholds=(5.0,)), "second": measure(front_left, thresholds=(5.0,))}
-    differences = [figure for name, figure in map_figures(rigs) if name.startswith("difference")]
+    differences = [figure for name, figure in plot_maps(rigs) if name.startswith("difference")]
     assert len(differences) == 4
     for figure in differences:
         red, _, blue = np.moveaxis(colours(figure), 2, 0)
@@ -211,7 +211,7 @@ def test_a_worse_place_is_red_and_a_better_one_blue_whatever_is_measured(measure
 
 
 def test_a_difference_says_which_minus_which_and_what_is_better(pair):
-    differences = [words(figure) for name, figure in map_figures(pair) if name.startswith("difference")]
+    differences = [words(figure) for name, figure in plot_maps(pair) if name.startswith("difference")]
     quantities = ("mean blind spot radius", "detection within 0.4 m")
     expected = [f"many minus few: {quantity}, {band}" for quantity in quantities for band in BANDS]
     assert [title for title, _ in differences] == expected
@@ -220,23 +220,23 @@ def test_a_difference_says_which_minus_which_and_what_is_better(pair):
 
 def test_the_difference_scale_is_symmetric_and_robust_and_turns_with_what_is_better():
     differences = torch.cat([torch.linspace(-1.0, 0.5, 1000), torch.tensor([900.0, float("nan"), float("inf")])])
-    scale = difference_scale(RADIUS, differences)
+    scale = build_difference_scale(RADIUS, differences)
     assert scale.low == -scale.high
     assert 0.9 <= scale.high <= 1.0
     assert (scale.colormap, scale.unit) == ("RdBu_r", "m")
-    within = difference_scale(detection(0.4), differences)
+    within = build_difference_scale(detection(0.4), differences)
     assert (within.colormap, within.unit) == ("RdBu", "percentage points")
-    assert difference_scale(RADIUS, torch.zeros(9)).high > 0
+    assert build_difference_scale(RADIUS, torch.zeros(9)).high > 0
 
 
 def test_what_is_not_paired_is_refused_before_anything_is_drawn(measure, points):
     with pytest.raises(ValueError, match="'a' and 'b' cannot be compared"):
-        map_figures({"a": measure(points(9, 1)), "b": measure(points(9, 1), seed=7)})
+        plot_maps({"a": measure(points(9, 1)), "b": measure(points(9, 1), seed=7)})
 
 
 def test_titles_say_what_carried_the_rigs():
     coverage = coverage_of(SMALL)
-    _, figure = next(map_figures({"a": coverage}, vehicle="van"))
+    _, figure = next(plot_maps({"a": coverage}, vehicle="van"))
     assert "; on van, 1 step" in words(figure)[1]
-    _, figure = next(map_figures({"a": coverage}))
+    _, figure = next(plot_maps({"a": coverage}))
     assert " on " not in words(figure)[1]

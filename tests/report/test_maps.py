@@ -14,10 +14,10 @@ from matplotlib.figure import Figure
 from torchcover.coverage import BevGrid
 from torchcover.coverage.quantity import RADIUS, detection
 from torchcover.geometry import rigid, rotation_from_euler
-from torchcover.report import ColourScale, SensorView, draw_side_by_side, scale_of
+from torchcover.report import ColorScale, SensorView, build_color_scale, plot_side_by_side
 from torchcover.report.colours import INFINITE, UNKNOWN
 
-SCALE = ColourScale("blind spot radius", "m", "viridis_r", 0.0, 1.0)
+SCALE = ColorScale("blind spot radius", "m", "viridis_r", 0.0, 1.0)
 SQUARE = BevGrid(x=(-20.0, 20.0), y=(-10.0, 10.0), cell=1.0)
 EGO = np.array([[2.0, 1.0], [-2.0, 1.0], [-2.0, -1.0], [2.0, -1.0]])
 
@@ -57,7 +57,7 @@ def draw(values: torch.Tensor, grid: BevGrid = SQUARE, **options) -> Picture:
     for name in options.keys() & {"sensors", "opacity"}:
         options[name] = {"": options[name]}
     scale, title = options.pop("scale", SCALE), options.pop("title", "A map")
-    return Picture(draw_side_by_side({"": values}, grid, scale, title=title, **options))
+    return Picture(plot_side_by_side({"": values}, grid, scale, title=title, **options))
 
 
 def test_a_blind_spot_at_the_front_left_is_dark_at_the_upper_right():
@@ -111,7 +111,7 @@ def test_unknown_cells_are_grey_and_named_with_their_share():
 def test_infinite_cells_have_a_colour_of_their_own_and_leave_the_scale_alone():
     values = flat(0.5)
     values[:, 20:] = math.inf
-    picture = draw(values, scale=scale_of(RADIUS, values))
+    picture = draw(values, scale=build_color_scale(RADIUS, values))
     assert picture.at(10.5, 3.5) == pytest.approx(to_rgb(INFINITE), abs=0.01)
     assert "infinite: a step saw nothing (50.0 % of the cells)" in picture.legend
     assert picture.bar.get_ylim() == (0.0, 0.5)
@@ -129,7 +129,7 @@ def test_values_beyond_the_colours_are_admitted():
 
 def test_rounding_is_not_taken_for_values_beyond_the_colours():
     values = flat(1.0).double() * (0.1 + 0.2)
-    assert "beyond" not in draw(values, scale=scale_of(RADIUS, values)).bar.get_ylabel()
+    assert "beyond" not in draw(values, scale=build_color_scale(RADIUS, values)).bar.get_ylabel()
 
 
 @pytest.mark.parametrize(("yaw", "ahead"), [(0, (1, 0)), (90, (0, 1)), (180, (-1, 0)), (-90, (0, -1))])
@@ -212,26 +212,26 @@ def test_dollars_are_no_formula():
 def test_a_map_of_one_cell_or_one_value_can_be_drawn(value):
     grid = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0)
     values = flat(value, grid)
-    picture = draw(values, grid, scale=scale_of(RADIUS, values))
+    picture = draw(values, grid, scale=build_color_scale(RADIUS, values))
     unknown = picture.axes.get_legend().get_texts()[0].get_text()
     assert unknown == f"unknown: never probed ({100 if math.isnan(value) else 0} % of the cells)"
 
 
 def test_the_radius_scale_ends_at_the_98th_percentile_of_the_known_cells():
     radius = torch.cat([torch.linspace(0.0, 1.0, 1000), torch.full((5,), 500.0), torch.tensor([math.nan, math.inf])])
-    assert scale_of(RADIUS, radius).high == pytest.approx(0.99, abs=0.01)
+    assert build_color_scale(RADIUS, radius).high == pytest.approx(0.99, abs=0.01)
 
 
 def test_dark_means_blind_in_every_scale():
     halves = flat(0.0)
     halves[:, 20:] = 100.0
-    for scale, blind in ((scale_of(RADIUS, halves), 10.0), (scale_of(detection(0.4), halves), -10.0)):
+    for scale, blind in ((build_color_scale(RADIUS, halves), 10.0), (build_color_scale(detection(0.4), halves), -10.0)):
         picture = draw(halves, scale=scale)
         assert picture.at(blind, 5.0).sum() < 1.0 < picture.at(-blind, 5.0).sum()
 
 
 def test_a_few_blind_cells_among_perfect_ones_still_set_the_scale():
-    assert scale_of(RADIUS, torch.tensor([0.0] * 999 + [3.14])).high == 3.2
+    assert build_color_scale(RADIUS, torch.tensor([0.0] * 999 + [3.14])).high == 3.2
 
 
 def test_drawing_leaves_the_global_state_of_matplotlib_alone():
@@ -278,4 +278,4 @@ def test_wrong_shapes_are_refused_with_what_arrived():
 @pytest.mark.parametrize("bounds", [(1.0, 1.0), (2.0, 1.0), (0.0, math.inf), (math.nan, 1.0)])
 def test_a_scale_without_extent_is_refused(bounds):
     with pytest.raises(ValueError, match="finite low < high"):
-        ColourScale("radius", "m", "viridis", *bounds)
+        ColorScale("radius", "m", "viridis", *bounds)

@@ -8,8 +8,16 @@ import pytest
 import torch
 
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric, Region
-from torchcover.report import RENDERERS, CoverageTable, band_figures, map_figures, notes_on, parts_of, remarks_on
-from torchcover.report.records import COLUMNS, records_of
+from torchcover.report import (
+    RENDERERS,
+    CoverageTable,
+    build_page_tables,
+    collect_table_notes,
+    list_notes,
+    plot_band_maps,
+    plot_maps,
+)
+from torchcover.report.records import COLUMNS, build_records
 
 KEYS = ("radius_m", "detection_0.4m")
 SURFACE, CELLS = "Means over the square metres that the reference sees.", "Means over the known cells only"
@@ -20,7 +28,7 @@ NOTHING = Region("nothing", (2.0, 3.0), (0.0, 1.0))
 @pytest.fixture
 def table(surface_pair, regions):
     """Of the surface."""
-    return CoverageTable.of(surface_pair, regions)
+    return CoverageTable.from_coverages(surface_pair, regions)
 
 
 def two_cells() -> Coverage:
@@ -42,7 +50,7 @@ def header(table: CoverageTable) -> list[str]:
 
 
 def test_a_row_has_the_mean_over_the_surface_and_how_much_of_it_there_is():
-    (part,) = parts_of(CoverageTable.of({"rig": two_cells()}, [WALL, NOTHING]))
+    (part,) = build_page_tables(CoverageTable.from_coverages({"rig": two_cells()}, [WALL, NOTHING]))
     wall, nothing = [[cell.text for cell in row] for row in part.rows]
     assert wall[:4] == ["wall", "all", "0.25", "75.0"]
     assert nothing[:4] == ["nothing", "all", "unknown", "unknown"]
@@ -52,19 +60,19 @@ def test_a_row_has_the_mean_over_the_surface_and_how_much_of_it_there_is():
 
 @pytest.mark.parametrize("measure", ["area", "known"])
 def test_a_column_says_in_words_what_it_says_in_files(measure, table, trio, regions):
-    table = table if measure == "area" else CoverageTable.of({"few": trio["few"]}, regions)
+    table = table if measure == "area" else CoverageTable.from_coverages({"few": trio["few"]}, regions)
     assert len({column.key for column in COLUMNS}) == len(COLUMNS)
     assert {column.key for column in COLUMNS} <= set(header(table))
-    shown = [column for column in COLUMNS if column.heading and column.measure in (None, measure)]
-    part, own = parts_of(table)[0], records_of(table)
+    shown = [column for column in COLUMNS if column.heading and column.average in (None, measure)]
+    part, own = build_page_tables(table)[0], build_records(table)
     assert list(part.headings[-len(shown) :]) == [column.heading for column in shown]
     for column in shown:
         cells = [row[part.headings.index(column.heading)].text for row in part.rows]
-        assert cells == [column.words(record[column.key]) for record in own[: len(cells)]]
+        assert cells == [column.format_value(record[column.key]) for record in own[: len(cells)]]
 
 
 def test_files_have_both_measures_each_under_its_name():
-    wall, nothing = records(CoverageTable.of({"rig": two_cells()}, [WALL, NOTHING]))
+    wall, nothing = records(CoverageTable.from_coverages({"rig": two_cells()}, [WALL, NOTHING]))
     assert (wall["measure"], wall["visible_m2"], nothing["visible_m2"]) == ("area", 2.0, 0.0)
     assert (wall["radius_m"], wall["known_radius_m"]) == (0.25, 0.5)
     assert (wall["detection_0.4m"], wall["known_detection_0.4m"]) == (0.75, 0.5)
@@ -76,7 +84,7 @@ def test_every_row_of_a_file_names_what_its_band_is_over(band_frame):
     grid = BevGrid(x=(0.0, 4.0), y=(0.0, 2.0), cell=1.0, band_frame=band_frame)
     metric, point = CoverageMetric(grid), torch.tensor([[0.5, 0.5, 0.0]])
     metric.update(point, point, height=torch.zeros(1) if band_frame == "ground" else None)
-    table = CoverageTable.of({"rig": metric.compute()}, [Region("all", grid.x, grid.y)])
+    table = CoverageTable.from_coverages({"rig": metric.compute()}, [Region("all", grid.x, grid.y)])
     assert {row["band_frame"] for row in csv.DictReader(io.StringIO(RENDERERS["csv"](table)))} == {band_frame}
 
 
@@ -90,7 +98,7 @@ def test_records_are_those_of_the_summary(table, surface_pair, regions):
 
 
 def test_the_surface_adds_the_numbers_over_known_cells_and_no_other_column(table, trio, regions):
-    known = CoverageTable.of({name: trio[name] for name in table.rigs}, regions)
+    known = CoverageTable.from_coverages({name: trio[name] for name in table.rigs}, regions)
     more = {f"known_{key}{end}" for key in KEYS for end in ("", "_error", "_low", "_high")}
     assert [name for name in header(table) if name not in more] == header(known)
     assert set(header(table)) - set(header(known)) == more
@@ -98,25 +106,25 @@ def test_the_surface_adds_the_numbers_over_known_cells_and_no_other_column(table
 
 @pytest.mark.parametrize("name", ["text", "markdown"])
 def test_readers_are_told_which_measure_it_is(name, table, trio, regions):
-    surface, known = RENDERERS[name](table), RENDERERS[name](CoverageTable.of(trio, regions))
+    surface, known = RENDERERS[name](table), RENDERERS[name](CoverageTable.from_coverages(trio, regions))
     assert (SURFACE in surface, CELLS in surface, SURFACE in known, CELLS in known) == (True, False, False, True)
     assert ("visible surface" in surface, "known cells" in known) == (True, True)
 
 
 def test_without_a_region_no_measure_is_told(surface_pair):
-    table = CoverageTable.of(surface_pair, ())
-    assert {remark.name for remark in remarks_on(table, "few")} >= {"no_region"}
+    table = CoverageTable.from_coverages(surface_pair, ())
+    assert {remark.name for remark in collect_table_notes(table, "few")} >= {"no_region"}
     assert SURFACE not in RENDERERS["text"](table)
 
 
 def test_what_rigs_share_is_said_in_the_words_of_the_measure(table, trio, regions):
-    surface, known = notes_on(table)[0], notes_on(CoverageTable.of(trio, regions))[0]
+    surface, known = list_notes(table)[0], list_notes(CoverageTable.from_coverages(trio, regions))[0]
     assert surface.endswith("so they are asked about the same square metres.")
     assert known.endswith("so they know the same cells.")
 
 
 def test_maps_are_those_of_the_measure_and_name_what_is_unknown():
-    figures = dict(map_figures({"rig": two_cells()}))
+    figures = dict(plot_maps({"rig": two_cells()}))
     assert list(figures) == ["radius_area_m_all", "detection_area_0.4m_all"]
     for figure in figures.values():
         (legend,) = [axes.get_legend() for axes in figure.axes if axes.get_legend()]
@@ -131,4 +139,4 @@ def test_maps_are_those_of_the_measure_and_name_what_is_unknown():
 
 
 def test_the_bands_of_loggers_are_those_of_the_measure():
-    assert [name for name, _ in band_figures(two_cells())] == ["radius_area_m", "detection_area_0.4m"]
+    assert [name for name, _ in plot_band_maps(two_cells())] == ["radius_area_m", "detection_area_0.4m"]

@@ -20,28 +20,28 @@ from torchcover.coverage.quantity import RADIUS
 from torchcover.geometry import rigid, rotation_from_euler
 from torchcover.notebooks import small_html
 from torchcover.report import (
-    Line,
+    MapLine,
     Page,
     PageMap,
     PagePicture,
     PageRig,
     PageTable,
     SensorView,
-    Words,
-    maps_of,
-    page_html,
-    scale_of,
+    TextCell,
+    build_color_scale,
+    build_page_maps,
+    render_page,
 )
 from torchcover.report.page.content import Array
-from torchcover.report.page.map_content import CellBytes, encoded
-from torchcover.report.page.writing import fitted
+from torchcover.report.page.map_content import CellBuffer, encode_values
+from torchcover.report.page.writing import fit_maps
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 NASTY = "</script><script>document.title='broken'</script>"
 GRID = BevGrid(x=(-8.0, 12.0), y=(-5.0, 5.0), cell=1.0)
 EGO = np.array([[2.0, 1.0], [-2.0, 1.0], [-2.0, -1.0], [2.0, -1.0]])
 SENSOR = SensorView("<b>front</b>", np.eye(4), 90.0, (-10.0, 10.0), 8.0)
-SCALE = scale_of(RADIUS, torch.tensor([4.0]))
+SCALE = build_color_scale(RADIUS, torch.tensor([4.0]))
 TITLE = "mean blind spot radius, by area"
 
 # What a user does, and what is read then; `opened` is the page's own promise.
@@ -142,10 +142,10 @@ def browsed(page: str, path, script: str = "") -> tuple[str, list[str]]:
 
 def page_of(coverages, **more) -> Page:
     rigs = [PageRig(name, [SENSOR], f"name: {name}") for name in coverages]
-    table = PageTable(NASTY, ["region", "radius"], [[Words(NASTY), Words("1.0", "best")]], notes=[NASTY])
+    table = PageTable(NASTY, ["region", "radius"], [[TextCell(NASTY), TextCell("1.0", "best")]], notes=[NASTY])
     given = {"tables": [table], "rigs": rigs, "ego_outline_m": EGO, "facts": {NASTY: {NASTY: NASTY}}, **more}
-    outlines = [Line(NASTY, np.array([[0.0, 0.0], [5.0, 0.0], [5.0, 5.0]]))]
-    return Page(NASTY, NASTY, maps=list(maps_of(coverages)), outlines=outlines, **given)
+    outlines = [MapLine(NASTY, np.array([[0.0, 0.0], [5.0, 0.0], [5.0, 5.0]]))]
+    return Page(NASTY, NASTY, maps=list(build_page_maps(coverages)), outlines=outlines, **given)
 
 
 def over_surface(size: int, points) -> Coverage:
@@ -168,7 +168,7 @@ def seen(named, tmp_path_factory):
     """What a browser shows of two rigs, and its console."""
     if CHROMIUM is None:
         pytest.skip("no Chromium here: nobody looks at the page")
-    dom, console = browsed(page_html(page_of(named)), tmp_path_factory.mktemp("page") / "page.html", SCRIPT)
+    dom, console = browsed(render_page(page_of(named)), tmp_path_factory.mktemp("page") / "page.html", SCRIPT)
     found = re.search(r'<pre id="found">(.*?)</pre>', dom, re.DOTALL)
     assert found, console
     return json.loads(html.unescape(found[1])), console
@@ -263,8 +263,10 @@ def test_a_wide_table_fits_the_paper_and_breaks_no_short_heading(tmp_path):
         pytest.skip("no Chromium here: nobody looks at the page")
     sensors = [f"{what}_{side}" for what in ("camera", "lidar") for side in ("front", "rear", "left", "right")]
     headings = ["region", "height", "sensors that see\nit", "by two or more\n(%)", *sensors, "most lost with"]
-    row = [Words("behind"), Words("ground"), *[Words("unknown")] * 10, Words("camera_right")]
-    text = page_html(Page("rig", "lead", tables=[PageTable("", headings, [row])])).replace("@media print", "@media all")
+    row = [TextCell("behind"), TextCell("ground"), *[TextCell("unknown")] * 10, TextCell("camera_right")]
+    text = render_page(Page("rig", "lead", tables=[PageTable("", headings, [row])])).replace(
+        "@media print", "@media all"
+    )
     script = """
       const [table, first] = [document.querySelector("table"), document.querySelector("thead th")];
       document.body.style.width = "186mm";
@@ -304,7 +306,7 @@ def test_the_map_draws_the_true_field_of_view_of_a_tilted_sensor(named, tmp_path
     fields = (360.0, (-15.0, 15.0), 50.0), (60.0, (-20.0, 20.0), 50.0), (360.0, (-15.0, 15.0), 50.0)
     sensors = [SensorView("tilted", pose, *field) for pose, field in zip(poses, fields, strict=True)]
     page = page_of({"rig": named["many"]}, rigs=[PageRig("rig", sensors)])
-    dom, console = browsed(page_html(page), tmp_path / "page.html", script)
+    dom, console = browsed(render_page(page), tmp_path / "page.html", script)
     found = re.search(r'<pre id="found">(.*?)</pre>', dom, re.DOTALL)
     assert found, console
     sizes_m = [np.abs(np.array(points) - (1.0, -1.0)).max(axis=0).tolist() for points in json.loads(found[1])]
@@ -332,7 +334,7 @@ def test_names_are_text(seen):
 
 
 def test_a_page_is_one_file_that_asks_for_nothing(named):
-    text = page_html(page_of(named))
+    text = render_page(page_of(named))
     without_names = text.replace("http-equiv", "")
     assert re.findall(r"(?:src|href)=|https?:|url\((?!#)|@import", without_names) == []
     assert text.count("<script") == 3
@@ -340,7 +342,7 @@ def test_a_page_is_one_file_that_asks_for_nothing(named):
 
 
 def test_a_page_without_maps_or_sensors(tmp_path):
-    text = page_html(Page("rig", "lead", rigs=[PageRig("rig")]))
+    text = render_page(Page("rig", "lead", rigs=[PageRig("rig")]))
     assert "Its sensors are unknown" in text
     if CHROMIUM is None:
         pytest.skip("no Chromium here: nobody looks at the page")
@@ -366,7 +368,7 @@ def decoded(codes, bits, scale):
 )
 def test_codes_keep_what_a_reader_can_read(values, bits):
     values = np.append(values, [0.0, np.inf])
-    codes, scale = encoded(values, bits)
+    codes, scale = encode_values(values, bits)
     read = decoded(codes, bits, scale)
     assert read[-2:].tolist() == [0.0, np.inf]
     finite = values[:-1]
@@ -376,7 +378,7 @@ def test_codes_keep_what_a_reader_can_read(values, bits):
 
 
 def test_the_same_is_kept_once():
-    cells, values = CellBytes(), np.arange(200.0).reshape(10, 20)
+    cells, values = CellBuffer(), np.arange(200.0).reshape(10, 20)
     first = cells.add(values, 16)
     alone = len(cells.text)
     assert cells.add(values, 16) == first
@@ -401,7 +403,7 @@ def noisy(rigs: int) -> list[PageMap]:
             SCALE,
             errors=values * random.uniform(0.01, 0.5, values.shape),
             weights=weights,
-            full_weight=1.0,
+            opaque_weight=1.0,
             sides=np.ones(weights.shape, dtype=np.int64),
         )
 
@@ -413,20 +415,20 @@ def noisy(rigs: int) -> list[PageMap]:
 def test_no_page_has_more_than_half_a_megabyte(rigs):
     pictures = [PagePicture("a", bytes(150_000))]
     for given in ({}, {"pictures": pictures}):
-        assert len(page_html(Page("rig", "lead", maps=noisy(rigs), **given))) < 0.5e6
+        assert len(render_page(Page("rig", "lead", maps=noisy(rigs), **given))) < 0.5e6
 
 
 def test_cells_taken_together_have_their_mean_by_weight_and_the_page_says_so():
     whole = noisy(1)[0]
     known = replace(whole, values=np.where(np.arange(800) < 700, whole.values, np.nan))
-    (same,), _, silence = fitted([known], most_chars=10**7)
+    (same,), _, silence = fit_maps([known], max_chars=10**7)
     assert same is known
     assert silence == []
-    (rounded,), _, notes = fitted([known], most_chars=950_000)
+    (rounded,), _, notes = fit_maps([known], max_chars=950_000)
     assert rounded.values is known.values
-    assert (rounded.bits, rounded.errors is known.errors, notes[0][:7]) == (8, True, "Numbers")
+    assert (rounded.num_bits, rounded.errors is known.errors, notes[0][:7]) == (8, True, "Numbers")
     few = replace(known, values=known.values[:8, :12], errors=None, weights=None, sides=None, cell_m=1.0)
-    (coarse, still_few), _, notes = fitted([known, few], most_chars=200_000)
+    (coarse, still_few), _, notes = fit_maps([known, few], max_chars=200_000)
     assert still_few.cell_m == 1.0  # it takes next to nothing, and would have nothing left
     assert coarse.errors is None
     assert coarse.cell_m == 0.5
@@ -435,16 +437,16 @@ def test_cells_taken_together_have_their_mean_by_weight_and_the_page_says_so():
     assert coarse.values[5, 10] == pytest.approx(np.average(known.values[four], weights=known.weights[four]))
     assert np.isnan(coarse.values[:, 350:]).all()
     assert "errors of single cells are left out; some maps show 2 x 2 cells as one" in notes[-1]
-    assert re.search(r"show \d x \d cells as one, so that", page_html(Page("rig", "lead", maps=noisy(1))))
+    assert re.search(r"show \d x \d cells as one, so that", render_page(Page("rig", "lead", maps=noisy(1))))
 
 
 def test_words_between_backticks_are_code_everywhere():
     told = "Add `--steps`; 5 % of <b> are `a<b`."
-    table = PageTable(told, (told, told), [[Words(told), Words(told)]], notes=[told])
+    table = PageTable(told, (told, told), [[TextCell(told), TextCell(told)]], notes=[told])
     parts = {"tables": [table], "more_tables": [table], "pictures": [PagePicture(told, b"png")]}
     rigs = [PageRig(told, [replace(SENSOR, name=told)], "name: rig")]
-    page = Page(told, told, verdict=(told, told), rigs=rigs, facts={told: {told: told}}, **parts)
-    text = page_html(page).partition('<script type="application/json"')[0]
+    page = Page(told, told, findings=(told, told), rigs=rigs, facts={told: {told: told}}, **parts)
+    text = render_page(page).partition('<script type="application/json"')[0]
     assert text.count("Add <code>--steps</code>; 5&nbsp;% of &lt;b&gt; are <code>a&lt;b</code>.") == 23
     assert "<title>Add --steps; 5 % of &lt;b&gt; are a&lt;b.</title>" in text
     assert 'alt="Add --steps; 5 % of &lt;b&gt; are a&lt;b."' in text
@@ -467,10 +469,10 @@ class ElementNames(HTMLParser):
 @pytest.mark.parametrize("words", [NASTY, f"`{NASTY}`", '`" onerror="alert(1)`', "`<`/code`><img src=x>`", "``&lt;b``"])
 def test_backticks_do_not_break_escaping(words):
     def names(words: str) -> ElementNames:
-        table = PageTable(words, (words,), [[Words(words, words)]], notes=[words])
+        table = PageTable(words, (words,), [[TextCell(words, words)]], notes=[words])
         parts = {"tables": [table], "pictures": [PagePicture(words, b"")], "facts": {words: {words: words}}}
-        page = Page(words, words, verdict=[words, words], **parts)
-        return ElementNames(page_html(page) + small_html([words, words], Figure(figsize=(1, 1))))
+        page = Page(words, words, findings=[words, words], **parts)
+        return ElementNames(render_page(page) + small_html([words, words], Figure(figsize=(1, 1))))
 
     hostile, harmless = names(words), names("a `b` c")
     assert hostile.elements <= harmless.elements

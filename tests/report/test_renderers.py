@@ -12,12 +12,12 @@ from torchcover.report import (
     BOLD_MARKS,
     RENDERERS,
     CoverageTable,
-    Words,
-    json_record,
-    marks_on,
-    notes_on,
-    parts_of,
-    table_dict,
+    TextCell,
+    build_page_tables,
+    build_table_dict,
+    explain_marks,
+    list_notes,
+    to_json_record,
 )
 
 
@@ -32,7 +32,7 @@ def table(request, trio, pair, blind, regions):
         "infinite": blind,
         "no region": trio,
     }
-    return CoverageTable.of(of[request.param], () if request.param == "no region" else regions)
+    return CoverageTable.from_coverages(of[request.param], () if request.param == "no region" else regions)
 
 
 def csv_rows(table: CoverageTable) -> list[dict[str, str]]:
@@ -74,12 +74,12 @@ def test_csv_reads_back_as_json_and_json_as_the_table(table):
         assert (record["rig"], record["region"], record["height"]) == (row.rig, row.region.name, row.summary.height)
         assert (record["known_cells"], record["known_share"]) == (row.summary.known_cells, row.summary.known_share)
         for key, number in row.summary.numbers.items():
-            expected = json_record({part: getattr(number, part) for part in ("value", "error", "low", "high")})
+            expected = to_json_record({part: getattr(number, part) for part in ("value", "error", "low", "high")})
             assert [record[key], *(record[f"{key}_{part}"] for part in ("error", "low", "high"))] == [
                 *expected.values()
             ]
         for key, difference in row.differences.items():
-            expected = json_record(difference._asdict())
+            expected = to_json_record(difference._asdict())
             assert record[f"{key}_difference"] == expected["value"]
             for part in ("error", "low", "high"):
                 assert record[f"{key}_difference_{part}"] == expected[part]
@@ -88,16 +88,16 @@ def test_csv_reads_back_as_json_and_json_as_the_table(table):
 
 
 def test_text_and_markdown_have_the_same_cells_and_they_are_those_of_the_parts(table):
-    parts = [[cell.text for cell in row] for part in parts_of(table) for row in part.rows]
+    parts = [[cell.text for cell in row] for part in build_page_tables(table) for row in part.rows]
     assert text_cells(table) == parts
     assert markdown_cells(table) == [[cell.replace("  ", " ") for cell in row] for row in parts]
 
 
 def test_what_is_marked_in_text_is_bold_in_markdown(trio, regions):
-    table = CoverageTable.of(trio, regions)
+    table = CoverageTable.from_coverages(trio, regions)
     signs = re.findall(r"│ +([*!]) ", RENDERERS["text"](table))
     bold = re.findall(r"\*\*[^*]+\*\*", RENDERERS["markdown"](table))
-    marks = [cell.mark for part in parts_of(table) for row in part.rows for cell in row if cell.mark]
+    marks = [cell.mark for part in build_page_tables(table) for row in part.rows for cell in row if cell.mark]
     assert len(bold) == len(marks) > 4
     assert signs == [{"best": "*", "significant": "!"}[mark] for mark in marks]
     assert set(marks) == {"best", "significant"}
@@ -109,7 +109,7 @@ def test_no_renderer_calls_anything_nan(table):
 
 
 def test_the_columns_are_the_same_for_one_rig_and_for_several_which_have_more(trio, regions):
-    one, three = (list(csv_rows(CoverageTable.of(of, regions))[0]) for of in ({"few": trio["few"]}, trio))
+    one, three = (list(csv_rows(CoverageTable.from_coverages(of, regions))[0]) for of in ({"few": trio["few"]}, trio))
     assert three[: len(one)] == one
     assert one[:5] == ["rig", "region", "height", "radius_m", "radius_m_error"]
     numbers = ("difference", "difference_error", "difference_low", "difference_high")
@@ -118,13 +118,13 @@ def test_the_columns_are_the_same_for_one_rig_and_for_several_which_have_more(tr
 
 
 def test_without_regions_csv_still_has_its_header(trio, regions):
-    headers = {RENDERERS["csv"](CoverageTable.of(trio, places)).splitlines()[0] for places in ((), regions)}
+    headers = {RENDERERS["csv"](CoverageTable.from_coverages(trio, places)).splitlines()[0] for places in ((), regions)}
     assert len(headers) == 1
     assert headers.pop().startswith("rig,region,height,radius_m,")
 
 
 def test_files_hold_the_bounds_and_the_blocks(trio, regions):
-    table = CoverageTable.of(trio, regions)
+    table = CoverageTable.from_coverages(trio, regions)
     row = csv_rows(table)[3]
     assert [float(row[f"{axis}_{end}_m"]) for axis in "xyz" for end in ("min", "max")] == [-8, -6, -5, 5, 0.5, 2]
     assert (row["steps"], row["blocks"], row["steps_per_block"], row["cell_m"]) == ("24", "12", "2", "1.0")
@@ -137,28 +137,28 @@ def test_files_hold_the_bounds_and_the_blocks(trio, regions):
         "heights_m": {"ground": [-0.5, 0.5], "obstacle": [0.5, 2.0]},
     }
     assert content["counts"] == {rig: coverage.counts for rig, coverage in trio.items()}
-    assert json_of(CoverageTable.of({"few": trio["few"]}, regions))["counts"] == trio["few"].counts
+    assert json_of(CoverageTable.from_coverages({"few": trio["few"]}, regions))["counts"] == trio["few"].counts
 
 
 def test_without_blocks_there_are_none_in_files(pair, regions):
-    content = table_dict(CoverageTable.of(pair, regions))
+    content = build_table_dict(CoverageTable.from_coverages(pair, regions))
     assert (content["blocks"], content["steps_per_block"]) == (None, None)
     assert {row["radius_m_error"] for row in content["rows"]} == {None}
 
 
 def test_infinity_survives_json_and_is_not_unknown(blind, regions):
-    content = json_of(CoverageTable.of(blind, regions))
+    content = json_of(CoverageTable.from_coverages(blind, regions))
     assert float(content["max_radius_m"]) == float(content["rows"][0]["radius_m"]) == math.inf
     assert content["rows"][2]["radius_m"] is None
 
 
 def test_names_that_look_like_markup_stay_what_they_are(trio, regions):
     names = ["a|b", "[bold]:car:[/bold]", "_x_*y* `z` <b> &amp; \\"]
-    table = CoverageTable.of(dict(zip(names, trio.values(), strict=True)), regions)
+    table = CoverageTable.from_coverages(dict(zip(names, trio.values(), strict=True)), regions)
     text, markdown = RENDERERS["text"](table), RENDERERS["markdown"](table)
     assert all(name in text for name in names)
     rows = markdown_lines(markdown)
-    parts = parts_of(table)  # of which those of the differences to the first rig have a column less
+    parts = build_page_tables(table)  # of which those of the differences to the first rig have a column less
     assert {len(row) for row in rows} == {len(part.headings) for part in parts}
     assert len({len(part.headings) for part in parts}) == 2
     assert rows[0][2:5] == [r"a\|b", r"\[bold\]:car:\[/bold\]", r"\_x\_\*y\* \`z\` \<b> \&amp; \\"]
@@ -166,12 +166,12 @@ def test_names_that_look_like_markup_stay_what_they_are(trio, regions):
 
 
 def test_names_without_special_signs_are_left_alone_in_markdown(trio, regions):
-    table = CoverageTable.of({"front_roof_128": trio["few"], "it's 5 < 6 & more": trio["many"]}, regions)
+    table = CoverageTable.from_coverages({"front_roof_128": trio["few"], "it's 5 < 6 & more": trio["many"]}, regions)
     assert "| front_roof_128 | it's 5 < 6 & more |" in RENDERERS["markdown"](table)
 
 
 def test_the_notes_of_the_caller_are_in_what_a_reader_reads(trio, regions):
-    table = CoverageTable.of(trio, regions, ["Reference sensor: a cat."])
+    table = CoverageTable.from_coverages(trio, regions, ["Reference sensor: a cat."])
     assert "Reference sensor: a cat." in RENDERERS["text"](table)
     assert "* Reference sensor: a cat." in RENDERERS["markdown"](table)
 
@@ -179,20 +179,20 @@ def test_the_notes_of_the_caller_are_in_what_a_reader_reads(trio, regions):
 def test_a_renderer_of_ones_own_needs_no_more_than_what_is_public(trio, regions):
     def as_html(table: CoverageTable) -> str:
         cells = ("<td>{}</td>".format(f"<b>{cell.text}</b>" if cell.mark else cell.text) for cell in cells_of(table))
-        legend = [f"{BOLD_MARKS[mark]}: {meaning}" for mark, meaning in marks_on(table).items()]
-        return "".join([*cells, *(f"<li>{note}</li>" for note in (*legend, *notes_on(table)))])
+        legend = [f"{BOLD_MARKS[mark]}: {meaning}" for mark, meaning in explain_marks(table).items()]
+        return "".join([*cells, *(f"<li>{note}</li>" for note in (*legend, *list_notes(table)))])
 
-    def cells_of(table: CoverageTable) -> list[Words]:
-        return [cell for part in parts_of(table) for row in part.rows for cell in row]
+    def cells_of(table: CoverageTable) -> list[TextCell]:
+        return [cell for part in build_page_tables(table) for row in part.rows for cell in row]
 
-    table = CoverageTable.of(trio, regions)
+    table = CoverageTable.from_coverages(trio, regions)
     html = as_html(table)
     assert html.count("<td>") == len(cells_of(table))
     assert html.count("<b>") == sum(bool(cell.mark) for cell in cells_of(table)) > 4
-    assert html.count("<li>") == len(notes_on(table)) + len(BOLD_MARKS)
+    assert html.count("<li>") == len(list_notes(table)) + len(BOLD_MARKS)
     assert "<li>In bold among the differences: more than chance" in html
 
 
 @pytest.mark.parametrize(("steps", "explained"), [(4, False), (24, True)])
 def test_the_mark_of_chance_is_explained_where_there_are_errors(trios, regions, steps, explained):
-    assert ("significant" in marks_on(CoverageTable.of(trios(steps), regions))) is explained
+    assert ("significant" in explain_marks(CoverageTable.from_coverages(trios(steps), regions))) is explained

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from torchcover.coverage import BevGrid
 from torchcover.coverage.quantity import RADIUS
-from torchcover.report import SensorView, draw_side_by_side, scale_of
+from torchcover.report import SensorView, build_color_scale, plot_side_by_side
 
 GRID = BevGrid(x=(-8.0, 12.0), y=(-5.0, 5.0), cell=1.0)
 AROUND = BevGrid(x=(-10.0, 10.0), y=(-10.0, 10.0), cell=0.25)
@@ -35,7 +35,7 @@ def cut(everything: np.ndarray, figure: Figure, at: int) -> np.ndarray:
 
 
 def side_by_side(grid: BevGrid, arrays: dict[str, torch.Tensor], **options) -> Figure:
-    return draw_side_by_side(arrays, grid, scale_of(RADIUS, torch.ones(2)), title="Title", **options)
+    return plot_side_by_side(arrays, grid, build_color_scale(RADIUS, torch.ones(2)), title="Title", **options)
 
 
 def test_the_same_value_has_the_same_colour_in_every_panel():

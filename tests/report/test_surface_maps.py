@@ -11,11 +11,11 @@ from torchcover.coverage.blocks import BlockSums
 from torchcover.report.map_subjects import (
     FAINTEST,
     MIN_POINTS,
-    as_drawn,
-    opacity_of,
-    over_squares,
-    ratios,
-    square_sides,
+    compute_opacity,
+    compute_ratios,
+    compute_square_sides,
+    downsample_coverage,
+    sum_over_squares,
 )
 
 CELL_M = 0.25
@@ -46,7 +46,7 @@ def coverage():
 @pytest.fixture(scope="module")
 def sides(coverage):
     """How its maps are cut."""
-    return square_sides(coverage.points, CELL_M)
+    return compute_square_sides(coverage.points, CELL_M)
 
 
 def cut(points: np.ndarray, sides: np.ndarray, y: int, x: int, side: int) -> None:
@@ -74,7 +74,7 @@ def test_squares_are_cut_where_every_quarter_has_points_enough_or_none(coverage,
 def test_no_square_is_larger_than_two_metres_unless_the_cell_is(cell_m, largest):
     points = torch.zeros(1, 20, 20, dtype=torch.int64)
     points[0, 9, 9] = 1
-    square = square_sides(points, cell_m) == largest
+    square = compute_square_sides(points, cell_m) == largest
     # What is empty is cut to cells.
     assert int(square.sum()) == (400 if largest == 1 else largest**2)
     assert square[0, 9, 9]
@@ -83,14 +83,14 @@ def test_no_square_is_larger_than_two_metres_unless_the_cell_is(cell_m, largest)
 def test_where_points_are_many_a_cell_has_its_own_ratio(coverage, sides):
     alone = (sides == 1) & (coverage.points > 0)
     assert int(alone.sum()) > 40
-    for found, key in zip(ratios(coverage.area, sides), list(coverage.layers)[3:], strict=True):
+    for found, key in zip(compute_ratios(coverage.area, sides), list(coverage.layers)[3:], strict=True):
         assert torch.equal(found[alone], coverage.layers[key].values[alone])
 
 
 def test_a_square_has_the_ratio_of_the_sums_of_its_cells(coverage, sides):
     m2, *sums = coverage.area.totals().numpy()
     sums = np.stack(sums)
-    found = ratios(coverage.area, sides).numpy()
+    found = compute_ratios(coverage.area, sides).numpy()
     for band, y, x in zip(*(sides == 4).numpy().nonzero(), strict=True):
         rows, columns = (slice(at // 4 * 4, at // 4 * 4 + 4) for at in (y, x))
         expected = sums[:, band, rows, columns].sum(axis=(1, 2)) / m2[band, rows, columns].sum()
@@ -98,18 +98,18 @@ def test_a_square_has_the_ratio_of_the_sums_of_its_cells(coverage, sides):
 
 
 def test_what_is_drawn_weighs_as_much_as_the_region_has(coverage, sides):
-    m2 = over_squares(coverage.area.totals()[0], sides)
-    each = m2 / over_squares(torch.ones_like(m2), sides)
+    m2 = sum_over_squares(coverage.area.totals()[0], sides)
+    each = m2 / sum_over_squares(torch.ones_like(m2), sides)
     for band, height in enumerate(GRID.heights):
-        weighted = (ratios(coverage.area, sides)[:, band] * each[band]).nansum(dim=(1, 2)) / each[band].sum()
+        weighted = (compute_ratios(coverage.area, sides)[:, band] * each[band]).nansum(dim=(1, 2)) / each[band].sum()
         torch.testing.assert_close(weighted, coverage.estimate(ALL, height).value, rtol=1e-12, atol=0)
 
 
 def test_a_place_without_a_square_metre_is_unknown_and_has_no_opacity(coverage, sides):
-    seen = over_squares(coverage.area.totals()[0], sides) > 0
+    seen = sum_over_squares(coverage.area.totals()[0], sides) > 0
     assert 0 < int(seen.sum()) < seen.numel()
-    assert torch.equal(ratios(coverage.area, sides).isfinite(), seen.expand(3, -1, -1, -1))
-    opacity = opacity_of(coverage.area, 16, sides, CELL_M)
+    assert torch.equal(compute_ratios(coverage.area, sides).isfinite(), seen.expand(3, -1, -1, -1))
+    opacity = compute_opacity(coverage.area, 16, sides, CELL_M)
     assert torch.equal(opacity == 0, ~seen)
     assert opacity[seen].min() > FAINTEST
     assert opacity.max() <= 1
@@ -128,16 +128,16 @@ def sums_of(m2: torch.Tensor) -> BlockSums:
 def test_opacity_grows_with_the_surface_up_to_that_of_open_ground():
     m2 = torch.tensor([0.0, 1e-9, 0.01, 0.1, 10 * CELL_M**2, 50.0]).double()[None, None]
     one = torch.ones(m2.shape, dtype=torch.int64)
-    nothing, *rising, full, more = opacity_of(sums_of(m2), 10, one, CELL_M).flatten().tolist()
+    nothing, *rising, full, more = compute_opacity(sums_of(m2), 10, one, CELL_M).flatten().tolist()
     assert nothing == 0 < FAINTEST < rising[0] < rising[1] < rising[2] < full == more == 1
 
 
 def test_open_ground_is_opaque_in_squares_that_the_grid_cuts_off_too():
     ground = torch.full((1, 5, 5), 10 * CELL_M**2).double()
     for side in (1, 2, 4, 8):
-        opacity = opacity_of(sums_of(ground), 10, torch.full((1, 5, 5), side), CELL_M)
+        opacity = compute_opacity(sums_of(ground), 10, torch.full((1, 5, 5), side), CELL_M)
         torch.testing.assert_close(opacity, torch.ones_like(opacity), rtol=1e-12, atol=0)
-        quarter = opacity_of(sums_of(ground / 4), 10, torch.full((1, 5, 5), side), CELL_M)
+        quarter = compute_opacity(sums_of(ground / 4), 10, torch.full((1, 5, 5), side), CELL_M)
         torch.testing.assert_close(quarter, torch.full_like(quarter, (1 + FAINTEST) / 2), rtol=1e-12, atol=0)
 
 
@@ -145,7 +145,7 @@ def test_infinity_stays_in_its_square():
     sums = torch.zeros(1, 1, 4, 4).double()
     sums[..., 0, 0] = math.inf
     area = listed_of(torch.ones(1, 4, 4).double(), sums.flatten(1))
-    (found,) = ratios(area, torch.full((1, 4, 4), 2))
+    (found,) = compute_ratios(area, torch.full((1, 4, 4), 2))
     assert torch.equal(found.isinf()[0], torch.tensor([[True, True, False, False]] * 2 + [[False] * 4] * 2))
 
 
@@ -159,7 +159,7 @@ def test_small_cells_are_drawn_in_squares_with_the_same_numbers(cell, drawn_m):
         rig, reference = (torch.rand(99, 3, generator=random) * torch.tensor([7.0, 4.0, 2.0]) for _ in range(2))
         metric.update(rig, reference, weights=torch.rand(99, generator=random) + 0.1, place_in_time=seed)
     whole = metric.compute()
-    drawn = as_drawn(whole)
+    drawn = downsample_coverage(whole)
     assert (drawn.grid.cell, drawn is whole) == (pytest.approx(drawn_m), drawn_m == cell)
     assert drawn.points.sum() == whole.points.sum()
     assert drawn.layers.keys() == whole.layers.keys()

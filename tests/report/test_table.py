@@ -7,102 +7,102 @@ import pytest
 import torch
 
 from torchcover.coverage import BevGrid, CoverageMetric, Region, differences
-from torchcover.report import CoverageTable, remarks_on
+from torchcover.report import CoverageTable, collect_table_notes
 
 
 def names(table: CoverageTable, rig: str) -> set[str]:
-    return {remark.name for remark in remarks_on(table, rig)}
+    return {remark.name for remark in collect_table_notes(table, rig)}
 
 
 def test_a_table_has_the_summaries_of_its_coverages(trio, regions):
-    table = CoverageTable.of(trio, regions, ["by hand"])
+    table = CoverageTable.from_coverages(trio, regions, ["by hand"])
     assert (table.rigs, table.notes, table.grid) == (("few", "other", "many"), ("by hand",), trio["few"].grid)
     for rig, coverage in trio.items():
         # As text, for NaN is not equal to itself.
         assert str([row.summary for row in table.rows[rig]]) == str(coverage.summary(regions))
         assert table.conditions[rig].counts == coverage.counts
-        assert (table.conditions[rig].blocks, table.conditions[rig].steps_per_block) == (12, 2)
-    assert [[row.rig for row in rows] for rows in table.places] == [list(table.rigs)] * 4
+        assert (table.conditions[rig].blocks, table.conditions[rig].frames_per_block) == (12, 2)
+    assert [[row.rig for row in rows] for rows in table.rows_by_region] == [list(table.rigs)] * 4
 
 
 def test_differences_are_the_paired_ones_of_the_coverage(trio, regions):
-    table = CoverageTable.of(trio, regions)
-    for rows in table.places:
+    table = CoverageTable.from_coverages(trio, regions)
+    for rows in table.rows_by_region:
         expected = differences(trio, rows[0].region, rows[0].summary.height)
         assert str({row.rig: row.differences for row in rows}) == str(expected)
 
 
 def test_one_rig_has_neither_marks_nor_differences(trio, regions):
-    for (row,) in CoverageTable.of({"few": trio["few"]}, regions).places:
-        assert not row.best
+    for (row,) in CoverageTable.from_coverages({"few": trio["few"]}, regions).rows_by_region:
+        assert not row.leading_keys
         assert not row.differences
 
 
 def test_the_order_of_the_rigs_changes_no_number_and_no_mark(trio, regions):
-    expected = CoverageTable.of(trio, regions)
+    expected = CoverageTable.from_coverages(trio, regions)
     for order in permutations(trio):
-        table = CoverageTable.of({rig: trio[rig] for rig in order}, regions)
+        table = CoverageTable.from_coverages({rig: trio[rig] for rig in order}, regions)
         assert table.rigs == order
         for rig in order:
             for row, same in zip(table.rows[rig], expected.rows[rig], strict=True):
                 assert str(row.summary) == str(same.summary)
-                assert row.best == same.best
+                assert row.leading_keys == same.leading_keys
 
 
 def test_a_rig_against_itself_differs_nowhere_and_none_is_marked(measure, points, regions):
     one = measure(points(50, 1), thresholds=(0.4, 1.0))
-    table = CoverageTable.of({"a": one, "b": one}, regions)
+    table = CoverageTable.from_coverages({"a": one, "b": one}, regions)
     for rows in table.rows.values():
         for row in rows[:2]:
-            assert not row.best
+            assert not row.leading_keys
             assert [difference.value for difference in row.differences.values()] == [0.0] * 3
 
 
 def test_the_unknown_never_wins(pair, regions):
-    for rows in CoverageTable.of(pair, regions).rows.values():
+    for rows in CoverageTable.from_coverages(pair, regions).rows.values():
         for row in rows[2:]:
             assert row.summary.region == "behind"
             assert math.isnan(row.summary.numbers["radius_m"].value)
             assert math.isnan(row.differences["radius_m"].value)
-            assert not row.best
+            assert not row.leading_keys
 
 
 def test_two_blind_rigs_are_equal_not_unknown(blind, regions):
-    rows = {rig: rows[0] for rig, rows in CoverageTable.of(blind, regions).rows.items()}
+    rows = {rig: rows[0] for rig, rows in CoverageTable.from_coverages(blind, regions).rows.items()}
     assert rows["[blind]"].summary.numbers["radius_m"].value == math.inf
     assert rows["[blind]"].differences["radius_m"].value == 0.0
     assert rows["seeing"].differences["radius_m"].value == -math.inf
-    assert not any(row.best for row in rows.values())
+    assert not any(row.leading_keys for row in rows.values())
 
 
 def test_the_best_is_marked_where_its_lead_over_the_next_is_more_than_chance(trio, regions):
-    table = CoverageTable.of(trio, regions)
-    for rows in table.places[:2]:
+    table = CoverageTable.from_coverages(trio, regions)
+    for rows in table.rows_by_region[:2]:
         for key in ("radius_m", "detection_0.4m"):
             each = {row.rig: trio[row.rig].estimate(row.region, row.summary.height) for row in rows}
             ahead = [each["many"].differences(each[other])[key].significant for other in ("few", "other")]
-            assert [key in row.best for row in rows] == [False, False, all(ahead)]
+            assert [key in row.leading_keys for row in rows] == [False, False, all(ahead)]
             assert all(ahead)
     # Far ahead of the last is not ahead of the next.
-    tied = CoverageTable.of({**trio, "again": trio["many"]}, regions)
-    assert not any(row.best for rows in tied.places for row in rows)
+    tied = CoverageTable.from_coverages({**trio, "again": trio["many"]}, regions)
+    assert not any(row.leading_keys for rows in tied.rows_by_region for row in rows)
 
 
 def test_remarks_are_made_of_what_did_happen_only(blind, trios, regions):
-    table = CoverageTable.of(blind, regions)
+    table = CoverageTable.from_coverages(blind, regions)
     assert "empty_sensor_steps" not in names(table, "seeing")
-    (remark,) = [remark for remark in remarks_on(table, "blind") if remark.name == "empty_sensor_steps"]
-    assert (remark.count, remark.of) == (1, 1)
+    (remark,) = [remark for remark in collect_table_notes(table, "blind") if remark.name == "empty_sensor_steps"]
+    assert (remark.count, remark.total) == (1, 1)
     assert "unknown_cells" in names(table, "seeing")
-    assert names(CoverageTable.of({"few": trios(5)["few"]}, ()), "few") == {"no_region", "too_few_blocks"}
+    assert names(CoverageTable.from_coverages({"few": trios(5)["few"]}, ()), "few") == {"no_region", "too_few_blocks"}
 
 
 def test_there_is_nothing_to_remark_where_every_cell_is_known():
     grid = BevGrid(x=(0.0, 4.0), y=(0.0, 2.0), cell=1.0, heights={"ground": (-0.5, 0.5)})
     metric = CoverageMetric(grid)
     metric.update(torch.zeros(1, 3), torch.cartesian_prod(torch.arange(4) + 0.5, torch.arange(2) + 0.5, torch.zeros(1)))
-    table = CoverageTable.of({"full": metric.compute()}, [Region("all", grid.x, grid.y)])
-    assert not remarks_on(table, "full")
+    table = CoverageTable.from_coverages({"full": metric.compute()}, [Region("all", grid.x, grid.y)])
+    assert not collect_table_notes(table, "full")
 
 
 @pytest.mark.parametrize(
@@ -117,11 +117,11 @@ def test_there_is_nothing_to_remark_where_every_cell_is_known():
 def test_coverages_that_are_not_paired_are_refused(measure, points, regions, other, message):
     unpaired = {"a": measure(points(9, 1)), "b": measure(points(9, 1), **other)}
     with pytest.raises(ValueError, match=f"'a' and 'b' cannot be compared: .*{message}"):
-        CoverageTable.of(unpaired, regions)
+        CoverageTable.from_coverages(unpaired, regions)
 
 
 def test_what_makes_no_table_is_refused(pair):
     with pytest.raises(ValueError, match="at least one rig"):
-        CoverageTable.of({}, ())
+        CoverageTable.from_coverages({}, ())
     with pytest.raises(ValueError, match="beyond the grid's"):
-        CoverageTable.of(pair, [Region("wide", x=(0.0, 99.0), y=(0.0, 2.0))])
+        CoverageTable.from_coverages(pair, [Region("wide", x=(0.0, 99.0), y=(0.0, 2.0))])

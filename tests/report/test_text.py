@@ -8,9 +8,9 @@ import torch
 from rich.console import Console
 
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric, Region
-from torchcover.report import CoverageTable, PageTable, Words, print_table, print_whole
+from torchcover.report import CoverageTable, PageTable, TextCell, print_page_tables, print_table
 from torchcover.report.records import COLUMNS
-from torchcover.report.renderers import narrowest_width, rich_tables
+from torchcover.report.renderers import build_rich_tables, compute_min_width
 
 NEAR = Region("near", x=(0.0, 2.0), y=(0.0, 2.0))
 FAR = Region("far", x=(2.0, 4.0), y=(0.0, 2.0))
@@ -48,7 +48,7 @@ def over_steps(steps: int) -> Coverage:
 
 def printed(coverages: dict[str, Coverage], regions, width=200, *, terminal=True) -> str:
     console = Console(width=width, file=io.StringIO(), force_terminal=terminal, color_system=None)
-    print_table(CoverageTable.of(coverages, regions), console)
+    print_table(CoverageTable.from_coverages(coverages, regions), console)
     return re.sub(r"\x1b\[[\d;]*m", "", console.file.getvalue())
 
 
@@ -177,7 +177,7 @@ def test_the_parts_of_the_table_have_equal_columns(pair, regions):
 def test_on_a_narrow_terminal_names_fold_but_numbers_stay_whole(pair, regions, rigs):
     one, other = pair.values()
     named = {f"rig_number_{at}_with_a_long_name": (one, other)[at % 2] for at in range(rigs)}
-    narrowest = narrowest_width(rich_tables(CoverageTable.of(named, regions)), list(named))
+    narrowest = compute_min_width(build_rich_tables(CoverageTable.from_coverages(named, regions)), list(named))
     assert narrowest == 35 + (len("unknown") + 3) * rigs
     assert_whole(named, regions, narrowest, r"[\d.]+ │|unknown", 8 * rigs)
 
@@ -186,7 +186,7 @@ def test_on_a_narrow_terminal_names_fold_but_numbers_stay_whole(pair, regions, r
 def test_on_a_narrow_terminal_numbers_with_errors_stay_whole(trios, regions, steps):
     names = ("a_rig_with_quite_a_long_name", "another_rig_with_a_long_name", "and_one_more_of_those")
     named = dict(zip(names, trios(steps).values(), strict=True))
-    narrowest = narrowest_width(rich_tables(CoverageTable.of(named, regions), 1), names)
+    narrowest = compute_min_width(build_rich_tables(CoverageTable.from_coverages(named, regions), 1), names)
     assert_whole(named, regions, narrowest, r"\[[+-]?[\d.]+, [+-]?[\d.]+\]|unknown", 11)
     assert narrowest < 100
 
@@ -213,9 +213,9 @@ def test_in_a_file_names_are_whole_however_narrow_it_says_it_is(trio, regions, r
 def test_tables_of_words_are_folded_to_eighty_columns_where_the_width_is_not_known(capsys, rigs):
     names, met = [f"rig_number_{at}" for at in range(rigs)], "child from behind a parked car: hatchback"
     times = [[f"{1.5 + speed / 100 + at:.2f} to 9.{speed}, too late" for at in range(rigs)] for speed in (10, 20, 30)]
-    rows = [[Words(text) for text in (met, str(10 * k), "0.73", *of)] for k, of in enumerate(times, 1)]
+    rows = [[TextCell(text) for text in (met, str(10 * k), "0.73", *of)] for k, of in enumerate(times, 1)]
     headings = ("encounter", "km/h", "needed\n(s)", *(f"{name}\n(s)" for name in names))
-    print_whole([PageTable("Time to collision at detection", headings, rows)])
+    print_page_tables([PageTable("Time to collision at detection", headings, rows)])
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) == 80
     # Nothing is cut but names in headings, and what is the same as in the row above is not said again.
@@ -227,7 +227,9 @@ def test_tables_of_words_are_folded_to_eighty_columns_where_the_width_is_not_kno
 
 
 def test_a_table_of_words_that_fits_is_not_folded(capsys):
-    print_whole([PageTable("", ("a b", "c"), [[Words("one two"), Words("3")], [Words("one two"), Words("4")]])])
+    print_page_tables(
+        [PageTable("", ("a b", "c"), [[TextCell("one two"), TextCell("3")], [TextCell("one two"), TextCell("4")]])]
+    )
     printed = capsys.readouterr().out
     assert (printed.count("one two"), len(printed.splitlines()[0])) == (2, 15)
 
@@ -244,7 +246,7 @@ def test_with_many_sensors_each_has_a_row_and_eighty_columns_are_enough():
     narrow, wide = (printed(computed, (NEAR, FAR), width).partition("Change of")[2] for width in (80, 400))
     assert max(map(len, narrow.splitlines())) <= 80
     assert max(map(len, wide.splitlines())) > 160
-    table = CoverageTable.of(computed, (NEAR, FAR))
+    table = CoverageTable.from_coverages(computed, (NEAR, FAR))
     for row in table.rows["rig"]:
         changes = {name: change["detection_0.4m"].value for name, change in row.summary.redundancy.change.items()}
         rows = re.findall(rf"│ {row.summary.region} .*(sensor_number_\d) │ *(?:! )?([+-][\d.]+)", narrow)

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from torchcover.coverage import BevGrid, CoverageMetric, Region
-from torchcover.report import CoverageTable, verdict
-from torchcover.report.remarks import single_point_of_failure
+from torchcover.report import CoverageTable, summarize_findings
+from torchcover.report.remarks import describe_single_point_of_failure
 from torchcover.report.table import Row
 
 AHEAD = (Region("near", (0.0, 4.0), (-5.0, 5.0)), Region("far", (0.0, 12.0), (-5.0, 5.0)),
@@ -32,33 +32,35 @@ def with_bodies(table, shares, best=None, places=30):
 
 
 def test_of_one_rig_the_farthest_region_ahead_is_told_with_its_interval(trio):
-    (sentence,) = verdict(CoverageTable.of({"few": trio["few"]}, AHEAD))
+    (sentence,) = summarize_findings(CoverageTable.from_coverages({"few": trio["few"]}, AHEAD))
     assert sentence.startswith("Detected to 12 m ahead (a point within 0.4 m): of 120 observed cells of ground ")
-    table = CoverageTable.of({"few": trio["few"]}, AHEAD)
+    table = CoverageTable.from_coverages({"few": trio["few"]}, AHEAD)
     rows = [row for row in table.rows["few"] if row.region is AHEAD[1]]
     told = [int(number) for number in re.findall(r"(\d+) % \[(?:\d+), (?:\d+)\]", sentence)]
-    assert told == [round(100 * row.summary.numbers[table.means[1].key].value) for row in rows]
+    assert told == [round(100 * row.summary.numbers[table.mean_quantities[1].key].value) for row in rows]
 
 
 def test_of_several_only_who_leads_by_more_than_chance_is_told(trio):
-    table = CoverageTable.of({name: trio[name] for name in ("few", "many")}, AHEAD)
-    (sentence,) = verdict(table)
+    table = CoverageTable.from_coverages({name: trio[name] for name in ("few", "many")}, AHEAD)
+    (sentence,) = summarize_findings(table)
     assert re.search(
         r"ground many \d+ %, few \d+ %; of 120 observed cells of obstacles many \d+ %, few \d+ %", sentence
     )
-    (sentence,) = verdict(CoverageTable.of({name: trio[name] for name in ("few", "other")}, AHEAD))
+    (sentence,) = summarize_findings(
+        CoverageTable.from_coverages({name: trio[name] for name in ("few", "other")}, AHEAD)
+    )
     assert sentence == "No rig detects more than the others to 12 m ahead (a point within 0.4 m) beyond chance."
 
 
 def test_without_errors_nothing_is_told(pair, blind, trios, regions):
     for coverages in (pair, blind, {"few": pair["few"]}):
-        assert verdict(CoverageTable.of(coverages, AHEAD)) == ()
-    (sentence,) = verdict(CoverageTable.of(trios(4), AHEAD))
+        assert summarize_findings(CoverageTable.from_coverages(coverages, AHEAD)) == ()
+    (sentence,) = summarize_findings(CoverageTable.from_coverages(trios(4), AHEAD))
     assert sentence == (
         "Not enough frames for an answer: 4 form 4 blocks of time, intervals need about 9, which are 9 frames "
         "(`--steps`)."
     )
-    assert verdict(CoverageTable.of(pair, regions[1:])) == ()
+    assert summarize_findings(CoverageTable.from_coverages(pair, regions[1:])) == ()
 
 
 @pytest.mark.parametrize("frames", [2, 6, 11, 21, 24])
@@ -70,21 +72,23 @@ def test_the_advised_number_of_frames_gives_intervals(points, frames):
         for index in range(count):
             m2 = torch.full((100,), 0.2 + 0.8 * (index % 5 > 1))
             metric.update(points(40, index), points(100, 1000 + index), weights=m2, place_in_time=index // 3)
-        return CoverageTable.of({"one": metric.compute()}, AHEAD, block_ends=range(3, 300, 3))
+        return CoverageTable.from_coverages({"one": metric.compute()}, AHEAD, block_ends=range(3, 300, 3))
 
     table = table_of(frames)
-    (sentence,) = verdict(table)
+    (sentence,) = summarize_findings(table)
     assert sentence.startswith(f"Not enough frames for an answer: {frames} form {-(-frames // 3)} block")
     advised = int(re.search(r"which are (\d+) frames", sentence)[1])
     assert not table.has_intervals
     assert 24 < advised <= 40
     for row in table_of(advised).rows["one"]:
-        number = row.summary.numbers[table.means[1].key]
+        number = row.summary.numbers[table.mean_quantities[1].key]
         assert math.isnan(number.low) == math.isnan(number.value) == (row.region is AHEAD[2])
     visible_m2 = next(row.summary.visible_m2 for row in table_of(advised).rows["one"] if row.region is AHEAD[1])
-    assert f"(a point within 0.4 m): of {visible_m2:,.1f} m² of visible ground" in verdict(table_of(advised))[0]
+    assert (
+        f"(a point within 0.4 m): of {visible_m2:,.1f} m² of visible ground" in summarize_findings(table_of(advised))[0]
+    )
     short = replace(table, block_ends=(3, 6, 7))
-    assert verdict(short)[0].endswith("and this source has 3 in all.")
+    assert summarize_findings(short)[0].endswith("and this source has 3 in all.")
 
 
 @pytest.mark.parametrize(("shares", "best", "sentence"), [
@@ -95,15 +99,15 @@ def test_the_advised_number_of_frames_gives_intervals(points, frames):
     ({"few": 0.5, "many": 0.6}, None, "where a child is seen (detection within 0.4 m), no rig has more than"),
 ])  # fmt: skip
 def test_bodies_come_first(trio, shares, best, sentence):
-    table = with_bodies(CoverageTable.of({name: trio[name] for name in shares}, AHEAD), shares, best)
-    first, *_ = verdict(table)
+    table = with_bodies(CoverageTable.from_coverages({name: trio[name] for name in shares}, AHEAD), shares, best)
+    first, *_ = summarize_findings(table)
     assert sentence in first
 
 
 def test_few_places_that_all_say_the_same_are_no_answer(trio):
-    table = CoverageTable.of({"many": trio["many"]}, AHEAD)
+    table = CoverageTable.from_coverages({"many": trio["many"]}, AHEAD)
     for places, told in ((29, False), (30, True)):
-        words = " ".join(verdict(with_bodies(table, {"many": 1.0}, places=places)))
+        words = " ".join(summarize_findings(with_bodies(table, {"many": 1.0}, places=places)))
         assert ("where a child is seen (detection within 0.4 m): in front 100 %" in words) == told
 
 
@@ -121,6 +125,6 @@ def test_a_single_point_of_failure_costs_a_tenth_or_more_beyond_chance(alone, bl
         reference = torch.rand(100, 3, generator=torch.Generator().manual_seed(index)) * torch.tensor([4.0, 4.0, 0.2])
         seen = {"roof": reference[: 60 + alone(index)], "rear": reference[:60]}
         metric.update(seen, reference, weights=torch.full((100,), 0.1), place_in_time=index)
-    table = CoverageTable.of({"rig": metric.compute()}, AHEAD[:1])
-    assert single_point_of_failure(table, "rig").startswith(sentence)
-    assert any(words.startswith(sentence) for words in verdict(table))
+    table = CoverageTable.from_coverages({"rig": metric.compute()}, AHEAD[:1])
+    assert describe_single_point_of_failure(table, "rig").startswith(sentence)
+    assert any(words.startswith(sentence) for words in summarize_findings(table))

@@ -9,7 +9,14 @@ from hypothesis import strategies as st
 
 from torchcover.coverage.quantity import RADIUS, detection
 from torchcover.estimation import Difference, Number
-from torchcover.report.wording import difference_words, error_words, number_words, percent, rounded, value_words
+from torchcover.report.wording import (
+    format_difference,
+    format_error,
+    format_number,
+    format_percent,
+    format_value,
+    round_number,
+)
 
 SHARE = detection(0.4)
 NUMBERS = st.tuples(
@@ -20,14 +27,14 @@ NUMBERS = st.tuples(
 
 @given(st.floats(0.0, 1.0))
 def test_only_nothing_is_0_percent_and_only_all_is_100(share):
-    assert (percent(share) in ("0", "0.0")) == (share == 0.0)
-    assert (percent(share) in ("100", "100.0")) == (share == 1.0)
-    assert abs(float(percent(share).strip("<>")) - 100 * share) <= 0.1
+    assert (format_percent(share) in ("0", "0.0")) == (share == 0.0)
+    assert (format_percent(share) in ("100", "100.0")) == (share == 1.0)
+    assert abs(float(format_percent(share).strip("<>")) - 100 * share) <= 0.1
 
 
 @given(st.floats(0.0, 1e3), st.floats(1e-11, 1e2))
 def test_a_number_and_its_ends_have_the_decimals_of_its_error(value, error):
-    words = number_words(Number(RADIUS, value, error, value - 3 * error, value + 3 * error))
+    words = format_number(Number(RADIUS, value, error, value - 3 * error, value + 3 * error))
     shown = [float(end) for end in re.fullmatch(r"[<>]?(\S+)  \[(\S+), (\S+)\]", words).groups()]
     (decimals,) = {len(number.partition(".")[2]) for number in re.findall(r"[\d.]+", words)}
     assert decimals <= 4
@@ -39,14 +46,14 @@ def test_a_number_and_its_ends_have_the_decimals_of_its_error(value, error):
 
 @given(st.floats(0.0, 1.0))
 def test_with_a_tiny_error_only_nothing_is_0_percent_and_only_all_is_100(share):
-    words = number_words(Number(SHARE, share, 1e-9))
+    words = format_number(Number(SHARE, share, 1e-9))
     assert (words == "0.000") == (share == 0.0)
     assert (words == "100.000") == (share == 1.0)
 
 
 @given(st.floats(-2.0, 2.0), st.floats(1e-9, 1.0))
 def test_a_difference_has_a_sign_and_none_is_minus_nothing(difference, error):
-    words = difference_words(Difference(RADIUS, difference, error))
+    words = format_difference(Difference(RADIUS, difference, error))
     assert words[0] == ("-" if float(words) < 0 else "+" if float(words) else "0")
     if float(words):
         assert math.copysign(1, difference) == math.copysign(1, float(words))
@@ -54,24 +61,24 @@ def test_a_difference_has_a_sign_and_none_is_minus_nothing(difference, error):
 
 @given(NUMBERS, NUMBERS, st.sampled_from([RADIUS, SHARE]))
 def test_two_numbers_are_equal_if_and_only_if_they_look_the_same(a, b, quantity):
-    look_the_same = number_words(Number(quantity, *a)) == number_words(Number(quantity, *b))
-    assert (rounded(*a, quantity.unit) == rounded(*b, quantity.unit)) is look_the_same
+    look_the_same = format_number(Number(quantity, *a)) == format_number(Number(quantity, *b))
+    assert (round_number(*a, quantity.unit) == round_number(*b, quantity.unit)) is look_the_same
 
 
 def test_without_an_error_or_an_interval_there_is_a_number_alone():
-    shares = [number_words(Number(SHARE, *number)) for number in ((1.0, math.nan), (0.0, 0.0), (0.5, 1e-17))]
+    shares = [format_number(Number(SHARE, *number)) for number in ((1.0, math.nan), (0.0, 0.0), (0.5, 1e-17))]
     assert shares == ["100", "0", "50.0"]
-    assert number_words(Number(RADIUS, 0.2, 0.013)) == "0.200"
-    assert number_words(Number(RADIUS, 0.2, 0.5, 0.001, 1e200)) == "0.20  [0.00, inf]"
-    assert difference_words(Difference(SHARE, 0.0, 0.0, 0.0, 0.0)) == "0"
-    assert difference_words(Difference(RADIUS, 0.0)) == "0"
-    assert difference_words(Difference(SHARE, -1e-6)) == "0.0"
-    assert error_words(math.nan, "m") == "unknown"
+    assert format_number(Number(RADIUS, 0.2, 0.013)) == "0.200"
+    assert format_number(Number(RADIUS, 0.2, 0.5, 0.001, 1e200)) == "0.20  [0.00, inf]"
+    assert format_difference(Difference(SHARE, 0.0, 0.0, 0.0, 0.0)) == "0"
+    assert format_difference(Difference(RADIUS, 0.0)) == "0"
+    assert format_difference(Difference(SHARE, -1e-6)) == "0.0"
+    assert format_error(math.nan, "m") == "unknown"
 
 
 def test_infinity_and_the_unknown_have_neither_digits_nor_intervals():
-    assert number_words(Number(RADIUS, math.inf)) == value_words(math.inf, "m") == "infinite"
-    assert difference_words(Difference(SHARE, math.inf, 1.0)) == "+infinite"
-    assert difference_words(Difference(RADIUS, -math.inf)) == "-infinite"
-    assert number_words(Number(RADIUS, math.nan, 0.1)) == value_words(math.nan, "m") == "unknown"
-    assert difference_words(Difference(SHARE, math.nan, 0.1)) == "unknown"
+    assert format_number(Number(RADIUS, math.inf)) == format_value(math.inf, "m") == "infinite"
+    assert format_difference(Difference(SHARE, math.inf, 1.0)) == "+infinite"
+    assert format_difference(Difference(RADIUS, -math.inf)) == "-infinite"
+    assert format_number(Number(RADIUS, math.nan, 0.1)) == format_value(math.nan, "m") == "unknown"
+    assert format_difference(Difference(SHARE, math.nan, 0.1)) == "unknown"

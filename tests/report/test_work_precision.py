@@ -2,7 +2,7 @@
 
 from itertools import pairwise
 
-from torchcover.report import draw_work_precision
+from torchcover.report import plot_work_precision
 
 POINTS = [(1.0, 3.0), (2.0, 1.0)]
 
@@ -17,7 +17,7 @@ def lines(figure, at: int = 0):
 
 def test_it_has_a_line_for_each_setting():
     panels = {label: dict.fromkeys("ab", POINTS) for label in ("error (%)", "error (m)")}
-    figure = draw_work_precision(panels, title="rig in $scene$", legend_title="rays")
+    figure = plot_work_precision(panels, title="rig in $scene$", legend_title="rays")
     first, second = lines(figure, 0), lines(figure, 1)
     assert list(first) == list(second) == ["a", "b"]
     assert first["a"].get_xydata().tolist() == [list(one) for one in POINTS]
@@ -27,12 +27,12 @@ def test_it_has_a_line_for_each_setting():
 
 
 def test_lines_look_different_and_more_than_there_are_markers_are_drawn_too():
-    drawn = lines(draw_work_precision(panel("abcdefghij"), title=""))
+    drawn = lines(plot_work_precision(panel("abcdefghij"), title=""))
     assert len({(line.get_color(), line.get_marker()) for line in drawn.values()}) == 10
 
 
 def test_no_number_of_an_axis_lies_on_another():
-    figure = draw_work_precision({"error (%)": {"a": [(3.0, 0.9), (60.0, 0.3)]}}, title="")
+    figure = plot_work_precision({"error (%)": {"a": [(3.0, 0.9), (60.0, 0.3)]}}, title="")
     figure.canvas.draw()
     (axes,) = figure.axes
     for axis, side in ((axes.xaxis, 0), (axes.yaxis, 1)):

@@ -41,7 +41,7 @@ def test_a_depth_image_that_is_cast_unprojects_to_the_hits(lens):
     vehicle_T_mount = sensor.mount.matrix()
     image = instant.range_image(vehicle_T_mount, sensor.directions(), max_range_m=60.0)
     model = sensor.camera()
-    cloud = model.to_vehicle(model.unproject(torch.from_numpy(image), kind="distance")).numpy()
+    cloud = model.to_vehicle(model.unproject(torch.from_numpy(image), depth_kind="distance")).numpy()
     tiles = into_tiles(sensor.directions())
     scan = instant.scan(vehicle_T_mount, tiles, max_range_m=60.0)
     # The image shows the ego's hood, the scan leaves it out.

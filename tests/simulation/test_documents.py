@@ -71,7 +71,7 @@ def test_degrees_that_look_like_radians_are_reported(keys, told):
 
 def test_mounts_of_recordings_that_look_like_radians_are_reported():
     with pytest.warns(UserWarning, match="yaw_deg: 1.5708 looks like 90 degrees"):
-        Mount(x_m=1.0, y_m=0.0, z_m=0.0, yaw_deg=1.5708).matrix()
+        Mount(x_m=1.0, y_m=0.0, z_m=0.0, yaw_deg=1.5708).to_matrix()
 
 
 def test_a_scenario_is_read_and_mesh_paths_are_relative_to_it(tmp_path):

@@ -73,10 +73,10 @@ class Turning(Drive):
         place_m = np.stack([20.0 * time_s, 1.75 * time_s**2, 0.0 * time_s], axis=-1)
         return rigid(rotation_from_euler(10.0 * time_s, 0.0 * time_s, 0.0 * time_s), place_m)
 
-    def world_T_vehicle(self, index):
+    def get_world_T_vehicle(self, index):
         return self.pose(np.array([0.1 * index]))[0]
 
-    def scan(self, sensor, index):
+    def read_scan(self, sensor, index):
         sense, begin_deg, before = self.turn
         directions = self.lidar.directions().reshape(3, -1)
         azimuth_deg = np.rad2deg(np.arctan2(directions[1], directions[0]))

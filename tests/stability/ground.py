@@ -6,8 +6,8 @@ from functools import lru_cache
 import numpy as np
 
 from torchcover.geometry import HeightField
-from torchcover.recordings.ground_model import GroundModel, low_surfaces
-from torchcover.recordings.sweeps import pose_jumps
+from torchcover.recordings.ground_model import GroundModel, extract_low_surfaces
+from torchcover.recordings.sweeps import find_pose_discontinuities
 from torchcover.simulation.recorded_world import CELL_M, cell_mesh
 
 from .case import Case, most
@@ -26,7 +26,7 @@ def street():
 
 def heights_m(shift_m, dtype=np.float64):
     road_m, above_m = ((points_m + shift_m).astype(dtype).astype(np.float64) for points_m in street())
-    return GroundModel.below([low_surfaces(road_m, shift_m)], shift_m).heights_m(above_m)
+    return GroundModel.from_surfaces([extract_low_surfaces(road_m, shift_m)], shift_m).compute_heights_m(above_m)
 
 
 def shifted(dtype=np.float64):
@@ -42,7 +42,7 @@ def column():
     return points_m
 
 
-def mean_m(of=lambda points_m: low_surfaces(points_m, column()[0])[0, :3]):
+def mean_m(of=lambda points_m: extract_low_surfaces(points_m, column()[0])[0, :3]):
     return most(of(column()) - [math.fsum(along) / len(along) for along in column().T.tolist()])
 
 
@@ -81,7 +81,7 @@ def drive():
 
 def wrong_jumps(dtype=np.float64):
     times_s, poses, jump = drive()
-    found = pose_jumps(times_s, poses.astype(dtype).astype(np.float64))
+    found = find_pose_discontinuities(times_s, poses.astype(dtype).astype(np.float64))
     return float(len(set(found.tolist()) ^ {jump}))
 
 

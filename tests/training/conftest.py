@@ -8,5 +8,5 @@ from torchcover.training import figures
 def blank_maps(monkeypatch):
     """Maps with nothing on them, where it matters who gets them and when: drawing one takes half a second."""
     monkeypatch.setattr(
-        figures, "band_figures", lambda coverage: [("radius", Figure((1, 1))), ("blank", Figure((1, 1)))]
+        figures, "plot_band_maps", lambda coverage: [("radius", Figure((1, 1))), ("blank", Figure((1, 1)))]
     )

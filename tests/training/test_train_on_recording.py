@@ -20,16 +20,16 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 class Straight(Drive):
     """Along the wall, with a car ahead that keeps its distance and of which one row of points is seen at a time."""
 
-    def world_T_vehicle(self, index):
+    def get_world_T_vehicle(self, index):
         return rigid(torch.eye(3).numpy(), [1.5 * index, 0.0, 0.0])
 
     def world_T_car(self, index):
         return rigid(torch.eye(3).numpy(), [12.0 + 1.5 * index, 0.0, 0.75])
 
-    def scan(self, sensor, index):
+    def read_scan(self, sensor, index):
         whole, row = self.back_m, index % 7
         self.back_m = whole[row * 10 : row * 10 + 10]
-        seen = super().scan(sensor, index)
+        seen = super().read_scan(sensor, index)
         self.back_m = whole
         return seen
 

@@ -116,7 +116,7 @@ def two_processes():
 
 
 if __name__ == "__main__":
-    figures.band_figures = lambda coverage: [("radius", Figure((1, 1))), ("detection", Figure((1, 1)))]
+    figures.plot_band_maps = lambda coverage: [("radius", Figure((1, 1))), ("detection", Figure((1, 1)))]
     child = two_processes()
     fit("whole", SaveWithinEpoch())
     fit("resumed", ckpt_path=folder / "within.ckpt")

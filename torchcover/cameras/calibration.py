@@ -8,7 +8,7 @@ from typing import Any, TypeGuard
 import numpy as np
 from numpy.typing import ArrayLike
 
-from torchcover.cameras.lens import as_vector
+from torchcover.cameras.lens import to_vector
 from torchcover.cameras.models import check_image, check_model
 from torchcover.files import naming, parse_yaml, parse_yaml_stream, read_json_table, read_short_text, reads
 from torchcover.geometry import check_rigid, invert, rigid, rotation_from_euler, rotation_from_quaternion
@@ -30,12 +30,12 @@ _MODEL_NAMES = {
 }
 
 
-def told(value: object) -> str:
+def describe_value(value: object) -> str:
     """What arrived, for a message. YAML may hold lists of lists whose text has no end."""
     return repr(value)[:80] if isinstance(value, str | int | float | None) else f"a {type(value).__name__}"
 
 
-def first(content: Mapping[str, Any], *names: str) -> tuple[str, Any]:
+def get_first_entry(content: Mapping[str, Any], *names: str) -> tuple[str, Any]:
     """The first entry of these names that there is."""
     for name in names:
         if name in content:
@@ -43,46 +43,46 @@ def first(content: Mapping[str, Any], *names: str) -> tuple[str, Any]:
     raise ValueError(f"{' or '.join(names)} is missing")
 
 
-def whole(content: Mapping[str, Any], *names: str) -> int:
+def get_integer(content: Mapping[str, Any], *names: str) -> int:
     """The first of these entries, a whole number."""
-    name, value = first(content, *names)
+    name, value = get_first_entry(content, *names)
     if type(value) is not int:
-        raise ValueError(f"{name}: a whole number is needed; got {told(value)}")
+        raise ValueError(f"{name}: a whole number is needed; got {describe_value(value)}")
     return value
 
 
-def numbers(content: Mapping[str, Any], *names: str) -> Matrix:
+def get_matrix(content: Mapping[str, Any], *names: str) -> Matrix:
     """A matrix that is written as {rows, cols, data}, or a list of numbers."""
-    name, value = first(content, *names)
+    name, value = get_first_entry(content, *names)
     data = value.get("data") if isinstance(value, dict) else value
-    if not has_numbers(data):
-        raise ValueError(f"{name}: a list of finite numbers is needed; got {told(data)}")
+    if not is_number_list(data):
+        raise ValueError(f"{name}: a list of finite numbers is needed; got {describe_value(data)}")
     values = np.array([float(number) for number in data])
     if not isinstance(value, dict):
         return values
-    rows, columns = whole(value, "rows"), whole(value, "cols")
+    rows, columns = get_integer(value, "rows"), get_integer(value, "cols")
     if min(rows, columns) < 0 or rows * columns != values.size:
         raise ValueError(f"{name}: {rows} rows and {columns} columns are not {values.size} numbers")
     return values.reshape(rows, columns)
 
 
-def numbers_of(table: Mapping[str, Sequence[str]], key: str, length: int) -> Matrix:
+def get_numbers(entries: Mapping[str, Sequence[str]], key: str, count: int) -> Matrix:
     """The numbers behind a key of a KITTI file."""
-    words = table.get(key, [])
-    if not has_numbers(words, length):
+    words = entries.get(key, [])
+    if not is_number_list(words, count):
         arrived = " ".join(words)[:120] or "nothing"
-        raise ValueError(f"{key} with {length} numbers is needed; got {arrived}; the file holds {', '.join(table)}")
+        raise ValueError(f"{key} with {count} numbers is needed; got {arrived}; the file holds {', '.join(entries)}")
     return np.array(words, dtype=np.float64)
 
 
-def has_numbers(values: object, length: int | None = None) -> TypeGuard[list[Any]]:
+def is_number_list(values: object, count: int | None = None) -> TypeGuard[list[Any]]:
     """Whether it is a list of finite numbers, without a look into whatever else may be in it.
 
     YAML takes 1e-1, without a point, for text.
     """
     return (
         isinstance(values, list)
-        and length in (None, len(values))
+        and count in (None, len(values))
         and all(isinstance(value, int | float | str) and _is_finite(value) for value in values)
     )
 
@@ -131,7 +131,7 @@ def split_projection(numbers: Matrix, name: str) -> tuple[tuple[float, float, fl
     return intrinsics, rigid(np.eye(3), np.linalg.solve(P[:, :3], P[:, 3]))
 
 
-def carla_pose(
+def convert_carla_pose(
     location_m: Sequence[float], *, pitch_deg: float = 0.0, yaw_deg: float = 0.0, roll_deg: float = 0.0
 ) -> Matrix:
     """`vehicle_T_camera` of a camera attached to a vehicle in CARLA, from the carla.Transform that attached it.
@@ -149,7 +149,7 @@ def carla_pose(
         (4, 4) float64 matrix.
 
     Example:
-        >>> carla_pose([0.0, 1.0, 2.8])[:3, 3]  # a metre to the right
+        >>> convert_carla_pose([0.0, 1.0, 2.8])[:3, 3]  # a metre to the right
         array([ 0. , -1. ,  2.8])
     """
     x, y, z = location_m
@@ -176,14 +176,14 @@ def read_ros(path: Path) -> Calibration:
     content, *others = map(_check_mapping, parse_yaml_stream(read_short_text(path)) or [None])
     if any({**other, "header": None} != {**content, "header": None} for other in others):
         raise ValueError(f"{1 + len(others)} messages of different content; keep one of them")
-    size = whole(content, "image_width", "width"), whole(content, "image_height", "height")
-    matrix = numbers(content, "camera_matrix", "k", "K")
+    size = get_integer(content, "image_width", "width"), get_integer(content, "image_height", "height")
+    matrix = get_matrix(content, "camera_matrix", "k", "K")
     if matrix.size != 9:
         raise ValueError(f"the camera matrix has 9 numbers; got {matrix.size}")
-    distortion = numbers(content, "distortion_coefficients", "d", "D")
-    _, model = first(content, "distortion_model")
+    distortion = get_matrix(content, "distortion_coefficients", "d", "D")
+    _, model = get_first_entry(content, "distortion_model")
     if not isinstance(model, str) or model not in _MODEL_NAMES:
-        raise ValueError(f"distortion_model {told(model)} is unknown; allowed: {', '.join(_MODEL_NAMES)}")
+        raise ValueError(f"distortion_model {describe_value(model)} is unknown; allowed: {', '.join(_MODEL_NAMES)}")
     name = content.get("camera_name")
     name = name if isinstance(name, str) else path.stem
     size, K = _cut_and_binned(content, size, matrix.reshape(3, 3))
@@ -219,9 +219,9 @@ def read_opencv(
         raise ValueError(f"{', '.join(missing)} not in the file; it holds {', '.join(map(str, content))}")
     if "xi" in content:
         raise ValueError("xi: the omnidirectional model of OpenCV is not read; calibrate with its fisheye model")
-    size = size or (whole(content, "image_width"), whole(content, "image_height"))
+    size = size or (get_integer(content, "image_width"), get_integer(content, "image_height"))
     model = model or ("kannala_brandt" if content.get("fisheye_model") else "brown_conrady")
-    matrix, distortion = numbers(content, matrix_key), numbers(content, distortion_key)
+    matrix, distortion = get_matrix(content, matrix_key), get_matrix(content, distortion_key)
     return _distorted(path.stem, size, matrix, model, distortion.ravel())
 
 
@@ -245,9 +245,9 @@ def read_kitti(
     """
     lines = (line.split(":", 1) for line in read_short_text(path).splitlines() if ":" in line)
     table = {key.strip(): value.split() for key, value in lines}
-    intrinsics, camera_T_rectified = split_projection(numbers_of(table, f"P{camera}", 12), f"P{camera}")
-    rotation = numbers_of(table, "R0_rect", 9).reshape(3, 3) if "R0_rect" in table else np.eye(3)
-    lidar = numbers_of(table, "Tr_velo_to_cam" if "Tr_velo_to_cam" in table else "Tr", 12)
+    intrinsics, camera_T_rectified = split_projection(get_numbers(table, f"P{camera}", 12), f"P{camera}")
+    rotation = get_numbers(table, "R0_rect", 9).reshape(3, 3) if "R0_rect" in table else np.eye(3)
+    lidar = get_numbers(table, "Tr_velo_to_cam" if "Tr_velo_to_cam" in table else "Tr", 12)
     reference_T_lidar = np.vstack([lidar.reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
     camera_T_lidar = camera_T_rectified @ rigid(rotation, np.zeros(3)) @ reference_T_lidar
     vehicle_T_lidar = check_rigid(np.eye(4) if vehicle_T_lidar is None else vehicle_T_lidar, "vehicle_T_lidar")
@@ -286,12 +286,14 @@ def read_nuscenes(
             tokens = ", ".join(row["token"] for row in rows)
             raise ValueError(f"{len(rows)} calibrations of {channel!r}; pass the token of one of them: {tokens}")
         matrix, rotation, translation = (rows[0].get(key) for key in keys)
-        if not (isinstance(matrix, list) and len(matrix) == 3 and all(has_numbers(row, 3) for row in matrix)):
-            raise ValueError(f"the camera_intrinsic of {channel!r} has three rows of three numbers; got {told(matrix)}")
-        if not (has_numbers(rotation, 4) and has_numbers(translation, 3)):
+        if not (isinstance(matrix, list) and len(matrix) == 3 and all(is_number_list(row, 3) for row in matrix)):
+            raise ValueError(
+                f"the camera_intrinsic of {channel!r} has three rows of three numbers; got {describe_value(matrix)}"
+            )
+        if not (is_number_list(rotation, 4) and is_number_list(translation, 3)):
             raise ValueError(
                 f"{channel!r} needs a rotation of four numbers and a translation of three; "
-                f"got {told(rotation)}, {told(translation)}"
+                f"got {describe_value(rotation)}, {describe_value(translation)}"
             )
         pose = check_rigid(rigid(rotation_from_quaternion(rotation), translation), f"{channel!r}")
         intrinsics = split_matrix(matrix, channel)
@@ -305,12 +307,12 @@ def _cut_and_binned(content: Mapping[str, Any], size: tuple[int, int], K: Matrix
     """
     roi = content.get("roi") or {}
     if not isinstance(roi, dict):
-        raise ValueError(f"roi: x_offset, y_offset, width and height are needed; got {told(roi)}")
+        raise ValueError(f"roi: x_offset, y_offset, width and height are needed; got {describe_value(roi)}")
     sides, K = list[int](), K.copy()
     for axis, (name, length) in enumerate(zip(("width", "height"), size, strict=True)):
-        offset, cut = (whole({key: 0, **roi}, key) for key in (f"{'xy'[axis]}_offset", name))
+        offset, cut = (get_integer({key: 0, **roi}, key) for key in (f"{'xy'[axis]}_offset", name))
         key = f"binning_{'xy'[axis]}"
-        binning = max(whole({key: 0, **content}, key), 1)
+        binning = max(get_integer({key: 0, **content}, key), 1)
         is_part = 0 <= offset < offset + cut <= length or (0 <= offset < MAX_PIXELS and cut == length)
         if (offset or cut) and not is_part:
             raise ValueError(
@@ -348,6 +350,6 @@ def _distorted(name: str, size: tuple[int, int], matrix: Matrix, model: str, coe
 
 def _checked(source: Calibration) -> Calibration:
     """Refuse what no camera can be made of, here, where the file is known."""
-    check_image(source.name, source.width, source.height, as_vector([source.fx, source.fy, source.cx, source.cy]))
+    check_image(source.name, source.width, source.height, to_vector([source.fx, source.fy, source.cx, source.cy]))
     check_model(source.model, source.coefficients)
     return source

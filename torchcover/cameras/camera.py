@@ -11,9 +11,17 @@ from torch import Tensor
 
 from torchcover.cameras import calibration
 from torchcover.cameras.calibration import Calibration
-from torchcover.cameras.depth import DepthKind, Selection, check_depth, count_unusable, scale_rays, select, usable
+from torchcover.cameras.depth import (
+    DepthKind,
+    PixelSelection,
+    check_depth,
+    count_unusable_depths,
+    mask_usable_depths,
+    scale_rays,
+    select_pixels,
+)
 from torchcover.cameras.inverse import ANSWERED
-from torchcover.cameras.lens import Scalar, as_vector
+from torchcover.cameras.lens import Scalar, to_vector
 from torchcover.cameras.models import check_image, check_model
 from torchcover.cameras.optics import Optics, RayTable
 from torchcover.devices import through_cpu
@@ -67,8 +75,8 @@ class Camera:
         name: str = "camera",
     ) -> None:
         self.width, self.height, self.model, self.name = width, height, model, name
-        self.intrinsics = as_vector([fx, fy, cx, cy])
-        self.coefficients = as_vector(list(coefficients))
+        self.intrinsics = to_vector([fx, fy, cx, cy])
+        self.coefficients = to_vector(list(coefficients))
         check_image(name, width, height, self.intrinsics)
         check_model(model, self.coefficients.tolist())
         pose = np.eye(4) if vehicle_T_camera is None else vehicle_T_camera
@@ -105,7 +113,7 @@ class Camera:
             width: Columns of the image.
             height: Rows of the image.
             fov_deg: Horizontal field of view from the left edge of the first pixel to the right edge of the last.
-            **rest: `vehicle_T_camera` (`carla_pose` makes one), `name`.
+            **rest: `vehicle_T_camera` (`convert_carla_pose` makes one), `name`.
 
         Returns:
             The camera, with its axis at (width - 1) / 2: CARLA's own matrix says width / 2, because it counts from
@@ -148,7 +156,7 @@ class Camera:
         size = f"{self.width}x{self.height}"
         return f"Camera({self.name!r}, {size}, {self.model}, fx={fx:g}, fy={fy:g}, cx={cx:g}, cy={cy:g})"
 
-    def rays(
+    def compute_rays(
         self, pixels: Tensor | None = None, *, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32
     ) -> tuple[Tensor, Tensor]:
         """Directions in which pixels look.
@@ -160,28 +168,28 @@ class Camera:
 
         Returns:
             Unit directions (H, W, 3), or (..., 3), and a mask (H, W), or (...), of the pixels that have one. The
-            others are NaN: outside the valid region of the lens, or not converged (`pixel_counts` tells which).
+            others are NaN: outside the valid region of the lens, or not converged (`count_pixels` tells which).
         """
         if pixels is None:
-            return self._table.points(str(torch.device(device)), dtype, "distance")
+            return self._table.get_points(str(torch.device(device)), dtype, "distance")
         if not pixels.is_floating_point() or pixels.shape[-1:] != (2,):
             raise ValueError(f"{self.name}: pixels are floats (..., 2); got {pixels.dtype} {tuple(pixels.shape)}")
         return self._rays_of(pixels)
 
     @through_cpu
     def _rays_of(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        directions, status = self._optics.directions(pixels.reshape(-1, 2).double())
+        directions, status = self._optics.unproject(pixels.reshape(-1, 2).double())
         shape = pixels.shape[:-1]
         return directions.to(pixels.dtype).reshape(*shape, 3), (status == ANSWERED).reshape(shape)
 
-    def pixel_counts(self) -> dict[str, int]:
+    def count_pixels(self) -> dict[str, int]:
         """How many pixels of the image have a ray, and why the others have none.
 
         Returns:
             `pixels_valid`, `pixels_outside` (no direction of the valid region has this image) and
             `pixels_unconverged` (the solver gave up); they add up to width * height.
         """
-        return self._table.pixel_counts()
+        return self._table.count_pixels()
 
     @through_cpu
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
@@ -199,7 +207,7 @@ class Camera:
         """
         if not points.is_floating_point() or points.ndim != 2 or points.shape[1] != 3:
             raise ValueError(f"{self.name}: points are floats (N, 3); got {points.dtype} {tuple(points.shape)}")
-        pixels, shown = self._optics.pixels(points.double())
+        pixels, shown = self._optics.project(points.double())
         size = pixels.new_tensor([self.width, self.height])
         inside = ((pixels >= -0.5) & (pixels < size - 0.5)).all(dim=1)
         return pixels.to(points.dtype), shown & inside
@@ -207,22 +215,22 @@ class Camera:
     def unproject(
         self,
         depth: Tensor,
-        kind: DepthKind = "z",
+        depth_kind: DepthKind = "z",
         *,
         stride: int = 1,
-        valid: Tensor | None = None,
-        max_depth: float = float("inf"),
+        valid_mask: Tensor | None = None,
+        max_depth_m: float = float("inf"),
     ) -> Tensor | list[Tensor]:
         """Points of a depth image.
 
         Args:
             depth: (H, W) metres, float; or (B, H, W). Values that are zero, negative, NaN, infinite or beyond
-                `max_depth` never become points; `count_dropped` counts them.
-            kind: "z", along the optical axis (CARLA, most renderers), or "distance", along the ray. At 90 degrees and
+                `max_depth_m` never become points; `count_excluded` counts them.
+            depth_kind: "z", along the optical axis (CARLA, most renderers), or "distance", along the ray. At 90 degrees and
                 more off the axis only distance exists.
             stride: Take every stride-th row and column, beginning with the first.
-            valid: (H, W) or (B, H, W) bool; pixels to leave out are False.
-            max_depth: Largest depth that is a measurement, metres, of the same kind as the depth.
+            valid_mask: (H, W) or (B, H, W) bool; pixels to leave out are False.
+            max_depth_m: Largest depth that is a measurement, metres, of the same kind as the depth.
 
         Returns:
             (N, 3) points in the camera frame, row by row, of the depth's dtype (half precision becomes float32); for
@@ -237,48 +245,48 @@ class Camera:
             tensor([[-1.3333,  0.0000,  2.0000],
                     [ 1.3333,  0.0000,  2.0000]])
         """
-        pixels = self._select(depth, kind, stride, valid)
-        keep = pixels.allowed & usable(pixels.depth, max_depth)
+        pixels = self._select(depth, depth_kind, stride, valid_mask)
+        keep = pixels.mask & mask_usable_depths(pixels.depth, max_depth_m)
         if pixels.depth.ndim == 2:
             return scale_rays(pixels.rays, pixels.depth, keep)
         return [scale_rays(pixels.rays, *image) for image in zip(pixels.depth, keep, strict=True)]
 
-    def count_dropped(
+    def count_excluded(
         self,
         depth: Tensor,
-        kind: DepthKind = "z",
+        depth_kind: DepthKind = "z",
         *,
         stride: int = 1,
-        valid: Tensor | None = None,
-        max_depth: float = float("inf"),
+        valid_mask: Tensor | None = None,
+        max_depth_m: float = float("inf"),
     ) -> dict[str, int]:
         """Why pixels of a depth image do not become points; the arguments are those of `unproject`.
 
         Returns:
-            `no_ray` (the lens has no answer, or no z-depth in that direction), `masked` (by `valid`), then
+            `no_ray` (the lens has no answer, or no z-depth in that direction), `masked` (by `valid_mask`), then
             `depth_zero`, `depth_negative`, `depth_nan`, `depth_infinite`, `depth_beyond_range`. Every pixel is
             counted once, under the first reason that fits.
         """
-        pixels = self._select(depth, kind, stride, valid)
+        pixels = self._select(depth, depth_kind, stride, valid_mask)
         has_ray = pixels.has_ray.expand(pixels.depth.shape)
-        allowed = pixels.allowed.expand(pixels.depth.shape)
+        allowed = pixels.mask.expand(pixels.depth.shape)
         counts = {"no_ray": int((~has_ray).sum()), "masked": int((has_ray & ~allowed).sum())}
-        return counts | count_unusable(pixels.depth[allowed], max_depth)
+        return counts | count_unusable_depths(pixels.depth[allowed], max_depth_m)
 
-    def _select(self, depth: Tensor, kind: DepthKind, stride: int, valid: Tensor | None) -> Selection:
+    def _select(self, depth: Tensor, kind: DepthKind, stride: int, valid: Tensor | None) -> PixelSelection:
         depth = check_depth(depth, kind, stride, valid, (self.height, self.width), self.name)
-        rays, has_ray = self._table.points(str(depth.device), depth.dtype, kind)
-        return select(rays, has_ray, depth, stride, valid)
+        rays, has_ray = self._table.get_points(str(depth.device), depth.dtype, kind)
+        return select_pixels(rays, has_ray, depth, stride, valid)
 
     @through_cpu
-    def z_to_distance(self, depth: Tensor) -> Tensor:
+    def convert_z_to_distance(self, depth: Tensor) -> Tensor:
         """Distance along the ray for depth along the axis: (H, W) or (B, H, W), NaN where a pixel has no z-depth."""
         depth = check_depth(depth, "z", 1, None, (self.height, self.width), self.name)
         forward = self._forward(depth.device)
         return (depth.double() / torch.where(forward > 0, forward, torch.nan)).to(depth.dtype)
 
     @through_cpu
-    def distance_to_z(self, depth: Tensor) -> Tensor:
+    def convert_distance_to_z(self, depth: Tensor) -> Tensor:
         """Depth along the axis for distance along the ray: (H, W) or (B, H, W), NaN where a pixel has no ray.
 
         Example:
@@ -291,7 +299,7 @@ class Camera:
 
     def _forward(self, device: torch.device) -> Tensor:
         """Cosine of the angle between every pixel's ray and the axis, float64."""
-        rays, _ = self._table.points(str(device), torch.float64, "distance")
+        rays, _ = self._table.get_points(str(device), torch.float64, "distance")
         return rays[..., 2]
 
     def to_vehicle(self, points: Tensor) -> Tensor:

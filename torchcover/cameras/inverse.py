@@ -28,13 +28,13 @@ _PLANE_RADII = np.concatenate([np.tan(np.linspace(0.0, np.pi / 2, 512, endpoint=
 
 
 @dataclass(frozen=True)
-class Polar:
+class AzimuthFunction:
     """A positive function of the azimuth: one number, or a table over -pi..pi whose last entry repeats the first."""
 
     values: Float64
 
     @property
-    def least(self) -> float:
+    def minimum(self) -> float:
         """Its minimum."""
         return float(self.values.min())
 
@@ -47,9 +47,9 @@ class Polar:
         left = self.values[low]
         return np.asarray(left + (place - low) * (self.values[low + 1] - left))
 
-    def holds(self, radius: Float64, a: Float64, b: Float64) -> Bools:
+    def contains(self, radius: Float64, a: Float64, b: Float64) -> Bools:
         """Whether the radii of (a, b) are at most the function; it is looked up only where its minimum is passed."""
-        held: Bools = radius <= self.least
+        held: Bools = radius <= self.minimum
         unsure = np.flatnonzero(~held)
         if len(unsure) and len(self.values) > 1:
             held[unsure] = radius[unsure] <= self(a[unsure], b[unsure])
@@ -60,25 +60,25 @@ class Polar:
 class ValidRegion:
     """The part of the chart around the optical axis in which a distortion is one-to-one.
 
-    In every direction it ends at the radius `edge`: the first at which the determinant of the Jacobian is not positive,
+    In every direction it ends at the radius `edge_radius`: the first at which the determinant of the Jacobian is not positive,
     or where the chart ends. Behind a fold the same pixels are met again; nothing there is an answer.
-    Up to `guard`, which lies behind the edge, a positive determinant means "inside", so that it decides, not the table.
-    `reach` is the largest distorted radius of any pixel worth solving, over the azimuth of the distorted point.
+    Up to `guard_radius`, which lies behind the edge, a positive determinant means "inside", so that it decides, not the table.
+    `max_distorted_radius` is the largest distorted radius of any pixel worth solving, over the azimuth of the distorted point.
     """
 
-    edge: Polar
-    guard: Polar
-    reach: Polar
+    edge_radius: AzimuthFunction
+    guard_radius: AzimuthFunction
+    max_distorted_radius: AzimuthFunction
 
     def contains(self, a: Float64, b: Float64, determinant: Float64) -> Bools:
         """Whether drawn points lie in the region; `determinant` is that of the Jacobian at them."""
-        return (determinant > 0.0) & self.guard.holds(np.sqrt(a * a + b * b), a, b)
+        return (determinant > 0.0) & self.guard_radius.contains(np.sqrt(a * a + b * b), a, b)
 
 
-def find_region(distortion: Distortion, limit: float) -> ValidRegion:
+def find_valid_region(distortion: Distortion, limit: float) -> ValidRegion:
     """Find the valid region."""
     limit = min(limit, HORIZON)
-    count = 1 if distortion.symmetric else _DIRECTIONS + 1
+    count = 1 if distortion.is_radial else _DIRECTIONS + 1
     azimuth = np.linspace(-np.pi, np.pi, count)
     cosine, sine = np.cos(azimuth), np.sin(azimuth)
     radii = _radii(distortion, limit)
@@ -91,12 +91,14 @@ def find_region(distortion: Distortion, limit: float) -> ValidRegion:
     again = good & (radii > edge[:, None])
     next_good = np.where(again.any(axis=1), radii[again.argmax(axis=1)], 2.0 * limit)
     guard = ((edge + next_good) / 2.0).clip(max=limit)
-    return ValidRegion(Polar(edge), Polar(guard), Polar(_reach(distortion, edge * cosine, edge * sine)))
+    return ValidRegion(
+        AzimuthFunction(edge), AzimuthFunction(guard), AzimuthFunction(_reach(distortion, edge * cosine, edge * sine))
+    )
 
 
 def _radii(distortion: Distortion, limit: float) -> Float64:
     """Radii to look at: critical ones, the middles between them so that no fold is stepped over, and a plain grid."""
-    critical = np.sort(distortion.critical_radii())
+    critical = np.sort(distortion.find_critical_radii())
     middles = (critical[:-1] + critical[1:]) / 2.0
     plain = np.append(_PLANE_RADII, HORIZON) if limit >= HORIZON else np.linspace(0.0, limit, 512)
     radii = np.unique(np.concatenate([plain, critical, middles]))
@@ -105,7 +107,7 @@ def _radii(distortion: Distortion, limit: float) -> Float64:
 
 def _determinant(distortion: Distortion, a: Float64, b: Float64) -> Float64:
     with np.errstate(all="ignore"):
-        return np.nan_to_num(distortion.linearise(a, b).determinant, nan=-1.0)
+        return np.nan_to_num(distortion.linearize(a, b).determinant, nan=-1.0)
 
 
 def _bisect(distortion: Distortion, cosine: Float64, sine: Float64, low: Float64, high: Float64) -> Float64:
@@ -121,9 +123,9 @@ def _reach(distortion: Distortion, a: Float64, b: Float64) -> Float64:
     """Distorted radius of the edge over the azimuth of the image, a little widened for what lies between entries."""
     if np.hypot(a, b).max() >= HORIZON:
         return np.array([np.inf])
-    image = distortion.linearise(a, b)
+    image = distortion.linearize(a, b)
     radius = np.hypot(image.u, image.v)
-    if distortion.symmetric:
+    if distortion.is_radial:
         return radius * (1.0 + 1e-14)
     azimuth = np.arctan2(image.v, image.u)
     turns = np.diff(np.unwrap(azimuth))
@@ -143,52 +145,52 @@ _FARTHEST_SEED = 500.0
 class StartTable:
     """Undistorted radius over distorted radius.
 
-    `step`: distorted radius from one entry to the next; `radii`: (K,) undistorted radii.
+    `radius_step`: distorted radius from one entry to the next; `radii`: (K,) undistorted radii.
     """
 
-    step: float
+    radius_step: float
     radii: Float64
 
     def __call__(self, distorted: Float64) -> Float64:
         """Undistorted radius, linearly interpolated and held at the end."""
-        place = np.minimum(distorted / self.step, len(self.radii) - 1.001)
+        place = np.minimum(distorted / self.radius_step, len(self.radii) - 1.001)
         low = place.astype(np.int64)
         left = self.radii[low]
         return left + (place - low) * (self.radii[low + 1] - left)
 
 
-def make_start_table(distortion: Distortion, limit: float, farthest: float) -> StartTable:
+def build_start_table(distortion: Distortion, limit: float, max_distorted_radius: float) -> StartTable:
     """Tabulate the inverse of the radial part up to its own fold, or as far as the pixels go."""
     fold = _radial_fold(distortion, limit)
-    top = _radius_for(distortion, farthest) if np.isinf(fold) else fold
+    top = _radius_for(distortion, max_distorted_radius) if np.isinf(fold) else fold
     even = np.linspace(0.0, 1.0, _ENTRIES)
     # Towards a fold the inverse has the slope of a square root; without one the radii run evenly in angle.
     radii = np.tan(even * np.arctan(top)) if np.isinf(fold) else top * (1.0 - (1.0 - even) ** 2)
     with np.errstate(all="ignore"):  # a pole at the very end
-        distorted = np.maximum.accumulate(np.nan_to_num(distortion.radial(radii)))
-    end = max(min(farthest, float(distorted[-1])), 1e-30)
+        distorted = np.maximum.accumulate(np.nan_to_num(distortion.distort_radius(radii)))
+    end = max(min(max_distorted_radius, float(distorted[-1])), 1e-30)
     table = np.interp(np.linspace(0.0, end, _ENTRIES), distorted, radii)
     return StartTable(end / (_ENTRIES - 1), table)
 
 
 def _radial_fold(distortion: Distortion, limit: float) -> float:
     """First critical radius after which the radial part does not grow, or comes back from a pole."""
-    critical = np.sort(distortion.critical_radii())
+    critical = np.sort(distortion.find_critical_radii())
     after = np.append((critical[:-1] + critical[1:]) / 2.0, critical[-1:] * 1.01)
-    value = distortion.radial(after)
-    folds = critical[(value < 0.0) | (distortion.radial(after * (1.0 + 1e-6)) <= value)]
+    value = distortion.distort_radius(after)
+    folds = critical[(value < 0.0) | (distortion.distort_radius(after * (1.0 + 1e-6)) <= value)]
     return min(float(folds[0]) if len(folds) else np.inf, limit)
 
 
 def _radius_for(distortion: Distortion, distorted: float) -> float:
     """A radius whose image is at least this far out, or the horizon."""
     radius = 1.0
-    while radius < HORIZON and not distortion.radial(np.array([radius]))[0] >= distorted:
+    while radius < HORIZON and not distortion.distort_radius(np.array([radius]))[0] >= distorted:
         radius *= 2.0
     return radius
 
 
-def nearest_seeds(distortion: Distortion, region: ValidRegion, u: Float64, v: Float64) -> tuple[Float64, Float64]:
+def find_nearest_seeds(distortion: Distortion, region: ValidRegion, u: Float64, v: Float64) -> tuple[Float64, Float64]:
     """The second try: of points spread over the valid region, those whose images lie nearest.
 
     Strong tangential terms bend the region so far from round that Newton's method, coming from the radial part's
@@ -196,10 +198,10 @@ def nearest_seeds(distortion: Distortion, region: ValidRegion, u: Float64, v: Fl
     """
     azimuth = np.linspace(-np.pi, np.pi, 96, endpoint=False)
     cosine, sine = np.cos(azimuth)[:, None], np.sin(azimuth)[:, None]
-    edge = np.minimum(0.999 * region.edge(cosine, sine), _FARTHEST_SEED)
+    edge = np.minimum(0.999 * region.edge_radius(cosine, sine), _FARTHEST_SEED)
     radius = np.tan(np.linspace(0.02, 1.0, 48) * np.arctan(edge))
     seed_a, seed_b = (radius * cosine).ravel(), (radius * sine).ravel()
-    image = distortion.linearise(seed_a, seed_b)
+    image = distortion.linearize(seed_a, seed_b)
     half_square = (image.u**2 + image.v**2) / 2.0
     nearest = np.empty(len(u), dtype=np.int64)
     for start in range(0, len(u), 1024):  # |m|^2 - 2 m.s + |s|^2, less what is the same for all seeds
@@ -221,7 +223,7 @@ _MIN_DAMPING = 2.0**-20
 # Pixels solved side by side: few enough for the cache, many enough to outweigh the interpreter.
 _CHUNK = 1 << 15
 
-Status = NDArray[np.uint8]
+SolverStatus = NDArray[np.uint8]
 
 
 class _Search:
@@ -280,7 +282,7 @@ class _Search:
 
     def _newton(self, a: Float64, b: Float64, u: Float64, v: Float64) -> tuple[Float64, Float64, Float64, Bools]:
         """Full Newton step, residual in pixels, and whether the point lies in the region."""
-        at = self.distortion.linearise(a, b)
+        at = self.distortion.linearize(a, b)
         du, dv = at.u - u, at.v - v
         determinant = at.determinant
         inverse = 1.0 / determinant
@@ -290,8 +292,13 @@ class _Search:
 
 
 def solve(
-    distortion: Distortion, region: ValidRegion, table: StartTable, u: Float64, v: Float64, focal: tuple[float, float]
-) -> tuple[Float64, Float64, Status]:
+    distortion: Distortion,
+    region: ValidRegion,
+    start_table: StartTable,
+    u: Float64,
+    v: Float64,
+    focal: tuple[float, float],
+) -> tuple[Float64, Float64, SolverStatus]:
     """Find the points of the valid region whose distorted images are (u, v), on as many threads as torch may use.
 
     `u` and `v` are (N,) float64 normalised image coordinates, `focal` is pixels per unit of both, for the residual is
@@ -303,10 +310,10 @@ def solve(
 
     def quick(u: Float64, v: Float64) -> tuple[Float64, ...]:
         distorted = np.sqrt(u * u + v * v)
-        reached = np.flatnonzero(region.reach.holds(distorted, u, v))
+        reached = np.flatnonzero(region.max_distorted_radius.contains(distorted, u, v))
         if len(reached) < len(u):
             return _scatter(len(u), reached, quick(u[reached], v[reached]) if len(reached) else ())
-        search = _Search(distortion, region, focal, u, v, *_first_guess(region, table, u, v, distorted))
+        search = _Search(distortion, region, focal, u, v, *_first_guess(region, start_table, u, v, distorted))
         search.run(_QUICK_STEPS)
         return search.a, search.b, search.error
 
@@ -314,8 +321,8 @@ def solve(
         search = _Search(distortion, region, focal, u, v, a, b)
         search.run(_MAX_STEPS)
         lost = np.flatnonzero(search.error > ACCEPT_PX)
-        if len(lost) and not distortion.symmetric:
-            search.retry(lost, *nearest_seeds(distortion, region, u[lost], v[lost]))
+        if len(lost) and not distortion.is_radial:
+            search.retry(lost, *find_nearest_seeds(distortion, region, u[lost], v[lost]))
         return search.a, search.b, search.error
 
     a, b, error = _in_chunks(quick, u, v)
@@ -348,11 +355,11 @@ def _scatter(count: int, reached: NDArray[np.intp], found: tuple[Float64, ...]) 
     return result
 
 
-def _status(region: ValidRegion, a: Float64, b: Float64, error: Float64) -> Status:
+def _status(region: ValidRegion, a: Float64, b: Float64, error: Float64) -> SolverStatus:
     status = np.full(error.shape, ANSWERED, np.uint8)
     failed = np.flatnonzero(~(error <= ACCEPT_PX))
     # Stuck at the edge of the region: the image lies behind the fold.
-    at_edge = ~region.edge.holds(np.hypot(a[failed], b[failed]) / 0.98, a[failed], b[failed])
+    at_edge = ~region.edge_radius.contains(np.hypot(a[failed], b[failed]) / 0.98, a[failed], b[failed])
     status[failed] = np.where(at_edge | np.isnan(error[failed]), OUTSIDE, UNCONVERGED)
     return status
 
@@ -362,8 +369,8 @@ def _first_guess(
 ) -> tuple[Float64, Float64]:
     """The answer of the radial part alone, pulled inside the region."""
     radius = table(distorted)
-    if not (radius <= 0.999 * region.edge.least).all():
-        radius = np.minimum(radius, 0.999 * region.edge(u, v))
+    if not (radius <= 0.999 * region.edge_radius.minimum).all():
+        radius = np.minimum(radius, 0.999 * region.edge_radius(u, v))
     ratio = np.where(distorted > 0.0, radius / distorted, 1.0)
     return u * ratio, v * ratio
 
@@ -384,14 +391,14 @@ class _ImplicitSolution(torch.autograd.Function):
 
 
 def attach_gradients(
-    solver: Distortion, distortion: Distortion, a: Tensor, b: Tensor, u: Tensor, v: Tensor
+    float_distortion: Distortion, distortion: Distortion, a: Tensor, b: Tensor, u: Tensor, v: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Make answered points `a`, `b` (N,) a function of the coefficients in `distortion` and of their images (u, v).
 
-    `solver` is the same distortion with coefficients that are floats. Gradients are of first order; second-order ones
+    `float_distortion` is the same distortion with coefficients that are floats. Gradients are of first order; second-order ones
     raise.
     """
-    at = solver.linearise(a.numpy(force=True), b.numpy(force=True))
+    at = float_distortion.linearize(a.numpy(force=True), b.numpy(force=True))
     rows = np.stack((at.u_a, at.u_b, at.v_a, at.v_b), axis=-1).reshape(-1, 2, 2)
     jacobian = torch.from_numpy(rows).to(a.device)
     image_u, image_v = distortion.distort(a, b)

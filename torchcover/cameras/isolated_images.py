@@ -10,7 +10,7 @@ from torchcover.files import apart, check_memory
 
 
 @apart
-def exr_image(path: Path, bytes_per_pixel: int) -> dict[str, NDArray[Any]]:
+def read_exr_image(path: Path, bytes_per_pixel: int) -> dict[str, NDArray[Any]]:
     """(H, W) `pixels` of an EXR image with one channel, each of which may take so much memory."""
     try:
         import OpenEXR  # type: ignore[import-not-found, unused-ignore]
@@ -34,7 +34,7 @@ def exr_image(path: Path, bytes_per_pixel: int) -> dict[str, NDArray[Any]]:
 
 
 @apart
-def png_image(path: Path) -> dict[str, NDArray[Any]]:
+def read_png_image(path: Path) -> dict[str, NDArray[Any]]:
     """Read the `pixels` of a PNG image, whose header was checked before."""
     from PIL import Image
 

@@ -29,14 +29,14 @@ class Chart(Protocol):
     def limit(self) -> float:
         """Radius on the plane at which the drawing ends; infinity where it does not."""
 
-    def draw(self, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def project(self, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Points (N,) each -> `a`, `b` (N,) and a mask (N,) of those that the chart can show."""
 
-    def lift(self, a: Tensor, b: Tensor) -> Tensor:
+    def unproject(self, a: Tensor, b: Tensor) -> Tensor:
         """Drawn points (N,) each -> unit directions (N, 3)."""
 
 
-class Linear(NamedTuple):
+class Linearization(NamedTuple):
     """A distortion at a point: the value (`u`, `v`) and the four partial derivatives."""
 
     u: Float64
@@ -60,19 +60,19 @@ class Distortion(Protocol):
     """
 
     @property
-    def symmetric(self) -> bool:
+    def is_radial(self) -> bool:
         """Whether it only moves points along their radius, the same in all directions."""
 
     def distort(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
         """The map, differentiable in the points and in the coefficients."""
 
-    def linearise(self, a: Float64, b: Float64) -> Linear:
+    def linearize(self, a: Float64, b: Float64) -> Linearization:
         """The map with its exact Jacobian; for coefficients that are floats."""
 
-    def radial(self, radius: Float64) -> Float64:
+    def distort_radius(self, radius: Float64) -> Float64:
         """Distorted radius of the radial part; for coefficients that are floats."""
 
-    def critical_radii(self) -> Float64:
+    def find_critical_radii(self) -> Float64:
         """Every radius at which the radial part may stop being monotonic, in any order."""
 
 
@@ -89,19 +89,19 @@ class Lens:
     tilt: "SensorTilt | None" = None
 
 
-def as_vector(values: Sequence[Scalar], like: Tensor | None = None) -> Tensor:
+def to_vector(values: Sequence[Scalar], like: Tensor | None = None) -> Tensor:
     """Numbers, or tensors with their gradients, as a vector, float64 or beside another tensor."""
     empty = torch.empty(0, dtype=torch.float64, device="cpu") if like is None else like.new_empty(0)
     parts = [torch.as_tensor(value, dtype=empty.dtype, device=empty.device) for value in values]
     return torch.stack(parts) if parts else empty
 
 
-def number(value: Scalar) -> float:
+def to_float(value: Scalar) -> float:
     """A coefficient's value, whether or not gradients flow into it."""
     return float(value.detach()) if isinstance(value, Tensor) else float(value)
 
 
-def positive_roots(coefficients: Sequence[float]) -> Float64:
+def find_positive_roots(coefficients: Sequence[float]) -> Float64:
     """Positive real roots of a polynomial whose coefficients start with the constant term.
 
     Nearly real pairs are kept: a double root comes out of the eigenvalue solver as a pair with a tiny imaginary part,
@@ -120,13 +120,13 @@ class PlaneChart:
 
     limit: float = torch.inf
 
-    def draw(self, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def project(self, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Points in front of the camera, drawn where their ray meets z = 1."""
         front = z > 0
         depth = torch.where(front, z, 1.0)  # a division by 0 behind the camera would put NaN into the gradients
         return x / depth, y / depth, front
 
-    def lift(self, a: Tensor, b: Tensor) -> Tensor:
+    def unproject(self, a: Tensor, b: Tensor) -> Tensor:
         """(a, b, 1), normalised."""
         norm = torch.sqrt(a * a + b * b + 1.0)
         return torch.stack((a / norm, b / norm, 1.0 / norm), dim=-1)
@@ -141,7 +141,7 @@ class BrownConrady:
     g = (1 + k1 s + k2 s^2 + k3 s^3) / (1 + k4 s + k5 s^2 + k6 s^3).
 
     The forward model is kornia's `distort_points`. The solver needs the Jacobian with the value, which kornia does not
-    give, so `linearise` states the formula once more; a test holds the two together.
+    give, so `linearize` states the formula once more; a test holds the two together.
 
     `coefficients`: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]: 4, 5, 8 or 12 numbers.
     """
@@ -150,11 +150,11 @@ class BrownConrady:
 
     @cached_property
     def _padded(self) -> tuple[float, ...]:
-        values = [number(value) for value in self.coefficients]
+        values = [to_float(value) for value in self.coefficients]
         return (*values, *[0.0] * (12 - len(values)))
 
     @property
-    def symmetric(self) -> bool:
+    def is_radial(self) -> bool:
         """Whether tangential and prism coefficients are all zero."""
         return not any((*self._padded[2:4], *self._padded[8:]))
 
@@ -164,10 +164,10 @@ class BrownConrady:
 
         points = torch.stack((a, b), dim=-1)
         identity = torch.eye(3, dtype=a.dtype, device=a.device)
-        distorted = distort_points(points, identity, as_vector(self.coefficients, a))
+        distorted = distort_points(points, identity, to_vector(self.coefficients, a))
         return distorted[..., 0], distorted[..., 1]
 
-    def linearise(self, a: Float64, b: Float64) -> Linear:
+    def linearize(self, a: Float64, b: Float64) -> Linearization:
         """Value and Jacobian; the terms of coefficients that are zero are left out."""
         _, _, p1, p2, *_ = self._padded
         s = a * a + b * b
@@ -183,14 +183,14 @@ class BrownConrady:
             u, v = u + a * shift + p2 * s, v + b * shift + p1 * s
             u_a, u_b = u_a + shift + (4.0 * p2) * a, u_b + cross
             v_a, v_b = v_a + cross, v_b + shift + (4.0 * p1) * b
-        return self._with_prism(Linear(u, v, u_a, u_b, v_a, v_b), a, b, s)
+        return self._with_prism(Linearization(u, v, u_a, u_b, v_a, v_b), a, b, s)
 
-    def _with_prism(self, bare: Linear, a: Float64, b: Float64, s: Float64) -> Linear:
+    def _with_prism(self, bare: Linearization, a: Float64, b: Float64, s: Float64) -> Linearization:
         s1, s2, s3, s4 = self._padded[8:]
         if not any((s1, s2, s3, s4)):
             return bare
         u_slope, v_slope = 2.0 * s1 + (4.0 * s2) * s, 2.0 * s3 + (4.0 * s4) * s
-        return Linear(
+        return Linearization(
             bare.u + s * (s1 + s2 * s),
             bare.v + s * (s3 + s4 * s),
             bare.u_a + a * u_slope,
@@ -210,20 +210,20 @@ class BrownConrady:
         gain = gain / below
         return gain, (slope - gain * (k4 + s * (2.0 * k5 + s * (3.0 * k6)))) / below
 
-    def radial(self, radius: Float64) -> Float64:
+    def distort_radius(self, radius: Float64) -> Float64:
         """The radius times g."""
         k1, k2, _, _, k3, k4, k5, k6, *_ = self._padded
         s = radius * radius
         return radius * (1.0 + s * (k1 + s * (k2 + s * k3))) / (1.0 + s * (k4 + s * (k5 + s * k6)))
 
-    def critical_radii(self) -> Float64:
+    def find_critical_radii(self) -> Float64:
         """Where d(r g)/dr is 0, where g is, and the poles."""
         k1, k2, _, _, k3, k4, k5, k6, *_ = self._padded
         above = np.polynomial.Polynomial([1.0, k1, k2, k3])
         below = np.polynomial.Polynomial([1.0, k4, k5, k6])
         s = np.polynomial.Polynomial([0.0, 1.0])
         slope = (above + 2.0 * s * above.deriv()) * below - 2.0 * s * above * below.deriv()
-        roots = [positive_roots(polynomial.coef.tolist()) for polynomial in (slope, above, below)]
+        roots = [find_positive_roots(polynomial.coef.tolist()) for polynomial in (slope, above, below)]
         return np.sqrt(np.concatenate(roots))
 
 
@@ -238,14 +238,14 @@ class SensorTilt:
         """Distorted points -> tilted ones and a mask of those in front of the tilted plane."""
         return self._map(u, v, inverse=False)
 
-    def undo(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def remove(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Tilted points -> distorted ones and a mask of those that come from the front."""
         return self._map(u, v, inverse=True)
 
     def _map(self, u: Tensor, v: Tensor, inverse: bool) -> tuple[Tensor, Tensor, Tensor]:
         from kornia.geometry.calibration import tilt_projection
 
-        tau_x, tau_y = as_vector([self.tau_x, self.tau_y], u)
+        tau_x, tau_y = to_vector([self.tau_x, self.tau_y], u)
         # Of kornia's two maps this one is right in all versions; the other turns the wrong way before 0.9.
         undo = tilt_projection(tau_x, tau_y, True)
         rows = undo if inverse else torch.linalg.inv(undo)
@@ -272,7 +272,7 @@ class AngleChart:
 
     limit: float = pi
 
-    def draw(self, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def project(self, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Every direction but the one straight back, whose azimuth is unknown."""
         squared = x * x + y * y
         off_axis = squared > 0
@@ -281,7 +281,7 @@ class AngleChart:
         stretch = torch.where(off_axis, torch.atan2(radius, z) / radius, 1.0 / torch.where(z > 0, z, 1.0))
         return x * stretch, y * stretch, off_axis | (z > 0)
 
-    def lift(self, a: Tensor, b: Tensor) -> Tensor:
+    def unproject(self, a: Tensor, b: Tensor) -> Tensor:
         """(a sin(t)/t, b sin(t)/t, cos t) with t = |(a, b)|."""
         squared = a * a + b * b
         small = squared < _SERIES
@@ -291,10 +291,10 @@ class AngleChart:
         return torch.stack((a * ratio, b * ratio, forward), dim=-1)
 
 
-def _stretched(a: Float64, b: Float64, gain: Float64, slope: Float64) -> Linear:
+def _stretched(a: Float64, b: Float64, gain: Float64, slope: Float64) -> Linearization:
     """A radial map (a, b) * gain whose gain has the gradient slope * (a, b)."""
     twist = slope * a * b
-    return Linear(a * gain, b * gain, gain + slope * a * a, twist, twist, gain + slope * b * b)
+    return Linearization(a * gain, b * gain, gain + slope * a * a, twist, twist, gain + slope * b * b)
 
 
 @dataclass(frozen=True)
@@ -302,7 +302,7 @@ class KannalaBrandt:
     """t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8): OpenCV's fisheye, Kalibr's equidistant."""
 
     coefficients: Sequence[Scalar]
-    symmetric: bool = True
+    is_radial: bool = True
 
     def distort(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
         """The map, along the radius."""
@@ -311,24 +311,24 @@ class KannalaBrandt:
         gain = 1.0 + s * (k1 + s * (k2 + s * (k3 + s * k4)))
         return a * gain, b * gain
 
-    def linearise(self, a: Float64, b: Float64) -> Linear:
+    def linearize(self, a: Float64, b: Float64) -> Linearization:
         """Value and Jacobian."""
-        k1, k2, k3, k4 = (number(k) for k in self.coefficients)
+        k1, k2, k3, k4 = (to_float(k) for k in self.coefficients)
         s = a * a + b * b
         gain = 1.0 + s * (k1 + s * (k2 + s * (k3 + s * k4)))
         slope = 2.0 * (k1 + s * (2.0 * k2 + s * (3.0 * k3 + s * (4.0 * k4))))
         return _stretched(a, b, gain, slope)
 
-    def radial(self, radius: Float64) -> Float64:
+    def distort_radius(self, radius: Float64) -> Float64:
         """Distorted angle."""
-        k1, k2, k3, k4 = (number(k) for k in self.coefficients)
+        k1, k2, k3, k4 = (to_float(k) for k in self.coefficients)
         s = radius * radius
         return radius * (1.0 + s * (k1 + s * (k2 + s * (k3 + s * k4))))
 
-    def critical_radii(self) -> Float64:
+    def find_critical_radii(self) -> Float64:
         """Where the derivative of the distorted angle is 0."""
-        k1, k2, k3, k4 = (number(k) for k in self.coefficients)
-        return np.sqrt(positive_roots([1.0, 3.0 * k1, 5.0 * k2, 7.0 * k3, 9.0 * k4]))
+        k1, k2, k3, k4 = (to_float(k) for k in self.coefficients)
+        return np.sqrt(find_positive_roots([1.0, 3.0 * k1, 5.0 * k2, 7.0 * k3, 9.0 * k4]))
 
 
 @dataclass(frozen=True)
@@ -336,7 +336,7 @@ class ThetaPolynomial:
     """k1 t + k2 t^2 + k3 t^3 + k4 t^4: WoodScape's surround-view fisheyes (there in pixels, with fx = fy = 1)."""
 
     coefficients: Sequence[Scalar]
-    symmetric: bool = True
+    is_radial: bool = True
 
     def distort(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
         """The map, along the radius."""
@@ -345,19 +345,19 @@ class ThetaPolynomial:
         gain = k1 + angle * (k2 + angle * (k3 + angle * k4))
         return a * gain, b * gain
 
-    def linearise(self, a: Float64, b: Float64) -> Linear:
+    def linearize(self, a: Float64, b: Float64) -> Linearization:
         """Value and Jacobian."""
-        k1, k2, k3, k4 = (number(k) for k in self.coefficients)
+        k1, k2, k3, k4 = (to_float(k) for k in self.coefficients)
         angle = np.sqrt(np.maximum(a * a + b * b, _KINK))
         gain = k1 + angle * (k2 + angle * (k3 + angle * k4))
         return _stretched(a, b, gain, (k2 + angle * (2.0 * k3 + angle * (3.0 * k4))) / angle)
 
-    def radial(self, radius: Float64) -> Float64:
+    def distort_radius(self, radius: Float64) -> Float64:
         """Distorted angle."""
-        k1, k2, k3, k4 = (number(k) for k in self.coefficients)
+        k1, k2, k3, k4 = (to_float(k) for k in self.coefficients)
         return radius * (k1 + radius * (k2 + radius * (k3 + radius * k4)))
 
-    def critical_radii(self) -> Float64:
+    def find_critical_radii(self) -> Float64:
         """Where the derivative of the distorted angle is 0."""
-        k1, k2, k3, k4 = (number(k) for k in self.coefficients)
-        return positive_roots([k1, 2.0 * k2, 3.0 * k3, 4.0 * k4])
+        k1, k2, k3, k4 = (to_float(k) for k in self.coefficients)
+        return find_positive_roots([k1, 2.0 * k2, 3.0 * k3, 4.0 * k4])

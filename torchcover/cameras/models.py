@@ -22,7 +22,7 @@ from torchcover.cameras.lens import (
     Scalar,
     SensorTilt,
     ThetaPolynomial,
-    number,
+    to_float,
 )
 
 
@@ -58,16 +58,16 @@ class SphereChart:
     @property
     def limit(self) -> float:
         """The rim of the sphere as an eye outside of it sees it."""
-        xi = number(self.xi)
+        xi = to_float(self.xi)
         return 1.0 / sqrt(xi * xi - 1.0) if xi > 1.0 else inf
 
-    def draw(self, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def project(self, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Directions on the near side of the rim."""
-        xi, norm = number(self.xi), _norm(x, y, z)
+        xi, norm = to_float(self.xi), _norm(x, y, z)
         shown = z > -norm * (1.0 / xi if xi > 1.0 else xi)
         return _over(x, y, z + self.xi * norm, shown)
 
-    def lift(self, a: Tensor, b: Tensor) -> Tensor:
+    def unproject(self, a: Tensor, b: Tensor) -> Tensor:
         """The nearer of the two points in which the line of sight meets the sphere."""
         s = a * a + b * b
         reach = (self.xi + _root(1.0 + (1.0 - self.xi * self.xi) * s)) / (s + 1.0)
@@ -87,17 +87,17 @@ class ExtendedChart:
     @property
     def limit(self) -> float:
         """Radius at which the image folds; none for alpha up to a half."""
-        alpha, beta = number(self.alpha), number(self.beta)
+        alpha, beta = to_float(self.alpha), to_float(self.beta)
         return 1.0 / sqrt(beta * (2.0 * alpha - 1.0)) if alpha > 0.5 else inf
 
-    def draw(self, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def project(self, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Directions before the fold."""
-        alpha = number(self.alpha)
+        alpha = to_float(self.alpha)
         d = _root(self.beta * (x * x + y * y) + z * z)
         shown = z > -d * (min(alpha, 1.0 - alpha) / max(alpha, 1.0 - alpha))
         return _over(x, y, self.alpha * d + (1.0 - self.alpha) * z, shown)
 
-    def lift(self, a: Tensor, b: Tensor) -> Tensor:
+    def unproject(self, a: Tensor, b: Tensor) -> Tensor:
         """Closed form of the paper."""
         s = self.beta * (a * a + b * b)
         below = self.alpha * _root(1.0 - (2.0 * self.alpha - 1.0) * s) + 1.0 - self.alpha
@@ -117,12 +117,12 @@ class DoubleSphereChart:
     @property
     def limit(self) -> float:
         """Radius at which the image folds; none for alpha up to a half."""
-        alpha = number(self.alpha)
+        alpha = to_float(self.alpha)
         return 1.0 / sqrt(2.0 * alpha - 1.0) if alpha > 0.5 else inf
 
-    def draw(self, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def project(self, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Directions before the fold."""
-        xi, alpha = number(self.xi), number(self.alpha)
+        xi, alpha = to_float(self.xi), to_float(self.alpha)
         # The image folds where the direction as seen from the second centre has the cosine -w1; w2 is that cosine as
         # seen from the first. (The paper's w2 takes both distances to that point as 1, and ends degrees too early.)
         w1 = min(alpha, 1.0 - alpha) / max(alpha, 1.0 - alpha)
@@ -133,7 +133,7 @@ class DoubleSphereChart:
         below = self.alpha * _norm(x, y, second) + (1.0 - self.alpha) * second
         return _over(x, y, below, z > -w2 * norm)
 
-    def lift(self, a: Tensor, b: Tensor) -> Tensor:
+    def unproject(self, a: Tensor, b: Tensor) -> Tensor:
         """Closed form of the paper."""
         s = a * a + b * b
         below = self.alpha * _root(1.0 - (2.0 * self.alpha - 1.0) * s) + 1.0 - self.alpha
@@ -202,12 +202,12 @@ def check_model(model: str, coefficients: Sequence[float]) -> None:
         raise ValueError(f"camera model {model!r}: k1 must be positive; got {coefficients[0]}")
 
 
-def build_lens(model: str, coefficients: Sequence[Scalar], *, trainable: bool) -> Lens:
+def build_lens(model: str, coefficients: Sequence[Scalar], *, is_trainable: bool) -> Lens:
     """The lens of a model that `check_model` has passed, without a distortion that does nothing.
 
-    A `trainable` one stays while its coefficients are zero, where its derivatives by them are not.
+    A `is_trainable` one stays while its coefficients are zero, where its derivatives by them are not.
     """
-    return _BUILD[model](coefficients, trainable)
+    return _BUILD[model](coefficients, is_trainable)
 
 
 def check_image(name: str, width: int, height: int, intrinsics: Tensor) -> None:

@@ -16,8 +16,8 @@ from torchcover.cameras.inverse import (
     UNCONVERGED,
     StartTable,
     ValidRegion,
-    find_region,
-    make_start_table,
+    build_start_table,
+    find_valid_region,
 )
 from torchcover.cameras.lens import Distortion
 from torchcover.cameras.models import build_lens
@@ -32,13 +32,13 @@ class Optics:
         trainable = coefficients.requires_grad
         self.intrinsics = intrinsics
         # One lens carries the gradients, its twin in floats is the solver's: no graph, no waiting for a GPU.
-        self._solver = build_lens(model, coefficients.tolist(), trainable=trainable)
-        self._lens = build_lens(model, coefficients.unbind(), trainable=True) if trainable else self._solver
-        self.differentiable = trainable or intrinsics.requires_grad
+        self._solver = build_lens(model, coefficients.tolist(), is_trainable=trainable)
+        self._lens = build_lens(model, coefficients.unbind(), is_trainable=True) if trainable else self._solver
+        self.is_differentiable = trainable or intrinsics.requires_grad
         self._found_region: ValidRegion | None = None
         self._start_tables: dict[int, StartTable] = {}
 
-    def directions(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    def unproject(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         """(N, 3) float64 unit directions that the lens maps to (N, 2) columns and rows; status of `inverse.solve`.
 
         Directions are NaN where there is none.
@@ -47,11 +47,11 @@ class Optics:
         u, v = (pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy
         front = None
         if self._lens.tilt is not None:
-            u, v, front = self._lens.tilt.undo(u, v)
+            u, v, front = self._lens.tilt.remove(u, v)
         a, b, status = self._undistort(u, v)
         if front is not None:
             status = torch.where(front, status, OUTSIDE)
-        rays = self._lens.chart.lift(a, b)
+        rays = self._lens.chart.unproject(a, b)
         return torch.where((status == ANSWERED)[:, None], rays, torch.nan), status
 
     def _undistort(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -61,7 +61,7 @@ class Optics:
             status = torch.where(shown, ANSWERED, OUTSIDE).to(torch.uint8)
             return torch.where(shown, u, 0.0), torch.where(shown, v, 0.0), status
         a, b, status = self._solve(solver, u.detach(), v.detach())
-        if u.requires_grad or self.differentiable:
+        if u.requires_grad or self.is_differentiable:
             a, b = inverse.attach_gradients(solver, distortion, a, b, u, v)
         return a, b, status
 
@@ -76,7 +76,7 @@ class Optics:
 
     def _region(self, solver: Distortion) -> ValidRegion:
         if self._found_region is None:
-            self._found_region = find_region(solver, self._solver.chart.limit)
+            self._found_region = find_valid_region(solver, self._solver.chart.limit)
         return self._found_region
 
     def _start_table(self, solver: Distortion, distorted: Float64) -> StartTable:
@@ -84,14 +84,14 @@ class Optics:
         farthest = float(distorted[np.isfinite(distorted)].max(initial=0.0))
         exponent = max(frexp(farthest)[1], -60)
         if exponent not in self._start_tables:
-            self._start_tables[exponent] = make_start_table(solver, self._solver.chart.limit, 2.0**exponent)
+            self._start_tables[exponent] = build_start_table(solver, self._solver.chart.limit, 2.0**exponent)
         return self._start_tables[exponent]
 
-    def pixels(self, points: Tensor) -> tuple[Tensor, Tensor]:
+    def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """(N, 2) float64 pixels that (N, 3) points are seen at, NaN if at none; (N,) bool if at any."""
         finite = torch.isfinite(points).all(dim=1)
         safe = torch.where(finite[:, None], points, points.new_tensor([0.0, 0.0, 1.0]))
-        a, b, shown = self._lens.chart.draw(*safe.unbind(dim=1))
+        a, b, shown = self._lens.chart.project(*safe.unbind(dim=1))
         shown = shown & finite & self._inside(a.detach(), b.detach())
         # Points that are not shown go along the axis, lest their infinities reach the gradients.
         u, v = torch.where(shown, a, 0.0), torch.where(shown, b, 0.0)
@@ -111,7 +111,7 @@ class Optics:
             return torch.ones_like(a, dtype=torch.bool)
         drawn = a.numpy(force=True), b.numpy(force=True)
         with np.errstate(all="ignore"):  # far outside the region the polynomials overflow
-            inside = self._region(solver).contains(*drawn, solver.linearise(*drawn).determinant)
+            inside = self._region(solver).contains(*drawn, solver.linearize(*drawn).determinant)
         return torch.from_numpy(inside).to(a.device)
 
 
@@ -133,32 +133,32 @@ class RayTable:
         """Without the tables: a worker process makes its own, which is faster than receiving them."""
         return {**self.__dict__, "_tables": {}}
 
-    def points(self, device: str, dtype: torch.dtype, kind: DepthKind) -> tuple[Tensor, Tensor]:
+    def get_points(self, device: str, dtype: torch.dtype, depth_kind: DepthKind) -> tuple[Tensor, Tensor]:
         """(H, W, 3) points, NaN where there is none, and (H, W) bool; made once unless gradients flow through them.
 
         They are at depth 1 along the ray ("distance") or along the axis ("z"). The lens is solved in float64 whatever
         the type.
         """
         if not has_float64(torch.device(device)):
-            rays, valid = self.points("cpu", dtype, kind)
+            rays, valid = self.get_points("cpu", dtype, depth_kind)
             return rays.to(device), valid.to(device)
-        trace = self._trace_image if kind == "distance" else self._plane
-        if self._optics.differentiable and torch.is_grad_enabled():
+        trace = self._trace_image if depth_kind == "distance" else self._plane
+        if self._optics.is_differentiable and torch.is_grad_enabled():
             return trace(device, dtype)
-        key = (device, dtype, kind)
+        key = (device, dtype, depth_kind)
         if key not in self._tables:
             self._tables[key] = trace(device, dtype)
         return self._tables[key]
 
-    def pixel_counts(self) -> dict[str, int]:
+    def count_pixels(self) -> dict[str, int]:
         """How many pixels have a ray, and why the others have none; see `Camera.pixel_counts`."""
         if self._pixel_counts is None:
-            self.points("cpu", torch.float32, "distance")
+            self.get_points("cpu", torch.float32, "distance")
         return dict(self._pixel_counts or {})
 
     def _plane(self, device: str, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         """Rays scaled to z = 1; at and beyond 90 degrees there is no z-depth."""
-        rays, valid = self.points(device, dtype, "distance")
+        rays, valid = self.get_points(device, dtype, "distance")
         valid = valid & (rays[..., 2] > 0)
         return rays / torch.where(valid, rays[..., 2], torch.nan)[..., None], valid
 
@@ -174,5 +174,5 @@ class RayTable:
 
     def _trace_rows(self, rows: Tensor, columns: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         y, x = torch.meshgrid(rows, columns, indexing="ij")
-        directions, status = self._optics.directions(torch.stack((x, y), dim=-1).reshape(-1, 2))
+        directions, status = self._optics.unproject(torch.stack((x, y), dim=-1).reshape(-1, 2))
         return directions.to(dtype).reshape(*y.shape, 3), status.reshape(y.shape)

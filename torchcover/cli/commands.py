@@ -322,12 +322,12 @@ def check(
     from torchcover.cli.printing import print_files, print_verdict
     from torchcover.evaluation import check
     from torchcover.files import lock_folder
-    from torchcover.report import Terminal, print_whole
+    from torchcover.report import Terminal, print_page_tables
 
     with lock_folder(out):
         found = check(rigs, requirements, scenario, progress=True, **settings)
         written = found.save(out)
-    print_whole(found.tables())
+    print_page_tables(found.tables())
     print_files(written, out, Terminal())
     print_verdict(found.verdict, Terminal())
     raise typer.Exit(0 if found.is_met else 1)
@@ -370,7 +370,7 @@ def encounter(
         save_encounters,
     )
     from torchcover.files import lock_folder
-    from torchcover.report import Terminal, check_film, print_whole, write_film
+    from torchcover.report import Terminal, check_animation, print_page_tables, write_animation
 
     criterion = Criterion(**{name: settings.pop(name) for name in Criterion.__annotations__})
     what, unused = "a set", {"worlds", "within_s"}
@@ -384,7 +384,7 @@ def encounter(
         if each.name in unused and source is not None and source.name == "COMMANDLINE":
             raise ValueError(f"{each.opts[0]}: of no use with {what}; leave it out")
     if film is not None:
-        check_film(film)
+        check_animation(film)
     with lock_folder(out):
         if frames is not None:
             found = met_in_recording(frames, criterion)
@@ -395,8 +395,8 @@ def encounter(
         written = save_encounters(found, out, files=files)
     if film is not None:
         told = {name: settings.get(name) for name in ("vehicle", "sensor_model")}
-        write_film(film, encounter_film((rigs or [])[0], found, **told), per_s=10)
-    print_whole(found.tables())
+        write_animation(film, encounter_film((rigs or [])[0], found, **told), frames_per_s=10)
+    print_page_tables(found.tables())
     print_files(written, out, Terminal())
     print_verdict(encounters_verdict(found), Terminal())
 

@@ -178,7 +178,7 @@ def opened(
         return None
     from rich.markup import escape
 
-    from torchcover.recordings import RecordedFrames, merge_recording_settings, reference_of_recording
+    from torchcover.recordings import RecordedFrames, create_reference, merge_recording_settings
     from torchcover.report import Terminal
 
     with Terminal(stderr=True).status(f"opening {escape(str(frames))}"):  # seconds, where there are 100,000 frames
@@ -187,17 +187,17 @@ def opened(
     return RecordedFrames(
         recording,
         rigs={names: names.split(",") for names in sensors} if sensors else None,
-        reference=reference_of_recording(settings.pop("reference", None), window_s),
+        reference=create_reference(settings.pop("reference", None), window_s),
     )
 
 
 def checkpoint_in(out: Path, settings: Settings, *, resume: bool) -> "Checkpoint":
     """The checkpoint in the folder of the results; one line if it is not what the user may think."""
     from torchcover.evaluation import Checkpoint
-    from torchcover.report import file_stems
+    from torchcover.report import build_file_stems
 
     checkpoint = Checkpoint(out / "checkpoint.npz", resume, keep=resume)
-    for each in map(checkpoint.within, file_stems(list(settings.mixture))) if settings.mixture else [checkpoint]:
+    for each in map(checkpoint.within, build_file_stems(list(settings.mixture))) if settings.mixture else [checkpoint]:
         if resume and not each.path.exists():
             typer.echo(f"torchcover: {each.path} is not there: the run starts with its first step", err=True)
         elif each.path.exists() and not resume and not _complete(out):
@@ -255,7 +255,7 @@ def finish(
     """Results are safe before anything is printed; then the command ends as the run did."""
     from torchcover.cli.printing import print_result
     from torchcover.evaluation import MixedResult
-    from torchcover.report import file_stems
+    from torchcover.report import build_file_stems
 
     if ranks is None or ranks.rank == 0:
         for world in result.worlds.values() if isinstance(result, MixedResult) else [result]:
@@ -267,7 +267,7 @@ def finish(
             log.finish(result)
     if isinstance(result, MixedResult):  # complete, for else there was none
         for each in (
-            map(checkpoint.within, file_stems(list(result.worlds))) if checkpoint and not checkpoint.keep else ()
+            map(checkpoint.within, build_file_stems(list(result.worlds))) if checkpoint and not checkpoint.keep else ()
         ):
             each.path.unlink(missing_ok=True)
         return

@@ -180,7 +180,7 @@ def open_recording(frames: Path, settings: "RecordingSettings", vehicle: str | N
     if vehicle is not None:
         from torchcover.simulation.recorded_rig import recorded_body
 
-        recording.body = recorded_body(recording, vehicle)
+        recording.ego_box = recorded_body(recording, vehicle)
     return recording
 
 

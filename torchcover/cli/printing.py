@@ -10,7 +10,7 @@ from torchcover.evaluation import MixedResult, Result, Study
 from torchcover.evaluation.mixed import MIXTURE
 from torchcover.evaluation.result_page import left_out_table
 from torchcover.evaluation.study import WANTED
-from torchcover.report import Terminal, print_table, print_whole
+from torchcover.report import Terminal, print_page_tables, print_table
 
 
 def print_result(result: Result, files: Sequence[Path], out: Path, *, explain: bool) -> None:
@@ -37,9 +37,9 @@ def print_verdict(sentences: Sequence[str], console: Terminal) -> None:
 def _print_world(result: Result, console: Terminal, *, explain: bool) -> None:
     print_table(result.table, console)
     if result.metrics:
-        print_whole(result.metrics.page_tables(parts=False))
+        print_page_tables(result.metrics.page_tables(parts=False))
     if explain and result.left_out:
-        print_whole([left_out_table(result.left_out)])
+        print_page_tables([left_out_table(result.left_out)])
     if explain and result.run:
         frames_s = result.run.seconds - result.run.measuring_s
         console.print(
@@ -64,7 +64,7 @@ def print_files(files: Sequence[Path], out: Path, console: Terminal) -> None:
 def print_study(study: Study, files: Sequence[Path], out: Path) -> None:
     """The tables, and the settings that are recommended."""
     console = Terminal()
-    print_whole(study.tables)
+    print_page_tables(study.tables)
     for wanted in WANTED:
         console.print(study.advice(wanted), markup=False, soft_wrap=True)
     print_files(files, out, console)

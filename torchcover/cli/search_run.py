@@ -10,19 +10,19 @@ from torchcover.cli.printing import print_files
 from torchcover.evaluation.cores import usual_workers
 from torchcover.files import SUMMARY, lock_folder
 from torchcover.placement import (
-    ChoiceSpace,
     PlacementSearch,
     SearchPlan,
     SearchResult,
     SearchSpace,
-    SensorChoice,
-    choose,
+    SelectionResult,
+    SelectionSpace,
     run_search,
+    run_selection,
 )
 from torchcover.placement.common_frames import WORLDS
 from torchcover.placement.plan import make_common_frames
 from torchcover.placement.running import JOURNAL
-from torchcover.report import Terminal, print_whole
+from torchcover.report import Terminal, print_page_tables
 from torchcover.simulation.documents import read_mapping
 
 CHOICE_KEY = "candidates"
@@ -50,10 +50,10 @@ def run(
     with lock_folder(out):
         report = find(path, out, resume=resume, **settings).report
         written = report.save(out, files=files)
-    print_whole(report.tables[:2])
+    print_page_tables(report.tables[:2])
     console = Terminal()
     print_files(written, out, console)
-    console.print(report.sentence, markup=False, soft_wrap=True)
+    console.print(report.summary, markup=False, soft_wrap=True)
 
 
 def _searched(path: Path, out: Path, *, resume: bool, **settings: Any) -> SearchResult:  # noqa: ANN401
@@ -68,7 +68,7 @@ def _searched(path: Path, out: Path, *, resume: bool, **settings: Any) -> Search
     return run_search(search, out, resume=resume, progress=True)
 
 
-def _chosen(path: Path, out: Path, *, resume: bool, **settings: Any) -> SensorChoice:  # noqa: ANN401
+def _chosen(path: Path, out: Path, *, resume: bool, **settings: Any) -> SelectionResult:  # noqa: ANN401
     asked = {
         "--budget": settings["budget_s"] is not None,
         "--evaluations": settings["evaluations"] is not None,
@@ -76,6 +76,8 @@ def _chosen(path: Path, out: Path, *, resume: bool, **settings: Any) -> SensorCh
     }
     if useless := [option for option, given in asked.items() if given]:
         raise ValueError(f"{', '.join(useless)}: the {CHOICE_KEY} of this file are all looked at; leave it out")
-    space, plan = ChoiceSpace.load(path), SearchPlan(**settings | {"budget_s": math.inf})
-    with make_common_frames(space, plan, plan.seed, plan.worlds) as frames:
-        return choose(space, frames, test_seed=plan.seed_of_test, fresh_worlds=plan.fresh_worlds, progress=True)
+    space, plan = SelectionSpace.load(path), SearchPlan(**settings | {"budget_s": math.inf})
+    with make_common_frames(space, plan, plan.seed, plan.num_scenes) as frames:
+        return run_selection(
+            space, frames, test_seed=plan.test_seed, num_held_out_scenes=plan.num_held_out_scenes, progress=True
+        )

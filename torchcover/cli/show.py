@@ -13,7 +13,7 @@ from torchcover.evaluation import cameras_of, rig_pictures, scenario_pictures, v
 from torchcover.evaluation.settings import DEFAULT_SCENARIO
 from torchcover.evaluation.task import as_called
 from torchcover.files import BadFileError, write_atomically
-from torchcover.report import Terminal, check_film, write_film
+from torchcover.report import Terminal, check_animation, write_animation
 from torchcover.simulation import Scenario, builtin_names
 from torchcover.simulation.bodies import Body, Vehicle, VehicleShape, body_called, describe_windows, mover_mesh
 from torchcover.simulation.documents import nearest, read_mapping
@@ -82,7 +82,7 @@ def run(
         return
     _refuse("a rig", {"--scenario": scenario}, f"{name!r} is a scenario")
     if film is not None:
-        check_film(film)
+        check_animation(film)
     world, seen_by = Scenario.load(name), as_called(rig or DEFAULT_RIG)
     steps = range(step or 0, (step or 0) + 1) if film is None else _steps_of_film(world, step or 0)
     figures = scenario_pictures(world, seen_by, steps, vehicle=vehicle, seed=seed or 0)
@@ -91,7 +91,7 @@ def run(
         _write(console, out / Path(name).stem, (("", figure) for figure in figures))
         return
     drawn = track(figures, "pictures", total=len(steps), console=console)
-    write_film(film, drawn, per_s=1 / (world.step_s * steps.step))
+    write_animation(film, drawn, frames_per_s=1 / (world.step_s * steps.step))
     console.print(f"Wrote {film}", markup=False, soft_wrap=True)
 
 

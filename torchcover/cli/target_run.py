@@ -9,7 +9,7 @@ from torchcover.cli.printing import print_files, print_verdict
 from torchcover.evaluation import save_targets, survey_target
 from torchcover.evaluation.target_survey import places_table, sides_table, target_verdict
 from torchcover.files import lock_folder
-from torchcover.report import Terminal, print_whole
+from torchcover.report import Terminal, print_page_tables
 from torchcover.simulation import Rig
 from torchcover.targets import Heading, Raster, TargetMap
 
@@ -91,6 +91,6 @@ def _print(seen: TargetMap) -> None:
         soft_wrap=True,
     )
     worst = places_table(seen.worst(), "The places with the fewest points, 1 m apart")
-    print_whole([sides_table(seen), worst])
+    print_page_tables([sides_table(seen), worst])
     if unknown := seen.counts["share_unknown"]:
         console.print(f"{unknown:,} places show no surface to any random place: their share is unknown.")

@@ -13,7 +13,7 @@ from torchcover.contrib.ranks import LEAST, Ranking, interval95, kendall_tau_b
 from torchcover.contrib.s_mig import unequal_rays
 from torchcover.estimation import Number
 from torchcover.files import csv_text
-from torchcover.report import PageTable, Words, json_record, number_words, shown_unit
+from torchcover.report import PageTable, TextCell, format_number, get_display_unit, to_json_record
 
 TITLE, TAU_TITLE = "Metrics of others", "Kendall's tau-b with torchcover's numbers, 95 % over worlds"
 
@@ -90,7 +90,9 @@ class MetricComparison:
         Args:
             parts: Whether numbers of a category or a region are rows too.
         """
-        rows = [[Words(cell) for cell in _format_row(ranking)] for ranking in (self.rankings if parts else self.main)]
+        rows = [
+            [TextCell(cell) for cell in _format_row(ranking)] for ranking in (self.rankings if parts else self.main)
+        ]
         headings = ["metric", "unit", "better", *self.rigs]
         title = f"{TITLE} (rank)" if len(self.rigs) > 1 else TITLE
         return [PageTable(title, headings, rows, 3, self.notes), *_tau_tables(self)]
@@ -111,10 +113,10 @@ class MetricComparison:
         return {"metrics.csv": csv_text(lines), "metrics_tau.csv": csv_text([Tau._fields, *taus])}
 
     def _number_records(self) -> list[dict[str, Any]]:
-        return [{**json_record(row), "parameters": json_record(row["parameters"])} for row in self.rows()]
+        return [{**to_json_record(row), "parameters": to_json_record(row["parameters"])} for row in self.rows()]
 
     def _tau_records(self) -> list[dict[str, Any]]:
-        return [json_record(tau._asdict()) for tau in self.taus()]
+        return [to_json_record(tau._asdict()) for tau in self.taus()]
 
 
 def tau_of(first: Ranking, second: Ranking) -> Tau:
@@ -130,13 +132,13 @@ def tau_of(first: Ranking, second: Ranking) -> Tau:
 def _format_row(one: Ranking) -> list[str]:
     better = "less" if one.quantity.lower_is_better else "more"
     ranks = one.ranks.tolist() if len(one.numbers) > 1 else [math.nan]
-    return [one.name, shown_unit(one.quantity.unit).name, better, *map(_words, one.numbers, ranks)]
+    return [one.name, get_display_unit(one.quantity.unit).name, better, *map(_words, one.numbers, ranks)]
 
 
 def _words(number: Number, rank: float) -> str:
     if not number.known:
         return "–"
-    return number_words(number) if math.isnan(rank) else f"{number_words(number)} ({rank:g})"
+    return format_number(number) if math.isnan(rank) else f"{format_number(number)} ({rank:g})"
 
 
 def _tau_tables(comparison: MetricComparison) -> list[PageTable]:
@@ -145,7 +147,7 @@ def _tau_tables(comparison: MetricComparison) -> list[PageTable]:
     # Numbers of torchcover that the table has room for: the detections.
     shown = [own.name for own in comparison.own if not own.quantity.lower_is_better]
     mains = [one.name for one in comparison.main if found]
-    rows = [[Words(name), *(Words(_tau_words(found[name, own])) for own in shown)] for name in mains]
+    rows = [[TextCell(name), *(TextCell(_tau_words(found[name, own])) for own in shown)] for name in mains]
     return [PageTable(TAU_TITLE, ["metric", *shown], rows)] if rows else []
 
 

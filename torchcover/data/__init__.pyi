@@ -21,10 +21,10 @@ from torchcover.recordings import RecordingFormat as RecordingFormat
 from torchcover.recordings import RecordingSettings as RecordingSettings
 from torchcover.recordings import Reference as Reference
 from torchcover.recordings import Scan as Scan
+from torchcover.recordings import create_reference as create_reference
 from torchcover.recordings import open_recording as open_recording
 from torchcover.recordings import read_cloud as read_cloud
 from torchcover.recordings import read_objects as read_objects
-from torchcover.recordings import reference_of_recording as reference_of_recording
 from torchcover.simulation import DEFAULT_REFERENCE as DEFAULT_REFERENCE
 from torchcover.simulation import GRID_X_M as GRID_X_M
 from torchcover.simulation import GRID_Y_M as GRID_Y_M

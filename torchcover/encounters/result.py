@@ -17,7 +17,7 @@ from torchcover.encounters.traffic import WHO, Approach
 from torchcover.estimation import Estimate, Number, Quantity
 from torchcover.files import csv_text
 from torchcover.notebooks import data_frame, small_html
-from torchcover.report import PageTable, Words, draw_encounters, json_record, percent
+from torchcover.report import PageTable, TextCell, format_percent, plot_encounters, to_json_record
 
 if TYPE_CHECKING:
     import pandas
@@ -184,7 +184,7 @@ class Sightings:
                 "ttc_s": float(one.ttc_s[0]), "in_time": None if np.isnan(one.in_time[0]) else bool(one.in_time[0])}
                for one in self.sightings if isinstance(one.encounter, Approach)]  # fmt: skip
         listed = {"rows": rows, "speeds": up_to, "met": met}
-        return self.settings() | {name: list(map(json_record, each)) for name, each in listed.items()}
+        return self.settings() | {name: list(map(to_json_record, each)) for name, each in listed.items()}
 
     def tables(self) -> list[PageTable]:
         """Up to which speed, when, and by which sensor."""
@@ -200,7 +200,9 @@ class Sightings:
         for (encounter, speed), group in groupby(rows, key=lambda row: (row.encounter, _speed(row))):
             of_rigs = {row.rig: row for row in group}
             needed_s = next(iter(of_rigs.values())).needed_s
-            cells.append(tuple(map(Words, (encounter, speed, f"{needed_s:.2f}", *(_time(of_rigs[r]) for r in rigs)))))
+            cells.append(
+                tuple(map(TextCell, (encounter, speed, f"{needed_s:.2f}", *(_time(of_rigs[r]) for r in rigs))))
+            )
         unsure = any(row.from_the_beginning for row in rows)
         notes = [
             "The least and the most over the phases of the looks and what was drawn, of that the mean with its 95 % "
@@ -216,7 +218,9 @@ class Sightings:
         for first in range(0, len(rows), len(rigs)):
             of_rigs = rows[first : first + len(rigs)]
             often = _with_interval(of_rigs[0], "per_hour", "{:.0f}".format)
-            cells.append(tuple(map(Words, (of_rigs[0].encounter, str(of_rigs[0].draws), often, *map(_met, of_rigs)))))
+            cells.append(
+                tuple(map(TextCell, (of_rigs[0].encounter, str(of_rigs[0].draws), often, *map(_met, of_rigs))))
+            )
         notes = [
             f"Met: came within {within_s:g} s of a collision, if both had gone straight on, in "
             f"{60 * sum(self.hours.values()):.0f} minutes. Detected before that, with a 95 % interval over "
@@ -230,7 +234,7 @@ class Sightings:
         return f"Sightings of {', '.join(self.sensors)} in {self.name}: {len(self.sightings)} encounters"
 
     def _repr_html_(self) -> str:
-        of_rows = {(row.encounter, row.rig): f"{percent(row.in_time)} %" for row in self.rows}
+        of_rows = {(row.encounter, row.rig): f"{format_percent(row.in_time)} %" for row in self.rows}
         up_to = {key: "at no speed" if kmh != kmh else f"up to {kmh:g} km/h" for key, kmh in self.up_to_kmh().items()}
         told = (f"{rig} in time, {name}: {words}." for (name, rig), words in (of_rows | up_to).items())
         return small_html([repr(self), *told], None if self.hours else self.plot())
@@ -246,7 +250,7 @@ class Sightings:
         """
         if self.hours:
             raise ValueError("no picture of what was met in traffic: its numbers are in `rows` and `to_dataframe()`")
-        return draw_encounters(list(self.bands()), title=f"{self.name}: time to collision at detection")
+        return plot_encounters(list(self.bands()), title=f"{self.name}: time to collision at detection")
 
     def to_dataframe(self) -> "pandas.DataFrame":
         """`rows`, a column for each field of `EncounterRow`.
@@ -305,22 +309,22 @@ def _met(row: EncounterRow) -> str:
     least = f", least {row.ttc_s_low:.2f} s" if row.from_the_beginning < 1 and row.never == 0 else ""
     never = f", {round(row.never * row.draws)} never" if row.never else ""
     late = f", {round((1 - row.in_time) * row.to_brake)} of {row.to_brake} too late" if row.in_time < 1 else ""
-    return f"{_with_interval(row, 'from_the_beginning', percent)} %{least}{never}{late}"
+    return f"{_with_interval(row, 'from_the_beginning', format_percent)} %{least}{never}{late}"
 
 
 def _speeds(up_to_kmh: dict[tuple[str, str], float], rigs: Sequence[str]) -> PageTable:
     names = dict.fromkeys(name for name, _ in up_to_kmh)
     speeds = {key: "none" if math.isnan(kmh) else f"{kmh:g}" for key, kmh in up_to_kmh.items()}
-    rows = [tuple(map(Words, (name, *(speeds[name, rig] for rig in rigs)))) for name in names]
+    rows = [tuple(map(TextCell, (name, *(speeds[name, rig] for rig in rigs)))) for name in names]
     headings = ("encounter", *(f"{rig}\n(km/h)" for rig in rigs))
     return PageTable("In time up to, of the speeds that were swept", headings, rows)
 
 
 def _sensors(rows: Sequence[EncounterRow]) -> PageTable:
     cells = [
-        tuple(map(Words, (row.rig, row.encounter, _speed(row), row.first or "none", row.worst,
+        tuple(map(TextCell, (row.rig, row.encounter, _speed(row), row.first or "none", row.worst,
                           f"{row.without_worst_s:.2f}" if row.without_worst_s else "-", f"{row.needed_s:.2f}")))
         for row in rows
     ]  # fmt: skip
     headings = ("rig", "encounter", "km/h", "first", "worst to lose", "without\n(s)", "needed\n(s)")
-    return PageTable("Sensors: which alone is first, and what is left without one", headings, cells, words_first=2)
+    return PageTable("Sensors: which alone is first, and what is left without one", headings, cells, num_text_columns=2)

@@ -13,8 +13,8 @@ from torchcover.encounters.criterion import Criterion
 from torchcover.encounters.sighting import NEVER, IsEnough, Sighting, detections, enough_of, first_run
 from torchcover.geometry import BoundingBox, contact_s, invert, outlines_at
 from torchcover.geometry.arrays import Float64, Int64
-from torchcover.recordings.in_vehicle import in_vehicle
-from torchcover.recordings.objects import Track, class_of, objects_of
+from torchcover.recordings.in_vehicle import transform_to_vehicle
+from torchcover.recordings.objects import Track, extract_objects, find_vehicle_class
 from torchcover.recordings.recording import Recording
 from torchcover.simulation.lidar import Lidar
 from torchcover.simulation.rays import Balls
@@ -65,7 +65,9 @@ class Drive(NamedTuple):
         tracks = []
         for actor in world.actors:
             size_m = BoundingBox.around(actor.mesh.vertices_m).size_m
-            tracks.append(Track(actor.name, actor.category, class_of(actor.category), size_m, actor.trajectory))
+            tracks.append(
+                Track(actor.name, actor.category, find_vehicle_class(actor.category), size_m, actor.trajectory)
+            )
         ego = BoundingBox.around(world.ego.mesh.vertices_m)
         return cls(name, times_s, world.ego.trajectory.at_each(times_s), ego, tracks)
 
@@ -75,8 +77,8 @@ class Drive(NamedTuple):
 
         ValueError: one of these is missing, the size of the vehicle, or road users among the objects.
         """
-        recorded = objects_of(recording)
-        if recording.body is None:
+        recorded = extract_objects(recording)
+        if recording.ego_box is None:
             raise ValueError(f"{recording.path}: it does not say how large its vehicle is, so nobody can touch it")
         users = [track for track in recorded.tracks if track.vehicle_class is not None]
         if not users:
@@ -88,7 +90,9 @@ class Drive(NamedTuple):
             for track, way_m in zip(users, ways_m, strict=True)
             if way_m >= PARKED_M or who(track) in ("on foot", "on bicycles")
         ]
-        return cls(recording.path.name, recorded.egos[0].times_s, recorded.egos[0].world_T_ego, recording.body, users)
+        return cls(
+            recording.path.name, recorded.egos[0].times_s, recorded.egos[0].world_T_ego, recording.ego_box, users
+        )
 
 
 class Approach(NamedTuple):
@@ -189,7 +193,10 @@ class Eyes(NamedTuple):
 
         @lru_cache(maxsize=SCANS)
         def read(step: int) -> Clouds:
-            return [in_vehicle(recording.scan(sensor, step), recording.body).points_m for sensor in sensors]
+            return [
+                transform_to_vehicle(recording.read_scan(sensor, step), recording.ego_box).points_m
+                for sensor in sensors
+            ]
 
         each = [1] * len(sensors)
         return cls(each, [criterion.points] * len(sensors), each, each, lambda step, _: read(step))

@@ -30,7 +30,7 @@ from torchcover.evaluation.settings import DEFAULT_SCENARIO, Settings
 from torchcover.evaluation.target_survey import free_space, in_world
 from torchcover.evaluation.task import AnyRig, AnyScenario, distinct_names, loaded, spread_s, task_of
 from torchcover.files import AtomicOutput
-from torchcover.report import PageTable, Words, json_record
+from torchcover.report import PageTable, TextCell, to_json_record
 from torchcover.simulation import Rig, Scenario, with_ego
 from torchcover.simulation.camera_sensor import CameraSensor
 from torchcover.simulation.moving import Solid
@@ -79,13 +79,13 @@ class Checked:
         """One for each rig, with what the requirements say about themselves."""
         asked, worlds = self.requirements, ", ".join(map(" ".join, self.settings["worlds"].items()))
         notes = [*filter(None, [asked.description]), f"Worlds: {worlds}.", NOTE]
-        rows = {rig: [tuple(map(Words, _row(one))) for one in each] for rig, each in self.verdicts.items()}
+        rows = {rig: [tuple(map(TextCell, _row(one))) for one in each] for rig, each in self.verdicts.items()}
         return [PageTable(f"{rig}: {asked.name}", HEADINGS, each, notes=notes) for rig, each in rows.items()]
 
     @property
     def record(self) -> dict[str, Any]:
         """All of it, for JSON."""
-        rigs = {rig: [json_record(_record(one)) for one in each] for rig, each in self.verdicts.items()}
+        rigs = {rig: [to_json_record(_record(one)) for one in each] for rig, each in self.verdicts.items()}
         about = {"requirements": self.requirements.name, "torchcover": __version__, **self.settings}
         return {**about, "met": self.is_met, "rigs": rigs}
 

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictFloat, ValidationError
 
-from torchcover.recordings.settings import RecordingSettings, explain_settings
+from torchcover.recordings.settings import RecordingSettings, explain_validation_error
 
 Names = tuple[str, ...]
 
@@ -179,7 +179,7 @@ def load_config(
     try:
         config = EvaluateConfig.model_validate(merged)
     except ValidationError as error:
-        raise ValueError(f"--set {'; --set '.join(explain_settings(error))}") from error
+        raise ValueError(f"--set {'; --set '.join(explain_validation_error(error))}") from error
     if path is None:
         return LoadedConfig(config, {})
     replaced = {
@@ -200,7 +200,7 @@ def _read_config(path: Path) -> dict[str, Any]:
         from torchcover.simulation.documents import SETTINGS_KIND, find_other_kind
 
         other = find_other_kind(SETTINGS_KIND, content)
-        mistakes = "; ".join(explain_settings(error))
+        mistakes = "; ".join(explain_validation_error(error))
         raise ValueError(f"this is {other}; {SETTINGS_KIND} is needed" if other else mistakes) from error
     return content
 

@@ -23,7 +23,7 @@ from torchcover.evaluation.task import AnyRig, as_called
 from torchcover.files import AtomicOutput
 from torchcover.geometry import invert, outlines_at
 from torchcover.recordings import Recording, open_recording
-from torchcover.report import ActorMark, Page, PagePicture, StandingFaces, draw_scene, page_html
+from torchcover.report import ActorMark, Page, PagePicture, StaticFaces, plot_scene, render_page
 from torchcover.simulation import Draws, PaperReference, Rig, Scenario, Simulator, with_ego
 from torchcover.simulation.bodies import called
 
@@ -205,12 +205,12 @@ def encounter_film(
         instant, at = scene.at(step), np.array([step])
         scans = [one.scan(instant, Draws(np.random.default_rng(step), one.sensor.rays)) for one in sensors]
         seen = ", ".join(f"{sensor} {looks.points([k], at)[0]}" for k, sensor in enumerate(names))
-        yield draw_scene(
+        yield plot_scene(
             *zip(low_m.tolist(), high_m.tolist(), strict=True),
-            standing=StandingFaces(np.empty((0, 3, 2)), np.empty(0)),
+            static_faces=StaticFaces(np.empty((0, 3, 2)), np.empty(0)),
             ego_outline_m=ego_m,
             actors=[ActorMark(called(body), there) for (body, _), there in zip(bodies, now_m, strict=True)],
-            sensor=np.concatenate([scan.points for scan in scans]),
+            sensor_points=np.concatenate([scan.points for scan in scans]),
             title=f"{staged.contact_s - STEP_S * step:.2f} s to the collision; points on it: {seen}",
             subtitle=told,
         )
@@ -232,7 +232,7 @@ def save_encounters(found: Sightings, folder: str | Path, *, files: str | Iterab
                 written.add("encounters.csv", found.write_csv)
             written.publish(record)
         if "page" in wanted:
-            written.add_text("report.html", page_html(encounters_page(found)))
+            written.add_text("report.html", render_page(encounters_page(found)))
         if "maps" in wanted and not found.hours:
             written.add_figure("encounters.png", found.plot())
         written.publish(record)
@@ -266,7 +266,7 @@ def encounters_page(found: Sightings) -> Page:
         title=f"In time? {', '.join(found.sensors)}",
         lead=f"The encounters of {found.name}, measured by torchcover. In time is geometry: what was seen when, with "
         "the brakes and the latency that were assumed.",
-        verdict=encounters_verdict(found),
+        findings=encounters_verdict(found),
         tables=found.tables(),
         pictures=pictures,
         facts={"Settings": words_of(found.settings()), "Run": {"torchcover": __version__}},

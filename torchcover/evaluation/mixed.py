@@ -19,8 +19,8 @@ from torchcover.evaluation.result_page import page_tables
 from torchcover.evaluation.settings import FILES, Settings, wanted_files
 from torchcover.evaluation.task import task_of
 from torchcover.files import SUMMARY, AtomicOutput, csv_text
-from torchcover.report import RENDERERS, CoverageTable, PageTable, file_stems, in_common_first, page_html
-from torchcover.report.records import records_of
+from torchcover.report import RENDERERS, CoverageTable, PageTable, build_file_stems, merge_notes, render_page
+from torchcover.report.records import build_records
 
 MIXTURE = "mixture"
 
@@ -89,8 +89,8 @@ class MixedResult(Result):
             "within each of them, and say nothing of other kinds or other weights. What is unknown in one of them is "
             "unknown; maps are of one of them each."
         )
-        of_kinds = in_common_first({name: world.notes for name, world in self.worlds.items()})
-        return CoverageTable.of(self.mixtures, self.regions, [note, *of_kinds], self.source)
+        of_kinds = merge_notes({name: world.notes for name, world in self.worlds.items()})
+        return CoverageTable.from_coverages(self.mixtures, self.regions, [note, *of_kinds], self.source)
 
     @property
     def record(self) -> dict[str, Any]:
@@ -123,7 +123,7 @@ class MixedResult(Result):
             files: As in `Result.save`.
         """
         wanted, record = wanted_files(files), self.record
-        worlds = dict(zip(file_stems(list(self.worlds)), self.worlds.values(), strict=True))
+        worlds = dict(zip(build_file_stems(list(self.worlds)), self.worlds.values(), strict=True))
         with AtomicOutput(Path(folder)) as written:
             with held_back():  # the numbers are safe before anything ends this
                 for stem, world in worlds.items():
@@ -136,13 +136,13 @@ class MixedResult(Result):
             for stem, world in worlds.items():
                 world.add_pictures(written, wanted, f"{stem}/")
             if "page" in wanted:
-                written.add_text("report.html", page_html(self.page))
+                written.add_text("report.html", render_page(self.page))
             written.publish(record)
         return written.paths
 
     def _csv(self) -> str:
         tables = {**{name: world.table for name, world in self.worlds.items()}, MIXTURE: self.table}
-        rows = [{"world": name, **row} for name, table in tables.items() for row in records_of(table)]
+        rows = [{"world": name, **row} for name, table in tables.items() for row in build_records(table)]
         columns = list(dict.fromkeys(chain.from_iterable(rows)))
         return csv_text([columns, *([row.get(column, "") for column in columns] for row in rows)])
 
@@ -177,7 +177,9 @@ def measured_in_each(settings: Settings) -> MixedResult:
     if settings.ranks or settings.observers:
         raise ValueError("several scenarios: observers, and processes that share a run, are for one at a time")
     tasks = {}
-    for (name, (scenario, _)), stem in zip(settings.mixture.items(), file_stems(list(settings.mixture)), strict=True):
+    for (name, (scenario, _)), stem in zip(
+        settings.mixture.items(), build_file_stems(list(settings.mixture)), strict=True
+    ):
         checkpoint = settings.checkpoint
         if checkpoint is not None:
             checkpoint = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(Path(checkpoint))

@@ -28,7 +28,15 @@ from torchcover.evaluation.target_survey import (
 from torchcover.evaluation.task import AnyRig, AnyScenario, distinct_names, loaded, simulation
 from torchcover.files import AtomicOutput
 from torchcover.notebooks import small_html
-from torchcover.report import Page, escaped, file_stems, on_range, page_html, ranges_of, too_few
+from torchcover.report import (
+    Page,
+    build_detection_shares,
+    build_file_stems,
+    describe_range,
+    escape_markdown,
+    explain_missing_intervals,
+    render_page,
+)
 from torchcover.simulation import Rig
 from torchcover.simulation.scenario import Mover
 from torchcover.targets import Target, TargetMap, write_arrays, write_csv
@@ -59,15 +67,15 @@ class Report:
     def verdict(self) -> tuple[str, ...]:
         """The answer in sentences, the first of which says most; each has its rule, and none tells what is chance."""
         first, *losses = target_verdict(self.targets)
-        range_words = on_range(self.result.table) or too_few(self.result.table, "ranges")
-        asked = [*self._met.verdict, *(self.checked.verdict if self.checked else ())]
+        range_words = describe_range(self.result.table) or explain_missing_intervals(self.result.table, "ranges")
+        asked = [*self._met.findings, *(self.checked.verdict if self.checked else ())]
         told = [first, range_words, *self.result.mixed_models, *losses, *asked, self.cut_short]
         return tuple(filter(None, told))
 
     @property
     def cut_short(self) -> str:
         """That fewer steps were measured than asked for; no words where all were."""
-        done = self.result.table.first.counts["steps"]
+        done = self.result.table.first_conditions.counts["steps"]
         over = f"The budget was over after {done:,} of {self.steps:,} steps of traffic." * (done < self.steps)
         return self.result.cut_short or over
 
@@ -79,7 +87,7 @@ class Report:
     def page(self) -> Page:
         """The answer and what shows it; below it the tables and maps that it comes from."""
         target, *_ = self.targets.values()
-        steps = f"{self.result.table.first.counts['steps']:,} steps of {self.result.source['scenario']}"
+        steps = f"{self.result.table.first_conditions.counts['steps']:,} steps of {self.result.source['scenario']}"
         lead = f"{target.target}, {target.hits} points or more, on flat ground with nothing else; {steps}."
         of_targets = [target_page(one) for one in self.targets.values()]
         sides = [
@@ -89,9 +97,9 @@ class Report:
         return replace(
             self.result.page,
             lead=lead,
-            verdict=self.verdict,
-            plans=[plan for page in of_targets for plan in page.plans],
-            ranges=ranges_of(self.result.table),
+            findings=self.verdict,
+            target_maps=[plan for page in of_targets for plan in page.target_maps],
+            detection_shares=build_detection_shares(self.result.table),
             pictures=self._met.pictures,
             tables=tables,
         )
@@ -102,7 +110,7 @@ class Report:
     @property
     def markdown(self) -> str:
         """The verdict, for a merge request."""
-        first, *others = map(escaped, self.verdict)
+        first, *others = map(escape_markdown, self.verdict)
         return "\n".join([f"**{first}**", "", *(f"- {words}" for words in others), ""])
 
     @property
@@ -137,7 +145,7 @@ class Report:
                 written.add_text("report.md", self.markdown)
                 written.publish(record)
             if "page" in wanted:
-                written.add_text("report.html", page_html(self.page))
+                written.add_text("report.html", render_page(self.page))
             for stem, figure in self.result.maps() if "maps" in wanted else ():
                 written.add_figure(f"maps/{stem}.png", figure)
             written.publish(record)
@@ -145,7 +153,7 @@ class Report:
 
     def _add_numbers(self, files: AtomicOutput) -> None:
         self.result.add_numbers(files)
-        for stem, one in zip(file_stems(list(self.targets)), self.targets.values(), strict=True):
+        for stem, one in zip(build_file_stems(list(self.targets)), self.targets.values(), strict=True):
             files.add(f"targets/{stem}.csv", partial(write_csv, one))
             files.add(f"targets/{stem}.npz", partial(write_arrays, one))
         if self.encounters:

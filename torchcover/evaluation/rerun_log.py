@@ -15,7 +15,7 @@ from torchcover.detection import Boxes
 from torchcover.files import write_atomically
 from torchcover.frames import Frame
 from torchcover.neighbors import blind_spot_radius
-from torchcover.report import ColourScale, SensorView, scale_of
+from torchcover.report import ColorScale, SensorView, build_color_scale
 
 if TYPE_CHECKING:
     from torchcover.evaluation.result import Result
@@ -57,7 +57,7 @@ class RerunLog:
         for rig, cloud in frame.clouds.items():
             self._stream.log([rig, "points"], rr.Points3D(_few(frame.landed(rig)), colors=[70, 120, 190]))
             radius = blind_spot_radius(frame.reference, cloud, max_radius=FAR_M)
-            colours = coloured(_few(radius), ColourScale("radius", "m", "viridis_r", 0.0, FAR_M))
+            colours = coloured(_few(radius), ColorScale("radius", "m", "viridis_r", 0.0, FAR_M))
             self._stream.log([rig, "reference by radius"], rr.Points3D(_few(frame.reference), colors=colours))
         if frame.boxes is not None:
             self._stream.log("boxes", _boxes(frame.boxes))
@@ -89,10 +89,10 @@ class RerunLog:
             for view in sensor_views(sensors):
                 self._stream.log([rig, "sensors", view.name], rr.LineStrips3D(frustum(view)), static=True)
         coverages = result.coverages
-        key = (by_area(RADIUS) if result.table.measure == "area" else RADIUS).key
+        key = (by_area(RADIUS) if result.table.average == "area" else RADIUS).key
         for rig, coverage in coverages.items():
             layer, grid = coverage.layers[key], coverage.grid
-            scale = scale_of(layer.quantity, layer.values)
+            scale = build_color_scale(layer.quantity, layer.values)
             for name, values in zip(grid.heights, layer.values.cpu().numpy(), strict=True):
                 self._stream.log([rig, "radius", name], _cells(values, grid, scale), static=True)
         self._stream.disconnect()
@@ -119,7 +119,7 @@ def frustum(view: SensorView) -> list[NDArray[np.float64]]:
     return [*rims, *(np.stack([view.position_m, rim[end]]) for rim in rims for end in (0, -1))]
 
 
-def _cells(values: NDArray[Any], grid: BevGrid, scale: ColourScale) -> Any:  # noqa: ANN401
+def _cells(values: NDArray[Any], grid: BevGrid, scale: ColorScale) -> Any:  # noqa: ANN401
     import rerun as rr
 
     row, column = np.nonzero(~np.isnan(values))
@@ -132,7 +132,7 @@ def _cells(values: NDArray[Any], grid: BevGrid, scale: ColourScale) -> Any:  # n
     return rr.Mesh3D(vertex_positions=_on_ground(corners), triangle_indices=faces, vertex_colors=colours)
 
 
-def coloured(values: NDArray[Any], scale: ColourScale) -> NDArray[np.uint8]:
+def coloured(values: NDArray[Any], scale: ColorScale) -> NDArray[np.uint8]:
     """(N, 3) colours of values."""
     share = np.clip((np.minimum(values, scale.high) - scale.low) / (scale.high - scale.low), 0.0, 1.0)
     return np.asarray(colormaps[scale.colormap](share, bytes=True)[:, :3])

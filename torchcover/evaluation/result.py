@@ -37,16 +37,16 @@ from torchcover.report import (
     Page,
     PageRig,
     PageTable,
-    file_stems,
-    map_figures,
-    maps_of,
-    page_html,
-    table_dict,
-    verdict,
+    build_file_stems,
+    build_page_maps,
+    build_table_dict,
+    plot_maps,
+    render_page,
+    summarize_findings,
 )
-from torchcover.report.map_subjects import quantities_shown
-from torchcover.report.records import records_of
-from torchcover.report.remarks import decisive
+from torchcover.report.map_subjects import list_map_quantities
+from torchcover.report.records import build_records
+from torchcover.report.remarks import get_main_quantity
 from torchcover.simulation import CameraSensor, Sensor
 from torchcover.simulation.memory import check_fits
 from torchcover.simulation.sensor import ScanTimes
@@ -159,12 +159,12 @@ class Result:
     @cached_property
     def table(self) -> CoverageTable:
         """The numbers, with errors, differences and marks; `RENDERERS` write it down."""
-        return CoverageTable.of(self.coverages, self.regions, self.notes, self.source, self.block_ends)
+        return CoverageTable.from_coverages(self.coverages, self.regions, self.notes, self.source, self.block_ends)
 
     @property
     def verdict(self) -> tuple[str, ...]:
         """The answer in sentences, the first of which says most; none tells what may be chance."""
-        return (*verdict(self.table), *self.mixed_models, *scan_period_words(self.sensors))
+        return (*summarize_findings(self.table), *self.mixed_models, *scan_period_words(self.sensors))
 
     @property
     def mixed_models(self) -> list[str]:
@@ -181,7 +181,7 @@ class Result:
     @property
     def summary(self) -> list[dict[str, Any]]:
         """A row for each rig, region and height band, as in `summary.json`: unknown is None, infinite "Infinity"."""
-        rows: list[dict[str, Any]] = table_dict(self.table)["rows"]
+        rows: list[dict[str, Any]] = build_table_dict(self.table)["rows"]
         return rows
 
     @property
@@ -201,10 +201,10 @@ class Result:
             "device": self.device,
             **self._run_record,
             "target_error": self._outcome[0],
-            "measure": self.table.measure,
+            "measure": self.table.average,
             "verdict": list(self.verdict),
             "notes": list(self.table.notes),
-            **table_dict(self.table),
+            **build_table_dict(self.table),
             **({} if self.metrics is None else {"metrics": self.metrics.record}),
         }
 
@@ -217,13 +217,13 @@ class Result:
         return Page(
             title=" against ".join(rigs) if len(rigs) == 2 else ", ".join(rigs),
             lead=f"Blind spots and coverage in {where}, measured by torchcover.",
-            verdict=self.verdict,
+            findings=self.verdict,
             tables=self.tables,
-            maps=list(maps_of(self.coverages)) if self.coverages else [],
+            maps=list(build_page_maps(self.coverages)) if self.coverages else [],
             rigs=[PageRig(name, sensor_views(of), rig_document(name, of)) for name, of in rigs.items()],
             ego_outline_m=self.ego_outline_m,
             outlines=[region_line(region) for region in self.regions],
-            facts=facts_of(self.record, self.rigs, self.table.first.counts["steps"]),
+            facts=facts_of(self.record, self.rigs, self.table.first_conditions.counts["steps"]),
             more_tables=[left_out_table(self.left_out)] if self.left_out else [],
         )
 
@@ -243,8 +243,8 @@ class Result:
         Raises:
             ValueError: No map shows that.
         """
-        first = decisive(self.table)
-        key = layer or (by_area(first) if self.table.measure == "area" else first).key
+        first = get_main_quantity(self.table)
+        key = layer or (by_area(first) if self.table.average == "area" else first).key
         for _, figure in self.maps(key):
             return figure
         raise ValueError(f"layer: no map shows {key!r}")
@@ -255,7 +255,7 @@ class Result:
         Raises:
             ModuleNotFoundError: pandas is not there.
         """
-        return data_frame(records_of(self.table))
+        return data_frame(build_records(self.table))
 
     def maps(self, layer: str | None = None) -> Iterator[tuple[str, Figure]]:
         """Draw the maps, one by one; several rigs side by side, and their differences to the first.
@@ -267,8 +267,8 @@ class Result:
             The stem of the file name, and a figure of its own, outside pyplot.
         """
         views = {name: sensor_views(sensors) for name, sensors in self.sensors.items()}
-        return map_figures(
-            self.coverages, ego_outline_m=self.ego_outline_m, sensors=views, vehicle=self.vehicle, layer=layer
+        return plot_maps(
+            self.coverages, ego_outline_m=self.ego_outline_m, sensors=views, vehicle=self.vehicle, quantity_key=layer
         )
 
     def save(self, folder: str | Path, *, files: str | Iterable[str] = FILES) -> list[Path]:
@@ -303,7 +303,7 @@ class Result:
     def estimate_pictures(self, wanted: Container[str], costs: PictureCosts = PictureCosts()) -> tuple[float, float]:
         """Estimate the memory in bytes and the time in seconds that the page and the maps take, if they are wanted."""
         first, rigs = self._first, len(self.coverages)
-        quantities, cells = len(quantities_shown(first)), first.grid.cells
+        quantities, cells = len(list_map_quantities(first)), first.grid.cells
         needed_bytes = float(rigs * cells * (costs.bytes_per_cell + costs.bytes_per_value * quantities))
         seconds = 3 * costs.seconds_per_panel * rigs * quantities * len(first.grid.heights) * ("maps" in wanted)
         return needed_bytes * ("maps" in wanted or "page" in wanted), seconds
@@ -327,13 +327,13 @@ class Result:
         needed_bytes, _ = self.estimate_pictures(wanted)
         check_fits(f"page and maps of {len(self.coverages)} rigs", needed_bytes, advice)
         if "page" in wanted:
-            files.add_text(f"{folder}report.html", page_html(self.page))
+            files.add_text(f"{folder}report.html", render_page(self.page))
         for stem, figure in self.maps() if "maps" in wanted else ():
             files.add_figure(f"{folder}maps/{stem}.png", figure)
 
     def add_numbers(self, files: AtomicOutput, folder: str = "") -> None:
         """Write the files of numbers; `folder` is a prefix that ends with a slash. Names of rigs become file names."""
-        stems = file_stems(list(self.coverages)) if self.is_comparison else ["coverage"]
+        stems = build_file_stems(list(self.coverages)) if self.is_comparison else ["coverage"]
         for stem, coverage in zip(stems, self.coverages.values(), strict=True):
             files.add(f"{folder}coverage/{stem}.npz" if self.is_comparison else f"{folder}coverage.npz", coverage.save)
         files.add_text(f"{folder}summary.csv", RENDERERS["csv"](self.table))

@@ -12,8 +12,8 @@ from pydantic import BaseModel
 
 from torchcover.coverage import AGGREGATIONS, Aggregation, Coverage, Region
 from torchcover.files import as_yaml
-from torchcover.report import BOLD_MARKS, Line, PageTable, SensorView, Words, parts_of
-from torchcover.report.remarks import marks_on, notes_on
+from torchcover.report import BOLD_MARKS, MapLine, PageTable, SensorView, TextCell, build_page_tables
+from torchcover.report.remarks import explain_marks, list_notes
 from torchcover.report.table import CoverageTable
 from torchcover.simulation import CameraSensor, Sensor, vertical_fov_deg
 
@@ -97,9 +97,9 @@ def left_out(
 
 def page_tables(table: CoverageTable) -> list[PageTable]:
     """The parts of a table, with its notes below the last."""
-    marks = [f"{BOLD_MARKS[mark]}: {meaning}" for mark, meaning in marks_on(table).items()]
-    *parts, last = parts_of(table)
-    return [*parts, replace(last, notes=[*marks, *notes_on(table)])]
+    marks = [f"{BOLD_MARKS[mark]}: {meaning}" for mark, meaning in explain_marks(table).items()]
+    *parts, last = build_page_tables(table)
+    return [*parts, replace(last, notes=[*marks, *list_notes(table)])]
 
 
 def sensor_views(sensors: Sequence[Sensor]) -> list[SensorView]:
@@ -137,10 +137,10 @@ def rig_document(name: str, sensors: Sequence[Sensor]) -> str:
     return as_yaml({"name": name, "sensors": known})
 
 
-def region_line(region: Region) -> Line:
+def region_line(region: Region) -> MapLine:
     """Its outline on the maps."""
     (left, right), (low, high) = region.x, region.y
-    return Line(region.name, np.array(region.corners_m or [[left, low], [right, low], [right, high], [left, high]]))
+    return MapLine(region.name, np.array(region.corners_m or [[left, low], [right, low], [right, high], [left, high]]))
 
 
 def facts_of(record: Mapping[str, Any], rigs: Mapping[str, str | None], steps: int) -> dict[str, dict[str, str]]:
@@ -184,7 +184,7 @@ def _value(value: object) -> str:
 
 def left_out_table(omissions: Sequence[Omission]) -> PageTable:
     """What a run left out."""
-    rows = [tuple(map(Words, _omission(one))) for one in omissions]
+    rows = [tuple(map(TextCell, _omission(one))) for one in omissions]
     return PageTable("Left out, for this run did not need it", ("what", "count", "of", "share"), rows)
 
 

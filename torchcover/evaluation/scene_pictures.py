@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from torchcover.evaluation.result_page import sensor_views
 from torchcover.geometry import BoundingBox, invert, transform
 from torchcover.geometry.rigid import Matrix
-from torchcover.report import ActorMark, SkinPatch, StandingFaces, draw_depths, draw_rig, draw_scene, draw_vehicle
+from torchcover.report import ActorMark, SkinPatch, StaticFaces, plot_depth_images, plot_rig, plot_scene, plot_vehicle
 from torchcover.simulation import GRID_X_M, GRID_Y_M, CameraSensor, PaperReference, Rig, Scenario, SimulatedFrames
 from torchcover.simulation.bodies import Vehicle
 from torchcover.simulation.mount_regions import MountRegion, Skin
@@ -47,7 +47,7 @@ def rig_pictures(
     ego = scene.world.ego.mesh
     length, width, height = scene.ego_box.size_m
     subtitle = f"on {frames.scenario.ego_name} in {scenario.name}, {length:.2f} x {width:.2f} x {height:.2f} m"
-    yield "", draw_rig(ego.vertices_m, ego.faces, sensor_views(rig.sensors), title=rig.name, subtitle=subtitle)
+    yield "", plot_rig(ego.vertices_m, ego.faces, sensor_views(rig.sensors), title=rig.name, subtitle=subtitle)
     if cameras := cameras_of(rig):
         instant = scene.at(step_of_world)
         images = {
@@ -58,7 +58,7 @@ def rig_pictures(
         }
         time_s = step_of_world * scene.world.time_step_s
         when = f"on {frames.scenario.ego_name} in {scenario.name}, step {step}, t = {time_s:g} s, seed {seed}"
-        yield "_depth", draw_depths(images, title=f"{rig.name}: distance along the ray", subtitle=when)
+        yield "_depth", plot_depth_images(images, title=f"{rig.name}: distance along the ray", subtitle=when)
 
 
 def scenario_pictures(
@@ -79,14 +79,14 @@ def scenario_pictures(
         frame = frames[step]
         scene, step_of_world = frames.simulator.scene_of(step)
         time_s, ego = step_of_world * scene.world.time_step_s, scene.world.ego.trajectory
-        yield draw_scene(
+        yield plot_scene(
             x_m,
             y_m,
-            standing=_standing(scene.world, time_s),
+            static_faces=_standing(scene.world, time_s),
             ego_outline_m=scene.ego_box.outline_m,
             actors=_actor_marks(scene.world, time_s),
-            sensor=frame.sensor.numpy(),
-            reference=frame.reference.numpy(),
+            sensor_points=frame.sensor.numpy(),
+            reference_points=frame.reference.numpy(),
             title=f"{scenario.name}, step {step}",
             subtitle=f"t = {time_s:g} s, seed {seed}; points of {rig.name} on {frames.scenario.ego_name}",
             path_m=transform(invert(ego.at(time_s)), ego.positions_m)[:, :2] if ego.moves else None,
@@ -103,7 +103,7 @@ def vehicle_picture(vehicle: Vehicle) -> Figure:
     skin, size_m = Skin(mesh), BoundingBox.around(mesh.vertices_m).size_m
     patches = [_patch(name, region, skin) for name, region in vehicle.mount_regions.items()]
     subtitle = f"{' x '.join(f'{extent:.2f}' for extent in size_m)} m; {len(patches) or 'no'} mount regions"
-    return draw_vehicle(mesh.vertices_m, mesh.faces, patches, title=vehicle.name, subtitle=subtitle)
+    return plot_vehicle(mesh.vertices_m, mesh.faces, patches, title=vehicle.name, subtitle=subtitle)
 
 
 def _patch(name: str, region: MountRegion, skin: Skin) -> SkinPatch:
@@ -121,7 +121,7 @@ def _frames(scenario: Scenario, rig: Rig, vehicle: str | None, step: int, seed: 
     return SimulatedFrames(scenario, rig, steps=step + 1, seed=seed, vehicle=vehicle, reference_sensor=reference)
 
 
-def _standing(world: World, time_s: float) -> StandingFaces:
+def _standing(world: World, time_s: float) -> StaticFaces:
     """The scenery within the picture, from above, by its height over the ground below it."""
     vehicle_T_world = invert(world.ego.trajectory.at(time_s))
     low, high = np.array([(GRID_X_M[end], GRID_Y_M[end]) for end in (0, 1)])
@@ -135,7 +135,7 @@ def _standing(world: World, time_s: float) -> StandingFaces:
         (terrain if lies else standing).append(corners if lies else corners[inside])
     corners = np.concatenate(standing)
     ground_m = _ground_m(np.concatenate(terrain), corners.mean(axis=1)[:, :2])
-    return StandingFaces(corners[..., :2], _heights_m(corners) - ground_m)
+    return StaticFaces(corners[..., :2], _heights_m(corners) - ground_m)
 
 
 def _ground_m(terrain_m: Matrix, places_m: Matrix) -> Matrix:

@@ -27,13 +27,13 @@ from torchcover.evaluation.task import simulation
 from torchcover.files import AtomicOutput, end_with_parent, reporting_stopped
 from torchcover.report import (
     PageTable,
-    Words,
-    difference_heading,
-    difference_words,
-    draw_work_precision,
-    error_words,
-    json_record,
-    shown_unit,
+    TextCell,
+    format_difference,
+    format_difference_heading,
+    format_error,
+    get_display_unit,
+    plot_work_precision,
+    to_json_record,
 )
 
 DEFAULT_STEPS = 512
@@ -200,7 +200,7 @@ class Study:
         for trial in self.trials:
             needed = [_steps_words(trial, trial.steps_for(error), self.start_s) for error in WANTED]
             times = [f"{1000 * s / trial.steps:.0f}" for s in (trial.seconds, trial.processor_s)]
-            rows.append(list(map(Words, [trial.options or "as given", *times, _bias(trial), *needed])))
+            rows.append(list(map(TextCell, [trial.options or "as given", *times, _bias(trial), *needed])))
         return PageTable(
             "Every detection in front to so many percentage points",
             ("setting", "step (ms)", "of processors (ms)", "bias (points)", *STEPS_HEADINGS),
@@ -215,9 +215,9 @@ class Study:
             words = [
                 _steps_words(first, each and rounded_up(max(each, first.least_steps)), self.start_s) for each in steps
             ]
-            error = error_words(one.error.error_after(first.steps), one.quantity.unit)
+            error = format_error(one.error.error_after(first.steps), one.quantity.unit)
             place = f"{one.region} {one.height}"
-            rows.append(list(map(Words, [place, difference_heading(one.quantity), error, *words])))
+            rows.append(list(map(TextCell, [place, format_difference_heading(one.quantity), error, *words])))
         headings = ("place", "number", f"error after {first.steps:,}", *STEPS_HEADINGS)
         return PageTable("Each number, as given", headings, rows)
 
@@ -258,12 +258,12 @@ class Study:
             lines = {}
             for trial in self.trials:
                 steps = [trial.least_steps << doubling for doubling in range(DOUBLINGS + 1)]
-                factor = shown_unit(quantity.unit).factor
+                factor = get_display_unit(quantity.unit).factor
                 errors = [factor * trial.error_after(each, quantity.unit) for each in steps]
                 times = [trial.seconds_for(each, self.start_s) for each in steps]
                 lines[trial.options or "as given"] = list(zip(times, errors, strict=True))
-            panels[f"largest error of the {difference_heading(quantity)}"] = lines
-        return draw_work_precision(panels, title=" in ".join(map(str, self.plan.named)), legend_title="setting")
+            panels[f"largest error of the {format_difference_heading(quantity)}"] = lines
+        return plot_work_precision(panels, title=" in ".join(map(str, self.plan.named)), legend_title="setting")
 
     def save(self, folder: str | Path) -> list[Path]:
         """Write `work_precision.png` and `summary.json` into a folder, which is made if need be."""
@@ -284,7 +284,7 @@ def _bias(trial: Trial) -> str:
         return "-" if trial.options else ""
     most = max(known, key=lambda one: (one.is_biased, abs(one.difference.value if one.difference else 0.0)))
     assert most.difference is not None
-    return f"{difference_words(most.difference)}{' *' * most.is_biased}"
+    return f"{format_difference(most.difference)}{' *' * most.is_biased}"
 
 
 def _record(trial: Trial) -> dict[str, Any]:
@@ -293,7 +293,9 @@ def _record(trial: Trial) -> dict[str, Any]:
         difference = one.difference._asdict() if one.difference else {}
         told = {name: difference.get(name, math.nan) for name in ("value", "error", "p")}
         own = {"region": one.region, "height": one.height, "quantity": one.quantity.key, "value": one.value}
-        numbers.append(json_record({**own, "a": one.error.a, "bias": one.error.bias, "difference": json_record(told)}))
+        numbers.append(
+            to_json_record({**own, "a": one.error.a, "bias": one.error.bias, "difference": to_json_record(told)})
+        )
     names = ("options", "steps", "least_steps", "seconds", "processor_s", "band_frame")
     return {**{name: getattr(trial, name) for name in names}, "numbers": numbers}
 

@@ -10,7 +10,7 @@ from typing import Any
 from torchcover.coverage import Coverage, Region, shown_places
 from torchcover.estimation import ROUND_OFF, ErrorModel
 from torchcover.evaluation.observers import Observer
-from torchcover.report import json_record
+from torchcover.report import to_json_record
 
 # An error from fewer steps is not believed, though they may fill enough blocks; nor is one that is small enough once,
 # for the looks at which it happens to be too small are those that would end the run.
@@ -248,7 +248,7 @@ def _record(target: TargetError, found: Sequence[Standing]) -> dict[str, Any]:
     numbers = []
     for standing, steps in zip(found, needed, strict=True):
         record = {name: value for name, value in asdict(standing).items() if name != "steps"}
-        numbers.append(json_record({**record, "reached": standing.reached, "steps_needed": steps}))
+        numbers.append(to_json_record({**record, "reached": standing.reached, "steps_needed": steps}))
     return {
         **asdict(target),
         "steps_needed": max(known) if known and len(known) == len(needed) else None,

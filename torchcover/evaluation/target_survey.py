@@ -15,21 +15,21 @@ from torchcover.evaluation.settings import FILES, wanted_files
 from torchcover.evaluation.task import AnyRig, AnyScenario, as_called, spread_s
 from torchcover.files import AtomicOutput
 from torchcover.report import (
-    ColourScale,
-    Line,
+    ColorScale,
+    MapLine,
     Page,
     PageMap,
-    PagePlan,
     PageRig,
     PageTable,
-    Words,
-    body_words,
-    capitalised,
-    json_record,
-    page_html,
-    percent,
-    square_metres,
-    whole_percent,
+    TargetVisibilityMap,
+    TextCell,
+    capitalize,
+    format_percent,
+    format_square_meters,
+    format_target_name,
+    format_whole_percent,
+    render_page,
+    to_json_record,
 )
 from torchcover.simulation import Rig, Scenario, Sensor, with_ego
 from torchcover.simulation.bodies import Body
@@ -139,7 +139,7 @@ def save_targets(
                 written.add("targets.npz", lambda path: write_arrays(seen, path))
             written.publish(record)
         if "page" in wanted:
-            written.add_text("report.html", page_html(target_page(seen, sensors)))
+            written.add_text("report.html", render_page(target_page(seen, sensors)))
         if "maps" in wanted:
             written.add_figure("targets.png", seen.plot())
         written.publish(record)
@@ -151,9 +151,9 @@ def target_record(seen: TargetMap) -> dict[str, Any]:
     return {
         **seen.settings(),
         "cells": seen.counts,
-        "sides": [json_record(side._asdict()) for side in seen.sides()],
-        "unseen_to_m": json_record(seen.unseen_to_m()),
-        "worst": [json_record(place._asdict()) for place in seen.worst()],
+        "sides": [to_json_record(side._asdict()) for side in seen.sides()],
+        "unseen_to_m": to_json_record(seen.unseen_to_m()),
+        "worst": [to_json_record(place._asdict()) for place in seen.worst()],
     }
 
 
@@ -162,8 +162,8 @@ def target_page(seen: TargetMap, sensors: Sequence[Sensor] = ()) -> Page:
     return Page(
         title=f"{seen.rig}: would it see {seen.target}?",
         lead=f"In {seen.scenario}, sensor model {seen.sensor_model}, measured by torchcover.",
-        verdict=target_verdict({seen.rig: seen}),
-        plans=[plan_of(seen)],
+        findings=target_verdict({seen.rig: seen}),
+        target_maps=[plan_of(seen)],
         tables=[sides_table(seen), places_table(seen.worst(), "The worst places")],
         maps=_maps(seen),
         rigs=[PageRig(seen.rig, sensor_views(sensors), rig_document(seen.rig, sensors))],
@@ -172,23 +172,23 @@ def target_page(seen: TargetMap, sensors: Sequence[Sensor] = ()) -> Page:
     )
 
 
-def plan_of(seen: TargetMap) -> PagePlan:
+def plan_of(seen: TargetMap) -> TargetVisibilityMap:
     """Where it is seen, and what is lost with each sensor, as a page shows it."""
     by = np.where(seen.enough, np.maximum(np.nan_to_num(seen.least_sensors), 1), 0).astype(np.int64)
     near = seen.free & (seen.distance_m <= NEAR_M)
     count, unseen = int(near.sum()), int((near & ~seen.enough).sum())
-    m2 = square_metres(unseen * seen.raster.step_m**2)
-    return PagePlan(
+    m2 = format_square_meters(unseen * seen.raster.step_m**2)
+    return TargetVisibilityMap(
         rig=seen.rig,
-        words=f"Not seen at {unseen:,} of {count:,} places within {NEAR_M:g} m, {m2} m².",
+        title=f"Not seen at {unseen:,} of {count:,} places within {NEAR_M:g} m, {m2} m².",
         x=seen.raster.x,
         y=seen.raster.y,
         cell_m=seen.raster.step_m,
-        seen_by=np.where(seen.free, by, -1),
+        sensor_counts=np.where(seen.free, by, -1),
         vehicle_box_m=seen.vehicle.outline_m,
         vehicle_outline_m=seen.vehicle_outline_m,
-        within_m=NEAR_M,
-        losses_m2=seen.losses_m2(NEAR_M) if len(seen.sensor_names) > 1 else {},
+        max_distance_m=NEAR_M,
+        failure_effects_m2=seen.losses_m2(NEAR_M) if len(seen.sensor_names) > 1 else {},
     )
 
 
@@ -198,13 +198,13 @@ def target_verdict(seen: Mapping[str, TargetMap]) -> tuple[str, ...]:
     known = sorted((rig for rig in shares if not math.isnan(shares[rig])), key=lambda rig: -shares[rig])
     if not known:
         return (f"No place within {NEAR_M:g} m is free: what is seen there is unknown.",)
-    alike = [(share, ", ".join(rigs)) for share, rigs in groupby(known, lambda rig: whole_percent(shares[rig]))]
+    alike = [(share, ", ".join(rigs)) for share, rigs in groupby(known, lambda rig: format_whole_percent(shares[rig]))]
     (most, best), *others = alike
     first = seen[known[0]]
     height = f", {first.target_bottom_m:.2f} m above the ground," if first.target_bottom_m else ""
-    body = f"{body_words(first.target)} of {first.target_size_m[2]:.2f} m{height}"
+    body = f"{format_target_name(first.target)} of {first.target_size_m[2]:.2f} m{height}"
     seen_words = f"is seen ({first.hits} points or more)"
-    told = [f"{capitalised(body)} {seen_words} at {most} % of the places within {NEAR_M:g} m by {best}"]
+    told = [f"{capitalize(body)} {seen_words} at {most} % of the places within {NEAR_M:g} m by {best}"]
     told += [f"at {share} % by {rigs}" for share, rigs in others]
     return (f"{', '.join(told)}.", *(_on_loss(rig, seen[rig]) for rig in known))
 
@@ -218,7 +218,7 @@ def _on_loss(rig: str, seen: TargetMap) -> str:
     if not most_m2:
         return f"{rig} loses no place within {NEAR_M:g} m, whichever sensor fails."
     worst = [sensor for sensor, m2 in losses.items() if m2 >= ALIKE * most_m2]
-    lost = f"{'up to ' * (len(worst) > 1)}{square_metres(most_m2)} m² more are not seen within {NEAR_M:g} m"
+    lost = f"{'up to ' * (len(worst) > 1)}{format_square_meters(most_m2)} m² more are not seen within {NEAR_M:g} m"
     return f"{rig} most needs its {' and '.join(worst)}: without {'one' if len(worst) > 1 else 'it'}, {lost}."
 
 
@@ -228,12 +228,12 @@ def _maps(seen: TargetMap) -> list[PageMap]:
     of_sensors = f"sensors with {seen.hits} points or more", "sensors", "viridis", 0.0, float(len(seen.sensor_names))
     near = f"visible surface within {seen.threshold_m:g} m of a point"
     each = [
-        (seen.points, ColourScale("points on it", "points", "viridis", 1.0, most, logarithmic=True)),
-        (100 * seen.seen, ColourScale(f"steps with {seen.hits} points or more", "%", "viridis", 0.0, 100.0)),
-        (100 * seen.share, ColourScale(near, "%", "viridis", 0.0, 100.0)),
-        (seen.sensors, ColourScale(*of_sensors)),
+        (seen.points, ColorScale("points on it", "points", "viridis", 1.0, most, logarithmic=True)),
+        (100 * seen.seen, ColorScale(f"steps with {seen.hits} points or more", "%", "viridis", 0.0, 100.0)),
+        (100 * seen.share, ColorScale(near, "%", "viridis", 0.0, 100.0)),
+        (seen.sensors, ColorScale(*of_sensors)),
     ]
-    line = Line(f"border of what is seen, with {seen.hits} points", seen.border_m())
+    line = MapLine(f"border of what is seen, with {seen.hits} points", seen.border_m())
     return [
         PageMap(
             quantity=scale.quantity,
@@ -244,7 +244,7 @@ def _maps(seen: TargetMap) -> list[PageMap]:
             cell_m=seen.raster.step_m,
             values=values,
             scale=scale,
-            unknown=NO_ROOM,
+            unobserved_label=NO_ROOM,
             lines=[line],
         )
         for values, scale in each
@@ -257,10 +257,10 @@ def sides_table(seen: TargetMap) -> PageTable:
     within = list(dict.fromkeys(side.within_m for side in sides))
     rows = []
     for name in dict.fromkeys(side.side for side in sides):
-        shares = ["-" if one.cells == 0 else percent(one.seen) for one in sides if one.side == name]
+        shares = ["-" if one.cells == 0 else format_percent(one.seen) for one in sides if one.side == name]
         to_m = unseen_to_m[name]
         unseen = "-" if np.isnan(to_m) else f"{to_m:.2f}" if to_m else "nowhere"
-        rows.append(tuple(map(Words, (name, *shares, unseen))))
+        rows.append(tuple(map(TextCell, (name, *shares, unseen))))
     of_steps = ", mean over the steps" if seen.step_count > 1 else ""
     headings = ("side", *(f"within {limit_m:g} m\n(%)" for limit_m in within), "unseen to\n(m)")
     return PageTable(f"Free places with {seen.hits} points or more{of_steps}", headings, rows)
@@ -269,10 +269,10 @@ def sides_table(seen: TargetMap) -> PageTable:
 def places_table(places: Sequence[Place], title: str) -> PageTable:
     """Where places are, and how much of a target is seen there."""
     headings = ("side", "x\n(m)", "y\n(m)", "distance\n(m)", "points", "sensors", "surface\n(%)")
-    rows = [tuple(map(Words, _place(place))) for place in places]
+    rows = [tuple(map(TextCell, _place(place))) for place in places]
     return PageTable(title, headings, rows)
 
 
 def _place(place: Place) -> tuple[str, ...]:
     lengths = (f"{value:.2f}" for value in (place.x_m, place.y_m, place.distance_m))
-    return place.side, *lengths, f"{place.points:.4g}", f"{place.sensors:.3g}", percent(place.share)
+    return place.side, *lengths, f"{place.points:.4g}", f"{place.sensors:.3g}", format_percent(place.share)

@@ -107,8 +107,8 @@ def task_of(settings: Settings) -> Task[FrameSource]:
     if isinstance(frames, str | Path):
         recording = open_recording(frames)
         if settings.vehicle is not None:
-            recording.body = recorded_body(recording, settings.vehicle)
-        source: FrameSource = RecordedFrames(recording, ground=settings.band_frame != "vehicle")
+            recording.ego_box = recorded_body(recording, settings.vehicle)
+        source: FrameSource = RecordedFrames(recording, use_ground_model=settings.band_frame != "vehicle")
     else:
         source = frames
     if missing := [name for name in vars(FrameSource) if not name.startswith("_") and not hasattr(source, name)]:
@@ -118,7 +118,7 @@ def task_of(settings: Settings) -> Task[FrameSource]:
             "torchcover.evaluation.observe(frames, observers)"
         )
     if settings.skip_bad_frames and isinstance(source, RecordedFrames):
-        source.leave_out_bad_sweeps()
+        source.skip_unreadable_sweeps()
     for doubt in source.doubts(settings.steps):
         warnings.warn(doubt, stacklevel=CALLER)
     return _recording(source, settings)

@@ -6,7 +6,7 @@ from .result import SearchResult as SearchResult
 from .running import run_search as run_search
 from .search import Evaluation as Evaluation
 from .search import PlacementSearch as PlacementSearch
-from .selection import SensorChoice as SensorChoice
-from .selection import choose as choose
-from .selection_space import ChoiceSpace as ChoiceSpace
+from .selection import SelectionResult as SelectionResult
+from .selection import run_selection as run_selection
+from .selection_space import SelectionSpace as SelectionSpace
 from .space import SearchSpace as SearchSpace

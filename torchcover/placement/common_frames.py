@@ -47,9 +47,9 @@ class Score(NamedTuple):
 class FrameIndex(NamedTuple):
     """A frame by the number of its scenario, the step there, and its world among all worlds."""
 
-    scenario: int
-    step: int
-    world: int
+    scenario_index: int
+    frame_index: int
+    scene_id: int
 
 
 class FrameRequest(NamedTuple):
@@ -59,11 +59,11 @@ class FrameRequest(NamedTuple):
     """
 
     rig: Rig | None
-    number: int
+    position: int
     is_measured: bool = False
 
 
-class HeldFrames(Dataset[Frame | MeasuredFrame]):
+class CachedFrames(Dataset[Frame | MeasuredFrame]):
     """Frames of any rig; their worlds and reference points stay in the process that made them.
 
     Frames are measured there, too, so that sums travel and not clouds.
@@ -75,41 +75,41 @@ class HeldFrames(Dataset[Frame | MeasuredFrame]):
         simulations: Sequence[SimulatedFrames],
         indices: Sequence[FrameIndex],
         queries: Queries,
-        estimate: Measure,
+        average: Measure,
     ) -> None:
-        self._simulations, self._indices, self._queries, self._estimate = simulations, indices, queries, estimate
+        self._simulations, self._indices, self._queries, self._estimate = simulations, indices, queries, average
         self._held: dict[int, tuple[Frame, Balls | None]] = {}
         self._rig: Rig | None = None
         self._mounted: dict[int, Simulator] = {}
         self._observer: CoverageObserver | None = None
 
     def __getitem__(self, request: FrameRequest) -> Frame | MeasuredFrame:
-        frame = self._frame(request.rig, request.number)
+        frame = self._frame(request.rig, request.position)
         if request.rig is None or not request.is_measured:
             return frame
         if self._observer is None:
-            self._observer = self._queries.observer_of(request.rig, self._estimate)
+            self._observer = self._queries.build_observer(request.rig, self._estimate)
         return MeasuredFrame(None, frame.counts, {self._estimate: self._observer.sums_of(frame)}, 0.0)
 
     def _frame(self, rig: Rig | None, number: int) -> Frame:
         index = self._indices[number]
         if number not in self._held:
-            built, within_m = self._build(index, number), self._queries.within_m
+            built, within_m = self._build(index, number), self._queries.search_radius_m
             # The memory of a tensor that travels to another process is given up.
             points = built.reference.numpy().copy()
             self._held[number] = built, None if within_m is None else Balls.around(points, within_m)
         held, within = self._held[number]
         if rig is None:
             return held
-        scans = self._mount(rig, index.scenario).scans(index.step, within)[rig.name]
+        scans = self._mount(rig, index.scenario_index).scans(index.frame_index, within)[rig.name]
         counts = {"rays": sum(scan.rays for scan in scans), "self_hits": sum(scan.self_hits for scan in scans)}
         return replace(held, **of_rigs({rig.name: rig}, {rig.name: scans}), counts=counts)
 
     def _build(self, index: FrameIndex, number: int) -> Frame:
-        frames = self._simulations[index.scenario]
-        frame = frames[index.step]
+        frames = self._simulations[index.scenario_index]
+        frame = frames[index.frame_index]
         heights_m = frame.heights_in(self._queries.grid.band_frame)
-        mask = self._queries.contains(frame.reference, heights_m)
+        mask = self._queries.mask_points(frame.reference, heights_m)
         assert frame.reference_weights is not None  # those of a SurfaceReference
         return replace(
             frame,
@@ -117,8 +117,8 @@ class HeldFrames(Dataset[Frame | MeasuredFrame]):
             reference_weights=frame.reference_weights[mask],
             reference_heights_m=None if heights_m is None else heights_m[mask],
             index=number,
-            place_in_time=index.world,
-            counts={"world_bytes": frames.simulator.scene_of(index.step)[0].bytes},
+            place_in_time=index.scene_id,
+            counts={"world_bytes": frames.simulator.scene_of(index.frame_index)[0].bytes},
         )
 
     def _mount(self, rig: Rig, scenario: int) -> Simulator:
@@ -147,7 +147,7 @@ class CommonFrames:
         every_s: Time between them.
         seed: Seed of the traffic and of the reference.
         rays: Approximate number of reference rays of each frame.
-        estimate: Average of the numbers: "area", the visible surface, or "known", the observed cells.
+        average: Average of the numbers: "area", the visible surface, or "known", the observed cells.
         sensor_model: "ideal", or else each rig as it is, as in `evaluate`.
         budget_bytes: What all worlds may take, about 35 MB for one of `urban`. All are held: to build one again takes
             five times as long as to score a rig on three frames of it.
@@ -176,12 +176,12 @@ class CommonFrames:
         objectives: Mapping[str, Objective],
         *,
         vehicle: str | Path | None = None,
-        worlds: int = WORLDS,
-        per_world: int = FRAMES_PER_WORLD,
-        every_s: float = EVERY_S,
+        num_scenes: int = WORLDS,
+        frames_per_scene: int = FRAMES_PER_WORLD,
+        frame_interval_s: float = EVERY_S,
         seed: int = 0,
         rays: int = RAYS,
-        estimate: Measure = "area",
+        average: Measure = "area",
         sensor_model: Literal["ideal", "real"] | None = None,
         budget_bytes: float = BUDGET_BYTES,
         workers: int = 0,
@@ -190,28 +190,33 @@ class CommonFrames:
         for name, number in (("scenarios", len(given)), ("objectives", len(objectives))):
             if number == 0:
                 raise ValueError(f"{name}: at least one is needed; got none")
-        for name, number in (("worlds", worlds), ("per_world", per_world)):
+        for name, number in (("worlds", num_scenes), ("per_world", frames_per_scene)):
             if number < 1:
                 raise ValueError(f"{name}: at least 1 is needed; got {number}")
         if workers < 0:
             raise ValueError(f"workers: a number >= 0 is needed; got {workers}")
         self.scenarios = tuple(one if isinstance(one, Scenario) else Scenario.load(one) for one in given)
-        self.seed, self.estimate, self.objectives = seed, estimate, dict(objectives)
+        self.seed, self.average, self.objectives = seed, average, dict(objectives)
         self.sensor_model = sensor_model
-        self._settings: dict[str, Any] = {"vehicle": vehicle, "per_world": per_world, "every_s": every_s, "rays": rays}
-        self._settings |= {"estimate": estimate, "sensor_model": sensor_model}
+        self._settings: dict[str, Any] = {
+            "vehicle": vehicle,
+            "per_world": frames_per_scene,
+            "every_s": frame_interval_s,
+            "rays": rays,
+        }
+        self._settings |= {"estimate": average, "sensor_model": sensor_model}
         self._settings |= {"budget_bytes": budget_bytes, "workers": workers}
         self._vehicles: set[str | None] = {None}  # that were found to be that of these worlds
         self._worlds = [with_ego(one, {}, vehicle) for one in self.scenarios]
-        self.queries = Queries.around(HostVehicle.of(self._worlds).outline_m, objectives)
-        shown: dict[str, Any] = {"steps": MANY, "seed": seed, "every_s": every_s, "kept_bytes": float("inf")}
-        shown |= {"reference_sensor": self.queries.reference_sensor(rays)}
+        self.queries = Queries.from_objectives(HostVehicle.from_scenarios(self._worlds).outline_m, objectives)
+        shown: dict[str, Any] = {"steps": MANY, "seed": seed, "every_s": frame_interval_s, "kept_bytes": float("inf")}
+        shown |= {"reference_sensor": self.queries.build_reference_sensor(rays)}
         simulations = [SimulatedFrames(one, rigs={}, **shown) for one in self._worlds]
-        self.indices = _index_frames([simulation.simulator for simulation in simulations], worlds, per_world)
+        self.indices = _index_frames([simulation.simulator for simulation in simulations], num_scenes, frames_per_scene)
         self._batches: list[list[FrameRequest]] = []
-        self._processes = min(workers, self.indices[-1].world + 1)
+        self._processes = min(workers, self.indices[-1].scene_id + 1)
         self._loader = DataLoader(
-            FramesOrErrors(HeldFrames(simulations, self.indices, self.queries, estimate)),
+            FramesOrErrors(CachedFrames(simulations, self.indices, self.queries, average)),
             batch_sampler=self._batches,
             collate_fn=list,
             num_workers=self._processes,
@@ -223,11 +228,11 @@ class CommonFrames:
 
     def _hold(self, budget_bytes: float) -> None:
         """Build all worlds, as many at a time as there are processes, unless they take more than there is room for."""
-        worlds, bytes_of = self.indices[-1].world + 1, dict[int, float]()
+        worlds, bytes_of = self.indices[-1].scene_id + 1, dict[int, float]()
         together = max(self._processes, 1)
         for first in range(0, worlds, together):
-            some = [at for at, one in enumerate(self.indices) if first <= one.world < first + together]
-            for frame in self.frames(None, some):
+            some = [at for at, one in enumerate(self.indices) if first <= one.scene_id < first + together]
+            for frame in self.iterate_frames(None, some):
                 bytes_of[frame.place_in_time] = frame.counts["world_bytes"]
             largest = max(bytes_of.values())
             expected = sum(bytes_of.values()) + largest * (worlds - len(bytes_of))
@@ -240,13 +245,13 @@ class CommonFrames:
     def __len__(self) -> int:
         return len(self.indices)
 
-    def resampled(self, seed: int, worlds: int, more: Mapping[str, Objective]) -> "CommonFrames":
+    def resample(self, seed: int, num_scenes: int, extra_objectives: Mapping[str, Objective]) -> "CommonFrames":
         """Return the same queries, and more, on as many frames in each of other worlds.
 
         Args:
             seed: Another one, so that no world is the same.
-            worlds: Worlds of each scenario with traffic; others are the same world for any seed, and are left out.
-            more: Other objectives, by name.
+            num_scenes: Worlds of each scenario with traffic; others are the same world for any seed, and are left out.
+            extra_objectives: Other objectives, by name.
 
         Raises:
             ValueError: The seed that these have; no scenario with traffic.
@@ -256,7 +261,9 @@ class CommonFrames:
         if not (fresh := [one for one in self.scenarios if not one.repeats]):
             names = ", ".join(repr(one.name) for one in self.scenarios)
             raise ValueError(f"scenarios: one whose worlds are drawn is needed; {names} is the same for any seed")
-        return CommonFrames(fresh, {**self.objectives, **more}, worlds=worlds, seed=seed, **self._settings)
+        return CommonFrames(
+            fresh, {**self.objectives, **extra_objectives}, num_scenes=num_scenes, seed=seed, **self._settings
+        )
 
     def score(self, rig: Rig) -> Score:
         """Return the numbers of a rig on all frames, and its share of self-hits.
@@ -264,25 +271,25 @@ class CommonFrames:
         Raises:
             ValueError: A sensor lies inside the vehicle or another body, or below the ground.
         """
-        required = {name: one for name, one in self.objectives.items() if one.requires}
-        kept = {name: one.share_kept(rig, self._worlds[0], self.sensor_model) for name, one in required.items()}
-        observer, rays, self_hits = self.queries.observer_of(rig, self.estimate), 0, 0
+        required = {name: one for name, one in self.objectives.items() if one.requirement}
+        kept = {name: one.compute_met_share(rig, self._worlds[0], self.sensor_model) for name, one in required.items()}
+        observer, rays, self_hits = self.queries.build_observer(rig, self.average), 0, 0
         for measured in self._compute(self._as_requested(rig), range(len(self)), is_measured=True):
-            observer.add(measured.sums[self.estimate])
+            observer.add(measured.sums[self.average])
             rays, self_hits = rays + measured.counts["rays"], self_hits + measured.counts["self_hits"]
         return Score(self.queries.estimate(observer.metric, kept), self_hits / rays)
 
-    def frames(self, rig: Rig | None = None, numbers: Sequence[int] | None = None) -> Iterator[Frame]:
+    def iterate_frames(self, rig: Rig | None = None, positions: Sequence[int] | None = None) -> Iterator[Frame]:
         """Yield frames of a rig, in order, with the reference points inside the queried regions.
 
         Args:
             rig: The sensors; none gives the reference alone.
-            numbers: Numbers of the frames; all if not given.
+            positions: Numbers of the frames; all if not given.
 
         Raises:
             ValueError: As `score`.
         """
-        rig, wanted = rig and self._as_requested(rig), range(len(self)) if numbers is None else numbers
+        rig, wanted = rig and self._as_requested(rig), range(len(self)) if positions is None else positions
         for start in range(0, len(wanted), BATCH):
             yield from self._compute(rig, wanted[start : start + BATCH])
 
@@ -293,7 +300,7 @@ class CommonFrames:
     def _compute(self, rig: Rig | None, numbers: Sequence[int], *, is_measured: bool = False) -> list[Any]:
         shares: list[list[int]] = [[] for _ in range(max(self._processes, 1))]
         for number in numbers:
-            shares[self.indices[number].world % len(shares)].append(number)
+            shares[self.indices[number].scene_id % len(shares)].append(number)
         # The k-th batch goes to the k-th process, which has built these worlds.
         self._batches[:] = [[FrameRequest(rig, number, is_measured) for number in share] for share in shares]
         made: dict[int, Frame | MeasuredFrame | ValueError] = {}

@@ -26,22 +26,22 @@ class Constraints(Document):
 
     Args:
         min_distance_m: Between a sensor that is free and any other.
-        max_self_hits: Share of a rig's rays that may end on the vehicle; known once it has been scanned.
+        max_self_hit_share: Share of a rig's rays that may end on the vehicle; known once it has been scanned.
         symmetric: Whether every sensor must have its mirror image beyond the vehicle's middle, or lie on that.
         max_cost_eur: What the rig may cost; see `cost` of the space.
     """
 
     min_distance_m: NonNegativeFloat = APART_M
-    max_self_hits: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
+    max_self_hit_share: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
     symmetric: bool = False
     max_cost_eur: NonNegativeFloat | None = None
 
-    def broken_by(self, rig: Rig, free: Collection[str], cost_eur: float | None) -> tuple[str, ...]:
+    def find_violations(self, rig: Rig, free_sensors: Collection[str], cost_eur: float | None) -> tuple[str, ...]:
         """What of it a rig does not keep to, in words; not its self-hits, which only a scan knows.
 
-        `free` are the names of the sensors that a search may place.
+        `free_sensors` are the names of the sensors that a search may place.
         """
-        return (*self._too_close(rig, free), *self._lopsided(rig), *self._too_dear(cost_eur))
+        return (*self._too_close(rig, free_sensors), *self._lopsided(rig), *self._too_dear(cost_eur))
 
     def _too_close(self, rig: Rig, free: Collection[str]) -> Iterator[str]:
         for one, other in combinations(rig.sensors, 2):
@@ -67,7 +67,7 @@ class Constraints(Document):
             yield f"it costs {cost_eur:g} EUR; max_cost_eur is {self.max_cost_eur:g}"
 
 
-def misplaced(sensor: Sensor, skin: Skin) -> str | None:
+def find_placement_error(sensor: Sensor, skin: Skin) -> str | None:
     """Why a sensor cannot be where it is: below the ground, or inside the vehicle; None if it can."""
     place_m: Matrix = sensor.mount.matrix()[:3, 3]
     if place_m[2] <= 0.0:
@@ -77,32 +77,35 @@ def misplaced(sensor: Sensor, skin: Skin) -> str | None:
     return None
 
 
-def price_eur(cost: Mapping[str, float], sensor: str, model: str | None) -> float:
+def get_price_eur(prices_eur: Mapping[str, float], sensor_name: str, model: str | None) -> float:
     """What a sensor costs, with its mount, by its model or by its name. ValueError: it has no price.
 
     Example:
-        >>> price_eur({"velodyne_vlp16": 3000.0, "mount": 100.0}, "roof", "velodyne_vlp16")
+        >>> get_price_eur({"velodyne_vlp16": 3000.0, "mount": 100.0}, "roof", "velodyne_vlp16")
         3100.0
     """
-    key = sensor if model is None or model not in cost else model
-    if key not in cost:
-        raise ValueError(f"cost: no price of {model or sensor!r}, for the sensor {sensor!r}; give it")
-    return cost[key] + cost.get(MOUNT, 0.0)
+    key = sensor_name if model is None or model not in prices_eur else model
+    if key not in prices_eur:
+        raise ValueError(f"cost: no price of {model or sensor_name!r}, for the sensor {sensor_name!r}; give it")
+    return prices_eur[key] + prices_eur.get(MOUNT, 0.0)
 
 
 def check_prices(
-    cost: Mapping[str, float], max_cost_eur: float | None, sensors: Sequence[Sensor], free: Mapping[str, FreeSensor]
+    prices_eur: Mapping[str, float],
+    max_cost_eur: float | None,
+    sensors: Sequence[Sensor],
+    free_sensors: Mapping[str, FreeSensor],
 ) -> None:
     """ValueError: a price is missing, is one of nothing, or the limit, if there is one, is below the cheapest rig."""
-    if not cost:
+    if not prices_eur:
         if max_cost_eur is not None:
             raise ValueError("constraints.max_cost_eur: nothing has a price; give them as cost")
         return
-    models = {model for one in free.values() for model in one.model or ()}
+    models = {model for one in free_sensors.values() for model in one.model or ()}
     known = {MOUNT, *models, *builtin_names("lidars"), *(sensor.name for sensor in sensors)}
-    if unknown := [key for key in cost if key not in known]:
+    if unknown := [key for key in prices_eur if key not in known]:
         raise ValueError(f"cost: {', '.join(unknown)}: no LiDAR model, no sensor of the rig, and not {MOUNT!r}")
-    cheapest = sum(min(_prices(cost, sensor, sensors, free)) for sensor in sensors)
+    cheapest = sum(min(_prices(prices_eur, sensor, sensors, free_sensors)) for sensor in sensors)
     if max_cost_eur is not None and cheapest > max_cost_eur:
         raise ValueError(
             f"constraints.max_cost_eur: {max_cost_eur:g}, but the cheapest rig of the space costs {cheapest:g}"
@@ -120,4 +123,4 @@ def _prices(
     if own is not None and own.present is not None:
         yield 0.0
     for model in (own.model if own else None) or (getattr(made, "model", None),):
-        yield price_eur(cost, sensor.name, model)
+        yield get_price_eur(cost, sensor.name, model)

@@ -18,7 +18,7 @@ MIRRORED = ("y_m", "yaw_deg", "roll_deg")
 # The middle of what a sensor measures from is about this far above its foot.
 HEIGHT_M = 0.1
 
-Value = float | str | bool
+VariableValue = float | str | bool
 DECIMALS = 6  # of numbers: micrometers and millionths of a degree, so that a table of them can be read back
 
 
@@ -29,20 +29,20 @@ class FreeNumber(NamedTuple):
     low: float
     high: float
 
-    def at(self, share: float) -> float:
+    def get_value(self, fraction: float) -> float:
         """Return the value at a share, 0 to 1, of the way from the lowest to the highest."""
-        return self.rounded(self.low + share * (self.high - self.low))
+        return self.round_value(self.low + fraction * (self.high - self.low))
 
-    def rounded(self, value: Value) -> float:
+    def round_value(self, value: VariableValue) -> float:
         """Return a value with the digits that files keep, within the bounds."""
         return min(max(round(float(value), DECIMALS), self.low), self.high)
 
     def check(self, value: object) -> None:
         """ValueError: the value is not a number within the bounds."""
-        if not self.holds(value):
+        if not self.is_allowed(value):
             raise ValueError(f"{self.name}: a number from {self.low:g} to {self.high:g} is needed; got {value!r}")
 
-    def holds(self, value: object) -> bool:
+    def is_allowed(self, value: object) -> bool:
         """Return whether a value is a number within the bounds."""
         return isinstance(value, int | float) and not isinstance(value, bool) and self.low <= value <= self.high
 
@@ -51,22 +51,22 @@ class FreeChoice(NamedTuple):
     """A free choice of several options."""
 
     name: str
-    options: tuple[Value, ...]
+    options: tuple[VariableValue, ...]
 
-    def at(self, share: float) -> Value:
+    def get_value(self, fraction: float) -> VariableValue:
         """Return the option at a share, 0 to 1, of all options."""
-        return self.options[min(int(share * len(self.options)), len(self.options) - 1)]
+        return self.options[min(int(fraction * len(self.options)), len(self.options) - 1)]
 
-    def rounded(self, value: Value) -> Value:
+    def round_value(self, value: VariableValue) -> VariableValue:
         """Return the option itself."""
         return value
 
     def check(self, value: object) -> None:
         """ValueError: the value is not one of the options."""
-        if not self.holds(value):
+        if not self.is_allowed(value):
             raise ValueError(f"{self.name}: one of {', '.join(map(str, self.options))} is needed; got {value!r}")
 
-    def holds(self, value: object) -> bool:
+    def is_allowed(self, value: object) -> bool:
         """Return whether a value is one of the options."""
         return any(value == option and type(value) is type(option) for option in self.options)
 
@@ -92,11 +92,11 @@ def _span(low: float, high: float) -> PlainValidator:
     return PlainValidator(read)
 
 
-Span = float | tuple[float, float]
-Metres = Annotated[Span, _span(-FARTHEST_M, FARTHEST_M)]
-Degrees = Annotated[Span, _span(-360.0, 360.0)]
-Share = Annotated[Span, _span(0.0, 1.0)]
-Height = Annotated[Span, _span(0.001, 10.0)]
+NumberOrRange = float | tuple[float, float]
+Meters = Annotated[NumberOrRange, _span(-FARTHEST_M, FARTHEST_M)]
+Degrees = Annotated[NumberOrRange, _span(-360.0, 360.0)]
+Share = Annotated[NumberOrRange, _span(0.0, 1.0)]
+Height = Annotated[NumberOrRange, _span(0.001, 10.0)]
 
 
 class FreeSensor(Document):
@@ -127,10 +127,10 @@ class FreeSensor(Document):
         ['roof.x_m', 'roof.pitch_deg']
     """
 
-    x_m: Metres | None = None
-    y_m: Metres | None = None
-    z_m: Metres | None = None
-    z_above_body_m: Metres | None = None
+    x_m: Meters | None = None
+    y_m: Meters | None = None
+    z_m: Meters | None = None
+    z_above_body_m: Meters | None = None
     yaw_deg: Degrees | None = None
     pitch_deg: Degrees | None = None
     roll_deg: Degrees | None = None
@@ -163,14 +163,14 @@ class FreeSensor(Document):
                 raise ValueError(f"{key}: at least two different options are needed; got {', '.join(options)}")
         return self
 
-    def variables(self, sensor: str) -> tuple[Variable, ...]:
+    def list_variables(self, sensor_name: str) -> tuple[Variable, ...]:
         """What is free of it, under the name of the sensor."""
         free: list[Variable] = []
         for key, given in self._given().items():
             if key in ("present", "model") or (key == "region" and isinstance(given, tuple)):
-                free.append(FreeChoice(f"{sensor}.{key}", given))
+                free.append(FreeChoice(f"{sensor_name}.{key}", given))
             elif isinstance(given, tuple):
-                free.append(FreeNumber(f"{sensor}.{key}", *given))
+                free.append(FreeNumber(f"{sensor_name}.{key}", *given))
         return tuple(free)
 
     def _given(self) -> dict[str, Any]:
@@ -181,70 +181,76 @@ class FreeSensor(Document):
         usual = {"u": (0.0, 1.0), "v": (0.0, 1.0), "height_m": HEIGHT_M, **dict.fromkeys(ANGLES, 0.0)}
         return usual | given
 
-    def made(self, start: Sensor, values: Mapping[str, Value], host: HostVehicle) -> Sensor | None:
+    def build_sensor(
+        self, start_sensor: Sensor, values: Mapping[str, VariableValue], host: HostVehicle
+    ) -> Sensor | None:
         """The sensor that values make of that of the start, by the names of `variables`; None where they leave it out.
 
         ValueError: nothing of the body is at its place.
         """
-        own = {key: values.get(f"{start.name}.{key}", given) for key, given in self._given().items()}
+        own = {key: values.get(f"{start_sensor.name}.{key}", given) for key, given in self._given().items()}
         if own.get("present") is False:
             return None
         try:
-            mount = self._mount(start.mount, own, host)
+            mount = self._mount(start_sensor.mount, own, host)
         except ValueError as error:
-            raise ValueError(f"{start.name}: {error}") from error
-        if own.get("model", getattr(start, "model", None)) != getattr(start, "model", None):
-            return Lidar.model_validate({"name": start.name, "mount": mount, "model": own["model"]})
-        assert isinstance(start, Document)  # as all sensors of a rig
-        return start.model_copy(update={"mount": mount})
+            raise ValueError(f"{start_sensor.name}: {error}") from error
+        if own.get("model", getattr(start_sensor, "model", None)) != getattr(start_sensor, "model", None):
+            return Lidar.model_validate({"name": start_sensor.name, "mount": mount, "model": own["model"]})
+        assert isinstance(start_sensor, Document)  # as all sensors of a rig
+        return start_sensor.model_copy(update={"mount": mount})
 
     def _mount(self, start: Pose, own: Mapping[str, Any], host: HostVehicle) -> Pose:
         if self.region is None:
             numbers = {key: own[key] for key in (*PLACES[:3], *ANGLES) if key in own}
-            mount = moved(start, numbers)
+            mount = update_pose(start, numbers)
             if "z_above_body_m" in own:
-                mount = moved(mount, {"z_m": top_m(host, mount) + own["z_above_body_m"]})
+                mount = update_pose(mount, {"z_m": find_vehicle_top_m(host, mount) + own["z_above_body_m"]})
             return mount
-        region = host.region(own["region"])
+        region = host.get_mount_region(own["region"])
         point = region.on(host.skin, own["u"], own["v"])
         x, y, z = (point.place_m + own["height_m"] * point.outward).tolist()
-        return pose_of(x, y, z, region.heading_deg + own["yaw_deg"], own["pitch_deg"], own["roll_deg"])
+        return build_pose(x, y, z, region.heading_deg + own["yaw_deg"], own["pitch_deg"], own["roll_deg"])
 
-    def start_values(self, start: Sensor, host: HostVehicle) -> dict[str, Value]:
+    def get_start_values(self, start_sensor: Sensor, host: HostVehicle) -> dict[str, VariableValue]:
         """What the variables are in the rig that the search starts from, whether they may be that or not.
 
         On an unknown region: the sensor may be anywhere.
         """
-        known: dict[str, Value] = {"present": True}
-        if isinstance(start, Lidar) and start.model is not None:
-            known["model"] = start.model
+        known: dict[str, VariableValue] = {"present": True}
+        if isinstance(start_sensor, Lidar) and start_sensor.model is not None:
+            known["model"] = start_sensor.model
         if self.region is None:
-            known |= numbers_of(start.mount)
+            known |= get_pose_values(start_sensor.mount)
             if self.z_above_body_m is not None:
-                known["z_above_body_m"] = round(start.mount.z_m - top_m(host, start.mount), DECIMALS)
-        names = {variable.name for variable in self.variables(start.name)}
-        return {f"{start.name}.{key}": value for key, value in known.items() if f"{start.name}.{key}" in names}
+                known["z_above_body_m"] = round(
+                    start_sensor.mount.z_m - find_vehicle_top_m(host, start_sensor.mount), DECIMALS
+                )
+        names = {variable.name for variable in self.list_variables(start_sensor.name)}
+        return {
+            f"{start_sensor.name}.{key}": value for key, value in known.items() if f"{start_sensor.name}.{key}" in names
+        }
 
 
-def mirrored(start: Sensor, other: Sensor | None) -> Sensor | None:
+def mirror_sensor(target_sensor: Sensor, source_sensor: Sensor | None) -> Sensor | None:
     """A sensor as the mirror image of another, of the same model, beyond the vehicle's middle; None without one."""
-    if other is None:
+    if source_sensor is None:
         return None
-    numbers = {key: -value if key in MIRRORED else value for key, value in numbers_of(other.mount).items()}
-    assert isinstance(other, Document)  # as all sensors of a rig
-    return other.model_copy(update={"name": start.name, "mount": pose_of(*numbers.values())})
+    numbers = {key: -value if key in MIRRORED else value for key, value in get_pose_values(source_sensor.mount).items()}
+    assert isinstance(source_sensor, Document)  # as all sensors of a rig
+    return source_sensor.model_copy(update={"name": target_sensor.name, "mount": build_pose(*numbers.values())})
 
 
-def moved(pose: Pose, numbers: Mapping[str, float]) -> Pose:
+def update_pose(pose: Pose, values: Mapping[str, float]) -> Pose:
     """A pose with other numbers; a rotation stays as it is written, as long as none of its angles is another."""
-    if not numbers:
+    if not values:
         return pose
-    if pose.quaternion_wxyz is None or any(key in numbers for key in ANGLES):
-        return pose_of(*(numbers_of(pose) | dict(numbers)).values())
-    return Pose.model_validate(pose.model_dump() | dict(numbers))
+    if pose.quaternion_wxyz is None or any(key in values for key in ANGLES):
+        return build_pose(*(get_pose_values(pose) | dict(values)).values())
+    return Pose.model_validate(pose.model_dump() | dict(values))
 
 
-def numbers_of(pose: Pose) -> dict[str, float]:
+def get_pose_values(pose: Pose) -> dict[str, float]:
     """Place and angles of a pose, in the order of `Pose`."""
     if pose.quaternion_wxyz is None:
         angles = (pose.yaw_deg, pose.pitch_deg, pose.roll_deg)
@@ -253,14 +259,14 @@ def numbers_of(pose: Pose) -> dict[str, float]:
     return dict(zip((*PLACES[:3], *ANGLES), (pose.x_m, pose.y_m, pose.z_m, *angles), strict=True))
 
 
-def pose_of(x_m: float, y_m: float, z_m: float, yaw_deg: float, pitch_deg: float, roll_deg: float) -> Pose:
+def build_pose(x_m: float, y_m: float, z_m: float, yaw_deg: float, pitch_deg: float, roll_deg: float) -> Pose:
     """A pose of which a file keeps every digit."""
     given = x_m, y_m, z_m, yaw_deg, pitch_deg, roll_deg
     x, y, z, yaw, pitch, roll = (round(number, DECIMALS) + 0.0 for number in given)
     return Pose(x_m=x, y_m=y, z_m=z, yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll)
 
 
-def top_m(host: HostVehicle, mount: Pose) -> float:
+def find_vehicle_top_m(host: HostVehicle, mount: Pose) -> float:
     """How high the vehicle's body is where a sensor is mounted. ValueError: the body is not below it."""
     below = host.skin.seen_from("above", (mount.x_m, mount.y_m))
     if below is None:

@@ -11,7 +11,7 @@ from torchcover.coverage.grid import PAPER_HEIGHTS
 from torchcover.evaluation.requirements import RegionRequirement, Requirements
 from torchcover.geometry import BoundingBox
 from torchcover.geometry.arrays import Float64
-from torchcover.placement.objective import Name, Objective
+from torchcover.placement.objective import NonEmptyName, Objective
 from torchcover.simulation import Rig, Scenario, with_ego
 from torchcover.simulation.bodies import mount_regions_of
 from torchcover.simulation.documents import SEVERAL, NameOrFile, Readable, by_name, is_file_name
@@ -31,9 +31,9 @@ def _vehicle(given: str) -> str:
 # A rig, or the name or the file of one.
 NamedRig = Annotated[Rig, by_name(Rig)]
 # One name or file, or several.
-Names = Annotated[tuple[NameOrFile, ...], SEVERAL, Field(min_length=1)]
+NamesOrFiles = Annotated[tuple[NameOrFile, ...], SEVERAL, Field(min_length=1)]
 # A vehicle's.
-NamedVehicle = Annotated[NameOrFile, AfterValidator(_vehicle)]
+VehicleNameOrFile = Annotated[NameOrFile, AfterValidator(_vehicle)]
 
 
 class HostVehicle(NamedTuple):
@@ -41,7 +41,7 @@ class HostVehicle(NamedTuple):
 
     name: str
     skin: Skin
-    regions: dict[str, MountRegion]
+    mount_regions: dict[str, MountRegion]
 
     @property
     def outline_m(self) -> Float64:
@@ -49,7 +49,7 @@ class HostVehicle(NamedTuple):
         return BoundingBox.around(self.skin.mesh.vertices_m).outline_m
 
     @classmethod
-    def of(cls, scenarios: Sequence[Scenario]) -> "HostVehicle":
+    def from_scenarios(cls, scenarios: Sequence[Scenario]) -> "HostVehicle":
         """Return the ego vehicle of all scenarios.
 
         ValueError: they have different ones. FileNotFoundError: a mesh or vehicle file is missing.
@@ -61,36 +61,36 @@ class HostVehicle(NamedTuple):
             raise ValueError(f"scenario: their egos differ ({egos}), but a rig is mounted on one; say which by vehicle")
         return cls(first.ego_name, Skin(first.ego_mesh()), mount_regions_of(shape))
 
-    def region(self, name: str) -> MountRegion:
+    def get_mount_region(self, name: str) -> MountRegion:
         """Return a mount region. ValueError: there is none of this name; the message lists the others."""
-        if name not in self.regions:
-            told = ", ".join(self.regions) or "none at all: add mount_regions to its document"
+        if name not in self.mount_regions:
+            told = ", ".join(self.mount_regions) or "none at all: add mount_regions to its document"
             raise ValueError(f"region: {self.name} has no {name!r}; it has {told}")
-        return self.regions[name]
+        return self.mount_regions[name]
 
 
-class VehicleSpace(Readable):
+class PlacementSpace(Readable):
     """Base of a search space and a selection: the scenarios, the host vehicle, objectives and requirements."""
 
     kind: ClassVar[str] = "a search space"
     name: str
     description: str = ""
-    scenario: Names
-    vehicle: NamedVehicle | None = None
-    objectives: dict[Name, Objective] = Field(min_length=1, max_length=MAX_OBJECTIVES)
-    not_worse: tuple[Name | Objective, ...] = ()
+    scenario: NamesOrFiles
+    vehicle: VehicleNameOrFile | None = None
+    objectives: dict[NonEmptyName, Objective] = Field(min_length=1, max_length=MAX_OBJECTIVES)
+    not_worse: tuple[NonEmptyName | Objective, ...] = ()
     requirements: Annotated[Requirements, by_name(Requirements)] | None = None
 
     @property
-    def first_rig(self) -> Rig | None:
+    def base_rig(self) -> Rig | None:
         """The rig that is there in any case."""
         raise NotImplementedError
 
     @cached_property
-    def numbers(self) -> dict[str, Objective]:
+    def scored_objectives(self) -> dict[str, Objective]:
         """Numbers that rigs are scored by: the objectives, those that must not be worse, and those of requirements."""
         kept = [Objective(region=one) if isinstance(one, str) else one for one in self.not_worse]
-        named = {f"{NOT_WORSE}{one.words}": one for one in kept}
+        named = {f"{NOT_WORSE}{one.description}": one for one in kept}
         return self.objectives | named | {name: one for name, (one, _) in self._required.items()}
 
     @property
@@ -114,11 +114,11 @@ class VehicleSpace(Readable):
             region = {one.region: required.regions[one.region]} if one.region in required.regions else one.region
             for key in (one.number, *(f"{one.number}_without_{name}" for name in one.without)):
                 each = Objective(number=key, region=region, band=one.height)
-                numbers |= {f"{REQUIRED}{each.words}, {bound.words}": (each, bound.value) for bound in one.bounds}
+                numbers |= {f"{REQUIRED}{each.description}, {bound.words}": (each, bound.value) for bound in one.bounds}
         return numbers
 
     @cached_property
-    def to_check(self) -> Requirements | None:
+    def non_region_requirements(self) -> Requirements | None:
         """The requirements of targets and encounters; None if there are none."""
         required = self.requirements
         others = [one for one in required.requirements if not isinstance(one, RegionRequirement)] if required else []
@@ -127,10 +127,10 @@ class VehicleSpace(Readable):
     @cached_property
     def scenarios(self) -> tuple[Scenario, ...]:
         """The scenarios, each with the host vehicle as its ego."""
-        rigs = {self.first_rig.name: self.first_rig} if self.first_rig else {}
+        rigs = {self.base_rig.name: self.base_rig} if self.base_rig else {}
         return tuple(with_ego(Scenario.load(each), rigs, self.vehicle) for each in self.scenario)
 
     @cached_property
     def host(self) -> HostVehicle:
         """The host vehicle."""
-        return HostVehicle.of(self.scenarios)
+        return HostVehicle.from_scenarios(self.scenarios)

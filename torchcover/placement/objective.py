@@ -17,7 +17,7 @@ from torchcover.evaluation.target_survey import free_space
 from torchcover.simulation import Document, Rig, Scenario
 from torchcover.simulation.regions_of_interest import RegionOfInterest
 
-Name = Annotated[str, Field(min_length=1)]
+NonEmptyName = Annotated[str, Field(min_length=1)]
 
 THRESHOLD_M = 0.4
 # Numbers by area or over known cells.
@@ -25,13 +25,13 @@ CHOSEN = re.compile(r"(radius_m|(detection|sensors|seen_by_two)_[\d.]+m)(_withou
 
 
 def check_requirements(
-    rig: Rig, asked: Requirements, world: Scenario, sensor_model: Literal["ideal", "real"] | None
+    rig: Rig, requirements: Requirements, scenario: Scenario, sensor_model: Literal["ideal", "real"] | None
 ) -> Sequence[Verdict]:
     """Check requirements of targets and encounters for a rig on the ego of a world, in free space or their scenario."""
-    ego: Any = world.ego
-    where = asked.scenario or free_space().model_copy(update={"ego": ego})
+    ego: Any = scenario.ego
+    where = requirements.scenario or free_space().model_copy(update={"ego": ego})
     vehicle = getattr(ego.shape, "vehicle", None)
-    (found,) = check(rig, asked, where, vehicle=vehicle, sensor_model=sensor_model).verdicts.values()
+    (found,) = check(rig, requirements, where, vehicle=vehicle, sensor_model=sensor_model).verdicts.values()
     return found
 
 
@@ -43,13 +43,13 @@ class Objective(Document):
             "radius_maximum_m" of an aggregation; "seen_by_two_0.4m" or "detection_0.4m_without_roof" of redundancy,
             where "any" stands for the sensor whose failure is worst. Whether more or less of it is better, it knows
             itself.
-        detection: Threshold in metres, in short for the number `detection_0.4m`: a reference point with a point of the
+        threshold_m: Threshold in metres, in short for the number `detection_0.4m`: a reference point with a point of the
             rig within it counts as detected. 0.4 if no number is given.
         band: Name of a height band of the paper, "ground" or "obstacle", or several; both if not given.
         region: Name of a region, or several, as tables of `torchcover.evaluate` call them: "20m", "80m", "160m" ahead,
             "front_3m", "rear_3m", "left_3m", "right_3m" around the vehicle; or regions of one's own by name, written as
             those in a YAML file of `RegionsOfInterest`.
-        requires: Instead of all these one number that is required of a body at places, written out, or in encounters,
+        requirement: Instead of all these one number that is required of a body at places, written out, or in encounters,
             as in `Requirements`: made better is the share of the places, or encounters, that keep it. It is measured
             there, the same in all worlds; what is not checked is not kept.
 
@@ -63,29 +63,29 @@ class Objective(Document):
         "child_110cm, within_m 3.0 sides ['front'], points >= 5"
     """
 
-    number: Name | None = None
-    detection: NonNegativeFloat | None = None
-    band: Name | tuple[Name, ...] | None = None
+    number: NonEmptyName | None = None
+    threshold_m: NonNegativeFloat | None = None
+    band: NonEmptyName | tuple[NonEmptyName, ...] | None = None
     region: (
-        Name
-        | Annotated[tuple[Name, ...], Field(min_length=1)]
-        | Annotated[dict[Name, RegionOfInterest], Field(min_length=1)]
+        NonEmptyName
+        | Annotated[tuple[NonEmptyName, ...], Field(min_length=1)]
+        | Annotated[dict[NonEmptyName, RegionOfInterest], Field(min_length=1)]
         | None
     ) = None
-    requires: AnyRequirement | None = None
+    requirement: AnyRequirement | None = None
 
     @model_validator(mode="after")
     def _check_one_of(self) -> Self:
-        if self.requires is not None:
+        if self.requirement is not None:
             return self._check_requires()
-        if self.number is not None and self.detection is not None:
+        if self.number is not None and self.threshold_m is not None:
             raise ValueError(f"number, detection: one of the two is possible; got {self.number!r} and a threshold")
         if self.region is None:
             raise ValueError(f"region: it is needed for {self.key!r}")
         return self
 
     def _check_requires(self) -> Self:
-        one = self.requires
+        one = self.requirement
         if others := sorted(self.model_fields_set - {"requires"}):
             raise ValueError(f"requires: it makes an objective alone; leave out {', '.join(others)}")
         if isinstance(one, RegionRequirement):
@@ -96,32 +96,34 @@ class Objective(Document):
             raise ValueError(f"requires.at: write the place out, as in within_m: 3; got the name {at!r}")
         return self
 
-    def share_kept(self, rig: Rig, world: Scenario, sensor_model: Literal["ideal", "real"] | None) -> Estimate:
+    def compute_met_share(
+        self, rig: Rig, scenario: Scenario, sensor_model: Literal["ideal", "real"] | None
+    ) -> Estimate:
         """Of what `requires` asks about, in no blocks; NaN if it is nowhere, as no body has room."""
         (one,) = check_requirements(
-            rig, Requirements.model_validate({"requirements": [self.requires]}), world, sensor_model
+            rig, Requirements.model_validate({"requirements": [self.requirement]}), scenario, sensor_model
         )
         share = (one.count - one.failed - one.unknown) / one.count if one.count else math.nan
-        quantity = Quantity(self.key, self.words, "share", lower_is_better=False)
+        quantity = Quantity(self.key, self.description, "share", lower_is_better=False)
         return Estimate.of([quantity], torch.tensor([share], dtype=torch.float64, device="cpu"))
 
     @property
     def key(self) -> str:
         """Of its number."""
-        if self.requires is not None:
+        if self.requirement is not None:
             return "requires"
-        return self.number or f"detection_{THRESHOLD_M if self.detection is None else self.detection:g}m"
+        return self.number or f"detection_{THRESHOLD_M if self.threshold_m is None else self.threshold_m:g}m"
 
     @property
-    def words(self) -> str:
+    def description(self) -> str:
         """In one line.
 
         Example:
             >>> Objective(region="80m").words, Objective(number="radius_m", region="20m", band="ground").words
             ('80m', 'radius_m, 20m, ground')
         """
-        if self.requires is not None:
-            return f"{self.requires.words}, {self.requires.bounds[0].words}"
+        if self.requirement is not None:
+            return f"{self.requirement.words}, {self.requirement.bounds[0].words}"
         plain = self.key == f"detection_{THRESHOLD_M:g}m"
         bands = (self.band,) if isinstance(self.band, str) else self.band or ()
         regions = (self.region,) if isinstance(self.region, str) else self.region or ()
@@ -130,14 +132,14 @@ class Objective(Document):
     @property
     def parts(self) -> "tuple[Objective, ...]":
         """What it is the mean of: an objective for each region and band."""
-        each = ((region, band, self.region) for region, band in self.places)
+        each = ((region, band, self.region) for region, band in self.region_bands)
         return tuple(
             Objective(number=self.key, band=band, region={name: own[name]} if isinstance(own, dict) else name)
             for name, band, own in each
         )
 
     @property
-    def own_estimate(self) -> str:
+    def fixed_average(self) -> str:
         """What its number is a mean over where that is no choice.
 
         Returns:
@@ -153,28 +155,30 @@ class Objective(Document):
         return "" if CHOSEN.match(self.key) else "-"
 
     @property
-    def places(self) -> tuple[tuple[str, str], ...]:
+    def region_bands(self) -> tuple[tuple[str, str], ...]:
         """The regions and bands that it is the mean over; none of what is required."""
         bands = (self.band,) if isinstance(self.band, str) else tuple(PAPER_HEIGHTS) if self.band is None else self.band
         regions = (self.region,) if isinstance(self.region, str) else tuple(self.region or ())
         return tuple((region, band) for region in regions for band in bands)
 
-    def regions(self, usual: Mapping[str, Region]) -> tuple[Region, ...]:
+    def resolve_regions(self, named_regions: Mapping[str, Region]) -> tuple[Region, ...]:
         """Its regions.
 
         Args:
-            usual: Those that have names of their own.
+            named_regions: Those that have names of their own.
 
         Raises:
             ValueError: One is called by a name that none of these has; a band is none of the paper's, or there is none.
         """
-        if unknown := [band for _, band in self.places if band not in PAPER_HEIGHTS]:
+        if unknown := [band for _, band in self.region_bands if band not in PAPER_HEIGHTS]:
             raise ValueError(f"band {unknown[0]!r}: {' or '.join(map(repr, PAPER_HEIGHTS))} is needed")
-        if not self.places:
+        if not self.region_bands:
             raise ValueError("band: at least one is needed")
         if isinstance(self.region, dict):
             return tuple(region.called(name) for name, region in self.region.items())
-        names = dict.fromkeys(region for region, _ in self.places)
-        if unknown := [name for name in names if name not in usual]:
-            raise ValueError(f"region {unknown[0]!r}: one of {', '.join(usual)} is needed, or {{name: {{x_m, y_m}}}}")
-        return tuple(usual[name] for name in names)
+        names = dict.fromkeys(region for region, _ in self.region_bands)
+        if unknown := [name for name in names if name not in named_regions]:
+            raise ValueError(
+                f"region {unknown[0]!r}: one of {', '.join(named_regions)} is needed, or {{name: {{x_m, y_m}}}}"
+            )
+        return tuple(named_regions[name] for name in names)

@@ -35,7 +35,7 @@ FAILURE = re.compile(r"(.+)_without_(.+)")
 class Queries(NamedTuple):
     """Objectives by name, and the regions, bands and thresholds that they query around one vehicle.
 
-    Requirements of targets and encounters are not among them; `names` are those of all, in order.
+    Requirements of targets and encounters are not among them; `objective_names` are those of all, in order.
     The `grid` has cells of 0.5 m around these. Radii
     saturate at `max_radius_m`: as in `evaluate`, or at the largest threshold if no radius is asked for.
     """
@@ -45,25 +45,25 @@ class Queries(NamedTuple):
     grid: BevGrid
     max_radius_m: float
     thresholds_m: tuple[float, ...]
-    names: tuple[str, ...]
+    objective_names: tuple[str, ...]
 
     @classmethod
-    def around(cls, ego_outline_m: Float64, objectives: Mapping[str, Objective]) -> Self:
+    def from_objectives(cls, ego_outline_m: Float64, objectives: Mapping[str, Objective]) -> Self:
         """Return the queries for a vehicle with (K, 2) corners x, y.
 
         ValueError: a region or a band that is none; two regions of one name; one that holds no cell centre.
         """
         usual = {region.name: region for region in RegionsOfInterest().around(ego_outline_m).regions}
         regions, names = dict[str, Region](), tuple(objectives)
-        objectives = {name: one for name, one in objectives.items() if not one.requires} or FOR_STEPS
+        objectives = {name: one for name, one in objectives.items() if not one.requirement} or FOR_STEPS
         for name, objective in objectives.items():
             try:
-                for region in objective.regions(usual):
+                for region in objective.resolve_regions(usual):
                     if regions.setdefault(region.name, region) != region:
                         raise ValueError(f"region {region.name!r}: another objective calls another region so")
             except ValueError as error:
                 raise ValueError(f"objective {name!r}: {error}") from error
-        bands = [band for objective in objectives.values() for _, band in objective.places]
+        bands = [band for objective in objectives.values() for _, band in objective.region_bands]
         written = {name: _written(region) for name, region in regions.items()}
         heights = {band: PAPER_HEIGHTS[band] for band in bands}
         grid = RegionsOfInterest(regions=written, heights=heights).around(ego_outline_m, CELL_M).grid
@@ -75,7 +75,7 @@ class Queries(NamedTuple):
         return cls(objectives, regions, grid, max_radius_m, tuple(thresholds), names)
 
     @property
-    def within_m(self) -> float | None:
+    def search_radius_m(self) -> float | None:
         """How near to a point of the reference all lies that can change a number; None if anything can."""
         return self.max_radius_m if self.max_radius_m in self.thresholds_m else None
 
@@ -85,19 +85,19 @@ class Queries(NamedTuple):
         each = (_around(self.grid, [region]) for region in self.regions.values())
         return tuple((own.x, own.y) for own in each)
 
-    def reference_sensor(self, rays: int) -> SurfaceReference:
+    def build_reference_sensor(self, rays: int) -> SurfaceReference:
         """One that is aimed at what is asked about."""
         return SurfaceReference(
             self.areas, rays, bands_m=tuple(self.grid.heights.values()), band_frame=self.grid.band_frame
         )
 
-    def contains(self, points: Tensor, height: Tensor | None = None) -> Tensor:
+    def mask_points(self, points: Tensor, heights_m: Tensor | None = None) -> Tensor:
         """Return (M,) bool: which of (M, 3) points lie in a queried region and band."""
-        inside, of, cell = self.grid.bins(points, height)
+        inside, of, cell = self.grid.bins(points, heights_m)
         kept = torch.zeros(len(points), dtype=torch.bool, device="cpu")
         x, y, bands = *points[inside[of], :2].T, list(self.grid.heights)
         band, column = cell // (self.grid.cells // len(bands)), cell % (self.grid.cells // len(bands))
-        for place in dict.fromkeys(place for objective in self.objectives.values() for place in objective.places):
+        for place in dict.fromkeys(place for objective in self.objectives.values() for place in objective.region_bands):
             region = self.regions[place[0]]
             own = region.contains(x, y) | region.mask(self.grid).view(-1)[column]  # by area, or of a cell of it
             kept[inside[of[own & (band == bands.index(place[1]))]]] = True
@@ -110,7 +110,7 @@ class Queries(NamedTuple):
         """
         queries = self._replace(thresholds_m=self.thresholds_m or (THRESHOLD_M,))
         with warnings.catch_warnings(action="ignore"):  # that they were fed with nothing
-            of_coverage = [one.key for one in queries.observer_of(rig, "area").compute().every_quantity]
+            of_coverage = [one.key for one in queries.build_observer(rig, "area").compute().every_quantity]
         single = (RADIUS, *map(detection, queries.thresholds_m))
         others = [one.key for kind in AGGREGATIONS for one in kind.parse(kind.example).quantities]
         of_coverage += [one.key for one in (*single, *(without(ANY, each) for each in single))] + others
@@ -128,7 +128,7 @@ class Queries(NamedTuple):
     def _keys(self) -> list[str]:
         return [objective.key for objective in self.objectives.values()]
 
-    def observer_of(self, rig: Rig, measure: Measure) -> CoverageObserver:
+    def build_observer(self, rig: Rig, average: Measure) -> CoverageObserver:
         """Return an observer of the coverage of a rig, fed with nothing yet, for means by area or over known cells."""
         coverage = CoverageSums(
             self.grid,
@@ -138,35 +138,35 @@ class Queries(NamedTuple):
             regions=tuple(self.regions.values()),
             aggregations=self.aggregations,
             sensors=tuple(sensor.name for sensor in rig.sensors) if any(map(_of_failures, self._keys)) else (),
-            square_metres=measure == "area",
+            square_metres=average == "area",
         )
         return CoverageObserver(coverage, rig.name)
 
-    def estimate(self, metric: CoverageSums, kept: Mapping[str, Estimate]) -> Estimate:
+    def estimate(self, metric: CoverageSums, met_shares: Mapping[str, Estimate]) -> Estimate:
         """Return the objectives, each a quantity under its own name.
 
         Args:
-            metric: That of `observer_of`, with the sums of all frames.
-            kept: Name of an objective that is required of bodies -> share of the requirements that are met, the same in
+            metric: That of `build_observer`, with the sums of all frames.
+            met_shares: Name of an objective that is required of bodies -> share of the requirements that are met, the same in
                 every block.
         """
         answers = self._answers(metric)
         steps = max((one.steps for each in answers.values() for one in each), key=len)
         quantities, values, left_out = [], [], []
-        for name in self.names:
-            each = answers.get(name) or [kept[name]]
+        for name in self.objective_names:
+            each = answers.get(name) or [met_shares[name]]
             quantities.append(each[0].quantities[0]._replace(key=name))
             values.append(torch.cat([one.value for one in each]).mean())
             whole = all(len(one.left_out) == len(steps) for one in each)
             unknown = torch.full((len(steps),), math.nan, dtype=torch.float64, device="cpu")
             known = torch.cat([one.left_out for one in each], dim=1).mean(dim=1) if whole else unknown
-            left_out.append(values[-1].expand(len(steps)) if name in kept else known)
+            left_out.append(values[-1].expand(len(steps)) if name in met_shares else known)
         return Estimate(tuple(quantities), torch.stack(values), torch.stack(left_out, dim=1), steps)
 
     def _answers(self, metric: CoverageSums) -> dict[str, list[Estimate]]:
         """Return for each objective its number in each of its regions and bands."""
         plain = [quantity.key for quantity in MeanOfMeans(metric.thresholds).quantities]
-        places = list(dict.fromkeys(place for one in self.objectives.values() for place in one.places))
+        places = list(dict.fromkeys(place for one in self.objectives.values() for place in one.region_bands))
         if metric.square_metres and all(key in plain for key in self._keys):
             by_area = metric.estimates([(self.regions[region], band) for region, band in places], "area")
             found = dict(zip(places, by_area, strict=True))
@@ -189,7 +189,7 @@ class Queries(NamedTuple):
                 return replace(worst, quantities=(worst.quantities[0]._replace(title=title),))
             return number(key if sensor in ("", *metric.sensors) else alone, place)  # what is not there cannot fail
 
-        return {name: [answer(one.key, place) for place in one.places] for name, one in self.objectives.items()}
+        return {name: [answer(one.key, place) for place in one.region_bands] for name, one in self.objectives.items()}
 
 
 def _of_failures(key: str) -> bool:

@@ -20,7 +20,7 @@ from torchcover.files import AtomicOutput, csv_text
 from torchcover.geometry.arrays import Float64
 from torchcover.notebooks import data_frame, small_html
 from torchcover.placement.validation import replace_nan
-from torchcover.report import Page, PagePicture, PageRig, PageTable, page_html
+from torchcover.report import Page, PagePicture, PageRig, PageTable, render_page
 from torchcover.simulation import Rig
 
 if TYPE_CHECKING:
@@ -33,20 +33,20 @@ OF_THE_RUN = ("seconds", "torchcover", "space_sha256")
 class PlacementReport:
     """What was found, for its files, its page, and the terminal.
 
-    `record` stands in `search.json`, where what is unknown may be NaN; the page shows those `settings` of it, and the
-    rigs that are `shown`, by what they are. `rigs` and `rows`, tables with their headings, are by the names of their
-    files. The first table is printed, too. `pictures` makes the stem of a file, what it shows, and a figure of its own.
+    `record` stands in `search.json`, where what is unknown may be NaN; the page shows those `setting_names` of it, and the
+    rigs that are `page_rigs`, by what they are. `rigs` and `csv_tables`, tables with their headings, are by the names of their
+    files. The first table is printed, too. `render_plots` makes the stem of a file, what it shows, and a figure of its own.
     """
 
     title: str
-    sentence: str
+    summary: str
     record: Mapping[str, Any]
-    settings: Sequence[str]
+    setting_names: Sequence[str]
     rigs: Mapping[str, Rig]
-    shown: Mapping[str, Rig]
+    page_rigs: Mapping[str, Rig]
     tables: Sequence[PageTable]
-    rows: Mapping[str, Iterable[Iterable[object]]]
-    pictures: Callable[[], Iterator[tuple[str, str, Figure]]]
+    csv_tables: Mapping[str, Iterable[Iterable[object]]]
+    render_plots: Callable[[], Iterator[tuple[str, str, Figure]]]
     ego_outline_m: Float64
 
     def save(self, folder: str | Path, *, files: str | Iterable[str] = FILES) -> list[Path]:
@@ -56,51 +56,51 @@ class PlacementReport:
         `files` is as in `Result.save`; "maps" are the pictures.
         """
         wanted = wanted_files(files)
-        summary = {"torchcover": __version__, "complete": True, "sentence": self.sentence}
+        summary = {"torchcover": __version__, "complete": True, "sentence": self.summary}
         with AtomicOutput(Path(folder)) as written:
             with held_back():  # what was found is safe before anything ends this
                 if "numbers" in wanted:
                     self._add_numbers(written)
                 written.publish(summary)
             pictures = []
-            for stem, words, figure in self.pictures() if wanted & {"maps", "page"} else ():
+            for stem, words, figure in self.render_plots() if wanted & {"maps", "page"} else ():
                 png = BytesIO()
                 figure.savefig(png, dpi=figure.dpi)
                 pictures.append(PagePicture(words, png.getvalue()))
                 if "maps" in wanted:
                     written.add(f"{stem}.png", partial(Path.write_bytes, data=png.getvalue()))
             if "page" in wanted:
-                written.add_text("report.html", page_html(self._page(pictures)))
+                written.add_text("report.html", render_page(self._page(pictures)))
             written.publish(summary)
         return written.paths
 
     def _add_numbers(self, files: AtomicOutput) -> None:
         for name, rig in self.rigs.items():
             files.add(name, rig.save)
-        for name, rows in self.rows.items():
+        for name, rows in self.csv_tables.items():
             files.add_text(name, csv_text([*map(_digits, row)] for row in rows))
-        record = json.dumps(replace_nan({**self.record, "sentence": self.sentence}), indent=2, allow_nan=False)
+        record = json.dumps(replace_nan({**self.record, "sentence": self.summary}), indent=2, allow_nan=False)
         files.add_text("search.json", f"{record}\n")
 
     def _page(self, pictures: Sequence[PagePicture]) -> Page:
         record = replace_nan(self.record)
-        facts = {"Settings": self.settings, "Run": [name for name in OF_THE_RUN if name in record]}
+        facts = {"Settings": self.setting_names, "Run": [name for name in OF_THE_RUN if name in record]}
         return Page(
             title=self.title,
             lead="Measured by torchcover.",
-            verdict=re.split(r"(?<=[.]) (?=[A-Z])", self.sentence),
+            findings=re.split(r"(?<=[.]) (?=[A-Z])", self.summary),
             tables=self.tables,
             pictures=pictures,
             rigs=[
                 PageRig(f"{what}: {rig.name}", sensor_views(rig.sensors), rig_document(rig.name, rig.sensors))
-                for what, rig in self.shown.items()
+                for what, rig in self.page_rigs.items()
             ],
             ego_outline_m=self.ego_outline_m,
             facts={title: words_of({name: record[name] for name in names}) for title, names in facts.items()},
         )
 
 
-class Reported:
+class ReportMixin:
     """What has a report: files, a page, and what a notebook shows of it."""
 
     @property
@@ -110,11 +110,11 @@ class Reported:
 
     def _repr_html_(self) -> str:
         report = self.report
-        return small_html([report.title, report.sentence], self.plot())
+        return small_html([report.title, report.summary], self.plot())
 
     def plot(self) -> Figure:
         """The first of its pictures: a figure of its own, outside pyplot."""
-        return next(self.report.pictures())[2]
+        return next(self.report.render_plots())[2]
 
     def to_dataframe(self) -> "pandas.DataFrame":
         """The rows of its first table: `candidates.csv` of a choice, `evaluations.csv` of a search.
@@ -122,7 +122,7 @@ class Reported:
         Raises:
             ModuleNotFoundError: pandas is not there.
         """
-        headings, *rows = next(iter(self.report.rows.values()))
+        headings, *rows = next(iter(self.report.csv_tables.values()))
         return data_frame(dict(zip(map(str, headings), row, strict=True)) for row in rows)
 
     def save(self, folder: str | Path, *, files: str | Iterable[str] = FILES) -> list[Path]:

@@ -14,10 +14,10 @@ import torch
 from torchcover.evaluation.checkpoint import differences
 from torchcover.evaluation.progress import Progress, held_back
 from torchcover.files import BadFileError, check_memory, lock_folder, reads
-from torchcover.placement.plan import distributions_of, import_optuna, run_quietly
+from torchcover.placement.plan import build_distributions, import_optuna, run_quietly
 from torchcover.placement.result import Finalist, SearchResult
 from torchcover.placement.search import RANDOM, START, Evaluation, PlacementSearch
-from torchcover.placement.validation import ValidationTest, format_gain, validate
+from torchcover.placement.validation import ValidationResult, format_improvement, validate
 
 if TYPE_CHECKING:
     from optuna.trial import FrozenTrial
@@ -30,7 +30,7 @@ Clock = Callable[[], float]
 
 def run_search(
     search: PlacementSearch,
-    out: Path | None = None,
+    out_dir: Path | None = None,
     *,
     resume: bool = False,
     progress: bool = False,
@@ -40,7 +40,7 @@ def run_search(
 
     Args:
         search: A search that has proposed nothing yet.
-        out: Folder of its journal: every evaluation is on the disk before the next one begins.
+        out_dir: Folder of its journal: every evaluation is on the disk before the next one begins.
         resume: Whether to continue the journal that is there. With a number of evaluations, the result is that of a
             search without interruption.
         progress: Whether to show a progress bar.
@@ -52,9 +52,9 @@ def run_search(
     """
     if search.evaluations:
         raise ValueError("search: one that has proposed nothing yet is needed; make another one")
-    with nullcontext() if out is None else lock_folder(out):
+    with nullcontext() if out_dir is None else lock_folder(out_dir):
         try:
-            return _run(search, out, resume, progress, clock)
+            return _run(search, out_dir, resume, progress, clock)
         finally:
             if "frames" in vars(search):
                 search.frames.close()
@@ -66,7 +66,7 @@ def _run(search: PlacementSearch, out: Path | None, resume: bool, progress: bool
     journal = None if out is None else SearchJournal(out / JOURNAL, search)
     if journal is not None and resume:
         journal.resume()
-    earlier_s = sum(evaluation.seconds for evaluation in search.evaluations[1:])
+    earlier_s = sum(evaluation.duration_s for evaluation in search.evaluations[1:])
     if not search.evaluations:
         start = search.ask()
         assert start is not None  # the first one always is
@@ -93,8 +93,10 @@ class _Budget:
         self._search, self._clock, self._began_s = search, clock, began_s
         plan, objectives = search.plan, len(search.space.objectives)
         rigs = 3 if objectives == 1 else objectives + 2
-        held_out = plan.fresh_worlds * plan.per_world * sum(not each.repeats for each in search.space.scenarios)
-        self.evaluation_s = search.evaluations[0].seconds
+        held_out = (
+            plan.num_held_out_scenes * plan.frames_per_scene * sum(not each.repeats for each in search.space.scenarios)
+        )
+        self.evaluation_s = search.evaluations[0].duration_s
         rigs_s = rigs * self.evaluation_s
         self.test_s = held_out * (frame_s + rigs_s / len(search.frames)) + rigs_s
         self.until_s = math.inf if plan.budget_s is None else began_s + plan.budget_s - self.test_s
@@ -103,8 +105,8 @@ class _Budget:
     def expected(self) -> int:
         """Expected number of evaluations in all."""
         plan = self._search.plan
-        if plan.evaluations is not None:
-            return plan.evaluations + 1
+        if plan.num_evaluations is not None:
+            return plan.num_evaluations + 1
         left_s = max(self.until_s - self._clock(), 0.0)
         return len(self._search.evaluations) + int(left_s / max(self.evaluation_s, 1e-9))
 
@@ -128,7 +130,7 @@ class _Budget:
 def _spend(
     search: PlacementSearch, budget: _Budget, journal: "SearchJournal | None", advance: Callable[[int, str], Any]
 ) -> None:
-    search.until_s = budget.until_s
+    search.deadline_s = budget.until_s
     if journal is not None:
         journal.write()
     while budget.is_left() and (candidate := search.ask()) is not None:
@@ -141,47 +143,51 @@ def _spend(
 
 
 def _describe_best(search: PlacementSearch) -> str:
-    best = search.pick_compromise(search.best_of())
+    best = search.select_compromise(search.find_best())
     start = search.evaluations[0].estimate
     if best is None or start is None:
         return "no possible rig yet"
-    pairs = zip(start.quantities, search.gains[best].tolist(), strict=False)  # the objectives come first
-    return "  ".join(f"{quantity.key} {format_gain(gain, quantity.unit)}" for quantity, gain in pairs)
+    pairs = zip(start.quantities, search.improvements[best].tolist(), strict=False)  # the objectives come first
+    return "  ".join(f"{quantity.key} {format_improvement(gain, quantity.unit)}" for quantity, gain in pairs)
 
 
 def _pick_finalists(search: PlacementSearch) -> list[Finalist]:
     """Return the rigs to test: the best, of several objectives the ends of the front, and the best random one."""
-    front, several = search.best_of(), len(search.space.objectives) > 1
-    best = search.pick_compromise(front)
+    front, several = search.find_best(), len(search.space.objectives) > 1
+    best = search.select_compromise(front)
     if best is None:
         return []
     roles = {"compromise" if several else "best": best}
     if several:
-        columns = zip(search.space.objectives, search.gains[front].T, strict=True)
+        columns = zip(search.space.objectives, search.improvements[front].T, strict=True)
         roles |= {name: front[int(np.argmax(column))] for name, column in columns}
     else:
-        random = search.pick_compromise(search.best_of((START, RANDOM)))
+        random = search.select_compromise(search.find_best((START, RANDOM)))
         roles |= {RANDOM: best if random is None else random}
     finalists = []
     for role, at in roles.items():
         evaluation, rig = search.evaluations[at], search.space.start
         if at:
-            rig = search.space.rig(evaluation.values, f"{search.space.name}_{role}")
+            rig = search.space.build_rig(evaluation.values, f"{search.space.name}_{role}")
         finalists.append(Finalist(role, evaluation, rig))
     return finalists
 
 
-def _validate(search: PlacementSearch, finalists: list[Finalist]) -> tuple[list[Finalist], ValidationTest | None, str]:
+def _validate(
+    search: PlacementSearch, finalists: list[Finalist]
+) -> tuple[list[Finalist], ValidationResult | None, str]:
     """Return the finalists with their gains on held-out worlds, the test, and the reason why there is none."""
     moved = {finalist.role: finalist.rig for finalist in finalists if not finalist.is_start}
     if not moved:
         return finalists, None, ""
     plan = search.plan
     try:
-        test = validate(moved, search.space.start, search.frames, test_seed=plan.seed_of_test, worlds=plan.fresh_worlds)
+        test = validate(
+            moved, search.space.start, search.frames, test_seed=plan.test_seed, num_scenes=plan.num_held_out_scenes
+        )
     except ValueError as error:
         return finalists, None, str(error)
-    tested = [replace(finalist, gains=test.gains.get(finalist.role, ())) for finalist in finalists]
+    tested = [replace(finalist, improvements=test.improvements.get(finalist.role, ())) for finalist in finalists]
     return tested, test, ""
 
 
@@ -198,7 +204,7 @@ class SearchJournal:
         self._search = search
         self._written = 0
         self._study: Any = None
-        settings = search.plan.settings(search.space)
+        settings = search.plan.collect_settings(search.space)
         self._settings = {name: str(value) for name, value in settings.items()}
 
     def resume(self) -> None:
@@ -247,14 +253,14 @@ class SearchJournal:
         return study
 
     def _trial(self, evaluation: Evaluation) -> "FrozenTrial":
-        optuna, spans = import_optuna(), distributions_of(self._search.space)
+        optuna, spans = import_optuna(), build_distributions(self._search.space)
         values = dict(evaluation.values)
-        gains = self._search.gains[evaluation.number].tolist()
+        gains = self._search.improvements[evaluation.number].tolist()
         state = optuna.trial.TrialState.COMPLETE
         if math.isnan(gains[0]):
             state, gains = optuna.trial.TrialState.FAIL, None
         known = {name: spans[name] for name in values}
-        attributes = {"evaluation": evaluation.record()}
+        attributes = {"evaluation": evaluation.to_record()}
         trial: FrozenTrial = optuna.create_trial(
             params=values, distributions=known, values=gains, state=state, user_attrs=attributes
         )

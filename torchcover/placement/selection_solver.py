@@ -25,7 +25,7 @@ class SolverParams:
         cent_eur: Rounding of prices in EUR.
         shortfall_weight: Weight of a missed minimum: it is never traded for the objective.
         secondary_weight: Weight of the other objectives where one is optimized: they decide between equals.
-        scale: Factor of the objective; HiGHS stops at 1e-6 of its own units, and a price must be more than that.
+        objective_scale: Factor of the objective; HiGHS stops at 1e-6 of its own units, and a price must be more than that.
         time_limit_s: After this time, HiGHS returns its best selection with a bound.
         bisection_steps: Steps to the selection between the best of several objectives.
     """
@@ -35,7 +35,7 @@ class SolverParams:
     cent_eur: float = 0.01
     shortfall_weight: float = 1e4
     secondary_weight: float = 1e-5
-    scale: float = 1e3
+    objective_scale: float = 1e3
     time_limit_s: float = 60.0
     bisection_steps: int = 7
 
@@ -52,26 +52,26 @@ class SelectionLimits:
         prices_eur: Price of each candidate; empty without prices.
         max_cost_eur: Total price at most.
         compatible: (C, C) whether two candidates may both be selected; all may if not given.
-        minimum: Least values of the rows of `CandidateCoverage.worth`; -inf where anything is allowed.
+        min_values: Least values of the rows of `CandidateCoverage.worth`; -inf where anything is allowed.
     """
 
     max_sensors: int
     prices_eur: Sequence[float] = ()
     max_cost_eur: float = np.inf
     compatible: Bools | None = None
-    minimum: Sequence[float] | Float64 | None = None
+    min_values: Sequence[float] | Float64 | None = None
 
-    def price(self, selected: Sequence[int]) -> float:
+    def compute_price_eur(self, selected: Sequence[int]) -> float:
         """Return the total price of a selection in EUR."""
         return float(sum(self.prices_eur[index] for index in selected)) if self.prices_eur else 0.0
 
-    def allow(self, selected: Sequence[int], other: int) -> bool:
+    def can_add(self, selected: Sequence[int], candidate: int) -> bool:
         """Return whether a candidate may be added to a selection, whatever `minimum` is."""
-        if len(selected) >= self.max_sensors or other in selected:
+        if len(selected) >= self.max_sensors or candidate in selected:
             return False
-        if self.compatible is not None and not all(self.compatible[other, index] for index in selected):
+        if self.compatible is not None and not all(self.compatible[candidate, index] for index in selected):
             return False
-        return self.price([*selected, other]) <= self.max_cost_eur + PARAMS.cent_eur / 2
+        return self.compute_price_eur([*selected, candidate]) <= self.max_cost_eur + PARAMS.cent_eur / 2
 
 
 class SensorSelection(NamedTuple):
@@ -101,39 +101,39 @@ class CandidateCoverage:
 
     Args:
         observes: (G, C) bool, which candidates observe a group; all rows differ.
-        worth: (Q, G) float64, value of the points of each group, one row for each number.
-        base: (Q,) value of what is observed without any candidate.
+        group_values: (Q, G) float64, value of the points of each group, one row for each number.
+        base_values: (Q,) value of what is observed without any candidate.
     """
 
     observes: Bools
-    worth: Float64
-    base: Float64
+    group_values: Float64
+    base_values: Float64
 
     @classmethod
-    def from_points(cls, worth: ArrayLike, observed: Sequence[Bools], base: Bools) -> Self:
+    def from_points(cls, point_values: ArrayLike, observed: Sequence[Bools], base_mask: Bools) -> Self:
         """Group points by the candidates that observe them.
 
         Args:
-            worth: (Q, P) value of each point.
+            point_values: (Q, P) value of each point.
             observed: For each candidate (P,) bool.
-            base: (P,) whether a point is observed without any candidate.
+            base_mask: (P,) whether a point is observed without any candidate.
         """
-        worth = np.asarray(worth, dtype=np.float64)
+        point_values = np.asarray(point_values, dtype=np.float64)
         packed = np.packbits(np.stack(observed), axis=0)  # eight candidates a byte
-        used = ~base & packed.any(axis=0) & worth.any(axis=0)
+        used = ~base_mask & packed.any(axis=0) & point_values.any(axis=0)
         groups, group_of = np.unique(packed[:, used].T, axis=0, return_inverse=True)
-        sums = [np.bincount(group_of.reshape(-1), row, len(groups)) for row in worth[:, used]]
+        sums = [np.bincount(group_of.reshape(-1), row, len(groups)) for row in point_values[:, used]]
         observes = np.unpackbits(groups, axis=1, count=len(observed)).astype(bool)
-        return cls(observes, np.stack(sums).astype(np.float64), worth[:, base].sum(axis=1))
+        return cls(observes, np.stack(sums).astype(np.float64), point_values[:, base_mask].sum(axis=1))
 
-    def values(self, selected: Sequence[int]) -> Float64:
+    def compute_values(self, selected: Sequence[int]) -> Float64:
         """Return the (Q,) values of a selection."""
-        return self.base + self.worth @ self.observes[:, list(selected)].any(axis=1)
+        return self.base_values + self.group_values @ self.observes[:, list(selected)].any(axis=1)
 
-    def losses(self, selected: Sequence[int]) -> Float64:
+    def compute_failure_effects(self, selected: Sequence[int]) -> Float64:
         """Return the (selected, Q) loss of value when each selected sensor fails."""
         remaining = [[other for other in selected if other != index] for index in selected]
-        return np.array([self.values(selected) - self.values(others) for others in remaining])
+        return np.array([self.compute_values(selected) - self.compute_values(others) for others in remaining])
 
 
 def select_sensors(
@@ -152,15 +152,15 @@ def select_sensors(
         time_limit_s: After this time HiGHS returns its best selection, with a bound.
     """
     count = coverage.observes.shape[1]
-    row_weights = np.zeros(len(coverage.worth))
+    row_weights = np.zeros(len(coverage.group_values))
     row_weights[: len(weights)] = weights
-    minimum = np.resize(-np.inf if limits.minimum is None else limits.minimum, len(coverage.worth))
+    minimum = np.resize(-np.inf if limits.min_values is None else limits.min_values, len(coverage.group_values))
     prices = np.array(limits.prices_eur or np.zeros(count)) + PARAMS.sensor_eur
     # No difference in price weighs as much as the tolerance.
     largest = min(float(np.sort(prices)[-limits.max_sensors :].sum()), limits.max_cost_eur + PARAMS.sensor_eur * count)
     costs = PARAMS.tolerance * prices / largest
     selected, gap = _solve(coverage, limits, row_weights, minimum, costs, time_limit_s)
-    values = coverage.values(selected)
+    values = coverage.compute_values(selected)
     return SensorSelection(selected, tuple(values.tolist()), gap, float((minimum - values).clip(0.0).sum()))
 
 
@@ -192,14 +192,14 @@ def _solve(
     for clique in () if limits.compatible is None else _incompatible_cliques(limits.compatible):
         rows, upper = [*rows, row(np.isin(range(count), clique))], [*upper, 1.0]
     for position, number in enumerate(bounded):
-        rows.append(row(0.0, -coverage.worth[number], -np.eye(len(bounded))[position]))
-        upper.append(coverage.base[number] - minimum[number])
-    objective = row(-costs, weights @ coverage.worth, -PARAMS.shortfall_weight)
+        rows.append(row(0.0, -coverage.group_values[number], -np.eye(len(bounded))[position]))
+        upper.append(coverage.base_values[number] - minimum[number])
+    objective = row(-costs, weights @ coverage.group_values, -PARAMS.shortfall_weight)
     observed = hstack(
         [csr_array(-coverage.observes.astype(float)), eye_array(groups), csr_array((groups, len(bounded)))]
     )
     solution = milp(
-        -PARAMS.scale * objective,
+        -PARAMS.objective_scale * objective,
         integrality=row(1.0),
         bounds=Bounds(0.0, row(1.0, 1.0, np.inf)),
         constraints=[LinearConstraint(observed, ub=0.0), LinearConstraint(csr_array(np.array(rows)), ub=upper)],
@@ -209,7 +209,7 @@ def _solve(
         return (), np.inf
     selected = tuple(np.flatnonzero(solution.x[:count] > 0.5).tolist())
     bound = solution.fun if solution.mip_dual_bound is None else solution.mip_dual_bound
-    return selected, max((solution.fun - bound) / PARAMS.scale, 0.0)
+    return selected, max((solution.fun - bound) / PARAMS.objective_scale, 0.0)
 
 
 def _incompatible_cliques(compatible: Bools) -> Iterator[list[int]]:
@@ -225,7 +225,7 @@ def _incompatible_cliques(compatible: Bools) -> Iterator[list[int]]:
 
 
 def select_for_objectives(
-    coverage: CandidateCoverage, limits: SelectionLimits, objectives: int
+    coverage: CandidateCoverage, limits: SelectionLimits, num_objectives: int
 ) -> list[SensorSelection]:
     """Return the best selection of one objective, or of several a compromise and then the best of each.
 
@@ -235,21 +235,23 @@ def select_for_objectives(
     Args:
         coverage: What the candidates observe; the first rows of its `worth` are the objectives.
         limits: What a selection must keep to.
-        objectives: Number of objectives.
+        num_objectives: Number of objectives.
     """
-    if objectives == 1:
+    if num_objectives == 1:
         return [select_sensors(coverage, limits)]
-    rows = np.arange(objectives)
+    rows = np.arange(num_objectives)
     ends = [select_sensors(coverage, limits, np.where(rows == row, 1.0, PARAMS.secondary_weight)) for row in rows]
-    values = np.array([end.values[:objectives] for end in ends])
+    values = np.array([end.values[:num_objectives] for end in ends])
     low, span = values.min(axis=0), np.ptp(values, axis=0)
     weights = 1.0 / np.where(span > PARAMS.tolerance, span, 1.0)
-    minimum = np.resize(-np.inf if limits.minimum is None else limits.minimum, len(coverage.worth)).astype(float)
+    minimum = np.resize(-np.inf if limits.min_values is None else limits.min_values, len(coverage.group_values)).astype(
+        float
+    )
     compromise, share, step = select_sensors(coverage, limits, weights), 0.0, 0.5
     for _ in range(PARAMS.bisection_steps):
         raised = minimum.copy()
-        raised[:objectives] = np.maximum(raised[:objectives], low + (share + step) * span - PARAMS.tolerance)
-        selection = select_sensors(coverage, replace(limits, minimum=raised), weights)
+        raised[:num_objectives] = np.maximum(raised[:num_objectives], low + (share + step) * span - PARAMS.tolerance)
+        selection = select_sensors(coverage, replace(limits, min_values=raised), weights)
         if selection.shortfall <= compromise.shortfall + PARAMS.tolerance:
             compromise, share = selection, share + step
         step /= 2
@@ -264,7 +266,7 @@ def sample_selections(
     for _ in range(count):
         selected: list[int] = []
         for index in generator.permutation(coverage.observes.shape[1]).tolist():
-            if limits.allow(selected, index):
+            if limits.can_add(selected, index):
                 selected.append(index)
-        selections.append(SensorSelection(tuple(selected), tuple(coverage.values(selected).tolist())))
+        selections.append(SensorSelection(tuple(selected), tuple(coverage.compute_values(selected).tolist())))
     return selections

@@ -9,9 +9,9 @@ from typing import Self
 import numpy as np
 from pydantic import Field, NonNegativeFloat, model_validator
 
-from torchcover.placement.constraints import Constraints, check_prices, misplaced, price_eur
-from torchcover.placement.free_sensor import FreeSensor, Value, Variable, mirrored
-from torchcover.placement.host_vehicle import NamedRig, VehicleSpace
+from torchcover.placement.constraints import Constraints, check_prices, find_placement_error, get_price_eur
+from torchcover.placement.free_sensor import FreeSensor, Variable, VariableValue, mirror_sensor
+from torchcover.placement.host_vehicle import NamedRig, PlacementSpace
 from torchcover.placement.queries import Queries
 from torchcover.simulation import Lidar, LidarModel, Rig, Sensor
 from torchcover.simulation.documents import NameOrFile
@@ -20,7 +20,7 @@ from torchcover.simulation.documents import NameOrFile
 TRIES = 256
 
 
-class SearchSpace(VehicleSpace):
+class SearchSpace(PlacementSpace):
     """Where sensors may go, and what a good place is.
 
     Args:
@@ -31,7 +31,7 @@ class SearchSpace(VehicleSpace):
         vehicle: What carries the rig, by name or file; if not given, what `start` is simulated on.
         free: Name of a sensor of `start` -> what of it is free.
         constraints: What a rig must keep to.
-        cost: Prices in euros, by model, by the name of a sensor that has none, and of `mount`, which each sensor needs.
+        prices_eur: Prices in euros, by model, by the name of a sensor that has none, and of `mount`, which each sensor needs.
         objectives: One to three, by name. One is made as large as it gets; of several, what one gains is weighed
             against what the others lose.
         not_worse: What must not be worse than with `start`: names of usual regions, of which detection within 0.4 m in
@@ -61,7 +61,7 @@ class SearchSpace(VehicleSpace):
     start: NamedRig
     free: dict[str, FreeSensor] = Field(min_length=1)
     constraints: Constraints = Constraints()
-    cost: dict[NameOrFile, NonNegativeFloat] = Field(default_factory=dict)
+    prices_eur: dict[NameOrFile, NonNegativeFloat] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _check_sensors(self) -> Self:
@@ -84,7 +84,7 @@ class SearchSpace(VehicleSpace):
                 )
         if not self.variables:
             raise ValueError("free: every number is set, so that there is nothing to search; give two for a range")
-        check_prices(self.cost, self.constraints.max_cost_eur, self.start.sensors, self.free)
+        check_prices(self.prices_eur, self.constraints.max_cost_eur, self.start.sensors, self.free)
         return self
 
     @model_validator(mode="after")
@@ -96,12 +96,12 @@ class SearchSpace(VehicleSpace):
         for name, free in self.free.items():
             for region in (free.region,) if isinstance(free.region, str) else free.region or ():
                 try:
-                    host.region(region)
+                    host.get_mount_region(region)
                 except ValueError as error:
                     raise ValueError(f"free.{name}.{error}") from error
         for name in self.free:
             self._check_place(name)
-        queries = Queries.around(host.outline_m, self.numbers)
+        queries = Queries.from_objectives(host.outline_m, self.scored_objectives)
         queries.check(self.start)
         self._check_constraints()
         outside = self._outside()
@@ -121,7 +121,7 @@ class SearchSpace(VehicleSpace):
             except ValueError as error:
                 complaint = str(error)
                 continue
-            wrong = misplaced(sensor, self.host.skin) if sensor is not None else complaint
+            wrong = find_placement_error(sensor, self.host.skin) if sensor is not None else complaint
             if wrong is None:
                 return
             complaint = wrong
@@ -131,7 +131,7 @@ class SearchSpace(VehicleSpace):
         broken: Counter[str] = Counter()
         for values in self._tries():
             try:
-                violations = self.violations(self.rig(values, self.name))
+                violations = self.find_violations(self.build_rig(values, self.name))
             except ValueError as error:
                 violations = (str(error),)
             if not violations:
@@ -141,28 +141,30 @@ class SearchSpace(VehicleSpace):
             f"constraints: none of {TRIES} candidates keeps to them; as of one: {broken.most_common(1)[0][0]}"
         )
 
-    def _tries(self) -> Iterator[dict[str, Value]]:
+    def _tries(self) -> Iterator[dict[str, VariableValue]]:
         """Values all over the space; the same ones every time."""
         for shares in np.random.default_rng(0).random((TRIES, len(self.variables))).tolist():
-            yield {variable.name: variable.at(share) for variable, share in zip(self.variables, shares, strict=True)}
+            yield {
+                variable.name: variable.get_value(share) for variable, share in zip(self.variables, shares, strict=True)
+            }
 
     def _outside(self) -> list[str]:
         """Why the rig that the search starts from is none of the space."""
         values, known = self._values_of_start(), {variable.name: variable for variable in self.variables}
-        out = [f"{name} is {value}" for name, value in values.items() if not known[name].holds(value)]
-        return out or list(self.violations(self.start))
+        out = [f"{name} is {value}" for name, value in values.items() if not known[name].is_allowed(value)]
+        return out or list(self.find_violations(self.start))
 
     @cached_property
     def variables(self) -> tuple[Variable, ...]:
         """What is free, in the order of the file."""
-        return tuple(variable for name, free in self.free.items() for variable in free.variables(name))
+        return tuple(variable for name, free in self.free.items() for variable in free.list_variables(name))
 
     @property
-    def first_rig(self) -> Rig:
+    def base_rig(self) -> Rig:
         """The start."""
         return self.start
 
-    def rig(self, values: Mapping[str, Value], name: str) -> Rig:
+    def build_rig(self, values: Mapping[str, VariableValue], name: str) -> Rig:
         """The rig that values make.
 
         Args:
@@ -196,40 +198,42 @@ class SearchSpace(VehicleSpace):
             sensors=tuple(sensor for sensor in sensors if sensor is not None),
         )
 
-    def _sensor(self, name: str, values: Mapping[str, Value]) -> Sensor | None:
+    def _sensor(self, name: str, values: Mapping[str, VariableValue]) -> Sensor | None:
         """A sensor of the start, as the values have it."""
         start = next(sensor for sensor in self.start.sensors if sensor.name == name)
         free = self.free.get(name)
         if free is None:
             return start
         if free.mirror_of is not None:
-            return mirrored(start, self._sensor(free.mirror_of, values))
-        return free.made(start, values, self.host)
+            return mirror_sensor(start, self._sensor(free.mirror_of, values))
+        return free.build_sensor(start, values, self.host)
 
-    def start_values(self) -> dict[str, Value]:
+    def get_start_values(self) -> dict[str, VariableValue]:
         """Values of the rig that the search starts from, of those variables of which it has one in the space.
 
         A sensor that is free on a mount region has none there.
         """
         known = {variable.name: variable for variable in self.variables}
-        return {name: value for name, value in self._values_of_start().items() if known[name].holds(value)}
+        return {name: value for name, value in self._values_of_start().items() if known[name].is_allowed(value)}
 
-    def _values_of_start(self) -> dict[str, Value]:
+    def _values_of_start(self) -> dict[str, VariableValue]:
         return {
             name: value
             for sensor in self.start.sensors
             if sensor.name in self.free
-            for name, value in self.free[sensor.name].start_values(sensor, self.host).items()
+            for name, value in self.free[sensor.name].get_start_values(sensor, self.host).items()
         }
 
-    def violations(self, rig: Rig) -> tuple[str, ...]:
+    def find_violations(self, rig: Rig) -> tuple[str, ...]:
         """Why a rig cannot be, in words; nothing if it can. Self-hits are not among it: they are known after a scan."""
-        wrong = (misplaced(sensor, self.host.skin) for sensor in rig.sensors if sensor.name in self.free)
+        wrong = (find_placement_error(sensor, self.host.skin) for sensor in rig.sensors if sensor.name in self.free)
         places = tuple(each for each in wrong if each is not None)
-        return (*places, *self.constraints.broken_by(rig, self.free, self.cost_eur(rig)))
+        return (*places, *self.constraints.find_violations(rig, self.free, self.compute_cost_eur(rig)))
 
-    def cost_eur(self, rig: Rig) -> float | None:
+    def compute_cost_eur(self, rig: Rig) -> float | None:
         """What a rig costs: its models, and a mount for each; None if the space has no prices."""
-        if not self.cost:
+        if not self.prices_eur:
             return None
-        return sum(price_eur(self.cost, sensor.name, getattr(sensor, "model", None)) for sensor in rig.sensors)
+        return sum(
+            get_price_eur(self.prices_eur, sensor.name, getattr(sensor, "model", None)) for sensor in rig.sensors
+        )

@@ -16,8 +16,8 @@ from torchcover.evaluation.target_survey import free_space
 from torchcover.placement.common_frames import CommonFrames
 from torchcover.placement.host_vehicle import NOT_WORSE
 from torchcover.placement.objective import THRESHOLD_M, Objective
-from torchcover.report import PageTable, Words
-from torchcover.report.wording import difference_words, shown_unit
+from torchcover.report import PageTable, TextCell
+from torchcover.report.wording import format_difference, get_display_unit
 from torchcover.simulation import RegionsOfInterest, Rig, with_ego
 from torchcover.targets import TARGETS, Raster, Target, survey
 
@@ -30,50 +30,50 @@ ANY_OUTLINE_M = np.array([[-2.0, -1.0], [2.0, -1.0], [2.0, 1.0], [-2.0, 1.0]])
 CHANGE_HEADINGS = ("what", "gain on\nheld-out worlds", "unit", "p (Holm)", "share of\nthe gain")
 
 
-class HeldOutGain(NamedTuple):
+class HeldOutImprovement(NamedTuple):
     """Improvement of a finalist over the start in one objective.
 
     Args:
         objective: Its name.
-        estimate: Average of the number, "area" or "known"; "-" where the number has no such choice.
-        test: Paired difference on held-out worlds.
-        search_gain: The same difference on the frames of the search.
+        average: Average of the number, "area" or "known"; "-" where the number has no such choice.
+        difference: Paired difference on held-out worlds.
+        search_improvement: The same difference on the frames of the search.
     """
 
     objective: str
-    estimate: str
-    test: Difference
-    search_gain: float
+    average: str
+    difference: Difference
+    search_improvement: float
 
     @property
-    def words(self) -> str:
+    def description(self) -> str:
         """The improvement on held-out worlds with its interval, without its unit: shares in percentage points."""
-        return signed_words(self.test)
+        return format_signed_difference(self.difference)
 
     @property
     def optimism(self) -> float:
         """How much larger the improvement was in the search."""
-        return self.search_gain - self.test.gain
+        return self.search_improvement - self.difference.gain
 
     @property
-    def t(self) -> float:
+    def t_statistic(self) -> float:
         """Gain over error; NaN if the error is unknown, or 0."""
-        return self.test.gain / self.test.error if self.test.error > 0 else math.nan
+        return self.difference.gain / self.difference.error if self.difference.error > 0 else math.nan
 
     @property
     def record(self) -> dict[str, Any]:
         """All of it, for JSON."""
-        test = self.test
+        test = self.difference
         return {
             "unit": test.quantity.unit,
             "gain": test.gain,
             "error": test.error,
             "interval": sorted([test.quantity.gain(test.low), test.quantity.gain(test.high)]),
-            "t": self.t,
+            "t": self.t_statistic,
             "p": test.p,
             "worlds": test.blocks,
             "better": test.better,
-            "search_gain": self.search_gain,
+            "search_improvement": self.search_improvement,
             "optimism": self.optimism,
         }
 
@@ -82,46 +82,46 @@ class SideEffect(NamedTuple):
     """A change of another number on held-out worlds.
 
     Args:
-        what: The number in words.
-        test: Paired difference to the start.
-        p: Its p value, adjusted for all changes (Holm 1979).
-        shares: Objective -> share of its improvement, if the number is a part of it.
+        name: The number in words.
+        difference: Paired difference to the start.
+        p_value: Its p value, adjusted for all changes (Holm 1979).
+        objective_shares: Objective -> share of its improvement, if the number is a part of it.
     """
 
-    what: str
-    test: Difference
-    p: float
-    shares: Mapping[str, float]
+    name: str
+    difference: Difference
+    p_value: float
+    objective_shares: Mapping[str, float]
 
     @property
     def is_worse(self) -> bool:
         """Whether it got worse beyond chance."""
-        return self.p <= 0.05 and self.test.gain < 0
+        return self.p_value <= 0.05 and self.difference.gain < 0
 
     @property
-    def words(self) -> str:
+    def description(self) -> str:
         """It with its interval and unit."""
-        unit = self.test.quantity.unit
-        return f"{self.what} {signed_words(self.test)} {unit_words(unit)}"
+        unit = self.difference.quantity.unit
+        return f"{self.name} {format_signed_difference(self.difference)} {format_unit(unit)}"
 
 
-class ValidationTest(NamedTuple):
+class ValidationResult(NamedTuple):
     """Result of `validate`.
 
     Args:
-        gains: Name of a finalist -> improvements of all numbers of the search.
-        changes: Side effects of the first finalist, significant deteriorations first.
+        improvements: Name of a finalist -> improvements of all numbers of the search.
+        side_effects: Side effects of the first finalist, significant deteriorations first.
     """
 
-    gains: Mapping[str, tuple[HeldOutGain, ...]]
-    changes: tuple[SideEffect, ...]
+    improvements: Mapping[str, tuple[HeldOutImprovement, ...]]
+    side_effects: tuple[SideEffect, ...]
 
     @property
-    def sentence(self) -> str:
+    def summary(self) -> str:
         """The side effects in words."""
-        worse = [change.words for change in self.changes if change.is_worse]
+        worse = [change.description for change in self.side_effects if change.is_worse]
         told = [*worse[:MOST_TOLD], *([f"{len(worse) - MOST_TOLD} more"] if len(worse) > MOST_TOLD else [])]
-        number = f"of {len(self.changes)} numbers around the vehicle"
+        number = f"of {len(self.side_effects)} numbers around the vehicle"
         if not worse:
             return f"None {number} got worse beyond chance"
         return f"Worse beyond chance, {number}: {'; '.join(told)}"
@@ -131,13 +131,13 @@ class ValidationTest(NamedTuple):
         """All changes."""
         rows = [
             (
-                Words(change.what),
-                Words(signed_words(change.test), "significant" if change.p <= 0.05 else ""),
-                Words(unit_words(change.test.quantity.unit)),
-                Words("-" if math.isnan(change.p) else f"{change.p:.2g}"),
-                Words(", ".join(f"{name} {share:.0%}" for name, share in change.shares.items())),
+                TextCell(change.name),
+                TextCell(format_signed_difference(change.difference), "significant" if change.p_value <= 0.05 else ""),
+                TextCell(format_unit(change.difference.quantity.unit)),
+                TextCell("-" if math.isnan(change.p_value) else f"{change.p_value:.2g}"),
+                TextCell(", ".join(f"{name} {share:.0%}" for name, share in change.objective_shares.items())),
             )
-            for change in self.changes
+            for change in self.side_effects
         ]
         return PageTable("What else changed", CHANGE_HEADINGS, rows, 1)
 
@@ -145,40 +145,51 @@ class ValidationTest(NamedTuple):
     def record(self) -> list[dict[str, Any]]:
         """The changes, for JSON."""
         return [
-            {"what": one.what, "gain": one.test.gain, "error": one.test.error, "p_holm": one.p, "shares": one.shares}
-            for one in self.changes
+            {
+                "what": one.name,
+                "gain": one.difference.gain,
+                "error": one.difference.error,
+                "p_holm": one.p_value,
+                "shares": one.objective_shares,
+            }
+            for one in self.side_effects
         ]
 
 
 def validate(
-    winners: Mapping[str, Rig], start: Rig, searched: CommonFrames, *, test_seed: int, worlds: int
-) -> ValidationTest:
+    finalists: Mapping[str, Rig], start: Rig, search_frames: CommonFrames, *, test_seed: int, num_scenes: int
+) -> ValidationResult:
     """Score finalists of a search, by name, on worlds of another seed, frame by frame against the same reference.
 
     A scenario without traffic is the same world for any seed, and is left out.
 
     ValueError: the seed of the search; no scenario with traffic; a rig that cannot be mounted in a fresh world.
     """
-    first = next(iter(winners))
-    others, parts = _others(searched.objectives, failures=max(len(start.sensors), len(winners[first].sensors)) > 1)
-    with closing(searched.resampled(test_seed, worlds, others)) as fresh:
+    first = next(iter(finalists))
+    others, parts = _others(
+        search_frames.objectives, failures=max(len(start.sensors), len(finalists[first].sensors)) > 1
+    )
+    with closing(search_frames.resample(test_seed, num_scenes, others)) as fresh:
         start_by_test = fresh.score(start).estimate
         by_test = {
-            name: _differences(fresh.score(winner).estimate, start_by_test, searched.objectives)
-            for name, winner in winners.items()
+            name: _differences(fresh.score(winner).estimate, start_by_test, search_frames.objectives)
+            for name, winner in finalists.items()
         }
-    start_by_search = searched.score(start).estimate
+    start_by_search = search_frames.score(start).estimate
     gains, found = {}, by_test[first]
-    for name, winner in winners.items():
-        in_search = searched.score(winner).estimate.differences(start_by_search)
+    for name, winner in finalists.items():
+        in_search = search_frames.score(winner).estimate.differences(start_by_search)
         gains[name] = tuple(
-            HeldOutGain(
-                objective, asked.own_estimate or searched.estimate, by_test[name][objective], in_search[objective].gain
+            HeldOutImprovement(
+                objective,
+                asked.fixed_average or search_frames.average,
+                by_test[name][objective],
+                in_search[objective].gain,
             )
-            for objective, asked in searched.objectives.items()
+            for objective, asked in search_frames.objectives.items()
         )
     tests = {name: test for name, test in found.items() if name in others or name.startswith(NOT_WORSE)}
-    tests |= _of_targets(winners[first], start, searched)
+    tests |= _of_targets(finalists[first], start, search_frames)
     shares: dict[str, dict[str, float]] = {name: {} for name in tests}
     for objective, each in parts.items():
         whole = sum(found[part].gain for part in each)
@@ -188,14 +199,14 @@ def validate(
         SideEffect(name, test, p, shares[name])
         for (name, test), p in zip(tests.items(), adjust_holm([test.p for test in tests.values()]), strict=True)
     ]
-    changes.sort(key=lambda one: (not one.is_worse, math.isnan(one.p), one.p, one.test.gain))
-    return ValidationTest(gains, tuple(changes))
+    changes.sort(key=lambda one: (not one.is_worse, math.isnan(one.p_value), one.p_value, one.difference.gain))
+    return ValidationResult(gains, tuple(changes))
 
 
 def _differences(one: Estimate, other: Estimate, asked: Mapping[str, Objective]) -> dict[str, Difference]:
     """Of two rigs. What is required is looked at once and not in worlds, so that chance has no part in it."""
     found = one.differences(other)
-    for name in (name for name, each in asked.items() if each.requires):
+    for name in (name for name, each in asked.items() if each.requirement):
         value = found[name].value
         differs = abs(value) > ROUND_OFF
         p = 0.0 if differs else 1.0
@@ -203,15 +214,15 @@ def _differences(one: Estimate, other: Estimate, asked: Mapping[str, Objective])
     return found
 
 
-def adjust_holm(p: Sequence[float]) -> list[float]:
+def adjust_holm(p_values: Sequence[float]) -> list[float]:
     """Of each probability, what it is with all others looked at (Holm 1979); what is unknown stays so, and counts not.
 
     Example:
         >>> adjust_holm([0.02, 0.001, math.nan, 0.9])
         [0.04, 0.003, nan, 0.9]
     """
-    known = sorted((one, at) for at, one in enumerate(p) if not math.isnan(one))
-    adjusted, least = [math.nan] * len(p), 0.0
+    known = sorted((one, at) for at, one in enumerate(p_values) if not math.isnan(one))
+    adjusted, least = [math.nan] * len(p_values), 0.0
     for rank, (one, at) in enumerate(known):
         least = adjusted[at] = max(least, min((len(known) - rank) * one, 1.0))
     return adjusted
@@ -221,18 +232,20 @@ def _others(asked: Mapping[str, Objective], *, failures: bool) -> tuple[dict[str
     """Return further numbers to test, by their words, and the names of those that each objective is the mean of."""
     found, parts = dict[str, Objective](), dict[str, list[str]]()
     for name, objective in asked.items():
-        if name.startswith(NOT_WORSE) or len(objective.places) < 2:
+        if name.startswith(NOT_WORSE) or len(objective.region_bands) < 2:
             continue
-        each = {one.words: one for one in objective.parts}
+        each = {one.description: one for one in objective.parts}
         found, parts[name] = found | each, list(each)
     own = {region for objective in asked.values() if isinstance(objective.region, dict) for region in objective.region}
     plain = detection(THRESHOLD_M).key
     for region in RegionsOfInterest().around(ANY_OUTLINE_M).regions:
         for band in PAPER_HEIGHTS if region.name not in own else ():
             one = Objective(region=region.name, band=band)
-            found[one.words] = one
+            found[one.description] = one
             if failures:
-                found[f"{one.words}, any one sensor failed"] = one.model_copy(update={"number": f"{plain}_without_any"})
+                found[f"{one.description}, any one sensor failed"] = one.model_copy(
+                    update={"number": f"{plain}_without_any"}
+                )
     return {name: one for name, one in found.items() if name not in asked}, parts
 
 
@@ -257,38 +270,38 @@ def _of_targets(rig: Rig, start: Rig, searched: CommonFrames) -> dict[str, Diffe
     return found
 
 
-def signed_words(test: Difference) -> str:
+def format_signed_difference(difference: Difference) -> str:
     """A difference with its interval and no unit, its sign turned so that more is better."""
-    if test.quantity.lower_is_better:
-        test = test._replace(value=-test.value, low=-test.high, high=-test.low)
-    return difference_words(test)
+    if difference.quantity.lower_is_better:
+        difference = difference._replace(value=-difference.value, low=-difference.high, high=-difference.low)
+    return format_difference(difference)
 
 
-def format_gain(value: float, unit: str) -> str:
+def format_improvement(value: float, unit: str) -> str:
     """A gain without its unit: shares in percentage points.
 
     Example:
-        >>> format_gain(0.01234, "share"), format_gain(0.01234, "m")
+        >>> format_improvement(0.01234, "share"), format_improvement(0.01234, "m")
         ('+1.23', '+0.012')
     """
-    return f"{shown_unit(unit).factor * value:+.{2 if unit == 'share' else 3}f}"
+    return f"{get_display_unit(unit).factor * value:+.{2 if unit == 'share' else 3}f}"
 
 
-def unit_words(unit: str) -> str:
+def format_unit(unit: str) -> str:
     """What stands behind it."""
     return "points" if unit == "share" else unit
 
 
-def describe_gain(gain: HeldOutGain, *, optimism: bool = False) -> str:
+def describe_improvement(improvement: HeldOutImprovement, *, optimism: bool = False) -> str:
     """Describe an improvement; it is called one only if it is significant by Student's t at 95 %."""
-    test, unit = gain.test, gain.test.quantity.unit
+    test, unit = improvement.difference, improvement.difference.quantity.unit
     if math.isnan(test.value):
         return "unknown in the held-out worlds"
-    t = "t unknown" if math.isnan(gain.t) else f"t {gain.t:.1f}"
+    t = "t unknown" if math.isnan(improvement.t_statistic) else f"t {improvement.t_statistic:.1f}"
     where = f"on {test.blocks} held-out worlds ({t}, better in {test.better})"
-    rest = f"{gain.words} {unit_words(unit)} {'in any world' if test.low == test.high else where}"
-    if optimism and not math.isnan(gain.optimism):
-        rest += f", optimism {format_gain(gain.optimism, unit)}"
+    rest = f"{improvement.description} {format_unit(unit)} {'in any world' if test.low == test.high else where}"
+    if optimism and not math.isnan(improvement.optimism):
+        rest += f", optimism {format_improvement(improvement.optimism, unit)}"
     if test.significant:
         return f"{'gained' if test.gain > 0 else 'lost'} {rest}"
     return f"no gain is shown: {rest}"

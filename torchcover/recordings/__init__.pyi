@@ -5,7 +5,7 @@ from .formats import RecordingFormat as RecordingFormat
 from .formats import open_recording as open_recording
 from .formats import read_objects as read_objects
 from .recorded_frames import RecordedFrames as RecordedFrames
-from .recorded_frames import reference_of_recording as reference_of_recording
+from .recorded_frames import create_reference as create_reference
 from .recorders import RECORDERS as RECORDERS
 from .recording import Recording as Recording
 from .recording import Scan as Scan

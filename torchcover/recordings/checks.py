@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 
 from torchcover.detection import Boxes, points_in_boxes
 from torchcover.neighbors import nearest
-from torchcover.recordings.ground_model import GroundModel, low_surfaces
-from torchcover.recordings.in_vehicle import in_vehicle
+from torchcover.recordings.ground_model import GroundModel, extract_low_surfaces
+from torchcover.recordings.in_vehicle import transform_to_vehicle
 from torchcover.recordings.pose_checks import (
     check_frozen_poses,
     check_pose_conventions,
-    check_pose_jumps,
-    read_stretches,
+    check_pose_discontinuities,
+    read_pose_segments,
 )
-from torchcover.recordings.recording import Recording, whole_recording
+from torchcover.recordings.recording import Recording, read_complete_manifest
 from torchcover.recordings.reference import AccumulatedReference, RecordedReference, Reference
 
 Cloud = NDArray[np.float32]
@@ -37,15 +37,15 @@ class CheckParams:
         max_median_range_cm: Above this median range the unit is millimeters rather than centimeters.
         ground_radius_m: Ground is searched around the vehicle within this distance.
         max_ground_offset_m: Half of the lowest height band; ground beyond is in another band.
-        identical_m: Points nearer than this are the same point.
+        max_identical_distance_m: Points nearer than this are the same point.
         min_cloud_points: Smaller clouds may be alike by chance.
         num_identical_queries: Points that are compared, sampled at random.
-        box_range_m: Boxes of nearer objects have points.
-        box_foot_m: Height at the foot of a box that may be ground.
+        max_box_range_m: Boxes of nearer objects have points.
+        box_bottom_margin_m: Height at the foot of a box that may be ground.
         min_box_points: Points that a box needs to decide about mirrored axes.
-        box_ratio: A box is fuller one way if it has this many times the points of the other way.
+        min_point_count_ratio: A box is fuller one way if it has this many times the points of the other way.
         min_mirrored_boxes: Boxes that have to be fuller mirrored.
-        mirrored_ratio: Mirrored boxes have to be this many times those that are right.
+        min_mirrored_ratio: Mirrored boxes have to be this many times those that are right.
         min_mirrored_share: Share of all boxes that have to be fuller mirrored.
     """
 
@@ -55,15 +55,15 @@ class CheckParams:
     max_median_range_cm: float = 4000.0
     ground_radius_m: float = 30.0
     max_ground_offset_m: float = 0.5
-    identical_m: float = 1e-3
+    max_identical_distance_m: float = 1e-3
     min_cloud_points: int = 100
     num_identical_queries: int = 1000
-    box_range_m: float = 40.0
-    box_foot_m: float = 0.3
+    max_box_range_m: float = 40.0
+    box_bottom_margin_m: float = 0.3
     min_box_points: int = 5
-    box_ratio: int = 5
+    min_point_count_ratio: int = 5
     min_mirrored_boxes: int = 5
-    mirrored_ratio: int = 4
+    min_mirrored_ratio: int = 4
     min_mirrored_share: float = 0.6
 
 
@@ -94,21 +94,21 @@ def check_recording(
         check_ground_offset(clouds),
         *(check_mirrored_axis(sensor, frames) for sensor in clouds),
         *(check_identical_clouds(rig, sensors, recorded, frames) for rig, sensors in rigs.items()),
-        check_silent_sensors(clouds),
+        check_empty_clouds(clouds),
         check_missing_labels(recording, num_frames),
     ]
-    stretches = list(read_stretches(recording, num_frames))
+    stretches = list(read_pose_segments(recording, num_frames))
     pose_fault = check_frozen_poses(stretches) or check_pose_conventions(recording, stretches, widest)
-    faults.append(pose_fault or check_pose_jumps(recording, stretches))
+    faults.append(pose_fault or check_pose_discontinuities(recording, stretches))
     if isinstance(reference, AccumulatedReference):
-        faults.append(check_standing_vehicle(recording, reference, judged, num_frames))
+        faults.append(check_stationary_vehicle(recording, reference, judged, num_frames))
     return [f"{recording.path}: {fault}" for fault in faults if fault is not None]
 
 
 def check_units(recording: Recording, sensor: str) -> str | None:
     """Check whether coordinates are too large for meters."""
     try:
-        range_m = np.linalg.norm(recording.scan(sensor, recording.frames[0]).points_m, axis=1)
+        range_m = np.linalg.norm(recording.read_scan(sensor, recording.key_frames[0]).points_m, axis=1)
     except (OSError, ValueError, IndexError):
         return None
     median_m = float(np.median(np.append(range_m[np.isfinite(range_m)], 0.0)))
@@ -139,8 +139,8 @@ def estimate_ground_height(points_m: NDArray[np.floating]) -> float | None:
     """Estimate the height in m of the ground below the origin; None where no ground is measured near it."""
     near_m = points_m[(np.abs(points_m) < PARAMS.ground_radius_m).all(axis=1)].astype(np.float64)
     origin_m = np.zeros((1, 3))
-    ground = GroundModel.below([low_surfaces(near_m, origin_m[0])], origin_m[0])
-    above_m = np.nan if ground is None else float(ground.heights_m(origin_m)[0])
+    ground = GroundModel.from_surfaces([extract_low_surfaces(near_m, origin_m[0])], origin_m[0])
+    above_m = np.nan if ground is None else float(ground.compute_heights_m(origin_m)[0])
     return None if np.isnan(above_m) else -above_m
 
 
@@ -150,18 +150,20 @@ def check_mirrored_axis(sensor: str, frames: Sequence["CheckedFrame"]) -> str | 
     for frame in frames:
         if frame.boxes is None:
             continue
-        is_near = torch.linalg.vector_norm(frame.boxes.centre_m[:, :2], dim=1) < PARAMS.box_range_m
+        is_near = torch.linalg.vector_norm(frame.boxes.centre_m[:, :2], dim=1) < PARAMS.max_box_range_m
         rows = frame.boxes.rows[is_near].clone()
-        rows[:, 2] += PARAMS.box_foot_m / 2
-        rows[:, 5] -= PARAMS.box_foot_m
+        rows[:, 2] += PARAMS.box_bottom_margin_m / 2
+        rows[:, 5] -= PARAMS.box_bottom_margin_m
         boxes = Boxes.from_rows(rows[rows[:, 5] > 0])
         num_boxes += len(boxes)
         points_m = frame.clouds[sensor]
         counts = _count_in_boxes(points_m, boxes)
         mirrored = _count_in_boxes(points_m * np.array([1, -1, 1], np.float32), boxes)
-        fuller += int((counts >= (PARAMS.box_ratio * mirrored).clamp(min=PARAMS.min_box_points)).sum())
-        fuller_mirrored += int((mirrored >= (PARAMS.box_ratio * counts).clamp(min=PARAMS.min_box_points)).sum())
-    needed = (PARAMS.min_mirrored_boxes, PARAMS.mirrored_ratio * fuller, PARAMS.min_mirrored_share * num_boxes)
+        fuller += int((counts >= (PARAMS.min_point_count_ratio * mirrored).clamp(min=PARAMS.min_box_points)).sum())
+        fuller_mirrored += int(
+            (mirrored >= (PARAMS.min_point_count_ratio * counts).clamp(min=PARAMS.min_box_points)).sum()
+        )
+    needed = (PARAMS.min_mirrored_boxes, PARAMS.min_mirrored_ratio * fuller, PARAMS.min_mirrored_share * num_boxes)
     if fuller_mirrored < max(needed):
         return None
     return (
@@ -171,29 +173,29 @@ def check_mirrored_axis(sensor: str, frames: Sequence["CheckedFrame"]) -> str | 
 
 
 def check_identical_clouds(
-    rig: str, sensors: Sequence[str], recorded: Sequence[str], frames: Sequence["CheckedFrame"]
+    rig_name: str, sensors: Sequence[str], reference_sensors: Sequence[str], frames: Sequence["CheckedFrame"]
 ) -> str | None:
     """Check whether all reference points are points of the rig: then every radius is 0 m."""
     compared = 0
     for frame in frames:
-        reference_m, cloud_m = frame.join(recorded), frame.join(sensors)
+        reference_m, cloud_m = frame.join_clouds(reference_sensors), frame.join_clouds(sensors)
         if len(reference_m) < PARAMS.min_cloud_points:
             continue
         # Sampled at random: every n-th point may be one of the same laser.
         chosen = np.random.default_rng(0).integers(len(reference_m), size=PARAMS.num_identical_queries)
         query, points = torch.from_numpy(reference_m[chosen]), torch.from_numpy(cloud_m)
-        if not bool(nearest(query, points, max_distance=PARAMS.identical_m).distance.isfinite().all()):
+        if not bool(nearest(query, points, max_distance=PARAMS.max_identical_distance_m).distance.isfinite().all()):
             return None
         compared += 1
     if not compared:
         return None
     return (
-        f"the reference points are those of the rig {rig} itself, so that it must look perfect: give another "
+        f"the reference points are those of the rig {rig_name} itself, so that it must look perfect: give another "
         "sensor as the reference, or accumulate one (--reference accumulated)"
     )
 
 
-def check_silent_sensors(clouds: Mapping[str, Sequence[Cloud]]) -> str | None:
+def check_empty_clouds(clouds: Mapping[str, Sequence[Cloud]]) -> str | None:
     """Check whether sensors have no point in some frames."""
     empty = {sensor: sum(not len(cloud) for cloud in frames) for sensor, frames in clouds.items()}
     silent = [f"{sensor} has no point in {count} of {len(clouds[sensor])}" for sensor, count in empty.items() if count]
@@ -209,17 +211,17 @@ def check_missing_labels(recording: Recording, num_frames: int) -> str | None:
     """Check whether a recording with labels has none in any frame; a complete one of torchcover may have none."""
     try:
         positions = _spread(num_frames, PARAMS.num_label_frames)
-        labels = [recording.boxes(recording.frames[position]) for position in positions]
+        labels = [recording.read_boxes(recording.key_frames[position]) for position in positions]
     except (OSError, ValueError):
         return None
-    is_complete = recording.path.is_dir() and whole_recording(recording.path) is not None
+    is_complete = recording.path.is_dir() and read_complete_manifest(recording.path) is not None
     if not labels or is_complete or any(boxes is None or len(boxes) for boxes in labels):
         return None
     return f"it has labels, and none in {len(labels)} frames: do their names and times match those of its clouds?"
 
 
-def check_standing_vehicle(
-    recording: Recording, reference: AccumulatedReference, judged: Sequence[str], num_frames: int
+def check_stationary_vehicle(
+    recording: Recording, reference: AccumulatedReference, evaluated_sensors: Sequence[str], num_frames: int
 ) -> str | None:
     """Check whether accumulation windows hold too little time, or too little motion of a rig's own reference."""
     times_s = recording.times_s
@@ -232,8 +234,8 @@ def check_standing_vehicle(
             f"its instants are {interval_s:g} s apart, and a window of {reference.window_s:g} s holds one only: are "
             "the times in seconds? Else take a longer window (--set recording.window_s=SECONDS)"
         )
-    frames = list(recording.frames)[:num_frames]
-    standing = sum(reference.is_standing(recording, frame, judged) for frame in frames)
+    frames = list(recording.key_frames)[:num_frames]
+    standing = sum(reference.is_stationary(recording, frame, evaluated_sensors) for frame in frames)
     absent = "so there is no coverage" if standing == len(frames) else "which count nowhere"
     still = (
         f"the vehicle moves less than {reference.min_motion_m:g} m within {reference.window_s:g} s in {standing} of "
@@ -259,19 +261,20 @@ class CheckedFrame:
     clouds: dict[str, Cloud]
     boxes: Boxes | None
 
-    def join(self, sensors: Sequence[str]) -> Cloud:
+    def join_clouds(self, sensors: Sequence[str]) -> Cloud:
         """Join the clouds of some sensors to (N, 3) points."""
         return np.concatenate([np.empty((0, 3), np.float32), *(self.clouds[sensor] for sensor in sensors)])
 
 
 def _read_frames(recording: Recording, sensors: Sequence[str], num_frames: int) -> Iterator[CheckedFrame]:
     for position in _spread(num_frames, PARAMS.num_frames):
-        instant = recording.frames[position]
+        instant = recording.key_frames[position]
         try:
             clouds = {
-                sensor: in_vehicle(recording.scan(sensor, instant), recording.body).points_m for sensor in sensors
+                sensor: transform_to_vehicle(recording.read_scan(sensor, instant), recording.ego_box).points_m
+                for sensor in sensors
             }
-            yield CheckedFrame(clouds, recording.boxes(instant))
+            yield CheckedFrame(clouds, recording.read_boxes(instant))
         except (OSError, ValueError):
             continue
 

@@ -17,7 +17,7 @@ from torchcover.recordings.settings import RecordingSettings
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
 
 
-class Corrected:
+class CorrectedRecording:
     """A recording whose points, poses and times are corrected; other attributes are those of the recording."""
 
     def __init__(self, recording: Recording, settings: RecordingSettings) -> None:
@@ -28,32 +28,34 @@ class Corrected:
             raise AttributeError(name)
         return getattr(self.recording, name)
 
-    def scan(self, sensor: str, index: int) -> Scan:
+    def read_scan(self, sensor: str, index: int) -> Scan:
         """What the recording has, put right. ValueError: a LAS file says its unit, and a unit is set, too."""
-        scan, columns = self.recording.scan(sensor, index), ["xyz".index(axis) for axis in self.settings.axes]
+        scan, columns = self.recording.read_scan(sensor, index), ["xyz".index(axis) for axis in self.settings.axes]
         unit, path = self.settings.units, Path(scan.source)
         if unit != "m" and path.suffix.lower() in (".las", ".laz") and (read_las_scale(path) != 1.0).any():
             raise ValueError(f"{path}: it is converted to meters, as the file says; leave out recording.units={unit}")
         return replace(scan, points_m=scan.points_m[:, columns] * METRES[unit])
 
-    def world_T_vehicle(self, index: int) -> Matrix | None:
+    def get_world_T_vehicle(self, index: int) -> Matrix | None:
         """Where the vehicle was, put right."""
         return None if self._poses is None else self._poses[index]
 
     @cached_property
     def _poses(self) -> Matrix | None:
-        poses = [self.recording.world_T_vehicle(instant) for instant in range(len(self.recording.names))]
+        poses = [self.recording.get_world_T_vehicle(instant) for instant in range(len(self.recording.frame_names))]
         if any(pose is None for pose in poses):
             return None
         times_s = self.recording.times_s
-        if times_s is None and (self.settings.lag_s or self.settings.poses == "held"):
-            raise ValueError(f"{self.recording.path}: {self.settings.words} needs the times of its instants")
+        if times_s is None and (self.settings.time_offset_s or self.settings.poses == "held"):
+            raise ValueError(
+                f"{self.recording.path}: {self.settings.command_line_options} needs the times of its instants"
+            )
         return correct_poses(np.array(poses), np.arange(0.0, len(poses)) if times_s is None else times_s, self.settings)
 
 
 def correct_recording(recording: Recording, settings: RecordingSettings) -> Recording:
     """Return a recording with the corrections of its settings; the same one if there are none."""
-    corrected: Any = Corrected(recording, settings)  # has the attributes of the recording, too
+    corrected: Any = CorrectedRecording(recording, settings)  # has the attributes of the recording, too
     result: Recording = corrected if settings.corrections else recording
     return result
 
@@ -69,9 +71,9 @@ def correct_poses(world_T_vehicle: Matrix, times_s: NDArray[np.float64], setting
     elif settings.poses == "yx":
         poses[:, :3, 3] = poses[:, [1, 0, 2], 3]
     new = np.append(True, (np.diff(poses, axis=0) != 0).any(axis=(1, 2)) | (settings.poses != "held"))
-    if (settings.poses != "held" and not settings.lag_s) or new.sum() < 2:
+    if (settings.poses != "held" and not settings.time_offset_s) or new.sum() < 2:
         return poses
-    known, known_s, wanted_s = poses[new], times_s[new], times_s + settings.lag_s
+    known, known_s, wanted_s = poses[new], times_s[new], times_s + settings.time_offset_s
     after = np.searchsorted(known_s, wanted_s, side="right").clip(1, len(known) - 1)
     share = ((wanted_s - known_s[after - 1]) / np.diff(known_s)[after - 1])[:, None]
     angles_deg, places_m = geometry.euler_from_rotation(known[:, :3, :3]), known[:, :3, 3]

@@ -12,7 +12,7 @@ from torchcover.geometry.rigid import Matrix
 
 Float64 = NDArray[np.float64]
 # The sensor and the instant of a scan.
-Key = tuple[str, int]
+ScanKey = tuple[str, int]
 Kernel = Callable[..., None]
 
 # Bins of a fine image: 0.2 degrees across, and 0.25 degrees up at the horizon, even in the sine of the elevation. Of a
@@ -29,13 +29,13 @@ class RangeImage(NamedTuple):
     Below are `first_row` rows that nothing hit; `sensor_T_local` is from the frame in which places are given.
     """
 
-    free_m: NDArray[np.float32]
+    free_range_m: NDArray[np.float32]
     first_row: int
     sensor_T_local: Matrix
-    farthest_m: float
+    max_free_range_m: float
 
     @classmethod
-    def of(cls, points_m: NDArray[np.floating], sensor_T_local: Matrix) -> "RangeImage":
+    def from_points(cls, points_m: NDArray[np.floating], sensor_T_local: Matrix) -> "RangeImage":
         """Of the (N, 3) points that a scan has returned, in the frame of its sensor."""
         row, column, range_m = _bins(points_m.astype(np.float64), 1)
         if not len(row):
@@ -53,29 +53,31 @@ class RangeImage(NamedTuple):
         free_m = np.where(hit[1:-1, 1:-1], np.maximum((around_m - BEYOND_M) / (1 + BEYOND), 0.0), 0.0)
         return cls(free_m.astype(np.float32), int(low), sensor_T_local, float(free_m.max()))
 
-    def vote(self, points_m: Float64, votes: NDArray[np.int16], vote: int = 1) -> None:
+    def add_votes(self, points_m: Float64, votes: NDArray[np.int16], increment: int = 1) -> None:
         """Add to the (N,) votes of the (N, 3) places that lie in free space."""
-        compiled_or(vote_by_arrays)(points_m, *self, votes, vote)
+        get_fastest_kernel(count_votes_by_arrays)(points_m, *self, votes, increment)
 
 
-class Votes:
+class FreeSpaceCounter:
     """How many scans see past each point of others; only scans that come or go are looked through again."""
 
     def __init__(self) -> None:
-        self._counted: dict[Key, tuple[NDArray[np.int16], frozenset[Key]]] = {}
-        self._images: dict[Key, RangeImage] = {}
+        self._counted: dict[ScanKey, tuple[NDArray[np.int16], frozenset[ScanKey]]] = {}
+        self._images: dict[ScanKey, RangeImage] = {}
 
-    def of(self, scans: Mapping[Key, Float64], images: Mapping[Key, RangeImage]) -> dict[Key, NDArray[np.int16]]:
+    def update(
+        self, scans: Mapping[ScanKey, Float64], images: Mapping[ScanKey, RangeImage]
+    ) -> dict[ScanKey, NDArray[np.int16]]:
         """(N,) votes of the (N, 3) places of each scan."""
         known = {**self._images, **images}
-        counted: dict[Key, tuple[NDArray[np.int16], frozenset[Key]]] = {}
+        counted: dict[ScanKey, tuple[NDArray[np.int16], frozenset[ScanKey]]] = {}
         wanted = frozenset(images)
         for key, points_m in scans.items():
-            votes, given = self._counted.get(key, (np.zeros(len(points_m), np.int16), frozenset[Key]()))
+            votes, given = self._counted.get(key, (np.zeros(len(points_m), np.int16), frozenset[ScanKey]()))
             if len(given ^ wanted) > len(wanted):
-                votes, given = np.zeros(len(points_m), np.int16), frozenset[Key]()
+                votes, given = np.zeros(len(points_m), np.int16), frozenset[ScanKey]()
             for other in given ^ wanted:
-                known[other].vote(points_m, votes, 1 if other in wanted else -1)
+                known[other].add_votes(points_m, votes, 1 if other in wanted else -1)
             counted[key] = votes, wanted
         self._counted, self._images = counted, dict(images)
         return {key: votes for key, (votes, _) in counted.items()}
@@ -95,29 +97,29 @@ def _bins(points_m: Float64, times: int) -> tuple[NDArray[np.int64], NDArray[np.
     return np.minimum(row, ROWS - 1) // times, column % COLUMNS // times, range_m
 
 
-def vote_by_arrays(
+def count_votes_by_arrays(
     points_m: Float64,
-    free_m: NDArray[np.float32],
+    free_range_m: NDArray[np.float32],
     first_row: int,
     sensor_T_local: Matrix,
-    farthest_m: float,
+    max_free_range_m: float,
     votes: NDArray[np.int16],
-    vote: int,
+    increment: int,
 ) -> None:
     """`RangeImage.vote` where numba is missing."""
-    row, column, range_m = _bins(transform(sensor_T_local, points_m), COLUMNS // free_m.shape[1])
-    inside = np.flatnonzero((range_m < farthest_m) & (row >= first_row) & (row < first_row + len(free_m)))
-    votes[inside[range_m[inside] < free_m[row[inside] - first_row, column[inside]]]] += vote
+    row, column, range_m = _bins(transform(sensor_T_local, points_m), COLUMNS // free_range_m.shape[1])
+    inside = np.flatnonzero((range_m < max_free_range_m) & (row >= first_row) & (row < first_row + len(free_range_m)))
+    votes[inside[range_m[inside] < free_range_m[row[inside] - first_row, column[inside]]]] += increment
 
 
 @cache
-def compiled_or(by_arrays: Kernel) -> Kernel:
+def get_fastest_kernel(array_kernel: Kernel) -> Kernel:
     """The compiled loop that does what a function over arrays does; the function where numba is missing."""
     try:
         from torchcover.recordings import loops
     except ImportError:
-        return by_arrays
-    loop: Kernel = getattr(loops, by_arrays.__name__.replace("arrays", "loop"))
+        return array_kernel
+    loop: Kernel = getattr(loops, array_kernel.__name__.replace("arrays", "loop"))
     return loop
 
 
@@ -138,16 +140,16 @@ A1, A3, A5, A7, A9, TINY = 0.9998660, -0.3302995, 0.1801410, -0.0851330, 0.02083
 NEIGHBOURS, WIDEST_M = 8, 3.0
 
 
-def seen_share(points_m: Float64, body: BoundingBox, voxel_m: float, seed: int) -> Float64:
+def estimate_visible_share(points_m: Float64, ego_box: BoundingBox, voxel_m: float, seed: int) -> Float64:
     """(N,) share of places around the vehicle, which hides what is behind it, that see each of (N, 3) points.
 
     Where the points are near each other, it is by `voxel_m`. They are in the vehicle frame; the seed is of the places.
     """
-    seen, corners_m = np.zeros(len(points_m)), np.array([body.lower_m, body.upper_m])
+    seen, corners_m = np.zeros(len(points_m)), np.array([ego_box.lower_m, ego_box.upper_m])
     reach_m = np.append(np.inf, FILLED * voxel_m / (BINS_RAD[1:] / 2))
-    for place_m in _places_m(body, seed):
+    for place_m in _places_m(ego_box, seed):
         hidden = np.zeros(len(points_m), np.bool_)
-        compiled_or(hide_by_arrays)(points_m, place_m, corners_m, BINS_RAD, reach_m, hidden)
+        get_fastest_kernel(mark_hidden_by_arrays)(points_m, place_m, corners_m, BINS_RAD, reach_m, hidden)
         seen += ~hidden
     return seen / PLACES
 
@@ -177,20 +179,25 @@ def _places_m(body: BoundingBox, seed: int) -> Float64:
     return np.asarray(places_m[outside[:PLACES]])
 
 
-def hide_by_arrays(
-    points_m: Float64, place_m: Float64, body_m: Float64, bins_rad: Float64, reach_m: Float64, hidden: NDArray[np.bool_]
+def mark_hidden_by_arrays(
+    points_m: Float64,
+    viewpoint_m: Float64,
+    box_corners_m: Float64,
+    bin_sizes_rad: Float64,
+    max_occluder_ranges_m: Float64,
+    hidden: NDArray[np.bool_],
 ) -> None:
     """Mark the points that a body, or others at any size of bins, hide from a place, where numba is missing."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        one, other = (body_m - place_m)[:, None] / (points_m - place_m)
+        one, other = (box_corners_m - viewpoint_m)[:, None] / (points_m - viewpoint_m)
     enters, leaves = np.fmin(one, other).max(axis=1), np.fmax(one, other).min(axis=1)
     hidden |= (enters < leaves) & (leaves > 0) & (enters < 1)
-    x, y, z = (points_m - place_m).T
+    x, y, z = (points_m - viewpoint_m).T
     flat_m = np.sqrt(x * x + y * y)
     range_m = np.sqrt(flat_m * flat_m + z * z)
     up, over = _angle_rad(z, flat_m) + np.pi / 2, _angle_rad(z + OVER_M, flat_m) + np.pi / 2
     across = _angle_rad(y, x) + np.pi
-    for bin_rad, near_m in zip(bins_rad, reach_m, strict=True):
+    for bin_rad, near_m in zip(bin_sizes_rad, max_occluder_ranges_m, strict=True):
         columns = int(2 * np.pi / bin_rad) + 1
         column = (across / bin_rad).astype(np.int64)
         number, above = ((angle / bin_rad).astype(np.int64) * columns + column for angle in (up, over))

@@ -53,27 +53,27 @@ SIDE = int(2 * AROUND_M / NODE_M) + 2 * REACH + 1
 
 
 class GroundModel(NamedTuple):
-    """The ground around a place, made as this module says: a `field` of heights from `lower_m` (2,) on.
+    """The ground around a place, made as this module says: a `height_field` of heights from `corner_m` (2,) on.
 
-    In the frame of the points that it was made of. In the `known` (SIDE^2,) squares, row after row along y, there is a
+    In the frame of the points that it was made of. In the `observed` (SIDE^2,) squares, row after row along y, there is a
     height; they begin `REACH` before that.
     """
 
-    lower_m: Float64
-    field: HeightField
-    known: Bools
+    corner_m: Float64
+    height_field: HeightField
+    observed: Bools
 
     @classmethod
-    def below(cls, surfaces: Sequence[Float64], place_m: Float64) -> "GroundModel | None":
+    def from_surfaces(cls, surfaces: Sequence[Float64], vehicle_position_m: Float64) -> "GroundModel | None":
         """The ground that sweeps have seen around a place.
 
-        `surfaces`: `low_surfaces` of each sweep; `place_m`: (3,) where the vehicle is. Returns it; None where none of
+        `surfaces`: `low_surfaces` of each sweep; `vehicle_position_m`: (3,) where the vehicle is. Returns it; None where none of
         it is near the vehicle.
         """
-        low, above_m = _columns(np.concatenate([np.empty((0, 4)), *surfaces]), place_m)
+        low, above_m = _columns(np.concatenate([np.empty((0, 4)), *surfaces]), vehicle_position_m)
         if not len(low):
             return None
-        lower_m = place_m[:2] - AROUND_M
+        lower_m = vehicle_position_m[:2] - AROUND_M
         stands = above_m - low[:, 2] < STANDS_M[1]
         clear = np.flatnonzero(~_beside_what_stands(low, stands, lower_m)[~stands])
         across_m, heights_m = low[~stands, :2] - lower_m, low[~stands, 2]
@@ -84,7 +84,7 @@ class GroundModel(NamedTuple):
         size_m = low[:, :2].max(axis=0) - lower_m - first_m
         chosen = clear[_a_fifth_below(square[clear], heights_m[clear])]
         for _ in range(2):
-            found = _connected(square[chosen], heights_m[chosen] - place_m[2])
+            found = _connected(square[chosen], heights_m[chosen] - vehicle_position_m[2])
             chosen = chosen[found[square[chosen]]]
             if len(chosen) < FEWEST:
                 return None
@@ -99,23 +99,23 @@ class GroundModel(NamedTuple):
         known[square[chosen][:, None] + _around()[0]] = True
         return cls(lower_m, field._replace(lower_m=field.lower_m + first_m), known)
 
-    def heights_m(self, points_m: NDArray[np.floating]) -> Float64:
+    def compute_heights_m(self, points_m: NDArray[np.floating]) -> Float64:
         """(N,) how high above the ground (N, 3) points are, below it less than 0; NaN where that is unknown."""
-        across_m = points_m[:, :2] - self.lower_m
+        across_m = points_m[:, :2] - self.corner_m
         heights_m = np.full(len(points_m), np.nan)
         inside = np.flatnonzero(((across_m >= 0) & (across_m < 2 * AROUND_M)).all(axis=1))
-        inside = inside[self.known[_squares(across_m[inside])]]
-        heights_m[inside] = points_m[inside, 2] - self.field.heights_m(across_m[inside])
+        inside = inside[self.observed[_squares(across_m[inside])]]
+        heights_m[inside] = points_m[inside, 2] - self.height_field.heights_m(across_m[inside])
         return heights_m
 
 
-def low_surfaces(points_m: Float64, place_m: Float64) -> Float64:
+def extract_low_surfaces(points_m: Float64, vehicle_position_m: Float64) -> Float64:
     """What a sweep says about the ground: much less than all of its points, (N, 3) of nothing that moves.
 
-    The vehicle was at `place_m` (3,) in the same frame, whose z points up. Returns (K, 4) places of the low surfaces of
+    The vehicle was at `vehicle_position_m` (3,) in the same frame, whose z points up. Returns (K, 4) places of the low surfaces of
     columns with the number of their points, and the lowest of what stands or hangs above each, as one point.
     """
-    low, above_m = _columns(np.column_stack([points_m, np.ones(len(points_m))]), place_m)
+    low, above_m = _columns(np.column_stack([points_m, np.ones(len(points_m))]), vehicle_position_m)
     below = np.isfinite(above_m)
     above = np.column_stack([low[below, :2], above_m[below], np.ones(np.count_nonzero(below))])
     return np.concatenate([low, above])

@@ -16,23 +16,23 @@ from torchcover.recordings.recording import NO_RETURN_M, Scan
 MAX_COORDINATE_M = 1e5
 
 
-class InVehicle(NamedTuple):
+class VehicleCloud(NamedTuple):
     """A cloud of N points in the vehicle frame: what each counts for, and its height above the local ground, if known.
 
-    A height is NaN where there is no ground at or below. `dropped` says how many points were left out: `nonfinite`,
+    A height is NaN where there is no ground at or below. `excluded_counts` says how many points were left out: `nonfinite`,
     `no_return`, `own_vehicle`; of an accumulated reference also `gone`, those of objects that are not labelled then.
     """
 
     points_m: NDArray[np.float32]
-    dropped: Counter[str]
+    excluded_counts: Counter[str]
     weights: NDArray[np.float32] | None = None
     heights_m: NDArray[np.float32] | None = None
 
 
-def in_vehicle(scan: Scan, body: BoundingBox | None = None) -> InVehicle:
+def transform_to_vehicle(scan: Scan, ego_box: BoundingBox | None = None) -> VehicleCloud:
     """Move a scan into the vehicle frame; leave out what no surface of the world has returned.
 
-    `scan`: what was stored; `body`: the vehicle itself: points in it are its own. None: its size is unknown.
+    `scan`: what was stored; `ego_box`: the vehicle itself: points in it are its own. None: its size is unknown.
     ValueError: a coordinate beyond 1e5 m, as in a world frame.
     """
     points_m, weights, heights_m = scan.points_m, scan.weights, scan.heights_m
@@ -51,31 +51,31 @@ def in_vehicle(scan: Scan, body: BoundingBox | None = None) -> InVehicle:
         if scan.vehicle_T_sensor is not None:
             part_m = transform(scan.vehicle_T_sensor, part_m)
         farthest_m = max(farthest_m, float(part_m.max()), -float(part_m.min()))
-        if body is not None:
-            inside = within(part_m, body)
+        if ego_box is not None:
+            inside = find_points_in_box(part_m, ego_box)
             part_m = np.delete(part_m, inside, axis=0) if len(inside) else part_m
             own.append(rows.start + inside)
         with np.errstate(over="ignore"):  # see _check_range
             moved_m[count : count + len(part_m)] = part_m
         count += len(part_m)
     _check_range(farthest_m, scan.source)
-    if body is not None:
+    if ego_box is not None:
         dropped["own_vehicle"] = len(points_m) - count
     of_points = (
         None if values is None else np.delete(values, np.concatenate(own)).astype(np.float32)
         for values in (weights, heights_m)
     )
-    return InVehicle(moved_m[:count], dropped, *of_points)
+    return VehicleCloud(moved_m[:count], dropped, *of_points)
 
 
-def joined(clouds: Sequence[InVehicle]) -> InVehicle:
+def join_clouds(clouds: Sequence[VehicleCloud]) -> VehicleCloud:
     """Several clouds as one."""
     if len(clouds) == 1:
         return clouds[0]
-    dropped = sum((cloud.dropped for cloud in clouds), Counter[str]())
+    dropped = sum((cloud.excluded_counts for cloud in clouds), Counter[str]())
     weights = [cloud.weights for cloud in clouds if cloud.weights is not None]
     heights_m = [cloud.heights_m for cloud in clouds if cloud.heights_m is not None]
-    return InVehicle(
+    return VehicleCloud(
         np.concatenate([np.empty((0, 3), np.float32), *(cloud.points_m for cloud in clouds)]),
         dropped,
         np.concatenate(weights) if weights else None,
@@ -97,7 +97,7 @@ def _returned(points_m: Points) -> NDArray[np.bool_]:
     return returned
 
 
-def within(points_m: Points, box: BoundingBox) -> NDArray[np.intp]:
+def find_points_in_box(points_m: Points, box: BoundingBox) -> NDArray[np.intp]:
     """Numbers of the (N, 3) points in a box; across a vehicle there are the fewest to look at again."""
     x, y, z = points_m.T
     inside = np.flatnonzero((box.lower_m[1] < y) & (y < box.upper_m[1]))

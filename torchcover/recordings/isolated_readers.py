@@ -32,9 +32,9 @@ MCAP_INDEX_CODE = 0x07
 MCAP_INDEX_HEAD_BYTES = 15
 MCAP_INDEX_ENTRY = np.dtype([("time_ns", "<u8"), ("offset", "<u8")])
 
-Times = dict[str, NDArray[np.int64]]
+TimesByTopic = dict[str, NDArray[np.int64]]
 # Path, size in bytes and time of the last change of each file of a bag.
-Version = tuple[tuple[str, int, int], ...]
+FileVersion = tuple[tuple[str, int, int], ...]
 
 
 class _OpenBag(NamedTuple):
@@ -50,7 +50,7 @@ def find_ros1_files(path: Path) -> list[Path]:
     return [path] if path.name.endswith((ROS1_SUFFIX, f"{ROS1_SUFFIX}.active")) else []
 
 
-def name_remedy(path: Path) -> str:
+def find_repair_command(path: Path) -> str:
     """Say which command saves the messages of a damaged bag, or of one of its files."""
     name = next((file.name for file in sorted(path.glob("*")) if file.suffix in REMEDIES), path.name)
     command = REMEDIES.get(Path(name).suffix, "ros2 bag reindex {name}").format(name=name)
@@ -65,7 +65,9 @@ def _naming_remedy(path: Path) -> Iterator[None]:
         raise
     except Exception as error:
         reason = " ".join(str(error).split())[:MAX_REASON_CHARS]
-        raise ValueError(f"not readable as a bag ({type(error).__name__}: {reason}); {name_remedy(path)}") from error
+        raise ValueError(
+            f"not readable as a bag ({type(error).__name__}: {reason}); {find_repair_command(path)}"
+        ) from error
 
 
 @apart
@@ -165,7 +167,7 @@ def _open(path: Path) -> _OpenBag:
 
 
 @lru_cache(MAX_OPEN_BAGS)
-def _open_version(path: Path, _: Version) -> _OpenBag:
+def _open_version(path: Path, _: FileVersion) -> _OpenBag:
     try:
         from rosbags import rosbag1, rosbag2
     except ImportError as error:
@@ -180,30 +182,30 @@ def _open_version(path: Path, _: Version) -> _OpenBag:
     return _OpenBag(readers, bool(files))
 
 
-def _times_of_ros1(reader: Any) -> Times:  # noqa: ANN401  (rosbags has no types)
+def _times_of_ros1(reader: Any) -> TimesByTopic:  # noqa: ANN401  (rosbags has no types)
     times: dict[str, list[int]] = {}
     for connection in reader.connections:
         times.setdefault(connection.topic, []).extend(entry.time for entry in reader.indexes[connection.id])
     return {topic: np.array(times_ns, dtype=np.int64) for topic, times_ns in times.items()}
 
 
-def _times_of_ros2(reader: Any) -> Times:  # noqa: ANN401
+def _times_of_ros2(reader: Any) -> TimesByTopic:  # noqa: ANN401
     parts: dict[str, list[NDArray[np.int64]]] = {}
     for storage in getattr(reader.storage, "storages", [reader.storage]):
-        read: Callable[[Any], Times] = _times_of_database if storage.path.suffix == ".db3" else _times_of_mcap
+        read: Callable[[Any], TimesByTopic] = _times_of_database if storage.path.suffix == ".db3" else _times_of_mcap
         for topic, times_ns in read(storage).items():
             parts.setdefault(topic, []).append(times_ns)
     return {topic: np.concatenate(times_ns) for topic, times_ns in parts.items()}
 
 
-def _times_of_database(storage: Any) -> Times:  # noqa: ANN401
+def _times_of_database(storage: Any) -> TimesByTopic:  # noqa: ANN401
     topics = storage.dbconn.execute("SELECT id, name FROM topics").fetchall()
     rows = storage.dbconn.execute("SELECT topic_id, timestamp FROM messages").fetchall()
     table = np.array(rows, dtype=np.int64).reshape(-1, 2)
     return {str(name): table[table[:, 0] == number, 1] for number, name in topics}
 
 
-def _times_of_mcap(storage: Any) -> Times:  # noqa: ANN401
+def _times_of_mcap(storage: Any) -> TimesByTopic:  # noqa: ANN401
     topics = {one.id: one.topic for one in storage.connections}
     parts: dict[str, list[NDArray[np.int64]]] = {}
     for chunk in storage.chunks:
@@ -256,7 +258,7 @@ def read_feather(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
 
 
 @apart
-def laz_points(path: Path, points: int) -> dict[str, NDArray[Any]]:
+def read_laz_points(path: Path, num_points: int) -> dict[str, NDArray[Any]]:
     """(N, 3) int32 `xyz` as they are written in a LAZ file, of so many points."""
     try:
         import laspy
@@ -264,20 +266,22 @@ def laz_points(path: Path, points: int) -> dict[str, NDArray[Any]]:
     except ImportError as error:
         raise ImportError(f"{path}: LAZ needs laspy: pip install 'torchcover[las]'") from error
     with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False) as reader:
-        found = reader.read_points(points)
-    if len(found) != points:
-        raise ValueError(f"the header claims {points} points; {len(found)} are there")
+        found = reader.read_points(num_points)
+    if len(found) != num_points:
+        raise ValueError(f"the header claims {num_points} points; {len(found)} are there")
     return {"xyz": np.column_stack([found.X, found.Y, found.Z])}
 
 
 @apart
-def lzf_block(path: Path, start: int, compressed_bytes: int, plain_bytes: int) -> dict[str, NDArray[Any]]:
-    """Decompress the block of a file that begins at the byte `start`, into `plain` (plain_bytes,) uint8."""
+def decompress_lzf_block(
+    path: Path, start_byte: int, compressed_bytes: int, uncompressed_bytes: int
+) -> dict[str, NDArray[Any]]:
+    """Decompress the block of a file that begins at the byte `start_byte`, into `plain` (plain_bytes,) uint8."""
     import lzf
 
     with path.open("rb") as file:
-        file.seek(start)
-        plain = lzf.decompress(file.read(compressed_bytes), plain_bytes)
-    if plain is None or len(plain) != plain_bytes:
-        raise ValueError(f"the compressed block does not grow to the {plain_bytes} bytes that it claims")
+        file.seek(start_byte)
+        plain = lzf.decompress(file.read(compressed_bytes), uncompressed_bytes)
+    if plain is None or len(plain) != uncompressed_bytes:
+        raise ValueError(f"the compressed block does not grow to the {uncompressed_bytes} bytes that it claims")
     return {"plain": np.frombuffer(plain, np.uint8)}

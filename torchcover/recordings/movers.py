@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.recordings.free_space import compiled_or
+from torchcover.recordings.free_space import get_fastest_kernel
 
 Float64 = NDArray[np.float64]
 Cells = NDArray[np.int64]
@@ -28,7 +28,7 @@ TOGETHER_S, COMPARED_S = 0.31, 0.61
 WITHIN_M = 165.0
 
 
-class Moved(NamedTuple):
+class MovingCluster(NamedTuple):
     """Something that moves.
 
     `points_m`: (N, 3) where it is at the instant; `velocity_mps`: (2,) along x and y of the frame of the points.
@@ -38,17 +38,17 @@ class Moved(NamedTuple):
     velocity_mps: Float64
 
 
-def movers(scans_m: Sequence[Float64], apart_s: Float64) -> list[Moved]:
+def find_moving_clusters(scans_m: Sequence[Float64], times_s: Float64) -> list[MovingCluster]:
     """What moves, or has stood for a moment only.
 
-    `scans_m`: (N, 3) points of each scan that belong to nothing that stands; `apart_s`: (S,) when each scan was, from
+    `scans_m`: (N, 3) points of each scan that belong to nothing that stands; `times_s`: (S,) when each scan was, from
     the instant on; those of one time are one.
     """
-    found: list[Moved] = []
+    found: list[MovingCluster] = []
     # What one of several sensors sees is in no scan of the others.
-    apart_s, turn = np.unique(apart_s, return_inverse=True)
+    times_s, turn = np.unique(times_s, return_inverse=True)
     of_times = (
-        [each for each, of in zip(scans_m, turn, strict=True) if of == number] for number in range(len(apart_s))
+        [each for each, of in zip(scans_m, turn, strict=True) if of == number] for number in range(len(times_s))
     )
     scans_m = [np.concatenate(of_time) for of_time in of_times]
     if sum(map(len, scans_m)) < FEWEST or len(scans_m) < 2:
@@ -58,10 +58,10 @@ def movers(scans_m: Sequence[Float64], apart_s: Float64) -> list[Moved]:
     shape = np.max([cell.max(axis=0) for cell in cells if len(cell)], axis=0) + 3
     filled = np.stack([_filled(cell, shape) for cell in cells])
     left = [np.ones(len(points_m), np.bool_) for points_m in scans_m]
-    together = sorted(map(int, np.flatnonzero(np.abs(apart_s) <= TOGETHER_S)), key=lambda one: abs(apart_s[one]))
+    together = sorted(map(int, np.flatnonzero(np.abs(times_s) <= TOGETHER_S)), key=lambda one: abs(times_s[one]))
     for scan in together:
-        others = np.sort(np.argsort(np.abs(apart_s - apart_s[scan]), kind="stable")[1 : COMPARED + 1])
-        since_s = np.ascontiguousarray(apart_s[others] - apart_s[scan])
+        others = np.sort(np.argsort(np.abs(times_s - times_s[scan]), kind="stable")[1 : COMPARED + 1])
+        since_s = np.ascontiguousarray(times_s[others] - times_s[scan])
         rows = np.flatnonzero(left[scan])
         for cluster in _clusters(cells[scan][rows], shape):
             if len(cluster) < FEWEST:
@@ -75,15 +75,15 @@ def movers(scans_m: Sequence[Float64], apart_s: Float64) -> list[Moved]:
             low = cells[scan][own].min(axis=0) - 1
             within = _filled(cells[scan][own] - low, cells[scan][own].max(axis=0) - low + 3) > 0
             for other in together:
-                back_m = scans_m[other][:, :2] - velocity_mps * (apart_s[other] - apart_s[scan]) - lower_m
+                back_m = scans_m[other][:, :2] - velocity_mps * (times_s[other] - times_s[scan]) - lower_m
                 cell = np.floor(back_m / CELL_M).astype(np.int64) - low
                 same = np.flatnonzero(left[other] & ((cell >= 0) & (cell < within.shape)).all(axis=1))
                 same = same[within[tuple(cell[same].T)]]
                 left[other][same] = False
                 there_m = scans_m[other][same].copy()
-                there_m[:, :2] -= velocity_mps * apart_s[other]
+                there_m[:, :2] -= velocity_mps * times_s[other]
                 parts.append(there_m)
-            found.append(Moved(np.concatenate(parts), velocity_mps))
+            found.append(MovingCluster(np.concatenate(parts), velocity_mps))
     return found
 
 
@@ -133,26 +133,26 @@ def _velocity(places_m: Float64, since_s: Float64, filled: NDArray[np.uint8]) ->
         side = np.arange(-half_mps, half_mps + step_mps / 2, step_mps)
         tried = velocity_mps + np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
         overlap = np.empty(len(tried))
-        compiled_or(overlap_by_arrays)(places_m, since_s, filled, CELL_M, tried, overlap)
+        get_fastest_kernel(compute_overlap_by_arrays)(places_m, since_s, filled, CELL_M, tried, overlap)
         worth = overlap - SLOWER * np.linalg.norm(tried, axis=1)
         best = worth >= worth.max() - 1e-9
         velocity_mps, half_mps = tried[best].mean(axis=0), step_mps
     return velocity_mps, float(overlap[best].max())
 
 
-def overlap_by_arrays(
-    places_m: Float64,
-    since_s: Float64,
-    filled: NDArray[np.uint8],
+def compute_overlap_by_arrays(
+    positions_m: Float64,
+    time_offsets_s: Float64,
+    occupancy: NDArray[np.uint8],
     cell_m: float,
     velocities_mps: Float64,
     overlap: Float64,
 ) -> None:
     """How much of what each velocity makes of places is filled at other times, where numba is missing."""
     overlap[:] = 0.0
-    for apart_s, grid in zip(since_s, filled, strict=True):
-        cell = np.floor((places_m + apart_s * velocities_mps[:, None]) / cell_m).astype(np.int64)
+    for apart_s, grid in zip(time_offsets_s, occupancy, strict=True):
+        cell = np.floor((positions_m + apart_s * velocities_mps[:, None]) / cell_m).astype(np.int64)
         inside = ((cell >= 0) & (cell < grid.shape)).all(axis=-1)
         x, y = np.where(inside[..., None], cell, 0).transpose(2, 0, 1)
         overlap += (grid[x, y] * inside).sum(axis=1)
-    overlap /= 2.0 * len(since_s) * len(places_m)
+    overlap /= 2.0 * len(time_offsets_s) * len(positions_m)

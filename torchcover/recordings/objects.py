@@ -21,7 +21,7 @@ from torchcover.recordings.recording import Recording
 SAME_TIME_S = 1e-3
 
 
-class Seen(NamedTuple):
+class ObjectState(NamedTuple):
     """An object at an instant: `world_T_box` is its centre, x along its length; length, width, height are its size.
 
     `visibility` as `Boxes` has it.
@@ -35,28 +35,28 @@ class Seen(NamedTuple):
     visibility: float = math.nan
 
 
-def by_name(seen: Iterable[Seen]) -> dict[str, list[Seen]]:
+def group_by_name(states: Iterable[ObjectState]) -> dict[str, list[ObjectState]]:
     """Those of each object, in the order of time."""
-    found: dict[str, list[Seen]] = {}
-    for one in sorted(seen, key=lambda one: one.time_s):
+    found: dict[str, list[ObjectState]] = {}
+    for one in sorted(states, key=lambda one: one.time_s):
         found.setdefault(one.name, []).append(one)
     return found
 
 
-class SeenObjects:
+class ObjectInterpolator:
     """Objects at any time; between two of theirs they move evenly.
 
-    `seen`: when and where they were seen, in any order; `longest_gap_s`: where one was unseen for longer, it is unknown
+    `seen`: when and where they were seen, in any order; `max_gap_s`: where one was unseen for longer, it is unknown
     where it was.
     """
 
-    def __init__(self, seen: Sequence[Seen], longest_gap_s: float = 1.0) -> None:
-        ordered = by_name(seen)
-        self._seen = {name: ordered[name] for name in dict.fromkeys(one.name for one in seen)}
+    def __init__(self, states: Sequence[ObjectState], max_gap_s: float = 1.0) -> None:
+        ordered = group_by_name(states)
+        self._seen = {name: ordered[name] for name in dict.fromkeys(one.name for one in states)}
         self._times = {name: [one.time_s for one in of] for name, of in self._seen.items()}
-        self._longest_gap_s = longest_gap_s
+        self._longest_gap_s = max_gap_s
 
-    def at(self, time_s: float, vehicle_T_world: Matrix) -> Boxes:
+    def interpolate_boxes(self, time_s: float, vehicle_T_world: Matrix) -> Boxes:
         """The objects of an instant that lies within their times, in the vehicle frame."""
         between = (self._between(seen, self._times[name], time_s) for name, seen in self._seen.items())
         found = [one for one in between if one is not None]
@@ -74,7 +74,7 @@ class SeenObjects:
             visibility=torch.tensor([one.visibility for one in found], dtype=torch.float32, device="cpu"),
         )
 
-    def _between(self, seen: Sequence[Seen], times_s: Sequence[float], time_s: float) -> Seen | None:
+    def _between(self, seen: Sequence[ObjectState], times_s: Sequence[float], time_s: float) -> ObjectState | None:
         after = bisect_left(times_s, time_s - SAME_TIME_S)
         if after == len(seen):
             return None
@@ -132,7 +132,7 @@ class RecordedObjects(NamedTuple):
     tracks: tuple[Track, ...]
     egos: tuple[Ego, ...] = ()
 
-    def digest(self) -> str:
+    def compute_digest(self) -> str:
         """A hash of all of it."""
         found = hashlib.sha256()
         for track in self.tracks:
@@ -145,75 +145,77 @@ class RecordedObjects(NamedTuple):
         return found.hexdigest()
 
 
-def track_of(seen: Sequence[Seen], vehicle_class: str | None, world_T_source: Matrix | None = None) -> Track:
+def build_track(
+    states: Sequence[ObjectState], vehicle_class: str | None, world_T_source: Matrix | None = None
+) -> Track:
     """A track from boxes about their middles, in the order of time; of the sizes the median counts.
 
     `world_T_source` (K, 4, 4) is the frame in which it was seen each time; None: the world. ValueError: no size, times
     that do not ascend, numbers that are none; the message names the id.
     """
-    name = seen[0].name
-    sizes_m = np.array([one.size_m for one in seen], dtype=np.float64)
-    world_T_box = np.stack([one.world_T_box for one in seen])
+    name = states[0].name
+    sizes_m = np.array([one.size_m for one in states], dtype=np.float64)
+    world_T_box = np.stack([one.world_T_box for one in states])
     if world_T_source is not None:
         world_T_box = world_T_source @ world_T_box
     for size_m in sizes_m:
-        checked_size(name, size_m)
-    length, width, height = checked_size(name, np.median(sizes_m, axis=0))
+        check_box_size(name, size_m)
+    length, width, height = check_box_size(name, np.median(sizes_m, axis=0))
     places_m = world_T_box[:, :3, 3] - sizes_m[:, 2:] / 2 * world_T_box[:, :3, 2]
     angles_deg = euler_from_rotation(world_T_box[:, :3, :3])
-    trajectory = moving(name, np.array([one.time_s for one in seen]), places_m, angles_deg)
-    return Track(name, seen[0].category, vehicle_class, (length, width, height), trajectory)
+    trajectory = build_trajectory(name, np.array([one.time_s for one in states]), places_m, angles_deg)
+    return Track(name, states[0].category, vehicle_class, (length, width, height), trajectory)
 
 
-def checked_size(name: str, size_m: Matrix) -> tuple[float, ...]:
+def check_box_size(name: str, size_m: Matrix) -> tuple[float, ...]:
     """A size that a body can have, as far as it was recorded."""
     if not (np.isfinite(size_m).all() and (size_m > 0).all()):
         raise ValueError(f"id {name}: a box needs a positive length, width and height; got {size_m.tolist()}")
     return tuple(size_m.tolist())
 
 
-def moving(name: str, times_s: Matrix, places_m: Matrix, angles_deg: Matrix) -> Trajectory:
+def build_trajectory(name: str, times_s: Matrix, positions_m: Matrix, angles_deg: Matrix) -> Trajectory:
     """A trajectory that is there within its times."""
     try:
-        return Trajectory(times_s, places_m, angles_deg, transient=True)
+        return Trajectory(times_s, positions_m, angles_deg, transient=True)
     except ValueError as error:
         raise ValueError(f"id {name}: {error}") from error
 
 
-def objects_of(recording: Recording) -> RecordedObjects:
+def extract_objects(recording: Recording) -> RecordedObjects:
     """The labelled objects of a recording, and the drive of its vehicle, in the world of its poses."""
     with naming(recording.path, "objects of a recording"):
-        poses = [recording.world_T_vehicle(index) for index in range(len(recording.names))]
+        poses = [recording.get_world_T_vehicle(index) for index in range(len(recording.frame_names))]
         world_T_vehicle = np.stack([pose for pose in poses if pose is not None] or [np.eye(4)])
         if recording.times_s is None or len(world_T_vehicle) < len(poses):
             raise ValueError("its vehicle has no poses with times, without which its objects have no way")
         times_s = recording.times_s - recording.times_s[0]
-        seen = by_name(_labelled(recording, times_s, world_T_vehicle))
+        seen = group_by_name(_labelled(recording, times_s, world_T_vehicle))
         known = getattr(recording, "classes", None)  # of formats whose words mean other things
         tracks = tuple(
-            track_of(of, class_of(of[0].category) if known is None else known.get(of[0].category.lower()))
+            build_track(of, find_vehicle_class(of[0].category) if known is None else known.get(of[0].category.lower()))
             for of in seen.values()
         )
-    body = recording.body
+    body = recording.ego_box
     size_m = None if body is None else (*body.size_m[:2], body.upper_m[2])
     return RecordedObjects(tracks, (Ego("ego", times_s, world_T_vehicle, np.eye(4), size_m),))
 
 
-def class_of(category: str) -> str | None:
+def find_vehicle_class(category: str) -> str | None:
     """The class of a road user by a word of its category, the last that is known: of `vehicle.car` that of a car.
 
     Example:
-        >>> class_of("Car"), class_of("walker.pedestrian.0007"), class_of("static.barrier")
+        >>> find_vehicle_class("Car"), find_vehicle_class("walker.pedestrian.0007"), find_vehicle_class("static.barrier")
         ('passenger', 'pedestrian', None)
     """
     classes = road_user_classes()["usual"]
     return next((classes[word] for word in reversed(category.strip().lower().split(".")) if word in classes), None)
 
 
-def _labelled(recording: Recording, times_s: NDArray[np.float64], world_T_vehicle: Matrix) -> Iterator[Seen]:
+def _labelled(recording: Recording, times_s: NDArray[np.float64], world_T_vehicle: Matrix) -> Iterator[ObjectState]:
     labelled = False
-    for index, (name, time_s) in enumerate(zip(recording.names, times_s.tolist(), strict=True)):
-        boxes = recording.boxes(index)
+    for index, (name, time_s) in enumerate(zip(recording.frame_names, times_s.tolist(), strict=True)):
+        boxes = recording.read_boxes(index)
         if boxes is None:
             continue
         labelled = True
@@ -223,6 +225,6 @@ def _labelled(recording: Recording, times_s: NDArray[np.float64], world_T_vehicl
         turned = rotation_from_euler(np.rad2deg(rows[:, 6]), np.zeros(len(rows)), np.zeros(len(rows)))
         placed = world_T_vehicle[index] @ rigid(turned, rows[:, :3])
         for own, world_T_box, row, category in zip(boxes.ids, placed, rows, boxes.categories, strict=True):
-            yield Seen(own, time_s, world_T_box, tuple(row[3:6].tolist()), category)
+            yield ObjectState(own, time_s, world_T_box, tuple(row[3:6].tolist()), category)
     if not labelled:
         raise ValueError("no instant of it has labelled objects")

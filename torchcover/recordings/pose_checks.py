@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from torchcover.geometry import invert, transform
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.corrected import correct_poses
-from torchcover.recordings.in_vehicle import in_vehicle
+from torchcover.recordings.in_vehicle import transform_to_vehicle
 from torchcover.recordings.recording import Recording
 from torchcover.recordings.settings import RecordingSettings
-from torchcover.recordings.sweeps import pose_jumps, voxels
+from torchcover.recordings.sweeps import compute_voxel_indices, find_pose_discontinuities
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class SurfaceMap:
     def __init__(self, points_m: NDArray[np.floating], params: MatchingParams | None = None) -> None:
         self._params = params = params or MatchingParams()
         near_m: Matrix = points_m[np.linalg.norm(points_m, axis=1) < params.max_range_m].astype(np.float64)
-        numbers, voxel_of_point = np.unique(voxels(near_m, params.voxel_m), return_inverse=True)
+        numbers, voxel_of_point = np.unique(compute_voxel_indices(near_m, params.voxel_m), return_inverse=True)
         counts = np.bincount(voxel_of_point)
         sums = [np.bincount(voxel_of_point, coordinate_m, len(counts)) for coordinate_m in near_m.T]
         mean_m = np.stack(sums, axis=1) / counts[:, None]
@@ -92,7 +92,7 @@ class SurfaceMap:
 
         It is the mean of exp(-d^2 / 2), d the Mahalanobis distance to the Gaussian in the voxel of a point.
         """
-        numbers = voxels(points_m, self._params.voxel_m)
+        numbers = compute_voxel_indices(points_m, self._params.voxel_m)
         position = np.searchsorted(self._numbers, numbers).clip(max=len(self._numbers) - 1)
         inside = np.flatnonzero(self._numbers[position] == numbers)
         offset_m = points_m[inside] - self._mean_m[position[inside]]
@@ -105,39 +105,39 @@ class PoseCheckParams:
     """Parameters of the checks of poses.
 
     Args:
-        num_stretches: Stretches of consecutive instants whose poses are looked at.
-        stretch_length: Instants of a stretch.
+        num_segments: Stretches of consecutive instants whose poses are looked at.
+        frames_per_segment: Instants of a stretch.
         pair_distance_m: Two scans form a pair if the vehicle moved this far between them,
         pair_rotation_deg: or turned this much,
         pair_interval_s: or if they are this far apart in time;
         max_pair_interval_s: never farther.
         num_pairs: Pairs that are matched, of each kind.
-        min_gain: A correction is right if the match rises by this much
-        min_gain_ratio: and by this factor.
-        min_lag_gain: The same for a time offset, whose match has to reach
-        min_lag_match: at least this value,
-        max_lag_ripple: and may rise again on the way from the best offset by this much; noise of poses rises more.
+        min_match_gain: A correction is right if the match rises by this much
+        min_match_gain_ratio: and by this factor.
+        min_time_offset_gain: The same for a time offset, whose match has to reach
+        min_time_offset_match: at least this value,
+        max_time_offset_ripple: and may rise again on the way from the best offset by this much; noise of poses rises more.
         min_repeated_share: Poses are frozen if this share repeats the previous one
         max_repeats: for at most this many instants in a row.
-        max_jump_share: Where more poses jump, the poses are wrong in another way.
+        max_discontinuity_share: Where more poses jump, the poses are wrong in another way.
         min_motion_m: A vehicle that moves less between two scans stands still.
     """
 
-    num_stretches: int = 8
-    stretch_length: int = 25
+    num_segments: int = 8
+    frames_per_segment: int = 25
     pair_distance_m: float = 1.5
     pair_rotation_deg: float = 3.0
     pair_interval_s: float = 0.3
     max_pair_interval_s: float = 1.5
     num_pairs: int = 3
-    min_gain: float = 0.15
-    min_gain_ratio: float = 1.4
-    min_lag_gain: float = 0.06
-    min_lag_match: float = 0.6
-    max_lag_ripple: float = 0.03
+    min_match_gain: float = 0.15
+    min_match_gain_ratio: float = 1.4
+    min_time_offset_gain: float = 0.06
+    min_time_offset_match: float = 0.6
+    max_time_offset_ripple: float = 0.03
     min_repeated_share: float = 0.2
     max_repeats: int = 3
-    max_jump_share: float = 0.1
+    max_discontinuity_share: float = 0.1
     min_motion_m: float = 0.1
 
 
@@ -153,53 +153,55 @@ CONVENTIONS = (
 )
 
 
-class Stretch:
+class PoseSegment:
     """Consecutive instants of a recording: (N,) times, (N, 4, 4) `world_T_vehicle`, and the number of the first."""
 
-    def __init__(self, times_s: NDArray[np.float64], world_T_vehicle: Matrix, first: int) -> None:
-        self.times_s, self.world_T_vehicle, self.first = times_s, world_T_vehicle, first
-        jumps = pose_jumps(times_s, world_T_vehicle)
+    def __init__(self, times_s: NDArray[np.float64], world_T_vehicle: Matrix, first_frame: int) -> None:
+        self.times_s, self.world_T_vehicle, self.first_frame = times_s, world_T_vehicle, first_frame
+        jumps = find_pose_discontinuities(times_s, world_T_vehicle)
         # Where most poses jump, they are wrong in another way, which other checks find.
-        self.jumps = jumps[:0] if len(jumps) > max(2, PARAMS.max_jump_share * len(times_s)) else jumps
+        self.discontinuities = (
+            jumps[:0] if len(jumps) > max(2, PARAMS.max_discontinuity_share * len(times_s)) else jumps
+        )
 
 
 class ScanPair:
-    """Two scans of a sensor between which the vehicle moves, at places `one` and `other` of a stretch."""
+    """Two scans of a sensor between which the vehicle moves, at places `first` and `second` of a stretch."""
 
-    def __init__(self, stretch: Stretch, one: int, other: int) -> None:
-        self.stretch, self.one, self.other = stretch, one, other
-        self.interval_s = float(stretch.times_s[other] - stretch.times_s[one])
-        motion = self.motion()
+    def __init__(self, segment: PoseSegment, first: int, second: int) -> None:
+        self.segment, self.first, self.second = segment, first, second
+        self.interval_s = float(segment.times_s[second] - segment.times_s[first])
+        motion = self.compute_motion()
         self.distance_m = float(np.linalg.norm(motion[:3, 3]))
         self.rotation_deg = float(np.rad2deg(np.arccos(np.clip((np.trace(motion[:3, :3]) - 1) / 2, -1, 1))))
 
-    def motion(self, settings: RecordingSettings = UNCORRECTED) -> Matrix:
+    def compute_motion(self, settings: RecordingSettings = UNCORRECTED) -> Matrix:
         """(4, 4) transform from the vehicle frame of the other scan to that of the one."""
-        poses = self.stretch.world_T_vehicle
+        poses = self.segment.world_T_vehicle
         if settings is not UNCORRECTED:
-            poses = correct_poses(poses, self.stretch.times_s, settings)
-        return np.asarray(invert(poses[self.one]) @ poses[self.other])
+            poses = correct_poses(poses, self.segment.times_s, settings)
+        return np.asarray(invert(poses[self.first]) @ poses[self.second])
 
     @property
-    def lag_effect_m(self) -> float:
+    def time_offset_effect_m(self) -> float:
         """How far a time offset of 0.1 s moves points at half of the range of a map."""
-        early, late = (self.motion(RecordingSettings(lag_s=lag_s)) for lag_s in (-0.1, 0.1))
+        early, late = (self.compute_motion(RecordingSettings(time_offset_s=lag_s)) for lag_s in (-0.1, 0.1))
         change = late - early
         return float(np.linalg.norm(change[:3, 3]) + 20.0 * np.linalg.norm(change[:3, :3]))
 
-    def read(self, recording: Recording, sensor: str) -> bool:
+    def read_scans(self, recording: Recording, sensor: str) -> bool:
         """Read both scans; return whether enough surfaces above the ground are in them."""
         try:
-            instants = [self.stretch.first + place for place in (self.one, self.other)]
-            self.scans = [recording.scan(sensor, instant) for instant in instants]
-            self._maps = [SurfaceMap(in_vehicle(scan, recording.body).points_m) for scan in self.scans]
+            instants = [self.segment.first_frame + place for place in (self.first, self.second)]
+            self.scans = [recording.read_scan(sensor, instant) for instant in instants]
+            self._maps = [SurfaceMap(transform_to_vehicle(scan, recording.ego_box).points_m) for scan in self.scans]
         except (OSError, ValueError):
             return False
         return all(surfaces.has_enough_points for surfaces in self._maps)
 
     def match(self, settings: RecordingSettings) -> float:
         """Return how well the scans match (0 to 1) if they are read with these settings."""
-        motion = self.motion(settings)
+        motion = self.compute_motion(settings)
         if settings.axes == "yxz":  # both clouds are mirrored, each in the frame of its sensor
             swap = np.eye(4)[[1, 0, 2, 3]]
             mount = self.scans[0].vehicle_T_sensor
@@ -208,10 +210,10 @@ class ScanPair:
         return self._maps[0].match(transform(motion, self._maps[1].points_m))
 
 
-def check_frozen_poses(stretches: Sequence[Stretch]) -> str | None:
+def check_frozen_poses(segments: Sequence[PoseSegment]) -> str | None:
     """Check whether poses repeat the previous one while the vehicle drives."""
     repeated = steps = 0
-    for stretch in stretches:
+    for stretch in segments:
         is_same = (np.diff(stretch.world_T_vehicle, axis=0) == 0).all(axis=(1, 2))
         changes = np.concatenate([[-1], np.flatnonzero(~is_same), [len(is_same)]])
         run_lengths = np.diff(changes) - 1
@@ -226,9 +228,9 @@ def check_frozen_poses(stretches: Sequence[Stretch]) -> str | None:
     )
 
 
-def check_pose_conventions(recording: Recording, stretches: Sequence[Stretch], sensor: str) -> str | None:
+def check_pose_conventions(recording: Recording, segments: Sequence[PoseSegment], sensor: str) -> str | None:
     """Check whether scans match better with other conventions of rotations, poses or axes, or with a time offset."""
-    pairs = [pair for pair in select_pairs(stretches) if pair.read(recording, sensor)]
+    pairs = [pair for pair in select_pairs(segments) if pair.read_scans(recording, sensor)]
     moving = [pair.scans for pair in pairs if pair.distance_m > PARAMS.min_motion_m]
     if moving and all(np.array_equal(one.points_m, other.points_m, equal_nan=True) for one, other in moving):
         return f"{sensor} repeats the same scan while the vehicle moves by its poses: leave it out (--sensors)"
@@ -237,11 +239,11 @@ def check_pose_conventions(recording: Recording, stretches: Sequence[Stretch], s
     given = _mean_match(pairs, UNCORRECTED)
     best = max(CONVENTIONS, key=lambda settings: _mean_match(pairs, settings))
     match = _mean_match(pairs, best)
-    remedy = best.words
-    if match < max(given + PARAMS.min_gain, PARAMS.min_gain_ratio * given):
-        lag_s, match = find_lag(pairs)
+    remedy = best.command_line_options
+    if match < max(given + PARAMS.min_match_gain, PARAMS.min_match_gain_ratio * given):
+        lag_s, match = find_time_offset(pairs)
         remedy = f"--set recording.lag_s={lag_s:.2f}"
-        if match < max(given + PARAMS.min_lag_gain, PARAMS.min_lag_match):
+        if match < max(given + PARAMS.min_time_offset_gain, PARAMS.min_time_offset_match):
             return None
     return (
         f"two scans of {sensor} match to {given:.0%} once its poses move them, and to {match:.0%} with {remedy}: use "
@@ -249,34 +251,38 @@ def check_pose_conventions(recording: Recording, stretches: Sequence[Stretch], s
     )
 
 
-def find_lag(pairs: Sequence[ScanPair]) -> tuple[float, float]:
+def find_time_offset(pairs: Sequence[ScanPair]) -> tuple[float, float]:
     """Find the time offset in s with which pairs match best, and how well; zeros where noise has many offsets."""
-    matches = np.array([_mean_match(pairs, RecordingSettings(lag_s=lag_s)) for lag_s in LAGS_S])
+    matches = np.array([_mean_match(pairs, RecordingSettings(time_offset_s=lag_s)) for lag_s in LAGS_S])
     best = int(matches.argmax())
     sides = (matches[best::-1], matches[best:])
     ripple = max((side - np.minimum.accumulate(side)).max() for side in sides)
-    return (0.0, 0.0) if ripple > PARAMS.max_lag_ripple else (LAGS_S[best], float(matches[best]))
+    return (0.0, 0.0) if ripple > PARAMS.max_time_offset_ripple else (LAGS_S[best], float(matches[best]))
 
 
-def check_pose_jumps(recording: Recording, stretches: Sequence[Stretch]) -> str | None:
+def check_pose_discontinuities(recording: Recording, segments: Sequence[PoseSegment]) -> str | None:
     """Check whether a few poses jump."""
-    names = [recording.names[stretch.first + step + 1] for stretch in stretches for step in stretch.jumps.tolist()]
+    names = [
+        recording.frame_names[stretch.first_frame + step + 1]
+        for stretch in segments
+        for step in stretch.discontinuities.tolist()
+    ]
     if not names:
         return None
-    looked_at = sum(len(stretch.times_s) for stretch in stretches)
+    looked_at = sum(len(stretch.times_s) for stretch in segments)
     return (
         f"poses jump {len(names)} times in {looked_at} instants that were looked at, first at {names[0]}: no window "
         "extends over a jump, so that frames around it have fewer sweeps; give poses without jumps"
     )
 
 
-def select_pairs(stretches: Sequence[Stretch]) -> list[ScanPair]:
+def select_pairs(segments: Sequence[PoseSegment]) -> list[ScanPair]:
     """Select pairs of scans that are spread over the recording, and those that a time offset would change most."""
     pairs = []
-    for stretch in stretches:
+    for stretch in segments:
         last = len(stretch.times_s) - 1
         for one in range(last):
-            end = min(stretch.jumps[stretch.jumps >= one] + 1, default=last + 1)
+            end = min(stretch.discontinuities[stretch.discontinuities >= one] + 1, default=last + 1)
             for other in range(one + 1, end):
                 pair = ScanPair(stretch, one, other)
                 is_far = (
@@ -291,26 +297,26 @@ def select_pairs(stretches: Sequence[Stretch]) -> list[ScanPair]:
     if not pairs:
         return []
     spread = [pairs[place] for place in np.linspace(0, len(pairs) - 1, PARAMS.num_pairs).astype(int)]
-    sensitive = sorted(pairs, key=attrgetter("lag_effect_m"), reverse=True)[: PARAMS.num_pairs]
+    sensitive = sorted(pairs, key=attrgetter("time_offset_effect_m"), reverse=True)[: PARAMS.num_pairs]
     return list(dict.fromkeys((*spread, *sensitive)))
 
 
-def read_stretches(recording: Recording, num_frames: int) -> Iterator[Stretch]:
+def read_pose_segments(recording: Recording, num_frames: int) -> Iterator[PoseSegment]:
     """Read the poses of stretches that are spread over the first `num_frames` frames."""
     times_s = recording.times_s
     if times_s is None or not num_frames:
         return
     # The window of the last frame extends beyond it.
-    start = recording.frames[0]
-    stop = min(recording.frames[num_frames - 1] + PARAMS.stretch_length, len(recording.names))
+    start = recording.key_frames[0]
+    stop = min(recording.key_frames[num_frames - 1] + PARAMS.frames_per_segment, len(recording.frame_names))
     firsts, length = [start], stop - start
-    if length > PARAMS.num_stretches * PARAMS.stretch_length:
-        length = PARAMS.stretch_length
-        firsts = np.linspace(start, stop - length, PARAMS.num_stretches).astype(int).tolist()
+    if length > PARAMS.num_segments * PARAMS.frames_per_segment:
+        length = PARAMS.frames_per_segment
+        firsts = np.linspace(start, stop - length, PARAMS.num_segments).astype(int).tolist()
     for first in firsts if length > 1 else ():
-        poses = [recording.world_T_vehicle(instant) for instant in range(first, first + length)]
+        poses = [recording.get_world_T_vehicle(instant) for instant in range(first, first + length)]
         if all(pose is not None for pose in poses):
-            yield Stretch(times_s[first : first + length], np.array(poses), first)
+            yield PoseSegment(times_s[first : first + length], np.array(poses), first)
 
 
 def _mean_match(pairs: Sequence[ScanPair], settings: RecordingSettings) -> float:

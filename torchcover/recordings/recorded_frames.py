@@ -18,10 +18,10 @@ from torchcover.files import allow_links, find_link_roots
 from torchcover.frames.frame import Frame
 from torchcover.frames.source import BadFrameError, FrameDataset
 from torchcover.geometry import transform
-from torchcover.recordings.in_vehicle import InVehicle, in_vehicle, joined
+from torchcover.recordings.in_vehicle import VehicleCloud, join_clouds, transform_to_vehicle
 from torchcover.recordings.recording import Recording
 from torchcover.recordings.reference import AccumulatedReference, RecordedReference, Reference
-from torchcover.recordings.sweeps import Sweeps
+from torchcover.recordings.sweeps import SweepWindow
 
 NO_GROUND = "Ground: none was found near the vehicle, so heights are z of the vehicle frame."
 SEEN_GROUND = "Ground: a height field through what all sensors saw of it; unknown farther than 10 m from that."
@@ -42,7 +42,7 @@ class RecordedFrames(FrameDataset):
         rigs: Names of rigs -> names of their sensors; those of the recording if not given.
         reference: Where the reference clouds come from. Not given: the sensors that were recorded for it, or
             else an `AccumulatedReference`.
-        ground: Whether heights above the ground that were not recorded, also of boxes, come from a `GroundModel` of
+        use_ground_model: Whether heights above the ground that were not recorded, also of boxes, come from a `GroundModel` of
             what all sensors saw: within the window of the reference if it is accumulated, else at the instant.
 
     Raises:
@@ -66,7 +66,7 @@ class RecordedFrames(FrameDataset):
         *,
         rigs: Mapping[str, Sequence[str]] | None = None,
         reference: Reference | None = None,
-        ground: bool = True,
+        use_ground_model: bool = True,
     ) -> None:
         if isinstance(recording, str | os.PathLike):
             from torchcover.recordings.formats import open_recording  # all formats, for a path only
@@ -75,14 +75,16 @@ class RecordedFrames(FrameDataset):
         self.recording = recording
         settings = getattr(recording, "settings", None)
         self.corrections: str = settings.words if settings else ""
-        self.sensors_of_rigs = {name: tuple(of) for name, of in (rigs or self.recording.rigs).items()}
+        self.sensors_by_rig = {name: tuple(of) for name, of in (rigs or self.recording.rigs).items()}
         self._check_sensors()
         if reference is None:
             reference = RecordedReference() if self.recording.reference_sensors else AccumulatedReference()
         self.reference = reference
         self.reference.check(self.recording, self._judged)
-        self.ground = ground
-        self._sweeps = self.reference.sweeps if isinstance(self.reference, AccumulatedReference) else Sweeps(0.0)
+        self.use_ground_model = use_ground_model
+        self._sweeps = (
+            self.reference.sweep_window if isinstance(self.reference, AccumulatedReference) else SweepWindow(0.0)
+        )
         self._has_heights: bool | None = None
         self._modelled = False
 
@@ -93,19 +95,19 @@ class RecordedFrames(FrameDataset):
         allow_links(state["recording"].path, state.pop("_link_roots"))
         self.__dict__.update(state)
 
-    def leave_out_bad_sweeps(self) -> None:
+    def skip_unreadable_sweeps(self) -> None:
         """A scan that cannot be read costs its own frame, and not all whose window it is in; those count it."""
-        self._sweeps.skip_bad = True
+        self._sweeps.skip_unreadable = True
 
     @property
-    def names(self) -> Sequence[str]:
+    def frame_names(self) -> Sequence[str]:
         """What a user calls the frames."""
-        return tuple(self.recording.names[instant] for instant in self.recording.frames)
+        return tuple(self.recording.frame_names[instant] for instant in self.recording.key_frames)
 
     @property
     def rigs(self) -> tuple[str, ...]:
         """Names of the rigs."""
-        return tuple(self.sensors_of_rigs)
+        return tuple(self.sensors_by_rig)
 
     @property
     def sensors(self) -> Mapping[str, tuple[()]]:
@@ -115,7 +117,7 @@ class RecordedFrames(FrameDataset):
     @property
     def sensor_names(self) -> Mapping[str, tuple[str, ...]]:
         """The names of the sensors of each rig."""
-        return self.sensors_of_rigs
+        return self.sensors_by_rig
 
     def world_of(self, index: int) -> int:
         """The index: nothing has to be built."""
@@ -127,9 +129,9 @@ class RecordedFrames(FrameDataset):
 
     def has_boxes(self) -> bool:
         """Whether the first frame whose boxes can be read has any, or says that there are none."""
-        for instant in self.recording.frames:
+        for instant in self.recording.key_frames:
             try:
-                return self.recording.boxes(instant) is not None
+                return self.recording.read_boxes(instant) is not None
             except (OSError, ValueError):
                 continue  # whoever measures it will say so
         return False
@@ -153,12 +155,12 @@ class RecordedFrames(FrameDataset):
         from torchcover.recordings.checks import check_recording  # only before a measurement
 
         num_frames = len(self) if steps is None else min(steps, len(self))
-        return check_recording(self.recording, self.reference, self.sensors_of_rigs, num_frames)
+        return check_recording(self.recording, self.reference, self.sensors_by_rig, num_frames)
 
     @property
     def ego_outline_m(self) -> NDArray[np.float64] | None:
         """The outline of the vehicle, if the recording says how large it is."""
-        body = self.recording.body
+        body = self.recording.ego_box
         return None if body is None else body.outline_m
 
     @property
@@ -174,7 +176,7 @@ class RecordedFrames(FrameDataset):
     @property
     def reference_record(self) -> Mapping[str, object]:
         """Where the reference comes from, and the ground, if it was looked for to choose what bands are over."""
-        record = self.reference.record(self.recording, self._judged)
+        record = self.reference.describe(self.recording, self._judged)
         if self.corrections:
             notes = [*record["notes"], f"Read as asked: {self.corrections}."]  # type: ignore[misc]  # as below
             record = {**record, "notes": notes}
@@ -193,34 +195,34 @@ class RecordedFrames(FrameDataset):
         reference = {name: value for name, value in vars(self.reference).items() if not name.startswith("_")}
         return {
             "recording": list(_stamps(self.recording.path)),
-            "instants": [list(self.recording.names), list(self.recording.frames)],
-            "sensors": self.sensors_of_rigs,
-            "told": [repr(self.recording.body), getattr(self.recording, "told", {})],
+            "instants": [list(self.recording.frame_names), list(self.recording.key_frames)],
+            "sensors": self.sensors_by_rig,
+            "told": [repr(self.recording.ego_box), getattr(self.recording, "told", {})],
             "reference": [type(self.reference).__name__, reference],
-            "ground": self.ground,
+            "ground": self.use_ground_model,
             "corrections": self.corrections,
         }
 
     def __len__(self) -> int:
-        return len(self.recording.frames)
+        return len(self.recording.key_frames)
 
     def _frame_at(self, position: int) -> Frame:
-        instant = self.recording.frames[position]
-        name = self.recording.names[instant]
+        instant = self.recording.key_frames[position]
+        name = self.recording.frame_names[instant]
         try:
             scans = {sensor: self._read(sensor, instant) for sensor in self._judged}
-            reference = self.reference.cloud(self.recording, instant, self._judged)
-            heights_m, boxes = self._above_ground(instant, reference, self.recording.boxes(instant))
+            reference = self.reference.build_cloud(self.recording, instant, self._judged)
+            heights_m, boxes = self._above_ground(instant, reference, self.recording.read_boxes(instant))
         except BadFrameError as error:
             window = f"it is in the window of {name} (frame {position}); --set skip_bad_frames=true leaves it out"
             raise BadFrameError(f"{error}; {window}") from error
         except (OSError, ValueError) as error:
             raise BadFrameError(f"{name} (frame {position}): {error}") from error
-        dropped = sum((scan.dropped for scan in scans.values()), Counter[str]())
-        clouds = {rig: joined([scans[sensor] for sensor in of]) for rig, of in self.sensors_of_rigs.items()}
+        dropped = sum((scan.excluded_counts for scan in scans.values()), Counter[str]())
+        clouds = {rig: join_clouds([scans[sensor] for sensor in of]) for rig, of in self.sensors_by_rig.items()}
         counts = {
             f"{side}_{why}": number[why]
-            for side, number in (("sensor", dropped), ("reference", reference.dropped))
+            for side, number in (("sensor", dropped), ("reference", reference.excluded_counts))
             for why in sorted({"nonfinite", "no_return", "own_vehicle", *number})
         }
         tensors = {rig: torch.from_numpy(cloud.points_m) for rig, cloud in clouds.items()}
@@ -237,20 +239,24 @@ class RecordedFrames(FrameDataset):
             boxes=boxes,
             place_in_time=self._places_in_time[position],
             sensor_points={
-                rig: {sensor: len(scans[sensor].points_m) for sensor in of} for rig, of in self.sensors_of_rigs.items()
+                rig: {sensor: len(scans[sensor].points_m) for sensor in of} for rig, of in self.sensors_by_rig.items()
             },
         )
 
     @property
     def _judged(self) -> tuple[str, ...]:
         """The sensors of all rigs, each once."""
-        return tuple(dict.fromkeys(sensor for of in self.sensors_of_rigs.values() for sensor in of))
+        return tuple(dict.fromkeys(sensor for of in self.sensors_by_rig.values() for sensor in of))
 
     @cached_property
     def _places_in_time(self) -> Sequence[int]:
         """Of each frame; those within one window share most of their reference points, and so a place."""
-        frames, recording, window_s = list(self.recording.frames), self.recording, self._sweeps.window_s
-        places = list(range(len(frames))) if recording.instants is None else [recording.instants[at] for at in frames]
+        frames, recording, window_s = list(self.recording.key_frames), self.recording, self._sweeps.window_s
+        places = (
+            list(range(len(frames)))
+            if recording.block_indices is None
+            else [recording.block_indices[at] for at in frames]
+        )
         if not window_s or recording.times_s is None or not frames:
             return places
         windows = np.floor((recording.times_s[frames] - recording.times_s[frames[0]]) / window_s + 1e-6)
@@ -260,39 +266,39 @@ class RecordedFrames(FrameDataset):
 
     def _is_standing(self, position: int) -> bool:
         """Return whether the vehicle stands still in the window of a frame, which has no reference points then."""
-        reference, instant = self.reference, self.recording.frames[position]
-        return isinstance(reference, AccumulatedReference) and reference.is_standing(
+        reference, instant = self.reference, self.recording.key_frames[position]
+        return isinstance(reference, AccumulatedReference) and reference.is_stationary(
             self.recording, instant, self._judged
         )
 
-    def _read(self, sensor: str, instant: int) -> InVehicle:
-        return in_vehicle(self.recording.scan(sensor, instant), self.recording.body)
+    def _read(self, sensor: str, instant: int) -> VehicleCloud:
+        return transform_to_vehicle(self.recording.read_scan(sensor, instant), self.recording.ego_box)
 
     def _above_ground(
-        self, instant: int, reference: InVehicle, boxes: Boxes | None
+        self, instant: int, reference: VehicleCloud, boxes: Boxes | None
     ) -> tuple[NDArray[np.float32] | None, Boxes | None]:
         """The heights of the reference points, and the boxes with those of their bottoms."""
         # Recorded points with square metres, but without heights, were drawn for bands over z.
         drawn = reference.weights is not None and isinstance(self.reference, RecordedReference)
-        if reference.heights_m is not None or drawn or not self.ground:
+        if reference.heights_m is not None or drawn or not self.use_ground_model:
             return reference.heights_m, boxes
-        ground = self._sweeps.ground(self.recording, instant)
+        ground = self._sweeps.get_ground_model(self.recording, instant)
         self._modelled = True
         if ground is None:
             if self._has_heights is False:
                 return None, boxes  # nowhere, so that bands are over z
             return np.full(len(reference.points_m), np.nan, dtype=np.float32), boxes
-        local_T_vehicle = self._sweeps.local_T_vehicle(self.recording, instant)
+        local_T_vehicle = self._sweeps.compute_local_T_vehicle(self.recording, instant)
         if boxes is not None:
             centres_m = transform(local_T_vehicle, boxes.centre_m.double().numpy())
-            bottoms_m = torch.from_numpy(ground.heights_m(centres_m)).to(boxes.size_m) - boxes.size_m[:, 2] / 2
+            bottoms_m = torch.from_numpy(ground.compute_heights_m(centres_m)).to(boxes.size_m) - boxes.size_m[:, 2] / 2
             known = boxes.bottom_heights_m
             boxes = replace(boxes, bottom_heights_m=torch.where(known.isnan(), bottoms_m, known))
-        return ground.heights_m(transform(local_T_vehicle, reference.points_m)).astype(np.float32), boxes
+        return ground.compute_heights_m(transform(local_T_vehicle, reference.points_m)).astype(np.float32), boxes
 
     def _check_sensors(self) -> None:
         there = (*self.recording.sensors, *self.recording.reference_sensors)
-        for rig, sensors in self.sensors_of_rigs.items():
+        for rig, sensors in self.sensors_by_rig.items():
             unknown = [sensor for sensor in sensors if sensor not in there]
             if unknown or not sensors:
                 raise ValueError(
@@ -315,7 +321,7 @@ def _stamps(place: Path) -> Iterator[tuple[str, int, int]]:
             yield Path(folder, name).relative_to(place).as_posix(), status.st_size, status.st_mtime_ns
 
 
-def reference_of_recording(name: str | None = None, window_s: float | None = None) -> Reference | None:
+def create_reference(name: str | None = None, window_s: float | None = None) -> Reference | None:
     """The reference of a recording by its name.
 
     Args:
@@ -326,7 +332,7 @@ def reference_of_recording(name: str | None = None, window_s: float | None = Non
         ValueError: Another name, or a time for one that was recorded.
 
     Example:
-        >>> reference_of_recording("accumulated", 1.0).window_s
+        >>> create_reference("accumulated", 1.0).window_s
         1.0
     """
     if name not in (None, "recorded", "accumulated"):

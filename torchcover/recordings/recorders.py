@@ -23,18 +23,18 @@ from torchcover.recordings.formats.kitti import vehicle_T_velodyne
 class RecordingSetup(NamedTuple):
     """What is the same at every step: the mounts of the rig's sensors, which of these are LiDARs, the vehicle.
 
-    `square_metres` and `boxes` say whether the frames have those.
+    `square_metres` and `has_boxes` say whether the frames have those.
     """
 
-    rig: str
+    rig_name: str
     mounts: Mapping[str, Matrix]
-    lidars: Collection[str]
-    body: BoundingBox
+    lidar_names: Collection[str]
+    ego_box: BoundingBox
     square_metres: bool
-    boxes: bool
+    has_boxes: bool
 
 
-class RecordedStep(NamedTuple):
+class FrameRecord(NamedTuple):
     """A step of a recording, by the name of its files.
 
     `clouds` are (N, 3) float32 points of each sensor in the vehicle frame, as they landed; the frame is everything
@@ -49,19 +49,19 @@ class RecordedStep(NamedTuple):
 
 
 # Writes a file: its path within the folder, and what writes it to the path that it is given; see `AtomicOutput.add`.
-Add = Callable[[str, Callable[[Path], object]], None]
+AddFile = Callable[[str, Callable[[Path], object]], None]
 
 
 class Recorder(Protocol):
     """Writes a recording step by step; another process may go on where one has ended."""
 
-    def __init__(self, add: Add, setup: RecordingSetup, /) -> None:
+    def __init__(self, add_file: AddFile, setup: RecordingSetup, /) -> None:
         """Begin one. ValueError: a rig that the layout cannot hold."""
 
-    def write(self, step: RecordedStep, /) -> Sequence[Any]:
+    def write(self, record: FrameRecord, /) -> Sequence[Any]:
         """Write the files of a step; returns what `finish` has to know of it, as JSON takes it."""
 
-    def finish(self, steps: Sequence[Sequence[Any]], /) -> None:
+    def finish(self, frame_entries: Sequence[Sequence[Any]], /) -> None:
         """Write the files that are about all steps, of each of which `write` said this."""
 
 
@@ -77,40 +77,40 @@ class FolderRecorder:
     ValueError: a sensor whose name is none of a folder.
     """
 
-    def __init__(self, add: Add, setup: RecordingSetup) -> None:
-        self._add = add
+    def __init__(self, add_file: AddFile, setup: RecordingSetup) -> None:
+        self._add = add_file
         self._setup = setup
         for name in setup.mounts:
             if not name or Path(name).name != name or name.startswith(".") or name == REFERENCE:
                 raise ValueError(f"sensor {name!r}: a recording has a folder of this name; rename it in the rig")
 
-    def write(self, step: RecordedStep) -> Sequence[Any]:
+    def write(self, record: FrameRecord) -> Sequence[Any]:
         """Write a step; returns its line in `poses.csv`."""
-        for sensor, points in step.clouds.items():
+        for sensor, points in record.clouds.items():
             cloud = transform(invert(self._setup.mounts[sensor]), points)
-            self._add(f"sensors/{sensor}/{step.name}.npy", partial(np.save, arr=cloud))
-        frame = step.frame
+            self._add(f"sensors/{sensor}/{record.name}.npy", partial(np.save, arr=cloud))
+        frame = record.frame
         arrays = {"points": frame.reference.numpy()}
         if frame.reference_weights is not None:
             arrays["weights"] = frame.reference_weights.numpy()
         if frame.reference_heights_m is not None:
             arrays["heights_m"] = frame.reference_heights_m.numpy()
-        self._add(f"{REFERENCE}/{step.name}.npz", partial(write_npz, arrays=arrays))
+        self._add(f"{REFERENCE}/{record.name}.npz", partial(write_npz, arrays=arrays))
         if frame.boxes is not None:
-            self._add(f"{BOXES}/{step.name}.csv", partial(write_boxes, boxes=frame.boxes))
-        pose = step.world_T_vehicle
+            self._add(f"{BOXES}/{record.name}.csv", partial(write_boxes, boxes=frame.boxes))
+        pose = record.world_T_vehicle
         wxyz = quaternion_from_rotation(pose[:3, :3])
-        return [step.name, step.time_s, *pose[:3, 3].tolist(), *wxyz.tolist(), frame.place_in_time]
+        return [record.name, record.time_s, *pose[:3, 3].tolist(), *wxyz.tolist(), frame.place_in_time]
 
-    def finish(self, steps: Sequence[Sequence[Any]]) -> None:
+    def finish(self, frame_entries: Sequence[Sequence[Any]]) -> None:
         """Write `poses.csv` and `frames.yaml`."""
-        poses = csv_text([["frame", "time_s", *PLACE, *ROTATION, "instant"], *steps])
+        poses = csv_text([["frame", "time_s", *PLACE, *ROTATION, "instant"], *frame_entries])
         for name, text in ((POSES_FILE, poses), (SETTINGS_FILE, self._settings(self._setup))):
             self._add(name, partial(Path.write_text, data=text, encoding="utf-8"))
 
     def _settings(self, setup: RecordingSetup) -> str:
         """The text of `frames.yaml`; values as JSON, which YAML reads."""
-        own = setup.body
+        own = setup.ego_box
         body = BoundingBox((*own.lower_m[:2], own.lower_m[2] + CLEARANCE_M), own.upper_m)
         mounts = {name: {"vehicle_T_sensor": mount.tolist()} for name, mount in setup.mounts.items()}
         lines = ["sensors:", *(f"  {json.dumps(name)}: {json.dumps(mount)}" for name, mount in mounts.items())]
@@ -139,37 +139,37 @@ class KittiRecorder:
     ValueError: another rig than of one LiDAR.
     """
 
-    def __init__(self, add: Add, setup: RecordingSetup) -> None:
-        if len(setup.mounts) != 1 or not setup.lidars:
+    def __init__(self, add_file: AddFile, setup: RecordingSetup) -> None:
+        if len(setup.mounts) != 1 or not setup.lidar_names:
             names = ", ".join(setup.mounts)
             raise ValueError(
-                f"format kitti: a rig of one LiDAR is needed; {setup.rig} has {names}; use the format folder"
+                f"format kitti: a rig of one LiDAR is needed; {setup.rig_name} has {names}; use the format folder"
             )
-        self._add = add
+        self._add = add_file
         rows = {f"P{camera}": PROJECTION for camera in range(4)}
         rows["R0_rect"] = "1 0 0 0 1 0 0 0 1"
         rows["Tr_velo_to_cam"] = " ".join(f"{number:g}" for number in camera_T_velodyne[:3].ravel())
         rows["Tr_imu_to_velo"] = "1 0 0 0 0 1 0 0 0 0 1 0"
         self._calibration = "".join(f"{key}: {numbers}\n" for key, numbers in rows.items())
 
-    def write(self, step: RecordedStep) -> Sequence[Any]:
+    def write(self, record: FrameRecord) -> Sequence[Any]:
         """Write a step."""
-        frame, velodyne_T_vehicle = step.frame, invert(vehicle_T_velodyne)
-        self._add_text(f"calib/{step.name}.txt", self._calibration)
+        frame, velodyne_T_vehicle = record.frame, invert(vehicle_T_velodyne)
+        self._add_text(f"calib/{record.name}.txt", self._calibration)
         if frame.boxes is not None:
             seen = box_visibility(frame.sensor, frame.reference, frame.boxes, reference_weights=frame.reference_weights)
-            self._add_text(f"label_2/{step.name}.txt", _labels(frame.boxes, seen.level.tolist()))
+            self._add_text(f"label_2/{record.name}.txt", _labels(frame.boxes, seen.level.tolist()))
         arrays = {"points": transform(velodyne_T_vehicle, frame.reference.numpy())}
         if frame.reference_weights is not None:
             arrays["weights"] = frame.reference_weights.numpy()
-        self._add(f"reference/{step.name}.npz", partial(write_npz, arrays=arrays))
-        (cloud,) = step.clouds.values()
+        self._add(f"reference/{record.name}.npz", partial(write_npz, arrays=arrays))
+        (cloud,) = record.clouds.values()
         records = np.zeros((len(cloud), 4), dtype="<f4")
         records[:, :3] = transform(velodyne_T_vehicle, cloud)
-        self._add(f"velodyne/{step.name}.bin", lambda path: path.write_bytes(records.tobytes()))
+        self._add(f"velodyne/{record.name}.bin", lambda path: path.write_bytes(records.tobytes()))
         return ()
 
-    def finish(self, steps: Sequence[Sequence[Any]]) -> None:
+    def finish(self, frame_entries: Sequence[Sequence[Any]]) -> None:
         """Nothing: the layout has no file about all steps."""
 
     def _add_text(self, name: str, text: str) -> None:

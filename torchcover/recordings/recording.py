@@ -40,7 +40,7 @@ class Scan:
         weights: (N,) what each point of a reference counts for, positive; None if all count the same.
         heights_m: (N,) height of each point of a reference above the local ground, NaN where there is none at or below;
             None if it is unknown.
-        rows: (N,) number of the laser of each point; None if it is unknown.
+        rings: (N,) number of the laser of each point; None if it is unknown.
         offsets_s: (N,) when each point was measured, after the instant that it was moved to; None: as measured, or
             nobody says it.
     """
@@ -51,17 +51,17 @@ class Scan:
     min_range_m: float = 0.0
     weights: NDArray[np.float64] | None = None
     heights_m: NDArray[np.float32] | None = None
-    rows: NDArray[np.integer] | None = None
+    rings: NDArray[np.integer] | None = None
     offsets_s: NDArray[np.float64] | None = None
 
 
-def check_times(times_s: NDArray[np.float64], count: int, source: str) -> NDArray[np.float64]:
+def check_times(times_s: NDArray[np.float64], num_frames: int, source: str) -> NDArray[np.float64]:
     """Return the times of instants in seconds, if they can be those.
 
     ValueError: another number of them, or two that do not follow each other.
     """
-    if len(times_s) != count:
-        raise ValueError(f"{source}: {len(times_s):,} times for {count:,} scans; one each is needed")
+    if len(times_s) != num_frames:
+        raise ValueError(f"{source}: {len(times_s):,} times for {num_frames:,} scans; one each is needed")
     bad = np.flatnonzero(~(np.diff(times_s) > 0))
     if len(bad):
         first = int(bad[0])
@@ -111,21 +111,21 @@ class Recording(Protocol):
     by one.
 
     Args:
-        body: The vehicle itself, in its own frame; None if unknown. Whoever knows it may say so.
+        ego_box: The vehicle itself, in its own frame; None if unknown. Whoever knows it may say so.
     """
 
-    body: BoundingBox | None
+    ego_box: BoundingBox | None
 
     @property
     def path(self) -> Path:
         """Where it is."""
 
     @property
-    def names(self) -> Sequence[str]:
+    def frame_names(self) -> Sequence[str]:
         """What a user calls the instants; so many there are."""
 
     @property
-    def frames(self) -> Sequence[int]:
+    def key_frames(self) -> Sequence[int]:
         """Numbers of the instants that are meant to be looked at, ascending; the others serve a reference only."""
 
     @property
@@ -149,10 +149,10 @@ class Recording(Protocol):
         """Whether the scans of the reference sensors have weights, the square metres that their points stand for."""
 
     @property
-    def instants(self) -> Sequence[int] | None:
+    def block_indices(self) -> Sequence[int] | None:
         """`Frame.place_in_time` of each instant, for standard errors; None: no two of them are known to be alike."""
 
-    def scan(self, sensor: str, index: int, /) -> Scan:
+    def read_scan(self, sensor: str, index: int, /) -> Scan:
         """Read what a sensor recorded at an instant.
 
         Raises:
@@ -160,26 +160,26 @@ class Recording(Protocol):
             ValueError: It is not what it is meant to be.
         """
 
-    def world_T_vehicle(self, index: int, /) -> Matrix | None:
+    def get_world_T_vehicle(self, index: int, /) -> Matrix | None:
         """(4, 4) where the vehicle was, in a world that does not move; None if unknown."""
 
-    def boxes(self, index: int, /) -> Boxes | None:
+    def read_boxes(self, index: int, /) -> Boxes | None:
         """The labelled objects of an instant in the vehicle frame; None where it is not labelled."""
 
 
-class Layout:
+class RecordingBase:
     """What most layouts have in common: every instant is looked at, and no reference was recorded."""
 
-    names: Sequence[str]
+    frame_names: Sequence[str]
     reference_sensors: Sequence[str] = ()
     square_metres = False
-    instants: Sequence[int] | None = None
-    body: BoundingBox | None = None
+    block_indices: Sequence[int] | None = None
+    ego_box: BoundingBox | None = None
 
     @property
-    def frames(self) -> range:
+    def key_frames(self) -> range:
         """All instants."""
-        return range(len(self.names))
+        return range(len(self.frame_names))
 
 
 class SensorCalibrations(NamedTuple):
@@ -198,7 +198,7 @@ class SensorCalibrations(NamedTuple):
 class CalibratedRecording(Protocol):
     """A recording that knows more of its sensors."""
 
-    def calibrations(self) -> SensorCalibrations:
+    def read_calibrations(self) -> SensorCalibrations:
         """Read them; cameras are those of the images as the data set ships them.
 
         Raises:
@@ -211,7 +211,7 @@ class CalibratedRecording(Protocol):
 class UndistortedRecording(Protocol):
     """A recording that ships undistorted or rectified images, and knows the distortion of the lenses, too."""
 
-    def raw_cameras(self) -> tuple[Calibration, ...]:
+    def read_raw_cameras(self) -> tuple[Calibration, ...]:
         """Read the cameras with their lenses as calibrated, before images were undistorted.
 
         Raises:
@@ -220,23 +220,25 @@ class UndistortedRecording(Protocol):
         """
 
 
-def warn_of_missing_poses(path: Path, missing: Sequence[str], count: int) -> None:
+def warn_of_missing_poses(path: Path, frames_without_pose: Sequence[str], num_frames: int) -> None:
     """Warn of the sweeps that are left out because the vehicle's pose at their time is not known.
 
     Args:
         path: The file or folder of poses.
-        missing: Names of these sweeps.
-        count: Number of all sweeps.
+        frames_without_pose: Names of these sweeps.
+        num_frames: Number of all sweeps.
 
     Raises:
         ValueError: No sweep has a pose.
     """
-    if len(missing) == count:
-        raise ValueError(f"{path}: none of {count:,} sweeps has a pose, the first is {missing[0]}; is it one log?")
-    if missing:
+    if len(frames_without_pose) == num_frames:
+        raise ValueError(
+            f"{path}: none of {num_frames:,} sweeps has a pose, the first is {frames_without_pose[0]}; is it one log?"
+        )
+    if frames_without_pose:
         warnings.warn(
-            f"{path}: {len(missing):,} of {count:,} sweeps are left out, for there is no pose at their time; the first "
-            f"is {missing[0]}",
+            f"{path}: {len(frames_without_pose):,} of {num_frames:,} sweeps are left out, for there is no pose at their time; the first "
+            f"is {frames_without_pose[0]}",
             stacklevel=3,
         )
 
@@ -256,7 +258,7 @@ def read_recording_manifest(path: Path) -> dict[str, Any]:
     return manifest
 
 
-def whole_recording(folder: Path) -> dict[str, Any] | None:
+def read_complete_manifest(folder: Path) -> dict[str, Any] | None:
     """Read the manifest of a complete recording that torchcover has written; None of any other one.
 
     Raises:

@@ -10,28 +10,35 @@ from numpy.typing import NDArray
 
 from torchcover.detection.boxes import Boxes
 from torchcover.geometry import BoundingBox, invert, transform
-from torchcover.recordings.free_space import Key, seen_share, square_metres
-from torchcover.recordings.in_vehicle import InVehicle, in_vehicle, joined, within
-from torchcover.recordings.movers import COMPARED_S, WITHIN_M, Moved, movers
+from torchcover.recordings.free_space import ScanKey, estimate_visible_share, square_metres
+from torchcover.recordings.in_vehicle import VehicleCloud, find_points_in_box, join_clouds, transform_to_vehicle
+from torchcover.recordings.movers import COMPARED_S, WITHIN_M, MovingCluster, find_moving_clusters
 from torchcover.recordings.recording import Recording
-from torchcover.recordings.sweeps import MOVES_MPS, Sweeps, Thinned, first_of_each, pose_of, voxels
+from torchcover.recordings.sweeps import (
+    MOVES_MPS,
+    SweepWindow,
+    ThinnedScan,
+    compute_voxel_indices,
+    find_first_occurrences,
+    get_vehicle_T_box,
+)
 
 
 class Reference(Protocol):
     """Where the reference clouds of a recording come from."""
 
-    def check(self, recording: Recording, judged: Collection[str], /) -> None:
+    def check(self, recording: Recording, evaluated_sensors: Collection[str], /) -> None:
         """Whether a recording has what is needed.
 
         Args:
             recording: The recording.
-            judged: Names of the sensors that are measured against the reference.
+            evaluated_sensors: Names of the sensors that are measured against the reference.
 
         Raises:
             ValueError: It has not.
         """
 
-    def cloud(self, recording: Recording, index: int, judged: Collection[str], /) -> InVehicle:
+    def build_cloud(self, recording: Recording, index: int, evaluated_sensors: Collection[str], /) -> VehicleCloud:
         """The reference cloud of an instant.
 
         Raises:
@@ -41,14 +48,14 @@ class Reference(Protocol):
     def square_metres(self, recording: Recording, /) -> bool:
         """Whether its points have weights, the square metres that they stand for."""
 
-    def record(self, recording: Recording, judged: Collection[str], /) -> Mapping[str, object]:
+    def describe(self, recording: Recording, evaluated_sensors: Collection[str], /) -> Mapping[str, object]:
         """For `summary.json`: `sensor`, settings, and `notes`: what the reader of the numbers has to know."""
 
 
 class RecordedReference:
     """The clouds of the sensors that were recorded to be the reference."""
 
-    def check(self, recording: Recording, judged: Collection[str]) -> None:
+    def check(self, recording: Recording, evaluated_sensors: Collection[str]) -> None:
         """Whether there are any."""
         if not recording.reference_sensors:
             raise ValueError(
@@ -56,10 +63,10 @@ class RecordedReference:
                 "(--reference accumulated, AccumulatedReference())"
             )
 
-    def cloud(self, recording: Recording, index: int, judged: Collection[str]) -> InVehicle:
+    def build_cloud(self, recording: Recording, index: int, evaluated_sensors: Collection[str]) -> VehicleCloud:
         """All of them, at that instant."""
-        scans = [recording.scan(sensor, index) for sensor in recording.reference_sensors]
-        found = joined([in_vehicle(scan, recording.body) for scan in scans])
+        scans = [recording.read_scan(sensor, index) for sensor in recording.reference_sensors]
+        found = join_clouds([transform_to_vehicle(scan, recording.ego_box) for scan in scans])
         if not len(found.points_m):
             where = ", ".join(scan.source for scan in scans)
             raise ValueError(f"{where}: the reference cloud has no points, so there is nothing to measure against")
@@ -69,7 +76,7 @@ class RecordedReference:
         """Whether they were recorded with them."""
         return recording.square_metres
 
-    def record(self, recording: Recording, judged: Collection[str]) -> Mapping[str, object]:
+    def describe(self, recording: Recording, evaluated_sensors: Collection[str]) -> Mapping[str, object]:
         """That it was recorded."""
         sensors = ", ".join(recording.reference_sensors)
         return {"sensor": "recorded", "notes": [f"Reference: recorded by {sensors}."]}
@@ -145,14 +152,14 @@ class AccumulatedReference:
         self.voxel_m = voxel_m
         self.sensors = None if sensors is None else tuple(sensors)
         self.min_motion_m = min_motion_m
-        self._sweeps = Sweeps(window_s, voxel_m)
+        self._sweeps = SweepWindow(window_s, voxel_m)
 
     @property
-    def sweeps(self) -> Sweeps:
+    def sweep_window(self) -> SweepWindow:
         """What it is made of."""
         return self._sweeps
 
-    def check(self, recording: Recording, judged: Collection[str]) -> None:
+    def check(self, recording: Recording, evaluated_sensors: Collection[str]) -> None:
         """Whether the recording says when and where its scans were made.
 
         Raises:
@@ -165,62 +172,68 @@ class AccumulatedReference:
                 f"{', '.join(recording.sensors)}"
             )
         if self.window_s == 0:
-            if not set(self._taking_part(recording)) - set(judged):
+            if not set(self._taking_part(recording)) - set(evaluated_sensors):
                 raise ValueError(
                     f"{recording.path}: the reference of an instant (window 0 s) needs a sensor that is not judged; "
-                    f"all are ({', '.join(judged)}): choose some with --sensors, or a longer window"
+                    f"all are ({', '.join(evaluated_sensors)}): choose some with --sensors, or a longer window"
                 )
             return
-        if recording.times_s is None or recording.world_T_vehicle(0) is None:
+        if recording.times_s is None or recording.get_world_T_vehicle(0) is None:
             missing = "when its scans were made" if recording.times_s is None else "where the vehicle was"
             raise ValueError(
                 f"{recording.path}: a reference cannot be accumulated, for the recording does not say {missing}; add "
                 "it, or a recorded reference"
             )
 
-    def is_standing(self, recording: Recording, index: int, judged: Collection[str]) -> bool:
+    def is_stationary(self, recording: Recording, index: int, evaluated_sensors: Collection[str]) -> bool:
         """Return whether the vehicle stands still in the window of an instant in which a judged sensor takes part."""
-        if set(judged).isdisjoint(self._taking_part(recording)):
+        if set(evaluated_sensors).isdisjoint(self._taking_part(recording)):
             return False
-        poses = [recording.world_T_vehicle(instant) for instant in self._sweeps.instants(recording, index)]
+        poses = [
+            recording.get_world_T_vehicle(instant) for instant in self._sweeps.find_frames_in_window(recording, index)
+        ]
         places_m = [pose[:3, 3] for pose in poses if pose is not None]
         return len(places_m) > 1 and float(np.linalg.norm(np.ptp(places_m, axis=0))) < self.min_motion_m
 
-    def cloud(self, recording: Recording, index: int, judged: Collection[str]) -> InVehicle:
-        """The reference cloud of an instant; without points if the vehicle stands still, see `is_standing`.
+    def build_cloud(self, recording: Recording, index: int, evaluated_sensors: Collection[str]) -> VehicleCloud:
+        """The reference cloud of an instant; without points if the vehicle stands still, see `is_stationary`.
 
         Raises:
             OSError, ValueError: A scan cannot be read, or no point is left.
         """
-        if self.is_standing(recording, index, judged):
-            return InVehicle(np.empty((0, 3), np.float32), Counter(standing=1), np.empty(0, np.float32))
+        if self.is_stationary(recording, index, evaluated_sensors):
+            return VehicleCloud(np.empty((0, 3), np.float32), Counter(standing=1), np.empty(0, np.float32))
         sweeps, sensors = self._sweeps, self._taking_part(recording)
-        votes = sweeps.votes(recording, sensors, index)
-        scans = {key: sweeps.thinned(recording, *key) for key in votes if key[1] != index or key[0] not in judged}
-        within = set(sweeps.instants(recording, index))
+        votes = sweeps.count_free_space_votes(recording, sensors, index)
+        scans = {
+            key: sweeps.get_thinned_scan(recording, *key)
+            for key in votes
+            if key[1] != index or key[0] not in evaluated_sensors
+        }
+        within = set(sweeps.find_frames_in_window(recording, index))
         used = {key: scan for key, scan in scans.items() if key[1] in within}
-        dropped = Counter[str](sweeps=sum(not scan.dropped["sweeps_skipped"] for scan in used.values()))
-        if skipped := sweeps.skipped(recording, index):
+        dropped = Counter[str](sweeps=sum(not scan.excluded_counts["sweeps_skipped"] for scan in used.values()))
+        if skipped := sweeps.count_skipped_frames(recording, index):
             dropped["sweeps_skipped"] = len(sensors) * skipped
         for scan in used.values():
-            dropped += scan.dropped
-            dropped["gone"] += scan.unnamed
-        bodies = self._bodies(recording.boxes(index), used.values(), dropped)
+            dropped += scan.excluded_counts
+            dropped["gone"] += scan.unnamed_object_point_count
+        bodies = self._bodies(recording.read_boxes(index), used.values(), dropped)
         local_m = self._standing(recording, index, scans, used, votes, dropped)
         # Noise, and errors of poses, make the ground a thick layer that would count for more and hide what is behind.
         level_m = self._on_ground(recording, index, local_m)
-        first = first_of_each(sweeps.voxel(level_m))
-        first = first[np.argsort(voxels(level_m[first], BLOCK_M), kind="stable")]
-        vehicle_T_local = invert(sweeps.local_T_vehicle(recording, index))
+        first = find_first_occurrences(sweeps.compute_voxel_indices(level_m))
+        first = first[np.argsort(compute_voxel_indices(level_m[first], BLOCK_M), kind="stable")]
+        vehicle_T_local = invert(sweeps.compute_local_T_vehicle(recording, index))
         points_m, level_m = (
             np.concatenate([transform(vehicle_T_local, of[first]), *(body.points_m for body in bodies)])
             for of in (local_m, level_m)
         )
         part = np.repeat(np.arange(1 + len(bodies)), [len(first), *(len(body.points_m) for body in bodies)])
-        own = _beneath_or_in(points_m, recording.body)
+        own = _beneath_or_in(points_m, recording.ego_box)
         dropped["own_vehicle"] += len(own)
         points_m, level_m, part = (np.ascontiguousarray(np.delete(of, own, axis=0)) for of in (points_m, level_m, part))
-        share = seen_share(level_m, recording.body or USUAL_BODY, self.voxel_m, index)
+        share = estimate_visible_share(level_m, recording.ego_box or USUAL_BODY, self.voxel_m, index)
         seen = share > 0
         dropped["hidden"] = int((~seen).sum())
         points_m, level_m, part, share = points_m[seen], level_m[seen], part[seen], share[seen]
@@ -234,13 +247,13 @@ class AccumulatedReference:
         # Of few points in a box, the eighth neighbour is beside it.
         most_m2 = np.array([np.inf, *(body.most_m2 for body in bodies)])
         m2 *= np.minimum(1.0, most_m2[part] / np.bincount(part, m2)[part])
-        return InVehicle(points_m.astype(np.float32), dropped, (m2 * share).astype(np.float32))
+        return VehicleCloud(points_m.astype(np.float32), dropped, (m2 * share).astype(np.float32))
 
-    def _bodies(self, labelled: Boxes | None, scans: Iterable[Thinned], dropped: Counter[str]) -> list[_Body]:
+    def _bodies(self, labelled: Boxes | None, scans: Iterable[ThinnedScan], dropped: Counter[str]) -> list[_Body]:
         """What was seen of the objects that move, with their boxes to where these are at the instant."""
         of_box: dict[str, list[NDArray[np.float64]]] = {}
         for scan in scans:
-            for name, points_m in scan.of_box.items():
+            for name, points_m in scan.object_points_m.items():
                 of_box.setdefault(name, []).append(points_m)
         boxes, found = {name: number for number, name in enumerate(labelled.ids)} if labelled else {}, []
         for name, boxed in of_box.items():
@@ -248,8 +261,8 @@ class AccumulatedReference:
             if labelled is None or name not in boxes:
                 dropped["gone"] += len(points_m)
                 continue
-            first = first_of_each(self._sweeps.voxel(points_m))
-            placed_m = transform(pose_of(labelled, boxes[name]), points_m[first])
+            first = find_first_occurrences(self._sweeps.compute_voxel_indices(points_m))
+            placed_m = transform(get_vehicle_T_box(labelled, boxes[name]), points_m[first])
             found.append(_Body(placed_m, _sides_m2(*labelled.size_m[boxes[name]].tolist())))
         return found
 
@@ -257,55 +270,67 @@ class AccumulatedReference:
         self,
         recording: Recording,
         index: int,
-        scans: Mapping[Key, Thinned],
-        used: Mapping[Key, Thinned],
-        votes: Mapping[Key, NDArray[np.int16]],
+        scans: Mapping[ScanKey, ThinnedScan],
+        used: Mapping[ScanKey, ThinnedScan],
+        votes: Mapping[ScanKey, NDArray[np.int16]],
         dropped: Counter[str],
     ) -> NDArray[np.float64]:
         """(N, 3) places where something stands, and of what moves where it is at the instant, one a voxel."""
         passing = self._passing(recording, index, scans)
         loose = {key: (votes[key] >= VOTES) | passing[key] for key in scans}
-        dropped["rays"] = sum(len(scan.still_m) for scan in scans.values() if scan.image is not None)
+        dropped["rays"] = sum(len(scan.static_points_m) for scan in scans.values() if scan.range_image is not None)
         dropped["seen_past"] = sum(int((votes[key] >= VOTES).sum()) for key in used)
         dropped["passing"] = sum(int((passing[key] & (votes[key] < VOTES)).sum()) for key in used)
-        found = self._movers(recording, index, {key: scan.still_m[loose[key]] for key, scan in scans.items()})
+        found = self._movers(recording, index, {key: scan.static_points_m[loose[key]] for key, scan in scans.items()})
         dropped["movers"] = sum(
             len(mover.points_m) >= KNOWN_POINTS and bool(np.linalg.norm(mover.velocity_mps) > MOVES_MPS)
             for mover in found
         )
         moved_m = np.concatenate([np.empty((0, 3)), *(mover.points_m for mover in found)])
-        local_m = np.concatenate([*(scan.still_m[~loose[key]] for key, scan in used.items()), moved_m])
-        voxel = np.concatenate([*(scan.voxel[~loose[key]] for key, scan in used.items()), self._sweeps.voxel(moved_m)])
+        local_m = np.concatenate([*(scan.static_points_m[~loose[key]] for key, scan in used.items()), moved_m])
+        voxel = np.concatenate(
+            [
+                *(scan.voxel_indices[~loose[key]] for key, scan in used.items()),
+                self._sweeps.compute_voxel_indices(moved_m),
+            ]
+        )
         # Still those first that were seen nearest in time.
-        return np.asarray(local_m[np.sort(first_of_each(voxel))])
+        return np.asarray(local_m[np.sort(find_first_occurrences(voxel))])
 
-    def told_apart(self, recording: Recording, index: int) -> dict[Key, tuple[NDArray[np.float64], NDArray[np.int8]]]:
+    def classify_points(
+        self, recording: Recording, index: int
+    ) -> dict[ScanKey, tuple[NDArray[np.float64], NDArray[np.int8]]]:
         """Of each scan of the window `Thinned.still_m`, and (N,) 0 if it stands, 1 if it passes, 2 if seen past."""
-        votes = self._sweeps.votes(recording, self._taking_part(recording), index)
-        scans = {key: self._sweeps.thinned(recording, *key) for key in votes}
-        passing, within = self._passing(recording, index, scans), set(self._sweeps.instants(recording, index))
+        votes = self._sweeps.count_free_space_votes(recording, self._taking_part(recording), index)
+        scans = {key: self._sweeps.get_thinned_scan(recording, *key) for key in votes}
+        passing, within = (
+            self._passing(recording, index, scans),
+            set(self._sweeps.find_frames_in_window(recording, index)),
+        )
         return {
-            key: (scan.still_m, np.where(votes[key] >= VOTES, 2, passing[key]).astype(np.int8))
+            key: (scan.static_points_m, np.where(votes[key] >= VOTES, 2, passing[key]).astype(np.int8))
             for key, scan in scans.items()
             if key[1] in within
         }
 
     def _on_ground(self, recording: Recording, index: int, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """(N, 3) points, those near the ground put on it."""
-        ground = self._sweeps.ground(recording, index)
+        ground = self._sweeps.get_ground_model(recording, index)
         if ground is None:
             return points_m
-        heights_m = ground.heights_m(points_m)
-        away_m = np.linalg.norm(points_m[:, :2] - self._sweeps.local_T_vehicle(recording, index)[:2, 3], axis=1)
+        heights_m = ground.compute_heights_m(points_m)
+        away_m = np.linalg.norm(points_m[:, :2] - self._sweeps.compute_local_T_vehicle(recording, index)[:2, 3], axis=1)
         down_m = np.where(np.abs(heights_m) <= ON_GROUND_M + TILTED * away_m, heights_m, 0.0)
         return np.asarray(points_m - down_m[:, None] * np.array([0.0, 0.0, 1.0]))
 
-    def _passing(self, recording: Recording, index: int, scans: Mapping[Key, Thinned]) -> dict[Key, NDArray[np.bool_]]:
+    def _passing(
+        self, recording: Recording, index: int, scans: Mapping[ScanKey, ThinnedScan]
+    ) -> dict[ScanKey, NDArray[np.bool_]]:
         """Of the points of each scan, those above ground where nothing is seen for long."""
-        times_s = np.zeros(len(recording.names)) if recording.times_s is None else recording.times_s
+        times_s = np.zeros(len(recording.frame_names)) if recording.times_s is None else recording.times_s
         in_time = sorted(scans, key=itemgetter(1))
-        lengths = [len(scans[key].cells[0]) for key in in_time]
-        cells = np.concatenate([np.empty(0, np.int64), *(scans[key].cells[0] for key in in_time)])
+        lengths = [len(scans[key].occupied_cells[0]) for key in in_time]
+        cells = np.concatenate([np.empty(0, np.int64), *(scans[key].occupied_cells[0] for key in in_time)])
         instants, rank = np.unique(np.array([instant for _, instant in in_time], np.int64), return_inverse=True)
         order = np.argsort(cells, kind="stable")
         seen, another = np.repeat(rank, lengths)[order], np.diff(cells[order], prepend=-1) != 0
@@ -320,37 +345,39 @@ class AccumulatedReference:
         shortly |= count < SEEN_AGAIN * (last - first + 1)
         short = np.empty(len(cells), np.bool_)
         short[order] = np.repeat(shortly, length)
-        ground, found = self._sweeps.ground(recording, index), {}
+        ground, found = self._sweeps.get_ground_model(recording, index), {}
         for key, of_scan in zip(in_time, np.split(short, np.cumsum(lengths)), strict=False):
             scan = scans[key]
-            passing = of_scan[scan.cells[1]]
+            passing = of_scan[scan.occupied_cells[1]]
             if ground is not None:
                 rows = np.flatnonzero(passing)
-                passing[rows] = ~(ground.heights_m(scan.still_m[rows]) <= ON_GROUND_M)
+                passing[rows] = ~(ground.compute_heights_m(scan.static_points_m[rows]) <= ON_GROUND_M)
             found[key] = passing
         return found
 
-    def _movers(self, recording: Recording, index: int, loose_m: Mapping[Key, NDArray[np.float64]]) -> list[Moved]:
+    def _movers(
+        self, recording: Recording, index: int, loose_m: Mapping[ScanKey, NDArray[np.float64]]
+    ) -> list[MovingCluster]:
         """What moves around the instant."""
         if recording.times_s is None:
             return []
-        place_m = self._sweeps.local_T_vehicle(recording, index)[:2, 3]
+        place_m = self._sweeps.compute_local_T_vehicle(recording, index)[:2, 3]
         near_m, apart_s = [], []
         for (_, instant), points_m in loose_m.items():
             since_s = recording.times_s[instant] - recording.times_s[index]
             if abs(since_s) <= COMPARED_S:
                 near_m.append(points_m[np.linalg.norm(points_m[:, :2] - place_m, axis=1) < WITHIN_M])
                 apart_s.append(since_s)
-        return movers(near_m, np.array(apart_s))
+        return find_moving_clusters(near_m, np.array(apart_s))
 
     def square_metres(self, recording: Recording) -> bool:
         """Yes: what lies between the nearest points of each."""
         return True
 
-    def record(self, recording: Recording, judged: Collection[str]) -> Mapping[str, object]:
+    def describe(self, recording: Recording, evaluated_sensors: Collection[str]) -> Mapping[str, object]:
         """Settings, and what such a reference cannot know."""
         taking_part = self._taking_part(recording)
-        among = [sensor for sensor in taking_part if sensor in judged] if self.window_s else []
+        among = [sensor for sensor in taking_part if sensor in evaluated_sensors] if self.window_s else []
         measured_s, off = min(OFF.items(), key=lambda measured: abs(measured[0] - self.window_s))
         told = ", ".join(
             f"{points} points of detection and {share} % of radii in {of}" for of, (points, share) in off.items()
@@ -388,7 +415,7 @@ def _beneath_or_in(points_m: NDArray[np.float64], body: BoundingBox | None) -> N
     """Numbers of the points where the vehicle stands; no other sensor could see them at that instant."""
     if body is None:
         return np.empty(0, np.intp)
-    return within(points_m, BoundingBox((*body.lower_m[:2], -np.inf), body.upper_m))
+    return find_points_in_box(points_m, BoundingBox((*body.lower_m[:2], -np.inf), body.upper_m))
 
 
 def _sides_m2(length_m: float, width_m: float, height_m: float) -> float:

@@ -24,7 +24,7 @@ class Mount(BaseModel):
     pitch_deg: float = 0.0
     roll_deg: float = 0.0
 
-    def matrix(self) -> "Matrix":
+    def to_matrix(self) -> "Matrix":
         """The (4, 4) transform."""
         from torchcover.geometry import rigid, rotation_from_euler  # `--help` needs no NumPy
         from torchcover.geometry.rigid import warn_of_radians
@@ -63,7 +63,7 @@ class RecordingSettings(BaseModel):
         description="Its poses are world_T_vehicle (given), vehicle_T_world (inverse), have x and y exchanged (yx), or "
         "are each repeated until the next one (held: they are interpolated).",
     )
-    lag_s: float = Field(0.0, description="Seconds by which its poses are late.")
+    time_offset_s: float = Field(0.0, description="Seconds by which its poses are late.")
     window_s: Annotated[float, Field(gt=0)] | None = Field(
         None, description="Seconds over which `reference: accumulated` adds up the scans of all sensors (2)."
     )
@@ -85,7 +85,7 @@ class RecordingSettings(BaseModel):
         }
 
     @property
-    def words(self) -> str:
+    def command_line_options(self) -> str:
         """The corrections as options of the command line; empty if there are none.
 
         Example:
@@ -118,11 +118,11 @@ def _read(path: Path) -> dict[str, Any]:
     try:
         RecordingSettings.model_validate(content)
     except ValidationError as error:
-        raise ValueError("; ".join(explain_settings(error))) from error
+        raise ValueError("; ".join(explain_validation_error(error))) from error
     return content
 
 
-def explain_settings(error: ValidationError) -> Iterator[str]:
+def explain_validation_error(error: ValidationError) -> Iterator[str]:
     """Yield a sentence for each mistake that pydantic found: the key, what is wrong, what arrived."""
     for detail in error.errors(include_url=False):
         key = ".".join(str(part) for part in detail["loc"])

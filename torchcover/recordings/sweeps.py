@@ -15,9 +15,9 @@ from torchcover.detection import Boxes, points_in_boxes
 from torchcover.frames.source import BadFrameError
 from torchcover.geometry import invert, rigid, rotation_from_euler, transform
 from torchcover.geometry.rigid import Matrix
-from torchcover.recordings.free_space import Key, RangeImage, Votes
-from torchcover.recordings.ground_model import GroundModel, low_surfaces
-from torchcover.recordings.in_vehicle import in_vehicle
+from torchcover.recordings.free_space import FreeSpaceCounter, RangeImage, ScanKey
+from torchcover.recordings.ground_model import GroundModel, extract_low_surfaces
+from torchcover.recordings.in_vehicle import transform_to_vehicle
 from torchcover.recordings.recording import Recording, Scan
 
 # What is slower stands: between a time before and one after.
@@ -39,40 +39,40 @@ JUMP_M, HARDEST_MPS2, STEPS, AHEAD_M = 0.3, 12.0, 5, 10.0
 
 
 @dataclass(frozen=True)
-class Thinned:
+class ThinnedScan:
     """A scan, one point a voxel.
 
     Args:
-        still_m: (N, 3) float64 points of what stands, or has no box, in the world, from the recording's first place.
-        voxel: (N,) int64 number of the voxel of each, ascending.
-        of_box: Name of each object that moves -> (M, 3) float64 points in the frame of its box: x along its heading,
+        static_points_m: (N, 3) float64 points of what stands, or has no box, in the world, from the recording's first place.
+        voxel_indices: (N,) int64 number of the voxel of each, ascending.
+        object_points_m: Name of each object that moves -> (M, 3) float64 points in the frame of its box: x along its heading,
             its centre in the middle.
-        unnamed: Points in boxes without a name, which cannot be found again.
-        dropped: As `InVehicle.dropped`.
-        place_m: (3,) where the vehicle was, likewise.
-        image: How far the scan has seen; None if its rays are not asked for.
+        unnamed_object_point_count: Points in boxes without a name, which cannot be found again.
+        excluded_counts: As `VehicleCloud.dropped`.
+        vehicle_position_m: (3,) where the vehicle was, likewise.
+        range_image: How far the scan has seen; None if its rays are not asked for.
     """
 
-    still_m: NDArray[np.float64]
-    voxel: NDArray[np.int64]
-    of_box: Mapping[str, NDArray[np.float64]]
-    unnamed: int
-    dropped: Counter[str]
-    place_m: NDArray[np.float64]
-    image: RangeImage | None
+    static_points_m: NDArray[np.float64]
+    voxel_indices: NDArray[np.int64]
+    object_points_m: Mapping[str, NDArray[np.float64]]
+    unnamed_object_point_count: int
+    excluded_counts: Counter[str]
+    vehicle_position_m: NDArray[np.float64]
+    range_image: RangeImage | None
 
     @cached_property
-    def cells(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def occupied_cells(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """(K,) numbers of the cells in which it has points, and (N,) in which of these each of `still_m` is."""
-        return np.unique(voxels(self.still_m, CELL_M), return_inverse=True)
+        return np.unique(compute_voxel_indices(self.static_points_m, CELL_M), return_inverse=True)
 
     @cached_property
     def low_surfaces(self) -> NDArray[np.float64]:
         """(K, 4) what it says about the ground."""
-        return low_surfaces(self.still_m, self.place_m)
+        return extract_low_surfaces(self.static_points_m, self.vehicle_position_m)
 
 
-class Sweeps:
+class SweepWindow:
     """Scans within some time around an instant; those of the recording and the instant that were asked for last stay.
 
     Args:
@@ -80,20 +80,20 @@ class Sweeps:
         voxel_m: Side of a voxel in metres.
 
     Attributes:
-        skip_bad: Whether a scan that cannot be read is one without points, counted, and not an error.
+        skip_unreadable: Whether a scan that cannot be read is one without points, counted, and not an error.
     """
 
     def __init__(self, window_s: float = 2.0, voxel_m: float = 0.1) -> None:
-        self.skip_bad = False
+        self.skip_unreadable = False
         self.window_s = window_s
         self.voxel_m = voxel_m
         self._forget()
 
     def _forget(self) -> None:
-        self._kept: dict[Key, Thinned] = {}
+        self._kept: dict[ScanKey, ThinnedScan] = {}
         self._kept_of: Recording | None = None
         self._places: dict[int, dict[str, NDArray[np.float64]]] = {}
-        self._votes = Votes()
+        self._votes = FreeSpaceCounter()
         self._ground: tuple[int, GroundModel | None] | None = None
 
     def __getstate__(self) -> dict[str, object]:
@@ -103,75 +103,86 @@ class Sweeps:
         vars(self).update(state)
         self._forget()
 
-    def instants(self, recording: Recording, index: int, margin_s: float = 0.0) -> list[int]:
+    def find_frames_in_window(self, recording: Recording, index: int, margin_s: float = 0.0) -> list[int]:
         """The instants of the window, the nearest in time first: the one alone where times or poses are unknown.
 
         `recording`: the recording; `index`: the instant; `margin_s`: so much before and after the window, too.
         """
-        if not self.window_s or recording.times_s is None or recording.world_T_vehicle(index) is None:
+        if not self.window_s or recording.times_s is None or recording.get_world_T_vehicle(index) is None:
             return [index]
         apart_s = np.abs(recording.times_s - recording.times_s[index])
         near = np.flatnonzero(apart_s <= (self.window_s / 2 + margin_s) * (1 + 1e-9))
-        jumps = pose_jumps(recording.times_s[near], np.array([_pose(recording, int(one)) for one in near]))
+        jumps = find_pose_discontinuities(
+            recording.times_s[near], np.array([_pose(recording, int(one)) for one in near])
+        )
         own = int(np.searchsorted(near, index))
         near = near[max(jumps[jumps < own] + 1, default=0) : min(jumps[jumps >= own] + 1, default=len(near))]
         return [int(instant) for instant in near[np.argsort(apart_s[near], kind="stable")]]
 
-    def skipped(self, recording: Recording, index: int) -> int:
+    def count_skipped_frames(self, recording: Recording, index: int) -> int:
         """How many instants of the window are left out, for the pose jumps between them and this one."""
         if recording.times_s is None:
             return 0
         apart_s = np.abs(recording.times_s - recording.times_s[index])
-        return int((apart_s <= self.window_s / 2 * (1 + 1e-9)).sum()) - len(self.instants(recording, index))
+        return int((apart_s <= self.window_s / 2 * (1 + 1e-9)).sum()) - len(
+            self.find_frames_in_window(recording, index)
+        )
 
-    def keep(self, recording: Recording, instants: Sequence[int]) -> None:
+    def keep_frames(self, recording: Recording, frame_indices: Sequence[int]) -> None:
         """Forget all scans but those of some instants."""
         if recording is not self._kept_of:
             self._forget()
-        near = set(instants)
+        near = set(frame_indices)
         self._kept_of, self._kept = recording, {key: scan for key, scan in self._kept.items() if key[1] in near}
         self._places = {instant: places for instant, places in self._places.items() if instant in near}
 
-    def votes(self, recording: Recording, sensors: Sequence[str], index: int) -> dict[Key, NDArray[np.int16]]:
+    def count_free_space_votes(
+        self, recording: Recording, sensors: Sequence[str], index: int
+    ) -> dict[ScanKey, NDArray[np.int16]]:
         """How many scans see past each point, of the scans of the window and its margins."""
-        instants = self.instants(recording, index, MARGIN_S)
-        self.keep(recording, instants)
+        instants = self.find_frames_in_window(recording, index, MARGIN_S)
+        self.keep_frames(recording, instants)
         scans = {
-            (sensor, instant): self.thinned(recording, sensor, instant) for instant in instants for sensor in sensors
+            (sensor, instant): self.get_thinned_scan(recording, sensor, instant)
+            for instant in instants
+            for sensor in sensors
         }
-        images = {key: scan.image for key, scan in scans.items() if scan.image is not None}
-        return self._votes.of({key: scan.still_m for key, scan in scans.items()}, images)
+        images = {key: scan.range_image for key, scan in scans.items() if scan.range_image is not None}
+        return self._votes.update({key: scan.static_points_m for key, scan in scans.items()}, images)
 
-    def local_T_vehicle(self, recording: Recording, index: int) -> Matrix:
+    def compute_local_T_vehicle(self, recording: Recording, index: int) -> Matrix:
         """Where the vehicle was: in the world, from the first place of the drive, for coordinates may be too large."""
         return rigid(np.eye(3), -_pose(recording, 0)[:3, 3]) @ _pose(recording, index)
 
-    def ground(self, recording: Recording, index: int) -> GroundModel | None:
+    def get_ground_model(self, recording: Recording, index: int) -> GroundModel | None:
         """What all sensors have seen of the ground within the window; None where there is none near the vehicle."""
         sensors = (*recording.sensors, *recording.reference_sensors)
         if self._kept_of is not recording or self._ground is None or self._ground[0] != index:
-            instants = self.instants(recording, index)
+            instants = self.find_frames_in_window(recording, index)
             if self._kept_of is not recording or not {key[1] for key in self._kept} >= set(instants):
-                self.keep(recording, instants)
-            scans = [self.thinned(recording, sensor, instant) for instant in instants for sensor in sensors]
+                self.keep_frames(recording, instants)
+            scans = [self.get_thinned_scan(recording, sensor, instant) for instant in instants for sensor in sensors]
             surfaces = [scan.low_surfaces for scan in scans]
-            self._ground = index, GroundModel.below(surfaces, self.local_T_vehicle(recording, index)[:3, 3])
+            self._ground = (
+                index,
+                GroundModel.from_surfaces(surfaces, self.compute_local_T_vehicle(recording, index)[:3, 3]),
+            )
         return self._ground[1]
 
-    def thinned(self, recording: Recording, sensor: str, index: int) -> Thinned:
+    def get_thinned_scan(self, recording: Recording, sensor: str, index: int) -> ThinnedScan:
         """A scan of the window."""
         key = (sensor, index)
         if key in self._kept:
             return self._kept[key]
         try:
-            stored = recording.scan(sensor, index)
-            scan, boxes = in_vehicle(stored, recording.body), self._moving(recording, index)
+            stored = recording.read_scan(sensor, index)
+            scan, boxes = transform_to_vehicle(stored, recording.ego_box), self._moving(recording, index)
         except (OSError, ValueError) as error:
-            if not self.skip_bad:
-                raise BadFrameError(f"{recording.names[index]}: {error}") from error
+            if not self.skip_unreadable:
+                raise BadFrameError(f"{recording.frame_names[index]}: {error}") from error
             stored, boxes = Scan(np.empty((0, 3)), None, ""), None
-            scan = in_vehicle(stored)
-            scan.dropped["sweeps_skipped"] = 1
+            scan = transform_to_vehicle(stored)
+            scan.excluded_counts["sweeps_skipped"] = 1
         points_m = scan.points_m.astype(np.float64)
         in_box = np.zeros(len(points_m), dtype=bool)
         of_box, unnamed = {}, 0
@@ -183,27 +194,27 @@ class Sweeps:
             for number, name in enumerate(boxes.ids):
                 own_m = points_m[inside.point[inside.box == number].numpy()]
                 if name and len(own_m):
-                    own_m = transform(invert(pose_of(boxes, number)), own_m)
-                    of_box[name] = own_m[first_of_each(self.voxel(own_m))]
+                    own_m = transform(invert(get_vehicle_T_box(boxes, number)), own_m)
+                    of_box[name] = own_m[find_first_occurrences(self.compute_voxel_indices(own_m))]
                 else:
                     unnamed += len(own_m)
-        local_T_vehicle = self.local_T_vehicle(recording, index)
+        local_T_vehicle = self.compute_local_T_vehicle(recording, index)
         still_m = transform(local_T_vehicle, points_m[~in_box])
-        voxel = self.voxel(still_m)
-        first = first_of_each(voxel)
+        voxel = self.compute_voxel_indices(still_m)
+        first = find_first_occurrences(voxel)
         image = None
         if self.window_s and _casts_rays(recording, index):
             mount = np.eye(4) if stored.vehicle_T_sensor is None else stored.vehicle_T_sensor
             seen_m = transform(invert(mount), points_m)
-            image = RangeImage.of(seen_m, invert(local_T_vehicle @ mount))
+            image = RangeImage.from_points(seen_m, invert(local_T_vehicle @ mount))
         place_m = local_T_vehicle[:3, 3]
-        thinned = Thinned(still_m[first], voxel[first], of_box, unnamed, scan.dropped, place_m, image)
+        thinned = ThinnedScan(still_m[first], voxel[first], of_box, unnamed, scan.excluded_counts, place_m, image)
         self._kept[key] = thinned
         return thinned
 
     def _moving(self, recording: Recording, index: int) -> Boxes | None:
         """The boxes that move, or have no name, or are seen at no other time."""
-        boxes, times_s = recording.boxes(index), recording.times_s
+        boxes, times_s = recording.read_boxes(index), recording.times_s
         if boxes is None or times_s is None or not self.window_s:
             return boxes
         ends = np.searchsorted(times_s, times_s[index] + np.array([-MOVED_S, MOVED_S])).clip(0, len(times_s) - 1)
@@ -223,15 +234,15 @@ class Sweeps:
         if index not in self._places:
             self._places[index] = {}
             with suppress(OSError, ValueError):
-                self._places[index] = _places_m(recording, index, recording.boxes(index))
+                self._places[index] = _places_m(recording, index, recording.read_boxes(index))
         return self._places[index]
 
-    def voxel(self, points_m: NDArray[np.float64]) -> NDArray[np.int64]:
+    def compute_voxel_indices(self, points_m: NDArray[np.float64]) -> NDArray[np.int64]:
         """(N,) number of the voxel of each point."""
-        return voxels(points_m, self.voxel_m)
+        return compute_voxel_indices(points_m, self.voxel_m)
 
 
-def pose_jumps(times_s: NDArray[np.float64], world_T_vehicle: Matrix) -> NDArray[np.intp]:
+def find_pose_discontinuities(times_s: NDArray[np.float64], world_T_vehicle: Matrix) -> NDArray[np.intp]:
     """After which of (N, 4, 4) poses the next lies, or points, elsewhere than those before and after say."""
     if len(times_s) < 3:
         return np.empty(0, np.intp)
@@ -246,23 +257,23 @@ def pose_jumps(times_s: NDArray[np.float64], world_T_vehicle: Matrix) -> NDArray
     return np.flatnonzero(off_m > JUMP_M + near // 2 * HARDEST_MPS2 * step_s[:, 0] ** 2)
 
 
-def voxels(points_m: NDArray[np.float64], side_m: float) -> NDArray[np.int64]:
+def compute_voxel_indices(points_m: NDArray[np.float64], voxel_m: float) -> NDArray[np.int64]:
     """(N,) number of the voxel of each of (N, 3) points."""
-    x, y, z = (np.floor(points_m / side_m).astype(np.int64) & ((1 << VOXEL_BITS) - 1)).T
+    x, y, z = (np.floor(points_m / voxel_m).astype(np.int64) & ((1 << VOXEL_BITS) - 1)).T
     return np.asarray((x << 2 * VOXEL_BITS) | (y << VOXEL_BITS) | z)
 
 
-def first_of_each(numbers: NDArray[np.int64]) -> NDArray[np.int64]:
+def find_first_occurrences(values: NDArray[np.int64]) -> NDArray[np.int64]:
     """Where each number is seen first, by ascending number; fast where ascending runs follow each other."""
-    order = np.argsort(numbers, kind="stable")
-    ordered = numbers[order]
+    order = np.argsort(values, kind="stable")
+    ordered = values[order]
     return np.asarray(order[np.append(True, ordered[1:] != ordered[:-1])[: len(order)]])
 
 
-def pose_of(boxes: Boxes, number: int) -> Matrix:
+def get_vehicle_T_box(boxes: Boxes, box_index: int) -> Matrix:
     """`vehicle_T_box` of one of them."""
-    yaw_deg = float(np.rad2deg(boxes.yaw_rad[number].item()))
-    return rigid(rotation_from_euler(yaw_deg, 0.0, 0.0), boxes.centre_m[number].double().numpy())
+    yaw_deg = float(np.rad2deg(boxes.yaw_rad[box_index].item()))
+    return rigid(rotation_from_euler(yaw_deg, 0.0, 0.0), boxes.centre_m[box_index].double().numpy())
 
 
 def _places_m(recording: Recording, index: int, boxes: Boxes | None) -> dict[str, NDArray[np.float64]]:
@@ -282,5 +293,5 @@ def _casts_rays(recording: Recording, index: int) -> bool:
 
 def _pose(recording: Recording, index: int) -> Matrix:
     """Where the vehicle was; it has not moved where that is unknown."""
-    pose = recording.world_T_vehicle(index)
+    pose = recording.get_world_T_vehicle(index)
     return np.eye(4) if pose is None else pose

@@ -11,14 +11,14 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
-from torchcover.report.sheet import charts
+from torchcover.report.sheet import create_charts
 
 # Speed in km/h, least and most time to collision in s.
-Band = Sequence[tuple[float, float, float]]
+DetectionBand = Sequence[tuple[float, float, float]]
 
 
-def draw_encounters(
-    panels: Sequence[tuple[str, Mapping[str, Band], Sequence[tuple[float, float]]]], *, title: str
+def plot_encounters(
+    panels: Sequence[tuple[str, Mapping[str, DetectionBand], Sequence[tuple[float, float]]]], *, title: str
 ) -> Figure:
     """Draw when rigs detected whom they met: a panel each encounter, a band each rig, a line for what is needed.
 
@@ -31,7 +31,7 @@ def draw_encounters(
     """
     across = min(len(panels), 3)
     down = -(-len(panels) // across)
-    figure, grid = charts(down, across, (1.5 + 4.2 * across, 0.8 + 3.6 * down), title, sharey=True)
+    figure, grid = create_charts(down, across, (1.5 + 4.2 * across, 0.8 + 3.6 * down), title, sharey=True)
     views = [axes for row in grid for axes in row]
     for axes, (name, bands, needed) in zip(views, panels, strict=False):
         for number, (rig, band) in enumerate(bands.items()):
@@ -61,7 +61,7 @@ BEST = "#000000"
 BOUND = "#999999"
 
 
-def draw_progress(lines: Mapping[str, Float64], *, title: str) -> Figure:
+def plot_progress(lines: Mapping[str, Float64], *, title: str) -> Figure:
     """Draw how much was gained after how many candidates.
 
     Args:
@@ -79,7 +79,7 @@ def draw_progress(lines: Mapping[str, Float64], *, title: str) -> Figure:
     return figure
 
 
-def draw_fronts(
+def plot_fronts(
     names: Sequence[str], candidates: Mapping[str, Float64], fronts: Mapping[str, Float64], *, title: str
 ) -> Figure:
     """Draw the gains of candidates in each pair of objectives.
@@ -105,29 +105,34 @@ def draw_fronts(
     return figure
 
 
-class ChoiceSize(NamedTuple):
+class SelectionSize(NamedTuple):
     """The best choice of so many sensors that was found.
 
     Args:
-        sensors: How many.
+        num_sensors: How many.
         value: What they are worth, a share.
         upper_bound: No choice of so many is worth more.
     """
 
-    sensors: int
+    num_sensors: int
     value: float
     upper_bound: float
 
 
-def draw_choice(
-    sizes: Sequence[ChoiceSize], drawn: Sequence[float], drawn_sensors: int, best: float, *, title: str
+def plot_selection_sizes(
+    sizes: Sequence[SelectionSize],
+    sampled_values: Sequence[float],
+    num_sampled_sensors: int,
+    best: float,
+    *,
+    title: str,
 ) -> Figure:
     """Draw what choices are worth over the number of their sensors.
 
     Args:
         sizes: Choices that were found.
-        drawn: What random choices are worth.
-        drawn_sensors: How many sensors these have, about.
+        sampled_values: What random choices are worth.
+        num_sampled_sensors: How many sensors these have, about.
         best: What the best choice is worth.
         title: What there was to choose from.
 
@@ -140,12 +145,12 @@ def draw_choice(
         numbers = numbers / 100
         axes.fill_between(numbers, values, bounds, color=BOUND, alpha=0.3, linewidth=0, label="where the best lies")
         axes.plot(numbers, values, color=COLOURS[0], marker="o", markersize=4, label="found")
-    parts = axes.violinplot(100 * np.array(drawn), [drawn_sensors], widths=0.5, showmedians=True)
+    parts = axes.violinplot(100 * np.array(sampled_values), [num_sampled_sensors], widths=0.5, showmedians=True)
     for part in (*parts["bodies"], *(parts[key] for key in ("cmins", "cmaxes", "cbars", "cmedians"))):  # type: ignore[misc]
         part.set_color(COLOURS[1])
-    axes.plot([], [], color=COLOURS[1], label=f"{len(drawn):,} random choices")
+    axes.plot([], [], color=COLOURS[1], label=f"{len(sampled_values):,} random choices")
     axes.plot(
-        [drawn_sensors], [100 * best], color=COLOURS[0], marker="*", markersize=12, linestyle="none", label="best"
+        [num_sampled_sensors], [100 * best], color=COLOURS[0], marker="*", markersize=12, linestyle="none", label="best"
     )
     axes.set(xlabel="sensors", ylabel="objective (%)")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -155,7 +160,7 @@ def draw_choice(
 
 
 def _sheet(rows: int, columns: int, title: str) -> tuple[Figure, list[list[Axes]]]:
-    return charts(rows, columns, (max(4.2 * columns, 6.4), 3.6 * rows + 0.9), title)
+    return create_charts(rows, columns, (max(4.2 * columns, 6.4), 3.6 * rows + 0.9), title)
 
 
 COLORMAP = "viridis"
@@ -164,7 +169,7 @@ MAX_LIGHTNESS = 0.85
 Lines = Mapping[str, Sequence[tuple[float, float]]]
 
 
-def draw_work_precision(panels: Mapping[str, Lines], *, title: str, legend_title: str = "") -> Figure:
+def plot_work_precision(panels: Mapping[str, Lines], *, title: str, legend_title: str = "") -> Figure:
     """Draw the work-precision diagram: error over time, both logarithmic.
 
     Args:
@@ -176,7 +181,7 @@ def draw_work_precision(panels: Mapping[str, Lines], *, title: str, legend_title
     Returns:
         A figure of its own, outside pyplot. Lines differ in marker and colour, by their order.
     """
-    figure, (views,) = charts(1, len(panels), (12.0, 5.6), title)
+    figure, (views,) = create_charts(1, len(panels), (12.0, 5.6), title)
     for axes, (label, lines) in zip(views, panels.items(), strict=True):
         _draw_panel(axes, label, lines)
     handles, labels = views[0].get_legend_handles_labels()

@@ -22,18 +22,18 @@ from torch import Tensor
 
 from torchcover.coverage import BevGrid
 from torchcover.estimation import Quantity
-from torchcover.report.overlay import SensorView, draw_ego, draw_places, draw_sensors
+from torchcover.report.overlay import SensorView, plot_ego, plot_sensor_positions, plot_sensors
 from torchcover.report.sheet import (
     HEADING_POINTS,
     Sheet,
+    create_sheets,
+    find_lower_left,
     fit_paper,
-    lay_out,
-    lower_left,
     write_heading,
     write_legend,
     write_title,
 )
-from torchcover.report.wording import percent, shown_unit
+from torchcover.report.wording import format_percent, get_display_unit
 
 # A few cells far behind an obstacle must not take the colours away from all others.
 ROBUST_PERCENTILE = 98
@@ -44,7 +44,7 @@ PALER = "paler: less visible surface in a step than open ground has"
 
 
 @dataclass(frozen=True)
-class ColourScale:
+class ColorScale:
     """What a colour says.
 
     Args:
@@ -60,7 +60,7 @@ class ColourScale:
             above 0.
 
     Example:
-        >>> ColourScale("change of the blind spot radius", "m", "PuOr", -1.0, 1.0).label
+        >>> ColorScale("change of the blind spot radius", "m", "PuOr", -1.0, 1.0).label
         'change of the blind spot radius (m)'
     """
 
@@ -83,7 +83,7 @@ class ColourScale:
         return f"{self.quantity} ({self.unit})"
 
 
-def scale_of(quantity: Quantity, values: Tensor) -> ColourScale:
+def build_color_scale(quantity: Quantity, values: Tensor) -> ColorScale:
     """Scale for a quantity as it is shown: shares from 0 to 100 %, others from 0 to the 98th percentile of the known.
 
     Args:
@@ -93,20 +93,22 @@ def scale_of(quantity: Quantity, values: Tensor) -> ColourScale:
     Example:
         >>> import torch
         >>> from torchcover.coverage.quantity import RADIUS
-        >>> scale_of(RADIUS, torch.tensor([0.5, 2.04])).label
+        >>> build_color_scale(RADIUS, torch.tensor([0.5, 2.04])).label
         'mean blind spot radius (m)'
     """
-    unit = shown_unit(quantity.unit)
+    unit = get_display_unit(quantity.unit)
     colormap = "viridis_r" if quantity.lower_is_better else "viridis"
-    high = unit.highest if math.isfinite(unit.highest) else _robust_end(values)
-    return ColourScale(quantity.title, unit.name, colormap, 0.0, high)
+    high = unit.max_value if math.isfinite(unit.max_value) else _robust_end(values)
+    return ColorScale(quantity.title, unit.name, colormap, 0.0, high)
 
 
-def difference_scale(quantity: Quantity, differences: Tensor) -> ColourScale:
+def build_difference_scale(quantity: Quantity, differences: Tensor) -> ColorScale:
     """Scale for differences: white is none, blue is better, red is worse, both to the 98th percentile of the size."""
     end = _robust_end(differences.abs())
     colormap = "RdBu_r" if quantity.lower_is_better else "RdBu"
-    return ColourScale(f"difference, {quantity.title}", shown_unit(quantity.unit).difference_name, colormap, -end, end)
+    return ColorScale(
+        f"difference, {quantity.title}", get_display_unit(quantity.unit).difference_name, colormap, -end, end
+    )
 
 
 def _robust_end(values: Tensor) -> float:
@@ -124,13 +126,13 @@ def _round_up(value: float) -> float:
     return float(f"{math.ceil(value / step - 1e-9) * step:.2g}")
 
 
-def draw_cells(
+def plot_cells(
     axes: Axes,
     array: NDArray[np.float64],
-    scale: ColourScale,
+    scale: ColorScale,
     *,
     opacity: NDArray[np.float64] | None = None,
-    infinite: str = INFINITE,
+    infinite_color: str = INFINITE,
 ) -> AxesImage:
     """Colour (Y, X) cells; unknown ones, NaN, are hatched grey, infinite ones have a colour of their own.
 
@@ -145,25 +147,25 @@ def draw_cells(
     image = _draw_image(axes, np.ma.masked_invalid(array), alpha=opacity, cmap=scale.colormap, norm=norm)
     endless = np.isinf(array)
     if endless.any():
-        _draw_image(axes, np.ma.masked_where(~endless, endless), alpha=opacity, cmap=ListedColormap([infinite]))
+        _draw_image(axes, np.ma.masked_where(~endless, endless), alpha=opacity, cmap=ListedColormap([infinite_color]))
     return image
 
 
-def cell_entries(array: NDArray[np.float64], unknown: str = NEVER_PROBED) -> list[Artist]:
+def build_cell_legend(array: NDArray[np.float64], unobserved_label: str = NEVER_PROBED) -> list[Artist]:
     """The legend entries for cells without a colour of the scale.
 
-    `array`: values of one map, or of several, NaN where unknown; `unknown`: why they are.
+    `array`: values of one map, or of several, NaN where unknown; `unobserved_label`: why they are.
     """
-    unknown_share = percent(float(np.isnan(array).mean()))
-    entries: list[Artist] = [Patch(label=f"unknown: {unknown} ({unknown_share} % of the cells)", **UNKNOWN)]
+    unknown_share = format_percent(float(np.isnan(array).mean()))
+    entries: list[Artist] = [Patch(label=f"unknown: {unobserved_label} ({unknown_share} % of the cells)", **UNKNOWN)]
     infinite = np.isinf(array)
     if infinite.any():
-        label = f"infinite: a step saw nothing ({percent(float(infinite.mean()))} % of the cells)"
+        label = f"infinite: a step saw nothing ({format_percent(float(infinite.mean()))} % of the cells)"
         entries.append(Patch(facecolor=INFINITE, label=label))
     return entries
 
 
-def draw_colour_bar(sheet: Sheet, image: AxesImage, array: NDArray[np.float64], scale: ColourScale) -> None:
+def plot_color_bar(sheet: Sheet, image: AxesImage, array: NDArray[np.float64], scale: ColorScale) -> None:
     """Draw the colour bar with quantity and unit; if values lie beyond an end, an arrow and how many there are.
 
     Maps that share it are beside each other on the sheet; `array` has the values of all.
@@ -174,8 +176,8 @@ def draw_colour_bar(sheet: Sheet, image: AxesImage, array: NDArray[np.float64], 
     extend = {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}
     label = scale.label
     if beyond := below + above:
-        label += f"\n{percent(float(beyond / len(known)))} % of the known cells lie beyond"
-    sheet.figure.colorbar(image, cax=sheet.bar, extend=extend[bool(below), bool(above)], label=label)
+        label += f"\n{format_percent(float(beyond / len(known)))} % of the known cells lie beyond"
+    sheet.figure.colorbar(image, cax=sheet.color_bar_axes, extend=extend[bool(below), bool(above)], label=label)
 
 
 def _draw_image(axes: Axes, array: NDArray[Any], **colours: Any) -> AxesImage:  # noqa: ANN401  (imshow's own)
@@ -192,17 +194,17 @@ def _draw_image(axes: Axes, array: NDArray[Any], **colours: Any) -> AxesImage:  
     )
 
 
-def draw_side_by_side(
+def plot_side_by_side(
     values: Mapping[str, Tensor],
     grid: BevGrid,
-    scale: ColourScale,
+    scale: ColorScale,
     *,
     title: str,
     subtitle: str = "",
     ego_outline_m: NDArray[np.floating] | None = None,
     sensors: Mapping[str, Sequence[SensorView]] | None = None,
-    directions: bool = True,
-    unknown: str = NEVER_PROBED,
+    show_directions: bool = True,
+    unobserved_label: str = NEVER_PROBED,
     opacity: Mapping[str, Tensor] | None = None,
 ) -> Figure:
     """Draw arrays over one grid, seen from above, with one colour bar: x forward to the right, y left upwards.
@@ -216,8 +218,8 @@ def draw_side_by_side(
         subtitle: Second line, smaller.
         ego_outline_m: (K, 2) corners x, y of the ego in the vehicle frame in metres.
         sensors: What to mark, by the headings.
-        directions: Whether to draw directions and fields of view; else the places of the sensors only.
-        unknown: Why a cell is, for the legend.
+        show_directions: Whether to draw directions and fields of view; else the places of the sensors only.
+        unobserved_label: Why a cell is, for the legend.
         opacity: (Y, X) in [0, 1] by the headings, less where less of the surface is seen in a step; all cells alike if
             not given.
 
@@ -231,8 +233,8 @@ def draw_side_by_side(
         >>> import torch
         >>> grid = BevGrid(x=(0.0, 2.0), y=(-1.0, 1.0), cell=1.0)
         >>> change = torch.tensor([[0.5, -0.5], [float("nan"), 0.0]])
-        >>> scale = ColourScale("change of the blind spot radius", "m", "PuOr", -1.0, 1.0)
-        >>> draw_side_by_side({"": change}, grid, scale, title="Rig B against rig A").axes[0].get_xlabel()
+        >>> scale = ColorScale("change of the blind spot radius", "m", "PuOr", -1.0, 1.0)
+        >>> plot_side_by_side({"": change}, grid, scale, title="Rig B against rig A").axes[0].get_xlabel()
         'x forward (m)'
     """
     for name, given in (("values", values), ("opacity", opacity or {})):
@@ -240,31 +242,33 @@ def draw_side_by_side(
             if tuple(one.shape) != grid.shape[1:]:
                 wanted = f"shape {grid.shape[1:]} is needed, as of a band of the grid"
                 raise ValueError(f"{name}: {wanted}; got {tuple(one.shape)}")
-    arrays = {name: as_array(value) for name, value in values.items()}
-    opaque = {name: as_array(value) for name, value in (opacity or {}).items()}
-    sheets = lay_out(grid, len(arrays))
+    arrays = {name: to_array(value) for name, value in values.items()}
+    opaque = {name: to_array(value) for name, value in (opacity or {}).items()}
+    sheets = create_sheets(grid, len(arrays))
     images = [
-        draw_cells(sheet.axes, array, scale, opacity=opaque.get(name))
+        plot_cells(sheet.axes, array, scale, opacity=opaque.get(name))
         for sheet, (name, array) in zip(sheets, arrays.items(), strict=True)
     ]
     together = np.stack(list(arrays.values()))
-    draw_colour_bar(sheets[0], images[0], together, scale)
-    entries = cell_entries(together, unknown)
+    plot_color_bar(sheets[0], images[0], together, scale)
+    entries = build_cell_legend(together, unobserved_label)
     if opacity:
         entries.append(Line2D([], [], linestyle="none", label=PALER))  # words only, as it is about every colour
     for sheet, name in zip(sheets, values, strict=True):
         if name:
             write_heading(sheet.axes, name)
         if ego_outline_m is not None:
-            entries += draw_ego(sheet.axes, ego_outline_m)
+            entries += plot_ego(sheet.axes, ego_outline_m)
         own = (sensors or {}).get(name, ())
-        entries += draw_sensors(sheet, own, named=not name) if directions else draw_places(sheet, own)
+        entries += (
+            plot_sensors(sheet, own, show_names=not name) if show_directions else plot_sensor_positions(sheet, own)
+        )
     write_title(sheets[0].axes, title, subtitle, lift_points=HEADING_POINTS if any(arrays) else 0.0)
-    write_legend(lower_left(sheet.axes for sheet in sheets), entries, sheets[0].legend_columns)
+    write_legend(find_lower_left(sheet.axes for sheet in sheets), entries, sheets[0].legend_columns)
     fit_paper(sheets[0].figure)
     return sheets[0].figure
 
 
-def as_array(values: Tensor) -> NDArray[np.float64]:
+def to_array(values: Tensor) -> NDArray[np.float64]:
     """Numbers of cells as matplotlib takes them."""
     return values.detach().cpu().double().numpy()

@@ -8,9 +8,22 @@ from typing import NamedTuple
 
 from torchcover.estimation import Quantity
 from torchcover.report.records import COLUMNS
-from torchcover.report.remarks import decisive, failure_headings, failure_title, failure_words, sensors_of
+from torchcover.report.remarks import (
+    format_failure_cells,
+    format_failure_headings,
+    format_failure_title,
+    get_failure_sensors,
+    get_main_quantity,
+)
 from torchcover.report.table import CoverageTable, Row
-from torchcover.report.wording import UNKNOWN, capitalised, difference_heading, difference_words, heading, number_words
+from torchcover.report.wording import (
+    UNKNOWN,
+    capitalize,
+    format_difference,
+    format_difference_heading,
+    format_heading,
+    format_number,
+)
 
 MAX_HEADING_CHARS = 16
 PLACE_HEADINGS = ("region", "height")
@@ -21,7 +34,7 @@ Rows = tuple[Row, ...]
 BOLD_MARKS: Mapping[str, str] = MappingProxyType({"best": "In bold", "significant": "In bold among the differences"})
 
 
-class Words(NamedTuple):
+class TextCell(NamedTuple):
     """What a cell of a part says, and whether it is marked: as the best of its row, or as more than chance."""
 
     text: str
@@ -36,18 +49,18 @@ class PageTable:
         title: Above it; empty for none.
         headings: Of its columns.
         rows: Its cells; marked ones are bold.
-        words_first: How many columns are words, on the left; numbers follow, on the right.
+        num_text_columns: How many columns are words, on the left; numbers follow, on the right.
         notes: Below it.
     """
 
     title: str
     headings: Sequence[str]
-    rows: Sequence[Sequence[Words]]
-    words_first: int = 1
+    rows: Sequence[Sequence[TextCell]]
+    num_text_columns: int = 1
     notes: Sequence[str] = ()
 
 
-def parts_of(table: CoverageTable, *, sensors_in_rows: bool = False) -> list[PageTable]:
+def build_page_tables(table: CoverageTable, *, sensors_in_rows: bool = False) -> list[PageTable]:
     """The parts of a table.
 
     Args:
@@ -60,24 +73,24 @@ def parts_of(table: CoverageTable, *, sensors_in_rows: bool = False) -> list[Pag
         same of bodies beside the vehicle. With redundancy a part for each rig more, a column for each of its sensors.
     """
     of_failures = _of_each_failure if sensors_in_rows else _of_failures
-    failures = [of_failures(table, rig) for rig in table.rigs if sensors_of(table.rows[rig])]
-    of_bodies = list(zip(*table.bodies.values(), strict=True))
-    parts = _of_rows(table, table.places, table.quantities)
-    return [*parts, *(_of_rows(table, of_bodies, table.body_quantities) if of_bodies else ()), *failures]
+    failures = [of_failures(table, rig) for rig in table.rigs if get_failure_sensors(table.rows[rig])]
+    of_bodies = list(zip(*table.target_rows.values(), strict=True))
+    parts = _of_rows(table, table.rows_by_region, table.quantities)
+    return [*parts, *(_of_rows(table, of_bodies, table.target_quantities) if of_bodies else ()), *failures]
 
 
 def _of_rows(table: CoverageTable, places: Sequence[Rows], quantities: Sequence[Quantity]) -> list[PageTable]:
     if len(table.rigs) == 1:
-        headings = [fill(heading(quantity), MAX_HEADING_CHARS) for quantity in quantities]
+        headings = [fill(format_heading(quantity), MAX_HEADING_CHARS) for quantity in quantities]
         cells = [[_number(row, quantity) for quantity in quantities] for (row,) in places]
         return [_part(table, places, "", headings, cells)]
     (first, *others), parts = table.rigs, []
     for one in quantities:
         cells = [[_number(row, one) for row in rows] for rows in places]
-        parts.append(_part(table, places, capitalised(heading(one)), table.rigs, cells))
-    for one in quantities if table.first.blocks is not None else ():
+        parts.append(_part(table, places, capitalize(format_heading(one)), table.rigs, cells))
+    for one in quantities if table.first_conditions.blocks is not None else ():
         cells = [[_difference(row, one) for row in rows[1:]] for rows in places]
-        title = f"Difference to {first}: {difference_heading(one)}"
+        title = f"Difference to {first}: {format_difference_heading(one)}"
         parts.append(_part(table, places, title, others, cells))
     return parts
 
@@ -85,29 +98,33 @@ def _of_rows(table: CoverageTable, places: Sequence[Rows], quantities: Sequence[
 def _of_failures(table: CoverageTable, rig: str) -> PageTable:
     rows = []
     for row in table.rows[rig]:
-        cells = [Words(text, "significant" if marked else "") for text, marked in failure_words(table, row)]
-        rows.append((Words(row.summary.region), Words(row.summary.height), *cells))
-    return PageTable(failure_title(table, rig), [*PLACE_HEADINGS, *failure_headings(table, rig)], rows, PLACES)
+        cells = [TextCell(text, "significant" if marked else "") for text, marked in format_failure_cells(table, row)]
+        rows.append((TextCell(row.summary.region), TextCell(row.summary.height), *cells))
+    return PageTable(
+        format_failure_title(table, rig), [*PLACE_HEADINGS, *format_failure_headings(table, rig)], rows, PLACES
+    )
 
 
 def _of_each_failure(table: CoverageTable, rig: str) -> PageTable:
     """As narrow as it can be: by how many sensors a place is seen, and what it loses with each, most first."""
-    names, rows = sensors_of(table.rows[rig]), []
-    headings = failure_headings(table, rig)
+    names, rows = get_failure_sensors(table.rows[rig]), []
+    headings = format_failure_headings(table, rig)
     seen = len(headings) - len(names) - 1
     for row in table.rows[rig]:
-        words = failure_words(table, row)
+        words = format_failure_cells(table, row)
         lost = sorted(
-            (row.summary.redundancy.change[name][decisive(table).key].gain, name, *said)
+            (row.summary.redundancy.change[name][get_main_quantity(table).key].gain, name, *said)
             for name, said in zip(names, words[seen:-1], strict=True)
             if row.summary.redundancy and said[0] not in ("0", UNKNOWN)
         )
         for at, (_, name, text, marked) in enumerate(lost or [(0.0, words[-1][0], "", False)]):
             of_place = [said[0] if at == 0 else "" for said in words[: min(seen, 1)]]
-            last = Words(text, "significant" if marked else "")
-            rows.append((Words(row.summary.region), Words(row.summary.height), *map(Words, (*of_place, name)), last))
+            last = TextCell(text, "significant" if marked else "")
+            rows.append(
+                (TextCell(row.summary.region), TextCell(row.summary.height), *map(TextCell, (*of_place, name)), last)
+            )
     headings = [*PLACE_HEADINGS, *["sensors\nthat see it"][:seen], "without", "change"]
-    return PageTable(failure_title(table, rig), headings, rows, PLACES)
+    return PageTable(format_failure_title(table, rig), headings, rows, PLACES)
 
 
 def _part(
@@ -115,25 +132,25 @@ def _part(
     places: Sequence[Rows],
     title: str,
     headings: Sequence[str],
-    numbers: Sequence[Sequence[Words]],
+    numbers: Sequence[Sequence[TextCell]],
 ) -> PageTable:
     """A part with the columns that every part has: the place first, those of `COLUMNS` that are shown last."""
-    measure = places[0][0].summary.measure if places else table.measure
-    shown = [column for column in COLUMNS if column.heading and column.measure in (None, measure)]
+    measure = places[0][0].summary.measure if places else table.average
+    shown = [column for column in COLUMNS if column.heading and column.average in (None, measure)]
     rows = []
     for (row, *_), cells in zip(places, numbers, strict=True):
-        last = [Words(column.words(column.of(table, row))) for column in shown]
-        rows.append((Words(row.summary.region), Words(row.summary.height), *cells, *last))
+        last = [TextCell(column.format_value(column.get_value(table, row))) for column in shown]
+        rows.append((TextCell(row.summary.region), TextCell(row.summary.height), *cells, *last))
     first = BODY_HEADINGS if measure == "places" else PLACE_HEADINGS
     every = [*first, *headings, *(column.heading for column in shown)]
     return PageTable(title, every, rows, PLACES)
 
 
-def _number(row: Row, quantity: Quantity) -> Words:
-    words = number_words(row.summary.numbers[quantity.key])
-    return Words(words, "best" if quantity.key in row.best else "")
+def _number(row: Row, quantity: Quantity) -> TextCell:
+    words = format_number(row.summary.numbers[quantity.key])
+    return TextCell(words, "best" if quantity.key in row.leading_keys else "")
 
 
-def _difference(row: Row, quantity: Quantity) -> Words:
+def _difference(row: Row, quantity: Quantity) -> TextCell:
     difference = row.differences[quantity.key]
-    return Words(difference_words(difference), "significant" if difference.significant else "")
+    return TextCell(format_difference(difference), "significant" if difference.significant else "")

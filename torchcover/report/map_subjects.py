@@ -21,8 +21,8 @@ from torchcover.coverage.blocks import BlockSums, KnownCells
 from torchcover.coverage.quantity import by_area
 from torchcover.estimation import Quantity
 from torchcover.metrics import added_up
-from torchcover.report.colours import NEVER_PROBED, ColourScale, scale_of
-from torchcover.report.wording import shown_unit, steps_and_cell
+from torchcover.report.colours import NEVER_PROBED, ColorScale, build_color_scale
+from torchcover.report.wording import format_resolution, get_display_unit
 
 # A detection from 8 points is off by 18 percentage points at most: 1 / sqrt(4 * 8).
 MIN_POINTS = 8
@@ -32,7 +32,7 @@ SMALLEST_M = 0.25
 FAINTEST = 0.3
 
 
-def square_sides(points: Tensor, cell_m: float) -> Tensor:
+def compute_square_sides(points: Tensor, cell_m: float) -> Tensor:
     """Cut a grid into squares of cells: a square is cut in four if each quarter has 8 points at least, or none at all.
 
     Of (H, Y, X) points in each cell, gives (H, Y, X) int64 how many cells wide the square is that it lies in: a power
@@ -50,10 +50,10 @@ def square_sides(points: Tensor, cell_m: float) -> Tensor:
     return sides
 
 
-def over_squares(values: Tensor, sides: Tensor) -> Tensor:
+def sum_over_squares(values: Tensor, sides: Tensor) -> Tensor:
     """The sum over the square that each cell lies in.
 
-    `values`: (..., H, Y, X) what is added up; `sides`: (H, Y, X) as from `square_sides`. Returns (..., H, Y, X)
+    `values`: (..., H, Y, X) what is added up; `sides`: (H, Y, X) as from `compute_square_sides`. Returns (..., H, Y, X)
     float64.
     """
     sums, side = values.double(), 2
@@ -63,13 +63,13 @@ def over_squares(values: Tensor, sides: Tensor) -> Tensor:
     return sums
 
 
-def ratios(area: BlockSums, sides: Tensor) -> Tensor:
+def compute_ratios(area: BlockSums, sides: Tensor) -> Tensor:
     """(Q, H, Y, X) the radius in metres, then the detection at each threshold; NaN where nothing was seen."""
     m2, *sums = area.totals()
-    return over_squares(torch.stack(sums), sides) / over_squares(m2, sides)
+    return sum_over_squares(torch.stack(sums), sides) / sum_over_squares(m2, sides)
 
 
-def as_drawn(coverage: Coverage) -> Coverage:
+def downsample_coverage(coverage: Coverage) -> Coverage:
     """The same over squares of cells that are smaller than pictures show: of the largest up to 0.25 m.
 
     Itself where cells are as large, and where there are layers that are no ratios of sums.
@@ -113,15 +113,15 @@ def as_drawn(coverage: Coverage) -> Coverage:
     )
 
 
-def opacity_of(area: BlockSums, steps: int, sides: Tensor, cell_m: float) -> Tensor:
+def compute_opacity(area: BlockSums, num_frames: int, sides: Tensor, cell_m: float) -> Tensor:
     """How opaque a place is drawn, by how much surface is seen there in a step.
 
     Returns (H, Y, X): 0 where nothing was seen, 1 where as much as open ground has, which is the footprint of the
     square, or more; between them the root of the share, from 0.3 on.
     """
-    m2 = over_squares(area.totals()[0], sides)
-    footprint_m2 = over_squares(torch.full_like(m2, cell_m**2), sides)
-    share = (m2 / (max(steps, 1) * footprint_m2)).clamp(max=1)
+    m2 = sum_over_squares(area.totals()[0], sides)
+    footprint_m2 = sum_over_squares(torch.full_like(m2, cell_m**2), sides)
+    share = (m2 / (max(num_frames, 1) * footprint_m2)).clamp(max=1)
     return (FAINTEST + (1 - FAINTEST) * share.sqrt()).where(m2 > 0, 0.0)
 
 
@@ -152,12 +152,12 @@ class Window(NamedTuple):
     rows: slice
     columns: slice
 
-    def of(self, values: Tensor) -> Tensor:
+    def crop(self, values: Tensor) -> Tensor:
         """(..., Y, X) values in it."""
         return values[..., self.rows, self.columns]
 
 
-def asked_and_known(coverage: Coverage, ego_outline_m: Outline | None = None) -> Window:
+def find_observed_window(coverage: Coverage, ego_outline_m: Outline | None = None) -> Window:
     """What of a result is worth paper: where it knows cells within the regions' bounds, and the ego.
 
     `coverage`: the result; the whole grid if it knows nothing; `ego_outline_m`: (K, 2) corners x, y of the ego in
@@ -172,18 +172,18 @@ def asked_and_known(coverage: Coverage, ego_outline_m: Outline | None = None) ->
         x, y = (in_x, in_y) if in_x and in_y else (x, y)
     if ego_outline_m is not None:
         x, y = (_including(bounds, ego_outline_m[:, axis].tolist()) for axis, bounds in enumerate((x, y)))
-    return window(grid, x, y)
+    return crop_grid(grid, x, y)
 
 
-def near_field(grid: BevGrid, ego_outline_m: Outline) -> Window | None:
+def find_near_field_window(grid: BevGrid, ego_outline_m: Outline) -> Window | None:
     """The ego and two of its lengths around it, as far as the grid goes; None where that is nothing."""
     low, high = ego_outline_m.min(axis=0), ego_outline_m.max(axis=0)
     reach_m = NEAR_LENGTHS * float(high[0] - low[0])
     x, y = ((float(low[axis]) - reach_m, float(high[axis]) + reach_m) for axis in (0, 1))
-    return window(grid, x, y) if _both(x, grid.x) and _both(y, grid.y) else None
+    return crop_grid(grid, x, y) if _both(x, grid.x) and _both(y, grid.y) else None
 
 
-def window(grid: BevGrid, x: Bounds, y: Bounds) -> Window:
+def crop_grid(grid: BevGrid, x: Bounds, y: Bounds) -> Window:
     """The cells of a grid that lie within some bounds, or in part; at least one."""
     (columns, own_x), (rows, own_y) = (
         _cells(bounds, whole, grid.cell, count)
@@ -217,7 +217,7 @@ NOTHING_FOUND = "no visible surface found"
 
 
 @dataclass(frozen=True)
-class Subject:
+class MapLayer:
     """What some maps show: one quantity of every rig, (H, Y, X) in the unit that is shown, by one scale in every band.
 
     For the legend: why a cell has no number, and how much was measured, and how finely. `opacity` (H, Y, X) is None if
@@ -226,13 +226,13 @@ class Subject:
 
     quantity: Quantity
     values: Mapping[str, Tensor]
-    scale: ColourScale
-    unknown: str
+    scale: ColorScale
+    unobserved_label: str
     conditions: str
     opacity: Tensor | None = None
 
 
-def subjects_of(coverages: Mapping[str, Coverage]) -> Iterator[Subject]:
+def build_map_layers(coverages: Mapping[str, Coverage]) -> Iterator[MapLayer]:
     """The quantities of the measure that the results have, then those of other aggregations.
 
     `coverages`: by the name of the rig; one, or several that are paired.
@@ -240,13 +240,13 @@ def subjects_of(coverages: Mapping[str, Coverage]) -> Iterator[Subject]:
     first = next(iter(coverages.values()))
     if first.measure == "area":
         yield from _of_surface(coverages)
-    for quantity, by_surface in quantities_shown(first):
+    for quantity, by_surface in list_map_quantities(first):
         if not by_surface:
             values = {name: coverage.layers[quantity.key].values for name, coverage in coverages.items()}
             yield _subject(quantity, values, NEVER_PROBED, _conditions(first))
 
 
-def quantities_shown(coverage: Coverage) -> list[tuple[Quantity, bool]]:
+def list_map_quantities(coverage: Coverage) -> list[tuple[Quantity, bool]]:
     """The quantities of the measure, then those of other aggregations, and whether each is over the visible surface."""
     of_surface = [by_area(quantity) for quantity in coverage.quantities]
     of_both = {quantity.key for quantity in (*coverage.quantities, *of_surface)}
@@ -255,30 +255,32 @@ def quantities_shown(coverage: Coverage) -> list[tuple[Quantity, bool]]:
     return [*((one, coverage.measure == "area") for one in of_measure), *((one, False) for one in others)]
 
 
-def difference(values: Tensor, expected: Tensor) -> Tensor:
+def compute_difference(values: Tensor, baseline: Tensor) -> Tensor:
     """Where both are infinite there is no difference, rather than NaN, which means unknown."""
-    return (values - expected).where(values != expected, 0.0)
+    return (values - baseline).where(values != baseline, 0.0)
 
 
-def _of_surface(coverages: Mapping[str, Coverage]) -> Iterator[Subject]:
+def _of_surface(coverages: Mapping[str, Coverage]) -> Iterator[MapLayer]:
     first = next(iter(coverages.values()))
     areas = {name: coverage.area for name, coverage in coverages.items() if coverage.area is not None}
-    sides = square_sides(first.points, first.grid.cell)
+    sides = compute_square_sides(first.points, first.grid.cell)
     # The rigs share the reference points, and so the square metres.
-    opacity = opacity_of(next(iter(areas.values())), first.counts["steps"], sides, first.grid.cell)
-    each = {name: ratios(area, sides) for name, area in areas.items()}
+    opacity = compute_opacity(next(iter(areas.values())), first.counts["steps"], sides, first.grid.cell)
+    each = {name: compute_ratios(area, sides) for name, area in areas.items()}
     for at, quantity in enumerate(map(by_area, first.quantities)):
         values = {name: values[at] for name, values in each.items()}
         yield _subject(quantity, values, NOTHING_FOUND, _conditions(first) + LARGER, opacity)
 
 
 def _conditions(coverage: Coverage) -> str:
-    return steps_and_cell(coverage.counts["steps"], coverage.grid)
+    return format_resolution(coverage.counts["steps"], coverage.grid)
 
 
 def _subject(
     quantity: Quantity, values: Mapping[str, Tensor], unknown: str, conditions: str, opacity: Tensor | None = None
-) -> Subject:
+) -> MapLayer:
     """With the values in the unit that is shown, and one scale for all."""
-    shown = {name: shown_unit(quantity.unit).factor * each for name, each in values.items()}
-    return Subject(quantity, shown, scale_of(quantity, torch.stack(list(shown.values()))), unknown, conditions, opacity)
+    shown = {name: get_display_unit(quantity.unit).factor * each for name, each in values.items()}
+    return MapLayer(
+        quantity, shown, build_color_scale(quantity, torch.stack(list(shown.values()))), unknown, conditions, opacity
+    )

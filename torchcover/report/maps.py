@@ -14,31 +14,31 @@ from torch import Tensor
 
 from torchcover.coverage import BevGrid, Coverage, check_paired
 from torchcover.files import write_atomically
-from torchcover.report.colours import difference_scale, draw_side_by_side, scale_of
+from torchcover.report.colours import build_color_scale, build_difference_scale, plot_side_by_side
 from torchcover.report.map_subjects import (
-    Subject,
+    MapLayer,
     Window,
-    as_drawn,
-    asked_and_known,
-    difference,
-    near_field,
-    subjects_of,
+    build_map_layers,
+    compute_difference,
+    downsample_coverage,
+    find_near_field_window,
+    find_observed_window,
 )
 from torchcover.report.overlay import SensorView
-from torchcover.report.wording import capitalised, span
+from torchcover.report.wording import capitalize, format_height_band
 
 MAX_FILE_NAME = 48
-Named = tuple[str, Figure]
+NamedFigure = tuple[str, Figure]
 
 
-def map_figures(
+def plot_maps(
     coverages: Mapping[str, Coverage],
     *,
     ego_outline_m: NDArray[np.floating] | None = None,
     sensors: Mapping[str, Sequence[SensorView]] | None = None,
     vehicle: str | None = None,
-    layer: str | None = None,
-) -> Iterator[Named]:
+    quantity_key: str | None = None,
+) -> Iterator[NamedFigure]:
     """Draw what was measured in every height band, for one rig or for several.
 
     Results over the visible surface are drawn as the ratio of each cell, or of a larger square where points are few;
@@ -52,7 +52,7 @@ def map_figures(
         ego_outline_m: (K, 2) corners x, y of the ego in the vehicle frame in metres.
         sensors: What to mark, by the name of the rig.
         vehicle: What the ego is called, for the titles.
-        layer: Key of the only quantity to draw; all if not given.
+        quantity_key: Key of the only quantity to draw; all if not given.
 
     Returns:
         Pairs, drawn one by one, of a name that is fit for a file and a figure: `radius_m_ground`,
@@ -66,42 +66,42 @@ def map_figures(
         >>> from torchcover.coverage import CoverageMetric
         >>> metric = CoverageMetric(BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)}))
         >>> metric.update(torch.zeros(1, 3), torch.tensor([[0.3, 0.0, 0.0]]))
-        >>> [name for name, _ in map_figures({"my rig": metric.compute()})]
+        >>> [name for name, _ in plot_maps({"my rig": metric.compute()})]
         ['radius_m_all', 'detection_0.4m_all']
     """
     if len(coverages) > 1:
         check_paired(coverages)
-    coverages = {name: as_drawn(coverage) for name, coverage in coverages.items()}
-    return _figures(coverages, _Setting(ego_outline_m, sensors or {}, vehicle), layer)
+    coverages = {name: downsample_coverage(coverage) for name, coverage in coverages.items()}
+    return _figures(coverages, _Setting(ego_outline_m, sensors or {}, vehicle), quantity_key)
 
 
-def band_figures(coverage: Coverage) -> Iterator[Named]:
+def plot_band_maps(coverage: Coverage) -> Iterator[NamedFigure]:
     """Draw what was measured, the bands of a quantity side by side: `radius_m`, `detection_0.4m`, ...
 
     Args:
         coverage: What `CoverageMetric.compute` returned.
     """
-    headings = [f"{name}, {span(coverage.grid, name)}" for name in coverage.grid.heights]
-    shown = asked_and_known(coverage)
-    for whole in subjects_of({"": coverage}):
+    headings = [f"{name}, {format_height_band(coverage.grid, name)}" for name in coverage.grid.heights]
+    shown = find_observed_window(coverage)
+    for whole in build_map_layers({"": coverage}):
         subject = _within(whole, shown)
-        figure = draw_side_by_side(
+        figure = plot_side_by_side(
             dict(zip(headings, subject.values[""], strict=True)),
             shown.grid,
             subject.scale,
-            title=capitalised(subject.quantity.title),
+            title=capitalize(subject.quantity.title),
             subtitle=subject.conditions,
-            unknown=subject.unknown,
+            unobserved_label=subject.unobserved_label,
             opacity=None if subject.opacity is None else dict(zip(headings, subject.opacity, strict=True)),
         )
         yield subject.quantity.key, figure
 
 
-def write_figures(figures: Iterable[Named], folder: str | Path) -> list[Path]:
+def write_figures(figures: Iterable[NamedFigure], folder: str | Path) -> list[Path]:
     """Write figures as PNG files, one after the other.
 
     Args:
-        figures: Their names without suffix, and they: what `map_figures` gives.
+        figures: Their names without suffix, and they: what `plot_maps` gives.
         folder: Where to write; made if it does not exist.
     """
     paths = []
@@ -111,11 +111,11 @@ def write_figures(figures: Iterable[Named], folder: str | Path) -> list[Path]:
     return paths
 
 
-def file_stems(names: Sequence[str]) -> list[str]:
+def build_file_stems(names: Sequence[str]) -> list[str]:
     """A name for each that every file system takes and that no other has.
 
     Example:
-        >>> file_stems(["low/high", "low high", "ground"])
+        >>> build_file_stems(["low/high", "low high", "ground"])
         ['low_high', 'low_high_1', 'ground']
     """
     stems: list[str] = []
@@ -133,7 +133,7 @@ class _Setting:
     sensors: Mapping[str, Sequence[SensorView]]
     vehicle: str | None
 
-    def told(self, subject: Subject) -> Subject:
+    def told(self, subject: MapLayer) -> MapLayer:
         """With what carried the rigs."""
         if self.vehicle is None:
             return subject
@@ -147,24 +147,24 @@ class _Band:
     stem: str
     z: str
 
-    def subtitle(self, subject: Subject) -> str:
+    def subtitle(self, subject: MapLayer) -> str:
         """Where it is, and under which conditions a subject was measured."""
         return f"{self.z}; {subject.conditions}"
 
-    def opacity(self, subject: Subject) -> Tensor | None:
+    def opacity(self, subject: MapLayer) -> Tensor | None:
         """(Y, X) that of a subject in this band."""
         return None if subject.opacity is None else subject.opacity[self.number]
 
 
-def _figures(coverages: Mapping[str, Coverage], setting: _Setting, layer: str | None) -> Iterator[Named]:
+def _figures(coverages: Mapping[str, Coverage], setting: _Setting, layer: str | None) -> Iterator[NamedFigure]:
     first, ego = next(iter(coverages.values())), setting.ego_outline_m
     named, shown = (
-        zip(first.grid.heights, file_stems(list(first.grid.heights)), strict=True),
-        asked_and_known(first, ego),
+        zip(first.grid.heights, build_file_stems(list(first.grid.heights)), strict=True),
+        find_observed_window(first, ego),
     )
-    bands = [_Band(at, name, stem, span(first.grid, name)) for at, (name, stem) in enumerate(named)]
-    near = None if ego is None else near_field(first.grid, ego)
-    for whole in map(setting.told, subjects_of(coverages)):
+    bands = [_Band(at, name, stem, format_height_band(first.grid, name)) for at, (name, stem) in enumerate(named)]
+    near = None if ego is None else find_near_field_window(first.grid, ego)
+    for whole in map(setting.told, build_map_layers(coverages)):
         if layer not in (None, whole.quantity.key):
             continue
         subject = _within(whole, shown)
@@ -172,34 +172,34 @@ def _figures(coverages: Mapping[str, Coverage], setting: _Setting, layer: str | 
         yield from _draw_differences(subject, shown.grid, bands, setting)
         if near is not None:
             around = _within(whole, near)
-            own = scale_of(around.quantity, torch.stack(list(around.values.values())))
+            own = build_color_scale(around.quantity, torch.stack(list(around.values.values())))
             yield _draw_near(replace(around, scale=own), near.grid, bands, setting)
 
 
-def _within(subject: Subject, shown: Window) -> Subject:
-    values = {rig: shown.of(each) for rig, each in subject.values.items()}
-    return replace(subject, values=values, opacity=None if subject.opacity is None else shown.of(subject.opacity))
+def _within(subject: MapLayer, shown: Window) -> MapLayer:
+    values = {rig: shown.crop(each) for rig, each in subject.values.items()}
+    return replace(subject, values=values, opacity=None if subject.opacity is None else shown.crop(subject.opacity))
 
 
-def _draw_rigs(subject: Subject, grid: BevGrid, bands: Sequence[_Band], setting: _Setting) -> Iterator[Named]:
+def _draw_rigs(subject: MapLayer, grid: BevGrid, bands: Sequence[_Band], setting: _Setting) -> Iterator[NamedFigure]:
     headings = {rig: rig if len(subject.values) > 1 else "" for rig in subject.values}
     for band in bands:
         opacity = band.opacity(subject)
-        figure = draw_side_by_side(
+        figure = plot_side_by_side(
             {headings[rig]: values[band.number] for rig, values in subject.values.items()},
             grid,
             subject.scale,
-            title=f"{capitalised(subject.quantity.title)}, {band.name}",
+            title=f"{capitalize(subject.quantity.title)}, {band.name}",
             subtitle=band.subtitle(subject),
             ego_outline_m=setting.ego_outline_m,
             sensors={heading: setting.sensors.get(rig, ()) for rig, heading in headings.items()},
-            unknown=subject.unknown,
+            unobserved_label=subject.unobserved_label,
             opacity=None if opacity is None else dict.fromkeys(headings.values(), opacity),
         )
         yield f"{subject.quantity.key}_{band.stem}", figure
 
 
-def _draw_near(subject: Subject, grid: BevGrid, bands: Sequence[_Band], setting: _Setting) -> Named:
+def _draw_near(subject: MapLayer, grid: BevGrid, bands: Sequence[_Band], setting: _Setting) -> NamedFigure:
     several = len(subject.values) > 1
     panels = {
         f"{rig}, {band.name}, {band.z}" if several else f"{band.name}, {band.z}": (rig, band)
@@ -207,32 +207,34 @@ def _draw_near(subject: Subject, grid: BevGrid, bands: Sequence[_Band], setting:
         for band in bands
     }
     opacity = {heading: band.opacity(subject) for heading, (_, band) in panels.items()}
-    figure = draw_side_by_side(
+    figure = plot_side_by_side(
         {heading: subject.values[rig][band.number] for heading, (rig, band) in panels.items()},
         grid,
         subject.scale,
-        title=f"{capitalised(subject.quantity.title)}, near the ego",
+        title=f"{capitalize(subject.quantity.title)}, near the ego",
         subtitle=subject.conditions,
         ego_outline_m=setting.ego_outline_m,
         sensors={heading: setting.sensors.get(rig, ()) for heading, (rig, _) in panels.items()},
-        directions=False,
-        unknown=subject.unknown,
+        show_directions=False,
+        unobserved_label=subject.unobserved_label,
         opacity={heading: each for heading, each in opacity.items() if each is not None},
     )
     return f"near_{subject.quantity.key}", figure
 
 
-def _draw_differences(subject: Subject, grid: BevGrid, bands: Sequence[_Band], setting: _Setting) -> Iterator[Named]:
+def _draw_differences(
+    subject: MapLayer, grid: BevGrid, bands: Sequence[_Band], setting: _Setting
+) -> Iterator[NamedFigure]:
     (first, expected), *others = subject.values.items()
     if not others:
         return
-    differences = [difference(values, expected) for _, values in others]
-    scale = difference_scale(subject.quantity, torch.stack(differences))
-    first_stem, *stems = file_stems(list(subject.values))
+    differences = [compute_difference(values, expected) for _, values in others]
+    scale = build_difference_scale(subject.quantity, torch.stack(differences))
+    first_stem, *stems = build_file_stems(list(subject.values))
     for (rig, _), stem, change in zip(others, stems, differences, strict=True):
         for band in bands:
             opacity = band.opacity(subject)
-            figure = draw_side_by_side(
+            figure = plot_side_by_side(
                 # What is infinite takes the last colour: it is better or worse, not a step without a point.
                 {"": change[band.number].clamp(2 * scale.low, 2 * scale.high)},
                 grid,
@@ -240,7 +242,7 @@ def _draw_differences(subject: Subject, grid: BevGrid, bands: Sequence[_Band], s
                 title=f"{rig} minus {first}: {subject.quantity.title}, {band.name}",
                 subtitle=f"blue: {rig} is better, red: {first} is better; {band.subtitle(subject)}",
                 ego_outline_m=setting.ego_outline_m,
-                unknown=subject.unknown,
+                unobserved_label=subject.unobserved_label,
                 opacity=None if opacity is None else {"": opacity},
             )
             yield f"difference_{subject.quantity.key}_{band.stem}_{stem}_minus_{first_stem}", figure

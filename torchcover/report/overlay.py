@@ -92,15 +92,15 @@ class SensorView:
         _, pitch_deg, roll_deg = euler_from_rotation(self.vehicle_T_sensor[:3, :3])
         return float(pitch_deg), float(roll_deg)
 
-    def outline_m(self, reach_m: float, points: int = 361) -> NDArray[np.float64]:
+    def compute_outline_m(self, max_range_m: float, num_points: int = 361) -> NDArray[np.float64]:
         """Trace the field of view from above, up to a reach, the range of the sensor, or the ground at z = 0.
 
         In each direction from above the ray decides that goes farthest. There is no ground below a sensor with z <= 0:
         such a frame has its origin in a sensor.
 
         Args:
-            reach_m: Longest ray in meters.
-            points: Number of directions.
+            max_range_m: Longest ray in meters.
+            num_points: Number of directions.
 
         Returns:
             (K, 2) corners x, y in the vehicle frame in meters.
@@ -108,16 +108,16 @@ class SensorView:
         position_m = self.position_m[:2]
         if not self.is_tilted:
             half_deg = self.horizontal_fov_deg / 2
-            angles = np.deg2rad(np.linspace(self.yaw_deg - half_deg, self.yaw_deg + half_deg, points))
-            radius_m = self.level_reach_m(reach_m)
+            angles = np.deg2rad(np.linspace(self.yaw_deg - half_deg, self.yaw_deg + half_deg, num_points))
+            radius_m = self.compute_level_range_m(max_range_m)
             arc_m = position_m + radius_m * np.stack([np.cos(angles), np.sin(angles)], axis=1)
             return arc_m if self.horizontal_fov_deg == 360 else np.vstack([arc_m, position_m])
-        angles = np.deg2rad(np.linspace(self.yaw_deg - 180, self.yaw_deg + 180, points))[:, None]
+        angles = np.deg2rad(np.linspace(self.yaw_deg - 180, self.yaw_deg + 180, num_points))[:, None]
         elevations = np.deg2rad(np.linspace(-90.0, 90.0, 1441))[None]  # near the horizon, 0.125 degrees are meters
         level, up = np.cos(elevations), np.sin(elevations) + 0.0 * angles
         rays = np.stack([level * np.cos(angles), level * np.sin(angles), up], axis=-1)
-        seen = self.sees(rays.reshape(-1, 3)).reshape(rays.shape[:2])
-        lengths_m = np.where(seen, self._horizontal_m(elevations, reach_m), 0.0).max(axis=1, keepdims=True)
+        seen = self.mask_directions(rays.reshape(-1, 3)).reshape(rays.shape[:2])
+        lengths_m = np.where(seen, self._horizontal_m(elevations, max_range_m), 0.0).max(axis=1, keepdims=True)
         return np.asarray(position_m + lengths_m * np.hstack([np.cos(angles), np.sin(angles)]))
 
     @property
@@ -125,10 +125,10 @@ class SensorView:
         """Whether its pitch or roll differs from zero."""
         return not np.allclose(self.tilt_deg, 0.0)
 
-    def level_reach_m(self, reach_m: float) -> float:
+    def compute_level_range_m(self, max_range_m: float) -> float:
         """Horizontal length in meters of the most level ray of a sensor that is not tilted, up to a reach."""
         most_level_deg = np.clip(0.0, *self.vertical_fov_deg)
-        return float(self._horizontal_m(np.deg2rad(most_level_deg), reach_m))
+        return float(self._horizontal_m(np.deg2rad(most_level_deg), max_range_m))
 
     def _horizontal_m(self, elevations: NDArray[np.float64], reach_m: float) -> NDArray[np.float64]:
         """Horizontal lengths in meters of rays of some elevations in radians, which end on the ground at z = 0."""
@@ -136,7 +136,7 @@ class SensorView:
         to_ground_m = np.where(elevations < 0, height_m / np.maximum(-np.sin(elevations), 1e-9), math.inf)
         return np.asarray(np.minimum(to_ground_m, min(reach_m, self.range_m)) * np.cos(elevations))
 
-    def sees(self, directions: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def mask_directions(self, directions: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Which of (N, 3) directions in the vehicle frame lie in the field of view."""
         x, y, z = (directions @ self.vehicle_T_sensor[:3, :3]).T
         azimuth_deg = np.rad2deg(np.arctan2(y, x))
@@ -147,19 +147,19 @@ class SensorView:
         return inside
 
 
-def sensor_colour(at: int) -> str:
+def get_sensor_color(index: int) -> str:
     """The colour of a sensor by its number, from 0 on: no other of the first 21 has it.
 
     Example:
-        >>> sensor_colour(0), sensor_colour(7), sensor_colour(14)
+        >>> get_sensor_color(0), get_sensor_color(7), get_sensor_color(14)
         ('#0072b2', '#003959', '#80b8d8')
     """
-    share, white = SHADES[at // len(COLOURS) % len(SHADES)]
-    red_green_blue = np.array([int(COLOURS[at % len(COLOURS)][digit : digit + 2], 16) for digit in (1, 3, 5)])
+    share, white = SHADES[index // len(COLOURS) % len(SHADES)]
+    red_green_blue = np.array([int(COLOURS[index % len(COLOURS)][digit : digit + 2], 16) for digit in (1, 3, 5)])
     return "#" + "".join(f"{value:02x}" for value in np.rint(share * red_green_blue + 255 * white).astype(int).tolist())
 
 
-def draw_ego(axes: Axes, outline_m: NDArray[np.floating]) -> list[Artist]:
+def plot_ego(axes: Axes, outline_m: NDArray[np.floating]) -> list[Artist]:
     """Fill the ego's outline.
 
     `axes`: axes of a map; `outline_m`: (K, 2) corners x, y in the vehicle frame in metres, K >= 3. Returns legend
@@ -173,10 +173,10 @@ def draw_ego(axes: Axes, outline_m: NDArray[np.floating]) -> list[Artist]:
     return [ego]
 
 
-def draw_sensors(sheet: Sheet, sensors: Sequence[SensorView], *, named: bool = True) -> list[Artist]:
+def plot_sensors(sheet: Sheet, sensors: Sequence[SensorView], *, show_names: bool = True) -> list[Artist]:
     """Draw each sensor as a dot with an arrow in its direction, numbered if there are several, and its field of view.
 
-    `sheet`: the sheet of the map; `sensors`: what to draw; `named`: whether the legend names each; else there are no
+    `sheet`: the sheet of the map; `sensors`: what to draw; `show_names`: whether the legend names each; else there are no
     numbers either. Returns legend entries.
     """
     if not sensors:
@@ -186,7 +186,7 @@ def draw_sensors(sheet: Sheet, sensors: Sequence[SensorView], *, named: bool = T
         _draw_view(sheet, sensor)
     for sensor in sensors:
         _draw_arrow(sheet, sensor)
-    if not named:
+    if not show_names:
         return [Line2D([], [], linestyle="none", marker="o", label="sensor, with its direction", **DOT), view]
     if len(sensors) > 1:
         _draw_numbers(sheet, sensors)
@@ -194,7 +194,7 @@ def draw_sensors(sheet: Sheet, sensors: Sequence[SensorView], *, named: bool = T
     return [*(_legend_entry(sheet, *pair) for pair in zip(marks, sensors, strict=True)), view]
 
 
-def draw_places(sheet: Sheet, sensors: Sequence[SensorView]) -> list[Artist]:
+def plot_sensor_positions(sheet: Sheet, sensors: Sequence[SensorView]) -> list[Artist]:
     """Draw each sensor as a dot, and nothing over the cells around it; returns legend entries."""
     for sensor in sensors:
         sheet.axes.plot(sensor.x_m, sensor.y_m, linestyle="none", marker="o", zorder=5, **DOT)
@@ -206,7 +206,7 @@ def _draw_view(sheet: Sheet, sensor: SensorView) -> None:
     furthest = max(math.dist(start, corner) for corner in product(sheet.axes.get_xlim(), sheet.axes.get_ylim()))
     # Infinity cannot be drawn; beyond the map all ranges look the same.
     wedge = Polygon(
-        sensor.outline_m(2 * furthest),
+        sensor.compute_outline_m(2 * furthest),
         fill=False,
         edgecolor="black",
         linewidth=0.8,
@@ -240,7 +240,7 @@ def _places(sheet: Sheet, sensors: Sequence[SensorView]) -> dict[tuple[float, fl
     places: dict[tuple[float, float], list[int]] = {}
     for number, sensor in enumerate(sensors, start=1):
         wanted = _ahead(sheet, sensor, NUMBER_POINTS)
-        near = (place for place in places if math.dist(place, wanted) < OVERLAP_POINTS / 72 * sheet.metres_per_inch)
+        near = (place for place in places if math.dist(place, wanted) < OVERLAP_POINTS / 72 * sheet.meters_per_inch)
         places.setdefault(next(near, wanted), []).append(number)
     return places
 
@@ -257,5 +257,5 @@ def _legend_entry(sheet: Sheet, mark: str, sensor: SensorView) -> Artist:
 
 def _ahead(sheet: Sheet, sensor: SensorView, points: float) -> tuple[float, float]:
     """The place so many points (1/72 inch) in front of the sensor, in metres."""
-    reach, yaw = points / 72 * sheet.metres_per_inch, math.radians(sensor.yaw_deg)
+    reach, yaw = points / 72 * sheet.meters_per_inch, math.radians(sensor.yaw_deg)
     return sensor.x_m + reach * math.cos(yaw), sensor.y_m + reach * math.sin(yaw)

@@ -10,26 +10,26 @@ from torchcover.coverage.measures import Measure
 from torchcover.coverage.redundancy import redundancy_quantities
 from torchcover.estimation import Difference, Number
 from torchcover.files import csv_text
-from torchcover.report.remarks import sensors_of
+from torchcover.report.remarks import get_failure_sensors
 from torchcover.report.table import CoverageTable, Row
-from torchcover.report.wording import percent, square_metres
+from torchcover.report.wording import format_percent, format_square_meters
 
 Record = dict[str, object]
-Columns = dict[str, Callable[[Row], object]]
+ColumnGetters = dict[str, Callable[[Row], object]]
 
 
 class Column(NamedTuple):
     """What stands in a row besides its numbers and their errors, of tables of one measure or of all.
 
-    `meaning` is for the documentation. In words it stands under its heading, if it has one, as `words` makes it text.
+    `meaning` is for the documentation. In words it stands under its heading, if it has one, as `format_value` makes it text.
     """
 
     key: str
     meaning: str
-    of: Callable[[CoverageTable, Row], object]
+    get_value: Callable[[CoverageTable, Row], object]
     heading: str = ""
-    words: Callable[[Any], str] = str
-    measure: Measure | None = None
+    format_value: Callable[[Any], str] = str
+    average: Measure | None = None
 
 
 def _sensor_model(table: CoverageTable, row: Row) -> object:
@@ -47,7 +47,7 @@ COLUMNS = (
         "mean of the square metres that the reference sees in a step",
         lambda _, row: row.summary.visible_m2,
         "visible surface\n(m2)",
-        square_metres,
+        format_square_meters,
         "area",
     ),
     Column(
@@ -55,7 +55,7 @@ COLUMNS = (
         "share of the cells that are known",
         lambda _, row: row.summary.known_share,
         "known cells\n(%)",
-        percent,
+        format_percent,
         "known",
     ),
     Column(
@@ -63,13 +63,13 @@ COLUMNS = (
         "how many are known; of a body, places with room",
         lambda _, row: row.summary.known_cells,
         "free places",
-        measure="places",
+        average="places",
     ),
     Column("cells", "of the region; of a body, places that were tried", lambda _, row: row.summary.cells),
     Column("cell_m", "side of a cell", lambda table, _: table.grid.cell),
     Column("steps", "how many were measured", lambda table, row: table.conditions[row.rig].counts["steps"]),
     Column("blocks", "how many the errors come from", lambda table, row: table.conditions[row.rig].blocks),
-    Column("steps_per_block", "of a full one", lambda table, row: table.conditions[row.rig].steps_per_block),
+    Column("steps_per_block", "of a full one", lambda table, row: table.conditions[row.rig].frames_per_block),
     Column("vehicle", "what carries the rig; empty if unknown", lambda table, _: table.source.get("vehicle")),
     Column("sensor_model", "what sensors make of their hits: `ideal` or `real`; empty if unknown", _sensor_model),
     Column("x_min_m", "where the region begins", lambda _, row: row.region.x[0]),
@@ -84,33 +84,33 @@ COLUMNS = (
 )
 
 
-def records_of(table: CoverageTable) -> list[Record]:
+def build_records(table: CoverageTable) -> list[Record]:
     """A record for each row, rig by rig; lengths in metres, detection and shares in [0, 1], NaN where unknown."""
-    columns = columns_of(table)
-    rows = [row for each in (table.rows, table.bodies) for of_rig in each.values() for row in of_rig]
+    columns = build_columns(table)
+    rows = [row for each in (table.rows, table.target_rows) for of_rig in each.values() for row in of_rig]
     return [{name: of(row) for name, of in columns.items()} for row in rows]
 
 
-def columns_of(table: CoverageTable) -> Columns:
+def build_columns(table: CoverageTable) -> ColumnGetters:
     """What each record has, and where it is in a row."""
-    keys = [quantity.key for quantity in (*table.quantities, *table.body_quantities)]
-    means = [quantity.key for quantity in table.means]
-    columns: Columns = {
+    keys = [quantity.key for quantity in (*table.quantities, *table.target_quantities)]
+    means = [quantity.key for quantity in table.mean_quantities]
+    columns: ColumnGetters = {
         "rig": lambda row: row.rig,
         "region": lambda row: row.summary.region,
         "height": lambda row: row.summary.height,
     }
     for key in keys:
         columns |= _of_summary(key)
-    for key in means if table.measure == "area" else ():
+    for key in means if table.average == "area" else ():
         columns |= _known(key)
-    columns |= {column.key: partial(column.of, table) for column in COLUMNS}
+    columns |= {column.key: partial(column.get_value, table) for column in COLUMNS}
     for key in keys if len(table.rigs) > 1 else ():
         columns |= _compared(key)
-    sensors = dict.fromkeys(sensor for rows in table.rows.values() for sensor in sensors_of(rows))
+    sensors = dict.fromkeys(sensor for rows in table.rows.values() for sensor in get_failure_sensors(rows))
     if sensors:
         columns |= {"indispensable_sensor": _indispensable}
-        for quantity in redundancy_quantities((), table.thresholds):
+        for quantity in redundancy_quantities((), table.thresholds_m):
             columns |= _seen_by(quantity.key)
     for sensor in sensors:
         for key in means:
@@ -118,17 +118,17 @@ def columns_of(table: CoverageTable) -> Columns:
     return columns
 
 
-def _of_summary(key: str) -> Columns:
+def _of_summary(key: str) -> ColumnGetters:
     return _number(key, lambda row: row.summary.numbers.get(key))
 
 
-def _known(key: str) -> Columns:
+def _known(key: str) -> ColumnGetters:
     return _number(f"known_{key}", lambda row: row.summary.known.get(key))
 
 
-def _compared(key: str) -> Columns:
+def _compared(key: str) -> ColumnGetters:
     return {
-        f"{key}_best": lambda row: key in row.best,
+        f"{key}_best": lambda row: key in row.leading_keys,
         **_number(f"{key}_difference", lambda row: row.differences.get(key)),
         f"{key}_difference_significant": lambda row: getattr(row.differences.get(key), "significant", None),
     }
@@ -138,14 +138,14 @@ def _indispensable(row: Row) -> object:
     return "" if row.summary.redundancy is None else row.summary.redundancy.indispensable or ""
 
 
-def _seen_by(key: str) -> Columns:
+def _seen_by(key: str) -> ColumnGetters:
     def number(row: Row) -> Number | None:
         return row.summary.redundancy.seen_by[key] if row.summary.redundancy else None
 
     return _number(key, number)
 
 
-def _without(sensor: str, key: str) -> Columns:
+def _without(sensor: str, key: str) -> ColumnGetters:
     """NaN for a rig that has no such sensor."""
 
     def number(row: Row) -> Number | None:
@@ -160,7 +160,7 @@ def _without(sensor: str, key: str) -> Columns:
     return {**columns, significant: lambda row: getattr(change(row), "significant", None)}
 
 
-def _number(key: str, number: Callable[[Row], Number | Difference | None]) -> Columns:
+def _number(key: str, number: Callable[[Row], Number | Difference | None]) -> ColumnGetters:
     """A number, its standard error and the ends of its interval."""
     parts = {"value": key, "error": f"{key}_error", "low": f"{key}_low", "high": f"{key}_high"}
     return {name: partial(_part, number, part) for part, name in parts.items()}
@@ -172,10 +172,10 @@ def _part(number: Callable[[Row], Number | Difference | None], part: str, row: R
 
 def render_json(table: CoverageTable) -> str:
     """The table as JSON text."""
-    return json.dumps(table_dict(table), indent=2, allow_nan=False) + "\n"
+    return json.dumps(build_table_dict(table), indent=2, allow_nan=False) + "\n"
 
 
-def table_dict(table: CoverageTable) -> dict[str, Any]:
+def build_table_dict(table: CoverageTable) -> dict[str, Any]:
     """Everything of a table that JSON can hold, for `summary.json`.
 
     Returns:
@@ -197,20 +197,20 @@ def table_dict(table: CoverageTable) -> dict[str, Any]:
             row.region.name: {"x_m": row.region.x, "y_m": row.region.y, "corners_m": row.region.corners_m}
             for row in table.rows[table.rigs[0]]
         },
-        "thresholds_m": list(table.thresholds),
-        "max_radius_m": _json_number(table.max_radius),
-        "blocks": table.first.blocks,
-        "steps_per_block": table.first.steps_per_block,
+        "thresholds_m": list(table.thresholds_m),
+        "max_radius_m": _json_number(table.max_radius_m),
+        "blocks": table.first_conditions.blocks,
+        "steps_per_block": table.first_conditions.frames_per_block,
         "counts": counts if len(counts) > 1 else counts[table.rigs[0]],
-        "rows": [json_record(record) for record in records_of(table)],
+        "rows": [to_json_record(record) for record in build_records(table)],
     }
 
 
-def json_record(record: Mapping[str, object]) -> Record:
+def to_json_record(record: Mapping[str, object]) -> Record:
     """A record for JSON, which has neither NaN nor infinity: None is unknown, "Infinity" and "-Infinity" are words.
 
     Example:
-        >>> json_record({"radius_m": float("inf"), "radius_m_error": float("nan"), "steps": 3})
+        >>> to_json_record({"radius_m": float("inf"), "radius_m_error": float("nan"), "steps": 3})
         {'radius_m': 'Infinity', 'radius_m_error': None, 'steps': 3}
     """
     return {name: _json_number(value) for name, value in record.items()}
@@ -226,4 +226,4 @@ def _json_number(value: object) -> object:
 
 def render_csv(table: CoverageTable) -> str:
     """A line for each rig, region and band, under a header; an unknown number is an empty field, infinity is `inf`."""
-    return csv_text([columns_of(table), *(record.values() for record in records_of(table))])
+    return csv_text([build_columns(table), *(record.values() for record in build_records(table))])

@@ -11,55 +11,55 @@ from torchcover.estimation import MIN_BLOCKS, Quantity, blocks_needed
 from torchcover.report.table import CoverageTable, Row
 from torchcover.report.wording import (
     UNKNOWN,
-    difference_heading,
-    difference_words,
-    number_words,
-    span,
-    square_metres,
-    steps_and_cell,
-    value_words,
+    format_difference,
+    format_difference_heading,
+    format_height_band,
+    format_number,
+    format_resolution,
+    format_square_meters,
+    format_value,
 )
 
 MAX_HEADING_CHARS = 16
 NONE = "none"
 
 
-def decisive(table: CoverageTable) -> Quantity:
+def get_main_quantity(table: CoverageTable) -> Quantity:
     """What sensors are judged by: the detection at the first threshold, or the radius where there is none."""
-    return table.means[min(1, len(table.thresholds))]
+    return table.mean_quantities[min(1, len(table.thresholds_m))]
 
 
-def sensors_of(rows: Sequence[Row]) -> tuple[str, ...]:
+def get_failure_sensors(rows: Sequence[Row]) -> tuple[str, ...]:
     """The sensors that the rows of a rig have numbers without; none if that was not asked for."""
     known = (row.summary.redundancy for row in rows)
     return next((tuple(redundancy.without) for redundancy in known if redundancy), ())
 
 
-def failure_title(table: CoverageTable, rig: str) -> str:
+def format_failure_title(table: CoverageTable, rig: str) -> str:
     """What stands above the part of the table that is about one rig."""
     beginning = f"{rig}: change" if len(table.rigs) > 1 else "Change"
-    return f"{beginning} of {difference_heading(decisive(table))} when one sensor fails"
+    return f"{beginning} of {format_difference_heading(get_main_quantity(table))} when one sensor fails"
 
 
-def failure_headings(table: CoverageTable, rig: str) -> list[str]:
+def format_failure_headings(table: CoverageTable, rig: str) -> list[str]:
     """Of its columns, but for the place."""
     several = [fill(heading, MAX_HEADING_CHARS) for heading in ("sensors that see it", "by two or more (%)")]
-    return [*(several if table.thresholds else ()), *sensors_of(table.rows[rig]), "most lost with"]
+    return [*(several if table.thresholds_m else ()), *get_failure_sensors(table.rows[rig]), "most lost with"]
 
 
-def failure_words(table: CoverageTable, row: Row) -> list[tuple[str, bool]]:
+def format_failure_cells(table: CoverageTable, row: Row) -> list[tuple[str, bool]]:
     """The cells of one row but for the place, each with whether it is marked as more than chance."""
-    redundancy, key = row.summary.redundancy, decisive(table).key
-    sensors = sensors_of(table.rows[row.rig])
+    redundancy, key = row.summary.redundancy, get_main_quantity(table).key
+    sensors = get_failure_sensors(table.rows[row.rig])
     if redundancy is None:
-        return [(UNKNOWN, False)] * len(failure_headings(table, row.rig))
+        return [(UNKNOWN, False)] * len(format_failure_headings(table, row.rig))
     words = []
-    for threshold in table.thresholds[:1]:
-        words.append((number_words(redundancy.seen_by[sensors_seeing(threshold).key]), False))
-        words.append((number_words(redundancy.seen_by[seen_by_two(threshold).key]), False))
+    for threshold in table.thresholds_m[:1]:
+        words.append((format_number(redundancy.seen_by[sensors_seeing(threshold).key]), False))
+        words.append((format_number(redundancy.seen_by[seen_by_two(threshold).key]), False))
     for sensor in sensors:
         change = redundancy.change[sensor][key]
-        words.append((difference_words(change), bool(change.significant)))
+        words.append((format_difference(change), bool(change.significant)))
     known = not math.isnan(row.summary.numbers[key].value)
     return [*words, (redundancy.indispensable or (NONE if known else UNKNOWN), False)]
 
@@ -69,14 +69,14 @@ class FailureParams:
     """When the loss of a sensor is called a single point of failure.
 
     Args:
-        least_share: Least loss that is more than chance: the share of the detection that is lost, or by which the
+        min_share: Least loss that is more than chance: the share of the detection that is lost, or by which the
             radius grows. A tenth is more than settings move a number, see docs/accuracy.md.
     """
 
-    least_share: float = 0.1
+    min_share: float = 0.1
 
 
-def single_point_of_failure(table: CoverageTable, rig: str, params: FailureParams = FailureParams()) -> str:
+def describe_single_point_of_failure(table: CoverageTable, rig: str, params: FailureParams = FailureParams()) -> str:
     """Name the sensor of a rig with which most is lost, and where, if the loss is large and more than chance.
 
     Args:
@@ -87,25 +87,25 @@ def single_point_of_failure(table: CoverageTable, rig: str, params: FailureParam
     Returns:
         A sentence; empty if redundancy was not asked for.
     """
-    quantity, rows = decisive(table), table.rows[rig]
-    if not sensors_of(rows):
+    quantity, rows = get_main_quantity(table), table.rows[rig]
+    if not get_failure_sensors(rows):
         return ""
     if all(math.isnan(row.summary.numbers[quantity.key].value) for row in rows):
         return "Whether one sensor is indispensable is unknown: nothing that was asked about was seen."
     if quantity.key != RADIUS.key and not any(row.summary.numbers[quantity.key].value > 0.0 for row in rows):
         return "Nothing of what was asked about is detected: no failure could take anything away."
-    if len(sensors_of(rows)) == 1:
-        return f"Its only sensor is {sensors_of(rows)[0]}: without it nothing is seen."
-    large = [row for row in rows if _lost_share(row, quantity) >= params.least_share]
+    if len(get_failure_sensors(rows)) == 1:
+        return f"Its only sensor is {get_failure_sensors(rows)[0]}: without it nothing is seen."
+    large = [row for row in rows if _lost_share(row, quantity) >= params.min_share]
     large = [row for row in large if _is_significant(row, quantity) is not False]
     real = [row for row in large if _is_significant(row, quantity)]
     worst = max(real or large, key=lambda row: _loss(row.summary.redundancy, quantity), default=None)
     if worst is None or (redundancy := worst.summary.redundancy) is None or redundancy.indispensable is None:
-        least = f"{100 * params.least_share:g} %"
+        least = f"{100 * params.min_share:g} %"
         return f"No single point of failure: no sensor's failure costs {least} or more of any number beyond chance."
     sensor = redundancy.indispensable
     before, after = worst.summary.numbers[quantity.key].value, redundancy.without[sensor][quantity.key].value
-    whole, rest = (value_words(value, quantity.unit) for value in (before, after))
+    whole, rest = (format_value(value, quantity.unit) for value in (before, after))
     unit = "m" if quantity.unit == "m" else "%"
     where = f"{worst.summary.region} {worst.summary.height}"
     change = f"{quantity.title} is {rest} {unit} in {where}, not {whole} {unit}"
@@ -139,39 +139,39 @@ MOSTLY = 0.8
 
 
 @dataclass(frozen=True)
-class Remark:
+class TableNote:
     """One thing to know.
 
     Args:
         name: Which.
         count: How many there are.
-        of: Of how many.
+        total: Of how many.
         sentence: In words.
     """
 
     name: str
     count: int
-    of: int
+    total: int
     sentence: str
 
 
-def remarks_on(table: CoverageTable, rig: str) -> tuple[Remark, ...]:
+def collect_table_notes(table: CoverageTable, rig: str) -> tuple[TableNote, ...]:
     """What is to be known about the numbers of a rig, of that which did happen."""
     return tuple(remark for remark in _looked_at(table, rig) if remark.count)
 
 
-def _looked_at(table: CoverageTable, rig: str) -> Iterator[Remark]:
+def _looked_at(table: CoverageTable, rig: str) -> Iterator[TableNote]:
     summaries = [row.summary for row in table.rows[rig]]
-    yield Remark("no_region", int(not summaries), 1, "No region, so no number: the maps cover the whole grid.")
-    if table.measure == "area":
+    yield TableNote("no_region", int(not summaries), 1, "No region, so no number: the maps cover the whole grid.")
+    if table.average == "area":
         seen = "Means over the square metres that the reference sees."
-        yield Remark("visible_surface", len(summaries), len(summaries), seen)
+        yield TableNote("visible_surface", len(summaries), len(summaries), seen)
     else:
         cells, known = sum(one.cells for one in summaries), sum(one.known_cells for one in summaries)
         flattered = "Means over the known cells only; the fewer are known, the more the numbers may flatter the rig."
-        yield Remark("unknown_cells", cells - known, cells, flattered)
+        yield TableNote("unknown_cells", cells - known, cells, flattered)
     yield from _on_errors(table, rig)
-    counts, inside, limit_m = table.conditions[rig].counts, table.conditions[rig].points, table.max_radius
+    counts, inside, limit_m = table.conditions[rig].counts, table.conditions[rig].point_count, table.max_radius_m
     every, outside = inside + counts["outside_points"], counts["outside_points"] - counts["no_ground_points"]
     far = "infinitely far" if math.isinf(limit_m) else f"{limit_m:.4g} m far, the limit"
     doubt = " Is the ground at z = 0, and x ahead?" if outside > MOSTLY * every else ""
@@ -183,52 +183,52 @@ def _looked_at(table: CoverageTable, rig: str) -> Iterator[Remark]:
         ("outside_points", every, f"reference points lie outside the grid: left out.{doubt}"),
         ("no_ground_points", every, "reference points have no known ground at or below them: in no band."),
     ):
-        yield Remark(name, some[name], of, f"{some[name]:,} of {of:,} {words}")
+        yield TableNote(name, some[name], of, f"{some[name]:,} of {of:,} {words}")
 
 
-def _on_errors(table: CoverageTable, rig: str) -> Iterator[Remark]:
-    blocks, steps = table.conditions[rig].blocks, table.conditions[rig].steps_per_block or 0
+def _on_errors(table: CoverageTable, rig: str) -> Iterator[TableNote]:
+    blocks, steps = table.conditions[rig].blocks, table.conditions[rig].frames_per_block or 0
     if blocks is None:
         return
     if not table.has_intervals:
-        where = f" in {table.conditions[rig].fewest}" * bool(table.conditions[rig].fewest)
-        needed = blocks_needed(blocks, table.first.effective[0])
+        where = f" in {table.conditions[rig].smallest_scene_kind}" * bool(table.conditions[rig].smallest_scene_kind)
+        needed = blocks_needed(blocks, table.first_conditions.effective_blocks[0])
         few = f"Not enough steps for intervals{where}: {blocks} block{'s' * (blocks != 1)}, about {needed} are needed."
-        yield Remark("too_few_blocks", blocks, needed, few)
+        yield TableNote("too_few_blocks", blocks, needed, few)
         return
-    means = [quantity.key for quantity in table.means]  # of a largest radius no error is ever known
+    means = [quantity.key for quantity in table.mean_quantities]  # of a largest radius no error is ever known
     numbers = [[row.summary.numbers[key] for key in means] for row in table.rows[rig]]
     without = sum(any(math.isfinite(number.value) and math.isnan(number.low) for number in row) for row in numbers)
     some = any(math.isfinite(number.low) for row in numbers for number in row)
     length = f"up to {steps:,} steps in a row" if steps > 1 else "a step"
     brackets = f"In brackets: 95 % intervals, from {blocks} blocks of {length}."
-    yield Remark("intervals", blocks * some, blocks, brackets)
+    yield TableNote("intervals", blocks * some, blocks, brackets)
     unknown = "No interval where too few blocks have probed the region, or all say the same."
-    yield Remark("no_intervals", without, len(numbers), unknown)
+    yield TableNote("no_intervals", without, len(numbers), unknown)
 
 
-def notes_on(table: CoverageTable) -> list[str]:
+def list_notes(table: CoverageTable) -> list[str]:
     """What the numbers hold under and what went wrong, a sentence each; what is about one rig only begins with it."""
-    of_rigs = in_common_first({rig: _of_rig(table, rig) for rig in table.rigs})
-    shared = {"known": "they know the same cells", "area": "they are asked about the same square metres"}[table.measure]
+    of_rigs = merge_notes({rig: _of_rig(table, rig) for rig in table.rigs})
+    shared = {"known": "they know the same cells", "area": "they are asked about the same square metres"}[table.average]
     paired = [f"All rigs were measured against the same reference points, so {shared}."]
     return [*(paired if len(table.rigs) > 1 else []), *of_rigs, *table.notes]
 
 
-def in_common_first(notes: Mapping[str, Sequence[str]]) -> list[str]:
+def merge_notes(notes: Mapping[str, Sequence[str]]) -> list[str]:
     """What is said of all, then what is said of some, which begins with their names.
 
     Example:
-        >>> in_common_first({"roof": ["8 steps.", "Blind."], "grille": ["8 steps."]})
+        >>> merge_notes({"roof": ["8 steps.", "Blind."], "grille": ["8 steps."]})
         ['8 steps.', 'roof: Blind.']
     """
     common = [note for note in next(iter(notes.values())) if all(note in each for each in notes.values())]
     return [*common, *(f"{name}: {note}" for name, each in notes.items() for note in each if note not in common)]
 
 
-def marks_on(table: CoverageTable) -> dict[str, str]:
+def explain_marks(table: CoverageTable) -> dict[str, str]:
     """What the marks of differences mean, by their names; empty where there are none."""
-    several, by_sensor = len(table.rigs) > 1, any(sensors_of(rows) for rows in table.rows.values())
+    several, by_sensor = len(table.rigs) > 1, any(get_failure_sensors(rows) for rows in table.rows.values())
     if not (several or by_sensor) or not table.has_intervals:
         return {}
     best = {"best": "the best of its row, where its lead over the next is more than chance."} if several else {}
@@ -237,10 +237,10 @@ def marks_on(table: CoverageTable) -> dict[str, str]:
 
 
 def _of_rig(table: CoverageTable, rig: str) -> list[str]:
-    bands = ", ".join(f"{name} {span(table.grid, name)}" for name in table.grid.heights)
-    first = f"{steps_and_cell(table.conditions[rig].counts['steps'], table.grid)}; {bands}."
-    sentences = (remark.sentence for remark in remarks_on(table, rig))
-    failure = single_point_of_failure(table, rig)
+    bands = ", ".join(f"{name} {format_height_band(table.grid, name)}" for name in table.grid.heights)
+    first = f"{format_resolution(table.conditions[rig].counts['steps'], table.grid)}; {bands}."
+    sentences = (remark.sentence for remark in collect_table_notes(table, rig))
+    failure = describe_single_point_of_failure(table, rig)
     return [first, *sentences, *([failure] if failure else [])]
 
 
@@ -252,7 +252,7 @@ LEAST_AGREED = 30
 SIDES = {"front_3m": "in front", "rear_3m": "behind", "left_3m": "on the left", "right_3m": "on the right"}
 
 
-def verdict(table: CoverageTable) -> tuple[str, ...]:
+def summarize_findings(table: CoverageTable) -> tuple[str, ...]:
     """What a meeting is told of a table; the first sentence says most.
 
     Args:
@@ -263,46 +263,46 @@ def verdict(table: CoverageTable) -> tuple[str, ...]:
         for, or that steps are too few.
     """
     told = tuple(filter(None, (rule(table) for rule in RULES)))
-    return tuple(filter(None, (*told, too_few(table, "ranges" if told else "an answer"))))
+    return tuple(filter(None, (*told, explain_missing_intervals(table, "ranges" if told else "an answer"))))
 
 
-def too_few(table: CoverageTable, what: str) -> str:
+def explain_missing_intervals(table: CoverageTable, subject: str) -> str:
     """Say that frames are too few for intervals, where these were asked for, and how many would give them.
 
     Args:
         table: Of one rig or several.
-        what: What intervals are needed for: "an answer".
+        subject: What intervals are needed for: "an answer".
 
     Returns:
         A sentence; empty where some number has an interval, or where none was asked for.
     """
-    steps, blocks = table.first.counts["steps"], table.first.blocks
+    steps, blocks = table.first_conditions.counts["steps"], table.first_conditions.blocks
     if blocks is None or table.has_intervals:
         return ""
-    needed, ends = blocks_needed(blocks, table.first.effective[0]), table.block_ends
-    begin = f"Not enough frames for {what}: {steps:,} form {blocks} block{'s' * (blocks != 1)} of time, "
+    needed, ends = blocks_needed(blocks, table.first_conditions.effective_blocks[0]), table.block_ends
+    begin = f"Not enough frames for {subject}: {steps:,} form {blocks} block{'s' * (blocks != 1)} of time, "
     if ends and len(ends) < needed:
         return f"{begin}intervals need about {needed}, and this source has {len(ends)} in all."
-    frames = ends[needed - 1] if ends else needed * (table.first.steps_per_block or 1)
+    frames = ends[needed - 1] if ends else needed * (table.first_conditions.frames_per_block or 1)
     return f"{begin}intervals need about {needed}, which are {frames:,} frames (`--steps`)."
 
 
-def on_near_field(table: CoverageTable) -> str:
+def describe_near_field(table: CoverageTable) -> str:
     """At what share of the free places beside the vehicle the first body is seen, side by side."""
-    rows = list(zip(*table.bodies.values(), strict=True))
+    rows = list(zip(*table.target_rows.values(), strict=True))
     if not rows:
         return ""
-    body, key = rows[0][0].summary.height, table.body_quantities[0].key
+    body, key = rows[0][0].summary.height, table.target_quantities[0].key
     near = [of for of in rows if of[0].summary.height == body and of[0].region.name in SIDES]
     of_sides = {SIDES[of[0].region.name]: of for of in near}
-    enough = (table.first.blocks or 0) >= MIN_BLOCKS
+    enough = (table.first_conditions.blocks or 0) >= MIN_BLOCKS
     told = {
         side: _told(of, key, enough=enough and of[0].summary.numbers[key].count >= LEAST_AGREED)
         for side, of in of_sides.items()
     }
     known = [f"{side} {words}" for side, words in told.items() if words]
-    criterion = table.body_quantities[0].title.removeprefix("free places with ")
-    seen = f"{body_words(body)} is seen ({criterion})"
+    criterion = table.target_quantities[0].title.removeprefix("free places with ")
+    seen = f"{format_target_name(body)} is seen ({criterion})"
     if known:
         return f"Free places within 3 m where {seen}: {'; '.join(known)}."
     unknown = all(math.isnan(row.summary.numbers[key].error) for of in of_sides.values() for row in of)
@@ -310,13 +310,13 @@ def on_near_field(table: CoverageTable) -> str:
     return f"Of the places within 3 m where {seen}, no rig has more than the others beyond chance." * several
 
 
-def on_range(table: CoverageTable) -> str:
+def describe_range(table: CoverageTable) -> str:
     """What is detected ahead: of one rig with intervals, of several who leads by more than chance."""
-    region = ahead(table)
-    if region is None or not table.thresholds or not table.has_intervals:
+    region = find_forward_region(table)
+    if region is None or not table.thresholds_m or not table.has_intervals:
         return ""
-    key, where = decisive(table).key, f"to {region.x[1]:g} m ahead ({detected_words(table)})"
-    bands = [of for of in table.places if of[0].region is region]
+    key, where = get_main_quantity(table).key, f"to {region.x[1]:g} m ahead ({detected_words(table)})"
+    bands = [of for of in table.rows_by_region if of[0].region is region]
     told = {surface_words(table, of[0]): _told(of, key, enough=True) for of in bands}
     known = [f"of {band} {words}" for band, words in told.items() if words]
     if known:
@@ -326,7 +326,7 @@ def on_range(table: CoverageTable) -> str:
 
 def detected_words(table: CoverageTable) -> str:
     """Describe the criterion of detection: how near a point of the rig must be."""
-    return f"a point within {table.thresholds[0]:g} m"
+    return f"a point within {table.thresholds_m[0]:g} m"
 
 
 def surface_words(table: CoverageTable, row: Row) -> str:
@@ -340,26 +340,26 @@ def surface_words(table: CoverageTable, row: Row) -> str:
         Words such as "512.3 m² of visible ground".
     """
     surface = BANDS.get(row.summary.height, row.summary.height)
-    if table.measure == "area":
-        return f"{square_metres(row.summary.visible_m2)} m² of visible {surface}"
+    if table.average == "area":
+        return f"{format_square_meters(row.summary.visible_m2)} m² of visible {surface}"
     return f"{row.summary.known_cells:,} observed cells of {surface}"
 
 
-def ahead(table: CoverageTable) -> Region | None:
+def find_forward_region(table: CoverageTable) -> Region | None:
     """The region that the range is told of: of those that begin at the vehicle the farthest to `RANGE_M`; else none."""
-    regions = dict.fromkeys(of[0].region for of in table.places)
+    regions = dict.fromkeys(of[0].region for of in table.rows_by_region)
     reached = [one for one in regions if one.x[0] == 0.0 and one.x[1] <= RANGE_M and not one.corners_m]
     return max(reached, key=lambda one: one.x[1], default=None)
 
 
-def on_failure(table: CoverageTable) -> str:
+def describe_failures(table: CoverageTable) -> str:
     """The sensor that most hangs on, of each rig."""
-    asked = [rig for rig in table.rigs if sensors_of(table.rows[rig])]
+    asked = [rig for rig in table.rigs if get_failure_sensors(table.rows[rig])]
     several = len(table.rigs) > 1
-    return " ".join(f"{rig}: " * several + single_point_of_failure(table, rig) for rig in asked)
+    return " ".join(f"{rig}: " * several + describe_single_point_of_failure(table, rig) for rig in asked)
 
 
-RULES: tuple[Callable[[CoverageTable], str], ...] = (on_near_field, on_range, on_failure)
+RULES: tuple[Callable[[CoverageTable], str], ...] = (describe_near_field, describe_range, describe_failures)
 
 
 def _told(rows: Sequence[Row], key: str, *, enough: bool) -> str:
@@ -368,31 +368,31 @@ def _told(rows: Sequence[Row], key: str, *, enough: bool) -> str:
         number = rows[0].summary.numbers[key]
         # Where all blocks say the same there is no interval, and nothing is left to chance.
         agreed = math.isnan(number.low) and number.value in (0.0, 1.0) and enough
-        interval = "" if agreed else f" [{whole_percent(number.low)}, {whole_percent(number.high)}]"
-        return f"{whole_percent(number.value)} %{interval}" if agreed or not math.isnan(number.low) else ""
-    leader = next((row for row in rows if key in row.best), None)
+        interval = "" if agreed else f" [{format_whole_percent(number.low)}, {format_whole_percent(number.high)}]"
+        return f"{format_whole_percent(number.value)} %{interval}" if agreed or not math.isnan(number.low) else ""
+    leader = next((row for row in rows if key in row.leading_keys), None)
     if leader is None:
         return ""
     second = max((row for row in rows if row is not leader), key=lambda row: row.summary.numbers[key].value)
-    return ", ".join(f"{row.rig} {whole_percent(row.summary.numbers[key].value)} %" for row in (leader, second))
+    return ", ".join(f"{row.rig} {format_whole_percent(row.summary.numbers[key].value)} %" for row in (leader, second))
 
 
-def body_words(name: str) -> str:
+def format_target_name(name: str) -> str:
     """What a body is called in a sentence.
 
     Example:
-        >>> body_words("child_110cm"), body_words("adult")
+        >>> format_target_name("child_110cm"), format_target_name("adult")
         ('a child', 'an adult')
     """
     plain = name.partition("_")[0]
     return f"{'an' if plain[:1] in 'aeiou' else 'a'} {plain}"
 
 
-def whole_percent(share: float) -> str:
+def format_whole_percent(share: float) -> str:
     """Without decimals, but some is not none, and nearly all is not all.
 
     Example:
-        >>> [whole_percent(share) for share in (0.0, 0.001, 0.126, 0.999, 1.0)]
+        >>> [format_whole_percent(share) for share in (0.0, 0.001, 0.126, 0.999, 1.0)]
         ['0', '1', '13', '99', '100']
     """
     return f"{min(max(round(100 * share), 1), 99) if 0 < share < 1 else 100 * share:.0f}"

@@ -17,9 +17,9 @@ from rich.table import Table
 from rich.text import Text
 
 from torchcover.files import shown
-from torchcover.report.layout import BOLD_MARKS, PageTable, Words, parts_of
+from torchcover.report.layout import BOLD_MARKS, PageTable, TextCell, build_page_tables
 from torchcover.report.records import render_csv, render_json
-from torchcover.report.remarks import marks_on, notes_on, verdict
+from torchcover.report.remarks import explain_marks, list_notes, summarize_findings
 from torchcover.report.table import CoverageTable
 
 # Survive files and terminals without bold type.
@@ -55,15 +55,15 @@ def print_table(table: CoverageTable, console: Console | None = None) -> None:
     """
     console = console or Terminal()
     folded = table.rigs if console.is_terminal and len(table.rigs) > 1 else ()
-    tables = rich_tables(table, console.width if console.is_terminal else None)
+    tables = build_rich_tables(table, console.width if console.is_terminal else None)
     # Rather lines that are too long than numbers that are cut off; in a file the names are whole too.
-    widths = [max(console.width, narrowest_width([part], folded)) for part in tables]
+    widths = [max(console.width, compute_min_width([part], folded)) for part in tables]
     for part, width in zip(tables, widths if console.is_terminal else [max(widths)] * len(tables), strict=True):
         console.width = width
         console.print(part)
 
 
-def rich_tables(table: CoverageTable, width: int | None = None) -> list[Table]:
+def build_rich_tables(table: CoverageTable, width: int | None = None) -> list[Table]:
     """The parts of a table for `rich.console.Console.print`.
 
     The best number of each row is bold and marked `*`; a difference that is more than chance is bold and marked `!`.
@@ -71,28 +71,28 @@ def rich_tables(table: CoverageTable, width: int | None = None) -> list[Table]:
     `width`: characters in a line; where more are needed, intervals stand below numbers, and sensors in rows. Returns a
     table for each part; what they hold under, and what went wrong, is the caption of the last.
     """
-    parts = parts_of(table)
-    if width is not None and narrowest_width([*map(_rich_table, parts)]) > width:
+    parts = build_page_tables(table)
+    if width is not None and compute_min_width([*map(_rich_table, parts)]) > width:
         folded = table.rigs if len(table.rigs) > 1 else ()
-        forms = [[*map(_below, each)] for each in (parts, parts_of(table, sensors_in_rows=True))]
+        forms = [[*map(_below, each)] for each in (parts, build_page_tables(table, sensors_in_rows=True))]
         parts = [
-            form if narrowest_width([_rich_table(form)], folded) <= width else narrow
+            form if compute_min_width([_rich_table(form)], folded) <= width else narrow
             for form, narrow in zip(*forms, strict=True)
         ]
     tables = [*map(_rich_table, parts)]
-    marks = [f"{SIGNS[mark]} {meaning}" for mark, meaning in marks_on(table).items()]
-    tables[-1].caption = Text("\n".join([*marks, *notes_on(table)]))
+    marks = [f"{SIGNS[mark]} {meaning}" for mark, meaning in explain_marks(table).items()]
+    tables[-1].caption = Text("\n".join([*marks, *list_notes(table)]))
     return tables
 
 
-def print_whole(tables: Sequence[PageTable]) -> None:
+def print_page_tables(tables: Sequence[PageTable]) -> None:
     """Print tables, folded between words where the terminal is narrower, or 80 columns if that is not known.
 
     Rather lines that are too long than words and numbers that are cut.
     """
     console = Terminal()
     whole = [_in_words(table, console.width) for table in tables]
-    console.width = max(console.width, narrowest_width(whole))
+    console.width = max(console.width, compute_min_width(whole))
     for table in whole:
         console.print(table)
 
@@ -124,16 +124,20 @@ def _longest(texts: Iterable[str], between: str | None = None) -> int:
     return max((cell_len(part) for text in texts for part in text.split(between)), default=0)
 
 
-def narrowest_width(tables: Sequence[Table], folded: Sequence[str] = ()) -> int:
+def compute_min_width(tables: Sequence[Table], folded_headings: Sequence[str] = ()) -> int:
     """Characters in a line that tables need at least.
 
-    `tables`: tables for rich, whose numbers stay whole; `folded`: headings that may be folded to the width of the
+    `tables`: tables for rich, whose numbers stay whole; `folded_headings`: headings that may be folded to the width of the
     numbers below.
     """
     console = Console(width=MAX_LINE_CHARS)
     natural = [Measurement.get(console, console.options, table).maximum for table in tables]
     spared = [
-        sum(max(0, cell_len(str(of.header)) - (of.min_width or 0)) for of in table.columns if str(of.header) in folded)
+        sum(
+            max(0, cell_len(str(of.header)) - (of.min_width or 0))
+            for of in table.columns
+            if str(of.header) in folded_headings
+        )
         for table in tables
     ]
     return max(width - less for width, less in zip(natural, spared, strict=True))
@@ -164,7 +168,7 @@ def _below(part: PageTable) -> PageTable:
     )
 
 
-def _text(cell: Words) -> Text:
+def _text(cell: TextCell) -> Text:
     return Text(f"{SIGNS[cell.mark]} {cell.text}", style="bold") if cell.mark else Text(cell.text)
 
 
@@ -174,29 +178,31 @@ SPECIAL = re.compile(r"[\\`*|\[\]]|<(?=[A-Za-z/!?])|&(?=[\w#]+;)|(?<![^\W_])_|_(
 
 def render_markdown(table: CoverageTable) -> str:
     """The table as Markdown text; what is marked is bold."""
-    marks = [f"{BOLD_MARKS[mark]}: {meaning}" for mark, meaning in marks_on(table).items()]
-    notes = [f"* {escaped(note)}" for note in (*marks, *notes_on(table))]
-    told = escaped(" ".join(verdict(table)))
+    marks = [f"{BOLD_MARKS[mark]}: {meaning}" for mark, meaning in explain_marks(table).items()]
+    notes = [f"* {escape_markdown(note)}" for note in (*marks, *list_notes(table))]
+    told = escape_markdown(" ".join(summarize_findings(table)))
     first = [told, ""] if told else []
-    return "\n".join([*first, *(line for part in parts_of(table) for line in _markdown_lines(part)), *notes, ""])
+    return "\n".join(
+        [*first, *(line for part in build_page_tables(table) for line in _markdown_lines(part)), *notes, ""]
+    )
 
 
 def _markdown_lines(part: PageTable) -> Iterator[str]:
     if part.title:
-        yield f"{escaped(part.title)}\n"
-    yield _markdown_line(map(escaped, part.headings))
-    yield _markdown_line(["---"] * part.words_first + ["---:"] * (len(part.headings) - part.words_first))
+        yield f"{escape_markdown(part.title)}\n"
+    yield _markdown_line(map(escape_markdown, part.headings))
+    yield _markdown_line(["---"] * part.num_text_columns + ["---:"] * (len(part.headings) - part.num_text_columns))
     yield from (_markdown_line(map(_markdown_cell, row)) for row in part.rows)
     yield ""
 
 
-def _markdown_cell(cell: Words) -> str:
-    return f"**{escaped(cell.text)}**" if cell.mark else escaped(cell.text)
+def _markdown_cell(cell: TextCell) -> str:
+    return f"**{escape_markdown(cell.text)}**" if cell.mark else escape_markdown(cell.text)
 
 
-def escaped(words: str) -> str:
+def escape_markdown(text: str) -> str:
     """Words that Markdown takes for nothing else."""
-    return SPECIAL.sub(r"\\\g<0>", shown(" ".join(words.split())))
+    return SPECIAL.sub(r"\\\g<0>", shown(" ".join(text.split())))
 
 
 def _markdown_line(cells: Iterable[str]) -> str:

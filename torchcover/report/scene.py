@@ -17,8 +17,8 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 from torchcover.coverage import BevGrid
-from torchcover.report.colours import UNKNOWN, ColourScale, draw_cells, draw_colour_bar
-from torchcover.report.overlay import HALO, draw_ego
+from torchcover.report.colours import UNKNOWN, ColorScale, plot_cells, plot_color_bar
+from torchcover.report.overlay import HALO, plot_ego
 from torchcover.report.sheet import (
     BELOW_IN,
     COLOUR_BAR_IN,
@@ -27,15 +27,15 @@ from torchcover.report.sheet import (
     HEADING_POINTS,
     Bounds,
     Sheet,
+    create_sheets,
+    find_lower_left,
     fit_paper,
-    lay_out,
-    lower_left,
     stack_views,
     write_heading,
     write_legend,
     write_title,
 )
-from torchcover.report.wording import percent
+from torchcover.report.wording import format_percent
 
 Points = NDArray[np.floating]
 Image = NDArray[np.floating]
@@ -71,7 +71,7 @@ class ActorMark:
 
 
 @dataclass(frozen=True, eq=False)
-class StandingFaces:
+class StaticFaces:
     """What stands in a frame and never moves.
 
     Args:
@@ -83,15 +83,15 @@ class StandingFaces:
     height_m: Points
 
 
-def draw_scene(
+def plot_scene(
     x: Bounds,
     y: Bounds,
     *,
-    standing: StandingFaces,
+    static_faces: StaticFaces,
     ego_outline_m: Points,
     actors: Sequence[ActorMark],
-    sensor: Points,
-    reference: Points | None = None,
+    sensor_points: Points,
+    reference_points: Points | None = None,
     title: str,
     subtitle: str = "",
     path_m: Points | None = None,
@@ -101,11 +101,11 @@ def draw_scene(
     Args:
         x: Bounds forward in metres.
         y: Bounds to the left in metres.
-        standing: What stands there.
+        static_faces: What stands there.
         ego_outline_m: (K, 2) corners of the ego in the vehicle frame in metres.
         actors: The others; what lies beyond the bounds is left out.
-        sensor: (N, 3) points of the rig.
-        reference: (M, 3) points of the reference sensor, if there is one.
+        sensor_points: (N, 3) points of the rig.
+        reference_points: (M, 3) points of the reference sensor, if there is one.
         title: First line.
         subtitle: Second line, smaller.
         path_m: (T, 2) the ego's way in the vehicle frame in metres; not drawn if it does not move.
@@ -117,12 +117,12 @@ def draw_scene(
     axes.set(xlabel="x forward (m)", ylabel="y left (m)")
     inside = [actor for actor in actors if _is_inside(actor.outline_m, x, y)]
     entries = [
-        *_draw_standing(axes, standing),
-        *([] if reference is None else _draw_cloud(axes, reference, REFERENCE, "reference points")),
-        *_draw_cloud(axes, sensor, SENSOR, "points of the rig"),
+        *_draw_standing(axes, static_faces),
+        *([] if reference_points is None else _draw_cloud(axes, reference_points, REFERENCE, "reference points")),
+        *_draw_cloud(axes, sensor_points, SENSOR, "points of the rig"),
         *_draw_actors(axes, inside),
         *([] if path_m is None else axes.plot(*path_m.T, color=PATH, linewidth=1.2, label="way of the ego", zorder=3)),
-        *draw_ego(axes, ego_outline_m),
+        *plot_ego(axes, ego_outline_m),
     ]
     write_title(axes, title, subtitle)
     write_legend(axes, entries, columns=4)
@@ -130,7 +130,7 @@ def draw_scene(
     return figure
 
 
-def _draw_standing(axes: Axes, standing: StandingFaces) -> list[Artist]:
+def _draw_standing(axes: Axes, standing: StaticFaces) -> list[Artist]:
     """Faces from above, the highest last; the ground itself is not drawn."""
     stands = standing.height_m > LOWEST_STANDING_M
     height_m = standing.height_m[stands]
@@ -169,7 +169,7 @@ def _is_inside(outline_m: Points, x: Bounds, y: Bounds) -> bool:
     return bool(high[0] >= x[0] and low[0] <= x[1] and high[1] >= y[0] and low[1] <= y[1])
 
 
-def draw_depths(images: Mapping[str, Image], *, title: str, subtitle: str = "") -> Figure:
+def plot_depth_images(images: Mapping[str, Image], *, title: str, subtitle: str = "") -> Figure:
     """Draw depth images.
 
     Args:
@@ -185,7 +185,7 @@ def draw_depths(images: Mapping[str, Image], *, title: str, subtitle: str = "") 
         ValueError: No image, or one that has not two dimensions or no pixel.
 
     Example:
-        >>> figure = draw_depths({"front": np.array([[2.0, np.inf], [1.0, np.nan]])}, title="My rig")
+        >>> figure = plot_depth_images({"front": np.array([[2.0, np.inf], [1.0, np.nan]])}, title="My rig")
         >>> [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
         ['nothing within range (25.0 % of the pixels)', 'no ray: beyond the lens (25.0 % of the pixels)']
     """
@@ -197,14 +197,14 @@ def draw_depths(images: Mapping[str, Image], *, title: str, subtitle: str = "") 
     *views, bar = figure.axes
     for axes, (name, array) in zip(views, arrays.items(), strict=True):
         # The first row of an image is its top; the first row of cells is their bottom.
-        image = draw_cells(axes, array[::-1], scale, infinite=SKY)
+        image = plot_cells(axes, array[::-1], scale, infinite_color=SKY)
         write_heading(axes, name)
     colours = figure.colorbar(
         image, cax=bar, extend="both", label=scale.label, ticks=LogLocator(subs=(1, 2, 5)), format="{x:g}"
     )
     colours.minorformatter = NullFormatter()
     write_title(views[0], title, subtitle, lift_points=HEADING_POINTS)
-    write_legend(lower_left(views), _entries(arrays), columns=2)
+    write_legend(find_lower_left(views), _entries(arrays), columns=2)
     fit_paper(figure)
     return figure
 
@@ -216,12 +216,12 @@ def _checked(name: str, image: Image) -> NDArray[np.float64]:
     return array
 
 
-def _scale(values: NDArray[np.float64]) -> ColourScale:
+def _scale(values: NDArray[np.float64]) -> ColorScale:
     hits = values[np.isfinite(values) & (values > 0)]
     low, high = np.percentile(hits, ROBUST_PERCENTILES) if len(hits) else FALLBACK_SCALE_M
     # A wall at one distance has no range of colours of its own.
     high = max(high, 1.01 * low)
-    return ColourScale("distance along the ray", "m", "viridis_r", float(low), float(high), logarithmic=True)
+    return ColorScale("distance along the ray", "m", "viridis_r", float(low), float(high), logarithmic=True)
 
 
 def _paper(arrays: list[NDArray[np.float64]]) -> Figure:
@@ -268,10 +268,10 @@ def _entries(arrays: Mapping[str, NDArray[np.float64]]) -> list[Artist]:
     infinite, none = float(np.isinf(values).mean()), float(np.isnan(values).mean())
     entries: list[Artist] = []
     if infinite:
-        label = f"nothing within range ({percent(infinite)} % of the pixels)"
+        label = f"nothing within range ({format_percent(infinite)} % of the pixels)"
         entries.append(Patch(facecolor=SKY, edgecolor="#9fb0c0", label=label))
     if none:
-        entries.append(Patch(label=f"no ray: beyond the lens ({percent(none)} % of the pixels)", **UNKNOWN))
+        entries.append(Patch(label=f"no ray: beyond the lens ({format_percent(none)} % of the pixels)", **UNKNOWN))
     return entries
 
 
@@ -284,28 +284,28 @@ RINGS_M = (1.0, 2.0, 3.0)
 CORNER_POINTS = 25
 
 
-def draw_targets(
-    points: Float64,
-    enough: Bools,
+def plot_target_visibility(
+    point_counts: Float64,
+    detected: Bools,
     grid: BevGrid,
     *,
     vehicle_outline_m: Float64,
     vehicle_box_m: Float64,
     sensors_m: Float64,
-    hits: int,
+    min_points: int,
     title: str,
     subtitle: str = "",
 ) -> Figure:
     """Draw how many points there are on a target.
 
     Args:
-        points: (Y, X) number of points, NaN where the target cannot stand.
-        enough: (Y, X) whether that is enough to see it.
+        point_counts: (Y, X) number of points, NaN where the target cannot stand.
+        detected: (Y, X) whether that is enough to see it.
         grid: The cells.
         vehicle_outline_m: (K, 2) what the vehicle looks like from above.
         vehicle_box_m: (4, 2) its box, from which the dashed lines are 1, 2 and 3 m away.
         sensors_m: (S, 2) where sensors are.
-        hits: How many points are enough, for the legend.
+        min_points: How many points are enough, for the legend.
         title: First line.
         subtitle: Second line, smaller.
 
@@ -315,14 +315,14 @@ def draw_targets(
     Raises:
         ValueError: Arrays of another shape than the grid.
     """
-    for name, array in (("points", points), ("enough", enough)):
+    for name, array in (("points", point_counts), ("enough", detected)):
         if array.shape != grid.shape[1:]:
             raise ValueError(f"{name}: shape {grid.shape[1:]} is needed, as of the grid; got {array.shape}")
-    (sheet,) = lay_out(grid)
-    entries = _draw_points(sheet, points)
+    (sheet,) = create_sheets(grid)
+    entries = _draw_points(sheet, point_counts)
     entries += _draw_rings(sheet.axes, vehicle_box_m)
-    entries += _draw_boundary(sheet.axes, enough, ~np.isnan(points), grid, hits)
-    entries += draw_ego(sheet.axes, vehicle_outline_m)
+    entries += _draw_boundary(sheet.axes, detected, ~np.isnan(point_counts), grid, min_points)
+    entries += plot_ego(sheet.axes, vehicle_outline_m)
     sheet.axes.plot(*sensors_m.T, linestyle="none", marker="o", markersize=3.5, color="black", zorder=4)
     entries.append(Line2D([], [], linestyle="none", marker="o", markersize=3.5, color="black", label="sensors"))
     write_title(sheet.axes, title, subtitle)
@@ -334,10 +334,10 @@ def draw_targets(
 def _draw_points(sheet: Sheet, points: Float64) -> list[Artist]:
     some = points[points > 0]
     high = max(float(np.percentile(some, ROBUST_PERCENTILE)), 10.0) if len(some) else 10.0
-    scale = ColourScale("points on the target", "mean of the steps", "viridis", 1.0, high, logarithmic=True)
+    scale = ColorScale("points on the target", "mean of the steps", "viridis", 1.0, high, logarithmic=True)
     # Fewer than one in the mean is as dark as one.
     shown = np.where(points > 0, np.maximum(points, 1.0), np.nan)
-    draw_colour_bar(sheet, draw_cells(sheet.axes, shown, scale), shown, scale)
+    plot_color_bar(sheet, plot_cells(sheet.axes, shown, scale), shown, scale)
     unseen = np.ma.masked_where(points != 0, np.ones_like(points))
     sheet.axes.imshow(
         unseen,

@@ -47,28 +47,28 @@ ABOVE: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset poin
 class Sheet:
     """An empty map, x to the right and y upwards in equal metres, alone on its paper or beside others.
 
-    These share the place of the `bar`. So many columns of a legend fit beside each other.
+    These share the place of the `color_bar_axes`. So many columns of a legend fit beside each other.
     """
 
     figure: Figure
     axes: Axes
-    bar: Axes
+    color_bar_axes: Axes
     legend_columns: int
-    metres_per_inch: float
+    meters_per_inch: float
 
 
-def lay_out(grid: BevGrid, maps: int = 1) -> list[Sheet]:
+def create_sheets(grid: BevGrid, num_maps: int = 1) -> list[Sheet]:
     """Empty maps of the grid on one paper: long ones below each other, others beside each other.
 
-    `grid`: bounds and cells; `maps`: how many. Returns the maps, row by row from the upper left.
+    `grid`: bounds and cells; `num_maps`: how many. Returns the maps, row by row from the upper left.
     """
     _, rows, columns = grid.shape
-    across, inches_per_cell = _arrange(grid, maps)
+    across, inches_per_cell = _arrange(grid, num_maps)
     dpi = min(math.ceil(MIN_DOTS_PER_INCH * inches_per_cell) / inches_per_cell, MAX_DOTS_PER_INCH)
     map_in = inches_per_cell * np.array([columns, rows])
     # Gaps of whole pixels, so that every cell of every map is whole pixels.
     step_in = map_in + np.round(np.array([BESIDE_IN, BELOW_IN]) * dpi) / dpi
-    paper_in = map_in + step_in * [across - 1, math.ceil(maps / across) - 1]
+    paper_in = map_in + step_in * [across - 1, math.ceil(num_maps / across) - 1]
     figure = Figure(figsize=tuple(paper_in), dpi=dpi)
 
     def place(left_in: float, top_in: float, size_in: NDArray[np.float64]) -> tuple[float, float, float, float]:
@@ -76,14 +76,14 @@ def lay_out(grid: BevGrid, maps: int = 1) -> list[Sheet]:
         return (*corner.tolist(), *(size_in / paper_in).tolist())
 
     views = []
-    for at in range(maps):
+    for at in range(num_maps):
         left_in, top_in = (step_in * [at % across, at // across]).tolist()
         views.append(figure.add_axes(place(left_in, top_in, map_in), xlim=grid.x, ylim=grid.y))
-        left, lowest = at % across == 0, at + across >= maps
+        left, lowest = at % across == 0, at + across >= num_maps
         views[-1].set(xlabel="x forward (m)" if lowest else "", ylabel="y left (m)" if left else "")
         views[-1].tick_params(labelbottom=lowest, labelleft=left)
     bar_in = np.array([COLOUR_BAR_IN, max(paper_in[1], MIN_COLOUR_BAR_IN)])
-    gap_in = GAP_IN if maps == 1 else BESIDE_IN  # the axis of a map above the last row has labels beside the bar
+    gap_in = GAP_IN if num_maps == 1 else BESIDE_IN  # the axis of a map above the last row has labels beside the bar
     bar = figure.add_axes(place(paper_in[0] + gap_in, 0.0, bar_in))
     legend_columns = max(1, int(paper_in[0] / LEGEND_COLUMN_IN))
     scale = grid.cell / inches_per_cell
@@ -119,7 +119,7 @@ def stack_views(views: Sequence[tuple[Bounds, Bounds]], *, width_in: float) -> t
     return figure, axes
 
 
-def charts(
+def create_charts(
     rows: int, columns: int, size_in: tuple[float, float], title: str, *, sharey: bool = False
 ) -> tuple[Figure, list[list[Axes]]]:
     """Empty charts in rows under a title, which matplotlib arranges: a figure of its own, outside pyplot."""
@@ -140,7 +140,7 @@ def write_heading(axes: Axes, heading: str) -> None:
     axes.annotate(heading, (0, 1), (0, 5), fontsize=9, fontweight="bold", **ABOVE)
 
 
-def lower_left(views: Iterable[Axes]) -> Axes:
+def find_lower_left(views: Iterable[Axes]) -> Axes:
     """The one in the lower left corner, under which the legend of all has its place."""
     return min(views, key=lambda axes: (axes.get_position().y0, axes.get_position().x0))
 
@@ -179,7 +179,7 @@ def fit_paper(figure: Figure) -> None:
 WRITERS: dict[str, type[FFMpegWriter] | type[PillowWriter]] = {".gif": PillowWriter, ".mp4": FFMpegWriter}
 
 
-def check_film(path: Path) -> None:
+def check_animation(path: Path) -> None:
     """Refuse, before the first figure is drawn, a film that could not be written.
 
     Raises:
@@ -199,15 +199,15 @@ def _pixels(figure: Figure) -> NDArray[np.uint8]:
     return np.asarray(canvas.buffer_rgba())
 
 
-def write_film(path: Path, figures: Iterable[Figure], *, per_s: float) -> None:
+def write_animation(path: Path, figures: Iterable[Figure], *, frames_per_s: float) -> None:
     """Write figures as a film. It is as large as the first of them; what a later one has beyond that is cut off.
 
     Args:
-        path: The file, .gif or .mp4; `check_film` says whether it can be written.
+        path: The file, .gif or .mp4; `check_animation` says whether it can be written.
         figures: At least one, each drawn when it is its turn.
-        per_s: How many of them a second shows.
+        frames_per_s: How many of them a second shows.
     """
-    write_atomically(path, partial(_write, figures, per_s))
+    write_atomically(path, partial(_write, figures, frames_per_s))
 
 
 def _write(figures: Iterable[Figure], per_s: float, path: Path) -> None:

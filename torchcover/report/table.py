@@ -29,30 +29,30 @@ class Row:
         rig: Name of the rig.
         region: The region.
         summary: Its numbers by the key of their quantity, and how many of its cells are known.
-        best: Keys of the quantities in which it leads here, and its lead over the next rig is more than chance.
+        leading_keys: Keys of the quantities in which it leads here, and its lead over the next rig is more than chance.
         differences: Key of the quantity -> difference to the first rig; empty if there is no other rig.
     """
 
     rig: str
     region: Region
     summary: RegionSummary
-    best: frozenset[str]
+    leading_keys: frozenset[str]
     differences: Mapping[str, Difference]
 
 
 class Conditions(NamedTuple):
     """What the numbers of one rig hold under: what happened, as in `Coverage.counts`, and how many points there were.
 
-    Errors come from so many blocks of contiguous steps, None without errors; of a mixture with too few, `fewest` is the
-    kind of world that has the fewest. `effective` are the least and the most of `Estimate.effective` in its regions.
+    Errors come from so many blocks of contiguous steps, None without errors; of a mixture with too few, `smallest_scene_kind` is the
+    kind of world that has the fewest. `effective_blocks` are the least and the most of `Estimate.effective` in its regions.
     """
 
     counts: Mapping[str, int]
     blocks: int | None
-    steps_per_block: int | None
-    points: int
-    fewest: str = ""
-    effective: tuple[float, float] = (0.0, 0.0)
+    frames_per_block: int | None
+    point_count: int
+    smallest_scene_kind: str = ""
+    effective_blocks: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -62,31 +62,31 @@ class CoverageTable:
     Args:
         quantities: What there is a number of: the means, then what other aggregations say.
         grid: Cells and height bands.
-        thresholds: Detection thresholds in metres.
-        max_radius: Saturation of the radius in metres.
-        measure: What the numbers of the rows are means over: "area", the visible surface, or "known", the known cells.
+        thresholds_m: Detection thresholds in metres.
+        max_radius_m: Saturation of the radius in metres.
+        average: What the numbers of the rows are means over: "area", the visible surface, or "known", the known cells.
         rows: Name of the rig -> its rows in the order of the regions, then of the bands.
         conditions: Name of the rig -> what its numbers hold under.
         notes: What else they hold under, in words of the caller.
         source: What carried the rigs, `vehicle`, and what sensors make of their hits, `sensor_model` by rig; if known.
-        bodies: Name of the rig -> its rows of bodies beside the vehicle, if any were put there.
+        target_rows: Name of the rig -> its rows of bodies beside the vehicle, if any were put there.
         block_ends: Frames of the source after which one block after the other is complete, as far as is known.
     """
 
     quantities: tuple[Quantity, ...]
     grid: BevGrid
-    thresholds: tuple[float, ...]
-    max_radius: float
-    measure: Measure
+    thresholds_m: tuple[float, ...]
+    max_radius_m: float
+    average: Measure
     rows: Mapping[str, tuple[Row, ...]]
     conditions: Mapping[str, Conditions]
     notes: tuple[str, ...]
     source: Mapping[str, object] = field(default_factory=dict)
-    bodies: Mapping[str, tuple[Row, ...]] = field(default_factory=dict)
+    target_rows: Mapping[str, tuple[Row, ...]] = field(default_factory=dict)
     block_ends: Sequence[int] = ()
 
     @classmethod
-    def of(
+    def from_coverages(
         cls,
         coverages: Mapping[str, Coverage | Mixture],
         regions: Sequence[Region],
@@ -122,21 +122,21 @@ class CoverageTable:
         return cls(
             quantities=(*first.quantities, *(first.aggregated.quantities if first.aggregated else ())),
             grid=first.grid,
-            thresholds=first.thresholds,
-            max_radius=first.max_radius,
-            measure=first.measure,
+            thresholds_m=first.thresholds,
+            max_radius_m=first.max_radius,
+            average=first.measure,
             rows={rig: tuple(row[rig] for row in rows) for rig in coverages},
             conditions={rig: _conditions(coverage, regions) for rig, coverage in coverages.items()},
             notes=tuple(notes),
             source=source or {},
-            bodies={rig: tuple(row[rig] for row in bodies) for rig in coverages},
+            target_rows={rig: tuple(row[rig] for row in bodies) for rig in coverages},
             block_ends=block_ends,
         )
 
     @property
-    def means(self) -> tuple[Quantity, ...]:
+    def mean_quantities(self) -> tuple[Quantity, ...]:
         """The mean radius, then the detection at each threshold."""
-        return self.quantities[: 1 + len(self.thresholds)]
+        return self.quantities[: 1 + len(self.thresholds_m)]
 
     @property
     def rigs(self) -> tuple[str, ...]:
@@ -144,24 +144,24 @@ class CoverageTable:
         return tuple(self.rows)
 
     @property
-    def first(self) -> Conditions:
+    def first_conditions(self) -> Conditions:
         """The conditions of the first rig; steps and blocks are those of every rig."""
         return self.conditions[self.rigs[0]]
 
     @property
     def has_intervals(self) -> bool:
         """Whether enough blocks are in effect for intervals in any region."""
-        return self.first.effective[1] > MIN_BLOCKS - ROUND_OFF
+        return self.first_conditions.effective_blocks[1] > MIN_BLOCKS - ROUND_OFF
 
     @property
-    def places(self) -> list[tuple[Row, ...]]:
+    def rows_by_region(self) -> list[tuple[Row, ...]]:
         """The rows of each region and band: one for each rig."""
         return list(zip(*self.rows.values(), strict=True))
 
     @property
-    def body_quantities(self) -> tuple[Quantity, ...]:
+    def target_quantities(self) -> tuple[Quantity, ...]:
         """What there is a number of for each body in each region."""
-        row = next((row for rows in self.bodies.values() for row in rows), None)
+        row = next((row for rows in self.target_rows.values() for row in rows), None)
         return tuple(number.quantity for number in row.summary.numbers.values()) if row else ()
 
 
@@ -202,8 +202,8 @@ def _conditions(coverage: Coverage | Mixture, regions: Sequence[Region]) -> Cond
     longest = [int(blocks.steps.max()) for blocks in each if blocks]
     found = Conditions(dict(coverage.counts), sum(used), max(longest, default=None), coverage.counts["inside_points"])
     if used:
-        found = found._replace(effective=_effective(coverage, regions, min(used)))
+        found = found._replace(effective_blocks=_effective(coverage, regions, min(used)))
     if min(used, default=0) >= MIN_BLOCKS:
         return found
     fewest = coverage.kinds[used.index(min(used))] if used and isinstance(coverage, Mixture) else ""
-    return found._replace(blocks=min(used, default=None), fewest=fewest)
+    return found._replace(blocks=min(used, default=None), smallest_scene_kind=fewest)

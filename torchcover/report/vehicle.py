@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 
-from torchcover.report.overlay import SensorView, sensor_colour
+from torchcover.report.overlay import SensorView, get_sensor_color
 from torchcover.report.sheet import (
     HEADING_POINTS,
     Bounds,
@@ -34,9 +34,9 @@ class View(NamedTuple):
 
     right: tuple[int, int, int]
     up: tuple[int, int, int]
-    towards: tuple[int, int, int]
+    toward: tuple[int, int, int]
 
-    def flat(self, points_m: Points) -> Points:
+    def project(self, points_m: Points) -> Points:
         """(..., 2) what (..., 3) points are on the paper."""
         return np.stack([points_m @ np.array(self.right), points_m @ np.array(self.up)], axis=-1)
 
@@ -50,15 +50,15 @@ VIEWS = {
 }
 
 
-def draw_body(axes: Axes, vertices_m: Points, faces: NDArray[np.int64], view: View) -> None:
+def plot_mesh(axes: Axes, vertices_m: Points, faces: NDArray[np.int64], view: View) -> None:
     """Draw (F, 3) triangles between (V, 3) corners, shaded: what is nearer to the eye is drawn later."""
     corners = vertices_m[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     shade = 0.55 + 0.35 * np.clip(normals @ LIGHT, 0.0, 1.0)
-    order = np.argsort((corners @ np.array(view.towards)).max(axis=1), kind="stable")
+    order = np.argsort((corners @ np.array(view.toward)).max(axis=1), kind="stable")
     colours = np.repeat(shade[order, None], 3, axis=1)
-    shown = view.flat(corners[order])
+    shown = view.project(corners[order])
     axes.add_collection(PolyCollection(list(shown), facecolors=colours, edgecolors=colours, linewidths=0.3, zorder=1))
 
 
@@ -76,15 +76,15 @@ class SkinPatch(NamedTuple):
     Args:
         name: What it is called.
         seen_from: "above", "front", "rear", "left" or "right".
-        places_m: (K, L, 3) places on it, in rows and columns.
+        points_m: (K, L, 3) places on it, in rows and columns.
     """
 
     name: str
     seen_from: str
-    places_m: Points
+    points_m: Points
 
 
-def draw_vehicle(
+def plot_vehicle(
     vertices_m: Points, faces: NDArray[np.int64], patches: Sequence[SkinPatch], *, title: str, subtitle: str = ""
 ) -> Figure:
     """Draw a vehicle from five sides: each region filled where it is seen from, and its outline from beside it.
@@ -134,11 +134,11 @@ def _draw_side(
 ) -> None:
     view = VIEWS[seen_from]
     aside = shift_m * np.array(view.right)
-    draw_body(axes, vertices_m + aside, faces, view)
+    plot_mesh(axes, vertices_m + aside, faces, view)
     for at, patch in enumerate(patches):
         if patch.seen_from == OPPOSITE.get(seen_from):
             continue
-        colour, flat = COLOURS((at + 0.5) / len(patches)), view.flat(patch.places_m + aside)
+        colour, flat = COLOURS((at + 0.5) / len(patches)), view.project(patch.points_m + aside)
         outline = np.concatenate([flat[:, 0], flat[-1], flat[::-1, -1], flat[0, ::-1]])
         axes.plot(*outline.T, color=colour, linewidth=0.7, zorder=2)
         if patch.seen_from == seen_from:
@@ -162,7 +162,7 @@ UNLIMITED_M = 300.0
 GROUND_M = -0.4
 
 
-def draw_rig(
+def plot_rig(
     vertices_m: Points, faces: NDArray[np.int64], sensors: Sequence[SensorView], *, title: str, subtitle: str = ""
 ) -> Figure:
     """Draw a rig on its vehicle.
@@ -181,20 +181,22 @@ def draw_rig(
     x, y, top_m, around_m = _around(vertices_m, sensors)
     beyond_m = float(np.hypot(x[1] - x[0], y[1] - y[0]))
     ranges_m = [min(sensor.range_m, UNLIMITED_M) for sensor in sensors]
-    wide = [sensor.outline_m(range_m) for sensor, range_m in zip(sensors, ranges_m, strict=True)]
+    wide = [sensor.compute_outline_m(range_m) for sensor, range_m in zip(sensors, ranges_m, strict=True)]
     views = [(x, y), (x, (GROUND_M, top_m)), _bounds_of_ranges([vertices_m[:, :2], *wide])]
     figure, (above, side, ranges) = stack_views(views, width_in=WIDTH_IN)
     for axes, seen_from in ((above, "above"), (side, "right"), (ranges, "above")):
-        draw_body(axes, vertices_m, faces, VIEWS[seen_from])
+        plot_mesh(axes, vertices_m, faces, VIEWS[seen_from])
     side.axhspan(GROUND_M, 0.0, facecolor="#d8d4cc", edgecolor="black", linewidth=0.8)
     for at, sensor in enumerate(sensors):
         near_m, place = min(ranges_m[at], beyond_m), sensor.position_m
         number_m = around_m * (FIRST_NUMBER + NUMBER_STEP * (at % NUMBER_PLACES))
-        _draw_sensor(above, at, place[:2], [sensor.outline_m(near_m)], [_along(sensor.outline_m(number_m))])
+        _draw_sensor(
+            above, at, place[:2], [sensor.compute_outline_m(near_m)], [_along(sensor.compute_outline_m(number_m))]
+        )
         fans, ends = _fans(sensor, near_m), [_along(fan) for fan in _fans(sensor, number_m)]
         _draw_sensor(side, at, place[[0, 2]], fans, ends)
         inwards = 1.0 - NUMBER_SHARE * (at % NUMBER_PLACES)
-        _draw_sensor(ranges, at, place[:2], [wide[at]], [_along(sensor.outline_m(inwards * ranges_m[at]))])
+        _draw_sensor(ranges, at, place[:2], [wide[at]], [_along(sensor.compute_outline_m(inwards * ranges_m[at]))])
     for axes in (above, ranges):
         axes.set_ylabel("y left (m)")
     above.tick_params(labelbottom=False)
@@ -236,7 +238,7 @@ def _fans(sensor: SensorView, reach_m: float) -> list[Points]:
     """(K, 2) outlines x, z of the parts of the field of view in the vertical plane along the vehicle; maybe none."""
     angles = np.deg2rad(np.arange(-180.0, 180.0, 0.25))
     ray_x, ray_z = np.cos(angles), np.sin(angles)
-    seen = sensor.sees(np.stack([ray_x, np.zeros_like(angles), ray_z], axis=1))
+    seen = sensor.mask_directions(np.stack([ray_x, np.zeros_like(angles), ray_z], axis=1))
     place = sensor.position_m[[0, 2]]
     to_ground_m = np.where(ray_z < 0, place[1] / np.maximum(-ray_z, 1e-9), np.inf)
     length_m = np.minimum(np.maximum(to_ground_m, 0.0), min(reach_m, sensor.range_m))
@@ -253,7 +255,7 @@ def _runs(seen: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
 
 
 def _draw_sensor(axes: Axes, at: int, place: Points, views: Sequence[Points], numbers: Sequence[Points]) -> None:
-    colour = sensor_colour(at)
+    colour = get_sensor_color(at)
     for outline in views:
         axes.add_patch(Polygon(outline, facecolor=colour, edgecolor="none", alpha=0.1, zorder=2))
         axes.add_patch(Polygon(outline, fill=False, edgecolor=colour, linewidth=1.0, zorder=3))
@@ -269,5 +271,5 @@ def _entry(at: int, sensor: SensorView) -> Artist:
     reach = f"to {sensor.range_m:g} m" if np.isfinite(sensor.range_m) else "without a limit"
     words = f"{sensor.horizontal_fov_deg:.1f}° wide, {low:.1f}° to {high:.1f}° high, {reach}"
     return Line2D(
-        [], [], linestyle="none", marker="o", color=sensor_colour(at), label=f"{at + 1}  {sensor.name}: {words}"
+        [], [], linestyle="none", marker="o", color=get_sensor_color(at), label=f"{at + 1}  {sensor.name}: {words}"
     )

@@ -156,6 +156,6 @@ class CameraSensor(Ranging):
         """(3, rows, columns) of (rows, columns, 2) pixels."""
         camera = self.camera()
         # Only the pixels that are used, and not all at once: the solver needs many times their memory.
-        rays = torch.cat([camera.rays(band)[0] for band in torch.split(pixels, ROWS_AT_ONCE)])
+        rays = torch.cat([camera.compute_rays(band)[0] for band in torch.split(pixels, ROWS_AT_ONCE)])
         right, down, forward = np.moveaxis(rays.numpy(), 2, 0)
         return np.stack([forward, -right, -down])

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from torchcover.geometry import invert, transform
 from torchcover.geometry.arrays import Bools, Float32, Float64, Int64
-from torchcover.recordings.in_vehicle import in_vehicle
+from torchcover.recordings.in_vehicle import transform_to_vehicle
 from torchcover.recordings.recording import Recording
 from torchcover.simulation.lidar import Lidar
 from torchcover.simulation.returns import SURE, Material, log_excess
@@ -295,7 +295,8 @@ def calibrate(recording: Recording, rig: Rig) -> tuple[Rig, list[LidarCalibratio
             sensors.append(sensor)
             continue
         sweeps = [
-            in_vehicle(recording.scan(names[sensor.name], index), recording.body).points_m for index in recording.frames
+            transform_to_vehicle(recording.read_scan(names[sensor.name], index), recording.ego_box).points_m
+            for index in recording.key_frames
         ]
         _check_different(sweeps, f"{recording.path}: {sensor.name}")
         told = _calibration(sensor, sweeps, road, str(recording.path))
@@ -328,10 +329,10 @@ def _paired(recording: Recording, rig: Rig) -> dict[str, str]:
 
 def _check_drive(recording: Recording) -> None:
     """Refuse several sweeps from one place: they see the same road, and would seem to know more than one does."""
-    frames = list(recording.frames)
+    frames = list(recording.key_frames)
     if not frames:
         raise ValueError(f"{recording.path}: no sweep in it")
-    poses = [pose for index in frames if (pose := recording.world_T_vehicle(index)) is not None]
+    poses = [pose for index in frames if (pose := recording.get_world_T_vehicle(index)) is not None]
     if len(poses) > 1:
         way_m = float(np.ptp([pose[:3, 3] for pose in poses], axis=0).max())
         if way_m < LEAST_WAY_M:

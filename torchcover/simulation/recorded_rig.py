@@ -62,7 +62,7 @@ def rig_document(
         raise ValueError(
             f"{recording.path}: no LiDAR {', '.join(unknown)}; the recording has {', '.join(recording.sensors)}"
         )
-    known = recording.calibrations() if isinstance(recording, CalibratedRecording) else SensorCalibrations("", {})
+    known = recording.read_calibrations() if isinstance(recording, CalibratedRecording) else SensorCalibrations("", {})
     cameras = _raw_cameras(recording) if raw_images else known.cameras
     told, documents = [], []
     for name in wanted:
@@ -89,7 +89,7 @@ def _raw_cameras(recording: Recording) -> tuple[Calibration, ...]:
         raise ValueError(
             f"{recording.path}: this recording knows one model of each lens, that of its images; leave out --raw-images"
         )
-    return recording.raw_cameras()
+    return recording.read_raw_cameras()
 
 
 def recorded_body(recording: Recording, vehicle: str | Path) -> BoundingBox:
@@ -106,19 +106,21 @@ def recorded_body(recording: Recording, vehicle: str | Path) -> BoundingBox:
         except ValueError as error:
             raise ValueError(f"vehicle {vehicle}: x0,x1,y0,y1,z0,z1 in metres are needed, x0 < x1: {error}") from error
     ego = BoundingBox.around(mover_mesh("vehicle", body_called(vehicle)).vertices_m)
-    mounts = recording.calibrations().mounts if isinstance(recording, RosBag) else {}
+    mounts = recording.read_calibrations().mounts if isinstance(recording, RosBag) else {}
     top_m = max([ego.upper_m[2], *(float(mount[2, 3]) + ABOVE_SENSOR_M for mount in mounts.values())])
     return BoundingBox((*ego.lower_m[:2], CLEARANCE_M), (*ego.upper_m[:2], top_m))
 
 
 def _lidar(recording: Recording, name: str, known: SensorCalibrations, model: str | None) -> tuple[dict[str, Any], str]:
     """The keys of a LiDAR, and where they are from."""
-    count = min(SCANS, len(recording.frames))
-    chosen = [recording.frames[position] for position in np.linspace(0, len(recording.frames) - 1, count, dtype=int)]
+    count = min(SCANS, len(recording.key_frames))
+    chosen = [
+        recording.key_frames[position] for position in np.linspace(0, len(recording.key_frames) - 1, count, dtype=int)
+    ]
     mount = known.mounts.get(name)
     mounted = "mount as calibrated"
     if mount is None:
-        mount, mounted = recording.scan(name, chosen[0]).vehicle_T_sensor, "mount as recorded"
+        mount, mounted = recording.read_scan(name, chosen[0]).vehicle_T_sensor, "mount as recorded"
     if mount is None:
         raise ValueError(
             f"{recording.path}: where {name} is mounted is not known, for its clouds are in the vehicle frame; a plain "

@@ -23,12 +23,12 @@ from torchcover.geometry.rigid import Matrix
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings.formats.tracks import BOX_COLUMNS, TRAJECTORY_COLUMNS
 from torchcover.recordings.free_space import RangeImage
-from torchcover.recordings.in_vehicle import within
-from torchcover.recordings.movers import COMPARED_S, WITHIN_M, Moved, movers
-from torchcover.recordings.objects import objects_of
+from torchcover.recordings.in_vehicle import find_points_in_box
+from torchcover.recordings.movers import COMPARED_S, WITHIN_M, MovingCluster, find_moving_clusters
+from torchcover.recordings.objects import extract_objects
 from torchcover.recordings.recording import Recording
 from torchcover.recordings.reference import KNOWN_POINTS, ON_GROUND_M, USUAL_BODY, VOTES, AccumulatedReference
-from torchcover.recordings.sweeps import MOVES_MPS, first_of_each, voxels
+from torchcover.recordings.sweeps import MOVES_MPS, compute_voxel_indices, find_first_occurrences
 from torchcover.simulation.height_field import Slopes
 from torchcover.simulation.recorded.run import pieces
 from torchcover.simulation.shapes import Mesh
@@ -105,23 +105,27 @@ def write_world(recording: Recording, folder: Path, *, steps: int | None = None)
     reference = AccumulatedReference(WINDOW_S)
     reference.check(recording, ())
     assert recording.times_s is not None  # as checked
-    last = recording.frames[(len(recording.frames) if steps is None else min(steps, len(recording.frames))) - 1]
+    last = recording.key_frames[
+        (len(recording.key_frames) if steps is None else min(steps, len(recording.key_frames))) - 1
+    ]
     times_s = recording.times_s[: last + 1] - recording.times_s[0]
     gaps = np.flatnonzero(np.diff(times_s) > WINDOW_S)
     if len(gaps):
-        before = sum(frame <= gaps[0] for frame in recording.frames)
+        before = sum(frame <= gaps[0] for frame in recording.key_frames)
         raise ValueError(
             f"{recording.path}: nothing is recorded for {np.diff(times_s)[gaps[0]]:,.1f} s after "
-            f"{recording.names[gaps[0]]}, and a world needs a frame at least every {WINDOW_S:g} s; record more often, "
+            f"{recording.frame_names[gaps[0]]}, and a world needs a frame at least every {WINDOW_S:g} s; record more often, "
             f"or make a world of the frames before (--steps {before})"
         )
-    poses = np.array([reference.sweeps.local_T_vehicle(recording, instant) for instant in range(last + 1)])
-    body = recording.body or USUAL_BODY
+    poses = np.array(
+        [reference.sweep_window.compute_local_T_vehicle(recording, instant) for instant in range(last + 1)]
+    )
+    body = recording.ego_box or USUAL_BODY
     beside_m = np.array([BESIDE_M, BESIDE_M, 0.0])
     own = BoundingBox.around(np.array([body.lower_m - beside_m, body.upper_m + beside_m]))
     seen = _seen(recording, reference, times_s, poses, own)
     drive = Trajectory.from_poses(times_s, poses)
-    labelled = recording.boxes(recording.frames[0]) is not None
+    labelled = recording.read_boxes(recording.key_frames[0]) is not None
     rows = list(_labelled(recording, float(times_s[-1])) if labelled else _found(seen, drive))
     driven = [(pose, body) for pose in poses] + [_around(row) for row in rows]
     cells = _cells(seen, driven)
@@ -163,32 +167,32 @@ def _seen(
     recording: Recording, reference: AccumulatedReference, times_s: Float64, poses: Matrix, own: BoundingBox
 ) -> Surveyed:
     """What all windows of a drive have seen, one after the other; nothing where the vehicle itself is."""
-    field, sweeps = _Field(poses[:, :2, 3]), reference.sweeps
+    field, sweeps = _Field(poses[:, :2, 3]), reference.sweep_window
     standing_m, loose, images = np.empty((0, 3)), [], []
     looked_s, look_every_s, done = dict.fromkeys(recording.sensors, -np.inf), min(LOOK_EVERY_S, times_s[-1] / 20), -1
     for middle_s in np.arange(0.45, times_s[-1] / WINDOW_S + 0.9, 0.9) * WINDOW_S:
         index = int(np.abs(times_s - middle_s).argmin())
-        if skipped := sweeps.skipped(recording, index):
+        if skipped := sweeps.count_skipped_frames(recording, index):
             raise ValueError(
-                f"{recording.path}: the poses jump within {WINDOW_S / 2:g} s of {recording.names[index]}, by which "
+                f"{recording.path}: the poses jump within {WINDOW_S / 2:g} s of {recording.frame_names[index]}, by which "
                 f"{skipped} instants are lost, and a world does not; mend them, or make one of fewer frames (--steps)"
             )
         parts = [standing_m]
-        for (sensor, instant), (points_m, told) in sorted(reference.told_apart(recording, index).items()):
+        for (sensor, instant), (points_m, told) in sorted(reference.classify_points(recording, index).items()):
             if not done < instant < len(times_s):
                 continue
             free = np.ones(len(points_m), np.bool_)
-            free[within(transform(invert(poses[instant]), points_m), own)] = False
+            free[find_points_in_box(transform(invert(poses[instant]), points_m), own)] = False
             parts.append(points_m[free & (told == 0)])
             loose.append((float(times_s[instant]), points_m[free & (told > 0)], told[free & (told > 0)] == 2))
-            image = sweeps.thinned(recording, sensor, instant).image
+            image = sweeps.get_thinned_scan(recording, sensor, instant).range_image
             if image is not None and times_s[instant] - looked_s[sensor] > look_every_s - 1e-6:
                 images.append(image)
                 looked_s[sensor] = times_s[instant]
         standing_m = np.concatenate(parts)
-        standing_m = standing_m[first_of_each(voxels(standing_m, CELL_M))]
+        standing_m = standing_m[find_first_occurrences(compute_voxel_indices(standing_m, CELL_M))]
         field.add(recording, reference, index, poses[index])
-        done = max(sweeps.instants(recording, index))
+        done = max(sweeps.find_frames_in_window(recording, index))
     return Surveyed(field.slopes(recording), standing_m, sorted(loose, key=lambda scan: scan[0]), images)
 
 
@@ -208,14 +212,16 @@ class _Field:
 
     def add(self, recording: Recording, reference: AccumulatedReference, index: int, pose: Matrix) -> None:
         """What is known around an instant."""
-        model = reference.sweeps.ground(recording, index)
+        model = reference.sweep_window.get_ground_model(recording, index)
         if model is None:
             return
         first = np.maximum(((pose[:2, 3] - AROUND_M - self._lower_m) / SQUARE_M).astype(int), 0)
         part = tuple(slice(start, start + int(2 * AROUND_M / SQUARE_M)) for start in first[::-1])
         rows, columns = self._heights_m[part].shape
         places_m = self._lower_m + SQUARE_M * (first + np.indices((rows, columns))[::-1].reshape(2, -1).T)
-        heights_m = -model.heights_m(np.column_stack([places_m, np.zeros(len(places_m))])).reshape(rows, columns)
+        heights_m = -model.compute_heights_m(np.column_stack([places_m, np.zeros(len(places_m))])).reshape(
+            rows, columns
+        )
         away_m = np.linalg.norm(places_m - pose[:2, 3], axis=1).reshape(rows, columns)
         better = np.isfinite(heights_m) & (away_m < self._away_m[part])
         self._heights_m[part][better], self._away_m[part][better] = heights_m[better], away_m[better]
@@ -249,7 +255,7 @@ def _cells(seen: Surveyed, driven: Sequence[tuple[Matrix, BoundingBox]]) -> Int6
     cells, places_m = np.concatenate([cells, filled]), np.concatenate([places_m, (filled + 0.5) * CELL_M])
     votes = np.zeros(len(cells), np.int16)
     for image in seen.images:
-        image.vote(places_m, votes)
+        image.add_votes(places_m, votes)
     cells = cells[votes < VOTES]
     cells = cells[np.argsort(cells[:, 0], kind="stable")]
     free = np.ones(len(cells), np.bool_)
@@ -257,7 +263,7 @@ def _cells(seen: Surveyed, driven: Sequence[tuple[Matrix, BoundingBox]]) -> Int6
         reach_m = float(np.linalg.norm(box.corners_m[:, :2], axis=1).max())
         first, end = np.searchsorted(cells[:, 0], (pose[0, 3] + np.array([-reach_m, reach_m])) / CELL_M)
         near = first + np.flatnonzero(np.abs((cells[first:end, 1] + 0.5) * CELL_M - pose[1, 3]) < reach_m)
-        free[near[within(transform(invert(pose), (cells[near] + 0.5) * CELL_M), box)]] = False
+        free[near[find_points_in_box(transform(invert(pose), (cells[near] + 0.5) * CELL_M), box)]] = False
     filling: Int64 = np.unique(cells[free], axis=0)
     return filling
 
@@ -298,10 +304,10 @@ def cell_mesh(cells: Int64) -> Mesh:
 
 def _labelled(recording: Recording, last_s: float) -> Iterator[Row]:
     """Rows of `movers.csv` of labelled objects."""
-    pose = recording.world_T_vehicle(0)
+    pose = recording.get_world_T_vehicle(0)
     assert pose is not None  # as checked
     first_m = pose[:3, 3]
-    for track in objects_of(recording).tracks:
+    for track in extract_objects(recording).tracks:
         for number, piece in enumerate(pieces(track.trajectory, GAP_S)):
             name = track.name if not number else f"{track.name} #{number + 1}"
             times_s = np.append(np.arange(piece.times_s[0], piece.times_s[-1] - 1e-6, STEP_S), piece.times_s[-1])
@@ -315,7 +321,7 @@ def _labelled(recording: Recording, last_s: float) -> Iterator[Row]:
 def _found(seen: Surveyed, drive: Trajectory) -> Iterator[Row]:
     """Rows of `movers.csv` of what rays tell to move, from one instant to the next."""
     scan_s = np.array([time_s for time_s, *_ in seen.loose])
-    tracks: list[list[tuple[float, Float64, Moved]]] = []
+    tracks: list[list[tuple[float, Float64, MovingCluster]]] = []
     before_s = -np.inf
     for time_s in np.unique(scan_s):
         if time_s - before_s < FOUND_EVERY_S - 1e-6:
@@ -324,7 +330,7 @@ def _found(seen: Surveyed, drive: Trajectory) -> Iterator[Row]:
         near = np.flatnonzero(np.abs(scan_s - time_s) <= COMPARED_S)
         scans_m = [seen.loose[scan][1] for scan in near]
         scans_m = [of_m[np.linalg.norm(of_m[:, :2] - ego_m[:2], axis=1) < WITHIN_M] for of_m in scans_m]
-        _go_on(tracks, time_s, movers(scans_m, scan_s[near] - time_s))
+        _go_on(tracks, time_s, find_moving_clusters(scans_m, scan_s[near] - time_s))
     number = 0
     for track in tracks:
         way_m = track[-1][1] - track[0][1]
@@ -349,12 +355,14 @@ def _seen_past(seen: Surveyed, scan_s: Float64, times_s: Sequence[float], boxes:
         pose, room = _around(("", "", "", *box.tolist()))
         for scan in np.flatnonzero(scan_s == time_s):
             _, points_m, is_past = seen.loose[scan]
-            rows = within(transform(invert(pose), points_m), room)
+            rows = find_points_in_box(transform(invert(pose), points_m), room)
             inside, past = inside + len(rows), past + int(is_past[rows].sum())
     return past / max(inside, 1)
 
 
-def _go_on(tracks: list[list[tuple[float, Float64, Moved]]], time_s: float, found: Sequence[Moved]) -> None:
+def _go_on(
+    tracks: list[list[tuple[float, Float64, MovingCluster]]], time_s: float, found: Sequence[MovingCluster]
+) -> None:
     """Append what is found to the track of whatever was to be there, else begin another."""
     middles_m = [moved.points_m[:, :2].mean(axis=0) for moved in found]
     going = [track for track in tracks if time_s - track[-1][0] <= GAP_S / 2]
@@ -373,7 +381,7 @@ def _go_on(tracks: list[list[tuple[float, Float64, Moved]]], time_s: float, foun
     tracks += [[(time_s, middles_m[which], found[which])] for which in sorted(left)]
 
 
-def _boxes(track: Sequence[tuple[float, Float64, Moved]], drive: Trajectory, ground: Slopes) -> Float64:
+def _boxes(track: Sequence[tuple[float, Float64, MovingCluster]], drive: Trajectory, ground: Slopes) -> Float64:
     """(K, 7) x, y, z of the bottom, length, width, height and yaw of what was found at each time of a track.
 
     Of a body the sides are seen that face the vehicle; there its box ends.

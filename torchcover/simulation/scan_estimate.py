@@ -13,7 +13,7 @@ from torchcover.geometry import invert, quaternion_from_rotation, transform
 from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.formats.ros_poses import PoseSeries
-from torchcover.recordings.in_vehicle import within
+from torchcover.recordings.in_vehicle import find_points_in_box
 from torchcover.recordings.recording import NO_RETURN_M, Recording
 
 # Elevations are counted in bins of this width and blurred with one width after the other.
@@ -239,8 +239,8 @@ class _Scan(NamedTuple):
         """Points in the frame of the LiDAR when each was measured."""
         assert self.way is not None
         tick, of_point = np.unique(np.rint(offsets_s * (1e9 / TICK_NS)).astype(np.int64), return_inverse=True)
-        world_T_then = self.way.at(tick * TICK_NS, "the LiDAR")
-        then_T_now = (np.linalg.inv(world_T_then) @ self.way.at(np.zeros(1, np.int64), "the LiDAR"))[of_point]
+        world_T_then = self.way.interpolate(tick * TICK_NS, "the LiDAR")
+        then_T_now = (np.linalg.inv(world_T_then) @ self.way.interpolate(np.zeros(1, np.int64), "the LiDAR"))[of_point]
         return np.asarray(np.einsum("nij,nj->ni", then_T_now[:, :3, :3], points_m) + then_T_now[:, :3, 3])
 
     def undone(self, turn: Turn, points_m: Matrix) -> Matrix:
@@ -313,17 +313,17 @@ def _best_turn(blur: Callable[[Turn | None], float]) -> tuple[Turn, float]:
 
 
 def _read(recording: Recording, sensor: str, index: int, vehicle_T_sensor: Matrix) -> _Scan:
-    scan = recording.scan(sensor, index)
+    scan = recording.read_scan(sensor, index)
     points_m = scan.points_m.astype(np.float64)
     came = np.asarray(np.isfinite(points_m).all(axis=1) & (np.abs(points_m) > NO_RETURN_M).any(axis=1))
     in_vehicle_m = points_m if scan.vehicle_T_sensor is None else transform(scan.vehicle_T_sensor, points_m)
-    if recording.body is not None:
-        came[within(in_vehicle_m, recording.body)] = False
-    rows = None if scan.rows is None else scan.rows[came]
+    if recording.ego_box is not None:
+        came[find_points_in_box(in_vehicle_m, recording.ego_box)] = False
+    rows = None if scan.rings is None else scan.rings[came]
     offsets_s = None if scan.offsets_s is None else scan.offsets_s[came]
     way, turn_s = None, 0.0
-    near = range(max(index - 1, 0), min(index + 2, len(recording.names)))
-    poses = [recording.world_T_vehicle(at) for at in near]
+    near = range(max(index - 1, 0), min(index + 2, len(recording.frame_names)))
+    poses = [recording.get_world_T_vehicle(at) for at in near]
     if recording.times_s is not None and len(poses) > 1 and all(pose is not None for pose in poses):
         world_T_sensor = np.stack([pose for pose in poses if pose is not None]) @ vehicle_T_sensor
         times_s = recording.times_s[near.start : near.stop] - recording.times_s[index]
@@ -334,4 +334,4 @@ def _read(recording: Recording, sensor: str, index: int, vehicle_T_sensor: Matri
 
 
 def _way_m(way: PoseSeries) -> float:
-    return float(np.linalg.norm(np.diff(way.places_m, axis=0), axis=1).min())
+    return float(np.linalg.norm(np.diff(way.positions_m, axis=0), axis=1).min())

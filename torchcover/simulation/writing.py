@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 from torchcover.files import RECORDING, WRITING, AtomicOutput
-from torchcover.recordings.recorders import RECORDERS, RecordedStep, RecordingSetup
+from torchcover.recordings.recorders import RECORDERS, FrameRecord, RecordingSetup
 from torchcover.recordings.recording import read_recording_manifest
 from torchcover.simulation.lidar import Lidar
 from torchcover.simulation.simulated_frames import SimulatedFrames
@@ -111,14 +111,14 @@ def _setup(frames: SimulatedFrames) -> RecordingSetup:
     )
 
 
-def _step(frames: SimulatedFrames, index: int) -> RecordedStep:
+def _step(frames: SimulatedFrames, index: int) -> FrameRecord:
     ((name, rig),) = frames.rigs.items()
     seen = frames.simulator.step(index)
     landed = [scan.points if scan.landed is None else scan.landed for scan in seen.scans[name]]
     scene, step = frames.simulator.scene_of(index)
     world = scene.world
     played = round(index * frames.every_s / world.time_step_s) // world.steps if world.steps > 1 else 0
-    return RecordedStep(
+    return FrameRecord(
         _name(index),
         index * frames.every_s + played * APART_S,
         world.ego.trajectory.at(step * world.time_step_s),

@@ -11,7 +11,7 @@ from torchcover.coverage import BevGrid
 from torchcover.geometry import BoundingBox
 from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.notebooks import data_set, small_html
-from torchcover.report import draw_targets, percent
+from torchcover.report import format_percent, plot_target_visibility
 from torchcover.targets.placing import SIDES, Heading, Raster, from_outline_m, side_of
 
 if TYPE_CHECKING:
@@ -229,7 +229,7 @@ class TargetMap(Spots):
         return f"TargetMap of {self.target} around {self.rig}: {self.raster.shape} places, {self.step_count} steps"
 
     def _repr_html_(self) -> str:
-        near = (f"{side.side} {percent(side.seen)} %" for side in self.sides(WITHIN_M[-1:]) if side.cells)
+        near = (f"{side.side} {format_percent(side.seen)} %" for side in self.sides(WITHIN_M[-1:]) if side.cells)
         where = f"Free places within {WITHIN_M[-1]:g} m where it gets {self.hits} points or more: {', '.join(near)}."
         return small_html([f"Would {self.rig} see {self.target}?", where], self.plot())
 
@@ -244,14 +244,14 @@ class TargetMap(Spots):
         """The points on the target at every place, with the border of what is seen: a figure of its own."""
         heading = f"{self.heading} side to the vehicle" if isinstance(self.heading, str) else f"yaw {self.heading:g}°"
         steps = f"{self.step_count} step{'s' if self.step_count > 1 else ''}"
-        return draw_targets(
+        return plot_target_visibility(
             self.points,
             self.enough,
             BevGrid(x=self.raster.x, y=self.raster.y, cell=self.raster.step_m),
             vehicle_outline_m=self.vehicle_outline_m,
             vehicle_box_m=self.vehicle.outline_m,
             sensors_m=self.sensors_m,
-            hits=self.hits,
+            min_points=self.hits,
             title=f"{self.rig}: points on {self.target}",
             subtitle=f"{self.target_words}, {heading}; {self.scenario}, {steps}",
         )

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from torchcover.coverage import Coverage
-from torchcover.report import band_figures
+from torchcover.report import plot_band_maps
 
 # Takes the tag of a figure, the figure, and where on its axis.
 Taker = Callable[[str, Figure, int], Any]
@@ -30,7 +30,7 @@ def log_maps(coverage: Coverage, loggers: Sequence[Any], prefix: str, step: int)
     Args:
         coverage: What `CoverageMetric.compute` returned.
         loggers: Lightning's loggers, or objects like them.
-        prefix: In front of the tags of `band_figures`, with a slash between.
+        prefix: In front of the tags of `plot_band_maps`, with a slash between.
         step: Where on the logger's axis.
 
     Returns:
@@ -39,7 +39,7 @@ def log_maps(coverage: Coverage, loggers: Sequence[Any], prefix: str, step: int)
     takers = [(logger, _taker(logger)) for logger in loggers]
     able = [take for _, take in takers if take is not None]
     if able:
-        for tag, figure in band_figures(coverage):
+        for tag, figure in plot_band_maps(coverage):
             for take in able:
                 take(f"{prefix}/{tag}", figure, step)
     return [type(logger).__name__ for logger, take in takers if take is None]

@@ -66,7 +66,7 @@ def drive(tmp_path_factory):
 def made(request, drive):
     recording = open_recording(drive / "recording")
     if request.param == "none":
-        recording.boxes = lambda index: None
+        recording.read_boxes = lambda index: None
     told = write_world(recording, drive / request.param)
     return recording, told, Scenario.load(drive / request.param / "scenario.yaml").world()
 
@@ -143,7 +143,7 @@ def test_what_no_world_can_be_made_of_is_told():
     ):
         write_world(gap, gap.path)
     jumping = Drive(steps=8)
-    place = jumping.world_T_vehicle
-    jumping.world_T_vehicle = lambda index: place(index) + JUMP * (index > 4)
+    place = jumping.get_world_T_vehicle
+    jumping.get_world_T_vehicle = lambda index: place(index) + JUMP * (index > 4)
     with pytest.raises(ValueError, match=r"the poses jump within 2\.5 s of f"):
         write_world(jumping, jumping.path)

@@ -302,7 +302,7 @@ def test_whatever_recording_has_boxes_plays_as_traffic(tmp_path, layout, name, f
     np.testing.assert_allclose(BoundingBox.around(car.mesh.vertices_m).size_m, CAR_SIZE_M, atol=1e-6)
     assert len(car.mesh.faces) >= faces  # a plain folder calls it "car, red", which is no word for a road user
     for instant, time_s in enumerate(recorded.times_s):
-        wanted = invert(recorded.world_T_vehicle(instant)) @ recorded.world_T_car(instant)
+        wanted = invert(recorded.get_world_T_vehicle(instant)) @ recorded.world_T_car(instant)
         wanted = wanted @ rigid(np.eye(3), [0.0, 0.0, -CAR_SIZE_M[2] / 2])
         found = invert(world.ego.trajectory.at(time_s)) @ car.trajectory.at(time_s)
         np.testing.assert_allclose(found, wanted, atol=1e-4, err_msg=str(instant))

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from torchcover.files import reads
-from torchcover.recordings.clouds.arrays import Points, read_archive, read_array, read_records
+from torchcover.recordings.clouds.arrays import Points, read_float32_cloud, read_npy_cloud, read_npz_cloud
 from torchcover.recordings.clouds.las import read_las
 from torchcover.recordings.clouds.pcd import read_pcd
 from torchcover.recordings.clouds.ply import read_ply
@@ -15,10 +15,10 @@ from torchcover.recordings.clouds.text import read_text
 
 # Suffix -> reader. A reader returns (N, 3) float32 or float64 and raises ValueError without naming the file.
 READERS: dict[str, Callable[[Path], Points]] = {
-    ".npy": read_array,
-    ".npz": read_archive,
-    ".bin": partial(read_records, columns=4),  # KITTI: x y z intensity
-    ".pcd.bin": partial(read_records, columns=5),  # nuScenes: x y z intensity ring; no PCD despite its name
+    ".npy": read_npy_cloud,
+    ".npz": read_npz_cloud,
+    ".bin": partial(read_float32_cloud, num_columns=4),  # KITTI: x y z intensity
+    ".pcd.bin": partial(read_float32_cloud, num_columns=5),  # nuScenes: x y z intensity ring; no PCD despite its name
     ".pcd": read_pcd,
     ".ply": read_ply,
     ".csv": read_text,

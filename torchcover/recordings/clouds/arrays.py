@@ -41,7 +41,7 @@ SIGNATURES = {
 SUFFIXES = {4: ".bin (x y z intensity)", 5: ".pcd.bin (x y z intensity ring)"}
 
 
-def check_records(data: bytes, columns: int) -> NDArray[np.float32]:
+def check_records(data: bytes, num_columns: int) -> NDArray[np.float32]:
     """(N, columns) little-endian float32, x y z first, if the bytes may be such.
 
     ValueError: bytes are left over, or the numbers are no coordinates.
@@ -50,31 +50,33 @@ def check_records(data: bytes, columns: int) -> NDArray[np.float32]:
     if known is None and all(byte in PRINTABLE for byte in data[:1024]):
         known = "text (.csv or .xyz?)"
     if known is not None:
-        raise ValueError(f"the content is {known}, not {columns} float32 a point; give it the suffix of its format")
-    record_bytes = 4 * columns
+        raise ValueError(f"the content is {known}, not {num_columns} float32 a point; give it the suffix of its format")
+    record_bytes = 4 * num_columns
     if len(data) % record_bytes:
         raise ValueError(
-            f"{len(data)} bytes are no whole number of {record_bytes}-byte points ({columns} float32 each), "
+            f"{len(data)} bytes are no whole number of {record_bytes}-byte points ({num_columns} float32 each), "
             f"{len(data) % record_bytes} bytes are left over: truncated, or of another format"
         )
-    records = np.frombuffer(data, "<f4").reshape(-1, columns)
+    records = np.frombuffer(data, "<f4").reshape(-1, num_columns)
     if not any(data):
         raise ValueError(f"all of its {len(data)} bytes are zero: it was never written")
     coordinates = _plainly_coordinates(records)
     complaint = (None if coordinates else _complaint(records[:, :3])) or _of_other_columns(records)
     if complaint:
-        others = " or ".join(suffix for width, suffix in SUFFIXES.items() if width != columns)
+        others = " or ".join(suffix for width, suffix in SUFFIXES.items() if width != num_columns)
         raise ValueError(
-            f"{complaint}, so it holds no {SUFFIXES[columns]} of little-endian float32: give it the suffix of its "
+            f"{complaint}, so it holds no {SUFFIXES[num_columns]} of little-endian float32: give it the suffix of its "
             f"format, as {others}, or write its points as .npy (N, 3 or more)"
         )
     return records
 
 
-def check_rest(rest: bytes) -> None:
+def check_trailing_bytes(trailing_bytes: bytes) -> None:
     """Refuse bytes behind the points that no header speaks of; zeros and line ends are padding."""
-    if rest.strip(b"\0\r\n"):
-        raise ValueError(f"{len(rest)} bytes follow the points that the header claims, and they are not all zero")
+    if trailing_bytes.strip(b"\0\r\n"):
+        raise ValueError(
+            f"{len(trailing_bytes)} bytes follow the points that the header claims, and they are not all zero"
+        )
 
 
 def _complaint(points: NDArray[np.float32]) -> str | None:
@@ -161,34 +163,34 @@ Points = NDArray[np.floating]
 MAX_COLUMNS = 16
 
 
-def read_records(path: Path, columns: int) -> Points:
+def read_float32_cloud(path: Path, num_columns: int) -> Points:
     """Read rows of little-endian float32 without a header, x y z first."""
     size_bytes = path.stat().st_size
     check_memory(2 * size_bytes)
-    return check_records(path.read_bytes(), columns)[:, :3]
+    return check_records(path.read_bytes(), num_columns)[:, :3]
 
 
 @reads("a point cloud with rings")
-def read_ringed_cloud(path: Path) -> tuple[Points, NDArray[np.int64]]:
+def read_cloud_with_rings(path: Path) -> tuple[Points, NDArray[np.int64]]:
     """(N, 3) points and (N,) rings of rows x y z intensity ring, as those of nuScenes."""
     check_memory(2 * path.stat().st_size)
     records = check_records(path.read_bytes(), 5)
     return records[:, :3], np.nan_to_num(records[:, 4]).astype(np.int64)
 
 
-def read_array(path: Path) -> Points:
+def read_npy_cloud(path: Path) -> Points:
     """Read a `.npy` file of shape (N, 3) or wider, x y z first."""
     return _coordinates(read_npy(path, _check))
 
 
-def read_archive(path: Path) -> Points:
+def read_npz_cloud(path: Path) -> Points:
     """Read the array `points` of a `.npz` file, or the only array, or the only one of shape (N, 3)."""
     (points,) = read_npz(path, _check, partial(_choose, path)).values()
     return _coordinates(points)
 
 
 @reads("a point cloud with weights")
-def read_weighted_cloud(path: Path) -> tuple[Points, NDArray[np.float64]]:
+def read_cloud_with_weights(path: Path) -> tuple[Points, NDArray[np.float64]]:
     """Read a cloud and what each of its points counts for: the arrays `points` and `weights` of a `.npz`.
 
     Returns (N, 3) points, and (N,) float64 weights. FileNotFoundError: there is no such file. BadFileError: not such a
@@ -207,7 +209,7 @@ def read_weighted_cloud(path: Path) -> tuple[Points, NDArray[np.float64]]:
 
 
 @reads("a point cloud with heights")
-def read_heights(path: Path, count: int) -> NDArray[np.float32] | None:
+def read_heights(path: Path, num_points: int) -> NDArray[np.float32] | None:
     """Read how high above the local ground the points of a cloud are: the array `heights_m` of a `.npz`.
 
     Returns (N,) metres, NaN where there is no ground at or below; None if the file does not say. BadFileError: another
@@ -216,11 +218,13 @@ def read_heights(path: Path, count: int) -> NDArray[np.float32] | None:
     if path.suffix.lower() != ".npz" or "heights_m" not in npz_headers(path):
         return None
     (heights_m,) = read_npz(path, partial(_check_values, "heights_m"), partial(_only, "heights_m")).values()
-    if len(heights_m) != count:
-        raise ValueError(f"one of heights_m for each point is needed; got {len(heights_m)} for {count}")
+    if len(heights_m) != num_points:
+        raise ValueError(f"one of heights_m for each point is needed; got {len(heights_m)} for {num_points}")
     bad = int(np.isinf(heights_m).sum())
     if bad:
-        raise ValueError(f"heights_m: metres are needed, NaN where there is no ground; {bad} of {count} are infinite")
+        raise ValueError(
+            f"heights_m: metres are needed, NaN where there is no ground; {bad} of {num_points} are infinite"
+        )
     return heights_m.astype(np.float32)
 
 

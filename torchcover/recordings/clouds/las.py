@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.files import check_memory
-from torchcover.recordings.isolated_readers import laz_points
+from torchcover.recordings.isolated_readers import read_laz_points
 
 HEADER_BYTES, HEADER_BYTES_1_4 = 227, 375
 COMPRESSED = 0x80  # of the point format
@@ -192,7 +192,7 @@ def read_las(path: Path) -> NDArray[np.float64]:
             _check_chunks(file, header, size_bytes)
     scale, offset_m = header.scale * meters, header.offset * meters
     if header.compressed:
-        return _to_meters(laz_points(path, header.points)["xyz"], scale, offset_m)
+        return _to_meters(read_laz_points(path, header.points)["xyz"], scale, offset_m)
     claimed_bytes = header.points * header.record_bytes
     if header.first_byte + claimed_bytes > size_bytes:
         raise ValueError(

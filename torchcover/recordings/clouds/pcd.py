@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from torchcover.files import check_memory
-from torchcover.recordings.clouds.arrays import Points, check_rest
+from torchcover.recordings.clouds.arrays import Points, check_trailing_bytes
 from torchcover.recordings.clouds.text import AXES, parse_rows, read_lines
-from torchcover.recordings.isolated_readers import lzf_block
+from torchcover.recordings.isolated_readers import decompress_lzf_block
 
 # The real ones have about 300 bytes; this bounds the search for the DATA line in a file that is no PCD.
 MAX_HEADER_BYTES = 65536
@@ -52,7 +52,7 @@ def read_pcd(path: Path) -> Points:
     if header.encoding == "ascii":
         return _parse_ascii(header, axes, body)
     if header.points == 0:
-        check_rest(body)
+        check_trailing_bytes(body)
         return np.empty((0, 3), f"<f{max(header.sizes[axis] for axis in axes)}")
     _check_size(header, body)
     return _columns(path, header, axes, body)
@@ -186,13 +186,13 @@ def _columns(path: Path, header: _Header, axes: Sequence[int], body: bytes) -> P
     starts = [0, *accumulate(header.field_bytes)]
     columns: list[tuple[bytes | memoryview, int, int]]
     if header.encoding == "binary":
-        check_rest(body[header.points * header.record_bytes :])
+        check_trailing_bytes(body[header.points * header.record_bytes :])
         columns = [(body, starts[axis], header.record_bytes) for axis in axes]
     else:
         compressed_bytes, plain_bytes = struct.unpack_from("<II", body)
-        check_rest(body[8 + compressed_bytes :])
+        check_trailing_bytes(body[8 + compressed_bytes :])
         block_start = path.stat().st_size - len(body) + 8
-        plain = lzf_block(path, block_start, compressed_bytes, plain_bytes)["plain"].data
+        plain = decompress_lzf_block(path, block_start, compressed_bytes, plain_bytes)["plain"].data
         columns = [(plain, starts[axis] * header.points, header.sizes[axis]) for axis in axes]
     kinds = [f"<f{header.sizes[axis]}" for axis in axes]
     return np.column_stack(

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from torchcover.files import check_memory
-from torchcover.recordings.clouds.arrays import Points, check_rest
+from torchcover.recordings.clouds.arrays import Points, check_trailing_bytes
 from torchcover.recordings.clouds.text import AXES, parse_rows, read_lines
 
 # Bounds the search for end_header in a file that is no PLY.
@@ -59,7 +59,7 @@ def read_ply(path: Path) -> Points:
         raise ValueError("a binary element with a list stands before the vertices; store the vertices first")
     _check_size(elements, sum(element.rows * element.row_bytes for element in elements), len(body), "bytes")
     if not any(element.has_list for element in elements):
-        check_rest(body[sum(element.rows * element.row_bytes for element in elements) :])
+        check_trailing_bytes(body[sum(element.rows * element.row_bytes for element in elements) :])
     dtype = np.dtype([(name, BYTE_ORDERS[encoding] + kind) for name, kind in vertex.types.items()])
     offset_bytes = sum(element.rows * element.row_bytes for element in before)
     table = np.frombuffer(body, dtype, vertex.rows, offset_bytes)

@@ -52,13 +52,13 @@ def read_text(path: Path) -> NDArray[np.float64]:
 
 
 def parse_rows(
-    rows: Iterable[str], columns: Sequence[int], width: int, delimiter: str | None = None
+    rows: Iterable[str], columns: Sequence[int], num_columns: int, delimiter: str | None = None
 ) -> NDArray[np.float64]:
     """(N, 3) numbers of rows, of which none is blank; float64 keeps all digits of UTM-sized coordinates.
 
     ValueError: a row of another width, or one without three numbers.
     """
-    checked = _of_width(rows, width, delimiter)
+    checked = _of_width(rows, num_columns, delimiter)
     try:
         return np.loadtxt(checked, np.float64, comments=None, delimiter=delimiter, usecols=columns, ndmin=2)
     except ValueError as error:

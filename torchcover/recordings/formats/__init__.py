@@ -17,9 +17,9 @@ from torchcover.recordings.formats.kitti_raw import KittiRaw
 from torchcover.recordings.formats.nuscenes import NuScenes
 from torchcover.recordings.formats.ros import RosBag
 from torchcover.recordings.formats.tracks import read_box_tracks, read_commonroad
-from torchcover.recordings.objects import RecordedObjects, objects_of
+from torchcover.recordings.objects import RecordedObjects, extract_objects
 from torchcover.recordings.other_formats import find_remedy
-from torchcover.recordings.recording import Recording, whole_recording
+from torchcover.recordings.recording import Recording, read_complete_manifest
 from torchcover.recordings.settings import RecordingSettings, merge_recording_settings
 
 
@@ -30,7 +30,7 @@ class RecordingFormat(Protocol):
     def layout(self) -> str:
         """What such a recording looks like, for messages."""
 
-    def recognises(self, path: Path, /) -> bool:
+    def can_read(self, path: Path, /) -> bool:
         """Whether what is at a path that exists is meant to be such a recording."""
 
     def __call__(self, path: Path, /) -> Recording:
@@ -82,10 +82,10 @@ def _open_checked(path: Path, settings: RecordingSettings) -> Recording:
         raise ValueError(f"format {settings.format!r}: no such format of recordings; there are {', '.join(FORMATS)}")
     written = _read_manifest(path)
     for name, recording_format in FORMATS.items():
-        if name != settings.format and (settings.format is not None or not recording_format.recognises(path)):
+        if name != settings.format and (settings.format is not None or not recording_format.can_read(path)):
             continue
         if recording_format is RosBag:
-            mounts = {sensor: mount.matrix() for sensor, mount in settings.mounts.items()}
+            mounts = {sensor: mount.to_matrix() for sensor, mount in settings.mounts.items()}
             return correct_recording(RosBag(path, settings.vehicle_frame, mounts, settings.point_times), settings)
         if settings.vehicle_frame is not None or settings.mounts or settings.point_times is not None:
             raise ValueError(
@@ -102,7 +102,7 @@ def _below(folder: Path) -> str:
     places, found = [folder], list[Path]()
     for _ in range(DEEP * folder.is_dir()):
         places = [inner for place in places if place.is_dir() for inner in sorted(place.iterdir())]
-        if found := [place for place in places if any(one.recognises(place) for one in FORMATS.values())]:
+        if found := [place for place in places if any(one.can_read(place) for one in FORMATS.values())]:
             break
     told = ", ".join(map(str, found[:BELOW])) + (f" and {len(found) - BELOW} more" if len(found) > BELOW else "")
     return f"; name one of those in it: {told}" if found else ""
@@ -112,7 +112,7 @@ def _read_manifest(path: Path) -> tuple[Path, dict[str, Any]] | None:
     """Read the manifest of a recording that torchcover has written; None of any other one."""
     if not path.is_dir():  # a bag may be one file
         return None
-    manifests = ((folder, whole_recording(folder)) for folder in (path, path / "training"))  # which is KITTI's
+    manifests = ((folder, read_complete_manifest(folder)) for folder in (path, path / "training"))  # which is KITTI's
     return next(((folder, manifest) for folder, manifest in manifests if manifest is not None), None)
 
 
@@ -121,7 +121,7 @@ def _checked(recording: Recording, written: tuple[Path, dict[str, Any]] | None) 
     if written is None:
         return recording
     folder, manifest = written
-    names, there = set(manifest["frames"]), set(recording.names)
+    names, there = set(manifest["frames"]), set(recording.frame_names)
     if names == there:
         if changed := find_changed(folder, manifest["files"]):
             more = f" and {len(changed) - BELOW:,} more" if len(changed) > BELOW else ""
@@ -142,7 +142,7 @@ def _checked(recording: Recording, written: tuple[Path, dict[str, Any]] | None) 
 class ObjectFormat(NamedTuple):
     """A format whose objects over time can be read without any scan."""
 
-    recognises: Callable[[Path], bool]
+    can_read: Callable[[Path], bool]
     read: Callable[[Path], RecordedObjects]
 
 
@@ -181,11 +181,11 @@ def read_objects(path: str | os.PathLike[str], scene: str | None = None) -> Reco
             raise ValueError(f"{path}: scene: is for tables of nuScenes; leave it out")
         return nuscenes.read_objects(path, scene)
     for one in OBJECT_FORMATS.values():
-        if one.recognises(path):
+        if one.can_read(path):
             return one.read(path)
     for recording_format in FORMATS.values():
-        if recording_format.recognises(path):
-            return objects_of(open_recording(path))
+        if recording_format.can_read(path):
+            return extract_objects(open_recording(path))
     remedy = f"{find_remedy(path)}; " * bool(find_remedy(path))
     raise ValueError(
         f"{path}: {remedy}recorded tracks are {'; '.join(OBJECT_FORMATS)}; or a recording with poses and boxes "

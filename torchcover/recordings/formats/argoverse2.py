@@ -17,8 +17,15 @@ from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_quater
 from torchcover.geometry.rigid import Matrix
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings.isolated_readers import read_feather
-from torchcover.recordings.objects import Ego, RecordedObjects, Seen, SeenObjects, by_name, track_of
-from torchcover.recordings.recording import Layout, Scan, SensorCalibrations, check_times, warn_of_missing_poses
+from torchcover.recordings.objects import (
+    Ego,
+    ObjectInterpolator,
+    ObjectState,
+    RecordedObjects,
+    build_track,
+    group_by_name,
+)
+from torchcover.recordings.recording import RecordingBase, Scan, SensorCalibrations, check_times, warn_of_missing_poses
 
 # The ego frame lies in the rear axle, 0.30 m above the ground; the centre of a Ford Fusion is 1.339 m before it, as in
 # the rig `argoverse2`, where the source is.
@@ -41,7 +48,7 @@ EGO_CATEGORY = "ego_vehicle"
 MAX_ANNOTATION_GAP_S = 0.1
 
 
-class Argoverse2(Layout):
+class Argoverse2(RecordingBase):
     """A folder with `sensors/lidar/TIME.feather`, `city_SE3_egovehicle.feather` and `annotations.feather`.
 
     The clouds are in the frame of the ego and corrected for its motion within a turn. Needs `torchcover[av2]`.
@@ -57,7 +64,7 @@ class Argoverse2(Layout):
 
     layout: ClassVar[str] = "sensors/lidar/TIME.feather, city_SE3_egovehicle.feather"
     sensors = tuple(LASERS)
-    body: BoundingBox | None = BODY
+    ego_box: BoundingBox | None = BODY
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
@@ -70,20 +77,20 @@ class Argoverse2(Layout):
         warn_of_missing_poses(self.path / POSES, missing, len(self._files))
         self._files = [file for file, posed in zip(self._files, has_pose, strict=True) if posed]
         self._times_ns = np.array([_time_ns(file) for file in self._files])
-        self.names = tuple(file.stem for file in self._files)
-        self.times_s = check_times(self._times_ns * 1e-9, len(self.names), str(self.path.joinpath(*SWEEPS)))
+        self.frame_names = tuple(file.stem for file in self._files)
+        self.times_s = check_times(self._times_ns * 1e-9, len(self.frame_names), str(self.path.joinpath(*SWEEPS)))
 
     @property
-    def classes(self) -> Mapping[str, str]:
+    def vehicle_classes(self) -> Mapping[str, str]:
         """By the words of the data set."""
         return road_user_classes()["argoverse2"]
 
     @classmethod
-    def recognises(cls, path: Path) -> bool:
+    def can_read(cls, path: Path) -> bool:
         """Whether it has sweeps and poses."""
         return path.joinpath(*SWEEPS).is_dir() and (path / POSES).exists()
 
-    def scan(self, sensor: str, index: int) -> Scan:
+    def read_scan(self, sensor: str, index: int) -> Scan:
         """The points of one LiDAR in a sweep."""
         columns = read_feather(self._files[index], ("x", "y", "z", "laser_number", "offset_ns"))
         low, high = LASERS[sensor]
@@ -91,24 +98,24 @@ class Argoverse2(Layout):
         own = (laser >= low) & (laser < high)
         points_m = np.column_stack([columns[axis][own].astype(np.float32) for axis in "xyz"])
         offsets_s = columns["offset_ns"][own] * 1e-9
-        return Scan(points_m, vehicle_T_ego, str(self._files[index]), rows=laser[own], offsets_s=offsets_s)
+        return Scan(points_m, vehicle_T_ego, str(self._files[index]), rings=laser[own], offsets_s=offsets_s)
 
-    def world_T_vehicle(self, index: int) -> Matrix:
+    def get_world_T_vehicle(self, index: int) -> Matrix:
         """The pose of the ego in the city."""
         return np.asarray(self._poses[index] @ invert(vehicle_T_ego))
 
-    def boxes(self, index: int) -> Boxes | None:
+    def read_boxes(self, index: int) -> Boxes | None:
         """The cuboids of that sweep; None without the file."""
         if self._tracks is None:
             return None
-        return self._tracks.at(float(self._times_ns[index] - self._times_ns[0]) * 1e-9, vehicle_T_ego)
+        return self._tracks.interpolate_boxes(float(self._times_ns[index] - self._times_ns[0]) * 1e-9, vehicle_T_ego)
 
-    def calibrations(self) -> SensorCalibrations:
+    def read_calibrations(self) -> SensorCalibrations:
         """Read the mounts of both LiDARs, and the cameras: pinholes, for released images are undistorted."""
         mounts, cameras = self._calibrations()
         return SensorCalibrations("calibration/", mounts, tuple(replace(one, **_PINHOLE) for one in cameras))
 
-    def raw_cameras(self) -> tuple[Calibration, ...]:
+    def read_raw_cameras(self) -> tuple[Calibration, ...]:
         """Read the cameras with the distortion of their lenses, which the released images no longer have."""
         return self._calibrations()[1]
 
@@ -118,7 +125,7 @@ class Argoverse2(Layout):
         poses = read_feather(folder / "egovehicle_SE3_sensor.feather", ("sensor_name", *POSE))
         lenses = read_feather(folder / "intrinsics.feather", ("sensor_name", *_LENS))
         with naming(folder, "calibrations of Argoverse 2"):
-            ego_T = {str(name): pose for name, pose in zip(poses["sensor_name"], poses_of(poses), strict=True)}
+            ego_T = {str(name): pose for name, pose in zip(poses["sensor_name"], build_poses(poses), strict=True)}
             missing = ({*LASERS} | {str(name) for name in lenses["sensor_name"]}) - ego_T.keys()
             if missing:
                 raise ValueError(f"egovehicle_SE3_sensor.feather has no {', '.join(sorted(missing))}")
@@ -127,12 +134,12 @@ class Argoverse2(Layout):
         return {name: vehicle_T_ego @ ego_T[name] for name in LASERS}, cameras
 
     @cached_property
-    def _tracks(self) -> SeenObjects | None:
+    def _tracks(self) -> ObjectInterpolator | None:
         """The cuboids of each sweep, in the frame of the ego at that time."""
         path = self.path / ANNOTATIONS[0]
         if not path.exists():
             return None
-        return SeenObjects(_seen(read_feather(path, CUBOIDS), int(self._times_ns[0])), longest_gap_s=0.0)
+        return ObjectInterpolator(_seen(read_feather(path, CUBOIDS), int(self._times_ns[0])), max_gap_s=0.0)
 
     def _read_poses(self, sweeps_ns: NDArray[np.int64]) -> tuple[Matrix, NDArray[np.bool_]]:
         """Return (M, 4, 4) poses of the sweeps that have one near their (N,) times, and the (N,) mask of these."""
@@ -143,7 +150,7 @@ class Argoverse2(Layout):
         before_is_nearer = sweeps_ns - times_ns[order[after - 1]] < times_ns[order[after]] - sweeps_ns
         nearest = order[after - before_is_nearer]
         has_pose = np.abs(times_ns[nearest] - sweeps_ns) <= MAX_CLOCK_GAP_NS
-        return poses_of({name: column[nearest[has_pose]] for name, column in columns.items()}), has_pose
+        return build_poses({name: column[nearest[has_pose]] for name, column in columns.items()}), has_pose
 
 
 def has_objects(path: Path) -> bool:
@@ -165,7 +172,7 @@ def read_objects(path: Path) -> RecordedObjects:
         origin_ns = int(poses["timestamp_ns"].min())
         ego_s = _seconds(poses, origin_ns)
         order = np.argsort(ego_s, kind="stable")
-        world_T_driven = poses_of(poses)[order]
+        world_T_driven = build_poses(poses)[order]
         drive = Trajectory.from_poses(ego_s[order], world_T_driven)
     with naming(annotations, "cuboids of Argoverse 2"):
         times_s = _seconds(cuboids, origin_ns)
@@ -180,26 +187,28 @@ def read_objects(path: Path) -> RecordedObjects:
         world_T_ego = {time_s: drive.at(time_s) for time_s in np.unique(times_s).tolist()}
         classes = road_user_classes()["argoverse2"]
         tracks = tuple(
-            track_of(seen, classes.get(seen[0].category), np.stack([world_T_ego[one.time_s] for one in seen]))
-            for seen in by_name(_seen(cuboids, origin_ns)).values()
+            build_track(seen, classes.get(seen[0].category), np.stack([world_T_ego[one.time_s] for one in seen]))
+            for seen in group_by_name(_seen(cuboids, origin_ns)).values()
             if seen[0].category != EGO_CATEGORY
         )
     return RecordedObjects(tracks, (Ego("ego", drive.times_s, world_T_driven, invert(vehicle_T_ego), SIZE_M),))
 
 
-def _seen(columns: Mapping[str, NDArray[Any]], origin_ns: int) -> list[Seen]:
+def _seen(columns: Mapping[str, NDArray[Any]], origin_ns: int) -> list[ObjectState]:
     """The cuboids, in the frame of the ego at their times, which are after an origin."""
     sizes_m = zip(*(columns[name].tolist() for name in CUBOIDS[3:6]), strict=True)
-    times_s, poses = _seconds(columns, origin_ns).tolist(), poses_of(columns)
+    times_s, poses = _seconds(columns, origin_ns).tolist(), build_poses(columns)
     rows = zip(columns["track_uuid"], columns["category"], times_s, poses, sizes_m, strict=True)
-    return [Seen(str(name), time_s, pose, size_m, str(what).lower()) for name, what, time_s, pose, size_m in rows]
+    return [
+        ObjectState(str(name), time_s, pose, size_m, str(what).lower()) for name, what, time_s, pose, size_m in rows
+    ]
 
 
 def _seconds(columns: Mapping[str, NDArray[Any]], origin_ns: int) -> Matrix:
     return np.asarray((columns["timestamp_ns"].astype(np.int64) - origin_ns) * 1e-9, dtype=np.float64)
 
 
-def poses_of(columns: Mapping[str, NDArray[Any]]) -> Matrix:
+def build_poses(columns: Mapping[str, NDArray[Any]]) -> Matrix:
     """(N, 4, 4) of the rows of a table with the columns `POSE`."""
     rotations = np.column_stack([columns[name] for name in POSE[:4]])
     places = np.column_stack([columns[name] for name in POSE[4:]])

@@ -14,8 +14,8 @@ from torchcover.recordings.clouds.arrays import Points
 from torchcover.recordings.isolated_readers import (
     METADATA,
     ROS1_SUFFIX,
+    find_repair_command,
     find_ros1_files,
-    name_remedy,
     read_bag_index,
     read_bag_messages,
     read_header_stamps,
@@ -60,19 +60,19 @@ class Bag:
             index = read_bag_index(path)
         topics, types = index["topics"].tolist(), index["types"].tolist()
         times_ns = np.split(index["times_ns"], np.cumsum(index["counts"]))
-        self.types = {topic: RENAMED.get(name, name) for topic, name in zip(topics, types, strict=True)}
+        self.type_by_topic = {topic: RENAMED.get(name, name) for topic, name in zip(topics, types, strict=True)}
         self._times_ns: dict[str, NDArray[np.int64]] = dict(zip(topics, times_ns, strict=False))
 
-    def times_ns(self, topic: str) -> NDArray[np.int64]:
+    def get_log_times_ns(self, topic: str) -> NDArray[np.int64]:
         """(M,) when the messages of a topic were recorded, ascending."""
         return self._times_ns.get(topic, np.empty(0, np.int64))
 
-    def stamps_ns(self, topic: str) -> NDArray[np.int64]:
+    def read_stamps_ns(self, topic: str) -> NDArray[np.int64]:
         """(M,) when the messages of a topic were made, by their headers, in the order of their recording.
 
         In a long bag a sample is read; if all of it was recorded equally late, to `STEADY_NS`, so was the rest.
         """
-        times_ns = self.times_ns(topic)
+        times_ns = self.get_log_times_ns(topic)
         count, steps_ns = len(times_ns), np.diff(times_ns)
         if count > SAMPLED:
             sample_ns = times_ns[np.unique(np.linspace(0, count - 1, SAMPLED).astype(int))]
@@ -86,18 +86,20 @@ class Bag:
         with naming(self.path, f"a bag, in {topic}"):
             wanted = None if times_ns is None else times_ns.tolist()
             stamps_ns = read_header_stamps(self.path, topic, wanted)["stamps_ns"]
-            recorded = len(self.times_ns(topic) if times_ns is None else times_ns)
+            recorded = len(self.get_log_times_ns(topic) if times_ns is None else times_ns)
             if len(stamps_ns) != recorded:
                 raise ValueError(
-                    f"{recorded} messages are in the index, {len(stamps_ns)} are there; {name_remedy(self.path)}"
+                    f"{recorded} messages are in the index, {len(stamps_ns)} are there; {find_repair_command(self.path)}"
                 )
             return np.asarray(stamps_ns)
 
-    def topics(self, *types: str) -> list[str]:
+    def list_topics(self, *types: str) -> list[str]:
         """Topics of these types that have messages, by name."""
-        return sorted(topic for topic, kind in self.types.items() if kind in types and len(self.times_ns(topic)))
+        return sorted(
+            topic for topic, kind in self.type_by_topic.items() if kind in types and len(self.get_log_times_ns(topic))
+        )
 
-    def messages(self, topic: str, start_ns: int | None = None, stop_ns: int | None = None) -> list[Any]:
+    def read_messages(self, topic: str, start_ns: int | None = None, stop_ns: int | None = None) -> list[Any]:
         """The messages of a topic that were recorded from a time on, until before another."""
         with naming(self.path, f"a bag, in {topic}"), np.errstate(all="ignore"):
             data, ends, types = read_bag_messages(self.path, topic, start_ns, stop_ns).values()
@@ -108,12 +110,14 @@ class Bag:
                 for start, end, name in zip(starts, ends.tolist(), types.tolist(), strict=False)
             ]
 
-    def message(self, topic: str, time_ns: int) -> Any:  # noqa: ANN401  (of a type that rosbags has made)
+    def read_message(self, topic: str, time_ns: int) -> Any:  # noqa: ANN401  (of a type that rosbags has made)
         """The message of a topic that was recorded at a time."""
-        found = self.messages(topic, time_ns, time_ns + 1)
+        found = self.read_messages(topic, time_ns, time_ns + 1)
         if not found:
             with naming(self.path, "a bag"):
-                raise ValueError(f"{topic}: the message at {time_ns} is in the index only; {name_remedy(self.path)}")
+                raise ValueError(
+                    f"{topic}: the message at {time_ns} is in the index only; {find_repair_command(self.path)}"
+                )
         return found[0]
 
 
@@ -191,21 +195,21 @@ class PointTimeParams:
     """How the unit of times of points is recognized.
 
     Args:
-        min_share: Points of one scan are measured over at least this share of the scan period; a scanner that looks at
+        min_period_share: Points of one scan are measured over at least this share of the scan period; a scanner that looks at
             a sector, or a recording of every other scan, has less, which is reported.
-        max_share: Points of one scan are measured over at most this share of the scan period.
-        least_share: Below this share of the scan period no unit is plausible.
-        usual_period_s: Scan period where a recording has one scan: that of most LiDARs.
-        longest_s: Times of points are at most this far from the stamp of their message; no LiDAR takes longer.
-        absolute_ns: Larger times count from 1970.
+        max_period_share: Points of one scan are measured over at most this share of the scan period.
+        min_plausible_period_share: Below this share of the scan period no unit is plausible.
+        default_period_s: Scan period where a recording has one scan: that of most LiDARs.
+        max_offset_s: Times of points are at most this far from the stamp of their message; no LiDAR takes longer.
+        min_absolute_ns: Larger times count from 1970.
     """
 
-    min_share: float = 0.4
-    max_share: float = 1.5
-    least_share: float = 0.02
-    usual_period_s: float = 0.1
-    longest_s: float = 1.0
-    absolute_ns: float = 1e15
+    min_period_share: float = 0.4
+    max_period_share: float = 1.5
+    min_plausible_period_share: float = 0.02
+    default_period_s: float = 0.1
+    max_offset_s: float = 1.0
+    min_absolute_ns: float = 1e15
 
 
 PARAMS = PointTimeParams()
@@ -228,21 +232,21 @@ class CloudMessage(NamedTuple):
     points_m: Points
     stamp_ns: int
     offsets_s: NDArray[np.float64] | None
-    rows: NDArray[np.integer] | None
+    rings: NDArray[np.integer] | None
 
 
-def cloud_of(message: Any, times: PointTimes) -> CloudMessage:  # noqa: ANN401  (of a type that rosbags has made)
+def parse_cloud(message: Any, point_times: PointTimes) -> CloudMessage:  # noqa: ANN401  (of a type that rosbags has made)
     """Read the fields x, y, z, and the time of each point if there is one.
 
     Args:
         message: A `sensor_msgs/msg/PointCloud2`.
-        times: As `choose_point_times` chose them for its sensor.
+        point_times: As `choose_point_times` chose them for its sensor.
 
     Raises:
         ValueError: A cloud that contradicts itself, or times far from its stamp.
     """
     fields = {field.name: field for field in message.fields}
-    time_field = _time_field(message) if times.unit != "none" else None
+    time_field = _time_field(message) if point_times.unit != "none" else None
     wanted = [fields[axis] for axis in "xyz" if axis in fields]
     if len(wanted) < 3 or any(field.datatype not in (7, 8) for field in wanted):
         told = ", ".join(f"{field.name} ({TYPES.get(field.datatype, field.datatype)})" for field in message.fields)
@@ -253,10 +257,10 @@ def cloud_of(message: Any, times: PointTimes) -> CloudMessage:  # noqa: ANN401  
     points_m: Points = np.stack([table[axis] for axis in "xyz"], axis=1)
     if points_m.dtype.byteorder == ">":
         points_m = points_m.astype(points_m.dtype.newbyteorder("="))
-    stamp_ns = stamp_of(message.header)
+    stamp_ns = get_stamp_ns(message.header)
     if time_field is None:
         return CloudMessage(points_m, stamp_ns, None, rows)
-    offsets_s = _checked(_offsets_s(table[time_field.name], stamp_ns, times), points_m, time_field.name)
+    offsets_s = _checked(_offsets_s(table[time_field.name], stamp_ns, point_times), points_m, time_field.name)
     return CloudMessage(points_m, stamp_ns, offsets_s, rows)
 
 
@@ -276,30 +280,30 @@ def choose_point_times(message: Any, period_s: float | None) -> tuple[PointTimes
     Raises:
         ValueError: A cloud that contradicts itself.
     """
-    field, period_s = _time_field(message), period_s or PARAMS.usual_period_s
+    field, period_s = _time_field(message), period_s or PARAMS.default_period_s
     if field is None:
         return PointTimes("none", period_s), ""
     axes = {axis.name: axis for axis in message.fields if axis.name in ("x", "y", "z")}
     table = _table(message, [field, *axes.values()])
     points_m = np.stack([table[axis] for axis in "xyz" if axis in axes], axis=1)
     measured = np.isfinite(points_m).all(axis=1) & (np.abs(points_m) > NO_RETURN_M).any(axis=1)
-    stored, stamp_ns = table[field.name][measured & np.isfinite(table[field.name])], stamp_of(message.header)
-    usual = "ns" if stored.dtype.kind in "iu" or np.abs(stored).max(initial=0) > PARAMS.absolute_ns else "s"
+    stored, stamp_ns = table[field.name][measured & np.isfinite(table[field.name])], get_stamp_ns(message.header)
+    usual = "ns" if stored.dtype.kind in "iu" or np.abs(stored).max(initial=0) > PARAMS.min_absolute_ns else "s"
     units = [usual, *(unit for unit in UNITS_NS if unit != usual), *([TURN] if stored.dtype.kind == "f" else [])]
     shares = {}
     for unit in units:
         offsets_s = _offsets_s(stored, stamp_ns, PointTimes(unit, period_s))
-        is_near = bool((np.abs(offsets_s) <= PARAMS.longest_s).all())
+        is_near = bool((np.abs(offsets_s) <= PARAMS.max_offset_s).all())
         shares[unit] = float(np.ptp(offsets_s)) / period_s if len(offsets_s) and is_near else np.inf * len(offsets_s)
     if shares[usual] == 0 or np.isnan(shares[usual]):  # no point, or all at one time
         return PointTimes(usual, period_s), ""
-    fitting = [unit for unit in units if PARAMS.min_share <= shares[unit] <= PARAMS.max_share]
+    fitting = [unit for unit in units if PARAMS.min_period_share <= shares[unit] <= PARAMS.max_period_share]
     span = f"the times of points in {field.name!r} ({TYPES[field.datatype]}) span {float(np.ptp(stored)):g}"
     if fitting:
         words = "shares of the scan period" if fitting[0] == TURN else fitting[0]
         note = f"{span} where scans are {period_s:.3g} s apart: they are read as {words}" if fitting[0] != usual else ""
         return PointTimes(fitting[0], period_s), note
-    if PARAMS.least_share <= shares[usual] < PARAMS.min_share:
+    if PARAMS.min_plausible_period_share <= shares[usual] < PARAMS.min_period_share:
         note = f"{span} {usual}, {shares[usual]:.0%} of the {period_s:.3g} s between scans; they are read as {usual}"
         return PointTimes(usual, period_s), note
     return None, (
@@ -314,7 +318,7 @@ def _time_field(message: Any) -> Any:  # noqa: ANN401
     return next((fields[name] for name in TIME_FIELDS if name in fields), None)
 
 
-def stamp_of(header: Any) -> int:  # noqa: ANN401
+def get_stamp_ns(header: Any) -> int:  # noqa: ANN401
     """The time of a message in nanoseconds."""
     return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
 
@@ -350,7 +354,7 @@ def _offsets_s(stored: NDArray[Any], stamp_ns: int, times: PointTimes) -> NDArra
     if times.unit == TURN:
         return stored.astype(np.float64) * times.period_s
     unit_ns = UNITS_NS[times.unit]
-    is_absolute = float(np.abs(stored[np.isfinite(stored)]).max(initial=0)) * unit_ns > PARAMS.absolute_ns
+    is_absolute = float(np.abs(stored[np.isfinite(stored)]).max(initial=0)) * unit_ns > PARAMS.min_absolute_ns
     # The whole units first: a float64 of both together would be off by 0.2 us.
     whole, rest_ns = divmod(stamp_ns, unit_ns) if is_absolute else (0, 0)
     since = stored.astype(np.int64) - whole if stored.dtype.kind in "iu" else stored.astype(np.float64) - whole
@@ -359,10 +363,10 @@ def _offsets_s(stored: NDArray[Any], stamp_ns: int, times: PointTimes) -> NDArra
 
 def _checked(offsets_s: NDArray[np.float64], points_m: Points, name: str) -> NDArray[np.float64]:
     of_points = offsets_s[np.isfinite(points_m).all(axis=1)]
-    is_near = np.abs(of_points) <= PARAMS.longest_s
+    is_near = np.abs(of_points) <= PARAMS.max_offset_s
     if not is_near.all():
         raise ValueError(
-            f"{name}: times of points within {PARAMS.longest_s:g} s of the cloud are needed; got "
+            f"{name}: times of points within {PARAMS.max_offset_s:g} s of the cloud are needed; got "
             f"{of_points[np.argmin(is_near)]:g} s"
         )
-    return np.nan_to_num(offsets_s, nan=0.0, posinf=0.0, neginf=0.0).clip(-PARAMS.longest_s, PARAMS.longest_s)
+    return np.nan_to_num(offsets_s, nan=0.0, posinf=0.0, neginf=0.0).clip(-PARAMS.max_offset_s, PARAMS.max_offset_s)

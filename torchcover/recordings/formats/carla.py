@@ -18,8 +18,8 @@ from torchcover.files import naming, parse_yaml, read_csv, read_short_text, read
 from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_euler, transform
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.clouds import read_cloud
-from torchcover.recordings.formats.frame_files import check_frames, check_same_names, frame_files
-from torchcover.recordings.recording import Layout, Scan, check_times
+from torchcover.recordings.formats.frame_files import check_same_names, find_frame_files, find_frame_rows
+from torchcover.recordings.recording import RecordingBase, Scan, check_times
 
 # Attributes of cameras that bend the image, and the values at which CARLA does not.
 LENS = {"lens_k": -1.0, "lens_kcube": 0.0, "lens_x_size": 0.08, "lens_y_size": 0.08}
@@ -66,7 +66,7 @@ class CarlaSensor(BaseModel):
     @property
     def parent_T_sensor(self) -> Matrix:
         """(4, 4) its mount, in right-handed axes."""
-        return right_handed([getattr(self, name) for name in POSE])
+        return to_right_handed([getattr(self, name) for name in POSE])
 
     @property
     def camera(self) -> Camera | None:
@@ -106,7 +106,7 @@ class CarlaVehicle(BaseModel):
         return rigid(np.eye(3), [-self.location.x, self.location.y, 0.0])
 
     @property
-    def body(self) -> BoundingBox:
+    def ego_box(self) -> BoundingBox:
         """The box in the vehicle frame, off the ground."""
         half, z = self.extent, self.location.z
         low_m = max(z - half.z, 0.0) + CLEARANCE_M
@@ -137,7 +137,7 @@ def read_carla_vehicle(path: Path) -> CarlaVehicle:
         vehicle = CarlaVehicle.model_validate(parse_yaml(read_short_text(path)))
     except ValidationError as error:
         raise ValueError(f"location and extent, each with x, y, z, are needed; {_complaints(error)}") from error
-    _ = vehicle.body  # refuses a box without a size
+    _ = vehicle.ego_box  # refuses a box without a size
     return vehicle
 
 
@@ -160,7 +160,7 @@ def read_carla_boxes(path: Path, vehicle_T_world: Matrix) -> Boxes:
             f"in one frame, such as {table.words['id'][empty]} ({table.words['category'][empty]}): {extent}",
             stacklevel=2,
         )
-    poses = right_handed([numbers[name] for name in POSE])
+    poses = to_right_handed([numbers[name] for name in POSE])
     size_m = 2 * np.column_stack([numbers[name] for name in EXTENT])
     over_ground = np.column_stack([numbers.get(name, np.full(count, np.nan)) for name in VELOCITY]) * [1.0, -1.0]
     velocity_mps = over_ground @ vehicle_T_world[:2, :2].T
@@ -173,7 +173,7 @@ def read_carla_boxes(path: Path, vehicle_T_world: Matrix) -> Boxes:
         )
 
 
-def right_handed(pose: list[float] | list[NDArray[np.float64]]) -> Matrix:
+def to_right_handed(pose: list[float] | list[NDArray[np.float64]]) -> Matrix:
     """(..., 4, 4) of x, y, z, roll, pitch, yaw in CARLA's axes: y and yaw to the right, pitch up."""
     x, y, z, roll, pitch, yaw = map(np.asarray, pose)
     return rigid(rotation_from_euler(-yaw, -pitch, roll), np.stack([x, -y, z], axis=-1))
@@ -191,7 +191,7 @@ OF_A_FILE = 0.02
 SECTOR_DEG = 60.0
 
 
-class Carla(Layout):
+class Carla(RecordingBase):
     """A folder with `sensors.json` and `ID/FRAME.ply` (or `.npy`; `.png` of a depth camera) of each sensor in it.
 
     All of it is in CARLA's left-handed axes. `sensors.json` (or `.yaml`) is the list that an agent of CARLA's
@@ -224,7 +224,7 @@ class Carla(Layout):
         self.path = Path(path)
         listed = read_carla_sensors(next(filter(Path.exists, _lists(self.path)), self.path / SENSORS_FILES[0]))
         vehicle = read_carla_vehicle(self.path / VEHICLE_FILE) if (self.path / VEHICLE_FILE).exists() else None
-        self.body = None if vehicle is None else vehicle.body
+        self.ego_box = None if vehicle is None else vehicle.ego_box
         self._vehicle_T_actor = np.eye(4) if vehicle is None else vehicle.vehicle_T_actor
         self._mounts = {one.id: self._vehicle_T_actor @ one.parent_T_sensor for one in listed}
         self._cameras = {one.id: one.camera for one in listed if one.camera is not None}
@@ -252,16 +252,16 @@ class Carla(Layout):
         if len(self._ticks) < turn:
             raise ValueError(f"{self.path}: a turn of its LiDARs takes {turn} frames; there are {len(self._ticks)}")
         self._lasts = range(turn - 1, len(self._ticks), turn)
-        self.names = tuple(self._ticks[last] for last in self._lasts)
+        self.frame_names = tuple(self._ticks[last] for last in self._lasts)
         if self.times_s is not None:
             self.times_s = self.times_s[self._lasts.start :: turn]
 
     @classmethod
-    def recognises(cls, path: Path) -> bool:
+    def can_read(cls, path: Path) -> bool:
         """Whether there is a list of sensors."""
         return any(file.is_file() for file in _lists(path))
 
-    def scan(self, sensor: str, index: int) -> Scan:
+    def read_scan(self, sensor: str, index: int) -> Scan:
         """Read a cloud, its y turned to the left, or a depth image; all parts of a turn."""
         last = self._lasts[index]
         cloud_m, vehicle_T_sensor, source = self._read(sensor, last)
@@ -273,16 +273,16 @@ class Carla(Layout):
             parts.append(self._moved(transform(vehicle_T_sensor, cloud_m), tick, last))
         return Scan(np.concatenate(parts), None, source)
 
-    def world_T_vehicle(self, index: int) -> Matrix | None:
+    def get_world_T_vehicle(self, index: int) -> Matrix | None:
         """Where the vehicle was, if there is a `poses.csv`."""
         return self._pose(self._lasts[index])
 
-    def boxes(self, index: int) -> Boxes | None:
+    def read_boxes(self, index: int) -> Boxes | None:
         """The objects of a frame; None without the folder."""
-        pose = self.world_T_vehicle(index)
+        pose = self.get_world_T_vehicle(index)
         if pose is None or not self._labelled:
             return None
-        return read_carla_boxes(self.path / BOXES / f"{self.names[index]}.csv", invert(pose))
+        return read_carla_boxes(self.path / BOXES / f"{self.frame_names[index]}.csv", invert(pose))
 
     def _read(self, sensor: str, tick: int) -> tuple[NDArray[np.floating], Matrix, str]:
         """Points of a file in right-handed axes, where their sensor was, and the file."""
@@ -304,16 +304,16 @@ class Carla(Layout):
         assert before is not None  # without times there are no parts
         assert after is not None
         moved_m = transform(invert(after) @ before, points_m)
-        if self.body is None:
+        if self.ego_box is None:
             return moved_m
-        own = ((points_m > self.body.lower_m) & (points_m < self.body.upper_m)).all(axis=1, keepdims=True)
+        own = ((points_m > self.ego_box.lower_m) & (points_m < self.ego_box.upper_m)).all(axis=1, keepdims=True)
         return np.where(own, points_m, moved_m)
 
     def _pose(self, tick: int) -> Matrix | None:
         return None if self._poses is None else self._poses[tick] @ invert(self._vehicle_T_actor)
 
     def _files_of(self, sensor: str) -> dict[str, Path]:
-        return frame_files(self.path / sensor, beside=(POSES_FILE,), images=sensor in self._cameras)
+        return find_frame_files(self.path / sensor, ignored_files=(POSES_FILE,), is_depth=sensor in self._cameras)
 
     def _warn_of_sectors(self, listed: list[CarlaSensor]) -> None:
         for one in listed:
@@ -334,8 +334,8 @@ class Carla(Layout):
         """(F,) times, or nothing, and (F, 4, 4) poses of the frames of a table."""
         table = read_csv(path, (*timed, *POSE), ("frame",))
         with naming(path, "a table of poses"):
-            order = check_frames(table.words["frame"], self._ticks)
-        poses = right_handed([table.numbers[name][order] for name in POSE])
+            order = find_frame_rows(table.words["frame"], self._ticks)
+        poses = to_right_handed([table.numbers[name][order] for name in POSE])
         return (table.numbers["time_s"][order] if timed else np.empty(0)), poses
 
 

@@ -11,9 +11,15 @@ from torchcover.files import parse_yaml, read_short_text, reads
 from torchcover.geometry import BoundingBox
 from torchcover.geometry.rigid import Matrix, check_rigid
 from torchcover.recordings.clouds import read_cloud
-from torchcover.recordings.clouds.arrays import read_heights, read_weighted_cloud
-from torchcover.recordings.formats.frame_files import PoseTable, check_same_names, frame_files, natural, read_boxes
-from torchcover.recordings.recording import Layout, Scan, check_times
+from torchcover.recordings.clouds.arrays import read_cloud_with_weights, read_heights
+from torchcover.recordings.formats.frame_files import (
+    PoseTable,
+    check_same_names,
+    find_frame_files,
+    make_natural_sort_key,
+    read_boxes,
+)
+from torchcover.recordings.recording import RecordingBase, Scan, check_times
 
 ALLOWED = (
     "allowed are sensor, or sensors or rigs by name, and reference, each with a 4x4 vehicle_T_sensor, flip_y and "
@@ -51,7 +57,7 @@ class _Settings(_Strict):
     vehicle: _Vehicle | None = None
 
 
-class PlaceSettings(NamedTuple):
+class CloudSettings(NamedTuple):
     """How the clouds of a place are to be read."""
 
     vehicle_T_sensor: Matrix | None = None
@@ -62,12 +68,12 @@ class PlaceSettings(NamedTuple):
 class FolderSettings(NamedTuple):
     """What the file says, by `sensor`, `sensors/NAME`, `rigs/NAME` or `reference`, where it does.
 
-    With `square_metres` the reference's files have weights; `body` is the vehicle itself, None if unknown.
+    With `square_metres` the reference's files have weights; `ego_box` is the vehicle itself, None if unknown.
     """
 
-    places: dict[str, PlaceSettings]
+    cloud_settings: dict[str, CloudSettings]
     square_metres: bool = False
-    body: BoundingBox | None = None
+    ego_box: BoundingBox | None = None
 
 
 def read_folder_settings(path: Path) -> FolderSettings:
@@ -95,10 +101,10 @@ def _read(path: Path) -> FolderSettings:
     )
 
 
-def _place(name: str, place: _Place) -> PlaceSettings:
+def _place(name: str, place: _Place) -> CloudSettings:
     pose = place.vehicle_T_sensor
     matrix = None if pose is None else check_rigid(pose, f"{name}.vehicle_T_sensor")
-    return PlaceSettings(matrix, place.flip_y, place.min_range_m)
+    return CloudSettings(matrix, place.flip_y, place.min_range_m)
 
 
 def _body(vehicle: _Vehicle) -> BoundingBox:
@@ -116,7 +122,7 @@ REFERENCE, BOXES = "reference", "boxes"
 ONLY_RIG = "recording"
 
 
-class FolderRecording(Layout):
+class FolderRecording(RecordingBase):
     """A folder with `sensor/FRAME.*`, in natural order (frame2 before frame10), and whatever else is known.
 
     Several sensors of one rig have `sensors/NAME/FRAME.*` each, several rigs `rigs/NAME/FRAME.*`. Any format of
@@ -124,7 +130,7 @@ class FolderRecording(Layout):
 
     * `reference/FRAME.*`, what the reference sensor saw; a `.npz` may have the array `heights_m` beside its points,
       their heights above the local ground, NaN where there is none at or below;
-    * `poses.csv`, time and place of the vehicle in each frame, see `PoseTable`: `world_T_vehicle`;
+    * `poses.csv`, time and place of the vehicle in each frame, see `PoseTable`: `get_world_T_vehicle`;
     * `PLACE/poses.csv`, where that sensor was on the vehicle in each frame: `vehicle_T_sensor`;
     * `boxes/FRAME.csv`, the objects of each frame, see `read_boxes`;
     * `frames.yaml`. Clouds are in the vehicle frame, unless it says where their sensor is:
@@ -163,23 +169,27 @@ class FolderRecording(Layout):
         self.rigs = {name: (name,) for name in self.sensors} if several_rigs else {ONLY_RIG: self.sensors}
         self.reference_sensors = (REFERENCE,) if (self.path / REFERENCE).is_dir() else ()
         self._places |= {name: name for name in self.reference_sensors}
-        files = {place: frame_files(self.path / place, beside=(POSES_FILE,)) for place in self._places.values()}
+        files = {
+            place: find_frame_files(self.path / place, ignored_files=(POSES_FILE,)) for place in self._places.values()
+        }
         self._labelled = (self.path / BOXES).is_dir()
         boxes = {BOXES: {path.stem: path for path in (self.path / BOXES).glob("*.csv")}} if self._labelled else {}
         check_same_names(self.path, {**files, **boxes})
         self._files = files
-        self.names = tuple(next(iter(files.values())))
+        self.frame_names = tuple(next(iter(files.values())))
         self._settings = read_folder_settings(self.path / SETTINGS_FILE)
-        self.body, self.square_metres = self._settings.body, self._settings.square_metres
+        self.ego_box, self.square_metres = self._settings.ego_box, self._settings.square_metres
         self._poses = self._table(self.path, timed=True)
-        self.instants = None if self._poses is None else self._poses.instants
+        self.block_indices = None if self._poses is None else self._poses.block_indices
         times_s = None if self._poses is None else self._poses.times_s
-        self.times_s = None if times_s is None else check_times(times_s, len(self.names), str(self.path / POSES_FILE))
+        self.times_s = (
+            None if times_s is None else check_times(times_s, len(self.frame_names), str(self.path / POSES_FILE))
+        )
         self._moving = {place: self._table(self.path / place, timed=False) for place in files}
         self._check(self._settings)
 
     @classmethod
-    def recognises(cls, path: Path) -> bool:
+    def can_read(cls, path: Path) -> bool:
         """Whether it is a folder with clouds of a sensor, of sensors, of rigs or of a reference in it."""
         if any((path / place).is_dir() for place in ("sensors", "rigs", REFERENCE)):
             return True
@@ -187,37 +197,37 @@ class FolderRecording(Layout):
         clouds = path / "sensor"
         return clouds.is_dir() and (any(one.is_file() for one in clouds.iterdir()) or not any(clouds.iterdir()))
 
-    def scan(self, sensor: str, index: int) -> Scan:
+    def read_scan(self, sensor: str, index: int) -> Scan:
         """Read a file."""
         place = self._places[sensor]
-        path = self._files[place][self.names[index]]
+        path = self._files[place][self.frame_names[index]]
         weights = None
         if sensor == REFERENCE and self.square_metres:
-            points_m, weights = read_weighted_cloud(path)
+            points_m, weights = read_cloud_with_weights(path)
         else:
             points_m = read_cloud(path)
         heights_m = read_heights(path, len(points_m)) if sensor == REFERENCE else None
-        settings, moving = self._settings.places.get(place, PlaceSettings()), self._moving[place]
+        settings, moving = self._settings.cloud_settings.get(place, CloudSettings()), self._moving[place]
         if settings.flip_y:
             points_m[:, 1] *= -1
         vehicle_T_sensor = settings.vehicle_T_sensor if moving is None else moving[index]
         return Scan(points_m, vehicle_T_sensor, str(path), settings.min_range_m, weights, heights_m)
 
-    def world_T_vehicle(self, index: int) -> Matrix | None:
+    def get_world_T_vehicle(self, index: int) -> Matrix | None:
         """Where the vehicle was, if there is a `poses.csv`."""
         return None if self._poses is None else self._poses[index]
 
-    def boxes(self, index: int) -> Boxes | None:
+    def read_boxes(self, index: int) -> Boxes | None:
         """The objects of a frame; None without the folder."""
-        return read_boxes(self.path / BOXES / f"{self.names[index]}.csv") if self._labelled else None
+        return read_boxes(self.path / BOXES / f"{self.frame_names[index]}.csv") if self._labelled else None
 
     def _table(self, folder: Path, *, timed: bool) -> PoseTable | None:
         path = folder / POSES_FILE
-        return PoseTable(path, self.names, timed=timed) if path.exists() else None
+        return PoseTable(path, self.frame_names, has_times=timed) if path.exists() else None
 
     def _check(self, settings: FolderSettings) -> None:
         file = self.path / SETTINGS_FILE
-        for place, said in settings.places.items():
+        for place, said in settings.cloud_settings.items():
             name = place.replace("/", ".")
             if place not in self._files:
                 raise ValueError(f"{file}: {name}: there is no {place}/ beside it")
@@ -243,4 +253,4 @@ def _places(folder: Path) -> dict[str, str]:
     if not names or REFERENCE in names:
         wrong = f"a {kind[:-1]} called reference" if names else f"no {kind[:-1]}"
         raise ValueError(f"{folder / kind}: {wrong}; each has a folder {kind}/NAME/ of its own")
-    return {name: f"{kind}/{name}" for name in sorted(names, key=natural)}
+    return {name: f"{kind}/{name}" for name in sorted(names, key=make_natural_sort_key)}

@@ -20,13 +20,17 @@ MAX_NAMES_SHOWN = 5
 CLOUDS = f"a cloud; allowed are files ending in {', '.join(READERS)}"
 
 
-def frame_files(
-    folder: Path, like: Sequence[str] | None = None, beside: Collection[str] = (), *, images: bool = False
+def find_frame_files(
+    folder: Path,
+    expected_names: Sequence[str] | None = None,
+    ignored_files: Collection[str] = (),
+    *,
+    is_depth: bool = False,
 ) -> dict[str, Path]:
     """The clouds, or depth images in PNG, by the names of their frames in natural order (frame2 before frame10).
 
-    There have to be those of `like`, and no others; files `beside` them are no clouds. ValueError: a file that is no
-    cloud, two files of one name, no files, or other names than `like`.
+    There have to be those of `expected_names`, and no others; files `ignored_files` them are no clouds. ValueError: a file that is no
+    cloud, two files of one name, no files, or other names than `expected_names`.
     """
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder; clouds are needed in it, one a frame")
@@ -34,49 +38,49 @@ def frame_files(
     with os.scandir(folder) as entries:
         found = sorted((entry.name, entry.is_dir()) for entry in entries)
     for file, is_folder in found:
-        if file in beside or file.startswith("."):  # what file managers and version control leave behind
+        if file in ignored_files or file.startswith("."):  # what file managers and version control leave behind
             continue
-        name, suffix = split_name(file, (".png",)) if images else split_name(file)
+        name, suffix = split_name(file, (".png",)) if is_depth else split_name(file)
         if not suffix or is_folder:
-            wanted = "a depth image; allowed are files ending in .png" if images else CLOUDS
+            wanted = "a depth image; allowed are files ending in .png" if is_depth else CLOUDS
             raise ValueError(f"{folder / file}: not {wanted}")
         if name in clouds:
             raise ValueError(f"{folder}: two files for the frame {name}: {clouds[name].name} and {file}")
         clouds[name] = folder / file
-    if like is not None:
-        check_same_names(folder.parent, {folder.name: clouds, "the others": dict.fromkeys(like)})
+    if expected_names is not None:
+        check_same_names(folder.parent, {folder.name: clouds, "the others": dict.fromkeys(expected_names)})
     numbers = all(map(str.isdecimal, clouds))  # which need not be taken apart
-    return {name: clouds[name] for name in sorted(clouds, key=_number if numbers else natural)}
+    return {name: clouds[name] for name in sorted(clouds, key=_number if numbers else make_natural_sort_key)}
 
 
-def check_same_names(folder: Path, files: Mapping[str, Mapping[str, object]]) -> None:
+def check_same_names(folder: Path, files_by_folder: Mapping[str, Mapping[str, object]]) -> None:
     """Whether all places have the same frames."""
-    places = " and ".join(f"{place}/" for place in files)
-    anywhere = set[str]().union(*files.values())
+    places = " and ".join(f"{place}/" for place in files_by_folder)
+    anywhere = set[str]().union(*files_by_folder.values())
     if not anywhere:
         raise ValueError(f"{folder}: no frames; {places} are empty")
     complaints = [
-        f"{len(gaps)} missing in {place}/ ({some_of(gaps)})"
-        for place, clouds in files.items()
-        if (gaps := sorted(anywhere - clouds.keys(), key=natural))
+        f"{len(gaps)} missing in {place}/ ({format_names(gaps)})"
+        for place, clouds in files_by_folder.items()
+        if (gaps := sorted(anywhere - clouds.keys(), key=make_natural_sort_key))
     ]
     if complaints:
         raise ValueError(f"{folder}: every frame needs a file in {places}; {' and '.join(complaints)}")
 
 
-def check_frames(frames: Sequence[str], names: Sequence[str]) -> list[int]:
+def find_frame_rows(table_frames: Sequence[str], frame_names: Sequence[str]) -> list[int]:
     """Which row of a table belongs to each frame."""
-    there, wanted = set(frames), set(names)
-    doubled = [frame for frame, count in Counter(frames).items() if count > 1]
-    missing, unknown = [name for name in names if name not in there], sorted(there - wanted)
+    there, wanted = set(table_frames), set(frame_names)
+    doubled = [frame for frame, count in Counter(table_frames).items() if count > 1]
+    missing, unknown = [name for name in frame_names if name not in there], sorted(there - wanted)
     for what, which in (("missing", missing), ("doubled", doubled), ("unknown", unknown)):
         if which:
-            raise ValueError(f"one row for every frame is needed; {len(which)} {what} ({some_of(which)})")
-    row_of = {frame: row for row, frame in enumerate(frames)}
-    return [row_of[name] for name in names]
+            raise ValueError(f"one row for every frame is needed; {len(which)} {what} ({format_names(which)})")
+    row_of = {frame: row for row, frame in enumerate(table_frames)}
+    return [row_of[name] for name in frame_names]
 
 
-def natural(name: str) -> tuple[list[str | int], str]:
+def make_natural_sort_key(name: str) -> tuple[list[str | int], str]:
     """A key to sort names by, numbers in them by their values."""
     # Text and number alternate, starting with text, so that two keys always compare; the name itself breaks a tie.
     parts = re.split(r"(\d+)", name)
@@ -87,7 +91,7 @@ def _number(name: str) -> tuple[int, str]:
     return int(name), name
 
 
-def some_of(names: Sequence[str]) -> str:
+def format_names(names: Sequence[str]) -> str:
     """The first of many names, for a message."""
     return ", ".join([*names[:MAX_NAMES_SHOWN], *["..."] * (len(names) > MAX_NAMES_SHOWN)])
 
@@ -105,16 +109,16 @@ class PoseTable:
     whole number that frames share which are no news to each other (`Frame.place_in_time`).
     """
 
-    def __init__(self, path: Path, names: Sequence[str], *, timed: bool) -> None:
-        optional = ("instant",) if timed else ()
-        table = read_csv(path, (*("time_s",) * timed, *PLACE, *ROTATION), ("frame",), optional)
+    def __init__(self, path: Path, frame_names: Sequence[str], *, has_times: bool) -> None:
+        optional = ("instant",) if has_times else ()
+        table = read_csv(path, (*("time_s",) * has_times, *PLACE, *ROTATION), ("frame",), optional)
         with naming(path, "a table of poses"):
-            order = check_frames(table.words["frame"], names)
+            order = find_frame_rows(table.words["frame"], frame_names)
             columns = {name: values[order] for name, values in table.numbers.items()}
             self._place_m = np.column_stack([columns[name] for name in PLACE])
             self._wxyz = np.column_stack([columns[name] for name in ROTATION])
-            self._check_norms(names)
-            self.instants = _whole_numbers("instant", columns["instant"]) if "instant" in columns else None
+            self._check_norms(frame_names)
+            self.block_indices = _whole_numbers("instant", columns["instant"]) if "instant" in columns else None
         self.times_s: NDArray[np.float64] | None = columns.get("time_s")
 
     def __getitem__(self, index: int) -> Matrix:
@@ -143,7 +147,7 @@ def read_boxes(path: Path) -> Boxes:
     with naming(path, "a table of boxes"):
         doubled = [name for name, count in Counter(ids).items() if name and count > 1]
         if doubled:
-            raise ValueError(f"id: every object has its own; {some_of(doubled)}: there twice")
+            raise ValueError(f"id: every object has its own; {format_names(doubled)}: there twice")
         known: dict[str, object] = {"ids": tuple(ids), "categories": tuple(table.words["category"])}
         if set(VELOCITY) & numbers.keys():
             unknown = np.full(len(ids), np.nan)

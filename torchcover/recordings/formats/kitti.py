@@ -16,8 +16,8 @@ from torchcover.files import BadFileError, check_memory, decode, naming, read_sh
 from torchcover.geometry import BoundingBox, check_rigid, invert, rigid, rotation_from_euler
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.clouds import read_cloud
-from torchcover.recordings.formats.frame_files import check_same_names, frame_files
-from torchcover.recordings.recording import Layout, Scan, SensorCalibrations
+from torchcover.recordings.formats.frame_files import check_same_names, find_frame_files
+from torchcover.recordings.recording import RecordingBase, Scan, SensorCalibrations
 
 # Of the WGS84 ellipsoid, as in the development kit.
 EARTH_RADIUS_M = 6_378_137.0
@@ -56,7 +56,7 @@ def read_calibration(path: Path) -> dict[str, NDArray[np.float64]]:
     return found
 
 
-def transform_of(calibration: dict[str, NDArray[np.float64]], key: str, path: Path) -> Matrix:
+def parse_transform(calibration: dict[str, NDArray[np.float64]], key: str, path: Path) -> Matrix:
     """(4, 4) the rigid transform of twelve (or nine) numbers under a key."""
     numbers = calibration.get(key)
     if numbers is None or numbers.size not in (9, 12):
@@ -67,19 +67,19 @@ def transform_of(calibration: dict[str, NDArray[np.float64]], key: str, path: Pa
     return check_rigid(matrix, f"{path}: {key}")
 
 
-def read_rigid(path: Path) -> Matrix:
+def read_transform(path: Path) -> Matrix:
     """(4, 4) the transform of a file with `R` and `T`, such as `calib_velo_to_cam.txt`."""
     numbers = read_calibration(path)
     translation_m = numbers.get("T", np.empty(0))
     if translation_m.size != 3:
         raise BadFileError(f"{path}: T with 3 numbers is needed; got {translation_m.size}")
-    return rigid(transform_of(numbers, "R", path)[:3, :3], translation_m)
+    return rigid(parse_transform(numbers, "R", path)[:3, :3], translation_m)
 
 
-def read_rectified(path: Path, vehicle_T_camera0: Matrix) -> tuple[Calibration, ...]:
+def read_rectified_cameras(path: Path, vehicle_T_camera0: Matrix) -> tuple[Calibration, ...]:
     """The cameras of `calib_cam_to_cam.txt`: pinholes, for their images are rectified."""
     numbers = read_calibration(path)
-    vehicle_T_rectified = vehicle_T_camera0 @ invert(transform_of(numbers, "R_rect_00", path))
+    vehicle_T_rectified = vehicle_T_camera0 @ invert(parse_transform(numbers, "R_rect_00", path))
     found = []
     for name in (f"{number:02d}" for number in range(4)):
         matrix, size = numbers.get(f"P_rect_{name}", np.empty(0)), numbers.get(f"S_rect_{name}", np.empty(0))
@@ -93,7 +93,7 @@ def read_rectified(path: Path, vehicle_T_camera0: Matrix) -> tuple[Calibration, 
     return tuple(found)
 
 
-def read_distorted(path: Path, vehicle_T_camera0: Matrix) -> tuple[Calibration, ...]:
+def read_distorted_cameras(path: Path, vehicle_T_camera0: Matrix) -> tuple[Calibration, ...]:
     """Read the cameras of `calib_cam_to_cam.txt` before rectification.
 
     Args:
@@ -115,7 +115,7 @@ def read_distorted(path: Path, vehicle_T_camera0: Matrix) -> tuple[Calibration, 
             raise BadFileError(f"{path}: 2, 9, 5 and 3 numbers of S, K, D and T_{name} are needed; got {arrived}")
         with naming(path, "a KITTI calibration"):
             intrinsics = split_matrix(matrix.reshape(3, 3), f"K_{name}")
-        camera_T_camera0 = rigid(transform_of(numbers, f"R_{name}", path)[:3, :3], place_m)
+        camera_T_camera0 = rigid(parse_transform(numbers, f"R_{name}", path)[:3, :3], place_m)
         cameras.append(
             Calibration(
                 int(size[0]),
@@ -131,7 +131,7 @@ def read_distorted(path: Path, vehicle_T_camera0: Matrix) -> tuple[Calibration, 
 
 
 @reads("a PNG image")
-def png_size(path: Path) -> tuple[int, int]:
+def read_png_size(path: Path) -> tuple[int, int]:
     """Width and height of an image; its pixels are not read."""
     with path.open("rb") as file:
         head = file.read(24)
@@ -166,13 +166,13 @@ def read_oxts(path: Path) -> NDArray[np.float64]:
     return numbers[:6]
 
 
-def world_T_imu(oxts: NDArray[np.float64], latitude_deg: float) -> Matrix:
+def compute_world_T_imu(oxts: NDArray[np.float64], latitude_deg: float) -> Matrix:
     """(4, 4) the pose of the IMU in a Mercator projection, scaled at a latitude as in the development kit.
 
     `oxts`: (6,) as `read_oxts` gives it; `latitude_deg`: that of the drive's first record.
 
     Example:
-        >>> world_T_imu(np.array([49.0, 8.0, 110.0, 0.0, 0.0, np.pi / 2]), 49.0)[:3, 1].round(6)
+        >>> compute_world_T_imu(np.array([49.0, 8.0, 110.0, 0.0, 0.0, np.pi / 2]), 49.0)[:3, 1].round(6)
         array([-1.,  0.,  0.])
     """
     latitude, longitude, altitude_m, roll, pitch, yaw = oxts
@@ -184,7 +184,7 @@ def world_T_imu(oxts: NDArray[np.float64], latitude_deg: float) -> Matrix:
 
 
 @reads("time stamps")
-def read_timestamps(path: Path, numbers: Sequence[int]) -> NDArray[np.datetime64]:
+def read_timestamps(path: Path, frame_numbers: Sequence[int]) -> NDArray[np.datetime64]:
     """Read lines such as `2011-09-26 13:02:25.964389445`: one for each frame number.
 
     Line n is frame n, blank where there is no scan. A file that does not reach the last frame (part of a drive) has one
@@ -192,7 +192,7 @@ def read_timestamps(path: Path, numbers: Sequence[int]) -> NDArray[np.datetime64
 
     Args:
         path: A `timestamps.txt`.
-        numbers: The frame numbers that have a scan, ascending.
+        frame_numbers: The frame numbers that have a scan, ascending.
 
     Returns:
         (F,) datetime64[ns].
@@ -203,13 +203,13 @@ def read_timestamps(path: Path, numbers: Sequence[int]) -> NDArray[np.datetime64
     check_memory(BYTES_PER_BYTE * path.stat().st_size)
     lines = [line.strip().replace(" ", "T") for line in decode(path.read_bytes()).rstrip().split("\n")]
     stamps = [line for line in lines if line]
-    if len(lines) > numbers[-1]:
-        stamps = [lines[number] for number in numbers]
+    if len(lines) > frame_numbers[-1]:
+        stamps = [lines[number] for number in frame_numbers]
         if "" in stamps:
-            raise ValueError(f"line {numbers[stamps.index('')] + 1} is blank, but there is a scan of this frame")
-    if len(stamps) != len(numbers):
+            raise ValueError(f"line {frame_numbers[stamps.index('')] + 1} is blank, but there is a scan of this frame")
+    if len(stamps) != len(frame_numbers):
         raise ValueError(
-            f"a line for each frame up to {numbers[-1]} or one for each of {len(numbers)} scans is needed; got "
+            f"a line for each frame up to {frame_numbers[-1]} or one for each of {len(frame_numbers)} scans is needed; got "
             f"{len(lines)}"
         )
     try:
@@ -220,7 +220,7 @@ def read_timestamps(path: Path, numbers: Sequence[int]) -> NDArray[np.datetime64
         raise ValueError(f"lines of date and time are needed: {error}") from error
 
 
-class KittiObject(Layout):
+class KittiObject(RecordingBase):
     """A folder with `velodyne/FRAME.bin`, `calib/FRAME.txt`, and `label_2/FRAME.txt` where there are labels.
 
     The data set has no reference, and neighbours in the list are not neighbours in time: a reference has to be in a
@@ -232,36 +232,38 @@ class KittiObject(Layout):
     layout: ClassVar[str] = "velodyne/FRAME.bin, calib/FRAME.txt, label_2/FRAME.txt"
     sensors = ("velodyne",)
     times_s = None
-    body: BoundingBox | None = BODY
+    ego_box: BoundingBox | None = BODY
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = _split(Path(path))
-        self._clouds = frame_files(self.path / "velodyne")
+        self._clouds = find_frame_files(self.path / "velodyne")
         check_same_names(self.path, {"velodyne": self._clouds})
-        self.names = tuple(self._clouds)
+        self.frame_names = tuple(self._clouds)
         self.rigs = {"kitti": self.sensors}
         self.reference_sensors = ("reference",) if (self.path / "reference").is_dir() else ()
-        self._references = frame_files(self.path / "reference", like=self.names) if self.reference_sensors else {}
+        self._references = (
+            find_frame_files(self.path / "reference", expected_names=self.frame_names) if self.reference_sensors else {}
+        )
 
     @classmethod
-    def recognises(cls, path: Path) -> bool:
+    def can_read(cls, path: Path) -> bool:
         """Whether it has clouds and calibrations."""
         return all((_split(path) / place).is_dir() for place in ("velodyne", "calib"))
 
-    def scan(self, sensor: str, index: int) -> Scan:
+    def read_scan(self, sensor: str, index: int) -> Scan:
         """Read a cloud."""
-        path = (self._references if sensor == "reference" else self._clouds)[self.names[index]]
+        path = (self._references if sensor == "reference" else self._clouds)[self.frame_names[index]]
         return Scan(read_cloud(path), vehicle_T_velodyne, str(path))
 
-    def world_T_vehicle(self, index: int) -> None:
+    def get_world_T_vehicle(self, index: int) -> None:
         """Unknown."""
 
-    def calibrations(self) -> SensorCalibrations:
+    def read_calibrations(self) -> SensorCalibrations:
         """The rectified cameras of the first frame; their sizes are known only where there are images."""
-        name = self.names[0]
+        name = self.frame_names[0]
         calibration = self.path / "calib" / f"{name}.txt"
         images = [path for number in range(4) if (path := self.path / f"image_{number}" / f"{name}.png").exists()]
-        width, height = png_size(images[0]) if images else IMAGE_SIZE
+        width, height = read_png_size(images[0]) if images else IMAGE_SIZE
         cameras = [
             read_kitti(calibration, number, width=width, height=height, vehicle_T_lidar=vehicle_T_velodyne)
             for number in range(4)
@@ -270,13 +272,13 @@ class KittiObject(Layout):
         source = f"calib/{name}.txt, the LiDAR where KITTI's is, sizes of images {width} x {height} ({told})"
         return SensorCalibrations(source, {"velodyne": vehicle_T_velodyne}, tuple(cameras))
 
-    def boxes(self, index: int) -> Boxes | None:
+    def read_boxes(self, index: int) -> Boxes | None:
         """The labels, if there are any files of them."""
         if not (self.path / "label_2").is_dir():
             return None
-        name = f"{self.names[index]}.txt"
+        name = f"{self.frame_names[index]}.txt"
         calibration = read_calibration(self.path / "calib" / name)
-        camera_T_velodyne = transform_of(calibration, "R0_rect", self.path / "calib" / name) @ transform_of(
+        camera_T_velodyne = parse_transform(calibration, "R0_rect", self.path / "calib" / name) @ parse_transform(
             calibration, "Tr_velo_to_cam", self.path / "calib" / name
         )
         labels = read_labels(self.path / "label_2" / name)

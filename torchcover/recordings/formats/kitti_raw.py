@@ -17,24 +17,24 @@ from torchcover.files import parse_xml, reads
 from torchcover.geometry import BoundingBox
 from torchcover.geometry.rigid import Matrix, euler_from_rotation, invert, rotation_from_euler, transform
 from torchcover.recordings.clouds import read_cloud
-from torchcover.recordings.formats.frame_files import check_same_names, frame_files, some_of
+from torchcover.recordings.formats.frame_files import check_same_names, find_frame_files, format_names
 from torchcover.recordings.formats.kitti import (
     BODY,
-    read_distorted,
+    compute_world_T_imu,
+    read_distorted_cameras,
     read_oxts,
-    read_rectified,
-    read_rigid,
+    read_rectified_cameras,
     read_timestamps,
+    read_transform,
     vehicle_T_velodyne,
-    world_T_imu,
 )
-from torchcover.recordings.recording import Layout, Scan, SensorCalibrations, check_times, warn_of_missing_poses
+from torchcover.recordings.recording import RecordingBase, Scan, SensorCalibrations, check_times, warn_of_missing_poses
 
 # In synchronized drives, the GPS and IMU's record of a frame and its scan are some milliseconds apart.
 MAX_CLOCK_GAP_S = 0.1
 
 
-class KittiRaw(Layout):
+class KittiRaw(RecordingBase):
     """A folder `DATE/DATE_drive_NUMBER_sync` with `velodyne_points` and `oxts`; calibrations are in `DATE`.
 
     Boxes are those of `tracklet_labels.xml`, if it is there.
@@ -49,59 +49,59 @@ class KittiRaw(Layout):
 
     layout: ClassVar[str] = "DATE/DRIVE/velodyne_points/data/FRAME.bin, oxts/data/FRAME.txt"
     sensors = ("velodyne",)
-    body: BoundingBox | None = BODY
+    ego_box: BoundingBox | None = BODY
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
-        self._clouds = frame_files(self.path / "velodyne_points" / "data")
+        self._clouds = find_frame_files(self.path / "velodyne_points" / "data")
         check_same_names(self.path, {"velodyne_points/data": self._clouds})
         missing = [name for name in self._clouds if not self._oxts_path(name).exists()]
         warn_of_missing_poses(self.path / "oxts" / "data", missing, len(self._clouds))
         self.rigs = {"kitti": self.sensors}
-        scanned = frame_numbers(self.path, tuple(self._clouds))
-        self.names = tuple(name for name in self._clouds if name not in set(missing))
-        self._numbers = frame_numbers(self.path, self.names)
+        scanned = parse_frame_numbers(self.path, tuple(self._clouds))
+        self.frame_names = tuple(name for name in self._clouds if name not in set(missing))
+        self._numbers = parse_frame_numbers(self.path, self.frame_names)
         self.times_s = self._read_times(scanned)
-        velodyne_T_imu = read_rigid(self.path.parent / "calib_imu_to_velo.txt")
+        velodyne_T_imu = read_transform(self.path.parent / "calib_imu_to_velo.txt")
         self._imu_T_vehicle = invert(velodyne_T_imu) @ invert(vehicle_T_velodyne)
         self._tracklets = self.path / "tracklet_labels.xml"
         self._poses: dict[int, Matrix] = {}
 
     @classmethod
-    def recognises(cls, path: Path) -> bool:
+    def can_read(cls, path: Path) -> bool:
         """Whether it has scans and records of the GPS and IMU."""
         return all((path / place).is_dir() for place in ("velodyne_points", "oxts"))
 
-    def scan(self, sensor: str, index: int) -> Scan:
+    def read_scan(self, sensor: str, index: int) -> Scan:
         """Read a cloud, which the development kit has corrected for the motion within a turn."""
-        path = self._clouds[self.names[index]]
+        path = self._clouds[self.frame_names[index]]
         return Scan(read_cloud(path), vehicle_T_velodyne, str(path))
 
-    def world_T_vehicle(self, index: int) -> Matrix:
+    def get_world_T_vehicle(self, index: int) -> Matrix:
         """Where the vehicle was, by the GPS and IMU; a file each, which is read once."""
         if index not in self._poses:
-            self._poses[index] = world_T_imu(self._oxts(index), self._latitude_deg) @ self._imu_T_vehicle
+            self._poses[index] = compute_world_T_imu(self._oxts(index), self._latitude_deg) @ self._imu_T_vehicle
         return self._poses[index]
 
-    def calibrations(self) -> SensorCalibrations:
+    def read_calibrations(self) -> SensorCalibrations:
         """The rectified cameras of the day, where its `calib_cam_to_cam.txt` is there."""
         day = self.path.parent
         cameras = day / "calib_cam_to_cam.txt"
         mounts = {"velodyne": vehicle_T_velodyne}
         if not cameras.exists():
             return SensorCalibrations(f"the LiDAR where KITTI's is; no cameras, for there is no {cameras.name}", mounts)
-        placed = read_rectified(cameras, self._vehicle_T_camera0())
+        placed = read_rectified_cameras(cameras, self._vehicle_T_camera0())
         return SensorCalibrations(f"the LiDAR where KITTI's is, {cameras.name}", mounts, placed)
 
-    def raw_cameras(self) -> tuple[Calibration, ...]:
+    def read_raw_cameras(self) -> tuple[Calibration, ...]:
         """Read the cameras before rectification, with the distortion of their lenses."""
-        return read_distorted(self.path.parent / "calib_cam_to_cam.txt", self._vehicle_T_camera0())
+        return read_distorted_cameras(self.path.parent / "calib_cam_to_cam.txt", self._vehicle_T_camera0())
 
     def _vehicle_T_camera0(self) -> Matrix:
-        camera_T_velodyne = read_rigid(self.path.parent / "calib_velo_to_cam.txt")
+        camera_T_velodyne = read_transform(self.path.parent / "calib_velo_to_cam.txt")
         return np.asarray(vehicle_T_velodyne @ invert(camera_T_velodyne))
 
-    def boxes(self, index: int) -> Boxes | None:
+    def read_boxes(self, index: int) -> Boxes | None:
         """Return the tracklets of the frame number of a scan; None without the file."""
         if not self._tracklets.exists():
             return None
@@ -119,10 +119,10 @@ class KittiRaw(Layout):
                     f"{poses}: records of the GPS and IMU and scans of the same frame number are up to {gap_s:g} s "
                     "apart; take the drive's synced+rectified data (_sync), not _extract"
                 )
-        return check_times(np.asarray((times - times[0]) / second), len(self.names), str(stamps))
+        return check_times(np.asarray((times - times[0]) / second), len(self.frame_names), str(stamps))
 
     def _oxts(self, index: int) -> NDArray[np.float64]:
-        return read_oxts(self._oxts_path(self.names[index]))
+        return read_oxts(self._oxts_path(self.frame_names[index]))
 
     def _oxts_path(self, name: str) -> Path:
         return self.path / "oxts" / "data" / f"{name}.txt"
@@ -136,7 +136,7 @@ class KittiRaw(Layout):
         return read_tracklets(self._tracklets, vehicle_T_velodyne)
 
 
-def frame_numbers(folder: Path, names: Sequence[str]) -> list[int]:
+def parse_frame_numbers(folder: Path, names: Sequence[str]) -> list[int]:
     """Return the frame numbers that scans are named by; tracklets and time stamps count frames without a scan, too.
 
     Raises:
@@ -144,7 +144,7 @@ def frame_numbers(folder: Path, names: Sequence[str]) -> list[int]:
     """
     other = [name for name in names if not name.isdecimal()]
     if other:
-        raise ValueError(f"{folder}: scans of KITTI raw are named by frame numbers; got {some_of(other)}")
+        raise ValueError(f"{folder}: scans of KITTI raw are named by frame numbers; got {format_names(other)}")
     return [int(name) for name in names]
 
 

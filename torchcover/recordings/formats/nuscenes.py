@@ -16,8 +16,15 @@ from torchcover.detection.boxes import Boxes
 from torchcover.files import naming, read_json_table, road_user_classes
 from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_quaternion
 from torchcover.geometry.rigid import Matrix
-from torchcover.recordings.clouds.arrays import read_ringed_cloud
-from torchcover.recordings.objects import Ego, RecordedObjects, Seen, SeenObjects, by_name, track_of
+from torchcover.recordings.clouds.arrays import read_cloud_with_rings
+from torchcover.recordings.objects import (
+    Ego,
+    ObjectInterpolator,
+    ObjectState,
+    RecordedObjects,
+    build_track,
+    group_by_name,
+)
 from torchcover.recordings.recording import Scan, SensorCalibrations, check_times
 
 # The ego frame lies under the rear axle, on the ground; the centre of a Renault Zoe's box is 1.385 m before it, as in
@@ -49,8 +56,8 @@ class NuScenes:
     sensors = (CHANNEL,)
     reference_sensors = ()
     square_metres = False
-    instants = None
-    body: BoundingBox | None = BODY
+    block_indices = None
+    ego_box: BoundingBox | None = BODY
 
     def __init__(self, path: str | os.PathLike[str], scenes: Sequence[str] | None = None) -> None:
         tables = _tables(Path(path))
@@ -60,29 +67,29 @@ class NuScenes:
             self._read(tables, scenes)
 
     @classmethod
-    def recognises(cls, path: Path) -> bool:
+    def can_read(cls, path: Path) -> bool:
         """Whether there are tables of samples."""
         return path.is_dir() and bool(_tables_with("sample_data", path))
 
-    def scan(self, sensor: str, index: int) -> Scan:
+    def read_scan(self, sensor: str, index: int) -> Scan:
         """Read a sweep."""
         path = self.path / self._files[index]
-        points_m, rows = read_ringed_cloud(path)
-        return Scan(points_m, vehicle_T_ego @ self._mounts[index], str(path), rows=rows)
+        points_m, rows = read_cloud_with_rings(path)
+        return Scan(points_m, vehicle_T_ego @ self._mounts[index], str(path), rings=rows)
 
-    def world_T_vehicle(self, index: int) -> Matrix:
+    def get_world_T_vehicle(self, index: int) -> Matrix:
         """The pose of the ego when the sweep was made."""
         world_T_ego = rigid(rotation_from_quaternion(self._rotations[index]), self._places_m[index])
         return world_T_ego @ invert(vehicle_T_ego)
 
-    def boxes(self, index: int) -> Boxes:
+    def read_boxes(self, index: int) -> Boxes:
         """The annotations; between two key frames, what lies between theirs."""
-        return self._tracks.at(float(self.times_s[index]), invert(self.world_T_vehicle(index)))
+        return self._tracks.interpolate_boxes(float(self.times_s[index]), invert(self.get_world_T_vehicle(index)))
 
-    def calibrations(self) -> SensorCalibrations:
+    def read_calibrations(self) -> SensorCalibrations:
         """The LiDAR's mount, and the cameras of its first key frame."""
         with naming(self._tables, "tables of nuScenes"):
-            first = self._sample_tokens[self.frames[0]]
+            first = self._sample_tokens[self.key_frames[0]]
             rows = [
                 row
                 for row in read_json_table(self._tables / "sample_data.json").rows
@@ -99,8 +106,8 @@ class NuScenes:
                 for row in sorted(rows, key=lambda row: str(row["filename"]))
             ]
         placed = [replace(one, vehicle_T_camera=vehicle_T_ego @ np.asarray(one.vehicle_T_camera)) for one in cameras]
-        source = f"calibrated_sensor.json for {self.names[self.frames[0]]}"
-        return SensorCalibrations(source, {CHANNEL: vehicle_T_ego @ self._mounts[self.frames[0]]}, tuple(placed))
+        source = f"calibrated_sensor.json for {self.frame_names[self.key_frames[0]]}"
+        return SensorCalibrations(source, {CHANNEL: vehicle_T_ego @ self._mounts[self.key_frames[0]]}, tuple(placed))
 
     def _read(self, tables: Path, scenes: Sequence[str] | None) -> None:
         samples = self._samples(tables, scenes)
@@ -114,25 +121,27 @@ class NuScenes:
             if f"/{CHANNEL}/" in str(row["filename"]) and row["sample_token"] in samples
         ]
         data.sort(key=lambda row: row["timestamp"])
-        self.names = tuple(row["filename"].rpartition("/")[2].removesuffix(".pcd.bin") for row in data)
-        self.frames = [number for number, row in enumerate(data) if row["is_key_frame"]]
-        if not self.frames:
+        self.frame_names = tuple(row["filename"].rpartition("/")[2].removesuffix(".pcd.bin") for row in data)
+        self.key_frames = [number for number, row in enumerate(data) if row["is_key_frame"]]
+        if not self.key_frames:
             raise ValueError(f"no key frame of {CHANNEL}")
         self.times_s = check_times(np.array([row["timestamp"] for row in data]) * 1e-6, len(data), CHANNEL)
-        self._files = [check_beneath(self.path, row["filename"]) for row in data]
+        self._files = [check_path_within(self.path, row["filename"]) for row in data]
         driven = [poses.row(row["ego_pose_token"]) for row in data]
         self._rotations = np.array([row["rotation"] for row in driven], dtype=np.float64)
         self._places_m = np.array([row["translation"] for row in driven], dtype=np.float64)
         _check_poses(self._rotations, self._places_m)
-        mounts = {token: pose_of(calibrations.row(token)) for token in {row["calibrated_sensor_token"] for row in data}}
+        mounts = {
+            token: parse_pose(calibrations.row(token)) for token in {row["calibrated_sensor_token"] for row in data}
+        }
         self._mounts = [mounts[row["calibrated_sensor_token"]] for row in data]
         self._sample_tokens = [row["sample_token"] for row in data]
         self._tables, self._sample_times = tables, samples
 
     @cached_property
-    def _tracks(self) -> SeenObjects:
+    def _tracks(self) -> ObjectInterpolator:
         with naming(self._tables, "annotations of nuScenes"):
-            return SeenObjects(_seen(self._tables, self._sample_times))
+            return ObjectInterpolator(_seen(self._tables, self._sample_times))
 
     def _samples(self, tables: Path, scenes: Sequence[str] | None) -> dict[str, float]:
         """Token -> time in seconds of the key frames of the wanted scenes."""
@@ -167,17 +176,17 @@ def read_objects(path: Path, scene: str | None = None) -> RecordedObjects:
         token = _scene(samples, tables / "scene.json", scene)
         taken = {row["token"]: row["timestamp"] for row in samples if row["scene_token"] == token}
         first_us, last_us = min(taken.values()), max(taken.values())
-        seen = by_name(_seen(tables, {token: (time_us - first_us) * 1e-6 for token, time_us in taken.items()}))
+        seen = group_by_name(_seen(tables, {token: (time_us - first_us) * 1e-6 for token, time_us in taken.items()}))
         driven = sorted((row for row in poses if first_us <= row["timestamp"] <= last_us), key=itemgetter("timestamp"))
         if not driven:
             raise ValueError("no ego_pose from the first sample of the scene to the last")
         ego_s = np.array([(row["timestamp"] - first_us) * 1e-6 for row in driven])
-        world_T_ego = np.stack([pose_of(row) for row in driven])
-        tracks = tuple(track_of(one, _class(one[0].category)) for one in seen.values())
+        world_T_ego = np.stack([parse_pose(row) for row in driven])
+        tracks = tuple(build_track(one, _class(one[0].category)) for one in seen.values())
     return RecordedObjects(tracks, (Ego("ego", ego_s, world_T_ego, invert(vehicle_T_ego), SIZE_M),))
 
 
-def _seen(tables: Path, times_s: Mapping[str, float]) -> list[Seen]:
+def _seen(tables: Path, times_s: Mapping[str, float]) -> list[ObjectState]:
     categories, instances = read_json_table(tables / "category.json"), read_json_table(tables / "instance.json")
     seen = []
     for row in read_json_table(tables / "sample_annotation.json").rows:
@@ -188,7 +197,7 @@ def _seen(tables: Path, times_s: Mapping[str, float]) -> list[Seen]:
             world_T_box = rigid(rotation_from_quaternion(row["rotation"]), row["translation"])
             visibility = SHARES.get(str(row.get("visibility_token")), np.nan)
             size_m = (length, width, height)
-            seen.append(Seen(name, times_s[row["sample_token"]], world_T_box, size_m, category, visibility))
+            seen.append(ObjectState(name, times_s[row["sample_token"]], world_T_box, size_m, category, visibility))
     return seen
 
 
@@ -210,7 +219,7 @@ def _class(category: str) -> str | None:
     return next((found for beginning, found in classes if category.lower().startswith(beginning)), None)
 
 
-def pose_of(row: dict[str, Any]) -> Matrix:
+def parse_pose(row: dict[str, Any]) -> Matrix:
     """(4, 4) the pose of a row with `rotation` (w, x, y, z) and `translation`."""
     matrix = rigid(rotation_from_quaternion(row["rotation"]), row["translation"])
     if not np.isfinite(matrix).all():
@@ -244,11 +253,11 @@ def _tables_with(table: str, path: Path) -> list[Path]:
     return sorted(found.parent for found in path.glob(f"v1.0-*/{table}.json"))
 
 
-def check_beneath(folder: Path, name: str) -> str:
+def check_path_within(folder: Path, name: str) -> str:
     """Return a path that a table names, if it is one within a folder.
 
     Example:
-        >>> check_beneath(Path("drive"), "samples/a.bin")
+        >>> check_path_within(Path("drive"), "samples/a.bin")
         'samples/a.bin'
     """
     # Of a hundred thousand names few need to be taken apart.

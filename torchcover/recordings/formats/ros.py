@@ -20,17 +20,17 @@ from torchcover.recordings.formats.bag import (
     CloudMessage,
     PointTimes,
     choose_point_times,
-    cloud_of,
+    parse_cloud,
 )
 from torchcover.recordings.formats.ros_poses import (
     FrameTree,
     VehiclePoses,
-    frame_name,
-    mounted_transforms,
-    vehicle_poses,
+    find_vehicle_poses,
+    normalize_frame_id,
+    read_static_transforms,
 )
 from torchcover.recordings.isolated_readers import METADATA, find_ros1_files
-from torchcover.recordings.recording import NO_RETURN_M, Layout, Scan, SensorCalibrations, check_times
+from torchcover.recordings.recording import NO_RETURN_M, RecordingBase, Scan, SensorCalibrations, check_times
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 # The first lies on the ground; robots have the second a wheel's radius above it.
@@ -51,7 +51,7 @@ STAMP_MARGIN_S = 0.01
 TICK_S = 1e-5
 
 
-class RosBag(Layout):
+class RosBag(RecordingBase):
     """A bag: a folder with `metadata.yaml` and `.db3` or `.mcap` files, or with `.bag` files; or one such file.
 
     The sensors are the topics of `PointCloud2`, named without the first slash, whose frame is mounted on the vehicle's,
@@ -90,7 +90,7 @@ class RosBag(Layout):
         self.path = Path(path)
         if point_times not in (None, *POINT_TIMES):
             raise ValueError(f"point_times: one of {', '.join(POINT_TIMES)} is needed; got {point_times!r}")
-        self.told = {
+        self.reader_options = {
             "vehicle_frame": vehicle_frame,
             "point_times": point_times,
             "mounts": {name: np.asarray(of).tolist() for name, of in (mounts or {}).items()},
@@ -98,12 +98,12 @@ class RosBag(Layout):
         self._bag = Bag(self.path)
         with naming(self.path, "a bag"):
             frames = self._frames_of_clouds()
-            tree = FrameTree(mounted_transforms(self._bag))
+            tree = FrameTree(read_static_transforms(self._bag))
             self.vehicle_frame = vehicle_frame or _vehicle_frame({*tree.frames, *frames.values()}, mounts or {})
             self._mounts = self._mounted(frames, tree, mounts or {})
             self.sensors = tuple(self._mounts)
             self.rigs = {"ros": self.sensors}
-            found = vehicle_poses(self._bag, tree, self.vehicle_frame)
+            found = find_vehicle_poses(self._bag, tree, self.vehicle_frame)
             self._poses = found[0] if found else None
             self._stamps_ns: dict[int, int] = {}
             self._pair_scans()
@@ -116,19 +116,19 @@ class RosBag(Layout):
             if len(found) > 1:
                 others = ", ".join(poses.source for poses in found[1:])
                 self._warn(f"poses are taken from {found[0].source}, not from {others}")
-            if self._poses is not None and self._poses.apart_m > APART_M:
+            if self._poses is not None and self._poses.max_disagreement_m > APART_M:
                 self._warn(
-                    f"poses of {self._poses.source} jump to and fro by {self._poses.apart_m:.2g} m: do two nodes "
+                    f"poses of {self._poses.source} jump to and fro by {self._poses.max_disagreement_m:.2g} m: do two nodes "
                     "send them? Record the bag again with one of them"
                 )
-            self.names = tuple(map(str, self._logged_ns[self.sensors[0]]))
+            self.frame_names = tuple(map(str, self._logged_ns[self.sensors[0]]))
             stamped_ns = self._stamped_ns[self.sensors[0]]
             self.times_s = check_times(
-                np.asarray((stamped_ns - stamped_ns[0]) * 1e-9), len(self.names), f"stamps of {self.sensors[0]}"
+                np.asarray((stamped_ns - stamped_ns[0]) * 1e-9), len(self.frame_names), f"stamps of {self.sensors[0]}"
             )
 
     @classmethod
-    def recognises(cls, path: Path) -> bool:
+    def can_read(cls, path: Path) -> bool:
         """Whether it is such a folder or file."""
         if find_ros1_files(path):
             return True
@@ -136,51 +136,55 @@ class RosBag(Layout):
             return (path / METADATA).exists() and any(any(path.glob(f"*{suffix}*")) for suffix in SUFFIXES.values())
         return path.suffix in SUFFIXES.values()
 
-    def scan(self, sensor: str, index: int) -> Scan:
+    def read_scan(self, sensor: str, index: int) -> Scan:
         """Read a cloud; where the vehicle's poses are known, it is moved to the instant."""
         cloud, stamp_ns = self._cloud(sensor, index)
         source, mount = f"{self.path}: {sensor} at {self._logged_ns[sensor][index]}", self._mounts[sensor]
         if self._poses is None:
-            return Scan(cloud.points_m, mount, source, rows=cloud.rows)
+            return Scan(cloud.points_m, mount, source, rings=cloud.rings)
         vehicle_T_world = invert(self._world_T_vehicle(self._poses, index))
         logged_ns = int(self._logged_ns[sensor][index])
         if cloud.offsets_s is None:
-            world_T_then = self._poses.at(np.array([stamp_ns]), logged_ns)[0]
-            return Scan(cloud.points_m, vehicle_T_world @ world_T_then @ mount, source, rows=cloud.rows)
+            world_T_then = self._poses.interpolate(np.array([stamp_ns]), logged_ns)[0]
+            return Scan(cloud.points_m, vehicle_T_world @ world_T_then @ mount, source, rings=cloud.rings)
         # Only what came back: zeros stay zeros, which say that nothing did.
         came = np.flatnonzero((np.abs(cloud.points_m) > NO_RETURN_M).any(axis=1))
         tick, of_point = np.unique(np.rint(cloud.offsets_s[came] / TICK_S).astype(np.int64), return_inverse=True)
         times_ns = stamp_ns + np.rint(tick * TICK_S * 1e9).astype(np.int64)
-        sensor_T_then = (invert(mount) @ vehicle_T_world @ self._poses.at(times_ns, logged_ns) @ mount)[of_point]
+        sensor_T_then = (invert(mount) @ vehicle_T_world @ self._poses.interpolate(times_ns, logged_ns) @ mount)[
+            of_point
+        ]
         points_m = cloud.points_m.astype(np.float64)
         points_m[came] = np.einsum("nij,nj->ni", sensor_T_then[:, :3, :3], points_m[came]) + sensor_T_then[:, :3, 3]
         offsets_s = cloud.offsets_s + (stamp_ns - self._stamp_ns(index)) * 1e-9
-        return Scan(points_m, mount, source, rows=cloud.rows, offsets_s=offsets_s)
+        return Scan(points_m, mount, source, rings=cloud.rings, offsets_s=offsets_s)
 
-    def world_T_vehicle(self, index: int) -> Matrix | None:
+    def get_world_T_vehicle(self, index: int) -> Matrix | None:
         """Where the vehicle was at the stamp of the instant; None in a bag without poses."""
         return None if self._poses is None else self._world_T_vehicle(self._poses, index)
 
-    def calibrations(self) -> SensorCalibrations:
+    def read_calibrations(self) -> SensorCalibrations:
         """The mounts."""
         return SensorCalibrations(f"transforms to {self.vehicle_frame}", self._mounts)
 
-    def boxes(self, index: int) -> None:
+    def read_boxes(self, index: int) -> None:
         """None: there are no labels."""
 
     def _frames_of_clouds(self) -> dict[str, str]:
         """Topic of each cloud that comes often -> its frame."""
-        topics = self._bag.topics(CLOUD)
+        topics = self._bag.list_topics(CLOUD)
         if not topics:
-            told = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(self._bag.types.items()))
+            told = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(self._bag.type_by_topic.items()))
             raise ValueError(f"a topic of {CLOUD} with messages is needed; there are {told or 'none'}")
-        counts = {topic: len(self._bag.times_ns(topic)) for topic in topics}
+        counts = {topic: len(self._bag.get_log_times_ns(topic)) for topic in topics}
         rare = [topic for topic, count in counts.items() if count < RAREST * max(counts.values())]
         if rare:
             self._warn(f"left out, for they come so rarely: {', '.join(rare)}")
         often = sorted((topic for topic in topics if topic not in rare), key=lambda topic: (counts[topic], topic))
         return {
-            topic: frame_name(self._bag.message(topic, int(self._bag.times_ns(topic)[0])).header.frame_id)
+            topic: normalize_frame_id(
+                self._bag.read_message(topic, int(self._bag.get_log_times_ns(topic)[0])).header.frame_id
+            )
             for topic in often
         }
 
@@ -192,7 +196,7 @@ class RosBag(Layout):
             raise ValueError(f"mount of {', '.join(unknown)}: there are clouds of {known}")
         for name, mount in given.items():
             tree.add(self.vehicle_frame, frames[self._topic(name)], mount)
-        found = {topic: tree.between(self.vehicle_frame, frame) for topic, frame in frames.items()}
+        found = {topic: tree.lookup_transform(self.vehicle_frame, frame) for topic, frame in frames.items()}
         found |= {self._topic(name): mount for name, mount in given.items()}
         lost = [f"{topic} ({frames[topic]})" for topic, mount in found.items() if mount is None]
         told = f"no static transform links to {self.vehicle_frame} the frame of {', '.join(lost)}"
@@ -207,7 +211,7 @@ class RosBag(Layout):
 
     def _pair_scans(self) -> None:
         """Find the scan of each sensor that was made nearest to each scan of the first one, by the stamps."""
-        logged_ns = {sensor: self._bag.times_ns(self._topic(sensor)) for sensor in self.sensors}
+        logged_ns = {sensor: self._bag.get_log_times_ns(self._topic(sensor)) for sensor in self.sensors}
         stamped_ns = {sensor: self._stamps_of(sensor, logged_ns[sensor]) for sensor in self.sensors}
         late_s = {sensor: (logged_ns[sensor] - stamped_ns[sensor]) * 1e-9 for sensor in self.sensors}
         first = self.sensors[0]
@@ -225,12 +229,12 @@ class RosBag(Layout):
         self._logged_ns, self._stamped_ns = {}, {}
         for sensor in self.sensors:
             order = np.argsort(stamped_ns[sensor], kind="stable")
-            chosen = order[nearest_of(stamped_ns[sensor][order], np.sort(stamped_ns[first]))]
+            chosen = order[find_nearest_times(stamped_ns[sensor][order], np.sort(stamped_ns[first]))]
             self._logged_ns[sensor] = logged_ns[sensor][chosen]
             self._stamped_ns[sensor] = stamped_ns[sensor][chosen]
 
     def _stamps_of(self, sensor: str, logged_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        stamped_ns = self._bag.stamps_ns(self._topic(sensor))
+        stamped_ns = self._bag.read_stamps_ns(self._topic(sensor))
         if stamped_ns.any():
             return stamped_ns
         self._warn(f"clouds of {sensor} have no stamps: they are taken as made when they were recorded")
@@ -241,12 +245,12 @@ class RosBag(Layout):
         logged_ns, stamped_ns = self._logged_ns[sensor], np.unique(self._stamped_ns[sensor])
         period_s = float(np.median(np.diff(stamped_ns))) * 1e-9 if len(stamped_ns) > 1 else None
         if point_times is not None:
-            return PointTimes(point_times, period_s or PARAMS.usual_period_s)
-        message = self._bag.message(self._topic(sensor), int(logged_ns[len(logged_ns) // 2]))
+            return PointTimes(point_times, period_s or PARAMS.default_period_s)
+        message = self._bag.read_message(self._topic(sensor), int(logged_ns[len(logged_ns) // 2]))
         try:
             chosen, note = choose_point_times(message, period_s)
         except ValueError:  # whoever reads this cloud will say so; the others may be whole
-            return PointTimes("ns", period_s or PARAMS.usual_period_s)
+            return PointTimes("ns", period_s or PARAMS.default_period_s)
         if chosen is None:
             raise ValueError(f"{sensor}: {note}")
         if note:
@@ -257,7 +261,7 @@ class RosBag(Layout):
         """Keep the instants between the first pose and the last."""
         if self._poses is None:
             return
-        inside = self._poses.covers(self._stamped_ns[self.sensors[0]], STAMP_MARGIN_S)
+        inside = self._poses.mask_covered_times(self._stamped_ns[self.sensors[0]], STAMP_MARGIN_S)
         if not inside.any():
             raise ValueError(
                 f"no scan lies between the first and the last pose of {self._poses.source}; do the clocks match?"
@@ -269,11 +273,11 @@ class RosBag(Layout):
         warnings.warn(f"{self.path}: {what}", stacklevel=5)
 
     def _topic(self, sensor: str) -> str:
-        return sensor if sensor in self._bag.types else f"/{sensor}"
+        return sensor if sensor in self._bag.type_by_topic else f"/{sensor}"
 
     def _world_T_vehicle(self, poses: VehiclePoses, index: int) -> Matrix:
         logged_ns = int(self._logged_ns[self.sensors[0]][index])
-        return np.asarray(poses.at(np.array([self._stamp_ns(index)]), logged_ns)[0])
+        return np.asarray(poses.interpolate(np.array([self._stamp_ns(index)]), logged_ns)[0])
 
     def _stamp_ns(self, index: int) -> int:
         """When the first sensor's scan was made, which is the time of the instant."""
@@ -288,23 +292,23 @@ class RosBag(Layout):
         with naming(self.path, f"a cloud of {sensor}"):
             if apart_s > FARTHEST_SCAN * every_s:
                 raise ValueError(f"the scan of {sensor} nearest to {first_ns[index]} is {apart_s:.3f} s off")
-            cloud = cloud_of(self._bag.message(self._topic(sensor), logged_ns), self._point_times[sensor])
+            cloud = parse_cloud(self._bag.read_message(self._topic(sensor), logged_ns), self._point_times[sensor])
         stamp_ns = cloud.stamp_ns or logged_ns
         if sensor == self.sensors[0]:
             self._stamps_ns[index] = stamp_ns
         return cloud, stamp_ns
 
 
-def nearest_of(times_ns: NDArray[np.int64], wanted_ns: NDArray[np.int64]) -> NDArray[np.intp]:
+def find_nearest_times(times_ns: NDArray[np.int64], query_ns: NDArray[np.int64]) -> NDArray[np.intp]:
     """For each wanted time the number of the nearest, of ascending ones.
 
     Example:
-        >>> nearest_of(np.array([0, 10, 20]), np.array([-5, 4, 6, 99]))
+        >>> find_nearest_times(np.array([0, 10, 20]), np.array([-5, 4, 6, 99]))
         array([0, 0, 1, 2])
     """
-    after = np.searchsorted(times_ns, wanted_ns).clip(1, max(len(times_ns) - 1, 1)).clip(max=len(times_ns) - 1)
+    after = np.searchsorted(times_ns, query_ns).clip(1, max(len(times_ns) - 1, 1)).clip(max=len(times_ns) - 1)
     before = np.maximum(after - 1, 0)
-    return np.where(wanted_ns - times_ns[before] <= times_ns[after] - wanted_ns, before, after)
+    return np.where(query_ns - times_ns[before] <= times_ns[after] - query_ns, before, after)
 
 
 def _vehicle_frame(frames: Collection[str], mounts: Collection[str]) -> str:

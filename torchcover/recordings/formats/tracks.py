@@ -14,7 +14,14 @@ from torchcover.files import NpyHeader, parse_xml, read_csv, read_npz, reads
 from torchcover.geometry import check_rigid, rigid, rotation_from_euler
 from torchcover.geometry.rigid import Matrix, warn_of_radians
 from torchcover.geometry.trajectory import Trajectory
-from torchcover.recordings.objects import Ego, RecordedObjects, Track, checked_size, class_of, moving
+from torchcover.recordings.objects import (
+    Ego,
+    RecordedObjects,
+    Track,
+    build_trajectory,
+    check_box_size,
+    find_vehicle_class,
+)
 from torchcover.recordings.recording import check_seconds
 
 TRAJECTORY_COLUMNS = ("t", "x", "y", "z", "roll", "pitch", "yaw")
@@ -65,10 +72,10 @@ def _tracks(path: Path) -> Iterator[Track]:
     _check_degrees("yaw", [(rows[of, 1:3], rows[of, 7]) for of in own.values()])
     for name, of in own.items():
         numbers, category = rows[of], table.words["category"][of[0]]
-        length, width, height = checked_size(name, numbers[0, 4:7])
+        length, width, height = check_box_size(name, numbers[0, 4:7])
         angles_deg = np.column_stack([numbers[:, 7], np.zeros((len(of), 2))])
-        trajectory = moving(name, numbers[:, 0], numbers[:, 1:4], angles_deg)
-        yield Track(name, category, class_of(category), (length, width, height), trajectory)
+        trajectory = build_trajectory(name, numbers[:, 0], numbers[:, 1:4], angles_deg)
+        yield Track(name, category, find_vehicle_class(category), (length, width, height), trajectory)
 
 
 def _read_csv(path: Path) -> Trajectory:
@@ -196,10 +203,10 @@ def _track(obstacle: Element, step_s: float) -> Track:
     left = np.stack([-forward[:, 1], forward[:, 0], forward[:, 2]], axis=1)
     places_m = np.array([row[1] for row in rows]) + middle_m[0] * forward + middle_m[1] * left
     angles_deg = np.column_stack([np.rad2deg(yaw + turn_rad), np.zeros((len(yaw), 2))])
-    trajectory = moving(name, times_s, places_m, angles_deg)
+    trajectory = build_trajectory(name, times_s, places_m, angles_deg)
     if obstacle.tag == "staticObstacle" or (obstacle.findtext("role") or "").strip() == "static":
         trajectory = Trajectory(times_s[:1], places_m[:1], angles_deg[:1])
-    return Track(name, category, class_of(category), size_m, trajectory)
+    return Track(name, category, find_vehicle_class(category), size_m, trajectory)
 
 
 def _shape(obstacle: Element, name: str) -> tuple[tuple[float, float, float], tuple[float, float], float]:
@@ -214,7 +221,7 @@ def _shape(obstacle: Element, name: str) -> tuple[tuple[float, float, float], tu
     corners = np.concatenate([_corners(shape, name) for shape in shapes]) @ np.array([[c, -s], [s, c]])
     low, high = corners.min(axis=0), corners.max(axis=0)
     middle_m: Matrix = np.array([[c, -s], [s, c]]) @ (low + high) / 2
-    length, width = checked_size(name, high - low)
+    length, width = check_box_size(name, high - low)
     return (length, width, math.nan), (float(middle_m[0]), float(middle_m[1])), turn_rad
 
 
@@ -227,7 +234,7 @@ def _corners(shape: Element, name: str) -> Matrix:
         half = np.full(2, _number(shape, "radius", owner))
     else:
         half = np.array([_number(shape, "length", owner), _number(shape, "width", owner)]) / 2
-    checked_size(name, 2 * half)
+    check_box_size(name, 2 * half)
     turn_rad = 0.0 if shape.find("orientation") is None else _number(shape, "orientation", owner)
     c, s = math.cos(turn_rad), math.sin(turn_rad)
     center = shape.find("center")

@@ -11,11 +11,17 @@ from torch import Tensor
 
 from torchcover.coverage import Coverage, Layer
 from torchcover.estimation import Number
-from torchcover.report.colours import NEVER_PROBED, ColourScale, as_array, difference_scale, scale_of
+from torchcover.report.colours import NEVER_PROBED, ColorScale, build_color_scale, build_difference_scale, to_array
 from torchcover.report.layout import PageTable
-from torchcover.report.map_subjects import NOTHING_FOUND, as_drawn, difference, quantities_shown, square_sides
+from torchcover.report.map_subjects import (
+    NOTHING_FOUND,
+    compute_difference,
+    compute_square_sides,
+    downsample_coverage,
+    list_map_quantities,
+)
 from torchcover.report.overlay import SensorView
-from torchcover.report.wording import shown_unit, span
+from torchcover.report.wording import format_height_band, get_display_unit
 
 Bounds = tuple[float, float]
 Array = NDArray[np.floating]
@@ -23,7 +29,7 @@ Sides = NDArray[np.integer]
 
 
 @dataclass(frozen=True, eq=False)
-class Line:
+class MapLine:
     """A line over a map, in metres in the vehicle frame.
 
     Args:
@@ -48,15 +54,15 @@ class PageMap:
         cell_m: Side of a cell.
         values: (Y, X) in the unit of the scale; NaN is unknown.
         scale: What the colours mean: the same for all bands and rigs.
-        unknown: Why a cell is.
+        unobserved_label: Why a cell is.
         errors: (Y, X) standard errors.
         weights: (Y, X) what each cell weighs where several are taken together.
         weight_name: What the weights are, with the unit.
-        full_weight: That of an opaque cell; less is paler. 0 if all are alike.
+        opaque_weight: That of an opaque cell; less is paler. 0 if all are alike.
         sides: (Y, X) how many cells wide the square is that each cell is drawn in; a power of 2.
-        difference: Colours of the difference to the first rig; None for the first, and where nothing is compared.
+        difference_scale: Colours of the difference to the first rig; None for the first, and where nothing is compared.
         lines: What is drawn over it.
-        bits: Of each number and weight in the file, 16 or 8.
+        num_bits: Of each number and weight in the file, 16 or 8.
     """
 
     quantity: str
@@ -66,58 +72,58 @@ class PageMap:
     y: Bounds
     cell_m: float
     values: Array
-    scale: ColourScale
-    unknown: str = NEVER_PROBED
+    scale: ColorScale
+    unobserved_label: str = NEVER_PROBED
     errors: Array | None = None
     weights: Array | None = None
     weight_name: str = ""
-    full_weight: float = 0.0
+    opaque_weight: float = 0.0
     sides: Sides | None = None
-    difference: ColourScale | None = None
-    lines: Sequence[Line] = ()
-    bits: int = 16
+    difference_scale: ColorScale | None = None
+    lines: Sequence[MapLine] = ()
+    num_bits: int = 16
 
 
 @dataclass(frozen=True, eq=False)
-class PagePlan:
+class TargetVisibilityMap:
     """Where a body is seen beside a vehicle, from above and true to scale.
 
     Args:
         rig: Who sees it.
-        words: A line above it.
+        title: A line above it.
         x: Bounds of the cells forward in metres.
         y: Bounds to the left.
         cell_m: Side of a cell.
-        seen_by: (Y, X) by how many sensors; 0 where it is not seen, -1 where it has no room.
+        sensor_counts: (Y, X) by how many sensors; 0 where it is not seen, -1 where it has no room.
         vehicle_box_m: (4, 2) corners x, y of what distances are from.
         vehicle_outline_m: (K, 2) what the vehicle looks like.
-        within_m: Up to which distance places count.
-        losses_m2: Sensor -> how much more is not seen within it when this one fails.
+        max_distance_m: Up to which distance places count.
+        failure_effects_m2: Sensor -> how much more is not seen within it when this one fails.
     """
 
     rig: str
-    words: str
+    title: str
     x: Bounds
     y: Bounds
     cell_m: float
-    seen_by: Sides
+    sensor_counts: Sides
     vehicle_box_m: Array
     vehicle_outline_m: Array
-    within_m: float
-    losses_m2: Mapping[str, float]
+    max_distance_m: float
+    failure_effects_m2: Mapping[str, float]
 
 
 @dataclass(frozen=True, eq=False)
-class PageRange:
+class DetectionShares:
     """Shares of one kind, of one rig or of several below each other.
 
     Args:
         name: What they are of.
-        of_rigs: Name of the rig -> its share, with its interval if there is one.
+        shares: Name of the rig -> its share, with its interval if there is one.
     """
 
     name: str
-    of_rigs: Mapping[str, Number]
+    shares: Mapping[str, Number]
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,9 +161,9 @@ class Page:
     Args:
         title: Its name.
         lead: One line below.
-        verdict: The answer in sentences, the first of which says most.
-        plans: What shows it, at the top.
-        ranges: How far it is seen, below.
+        findings: The answer in sentences, the first of which says most.
+        target_maps: What shows it, at the top.
+        detection_shares: How far it is seen, below.
         tables: The numbers.
         pictures: Above them.
         maps: In the order of the menus; differences are to the first rig.
@@ -170,26 +176,26 @@ class Page:
 
     title: str
     lead: str
-    verdict: Sequence[str] = ()
-    plans: Sequence[PagePlan] = ()
-    ranges: Sequence[PageRange] = ()
+    findings: Sequence[str] = ()
+    target_maps: Sequence[TargetVisibilityMap] = ()
+    detection_shares: Sequence[DetectionShares] = ()
     tables: Sequence[PageTable] = ()
     pictures: Sequence[PagePicture] = ()
     maps: Sequence[PageMap] = ()
     rigs: Sequence[PageRig] = ()
     ego_outline_m: Array | None = None
-    outlines: Sequence[Line] = ()
+    outlines: Sequence[MapLine] = ()
     facts: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     more_tables: Sequence[PageTable] = ()
 
 
-def maps_of(coverages: Mapping[str, Coverage]) -> Iterator[PageMap]:
+def build_page_maps(coverages: Mapping[str, Coverage]) -> Iterator[PageMap]:
     """A map for each quantity, height band and rig; first those of bodies, if there are any: the answer tells of them.
 
     Args:
         coverages: By the name of the rig; one, or several that are paired.
     """
-    coverages = {name: as_drawn(coverage) for name, coverage in coverages.items()}
+    coverages = {name: downsample_coverage(coverage) for name, coverage in coverages.items()}
     first = next(iter(coverages.values()))
     for rig, bodies in ((rig, coverage.bodies) for rig, coverage in coverages.items() if coverage.bodies):
         for body, cells in zip(bodies.bodies, bodies.cells, strict=True):
@@ -201,15 +207,15 @@ def maps_of(coverages: Mapping[str, Coverage]) -> Iterator[PageMap]:
                 x=bodies.grid.x,
                 y=bodies.grid.y,
                 cell_m=bodies.grid.cell,
-                values=shown_unit(quantity.unit).factor * as_array(share),
-                scale=scale_of(quantity, share),
-                unknown="no place was free",
+                values=get_display_unit(quantity.unit).factor * to_array(share),
+                scale=build_color_scale(quantity, share),
+                unobserved_label="no place was free",
                 weights=free,
                 weight_name="free places",
             )
-    shown = quantities_shown(first)
+    shown = list_map_quantities(first)
     surface = _weights(first) if first.measure == "area" else None
-    steps = Weights([_nan_where_none(one) for one in first.probed_steps], "steps that probed it")
+    steps = CellWeights([_nan_where_none(one) for one in first.probed_steps], "steps that probed it")
     for quantity, by_surface in shown:
         layers = {rig: coverage.listed[quantity.key] for rig, coverage in coverages.items()}
         errors = {rig: one.listed_errors.get(quantity.key) for rig, one in coverages.items()}
@@ -220,61 +226,61 @@ def maps_of(coverages: Mapping[str, Coverage]) -> Iterator[PageMap]:
         yield from _of_quantity(having, dict.fromkeys(having), surface or steps, first)
 
 
-class Weights(NamedTuple):
+class CellWeights(NamedTuple):
     """What a cell weighs, in each band; see `PageMap`."""
 
     values: list[Array]
     name: str
-    full: float = 0.0
+    opaque_weight: float = 0.0
     sides: list[Sides] | None = None
 
 
 def _of_quantity(
-    layers: Mapping[str, Layer], errors: Mapping[str, Tensor | None], weights: Weights, first: Coverage
+    layers: Mapping[str, Layer], errors: Mapping[str, Tensor | None], weights: CellWeights, first: Coverage
 ) -> Iterator[PageMap]:
     """Maps from numbers of the known cells, which are the same of all rigs; so are those of `first`."""
     grid, quantity = first.grid, next(iter(layers.values())).quantity
-    factor = shown_unit(quantity.unit).factor
+    factor = get_display_unit(quantity.unit).factor
     values = {rig: factor * layer.values for rig, layer in layers.items()}
-    scale = scale_of(quantity, torch.stack(list(values.values())))
+    scale = build_color_scale(quantity, torch.stack(list(values.values())))
     expected, *others = values.values()
-    differences = [difference(one, expected) for one in others]
-    against = difference_scale(quantity, torch.stack(differences)) if differences else None
-    spread = {rig: as_array(first.known.spread(one)) for rig, one in values.items()}
+    differences = [compute_difference(one, expected) for one in others]
+    against = build_difference_scale(quantity, torch.stack(differences)) if differences else None
+    spread = {rig: to_array(first.known.spread(one)) for rig, one in values.items()}
     of_errors = {
-        rig: None if one is None else factor * as_array(first.known.spread(one)) for rig, one in errors.items()
+        rig: None if one is None else factor * to_array(first.known.spread(one)) for rig, one in errors.items()
     }
     for band, height in enumerate(grid.heights):
         for at, rig in enumerate(values):
             error = of_errors[rig]
             yield PageMap(
                 quantity=quantity.title,
-                band=f"{height}, {span(grid, height)}",
+                band=f"{height}, {format_height_band(grid, height)}",
                 rig=rig,
                 x=grid.x,
                 y=grid.y,
                 cell_m=grid.cell,
                 values=spread[rig][band],
                 scale=scale,
-                unknown=NEVER_PROBED if weights.sides is None else NOTHING_FOUND,
+                unobserved_label=NEVER_PROBED if weights.sides is None else NOTHING_FOUND,
                 errors=None if error is None else error[band],
                 weights=weights.values[band],
                 weight_name=weights.name,
-                full_weight=weights.full,
+                opaque_weight=weights.opaque_weight,
                 sides=None if weights.sides is None else weights.sides[band],
-                difference=against if at else None,
+                difference_scale=against if at else None,
             )
 
 
-def _weights(first: Coverage) -> Weights | None:
+def _weights(first: Coverage) -> CellWeights | None:
     """Square metres; the rigs share the reference points, and so the square metres."""
     if first.area is None:
         return None
     m2 = [_nan_where_none(one) for one in first.area.totals()[0]]
-    sides = [one.cpu().numpy() for one in square_sides(first.points, first.grid.cell)]
-    return Weights(m2, "m² of surface seen in all steps", first.counts["steps"] * first.grid.cell**2, sides)
+    sides = [one.cpu().numpy() for one in compute_square_sides(first.points, first.grid.cell)]
+    return CellWeights(m2, "m² of surface seen in all steps", first.counts["steps"] * first.grid.cell**2, sides)
 
 
 def _nan_where_none(counts: Tensor) -> Array:
-    array = as_array(counts)
+    array = to_array(counts)
     return np.where(array > 0, array, np.nan)

@@ -7,12 +7,12 @@ from itertools import groupby
 import numpy as np
 
 from torchcover.notebooks import attribute_of, html_of
-from torchcover.report.layout import PageTable, Words
-from torchcover.report.overlay import SensorView, sensor_colour
-from torchcover.report.page.content import Array, PagePlan, PageRange
-from torchcover.report.remarks import decisive, detected_words, surface_words
+from torchcover.report.layout import PageTable, TextCell
+from torchcover.report.overlay import SensorView, get_sensor_color
+from torchcover.report.page.content import Array, DetectionShares, TargetVisibilityMap
+from torchcover.report.remarks import detected_words, get_main_quantity, surface_words
 from torchcover.report.table import CoverageTable
-from torchcover.report.wording import UNKNOWN, number_words, square_metres
+from torchcover.report.wording import UNKNOWN, format_number, format_square_meters
 
 # Of the plan, beyond which nothing is drawn; lines are so far from the vehicle.
 REACH_M = 3.4
@@ -21,68 +21,72 @@ RINGS_M = 1.0, 2.0, 3.0
 SEEN_BY = "not seen", "by one sensor only", "by two or more"
 
 
-def words_html(words: str) -> str:
+def render_text_html(text: str) -> str:
     """A sentence in HTML: no break before a per cent sign, and words between backticks as code."""
-    return html_of(words).replace(" %", "&nbsp;%")
+    return html_of(text).replace(" %", "&nbsp;%")
 
 
-def ranges_of(table: CoverageTable) -> list[PageRange]:
+def build_detection_shares(table: CoverageTable) -> list[DetectionShares]:
     """What is detected in the regions that begin at the vehicle, for a picture."""
-    key = decisive(table).key
+    key = get_main_quantity(table).key
     return [
-        PageRange(
+        DetectionShares(
             f"{surface_words(table, rows[0])} to {rows[0].region.x[1]:g} m: {detected_words(table)}",
             {row.rig: row.summary.numbers[key] for row in rows},
         )
-        for rows in table.places
-        if rows[0].region.x[0] == 0.0 and not rows[0].region.corners_m and table.thresholds
+        for rows in table.rows_by_region
+        if rows[0].region.x[0] == 0.0 and not rows[0].region.corners_m and table.thresholds_m
     ]
 
 
-def plans_html(plans: Sequence[PagePlan]) -> str:
+def render_target_maps(target_maps: Sequence[TargetVisibilityMap]) -> str:
     """Plans beside each other, below a key."""
-    if not plans:
+    if not target_maps:
         return ""
     key = "".join(f'<li><i class="seen{at}"></i>{words}</li>' for at, words in enumerate(SEEN_BY))
-    most = max((loss for plan in plans for loss in plan.losses_m2.values()), default=0.0)
-    return f'<ul class="key">{key}</ul><div class="plans">{"".join(_plan(plan, most) for plan in plans)}</div>'
+    most = max((loss for plan in target_maps for loss in plan.failure_effects_m2.values()), default=0.0)
+    return f'<ul class="key">{key}</ul><div class="plans">{"".join(_plan(plan, most) for plan in target_maps)}</div>'
 
 
-def ranges_html(ranges: Sequence[PageRange]) -> str:
+def render_detection_shares(detection_shares: Sequence[DetectionShares]) -> str:
     """A line for each share, with dots for the rigs and bars for their intervals."""
-    if not ranges:
+    if not detection_shares:
         return ""
     lines = []
-    for one in ranges:
-        for at, (rig, number) in enumerate(one.of_rigs.items()):
-            name = f'<th scope="rowgroup" rowspan="{len(one.of_rigs)}">{words_html(one.name)}</th>' if at == 0 else ""
+    for one in detection_shares:
+        for at, (rig, number) in enumerate(one.shares.items()):
+            name = (
+                f'<th scope="rowgroup" rowspan="{len(one.shares)}">{render_text_html(one.name)}</th>' if at == 0 else ""
+            )
             marks, words = "", UNKNOWN
             if not math.isnan(number.value):
-                value, words = 100 * number.value, words_html(f"{number_words(number)} %")
+                value, words = 100 * number.value, render_text_html(f"{format_number(number)} %")
                 marks = f'<circle cx="{value:.1f}" cy="4" r="1.6" class="rig{at % 2}"/>'
             if not math.isnan(number.low):
                 ends = f'x1="{100 * number.low:.1f}" x2="{100 * number.high:.1f}"'
                 marks += f'<line {ends} y1="4" y2="4" class="rig{at % 2}"/>'
             drawn = f'<svg viewBox="-3 0 106 8" aria-hidden="true"><path d="M0 8V7H100V8" class="axis"/>{marks}</svg>'
-            lines.append(f'<tr>{name}<th scope="row">{words_html(rig)}</th><td>{drawn}</td><td>{words}</td></tr>')
+            lines.append(f'<tr>{name}<th scope="row">{render_text_html(rig)}</th><td>{drawn}</td><td>{words}</td></tr>')
     table = f'<table class="ranges"><tbody>{"".join(lines)}</tbody></table>'
     return f'<h2>How far: share that is detected</h2><div class="wide">{table}</div>'
 
 
-def _plan(plan: PagePlan, most_m2: float) -> str:
+def _plan(plan: TargetVisibilityMap, most_m2: float) -> str:
     rows = []
-    for sensor, loss in plan.losses_m2.items():
+    for sensor, loss in plan.failure_effects_m2.items():
         width = 100 * loss / most_m2 if most_m2 else 0.0
         bar = f'<svg viewBox="0 0 100 8" preserveAspectRatio="none"><rect width="{width:.1f}" height="8"/></svg>'
-        lost = f"+{square_metres(loss)} m²"
-        rows.append(f'<tr><th scope="row">{words_html(sensor)}</th><td class="bar">{bar}</td><td>{lost}</td></tr>')
-    title = f"If one sensor fails, more is not seen within {plan.within_m:g} m"
+        lost = f"+{format_square_meters(loss)} m²"
+        rows.append(
+            f'<tr><th scope="row">{render_text_html(sensor)}</th><td class="bar">{bar}</td><td>{lost}</td></tr>'
+        )
+    title = f"If one sensor fails, more is not seen within {plan.max_distance_m:g} m"
     losses = f'<table class="losses"><caption>{title}</caption><tbody>{"".join(rows)}</tbody></table>' if rows else ""
-    words = f"<h2>{words_html(plan.rig)}</h2><p>{words_html(plan.words)}</p>"
+    words = f"<h2>{render_text_html(plan.rig)}</h2><p>{render_text_html(plan.title)}</p>"
     return f'<section class="plan">{words}{_plan_drawing(plan)}{losses}</section>'
 
 
-def _plan_drawing(plan: PagePlan) -> str:
+def _plan_drawing(plan: TargetVisibilityMap) -> str:
     """SVG in metres: x forward to the right, y down."""
     (left, low), (right, high) = plan.vehicle_box_m.min(axis=0), plan.vehicle_box_m.max(axis=0)
     box = f"{left - REACH_M:.2f} {-high - REACH_M:.2f} {right - left + 2 * REACH_M:.2f} {high - low + 2 * REACH_M:.2f}"
@@ -90,7 +94,7 @@ def _plan_drawing(plan: PagePlan) -> str:
     for ring_m in RINGS_M:
         place = f'x="{left - ring_m:.2f}" y="{-high - ring_m:.2f}" rx="{ring_m:g}"'
         size = f'width="{right - left + 2 * ring_m:.2f}" height="{high - low + 2 * ring_m:.2f}"'
-        parts.append(f'<rect class="{"ring counted" if ring_m == plan.within_m else "ring"}" {place} {size}/>')
+        parts.append(f'<rect class="{"ring counted" if ring_m == plan.max_distance_m else "ring"}" {place} {size}/>')
         parts.append(f'<text x="{left - ring_m + 0.06:.2f}" y="0.1">{ring_m:g} m</text>')
     corners = " ".join(f"{x:.2f},{-y:.2f}" for x, y in plan.vehicle_outline_m)
     parts.append(f'<polygon points="{corners}"/><text x="{right - 0.25:.2f}" y="0.1" text-anchor="end">front →</text>')
@@ -98,10 +102,10 @@ def _plan_drawing(plan: PagePlan) -> str:
     return f'<svg viewBox="{box}" role="img" aria-label="{title}">{"".join(parts)}</svg>'
 
 
-def _cells(plan: PagePlan, kind: int) -> str:
+def _cells(plan: TargetVisibilityMap, kind: int) -> str:
     """The cells of one colour, those beside each other in a row as one rectangle."""
     path = []
-    for row, seen_by in enumerate(plan.seen_by.clip(max=len(SEEN_BY) - 1).tolist()):
+    for row, seen_by in enumerate(plan.sensor_counts.clip(max=len(SEEN_BY) - 1).tolist()):
         column = 0
         for one, run in groupby(seen_by):
             width = len(list(run))
@@ -121,7 +125,7 @@ DASHED = 'stroke-width="0.03" stroke-dasharray="0.15 0.1"'
 TITLE = "The rig from above, forward to the right. Fields of view fade out; how far they reach is in the table."
 
 
-def rig_drawing(sensors: Sequence[SensorView], ego_outline_m: Array | None, number: int) -> str:
+def render_rig(sensors: Sequence[SensorView], ego_outline_m: Array | None, number: int) -> str:
     """An SVG element with x forward to the right; fields of view fade out, for they are longer than the paper.
 
     `sensors`: what to draw; `ego_outline_m`: (K, 2) corners x, y of the ego in metres, if it is known; `number`: of the
@@ -136,14 +140,14 @@ def rig_drawing(sensors: Sequence[SensorView], ego_outline_m: Array | None, numb
     if ego_outline_m is not None:
         corners = " ".join(f"{x:.3f},{-y:.3f}" for x, y in ego_outline_m)
         parts.append(f'<polygon points="{corners}" fill="none" stroke="currentColor" stroke-width="0.05"/>')
-    parts += [_field(f"fade-{number}-{at}", sensor_colour(at), view, reach) for at, view in enumerate(sensors)]
+    parts += [_field(f"fade-{number}-{at}", get_sensor_color(at), view, reach) for at, view in enumerate(sensors)]
     parts += [_disc(at, x, y) for at, (x, y) in enumerate(_apart(places))]
     parts.append(_scale_bar(left, -top))
     box = f"{left:.3f} {-bottom:.3f} {size[0]:.3f} {size[1]:.3f}"
     return f'<svg viewBox="{box}" role="img" aria-label="{TITLE}">{"".join(parts)}</svg><p class="note">{TITLE}</p>'
 
 
-def sensor_table(sensors: Sequence[SensorView]) -> PageTable:
+def build_sensor_table(sensors: Sequence[SensorView]) -> PageTable:
     """Where each sensor is, whereto it looks, and how far."""
     headings = ("sensor", "x, y, z (m)", "yaw, pitch, roll (°)", "wide (°)", "high (°)", "range (m)")
     rows = []
@@ -152,7 +156,7 @@ def sensor_table(sensors: Sequence[SensorView]) -> PageTable:
         low, high = view.vertical_fov_deg
         turned = ", ".join(f"{round(angle, 1) + 0.0:.1f}" for angle in (view.yaw_deg, *view.tilt_deg))
         each = turned, f"{view.horizontal_fov_deg:.1f}", f"{low:.1f} to {high:.1f}", f"{view.range_m:g}"
-        rows.append(tuple(map(Words, (f"{at + 1}  {view.name}", place, *each))))
+        rows.append(tuple(map(TextCell, (f"{at + 1}  {view.name}", place, *each))))
     return PageTable("", headings, rows)
 
 
@@ -167,9 +171,9 @@ def _field(name: str, colour: str, view: SensorView, reach: float) -> str:
     circle = f'cx="{x:.3f}" cy="{y:.3f}" r="{reach:.3f}"'
     fade = f'<radialGradient id="{name}" gradientUnits="userSpaceOnUse" {circle}>{stops}</radialGradient>'
     if view.is_tilted:
-        corners = " ".join(f"{x:.3f},{-y:.3f}" for x, y in view.outline_m(reach))
+        corners = " ".join(f"{x:.3f},{-y:.3f}" for x, y in view.compute_outline_m(reach))
         return f'{fade}<polygon points="{corners}" fill="url(#{name})" stroke="{colour}" {DASHED}/>'
-    reach = view.level_reach_m(reach)
+    reach = view.compute_level_range_m(reach)
     circle = f'cx="{x:.3f}" cy="{y:.3f}" r="{reach:.3f}"'
     if view.horizontal_fov_deg >= 360:
         return f'{fade}<circle {circle} fill="url(#{name})"/>'
@@ -194,7 +198,7 @@ def _apart(places: Array) -> Array:
 
 def _disc(at: int, x: float, y: float) -> str:
     return (
-        f'<circle cx="{x:.3f}" cy="{-y:.3f}" r="{NUMBER_M / 2}" fill="{sensor_colour(at)}" stroke="white" '
+        f'<circle cx="{x:.3f}" cy="{-y:.3f}" r="{NUMBER_M / 2}" fill="{get_sensor_color(at)}" stroke="white" '
         f'stroke-width="0.03"/><text x="{x:.3f}" y="{-y + 0.075:.3f}" font-size="0.22" text-anchor="middle" '
         f'fill="white" font-family="sans-serif">{at + 1}</text>'
     )

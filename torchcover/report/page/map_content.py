@@ -15,9 +15,9 @@ import numpy as np
 from matplotlib import colormaps
 from numpy.typing import NDArray
 
-from torchcover.report.colours import ColourScale
+from torchcover.report.colours import ColorScale
 from torchcover.report.overlay import SensorView
-from torchcover.report.page.content import Array, Line, Page, PageMap
+from torchcover.report.page.content import Array, MapLine, Page, PageMap
 
 # Beyond this ratio of the largest to the least, equal ratios are kept equally well.
 WIDE_RATIO = 50.0
@@ -25,38 +25,38 @@ DECADES = 9
 COMPRESSION = 6
 
 # The array, its codes, which cells are known, and the scale, by which array it is and its bits.
-Codes: TypeAlias = dict[tuple[int, int], tuple[NDArray[Any], bytes, bytes, Mapping[str, Any]]]
+CellCodes: TypeAlias = dict[tuple[int, int], tuple[NDArray[Any], bytes, bytes, Mapping[str, Any]]]
 
 
-class CellBytes:
+class CellBuffer:
     """Collects arrays of cells in one run of bytes; what is the same is kept once.
 
     Args:
         codes: What arrays were encoded to already, for another choice of them; more is added.
     """
 
-    def __init__(self, codes: Codes | None = None) -> None:
+    def __init__(self, codes: CellCodes | None = None) -> None:
         self.arrays: list[dict[str, Any]] = []
-        self._codes: Codes = {} if codes is None else codes
+        self._codes: CellCodes = {} if codes is None else codes
         self._parts: list[bytes] = []
         self._length = 0
         self._at: dict[bytes, int] = {}
         self._kept: dict[int, int] = {}
         self._text = ""
 
-    def add(self, values: NDArray[Any], bits: int) -> int:
+    def add(self, values: NDArray[Any], num_bits: int) -> int:
         """Keep an array.
 
-        `values`: (Y, X) numbers; NaN is unknown; `bits`: of each, 8 or 16. Returns its place in `arrays`.
+        `values`: (Y, X) numbers; NaN is unknown; `num_bits`: of each, 8 or 16. Returns its place in `arrays`.
         """
         if id(values) in self._kept:
             return self._kept[id(values)]
-        key = id(values), bits
+        key = id(values), num_bits
         if key not in self._codes:
-            self._codes[key] = values, *packed(values, bits)  # held, so that no other object is at its place
+            self._codes[key] = values, *pack_cells(values, num_bits)  # held, so that no other object is at its place
         _, planes, mask, scale = self._codes[key]
         where = {"at": self._place(planes), "mask": self._place(mask)}
-        self.arrays.append({**where, "count": 8 * len(planes) // bits, "bits": bits, **scale})
+        self.arrays.append({**where, "count": 8 * len(planes) // num_bits, "bits": num_bits, **scale})
         self._kept[id(values)] = len(self.arrays) - 1
         return len(self.arrays) - 1
 
@@ -76,20 +76,20 @@ class CellBytes:
         return self._at[content]
 
 
-def packed(values: NDArray[Any], bits: int) -> tuple[bytes, bytes, Mapping[str, Any]]:
+def pack_cells(values: NDArray[Any], num_bits: int) -> tuple[bytes, bytes, Mapping[str, Any]]:
     """The codes of known cells, high bytes first; which are known, a bit each; and the scale of the codes."""
     flat = np.asarray(values, dtype=np.float64).ravel()
     known = ~np.isnan(flat)
-    codes, scale = encoded(flat[known], bits)
+    codes, scale = encode_values(flat[known], num_bits)
     planes = (codes & 255).astype(np.uint8).tobytes()
-    if bits > 8:
+    if num_bits > 8:
         planes = (codes >> 8).astype(np.uint8).tobytes() + planes
     return planes, np.packbits(known, bitorder="little").tobytes(), scale
 
 
-def encoded(values: NDArray[np.float64], bits: int) -> tuple[NDArray[np.uint16], Mapping[str, Any]]:
+def encode_values(values: NDArray[np.float64], num_bits: int) -> tuple[NDArray[np.uint16], Mapping[str, Any]]:
     """Codes of numbers that are not NaN, and what a reader needs to have them back (`cells.js`)."""
-    top = 2**bits - 1
+    top = 2**num_bits - 1
     endless, nothing = np.isposinf(values), values == 0
     usual = values[np.isfinite(values) & ~nothing]
     low, high = (float(usual.min()), float(usual.max())) if len(usual) else (0.0, 1.0)
@@ -113,13 +113,13 @@ FARTHEST_M = 2000.0
 OUTLINE_POINTS = 181
 
 
-def map_content(page: Page, cells: CellBytes) -> dict[str, Any]:
+def build_map_content(page: Page, cells: CellBuffer) -> dict[str, Any]:
     """What the script reads."""
     rasters: dict[tuple[Any, ...], list[PageMap]] = {}
     for one in page.maps:
         rasters.setdefault((one.x, one.y, one.cell_m), []).append(one)
     places = list(rasters)
-    names = {scale.colormap for one in page.maps for scale in (one.scale, one.difference) if scale}
+    names = {scale.colormap for one in page.maps for scale in (one.scale, one.difference_scale) if scale}
     return {
         "maps": [_map(one, places.index((one.x, one.y, one.cell_m)), cells) for one in page.maps],
         "arrays": cells.arrays,
@@ -132,26 +132,26 @@ def map_content(page: Page, cells: CellBytes) -> dict[str, Any]:
     }
 
 
-def _map(one: PageMap, raster: int, cells: CellBytes) -> dict[str, Any]:
+def _map(one: PageMap, raster: int, cells: CellBuffer) -> dict[str, Any]:
     return {
         "quantity": one.quantity,
         "band": one.band,
         "rig": one.rig,
         "raster": raster,
-        "unknown": one.unknown,
-        **arrays_of(one, cells),
+        "unknown": one.unobserved_label,
+        **add_arrays(one, cells),
         "weight_name": one.weight_name,
-        "full": one.full_weight,
+        "full": one.opaque_weight,
         "scale": _scale(one.scale),
-        "difference": None if one.difference is None else _scale(one.difference),
+        "difference": None if one.difference_scale is None else _scale(one.difference_scale),
         "lines": _lines(one.lines),
     }
 
 
-def arrays_of(one: PageMap, cells: CellBytes) -> dict[str, int | None]:
+def add_arrays(page_map: PageMap, cells: CellBuffer) -> dict[str, int | None]:
     """Its numbers, as places in the arrays of the cells."""
-    bits = {"values": one.bits, "errors": 8, "weights": one.bits, "sides": 8}
-    arrays = {name: getattr(one, name) for name in bits}
+    bits = {"values": page_map.num_bits, "errors": 8, "weights": page_map.num_bits, "sides": 8}
+    arrays = {name: getattr(page_map, name) for name in bits}
     return {name: None if array is None else cells.add(array, bits[name]) for name, array in arrays.items()}
 
 
@@ -196,7 +196,7 @@ def _views(page: Page) -> list[dict[str, Any]]:
     return found
 
 
-def _lines(lines: Iterable[Line]) -> list[dict[str, Any]]:
+def _lines(lines: Iterable[MapLine]) -> list[dict[str, Any]]:
     return [{"name": line.name, "points": _points(line.points_m)} for line in lines]
 
 
@@ -204,7 +204,7 @@ def _points(points_m: Array) -> list[list[float | None]]:
     return [[None if np.isnan(value) else round(float(value), 4) for value in point] for point in points_m]
 
 
-def _scale(scale: ColourScale) -> dict[str, Any]:
+def _scale(scale: ColorScale) -> dict[str, Any]:
     return {
         "quantity": scale.quantity,
         "unit": scale.unit,
@@ -225,5 +225,10 @@ def _sensor(view: SensorView) -> dict[str, Any]:
     """A sensor with its field of view from above: an arc, or the outline of a tilted sensor."""
     place = {"x": view.x_m, "y": view.y_m}
     if view.is_tilted:
-        return {**place, "outline": _points(view.outline_m(FARTHEST_M, points=OUTLINE_POINTS).round(2))}
-    return {**place, "yaw": view.yaw_deg, "wide": view.horizontal_fov_deg, "range": view.level_reach_m(FARTHEST_M)}
+        return {**place, "outline": _points(view.compute_outline_m(FARTHEST_M, num_points=OUTLINE_POINTS).round(2))}
+    return {
+        **place,
+        "yaw": view.yaw_deg,
+        "wide": view.horizontal_fov_deg,
+        "range": view.compute_level_range_m(FARTHEST_M),
+    }

@@ -13,10 +13,16 @@ from string import Template
 import numpy as np
 
 from torchcover.notebooks import attribute_of
-from torchcover.report.layout import PageTable, Words
+from torchcover.report.layout import PageTable, TextCell
 from torchcover.report.page.content import Array, Page, PageMap, PagePicture, PageRig
-from torchcover.report.page.drawings import plans_html, ranges_html, rig_drawing, sensor_table, words_html
-from torchcover.report.page.map_content import CellBytes, Codes, arrays_of, map_content
+from torchcover.report.page.drawings import (
+    build_sensor_table,
+    render_detection_shares,
+    render_rig,
+    render_target_maps,
+    render_text_html,
+)
+from torchcover.report.page.map_content import CellBuffer, CellCodes, add_arrays, build_map_content
 
 # What maps and pictures may take in a file that is sent by mail without a thought, and the maps in any case; and how
 # many times that they may take before they are packed.
@@ -25,25 +31,25 @@ ROUNDED = "Numbers of single cells are rounded, those of a wide scale by up to 4
 NO_ERRORS = "errors of single cells are left out"
 
 
-def fitted(maps: Sequence[PageMap], most_chars: int = MOST_CHARS) -> tuple[list[PageMap], CellBytes, list[str]]:
+def fit_maps(maps: Sequence[PageMap], max_chars: int = MOST_CHARS) -> tuple[list[PageMap], CellBuffer, list[str]]:
     """Round numbers, then leave out errors, then take cells together where most are, until what is packed is small.
 
     Returns:
         The maps, what is packed, and what was left out in words.
     """
-    codes: Codes = {}
+    codes: CellCodes = {}
     kept, left_out = list(maps), []
-    cells = _packed(kept, most_chars, codes)
+    cells = _packed(kept, max_chars, codes)
     if cells is None:
-        kept, left_out = [replace(one, bits=8) for one in kept], [ROUNDED]
-        cells = _packed(kept, most_chars, codes)
+        kept, left_out = [replace(one, num_bits=8) for one in kept], [ROUNDED]
+        cells = _packed(kept, max_chars, codes)
     if cells is None and any(one.errors is not None for one in kept):
         kept, left_out = [replace(one, errors=None) for one in kept], [ROUNDED, NO_ERRORS]
-        cells = _packed(kept, most_chars, codes)
+        cells = _packed(kept, max_chars, codes)
     while cells is None:
         most = max(one.values.size for one in kept)
-        kept = [coarser(one) if one.values.size > most / 4 else one for one in kept]
-        cells = _packed(kept, most_chars, codes)
+        kept = [downsample_map(one) if one.values.size > most / 4 else one for one in kept]
+        cells = _packed(kept, max_chars, codes)
     sides = {round(one.cell_m / whole.cell_m) for one, whole in zip(kept, maps, strict=True)} - {1}
     if sides:
         left_out.append(f"some maps show {' or '.join(f'{side} x {side}' for side in sorted(sides))} cells as one")
@@ -51,41 +57,41 @@ def fitted(maps: Sequence[PageMap], most_chars: int = MOST_CHARS) -> tuple[list[
     return kept, cells, notes
 
 
-def _packed(maps: Sequence[PageMap], most_chars: int, codes: Codes) -> CellBytes | None:
+def _packed(maps: Sequence[PageMap], most_chars: int, codes: CellCodes) -> CellBuffer | None:
     """Their cells; None if they are too many."""
-    if sum(int((~np.isnan(one.values)).sum()) * one.bits // 8 for one in maps) > MOST_PACKED * most_chars:
+    if sum(int((~np.isnan(one.values)).sum()) * one.num_bits // 8 for one in maps) > MOST_PACKED * most_chars:
         return None
-    cells = CellBytes(codes)
+    cells = CellBuffer(codes)
     for one in maps:
-        arrays_of(one, cells)
+        add_arrays(one, cells)
     return cells if len(cells.text) <= most_chars else None
 
 
-def coarser(one: PageMap) -> PageMap:
+def downsample_map(page_map: PageMap) -> PageMap:
     """A map with four cells in each, without errors: their mean as the weights say, or all alike.
 
     Example:
-        >>> from torchcover.report.colours import ColourScale
-        >>> scale = ColourScale("radius", "m", "viridis_r", 0.0, 4.0)
+        >>> from torchcover.report.colours import ColorScale
+        >>> scale = ColorScale("radius", "m", "viridis_r", 0.0, 4.0)
         >>> cells = np.array([[1.0, 3.0], [np.nan, 2.0]])
         >>> coarser(PageMap("radius", "ground", "rig", (0.0, 2.0), (0.0, 2.0), 1.0, cells, scale)).values
         array([[2.]])
     """
-    known = ~np.isnan(one.values)
-    weights = known.astype(float) if one.weights is None else np.where(known, one.weights, 0.0)
-    base, sums = _sums(weights), _sums(np.where(known, weights * np.where(known, one.values, 0.0), 0.0))
+    known = ~np.isnan(page_map.values)
+    weights = known.astype(float) if page_map.weights is None else np.where(known, page_map.weights, 0.0)
+    base, sums = _sums(weights), _sums(np.where(known, weights * np.where(known, page_map.values, 0.0), 0.0))
     rows, columns = base.shape
-    cell_m = 2 * one.cell_m
+    cell_m = 2 * page_map.cell_m
     return replace(
-        one,
-        x=(one.x[0], one.x[0] + columns * cell_m),
-        y=(one.y[0], one.y[0] + rows * cell_m),
+        page_map,
+        x=(page_map.x[0], page_map.x[0] + columns * cell_m),
+        y=(page_map.y[0], page_map.y[0] + rows * cell_m),
         cell_m=cell_m,
         values=np.where(base > 0, sums / np.where(base > 0, base, 1.0), np.nan),
         errors=None,
-        weights=None if one.weights is None else np.where(base > 0, base, np.nan),
-        full_weight=4 * one.full_weight,
-        sides=None if one.sides is None else np.maximum(one.sides[::2, ::2] // 2, 1),
+        weights=None if page_map.weights is None else np.where(base > 0, base, np.nan),
+        opaque_weight=4 * page_map.opaque_weight,
+        sides=None if page_map.sides is None else np.maximum(page_map.sides[::2, ::2] // 2, 1),
     )
 
 
@@ -99,42 +105,42 @@ def _sums(values: Array) -> Array:
 SCRIPTS = ("cells.js", "map.js", "page.js", "controls.js")
 
 
-def page_html(page: Page) -> str:
+def render_page(page: Page) -> str:
     """The text of its file."""
-    first = plans_html(page.plans) + "".join(map(_picture, page.pictures))
-    maps, cells, notes = fitted(page.maps, max(MOST_CHARS - len(first), LEAST_CHARS))
-    content = as_json(map_content(replace(page, maps=maps), cells))
+    first = render_target_maps(page.target_maps) + "".join(map(_picture, page.pictures))
+    maps, cells, notes = fit_maps(page.maps, max(MOST_CHARS - len(first), LEAST_CHARS))
+    content = to_json(build_map_content(replace(page, maps=maps), cells))
     script = "\n".join(map(_file, SCRIPTS))
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    more = "".join(f"<li>{words_html(words)}</li>" for words in page.verdict[1:])
+    more = "".join(f"<li>{render_text_html(words)}</li>" for words in page.findings[1:])
     more = f'<ul class="more">{more}</ul>' if more else ""
     return Template(_file("page.html")).substitute(
         title=attribute_of(page.title),
-        heading=words_html(page.title),
-        lead=words_html(page.lead),
-        verdict="".join(f'<p class="verdict">{words_html(words)}</p>' for words in page.verdict[:1]),
-        answer=first + more * bool(first or not maps) + ranges_html(page.ranges),
+        heading=render_text_html(page.title),
+        lead=render_text_html(page.lead),
+        verdict="".join(f'<p class="verdict">{render_text_html(words)}</p>' for words in page.findings[:1]),
+        answer=first + more * bool(first or not maps) + render_detection_shares(page.detection_shares),
         more=more * bool(maps and not first),
         style=_file("page.css"),
         script_hash=f"sha256-{digest}",
-        tables="\n".join(map(table_html, page.tables)),
+        tables="\n".join(map(render_table, page.tables)),
         map_notes=_notes(notes),
         no_rigs="" if page.rigs else " hidden",
         rigs_heading="Rigs" if len(page.rigs) > 1 else "Rig",
         rigs="\n".join(_rig(rig, page.ego_outline_m, at) for at, rig in enumerate(page.rigs)),
         facts="\n".join(_facts(heading, facts) for heading, facts in page.facts.items()),
-        more_tables="\n".join(map(table_html, page.more_tables)),
+        more_tables="\n".join(map(render_table, page.more_tables)),
         content=content,
         cells=cells.text,
         script=script,
     )
 
 
-def as_json(content: object) -> str:
+def to_json(content: object) -> str:
     r"""JSON that ends no script and opens no comment, whatever its names are.
 
     Example:
-        >>> print(as_json({"rig": "</script>"}))
+        >>> print(to_json({"rig": "</script>"}))
         {"rig":"\u003c/script\u003e"}
     """
     text = json.dumps(content, separators=(",", ":"), allow_nan=False)
@@ -146,11 +152,11 @@ def _file(name: str) -> str:
     return files("torchcover.report.page").joinpath(name).read_text(encoding="utf-8")
 
 
-def table_html(table: PageTable) -> str:
+def render_table(table: PageTable) -> str:
     """A table, with its notes below."""
-    caption = f"<caption>{words_html(table.title)}</caption>" if table.title else ""
-    kinds = ["" if at < table.words_first else "number" for at in range(len(table.headings))]
-    headings = [words_html(heading).replace("_", "_<wbr>").replace("\n", "<br>") for heading in table.headings]
+    caption = f"<caption>{render_text_html(table.title)}</caption>" if table.title else ""
+    kinds = ["" if at < table.num_text_columns else "number" for at in range(len(table.headings))]
+    headings = [render_text_html(heading).replace("_", "_<wbr>").replace("\n", "<br>") for heading in table.headings]
     pairs = zip(kinds, headings, strict=True)
     head = "".join(f'<th scope="col" class="{kind}">{heading}</th>' for kind, heading in pairs)
     rows = "\n".join(f"<tr>{''.join(map(_cell, row, kinds))}</tr>" for row in table.rows)
@@ -161,29 +167,33 @@ def table_html(table: PageTable) -> str:
 def _picture(picture: PagePicture) -> str:
     title, data = picture.title, base64.b64encode(picture.png).decode()
     image = f'<img src="data:image/png;base64,{data}" alt="{attribute_of(title)}">'
-    return f'<figure class="picture">{image}<figcaption>{words_html(title)}</figcaption></figure>'
+    return f'<figure class="picture">{image}<figcaption>{render_text_html(title)}</figcaption></figure>'
 
 
 def _notes(notes: Sequence[str]) -> str:
-    items = "".join(f"<li>{words_html(note)}</li>" for note in notes)
+    items = "".join(f"<li>{render_text_html(note)}</li>" for note in notes)
     return f'<ul class="notes">{items}</ul>' if notes else ""
 
 
-def _cell(cell: Words, kind: str) -> str:
+def _cell(cell: TextCell, kind: str) -> str:
     if not kind:
-        return f'<th scope="row">{words_html(cell.text)}</th>'
-    return f'<td class="{kind} {attribute_of(cell.mark)}">{words_html(cell.text)}</td>'
+        return f'<th scope="row">{render_text_html(cell.text)}</th>'
+    return f'<td class="{kind} {attribute_of(cell.mark)}">{render_text_html(cell.text)}</td>'
 
 
 def _rig(rig: PageRig, ego_outline_m: Array | None, number: int) -> str:
-    drawing = rig_drawing(rig.sensors, ego_outline_m, number) if rig.sensors else ""
-    table = table_html(sensor_table(rig.sensors)) if rig.sensors else "<p>Its sensors are unknown.</p>"
-    document = f"<details><summary>{words_html(rig.name)} as YAML</summary><pre>{escape(rig.document)}</pre></details>"
-    return f'<h3>{words_html(rig.name)}</h3><div class="rig"><div>{drawing}</div><div>{table}</div></div>' + (
+    drawing = render_rig(rig.sensors, ego_outline_m, number) if rig.sensors else ""
+    table = render_table(build_sensor_table(rig.sensors)) if rig.sensors else "<p>Its sensors are unknown.</p>"
+    document = (
+        f"<details><summary>{render_text_html(rig.name)} as YAML</summary><pre>{escape(rig.document)}</pre></details>"
+    )
+    return f'<h3>{render_text_html(rig.name)}</h3><div class="rig"><div>{drawing}</div><div>{table}</div></div>' + (
         document if rig.document else ""
     )
 
 
 def _facts(heading: str, facts: Mapping[str, str]) -> str:
-    each = "".join(f"<dt>{words_html(name)}</dt><dd>{words_html(value)}</dd>" for name, value in facts.items())
-    return f"<h3>{words_html(heading)}</h3><dl>{each}</dl>"
+    each = "".join(
+        f"<dt>{render_text_html(name)}</dt><dd>{render_text_html(value)}</dd>" for name, value in facts.items()
+    )
+    return f"<h3>{render_text_html(heading)}</h3><dl>{each}</dl>"

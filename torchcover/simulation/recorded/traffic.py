@@ -101,7 +101,7 @@ class RecordedTraffic(Traffic):
         """Its keys, what was recorded, and the bodies that may stand for boxes."""
         return {
             **Traffic.content(self.model_copy(update={"path": None})),
-            "objects": self._objects.digest(),
+            "objects": self._objects.compute_digest(),
             "vehicles": builtin_hashes("vehicles"),
         }
 
