@@ -20,8 +20,8 @@ from torchcover import BevGrid, CoverageMetric, forward_regions, nearest
 from torchcover.coverage.quantity import RADIUS, detection, seen_by_two, sensors_seeing
 from torchcover.data import SimulatedFrames
 from torchcover.estimation import ErrorModel, Estimate
-from torchcover.evaluation import CoverageObserver, Settings, TargetError, TargetWatch
-from torchcover.evaluation.task import simulation
+from torchcover.evaluation import CoverageObserver, Settings, TargetError, TargetErrorRule
+from torchcover.evaluation.task import build_simulation_task
 from torchcover.simulation import PaperReference, Rig, SurfaceReference
 
 SCENARIOS = {"urban": 50, "highway": 35}
@@ -108,13 +108,13 @@ def simulated(scenario, cities, seed):
     """(n,) city and (n, P, 1 + V) square metres of each place, and those times each value, of each step."""
     torch.set_num_threads(1)
     steps = STEPS_OF_A_CITY * cities + 1
-    task = simulation(Settings(RIGS, scenario, steps=steps, seed=seed, band_frame="ground"))
-    places = [(region, band) for region in task.asked.regions for band in task.asked.grid.heights.values()]
+    task = build_simulation_task(Settings(RIGS, scenario, num_frames=steps, seed=seed, band_frame="ground"))
+    places = [(region, band) for region in task.query_plan.regions for band in task.query_plan.grid.heights.values()]
     city, sums = [], []
     for index in range(steps):
         frame = task.frames[index]
         points, m2, height = frame.reference.double(), frame.reference_weights.double(), frame.reference_heights_m
-        clouds, most = (frame.clouds[rig] for rig in RIGS), task.asked.grid.diagonal_m
+        clouds, most = (frame.clouds[rig] for rig in RIGS), task.query_plan.grid.diagonal_m
         radii = torch.stack([nearest(frame.reference, cloud, max_distance=most).distance for cloud in clouds])
         radii = radii.double().clamp(max=most)
         seen = radii <= THRESHOLD_M
@@ -123,7 +123,7 @@ def simulated(scenario, cities, seed):
         values = m2 * torch.stack([row.double() for row in (*rows, seen.sum(dim=0), seen.sum(dim=0) >= 2)])
         city.append(frame.place_in_time)
         sums.append([_within(points, height, values, *place) for place in places])
-    names = [f"{region.name} {height}" for region in task.asked.regions for height in task.asked.grid.heights]
+    names = [f"{region.name} {height}" for region in task.query_plan.regions for height in task.query_plan.grid.heights]
     return {"city": np.array(city), "S": np.array(sums), "places": np.array(names)}
 
 
@@ -244,7 +244,7 @@ class Cities:
 
 
 class Replay:
-    """A run that grows, as `TargetWatch` looks at it: its coverage of the regions in front."""
+    """A run that grows, as `TargetErrorRule` looks at it: its coverage of the regions in front."""
 
     def __init__(self, pool, random, most):
         self.pool, self.grid = pool, SimpleNamespace(heights=("ground", "obstacle"))
@@ -253,10 +253,10 @@ class Replay:
 
     def stops(self):
         """After how many steps."""
-        watch = TargetWatch(TargetError(detection=TARGET), {"roof": self}, forward_regions())
+        watch = TargetErrorRule(TargetError(detection=TARGET), {"roof": self}, forward_regions())
         while self.counts["steps"] < self.most:
-            self.counts["steps"] = watch.next_look
-            if watch.is_reached(watch.next_look):
+            self.counts["steps"] = watch.next_check_frame
+            if watch.is_reached(watch.next_check_frame):
                 break
         return self.counts["steps"]
 

@@ -14,7 +14,7 @@ from benchmarks import table
 from torchcover import nearest
 from torchcover.data import RegionsOfInterest, SimulatedFrames, reference_called
 from torchcover.evaluation import CoverageObserver, Settings
-from torchcover.evaluation.measuring import metric_of
+from torchcover.evaluation.measuring import build_metric
 from torchcover.neighbors.warp import wp
 from torchcover.simulation import PaperReference
 from torchcover.simulation.raycaster import RayCaster
@@ -126,7 +126,7 @@ def moved_and_added(observer, frame):
 
 def observer_on(device):
     asked = RegionsOfInterest().around(cell_m=0.25)
-    return CoverageObserver(metric_of(Settings(), asked, square_metres=True).to(device), RIG)
+    return CoverageObserver(build_metric(Settings(), asked, has_area_weights=True).to(device), RIG)
 
 
 def rays(device):

@@ -182,7 +182,7 @@ NOTHING = {
 
 def count_false_alarms(searches):
     space = SearchSpace.model_validate(json.loads(json.dumps(NOTHING)))
-    given = {"evaluations": 6, "worlds": 2, "fresh_worlds": 8, "rays": 4096}
+    given = {"evaluations": 6, "worlds": 2, "num_held_out_scenes": 8, "rays": 4096}
     results = [run_search(PlacementSearch(space, seed=2 * seed, **given)) for seed in range(searches)]
     tests = [result.test for result in results if result.test is not None]
     worse = sum(any(change.is_worse for change in test.side_effects) for test in tests)

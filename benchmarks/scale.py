@@ -28,8 +28,8 @@ from benchmarks import table
 from torchcover.data import RegionsOfInterest, SimulatedFrames, reference_called
 from torchcover.evaluation import CoverageObserver, Settings
 from torchcover.evaluation.checkpoint import write_checkpoint
-from torchcover.evaluation.measuring import metric_of
-from torchcover.evaluation.ranks import packed
+from torchcover.evaluation.measuring import build_metric
+from torchcover.evaluation.ranks import serialize
 from torchcover.simulation import Scenario
 
 RIG, SCENARIO, EVERY_S, STEPS_A_WORLD = "front_roof_128", "urban", 10.0, 6
@@ -99,7 +99,7 @@ def frames_of(steps, *, rays=16_384, rigs=1, scenario=SCENARIO):
 
 def observers_of(frames, cell_m=0.25):
     asked = RegionsOfInterest().around(cell_m=cell_m)
-    return [CoverageObserver(metric_of(Settings(), asked, square_metres=True), name) for name in frames.rigs]
+    return [CoverageObserver(build_metric(Settings(), asked, has_area_weights=True), name) for name in frames.rigs]
 
 
 def times(steps, *, cell_m=0.25, **settings):
@@ -146,7 +146,7 @@ def by_cells(steps):
             taken_s = time.process_time() - begin_s
             size_mb = path.stat().st_size / 1e6
         grid = observer.metric.grid
-        yield cell_m, grid.cells, steps_s / steps, sums_mb, taken_s, size_mb, len(packed(observer)) / 1e6
+        yield cell_m, grid.cells, steps_s / steps, sums_mb, taken_s, size_mb, len(serialize(observer)) / 1e6
 
 
 def by_ranks(steps):
@@ -160,12 +160,12 @@ def by_ranks(steps):
             for number in range(STEPS_A_WORLD):
                 observer.update(replace(seen[(city + number) % steps], place_in_time=city))
             ranks.append(observer)
-        sent_mb = len(packed(ranks[-1])) / 1e6
+        sent_mb = len(serialize(ranks[-1])) / 1e6
         while apart < size:
             pairs_s = []
             for rank in range(0, size, 2 * apart):
                 begin_s = time.process_time()
-                ranks[rank].merge_state(pickle.loads(packed(ranks[rank + apart])))
+                ranks[rank].merge_state(pickle.loads(serialize(ranks[rank + apart])))
                 pairs_s.append(time.process_time() - begin_s)
             took_s, apart = took_s + max(pairs_s), 2 * apart
         yield size, sent_mb, took_s

@@ -89,7 +89,7 @@ def main():
         "courtyard", rigs=rigs, steps=options.steps, seed=0, reference_sensor=PaperReference(rows=512, columns=512)
     )
     observers = {name: CoverageObserver(CoverageMetric(GRID, max_radius=GRID.diagonal_m), name) for name in rigs}
-    observe(frames, observers.values(), progress=True)
+    observe(frames, observers.values(), show_progress=True)
     coverages = {name: observer.compute() for name, observer in observers.items()}
     console = Console()
     print_table(CoverageTable.from_coverages(coverages, REGIONS), console)

@@ -19,7 +19,7 @@ from torch.distributed import HashStore
 from tests.files import apart_readers
 from torchcover.data import Frame
 from torchcover.evaluation import observe
-from torchcover.evaluation.heartbeat import Heartbeat, HeartbeatParams, reporting_silent_ranks
+from torchcover.evaluation.heartbeat import Heartbeat, HeartbeatParams, report_silent_ranks
 from torchcover.files import end_with_parent, isolated, reporting_stopped
 from torchcover.simulation.sumo import simulating
 
@@ -116,7 +116,7 @@ def test_what_makes_frames_ends_though_it_is_in_the_middle_of_one(alive):
             alive.hold()
             return Frame({"a": torch.zeros(1, 3)}, torch.zeros(1, 3), index, "f")
 
-    is_killed(lambda: observe(Drive(), [], workers=2), alive, children=2)
+    is_killed(lambda: observe(Drive(), [], num_workers=2), alive, children=2)
     assert alive.has_ended(within_s=LIVES_S / 3)
 
 
@@ -159,7 +159,7 @@ class StoppingDrive:
 
 
 def test_a_stopped_worker_is_reported_and_the_run_goes_on_with_it(stopped):
-    assert observe(StoppingDrive(), [], workers=2).steps == 4
+    assert observe(StoppingDrive(), [], num_workers=2).num_frames == 4
     assert [message.split(" (process ")[0] for message in stopped] == ["a worker"]
 
 
@@ -167,7 +167,7 @@ def test_a_run_with_a_stopped_worker_can_be_ended(stopped, monkeypatch):
     end = lambda message, *_, **__: (stopped.append(message), os.kill(os.getpid(), signal.SIGINT))  # noqa: E731
     monkeypatch.setattr("torchcover.files.processes.warnings.warn", end)
     with pytest.raises(KeyboardInterrupt):
-        observe(StoppingDrive(), [], workers=2)
+        observe(StoppingDrive(), [], num_workers=2)
     gc.collect()
     assert len(stopped) == 1
     assert active_children() == []
@@ -194,10 +194,10 @@ def test_a_stopped_reader_is_reported_and_ends_after_its_time(stopped, tmp_path,
 
 @pytest.mark.parametrize("pause_s", [0.0, 1.0])
 def test_a_rank_without_signs_of_life_is_reported_once(monkeypatch, pause_s):
-    reported, params, store = [], HeartbeatParams(every_s=0.05, silent_s=0.5), HashStore()
+    reported, params, store = [], HeartbeatParams(interval_s=0.05, timeout_s=0.5), HashStore()
     monkeypatch.setattr("torchcover.evaluation.heartbeat.warnings.warn", lambda words, *_, **__: reported.append(words))
     silent = Heartbeat(store, 1, 3, params)  # sends nothing
-    with reporting_silent_ranks(store, 0, 3, params), reporting_silent_ranks(store, 2, 3, params):
+    with report_silent_ranks(store, 0, 3, params), report_silent_ranks(store, 2, 3, params):
         time.sleep(0.2 + pause_s)
     assert sorted(words[:6] for words in reported) == ["rank 1"] * (2 if pause_s else 0)
     assert silent.find_silent(time.monotonic() + 9.0) == [0]  # the store, which rank 0 keeps, has not answered

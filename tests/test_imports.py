@@ -141,7 +141,7 @@ def test_the_public_names_are_those_of_the_contract():
         "BevGrid", "Camera", "Coverage", "CoverageMetric", "Region", "RegionsOfInterest", "Rig", "Scenario",
         "blind_spot_radius", "cameras", "check", "compare", "coverage", "data", "detection", "estimation", "evaluate",
         "encounter", "encounters", "evaluation", "forward_regions", "geometry", "metrics",
-        "nearest", "neighbors", "placement", "report", "simulation", "survey_target", "targets", "training",
+        "nearest", "neighbors", "placement", "report", "simulation", "map_target_visibility", "targets", "training",
     }  # fmt: skip
     assert torchcover.__all__ == sorted(torchcover.__all__)
 

@@ -21,9 +21,9 @@ from .coverage import Region as Region
 from .coverage import forward_regions as forward_regions
 from .evaluation import check as check
 from .evaluation import compare as compare
-from .evaluation import encounter as encounter
 from .evaluation import evaluate as evaluate
-from .evaluation import survey_target as survey_target
+from .evaluation import evaluate_encounters as evaluate_encounters
+from .evaluation import map_target_visibility as map_target_visibility
 from .neighbors import blind_spot_radius as blind_spot_radius
 from .neighbors import nearest as nearest
 from .simulation import RegionsOfInterest as RegionsOfInterest

@@ -6,7 +6,7 @@ from rich.console import Console
 from examples.paper.four_views import draw_four_views
 from examples.paper.measuring import Measurement
 from torchcover import BevGrid, Region
-from torchcover.evaluation import sensor_views
+from torchcover.evaluation import build_sensor_views
 from torchcover.report import RENDERERS, CoverageTable, plot_maps, print_table, write_figures
 
 RIG = "three_cameras"
@@ -25,7 +25,7 @@ def run(options):
     measurement = Measurement({RIG: RIG}, GRID, REGIONS, options)
     points = PointCount()
     coverages = measurement.run(range(options.steps), blocks=BLOCKS, also=[points])
-    views = sensor_views(measurement.frames.sensors[RIG])
+    views = build_sensor_views(measurement.frames.sensors[RIG])
     texts = []
     for (_, measure), coverage in coverages.items():
         table = CoverageTable.from_coverages({RIG: coverage}, REGIONS)

@@ -7,7 +7,7 @@ from examples.paper.measuring import Measurement
 from examples.paper.pieces import check_conditions, load_merged, save_piece
 from examples.paper.published import LIDARS
 from torchcover import BevGrid, Region, forward_regions
-from torchcover.evaluation import sensor_views
+from torchcover.evaluation import build_sensor_views
 from torchcover.report import plot_maps, write_figures
 
 MEASURES = ("known", "area")
@@ -39,7 +39,7 @@ def run(options):
     (options.out / "tables.json").write_text(json.dumps(records, indent=2) + "\n", encoding="utf-8")
     for rigs in sets.values():
         coverages = {rigs[lidar]: load_merged(pieces, rigs[lidar], "known") for lidar in MAPPED}
-        sensors = {rig: sensor_views(measurement.frames.sensors[rig]) for rig in coverages}
+        sensors = {rig: build_sensor_views(measurement.frames.sensors[rig]) for rig in coverages}
         figures = plot_maps(coverages, ego_outline_m=measurement.frames.ego_outline_m, sensors=sensors)
         write_figures(figures, options.out / "maps" / "_".join(coverages).replace("/", "-"))
 

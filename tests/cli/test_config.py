@@ -7,13 +7,13 @@ import typer
 
 from torchcover.cli.app import app
 from torchcover.data import RecordingSettings, open_recording
-from torchcover.evaluation.config import EvaluateConfig, load_config, write_defaults
+from torchcover.evaluation.config import EvaluateConfig, format_defaults, load_config
 from torchcover.files import BadFileError, parse_yaml
 from torchcover.simulation.documents import KINDS, SETTINGS_KIND
 
 
 def test_the_written_defaults_are_all_settings_with_a_comment_each(tmp_path):
-    text = write_defaults()
+    text = format_defaults()
     (tmp_path / "run.yaml").write_text(text)
     assert load_config(tmp_path / "run.yaml").config == EvaluateConfig()
     assert list(parse_yaml(text)) == list(EvaluateConfig.model_fields)
@@ -30,7 +30,7 @@ def test_an_option_wins_over_set_which_wins_over_the_file_and_both_are_recorded(
     path = tmp_path / "run.yaml"
     path.write_text("rays: 1\ncell_m: 1.0\nseed: 1\nrecording: {units: mm, lag_s: 0.2}\n")
     config, record = load_config(path, ["rays=2", "cell_m=2", "recording.units=cm"], {"rays": 3})
-    assert (config.rays, config.cell_m, config.seed) == (3, 2.0, 1)
+    assert (config.num_rays, config.cell_m, config.seed) == (3, 2.0, 1)
     assert (config.recording.units, config.recording.time_offset_s) == ("cm", 0.2)
     assert record["file"] == str(path)
     assert record["settings"]["rays"] == 1
@@ -41,7 +41,7 @@ def test_an_option_wins_over_set_which_wins_over_the_file_and_both_are_recorded(
         None, ["aggregations=[maximum, 'quantiles:0.5,0.9']", "probe=child,pole", "thresholds_m=1,2"]
     ).config
     assert lists.aggregations == ("maximum", "quantiles:0.5,0.9")
-    assert (lists.probe, lists.thresholds_m) == (("child", "pole"), (1.0, 2.0))
+    assert (lists.test_targets, lists.thresholds_m) == (("child", "pole"), (1.0, 2.0))
 
 
 @pytest.mark.parametrize(
@@ -87,7 +87,7 @@ def test_a_run_reads_a_file_and_its_result_has_it(torchcover, worlds):
     assert summary["config"]["settings"]["cell_m"] == 4
     assert summary["config"]["replaced"]["steps"] == {"file": 3, "option": 2}
     code, printed, _ = torchcover("config")
-    assert (code, printed) == (0, write_defaults())
+    assert (code, printed) == (0, format_defaults())
 
 
 def test_a_recording_says_how_to_read_it_and_settings_win(tmp_path):

@@ -8,7 +8,7 @@ import pytest
 
 from tests.placement.surfaces import Surface
 from torchcover.cli import search_run
-from torchcover.cli.commands import parsed_budget
+from torchcover.cli.commands import parse_budget_s
 from torchcover.placement import SearchPlan
 
 CHOICE = Path(__file__).parents[2] / "examples" / "placement" / "robot_corners.yaml"
@@ -89,7 +89,7 @@ def test_a_choice_has_no_budget(torchcover, tmp_path, options):
 
 
 def test_times():
-    assert [parsed_budget(text) for text in ("10s", "30min", "2h", "0.5 h")] == [10, 1800, 7200, 1800]
+    assert [parse_budget_s(text) for text in ("10s", "30min", "2h", "0.5 h")] == [10, 1800, 7200, 1800]
 
 
 def test_a_search_without_optuna_is_one_line(torchcover, space, tmp_path, monkeypatch):

@@ -9,8 +9,8 @@ from matplotlib.image import imread
 from PIL import Image
 
 from torchcover.cli import show
-from torchcover.evaluation import scene_pictures, sensor_views
-from torchcover.evaluation.task import as_called, distinct_names
+from torchcover.evaluation import build_sensor_views, scene_pictures
+from torchcover.evaluation.task import load_named_rig, make_rig_names
 from torchcover.simulation import Rig, Scenario, builtin_names
 
 
@@ -224,7 +224,7 @@ def test_a_world_is_built_once(torchcover, worlds, monkeypatch, arguments):
 
 @pytest.mark.parametrize("name", builtin_names("rigs"))
 def test_every_built_in_rig_has_fields_of_view_within_bounds(name):
-    for sensor in sensor_views(Rig.load(name).sensors):
+    for sensor in build_sensor_views(Rig.load(name).sensors):
         low, high = sensor.vertical_fov_deg
         assert -90 <= low < high <= 90
         assert 0 < sensor.horizontal_fov_deg <= 360
@@ -308,7 +308,7 @@ def test_a_warning_is_one_line_on_stderr_and_said_once(torchcover, worlds):
 def test_a_rig_has_its_own_name_in_every_command_whatever_its_file_is_called(worlds):
     (worlds / "renamed.yaml").write_text((worlds / "both.yaml").read_text())
     name = Rig.load(worlds / "both.yaml").name
-    assert [as_called(worlds / "renamed.yaml").name] == distinct_names([worlds / "renamed.yaml"]) == [name]
+    assert [load_named_rig(worlds / "renamed.yaml").name] == make_rig_names([worlds / "renamed.yaml"]) == [name]
 
 
 def test_it_prints_where_the_numbers_of_a_rig_come_from(torchcover, tmp_path):

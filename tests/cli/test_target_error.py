@@ -48,7 +48,7 @@ def test_a_target_beyond_the_steps_ends_the_run_as_ever_and_says_what_it_would_t
     assert "20m ground, radius_m of" in printed
     target = json.loads((tmp_path / "out" / "summary.json").read_text())["target_error"]
     assert target["reached"] is False
-    assert 1_000 < target["steps_needed"] < 1_000_000
+    assert 1_000 < target["frames_needed"] < 1_000_000
     assert Coverage.load(tmp_path / "out" / "coverage.npz").counts["steps"] == 40
 
 

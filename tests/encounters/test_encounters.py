@@ -12,7 +12,7 @@ from matplotlib.text import Text
 from tests.targets.worlds import EGO, FLOOR, lidar, on_target
 from torchcover.encounters import Criterion, Encounter, EncounterSet, Staged, sight_encounter
 from torchcover.encounters.sighting import NEVER, Looks, MountedRig, channels, first_run, look_steps
-from torchcover.evaluation import encounter, encounter_film, free_space
+from torchcover.evaluation import build_flat_ground, evaluate_encounters, plot_encounter_animation
 from torchcover.geometry import euler_from_rotation, overlapping
 from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, with_ego
 from torchcover.simulation.bodies import called
@@ -37,7 +37,7 @@ def rig(*sensors):
 
 
 def mounted(*sensors):
-    world = free_space().model_copy(update={"ego": Scenario.model_validate(
+    world = build_flat_ground().model_copy(update={"ego": Scenario.model_validate(
         {"name": "s", "ego": EGO, "bodies": [FLOOR]}).ego})  # fmt: skip
     return MountedRig(rig(*sensors), with_ego(world, {}))
 
@@ -297,7 +297,7 @@ def test_lists_are_combined_and_ranges_drawn_evenly_for_each_combination():
 def test_rows_are_of_speeds_with_intervals_over_draws():
     these = EncounterSet.model_validate({"name": "s", "draws": 8, "encounters": [FAMILY | {"obstacles": []}]})
     two = rig(high("ahead"), high("top", columns=40))
-    found = encounter([two], these, Criterion(points=3), phases=3, vehicle="suv")
+    found = evaluate_encounters([two], these, Criterion(points=3), num_start_offsets=3, vehicle="suv")
     rows = found.rows
     assert [(row.speed_kmh, row.draws, row.first) for row in rows] == [(20, 8, "ahead"), (40, 8, "ahead")]
     for row in rows:
@@ -323,19 +323,21 @@ def test_in_time_up_to_a_speed_is_in_time_at_all_that_are_slower():
         {"name": "s", "encounters": [FAMILY | {"ego": {"speed_kmh": [50, 10, 30]}, "obstacles": [], "other":
          {"body": "child_120cm", "speed_kmh": 5, "from_m": 1.5}}]}
     )  # fmt: skip
-    partly = encounter(rig(high("ahead")), these, phases=5)
+    partly = evaluate_encounters(rig(high("ahead")), these, num_start_offsets=5)
     ttc_s = np.sort(partly.sightings[0].ttc_s)
     between = Criterion(deceleration_mps2=50 / 3.6 / 2 / (ttc_s[2] - 0.1), latency_s=0.1)
-    found = encounter(rig(high("ahead")), these, between, phases=5)
+    found = evaluate_encounters(rig(high("ahead")), these, between, num_start_offsets=5)
     assert [row.in_time for row in found.rows][-1] == 0.6
     assert list(found.up_to_kmh().values()) == [30.0]
     for brakes, expected, words in ((1e6, 50.0, "50"), (1.0, math.nan, "none")):
-        found = encounter(rig(high("ahead")), these, Criterion(deceleration_mps2=brakes, latency_s=0.1), phases=5)
+        found = evaluate_encounters(
+            rig(high("ahead")), these, Criterion(deceleration_mps2=brakes, latency_s=0.1), num_start_offsets=5
+        )
         assert list(found.up_to_kmh().values()) == pytest.approx([expected], nan_ok=True)
         assert found.tables()[0].rows[0][1].text == words
     standing = [crossing(float(kmh), {"from_m": 3}) for kmh in (-50, 0, -20)]
     both = EncounterSet(name="s", encounters=tuple(standing))
-    found = encounter(rig(high("ahead")), both, Criterion(deceleration_mps2=1.0), phases=2)
+    found = evaluate_encounters(rig(high("ahead")), both, Criterion(deceleration_mps2=1.0), num_start_offsets=2)
     assert (list(found.up_to_kmh().values()), found.tables()[0].rows[0][1].text) == ([0.0], "0")
     assert [row.speed_kmh for row in found.rows] == [0, -20, -50]
 
@@ -346,7 +348,14 @@ def test_a_film_shows_where_everybody_is_and_what_is_on_the_other():
         {"name": "s", "encounters": [FAMILY | {"ego": {"speed_kmh": [20, 90]}, "other": other}]}
     )
     two = rig(high("ahead"), high("top", columns=40))
-    pictures = list(islice(encounter_film(two, encounter([two], these, phases=2, vehicle="suv"), vehicle="suv"), 2))
+    pictures = list(
+        islice(
+            plot_encounter_animation(
+                two, evaluate_encounters([two], these, num_start_offsets=2, vehicle="suv"), vehicle="suv"
+            ),
+            2,
+        )
+    )
     picture, (axes,) = pictures[0], pictures[0].axes
     child, parked, ego = (patch.get_xy() for patch in axes.patches)
     for (low_m, high_m), of_axis in zip((axes.get_xlim(), axes.get_ylim()), range(2), strict=True):
@@ -395,7 +404,7 @@ def test_a_family_that_makes_no_sense_is_told_once(keys, told, tmp_path):
     path = tmp_path / "set.yaml"
     path.write_text(yaml.safe_dump({"name": "s", "encounters": [family]}))
     with pytest.raises((ValueError, FileNotFoundError), match=told) as failure:
-        encounter(rig(high("top")), path, phases=1)
+        evaluate_encounters(rig(high("top")), path, num_start_offsets=1)
     assert len(str(failure.value)) < 1000
 
 
@@ -430,4 +439,4 @@ def test_mistakes_of_the_last_encounter_are_told_before_the_first_look(monkeypat
     monkeypatch.setattr(MountedRig, "mounted", None)
     both = crossing(), crossing(36, {"at_width": 3.0, "yaw_deg": 0, "from_m": 4})
     with pytest.raises(ValueError, match="never touch"):
-        encounter(rig(), EncounterSet(name="s", encounters=both))
+        evaluate_encounters(rig(), EncounterSet(name="s", encounters=both))

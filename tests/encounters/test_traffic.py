@@ -15,7 +15,7 @@ from torchcover.detection import Boxes
 from torchcover.encounters import Criterion, Sightings
 from torchcover.encounters.sighting import NEVER
 from torchcover.encounters.traffic import Approach, Drive, Eyes, Watch, approaches, sight_approach
-from torchcover.evaluation import met_in_recording, met_in_traffic
+from torchcover.evaluation import evaluate_recorded_encounters, evaluate_traffic_encounters
 from torchcover.geometry import BoundingBox, rigid
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings import open_recording
@@ -231,7 +231,9 @@ def test_the_nearest_time_until_detection_counts_though_it_grew_again(seen_from,
 
 def test_who_is_hidden_until_braking_is_needed_is_too_late(scenario):
     soft, hard = (
-        met_in_traffic([rig(TOP)], scenario, Criterion(points=4, deceleration_mps2=brakes, latency_s=0.3), worlds=9)
+        evaluate_traffic_encounters(
+            [rig(TOP)], scenario, Criterion(points=4, deceleration_mps2=brakes, latency_s=0.3), num_scenes=9
+        )
         for brakes in (1.5, 4.0)
     )
     child = {name: next(row for row in found.rows if row.encounter == "on foot") for name, found in
@@ -251,7 +253,10 @@ def test_a_recording_of_a_world_says_the_same(scenario, tmp_path):
         scenario, rig(TOP), steps=31, boxes=True, reference_sensor=PaperReference(rows=2, columns=2)
     )
     write_recording(frames, tmp_path / "drive")
-    found, expected = met_in_recording(tmp_path / "drive"), met_in_traffic([rig(TOP)], scenario)
+    found, expected = (
+        evaluate_recorded_encounters(tmp_path / "drive"),
+        evaluate_traffic_encounters([rig(TOP)], scenario),
+    )
     assert [one.encounter.track.name for one in found.sightings] == ["child", "faster"]
     for one, other in zip(found.sightings, expected.sightings, strict=True):
         assert one.encounter.ttc_s == pytest.approx(other.encounter.ttc_s, abs=1e-5)
@@ -284,7 +289,7 @@ class Closing(SyntheticDrive):
 @pytest.mark.parametrize("layout", ["kitti_raw", "nuscenes", "argoverse2"])
 def test_real_road_users_are_first_hit_as_their_layout_says(layout, tmp_path):
     recording = open_recording(LAYOUTS[layout](Closing(steps=15), tmp_path))
-    (one,) = met_in_recording(recording).sightings
+    (one,) = evaluate_recorded_encounters(recording).sightings
     gap_m = 50.0 - CAR_SIZE_M[0] / 2 - recording.ego_box.upper_m[0]
     assert one.encounter.name == "cars and vans"
     assert one.encounter.ttc_s[0] == pytest.approx((gap_m - one.encounter.step) / 10, abs=0.02)
@@ -302,22 +307,22 @@ def test_parked_vehicles_are_not_met_and_people_who_stand_are(category, met):
             box = super().read_boxes(index)
             return Boxes.from_rows(box.rows, ids=box.ids, categories=(category,))
 
-    found = met_in_recording(Standing(steps=15, body=BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))))
+    found = evaluate_recorded_encounters(Standing(steps=15, body=BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))))
     assert len(found.sightings) == met
 
 
 def test_what_cannot_be_asked_is_told(tmp_path):
     with pytest.raises(ValueError, match="nothing ever moves in it"):
-        met_in_traffic([rig()], world())
+        evaluate_traffic_encounters([rig()], world())
     with pytest.raises(ValueError, match="worlds: a number >= 1"):
-        met_in_traffic([rig()], worlds=0)
+        evaluate_traffic_encounters([rig()], num_scenes=0)
     with pytest.raises(ValueError, match="how large its vehicle is"):
-        met_in_recording(Closing(steps=5))
+        evaluate_recorded_encounters(Closing(steps=5))
     with pytest.raises(ValueError, match="none of its 1 objects is a road user, by their categories"):
-        met_in_recording(open_recording(LAYOUTS["folder"](Closing(steps=5), tmp_path)))
+        evaluate_recorded_encounters(open_recording(LAYOUTS["folder"](Closing(steps=5), tmp_path)))
     way = drive(tmp_path, (0, 0, 0, 0), (1, 9, 0, 0))
     alone = world(ego={"shape": CAR, "trajectory": str(way)}, duration_s=1.0)
-    far = met_in_traffic([rig(TOP)], alone)
+    far = evaluate_traffic_encounters([rig(TOP)], alone)
     assert [(row.encounter, row.draws, row.ttc_s_high) for row in far.rows] == [("all", 0, 0.0)]
     (table,) = far.tables()
     assert table.rows[0][3].text == "-"

@@ -93,14 +93,14 @@ def test_workers_and_checkpoints_change_no_bit(both, tmp_path):
 
 def test_a_mixture_is_the_weighted_mean(both):
     other = evaluate(RIGS, yard("other"), **{**SMALL, "seed": 1})
-    mixed = MixedResult.of({"yard": both, "other": other}, {"yard": 0.75, "other": 0.25})
+    mixed = MixedResult.from_results({"yard": both, "other": other}, {"yard": 0.75, "other": 0.25})
     for row, first, second in zip(of_bodies(mixed), of_bodies(both), of_bodies(other), strict=True):
         value = 0.75 * first["places_5_points"] + 0.25 * second["places_5_points"]
         assert row["places_5_points"] == pytest.approx(value)
         assert row["known_cells"] == first["known_cells"] + second["known_cells"]
     without = evaluate(RIGS, yard("other"), **{**SMALL, "steps": 1, "probe": "none"})
     with pytest.raises(ValueError, match="other bodies"):
-        _ = MixedResult.of({"yard": both, "other": without}, {"yard": 0.75, "other": 0.25})
+        _ = MixedResult.from_results({"yard": both, "other": without}, {"yard": 0.75, "other": 0.25})
 
 
 def test_who_asks_about_other_regions_asks_for_bodies_by_name_or_has_none():

@@ -123,7 +123,7 @@ def test_it_goes_on_after_ctrl_c_to_the_same_bits(frame_of, path, workers):
     for at in (0, 9, STEPS - 1):  # one run: it goes on twice
         part = cut_short(Drive(frame_of, {7}), path, seen=Seen(at, press), skip_bad_frames=True, workers=workers)
         assert isinstance(part.run.failure, KeyboardInterrupt)
-        assert len(part.observed["seen"]) == part.run.steps == at + 1 - (at > 7)
+        assert len(part.observer_results["seen"]) == part.run.num_frames == at + 1 - (at > 7)
     assert bits(measured(Drive(frame_of, {7}), path, skip_bad_frames=True)) == whole
 
 
@@ -164,8 +164,8 @@ def test_looks_at_a_target_error_go_on_as_they_would_have(frame_of, path, monkey
     monkeypatch.setattr("torchcover.evaluation.target_error.MIN_STEPS", 8)
     target = {"target_error": "0.2m", "thresholds_m": ()}
     whole = measured(Drive(frame_of), **target)
-    assert 8 < whole.run.steps < STEPS
-    for at in range(6, whole.run.steps - 1):
+    assert 8 < whole.run.num_frames < STEPS
+    for at in range(6, whole.run.num_frames - 1):
         cut_short(Drive(frame_of), path, seen=Seen(at, press), **target)
     assert bits(measured(Drive(frame_of), path, **target)) == bits(whole)
     assert bits(measured(Drive(frame_of, range(STEPS)), path, **target)) == bits(whole)
@@ -184,7 +184,7 @@ def test_it_is_written_every_minute_and_more_seldom_where_that_took_a_twentieth_
 
     monkeypatch.setattr(checkpoint, "time", SimpleNamespace(monotonic=lambda: now_s))
     monkeypatch.setattr(checkpoint, "write_checkpoint", write)
-    journal = checkpoint.Journal(Checkpoint(tmp_path / "a.npz"), {}, {})
+    journal = checkpoint.CheckpointManager(Checkpoint(tmp_path / "a.npz"), {}, {})
     run = SimpleNamespace(steps=1, counts=Counter(), skipped=[], seconds=0.0)
     while now_s < 1800.0:
         now_s += 1.0
@@ -228,7 +228,7 @@ def test_all_options_decide_about_a_run_but_those_that_it_names():
 def test_without_resume_it_starts_anew(frame_of, path):
     measured(Drive(frame_of), path, steps=3)
     result = measured(Drive(frame_of, content="other"), Checkpoint(path, resume=False), steps=2)
-    assert (result.run.steps, read_header(path)["run"]["steps"]) == (2, 2)
+    assert (result.run.num_frames, read_header(path)["run"]["steps"]) == (2, 2)
 
 
 def test_skipped_frames_are_not_forgotten(frame_of, path):
@@ -248,7 +248,7 @@ def test_a_full_disk_is_told_of_once_and_the_run_goes_on(frame_of, path, monkeyp
         with pytest.warns(UserWarning, match="no checkpoint was written .*No space left.*; the run goes on") as told:
             result = measured(Drive(frame_of), path, steps=9)
     assert len(told) == 1
-    assert (result.run.complete, bits(result)) == (True, bits(measured(Drive(frame_of), steps=9)))
+    assert (result.run.is_complete, bits(result)) == (True, bits(measured(Drive(frame_of), steps=9)))
     assert read_header(path)["run"]["steps"] == 3
     assert [file.name for file in path.parent.iterdir()] == [path.name]
     assert bits(measured(Drive(frame_of), path)) == bits(measured(Drive(frame_of)))

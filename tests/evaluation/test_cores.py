@@ -12,7 +12,7 @@ import torch
 from torchcover.data import SimulatedFrames
 from torchcover.evaluation import cores as module
 from torchcover.evaluation import evaluate, measuring
-from torchcover.evaluation.cores import cores, set_threads, usual_workers, warn_of_spinning
+from torchcover.evaluation.cores import compute_num_workers, count_cores, set_threads, warn_about_spinning
 
 SAID = (*module.WAITING, "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
@@ -47,7 +47,7 @@ def test_a_container_has_the_cores_that_it_is_given(tmp_path, monkeypatch, files
         (tmp_path / name).write_text(text)
     monkeypatch.setattr(module, "CPU_QUOTAS", ((tmp_path / "max",), (tmp_path / "quota", tmp_path / "period")))
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
-    assert cores() == expected
+    assert count_cores() == expected
 
 
 @pytest.mark.parametrize("said", [{}, {"OMP_NUM_THREADS": "7"}, *({name: "active"} for name in module.WAITING)])
@@ -58,7 +58,7 @@ def test_the_command_line_says_what_the_environment_does_not(nothing_said, said)
     assert {name: os.environ[name] for name in said} == said
     assert ("OMP_WAIT_POLICY" in os.environ) == ("GOMP_SPINCOUNT" not in said and "KMP_BLOCKTIME" not in said)
     assert os.environ["OPENBLAS_NUM_THREADS"] == "1"
-    assert os.environ["OMP_NUM_THREADS"] == said.get("OMP_NUM_THREADS", str(cores()))
+    assert os.environ["OMP_NUM_THREADS"] == said.get("OMP_NUM_THREADS", str(count_cores()))
 
 
 def test_it_is_said_before_torch_and_numpy_are_loaded():
@@ -74,11 +74,11 @@ def test_it_is_said_before_torch_and_numpy_are_loaded():
 
 def test_who_lets_threads_spin_is_told_once(nothing_said):
     with pytest.warns(UserWarning, match="OMP_WAIT_POLICY") as said:
-        warn_of_spinning(2)
+        warn_about_spinning(2)
     assert said[0].filename == __file__
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warn_of_spinning(2)
+        warn_about_spinning(2)
 
 
 def test_it_points_at_the_line_of_the_user(nothing_said, monkeypatch):
@@ -94,7 +94,7 @@ def test_who_does_not_is_told_nothing(nothing_said, said):
         nothing_said.setenv(said, "0")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warn_of_spinning(2 if said else 1)
+        warn_about_spinning(2 if said else 1)
 
 
 @pytest.mark.parametrize(
@@ -113,9 +113,9 @@ def test_workers_are_as_many_as_have_something_to_do(monkeypatch, count, frames,
     monkeypatch.setattr(module, "cores", lambda: count)
     monkeypatch.setattr(multiprocessing, "get_start_method", lambda allow_none: "fork")
     monkeypatch.setattr(module, "machine_bytes", lambda: 1e12)
-    assert usual_workers(frames, worlds, whole=False) == expected
+    assert compute_num_workers(frames, worlds, sends_frames=False) == expected
     monkeypatch.setattr(multiprocessing, "get_start_method", lambda allow_none: "spawn")
-    assert usual_workers(frames, worlds, whole=False) == 0
+    assert compute_num_workers(frames, worlds, sends_frames=False) == 0
 
 
 def test_workers_need_memory_and_room_for_frames_that_they_hand_over(monkeypatch, tmp_path):
@@ -132,7 +132,7 @@ def test_workers_need_memory_and_room_for_frames_that_they_hand_over(monkeypatch
     ):
         monkeypatch.setattr(module, "machine_bytes", lambda memory=memory: memory)
         monkeypatch.setattr(os, "statvfs", lambda _, room=room: os.statvfs_result([1] * 4 + [int(room)] + [1] * 5))
-        assert usual_workers(64, 64, whole=whole) == expected
+        assert compute_num_workers(64, 64, sends_frames=whole) == expected
 
 
 def test_a_simulation_has_the_usual_workers_and_frames_of_others_none(monkeypatch):
@@ -148,7 +148,7 @@ def test_a_simulation_has_the_usual_workers_and_frames_of_others_none(monkeypatc
 
     asked = []
     monkeypatch.setattr(measuring, "observe", observe)
-    monkeypatch.setattr(measuring, "usual_workers", usual)
+    monkeypatch.setattr(measuring, "compute_num_workers", usual)
     frames = SimulatedFrames("urban", "front_roof_32", steps=64)
     for given, expected in (
         ({"scenario": "urban", "steps": 64}, 2),

@@ -76,9 +76,9 @@ def test_the_random_states_and_the_default_device_of_the_user_are_neither_used_n
 
 def test_one_rig(tmp_path):
     result = torchcover.evaluate("front_roof_32", observers={"points": PointCount()}, **SMALL)
-    assert result.observed["points"] > 1000
+    assert result.observer_results["points"] > 1000
     assert result.coverage is result.coverages["front_roof_32"]
-    assert result.coverage.counts["steps"] == result.run.steps == 2
+    assert result.coverage.counts["steps"] == result.run.num_frames == 2
     # Of the near field, two sides hold a centre of such large cells, and of that the ground is asked about.
     places = [(row["region"], row["height"]) for row in result.summary]
     assert places[:6:2] == [("20m", "ground"), ("80m", "ground"), ("160m", "ground")]
@@ -86,7 +86,7 @@ def test_one_rig(tmp_path):
     assert places[8:] == [(f"{side}_3m", "pole_100cm") for side in ("front", "rear", "left", "right")]
     assert "front_roof_32: 2 steps" in repr(result)
     assert "mean blind spot" in str(result)
-    stem, figure = next(iter(result.maps()))
+    stem, figure = next(iter(result.plot_maps()))
     assert (stem, isinstance(figure, Figure)) == ("radius_area_m_ground", True)
     files = result.save(tmp_path / "new" / "out")
     assert files[-1].name == "summary.json"
@@ -126,7 +126,7 @@ def test_no_world_is_built_after_the_run_to_draw_the_ego(monkeypatch):
     built, build = [], Scenario.world
     monkeypatch.setattr(Scenario, "world", lambda *args: built.append(args) or build(*args))
     result = torchcover.evaluate("front_roof_32", **SMALL)
-    next(iter(result.maps()))
+    next(iter(result.plot_maps()))
     assert len(built) == 1
 
 
@@ -136,7 +136,7 @@ def test_any_source_of_frames_will_do():
     assert both.record["frames"] == "made up"
     assert both.record["reference"] is None
     one = torchcover.evaluate("high", frames=Source(), cell_m=4.0, steps=2)
-    assert one.run.steps == 2
+    assert one.run.num_frames == 2
     assert torch.equal(one.coverage.radius.nan_to_num(-1.0), both.coverages["high"].radius.nan_to_num(-1.0))
     with pytest.raises(ValueError, match=r"no clouds of the rig middle; the frames have low, high"):
         torchcover.evaluate(["low", "middle"], frames=Source())
@@ -146,8 +146,8 @@ def test_any_source_of_frames_will_do():
 
 def test_a_target_error_is_an_object_here():
     result = torchcover.evaluate(frames=Single(), cell_m=4.0, target_error=TargetError(radius_m=10.0))
-    assert result.run.steps == math.ceil(MIN_GROWTH * MIN_STEPS)  # the second look
-    assert result.target_lines[0] == f"Target error reached after {result.run.steps} steps."
+    assert result.run.num_frames == math.ceil(MIN_GROWTH * MIN_STEPS)  # the second look
+    assert result.target_error_lines[0] == f"Target error reached after {result.run.num_frames} steps."
 
 
 class Single(Source):
@@ -223,11 +223,11 @@ class Rigs:
 
 def test_observers_see_the_rigs_that_are_measured_under_their_names():
     one = torchcover.evaluate("high", frames=Source(), cell_m=4.0, observers={"rigs": Rigs()})
-    assert one.observed["rigs"] == {("high",)}
+    assert one.observer_results["rigs"] == {("high",)}
     named = torchcover.evaluate("kitti", frames=Single(), cell_m=4.0, steps=2, observers={"rigs": Rigs()})
-    assert named.observed["rigs"] == {("kitti",)}
+    assert named.observer_results["rigs"] == {("kitti",)}
     both = torchcover.evaluate(["high", "low"], frames=Source(), cell_m=4.0, observers={"rigs": Rigs()})
-    assert both.observed["rigs"] == {("high", "low")}
+    assert both.observer_results["rigs"] == {("high", "low")}
 
 
 def test_a_rig_may_be_called_what_no_file_can_be(tmp_path):
@@ -292,9 +292,9 @@ def test_results_are_compared_as_if_they_had_been_measured_together():
 
 def test_a_gpu_casts_rays_if_warp_is_there_and_no_workers_are_asked_for(monkeypatch):
     def device(given, **settings):
-        return task.casting_device(Settings("front_roof_32", device=given, **settings))
+        return task.find_ray_device(Settings("front_roof_32", device=given, **settings))
 
-    monkeypatch.setattr(task, "usable_device", torch.device)
+    monkeypatch.setattr(task, "get_device", torch.device)
     monkeypatch.setattr(task, "find_spec", lambda name: name == "warp")
     assert (device("cuda:1"), device("cuda", workers=0), device("cpu")) == ("cuda:1", "cuda", None)
     assert device("cuda", workers=2) is None
@@ -324,7 +324,7 @@ def test_aggregations_are_measured_drawn_and_saved(tmp_path):
     files = result.save(tmp_path)
     assert f"{quantity.key}_ground" in {path.stem for path in files}
     assert quantity.key in Coverage.load(tmp_path / "coverage.npz").layers
-    (kept_not,) = [omission.what for omission in result.left_out if "not kept" in omission.what]
+    (kept_not,) = [omission.description for omission in result.omissions if "not kept" in omission.description]
     assert Maximum.words not in kept_not
 
 
@@ -344,7 +344,7 @@ def test_of_detections_alone_the_same_is_known_and_of_radii_nothing():
             one, less = (each.estimate(region, height).value for each in (coverage, other))
             np.testing.assert_array_equal(less[1:], one[1:])
             assert less[0].isnan()
-    spared = {one.what: one.count for one in some.left_out if "near a reference point" in one.what}
+    spared = {one.description: one.count for one in some.omissions if "near a reference point" in one.description}
     assert list(spared.values()) == [some.run.counts["sensor_rays_spared"]]
     assert some.run.counts["sensor_rays_spared"] > 0.3 * some.run.counts["sensor_rays"]
     assert every.run.counts["sensor_rays_spared"] == 0

@@ -8,7 +8,7 @@ import pytest
 import torchcover
 from torchcover import Rig, Scenario
 from torchcover.data import SimulatedFrames
-from torchcover.evaluation.task import spread_s
+from torchcover.evaluation.task import compute_frame_interval_s
 from torchcover.simulation import PaperReference
 
 RIG = Rig.model_validate(
@@ -72,7 +72,7 @@ def test_going_round_again_makes_no_error_smaller(drive):
 
 def test_a_target_error_does_not_go_round_and_round(drive):
     result = torchcover.evaluate(RIG, drive(70), target_error="0.0001%", **FEW)
-    assert (result.run.steps, result.target_lines[0]) == (
+    assert (result.run.num_frames, result.target_error_lines[0]) == (
         70,
         "Target error not reached in 70 steps; the largest of each region:",
     )
@@ -120,7 +120,7 @@ def test_distinct_instants_are_those_that_were_seen(drive, every_steps):
 
 @pytest.mark.parametrize("instants", [1, 2, 3, 4, 5, 8, 13, 60, 64, 100, 301, 602, 3001])
 def test_any_number_of_steps_lies_evenly_over_a_given_scenario(drive, instants):
-    every = round(spread_s(drive(instants), None))
+    every = round(compute_frame_interval_s(drive(instants), None))
     seen = np.arange(2 * instants) * every % instants
     assert len(set(seen[:instants].tolist())) == instants
     for steps in {min(count, instants) for count in (5, 20, 64, 200)}:
@@ -129,6 +129,6 @@ def test_any_number_of_steps_lies_evenly_over_a_given_scenario(drive, instants):
 
 
 def test_a_time_that_is_given_is_kept_and_traffic_has_its_own():
-    assert spread_s(Scenario.load("courtyard"), 0.3) == 0.3
-    assert spread_s(Scenario.load("urban"), None) == 10.0
-    assert spread_s(Scenario.load("courtyard"), None) == 0.1
+    assert compute_frame_interval_s(Scenario.load("courtyard"), 0.3) == 0.3
+    assert compute_frame_interval_s(Scenario.load("urban"), None) == 10.0
+    assert compute_frame_interval_s(Scenario.load("courtyard"), None) == 0.1

@@ -123,7 +123,7 @@ def test_results_of_one_rig_each_are_compared_as_if_measured_together(mixed, yar
     each = [evaluate(rig, given, **SMALL) for rig in RIGS]
     assert compare(each).summary == mixed.summary
     with pytest.raises(ValueError, match="same scenarios with the same weights"):
-        compare([each[0], MixedResult.of(each[1].worlds, {"near": 0.5, "far": 0.5})])
+        compare([each[0], MixedResult.from_results(each[1].worlds, {"near": 0.5, "far": 0.5})])
     with pytest.raises(ValueError, match="same scenarios with the same weights"):
         compare([each[0], each[1].worlds["far"]])
 
@@ -194,7 +194,7 @@ def test_who_cannot_be_mixed_is_refused_before_anything_is_measured(yards, monke
     with pytest.raises(ValueError, match="exclude each other"):
         evaluate(RIGS[0], [near, "courtyard"], frames="recording", **SMALL)
     with pytest.raises(ValueError, match="one at a time here; got near, courtyard"):
-        _ = Settings(RIGS[0], [near, "courtyard"]).one_scenario
+        _ = Settings(RIGS[0], [near, "courtyard"]).single_scenario
 
 
 def test_who_needs_what_is_not_installed_is_refused_before_anything_is_measured(yards, monkeypatch):

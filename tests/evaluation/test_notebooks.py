@@ -27,9 +27,9 @@ def results():
     return {
         "result": result,
         "coverage": result.coverages[NASTY],
-        "target": torchcover.survey_target(nasty, "child", raster=Raster((-4.0, 4.0), (-3.0, 3.0), 0.5)),
-        "met": torchcover.encounter(
-            nasty, EncounterSet.model_validate({"name": "s", "encounters": [MEETING]}), phases=2
+        "target": torchcover.map_target_visibility(nasty, "child", raster=Raster((-4.0, 4.0), (-3.0, 3.0), 0.5)),
+        "met": torchcover.evaluate_encounters(
+            nasty, EncounterSet.model_validate({"name": "s", "encounters": [MEETING]}), num_start_offsets=2
         ),
     }
 

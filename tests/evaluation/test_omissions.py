@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchcover.coverage import AGGREGATIONS, BevGrid, CoverageMetric, Maximum
-from torchcover.evaluation import left_out
+from torchcover.evaluation import list_omissions
 from torchcover.simulation import CameraSensor
 
 
@@ -14,9 +14,9 @@ def test_points_outside_the_grid_are_counted_over_all_rigs():
     grid = BevGrid(x=(0.0, 2.0), y=(0.0, 2.0), cell=1.0)
     metric = CoverageMetric(grid)
     metric.update(torch.zeros(1, 3), torch.tensor([[0.5, 0.5, 0.0], [9.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]))
-    records = {row.what: row for row in left_out({}, [metric.compute()] * 2)}
+    records = {row.description: row for row in list_omissions({}, [metric.compute()] * 2)}
     outside = records["reference points outside every cell: not searched for"]
-    assert (outside.count, outside.of) == (4, 6)
+    assert (outside.count, outside.total) == (4, 6)
     others = ", ".join(aggregation.words for aggregation in AGGREGATIONS)
     assert f"{others}: not asked for, not kept" in records
 
@@ -24,7 +24,9 @@ def test_points_outside_the_grid_are_counted_over_all_rigs():
 def test_aggregations_that_were_asked_for_are_not_left_out():
     metric = CoverageMetric(BevGrid(x=(0.0, 2.0), y=(0.0, 2.0), cell=1.0), aggregations=[Maximum()])
     metric.update(torch.zeros(1, 3), torch.tensor([[0.5, 0.5, 0.0]]))
-    (listed,) = [row.what for row in left_out({}, [metric.compute()], [Maximum()]) if "not kept" in row.what]
+    (listed,) = [
+        row.description for row in list_omissions({}, [metric.compute()], [Maximum()]) if "not kept" in row.description
+    ]
     assert [kind.words in listed for kind in AGGREGATIONS] == [kind is not Maximum for kind in AGGREGATIONS]
 
 
@@ -33,7 +35,7 @@ def test_what_was_not_left_out_is_not_listed(count):
     metric = CoverageMetric(BevGrid(x=(0.0, 2.0), y=(0.0, 2.0), cell=1.0))
     metric.update(torch.zeros(1, 3), torch.tensor([[0.5, 0.5, 0.0]]))
     counts = {"moving_bodies_out_of_range": count, "moving_bodies": 9}
-    listed = [row.count for row in left_out(counts, [metric.compute()]) if row.of == 9]
+    listed = [row.count for row in list_omissions(counts, [metric.compute()]) if row.total == 9]
     assert listed == ([7] if count else [])
 
 
@@ -48,7 +50,11 @@ def test_nobody_is_told_that_the_distortion_of_a_lens_was_left_out(lens, coeffic
     bent = CameraSensor(name="b", lens=lens, coefficients=(0.1, 0.0, 0.0, 0.0), **size)
 
     def listed(*sensors, **options):
-        return [row.what for row in left_out({}, [], (), sensors, **options) if "lenses with distortion" in row.what]
+        return [
+            row.description
+            for row in list_omissions({}, [], (), sensors, **options)
+            if "lenses with distortion" in row.description
+        ]
 
     assert listed(straight) == ["kornia, for lenses with distortion: not imported"]
     assert listed(straight, bent) == []

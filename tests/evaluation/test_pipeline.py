@@ -16,8 +16,8 @@ from torch.utils.data import Subset
 from torchcover import BevGrid, CoverageMetric, Scenario, evaluate
 from torchcover.data import BadFrameError, ChosenRigs, SimulatedFrames
 from torchcover.evaluation import CoverageObserver, observe, pipeline
-from torchcover.evaluation.pipeline import MOST_TOGETHER, MeasuredFrames, made_together
-from torchcover.evaluation.progress import Progress, showing_wait, terminable
+from torchcover.evaluation.pipeline import MOST_TOGETHER, MeasuredFrames, group_by_scene
+from torchcover.evaluation.progress import Progress, handle_termination, show_wait
 from torchcover.frames import worlds_of
 from torchcover.simulation import PaperReference
 
@@ -108,15 +108,15 @@ def test_coverage_is_that_of_the_metric_with_weights_and_places_in_time(frames):
             )
         assert torch.equal(observer.compute().radius, metric.compute().radius)
         assert torch.equal(observer.compute().blocks.listed, metric.compute().blocks.listed)
-    assert (run.steps, dict(run.counts), run.complete) == (6, {"seen": 15}, True)
+    assert (run.num_frames, dict(run.counts), run.is_complete) == (6, {"seen": 15}, True)
 
 
 @pytest.mark.parametrize("workers", [0, 2])
 def test_workers_change_nothing_and_frames_come_in_order(frames, workers):
     names, occupancy = Names(), Occupancy()
-    run = observe(frames, [names, occupancy], workers=workers, steps=5)
+    run = observe(frames, [names, occupancy], num_workers=workers, num_frames=5)
     assert names.names == ["f0", "f1", "f2", "f3", "f4"]
-    assert run.steps == 5
+    assert run.num_frames == 5
     assert int(occupancy.compute().max()) <= 5
 
 
@@ -133,7 +133,7 @@ def test_frames_are_measured_where_they_are_made_and_travel_only_if_somebody_els
         alone.update(frame)
     for workers in (0, 2):
         together = [coverage("a"), *(make() for make in others), coverage("b")]
-        observe(frames, together, workers=workers)
+        observe(frames, together, num_workers=workers)
         state = together[-1].state_dict()
         assert all(torch.equal(value, state[name]) for name, value in alone.state_dict().items())
 
@@ -143,22 +143,22 @@ def test_what_cannot_be_measured_ends_the_run_with_what_was_seen_before(frames, 
     """The metric wants square metres, which one frame lacks."""
     observer = CoverageObserver(CoverageMetric(GRID, square_metres=True), "a")
     frames[4] = replace(frames[4], reference_weights=None)
-    run = observe(frames, [observer], workers=workers, keep_partial=True, skip_bad_frames=True)
-    assert (run.steps, run.skipped, int(observer.metric.steps)) == (4, [], 4)
+    run = observe(frames, [observer], num_workers=workers, keep_partial=True, skip_bad_frames=True)
+    assert (run.num_frames, run.skipped_frames, int(observer.metric.steps)) == (4, [], 4)
     assert "weights: the square metres of each reference point are needed" in str(run.failure)
 
 
 def test_of_several_workers_one_makes_the_frames_of_a_world_and_all_come_in_order():
     spread = SimulatedFrames("urban", "front_roof_32", steps=15, every_s=10.0)
-    tasks = list(made_together(range(15), spread.world_of))
+    tasks = list(group_by_scene(range(15), spread.world_of))
     assert tasks == [[*range(7)], [*range(7, 13)], [13, 14]]
     assert [{spread.simulator.run_of(index) for index in task} for task in tasks] == [{0}, {1}, {2}]
-    dense = list(made_together(range(700), SimulatedFrames("urban", "front_roof_32", steps=1000).world_of))
+    dense = list(group_by_scene(range(700), SimulatedFrames("urban", "front_roof_32", steps=1000).world_of))
     assert [index for task in dense for index in task] == [*range(700)]
     assert max(map(len, dense)) == MOST_TOGETHER
     still = SimulatedFrames("courtyard", "front_roof_32", steps=3)  # of which every process has the whole
     for alone in (still, []):
-        assert list(made_together(range(3), worlds_of(alone))) == [[0], [1], [2]]
+        assert list(group_by_scene(range(3), worlds_of(alone))) == [[0], [1], [2]]
 
 
 class Wrapped:
@@ -209,16 +209,16 @@ def test_each_world_is_built_by_one_worker_whoever_gives_the_frames(monkeypatch,
 @pytest.mark.parametrize("frames_of", [Wrapped, lambda frames: Subset(Wrapped(frames), [0, 1])])
 def test_a_source_that_does_not_know_its_worlds_is_refused_where_it_matters(frames, frames_of):
     source = frames_of(Told(frames))
-    assert observe(source, [Names()], workers=1).steps == len(source)
+    assert observe(source, [Names()], num_workers=1).num_frames == len(source)
     with pytest.raises(TypeError, match=r"^frames: Wrapped does not say which world a frame is of"):
-        observe(source, [Names()], workers=2, keep_partial=True)
+        observe(source, [Names()], num_workers=2, keep_partial=True)
 
 
 @pytest.mark.parametrize("scenario", ["urban", "courtyard"])
 def test_no_list_is_made_of_all_the_steps_there_may_be(scenario):
     frames = SimulatedFrames(scenario, "front_roof_32", steps=20_000)
     tracemalloc.start()
-    tasks = made_together(range(20_000), frames.world_of)
+    tasks = group_by_scene(range(20_000), frames.world_of)
     assert sum(map(len, tasks)) == 20_000
     _, most_bytes = tracemalloc.get_traced_memory()
     tracemalloc.stop()
@@ -246,7 +246,7 @@ def test_a_worker_makes_one_task_ahead(frames):
             time.sleep(0.3)
             ahead.append(counted.made.value)
 
-    observe(counted, [Names(then=wait)], workers=1)
+    observe(counted, [Names(then=wait)], num_workers=1)
     assert ahead[0] <= 2
 
 
@@ -260,7 +260,7 @@ def test_of_two_rigs_none_is_meant_until_it_is_named(frames):
 def test_a_bad_frame_ends_the_run_and_is_noted_for_who_keeps_what_there_is(frames):
     names = Names()
     run = observe(Spoiled(frames, {3}), [names], keep_partial=True)
-    assert (run.steps, names.names, run.complete) == (3, ["f0", "f1", "f2"], False)
+    assert (run.num_frames, names.names, run.is_complete) == (3, ["f0", "f1", "f2"], False)
     with pytest.raises(BadFrameError, match="f3"):
         run.raise_failure()
 
@@ -285,15 +285,15 @@ def test_square_metres_are_not_made_up(frames):
 @pytest.mark.parametrize("workers", [0, 2])
 def test_bad_frames_are_skipped_if_that_is_asked_for(frames, workers):
     names = Names()
-    run = observe(Spoiled(frames, {0, 3}), [names], skip_bad_frames=True, workers=workers)
+    run = observe(Spoiled(frames, {0, 3}), [names], skip_bad_frames=True, num_workers=workers)
     assert names.names == ["f1", "f2", "f4", "f5"]
-    assert run.skipped == ["f0 (frame 0): rubbish", "f3 (frame 3): rubbish"]
-    assert run.complete
+    assert run.skipped_frames == ["f0 (frame 0): rubbish", "f3 (frame 3): rubbish"]
+    assert run.is_complete
     run.raise_failure()
 
 
 def together(monkeypatch):
-    monkeypatch.setattr(pipeline, "made_together", lambda *_: [[0, 1, 2, 3], [4, 5]])
+    monkeypatch.setattr(pipeline, "group_by_scene", lambda *_: [[0, 1, 2, 3], [4, 5]])
 
 
 class OddError(ValueError):
@@ -319,9 +319,9 @@ class Invalid(Spoiled):
 def test_of_frames_that_are_made_together_a_bad_one_costs_itself_only(frames, workers, monkeypatch):
     together(monkeypatch)
     names = Names()
-    run = observe(Spoiled(frames, {1, 4}), [names], skip_bad_frames=True, workers=workers)
+    run = observe(Spoiled(frames, {1, 4}), [names], skip_bad_frames=True, num_workers=workers)
     assert names.names == ["f0", "f2", "f3", "f5"]
-    assert run.skipped == ["f1 (frame 1): rubbish", "f4 (frame 4): rubbish"]
+    assert run.skipped_frames == ["f1 (frame 1): rubbish", "f4 (frame 4): rubbish"]
 
 
 @pytest.mark.parametrize("workers", [0, 1, 2])
@@ -332,8 +332,8 @@ def test_of_frames_that_are_made_together_a_bad_one_costs_itself_only(frames, wo
 def test_the_frames_before_a_bad_one_are_kept(frames, workers, dataset, error, message, monkeypatch):
     together(monkeypatch)
     names = Names()
-    run = observe(dataset(frames, {2}), [names], keep_partial=True, workers=workers)
-    assert (run.steps, names.names, run.skipped) == (2, ["f0", "f1"], [])
+    run = observe(dataset(frames, {2}), [names], keep_partial=True, num_workers=workers)
+    assert (run.num_frames, names.names, run.skipped_frames) == (2, ["f0", "f1"], [])
     with pytest.raises(error) as raised:
         run.raise_failure()
     assert str(raised.value) == message
@@ -350,7 +350,7 @@ def test_without_a_good_frame_there_is_no_result(frames):
 def test_an_error_of_the_last_observer_costs_no_step_of_the_others(frames):
     names = Names()
     run = observe(frames, [names, Names(then=lambda: 1 / (4 - run_so_far(names)))], keep_partial=True)
-    assert (run.steps, names.names, run.complete) == (3, ["f0", "f1", "f2", "f3"], False)
+    assert (run.num_frames, names.names, run.is_complete) == (3, ["f0", "f1", "f2", "f3"], False)
     with pytest.raises(ZeroDivisionError):
         run.raise_failure()
     with pytest.raises(ZeroDivisionError):
@@ -374,18 +374,20 @@ class Deadly(Spoiled):
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_what_there_is_outlives_a_worker_that_is_killed(frames):
     names = Names()
-    run = observe(Deadly(frames, {5}), [names], workers=1, keep_partial=True)
-    assert (run.steps, run.complete) == (len(names.names), False)
+    run = observe(Deadly(frames, {5}), [names], num_workers=1, keep_partial=True)
+    assert (run.num_frames, run.is_complete) == (len(names.names), False)
     assert names.names == ["f0", "f1", "f2", "f3", "f4"][: len(names.names)]
-    with pytest.raises(ChildProcessError, match=rf"a worker was killed after step {run.steps}, .*; use fewer workers"):
+    with pytest.raises(
+        ChildProcessError, match=rf"a worker was killed after step {run.num_frames}, .*; use fewer workers"
+    ):
         run.raise_failure()
 
 
 @pytest.mark.parametrize("method", ["spawn", "forkserver"])
 def test_workers_may_be_started_in_other_ways_than_by_a_fork(frames, method, monkeypatch):
-    monkeypatch.setattr(pipeline, "start_method", lambda: method)
+    monkeypatch.setattr(pipeline, "get_start_method", lambda: method)
     names = Names()
-    observe(frames, [names], workers=1)
+    observe(frames, [names], num_workers=1)
     assert names.names == ["f0", "f1", "f2", "f3", "f4", "f5"]
 
 
@@ -393,7 +395,7 @@ def test_workers_may_be_started_in_other_ways_than_by_a_fork(frames, method, mon
 def test_a_program_that_starts_itself_is_told_how_it_should(method, tells, monkeypatch):
     monkeypatch.setattr(multiprocessing, "get_start_method", lambda **_: method)
     died = RuntimeError("DataLoader worker (pid(s) 7) exited unexpectedly")
-    assert ("__main__" in str(pipeline.killed_worker(died, workers=2, steps=0))) == tells
+    assert ("__main__" in str(pipeline.find_killed_worker(died, num_workers=2, num_frames=0))) == tells
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
@@ -401,10 +403,10 @@ def test_who_ends_the_workers_too_has_ended_the_run(frames, monkeypatch):
     """A scheduler ends all processes of a job, and a worker may be the first to go."""
     monkeypatch.setattr(pipeline, "clear_frames", lambda _: os.kill(os.getpid(), signal.SIGTERM))
     names = Names()
-    with terminable(lambda _: None) as signals:
-        run = observe(Deadly(frames, {5}), [names], workers=1, keep_partial=True)
+    with handle_termination(lambda _: None) as signals:
+        run = observe(Deadly(frames, {5}), [names], num_workers=1, keep_partial=True)
     assert signals == [signal.SIGTERM]
-    assert run.steps == len(names.names) > 0
+    assert run.num_frames == len(names.names) > 0
     assert isinstance(run.failure, KeyboardInterrupt)
 
 
@@ -419,7 +421,7 @@ def test_ctrl_c_within_a_frame_waits_for_all_observers(frames):
     before, first, last = signal.getsignal(signal.SIGINT), Names(press), Names()
     run = observe(frames, [first, last], keep_partial=True)
     assert first.names == last.names == ["f0", "f1", "f2"]
-    assert (run.steps, type(run.failure), run.complete) == (3, KeyboardInterrupt, False)
+    assert (run.num_frames, type(run.failure), run.is_complete) == (3, KeyboardInterrupt, False)
     assert signal.getsignal(signal.SIGINT) is before
     with pytest.raises(KeyboardInterrupt):
         run.raise_failure()
@@ -438,17 +440,17 @@ class AfterThree:
 
     words = "nearly there"
 
-    def is_reached(self, steps):
-        return steps >= 3
+    def is_reached(self, num_frames):
+        return num_frames >= 3
 
-    def expected_steps(self, most):
-        return min(most, 3)
+    def estimate_num_frames(self, max_frames):
+        return min(max_frames, 3)
 
 
 @pytest.mark.parametrize("progress", [False, True])
 def test_a_rule_ends_the_run_and_a_bar_tells_of_it(frames, progress, capsys):
-    run = observe(frames, [Names()], until=AfterThree(), progress=progress, title="frames")
-    assert (run.steps, run.complete) == (3, True)
+    run = observe(frames, [Names()], stopping_rule=AfterThree(), show_progress=progress, title="frames")
+    assert (run.num_frames, run.is_complete) == (3, True)
     told = capsys.readouterr().err
     assert ("3/3" in told and "nearly there" in told) == progress
     assert bool(told) == progress
@@ -461,7 +463,7 @@ def test_each_worker_is_left_a_core(frame_of, monkeypatch, workers, threads):
     torch.set_num_threads(2)
     try:
         names = Names(lambda: seen.append(torch.get_num_threads()))
-        observe([frame_of(index) for index in range(3)], [names], workers=workers)
+        observe([frame_of(index) for index in range(3)], [names], num_workers=workers)
         assert (seen, torch.get_num_threads()) == ([threads] * 3, 2)
     finally:
         torch.set_num_threads(before)
@@ -471,7 +473,7 @@ def test_each_worker_is_left_a_core(frame_of, monkeypatch, workers, threads):
 def test_a_wait_without_steps_is_shown_on_a_terminal(capsys, monkeypatch, shown):
     for variable in ("FORCE_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE"):
         monkeypatch.setenv(variable, "1")
-    with showing_wait("preparing the scene", shown=shown):
+    with show_wait("preparing the scene", shown=shown):
         pass
     assert ("preparing the scene" in capsys.readouterr().err) == shown
 
@@ -480,7 +482,7 @@ def test_rates_count_the_start_and_are_means_over_rounds_of_all_workers(monkeypa
     """Four workers start in 8 s; then each round gives four steps at once, every 4 s: a step a second."""
     now_s = 0.0
     monkeypatch.setattr("torchcover.evaluation.progress.time.monotonic", lambda: now_s)
-    bar, rates = Progress(100, "run", shown=True, workers=4), []
+    bar, rates = Progress(100, "run", is_shown=True, num_workers=4), []
     for step in range(60):
         now_s = 8.0 + 4.0 * (step // 4)
         bar.advance(100)

@@ -16,8 +16,8 @@ from torch.distributed import FileStore, HashStore, TCPStore
 
 import torchcover
 from torchcover.data import BadFrameError, FrameDataset, SimulatedFrames
-from torchcover.evaluation import Ranks, joined_ranks
-from torchcover.evaluation.ranks import ABORTED, packed
+from torchcover.evaluation import Ranks, join_ranks
+from torchcover.evaluation.ranks import ABORTED, serialize
 
 LONGEST_S = 30.0
 
@@ -99,8 +99,8 @@ def measured(source, ranks=None, **settings):
     for name, coverage in result.coverages.items():
         counts[name] = (coverage.counts, coverage.points, coverage.probed_steps, coverage.blocks.steps)
         sums[name] = (coverage.blocks.listed, coverage.radius)
-    run = (result.run.steps, dict(result.run.counts), result.run.skipped, str(result.run.failure))
-    return {"counts": (counts, run, result.observed), "sums": sums}
+    run = (result.run.num_frames, dict(result.run.counts), result.run.skipped_frames, str(result.run.failure))
+    return {"counts": (counts, run, result.observer_results), "sums": sums}
 
 
 def check_equal(found, single):
@@ -189,13 +189,13 @@ def test_each_rank_of_a_machine_has_a_gpu_of_its_own(monkeypatch, local, name, d
     monkeypatch.delenv("LOCAL_RANK", raising=False)
     if local:
         monkeypatch.setenv("LOCAL_RANK", local)
-    assert Ranks(HashStore(), 0, 2).device(name) == device
+    assert Ranks(HashStore(), 0, 2).get_device(name) == device
 
 
 def test_what_travels_is_on_the_cpu():
-    assert pickle.loads(packed({"x": torch.arange(3)}))["x"].tolist() == [0, 1, 2]
+    assert pickle.loads(serialize({"x": torch.arange(3)}))["x"].tolist() == [0, 1, 2]
     with pytest.raises(NotImplementedError, match="no data"):  # a device that nothing can be copied from
-        packed({"x": torch.empty(3, device="meta")})
+        serialize({"x": torch.empty(3, device="meta")})
 
 
 def test_who_waits_for_what_others_have_seen_learns_that_one_has_ended():
@@ -228,18 +228,18 @@ def test_ranks_leave_when_all_is_written_and_rank_0_as_the_last_one(monkeypatch,
 def test_rank_0_waits_for_one_that_is_gone_for_a_while_only(monkeypatch):
     monkeypatch.setattr("torchcover.evaluation.ranks.PARTING_S", 0.3)
     begin_s = time.monotonic()
-    Ranks(HashStore(), 0, 2).part()
+    Ranks(HashStore(), 0, 2).shut_down()
     assert 0.3 <= time.monotonic() - begin_s < 3.0
 
 
 def test_the_first_failure_is_the_one_that_is_told_of():
     first, second = (Ranks(store, rank, 2) for store in [HashStore()] for rank in range(2))
     assert first.failure is second.failure is None
-    second.tell(KeyboardInterrupt())
-    first.tell(ValueError("too late"))
+    second.report_failure(KeyboardInterrupt())
+    first.report_failure(ValueError("too late"))
     assert first.failure == second.failure == "rank 1: KeyboardInterrupt"
     with pytest.raises(ChildProcessError, match=r"^rank 1: KeyboardInterrupt$"):
-        first.check_others()
+        first.check_failures()
 
 
 def test_who_waits_for_what_rank_0_is_about_learns_that_it_has_ended():
@@ -334,13 +334,13 @@ def test_who_waits_for_a_rank_that_is_gone_can_be_ended(frame_of, tmp_path):
 def test_shares_are_whole_worlds_and_more_steps_only_add_to_them(every_s):
     frames = SimulatedFrames("urban", "front_roof_32", steps=5000, every_s=every_s)
     world_of, everybody = frames.simulator.run_of, [Ranks(None, rank, 3) for rank in range(3)]
-    shares = [list(ranks.share(range(5000), world_of)) for ranks in everybody]
+    shares = [list(ranks.iterate_share(range(5000), world_of)) for ranks in everybody]
     assert sorted(index for share in shares for index in share) == list(range(5000))
     worlds = [{world_of(index) for index in share} for share in shares]
     assert not (worlds[0] & worlds[1] | worlds[0] & worlds[2] | worlds[1] & worlds[2])
     assert max(map(len, worlds)) - min(map(len, worlds)) <= 1
     for ranks, share in zip(everybody, shares, strict=True):
-        fewer = list(ranks.share(range(1234), world_of))
+        fewer = list(ranks.iterate_share(range(1234), world_of))
         assert share[: len(fewer)] == fewer
 
 
@@ -349,7 +349,7 @@ def test_without_torchrun_there_are_no_ranks(monkeypatch):
         monkeypatch.delenv("WORLD_SIZE", raising=False)
         if size:
             monkeypatch.setenv("WORLD_SIZE", size)
-        with joined_ranks() as ranks:
+        with join_ranks() as ranks:
             assert ranks is None
 
 
@@ -361,8 +361,8 @@ def test_torchrun_tells_two_processes_which_they_are(frame_of, tmp_path):
 
     def work(ranks):
         os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": f"{port}", "WORLD_SIZE": "2", "RANK": f"{ranks.rank}"}
-        with joined_ranks() as joined:
-            return (joined.rank, joined.size), measured(Drive(frame_of), joined)
+        with join_ranks() as joined:
+            return (joined.rank, joined.num_ranks), measured(Drive(frame_of), joined)
 
     single = measured(Drive(frame_of))
     for rank, ((who, found), _) in enumerate(in_ranks(tmp_path, work)):

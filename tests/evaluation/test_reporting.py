@@ -10,7 +10,7 @@ import pytest
 
 from torchcover.encounters import EncounterSet
 from torchcover.evaluation import Requirements, report
-from torchcover.evaluation.target_survey import NEAR_M, plan_of, target_verdict
+from torchcover.evaluation.target_survey import NEAR_M, build_target_plan, summarize_target_maps
 from torchcover.report import render_page
 from torchcover.simulation import Rig
 
@@ -32,7 +32,7 @@ NEEDS = {"name": "needs", "requirements": [{"target": "child", "at": {"points_m"
 def found():
     crossing = EncounterSet.model_validate({"name": "one", "encounters": [CROSSING]})
     needs = Requirements.model_validate(NEEDS)
-    return report([ONE, TWO], "courtyard", steps=8, encounters=crossing, requirements=needs, workers=0)
+    return report([ONE, TWO], "courtyard", num_frames=8, encounters=crossing, requirements=needs, num_workers=0)
 
 
 def test_the_first_sentence_is_the_share_of_places_near_the_vehicle(found):
@@ -69,13 +69,13 @@ def test_sensors_that_cells_cannot_tell_apart_are_named_together():
     rig = Rig.model_validate({"name": "sides", "sensors": [
         {**lidar(side, 0.0), "mount": {"y_m": y_m, "z_m": 1.0}} for side, y_m in (("left", 1.1), ("right", -1.1))
     ]})  # fmt: skip
-    words = report(rig, "courtyard", steps=8, workers=0).verdict[-1]
+    words = report(rig, "courtyard", num_frames=8, num_workers=0).verdict[-1]
     assert "left and right: without one, up to" in words
 
 
 def test_a_plan_tells_by_how_many_sensors_each_place_is_seen(found):
     for seen in found.targets.values():
-        plan = plan_of(seen)
+        plan = build_target_plan(seen)
         assert ((plan.sensor_counts == -1) == ~seen.free).all()
         assert ((plan.sensor_counts > 0) == seen.enough).all()
         assert ((plan.sensor_counts > 1) == (seen.enough & (seen.least_sensors >= 2))).all()
@@ -108,11 +108,11 @@ def test_areas_of_the_plan_are_those_of_its_cells(found):
     for number in range(2):
         drawn = re.search(rf'<path class="seen{number}" d="([^"]*)"', text)[1]
         m2 = sum(float(w) * float(h) for w, h in re.findall(r"h(-?[\d.]+)v([\d.]+)", drawn))
-        assert m2 == pytest.approx((plan_of(seen).sensor_counts == number).sum() * 0.04)
+        assert m2 == pytest.approx((build_target_plan(seen).sensor_counts == number).sum() * 0.04)
 
 
 def test_a_budget_ends_the_traffic_once_it_has_intervals():
-    found = report(ONE, "courtyard", steps=64, budget_s=0.01, workers=0)
+    found = report(ONE, "courtyard", num_frames=64, budget_s=0.01, num_workers=0)
     assert found.result.table.first_conditions.counts["steps"] == 8
     assert found.verdict[-1] == "The budget was over after 8 of 64 steps of traffic."
     assert not found.record["complete"]
@@ -120,7 +120,7 @@ def test_a_budget_ends_the_traffic_once_it_has_intervals():
 
 def test_of_too_few_steps_no_range_is_told_but_how_many_are_needed():
     words = "Not enough frames for ranges: 4 form 4 blocks of time, intervals need about 11, which are 11 frames"
-    assert f"{words} (`--steps`)." in report(ONE, "courtyard", steps=4, workers=0).verdict
+    assert f"{words} (`--steps`)." in report(ONE, "courtyard", num_frames=4, num_workers=0).verdict
 
 
 def test_where_no_place_is_free_nothing_is_claimed(found):
@@ -128,8 +128,8 @@ def test_where_no_place_is_free_nothing_is_claimed(found):
     seen = found.targets["one"]
     nowhere = replace(seen, state=np.full_like(seen.state, 2))
     assert math.isnan(nowhere.share_seen(NEAR_M))
-    assert target_verdict({"one": nowhere}) == ("No place within 2 m is free: what is seen there is unknown.",)
-    assert "Not seen at 0 of 0 places" in plan_of(nowhere).title
+    assert summarize_target_maps({"one": nowhere}) == ("No place within 2 m is free: what is seen there is unknown.",)
+    assert "Not seen at 0 of 0 places" in build_target_plan(nowhere).title
 
 
 @pytest.mark.parametrize(("given", "words"), [
@@ -146,7 +146,7 @@ def test_what_fits_on_no_page_is_refused(given, words):
 def test_rigs_high_above_see_nothing_beside_the_vehicle_and_say_so():
     high = Rig.model_validate({"name": "high", "sensors": [lidar("mast", 0.0, 10.0)]})
     assert (
-        report(high, "courtyard", steps=8, workers=0)
+        report(high, "courtyard", num_frames=8, num_workers=0)
         .verdict[0]
         .endswith("seen (5 points or more) at 0 % of the places within 2 m by high.")
     )

@@ -11,8 +11,8 @@ from pydantic import ValidationError
 from tests.targets.worlds import drive, lidar, rig, world
 from torchcover.encounters import Criterion
 from torchcover.encounters.encounter import EncounterSet
-from torchcover.evaluation import Readings, Requirements, check, encounter, evaluate, verdicts
-from torchcover.evaluation.requirements import BodyPlaces, TargetRequirement
+from torchcover.evaluation import Readings, Requirements, check, evaluate, evaluate_encounters, judge_requirements
+from torchcover.evaluation.requirements import TargetPositions, TargetRequirement
 from torchcover.geometry import BoundingBox
 from torchcover.placement.selection_space import SelectionSpace
 from torchcover.placement.space import SearchSpace
@@ -40,7 +40,7 @@ def judged(bound, value, low=None, high=None):
     one = {"region": "20m", "height": "ground", "number": key} | {
         k: v for k, v in (("least", least), ("most", most)) if v
     }
-    (found,) = verdicts(asked(one), [{key: numbers}])
+    (found,) = judge_requirements(asked(one), [{key: numbers}])
     return found
 
 
@@ -70,7 +70,7 @@ LEAST, MOST = ("detection_0.4m", 0.9, None), ("radius_m", None, 0.5)
 )
 def test_a_bound_is_kept_where_all_of_the_interval_is_known_to_keep_it(bound, value, low, high, state, worst, where):
     found = judged(bound, value, low, high)
-    assert (found.state, found.where, found.count) == (state, where, len(value))
+    assert (found.state, found.worst_locations, found.total_count) == (state, where, len(value))
     if worst is None:
         assert np.isnan([found.value, found.margin]).all()
     else:
@@ -81,23 +81,23 @@ def test_a_bound_is_kept_where_all_of_the_interval_is_known_to_keep_it(bound, va
 
 def test_bodies_are_put_where_a_place_says():
     """Areas are filled to their border in steps that are no longer than asked for; other forms are what they say."""
-    behind = BodyPlaces(x_m=(-1.0, -0.2), relative_to="rear", step_m=0.3).positions_m(CAR)
+    behind = TargetPositions(x_m=(-1.0, -0.2), relative_to="rear", spacing_m=0.3).compute_positions_m(CAR)
     assert behind.min(0) == pytest.approx([-3.0, -1.0])
     assert behind.max(0) == pytest.approx([-2.2, 1.0])
     assert np.diff(np.unique(behind[:, 0].round(9))).max() <= 0.3
     assert len(np.unique(behind.round(9), axis=0)) == len(behind) == 4 * 8
-    beside = BodyPlaces(y_m=(0.5, 1.0), relative_to="left", step_m=1.0).positions_m(CAR)
+    beside = TargetPositions(y_m=(0.5, 1.0), relative_to="left", spacing_m=1.0).compute_positions_m(CAR)
     assert beside.min(0).tolist() == [-2.0, 1.5]  # of the vehicle's length
-    triangle = BodyPlaces(polygon_m=((0, 0), (4, 0), (0, 4)), step_m=1.0).positions_m(CAR)
+    triangle = TargetPositions(polygon_m=((0, 0), (4, 0), (0, 4)), spacing_m=1.0).compute_positions_m(CAR)
     assert len(triangle) == 15  # on its border, too
     assert (triangle.sum(axis=1) <= 4).all()
-    line = BodyPlaces(line_m=((3, -1), (3, 1), (5, 1)), step_m=0.6).positions_m(CAR)
+    line = TargetPositions(line_m=((3, -1), (3, 1), (5, 1)), spacing_m=0.6).compute_positions_m(CAR)
     assert len(line) == 8
     assert np.linalg.norm(np.diff(line, axis=0), axis=1).max() <= 0.6
-    assert BodyPlaces(points_m=((1, 2),), relative_to="front").positions_m(CAR).tolist() == [[3.0, 2.0]]
-    around = BodyPlaces(within_m=1.0, step_m=0.5)
-    each = [around.model_copy(update={"sides": (side,)}).positions_m(CAR) for side in SIDES]
-    everywhere = around.positions_m(CAR)
+    assert TargetPositions(points_m=((1, 2),), relative_to="front").compute_positions_m(CAR).tolist() == [[3.0, 2.0]]
+    around = TargetPositions(within_m=1.0, spacing_m=0.5)
+    each = [around.model_copy(update={"sides": (side,)}).compute_positions_m(CAR) for side in SIDES]
+    everywhere = around.compute_positions_m(CAR)
     away = np.linalg.norm(everywhere - np.clip(everywhere, (-2, -1), (2, 1)), axis=1)
     assert away.max() <= 1.0
     inside = int((away == 0).sum())
@@ -151,7 +151,7 @@ def test_requirements_that_read_alike_are_told_apart_or_refused():
     asked(AHEAD, {**AHEAD, "hits": 3}, {**AHEAD, "name": "again"}, {**AHEAD, "points": 6}, {**AHEAD, "by": "lidar"})
     late = {"encounters": "crossing_like", "in_time": {"deceleration": 9}}
     found = asked({**late, "looks": 1}, {**late, "points": 3}, {**late, "in_time": {"deceleration": 4}})
-    assert len({one.words for one in found.requirements}) == 3
+    assert len({one.text for one in found.requirements}) == 3
     with pytest.raises(ValueError, match=r"several requirements read 'child_110cm, .*: points >= 5'; give each a name"):
         asked(AHEAD, {**AHEAD, "target": "child_110cm"})
 
@@ -228,17 +228,17 @@ def test_what_is_judged_is_what_a_survey_sees():
     assert {v.bound.key: v.value for v in lidars}["points"] == seen.sensor_points[:2].sum(axis=0).min()
     # The mast hides all of it from the LiDAR behind it: whether or not what stands on it has failed.
     assert {v.bound.key: v.value for v in top}["points"] == seen.sensor_points[0].min() == 0
-    assert [v.count for v in top] == [2 * len(raster.positions_m)] * 4  # without it, and without nothing
+    assert [v.total_count for v in top] == [2 * len(raster.positions_m)] * 4  # without it, and without nothing
 
 
 def test_where_a_body_cannot_stand_a_point_is_unknown_and_an_area_goes_without():
     inside, near = {**AHEAD, "at": {"points_m": [[0, 0], [5, 0]]}}, {**AHEAD, "at": {"x_m": [0, 5], "y_m": [0, 0.1]}}
     nowhere = {**AHEAD, "at": {"x_m": [-1, 1], "y_m": [0, 0.1]}}
     found = check(rig(lidar(channels=61)), asked(inside, near, nowhere), world()).verdicts["small"]
-    assert [(one.state, one.unknown) for one in found] == [("not checked", 1), ("kept", 0), ("not checked", 0)]
-    assert found[0].where == ("x = 0.00, y = 0.00 m, no room",)
-    assert 0 < found[1].count < 2 * 26
-    assert [one.no_room for one in found] == [0, 52 - found[1].count, 22]
+    assert [(one.state, one.undecided_count) for one in found] == [("not checked", 1), ("kept", 0), ("not checked", 0)]
+    assert found[0].worst_locations == ("x = 0.00, y = 0.00 m, no room",)
+    assert 0 < found[1].total_count < 2 * 26
+    assert [one.occupied_count for one in found] == [0, 52 - found[1].total_count, 22]
 
 
 def test_it_is_said_in_how_many_steps_a_body_had_room(tmp_path):
@@ -246,14 +246,14 @@ def test_it_is_said_in_how_many_steps_a_body_had_room(tmp_path):
     passing = {"name": "p", "category": "car", "shape": {"type": "box", "size_m": [2.0, 1.0, 1.0]},
                "trajectory": drive(tmp_path, (0, 5, 0, 0), (2, 13, 0, 0))}  # fmt: skip
     there = world(actors=[passing], duration_s=2.0, time_step_s=0.5)
-    (found,) = check(rig(lidar(channels=61)), asked(AHEAD), there, steps=4).verdicts["small"]
-    assert (found.state, found.where) == ("kept", ("x = 5.00, y = 0.00 m, room in 3 of 4 steps",))
+    (found,) = check(rig(lidar(channels=61)), asked(AHEAD), there, num_frames=4).verdicts["small"]
+    assert (found.state, found.worst_locations) == ("kept", ("x = 5.00, y = 0.00 m, room in 3 of 4 steps",))
 
 
 def test_a_kind_that_the_rig_has_not_sees_nothing_and_a_place_that_holds_nobody_is_not_checked():
     tight = {**AHEAD, "at": {"within_m": 0.01}}
     found = check(rig(), asked({**AHEAD, "by": "camera"}, tight), world()).verdicts["small"]
-    assert [(one.state, one.count) for one in found] == [("not kept", 1), ("not checked", 0)]
+    assert [(one.state, one.total_count) for one in found] == [("not kept", 1), ("not checked", 0)]
     assert found[0].margin == -5.0
     with pytest.raises(ValueError, match="at least one rig"):
         check([], asked(AHEAD))
@@ -266,15 +266,15 @@ def test_numbers_of_regions_are_those_of_evaluate():
     found = check(
         THREE,
         asked({**one, "number": "detection_0.3m", "least": 0.001}, {**one, "number": "radius_m", "most": 1e-6}, **keys),
-        world(), steps=12, workers=0,
+        world(), num_frames=12, num_workers=0,
     ).verdicts["small"]  # fmt: skip
     asking = RegionsOfInterest.model_validate(keys)
     result = evaluate(THREE, world(), steps=12, workers=0, thresholds_m=0.3, redundancy=True, ask=asking)
     (row,) = (row for row in result.summary if row["height"] == "ground")
     for verdict, key, worse in zip(found, ("detection_0.3m", "radius_m"), (min, max), strict=True):
         assert verdict.value == worse(row[key], row[f"{key}_without_front"]) != row[key]
-        assert verdict.count == 2
-    assert found[0].where[0] == "near ground without front"
+        assert verdict.total_count == 2
+    assert found[0].worst_locations[0] == "near ground without front"
 
 
 @pytest.fixture
@@ -297,13 +297,15 @@ def test_times_to_collision_are_the_latest_of_all_phases(box):
     }
     requirements = asked(one)
     ttc, spare = check(THREE, requirements, vehicle=box).verdicts["small"]
-    seen = encounter(THREE, requirements.requirements[0].encounters, Criterion(**looks), vehicle=box).sightings
+    seen = evaluate_encounters(
+        THREE, requirements.requirements[0].encounters, Criterion(**looks), vehicle=box
+    ).sightings
     latest_s = [min(one.ttc_s.min(), one.without_ttc_s[1].min()) for one in seen]
     needed_s = [abs(one.encounter.ego.speed_mps) / 8 + 1.0 for one in seen]
-    assert (ttc.value, ttc.count) == (min(latest_s), 4)
+    assert (ttc.value, ttc.total_count) == (min(latest_s), 4)
     assert 0.0 < ttc.value < min(one.ttc_s.max() for one in seen)
     assert spare.value == pytest.approx(min(np.subtract(latest_s, needed_s)))
-    assert "at 30 km/h" in spare.where[0]
+    assert "at 30 km/h" in spare.worst_locations[0]
 
 
 def test_who_is_seen_from_the_beginning_may_have_been_before(box):
@@ -314,10 +316,13 @@ def test_who_is_seen_from_the_beginning_may_have_been_before(box):
     brakes = {"deceleration": 9, "latency_s": 0.75}
     found = check(two, asked({**one, "ttc_s": 0.9}, {**one, "ttc_s": 1.1, "in_time": brakes}), vehicle=box)
     kept, ttc, spare = found.verdicts["small"]
-    assert [(each.state, each.unknown) for each in (kept, ttc, spare)] == [("kept", 0), *[("not checked", 3)] * 2]
+    assert [(each.state, each.undecided_count) for each in (kept, ttc, spare)] == [
+        ("kept", 0),
+        *[("not checked", 3)] * 2,
+    ]
     assert 0.9 < ttc.value == ttc.low < 1.1 < ttc.high == np.inf
     assert spare.value == pytest.approx(ttc.value - 20 / 3.6 / 18 - 0.75)
-    (table,) = found.tables()
+    (table,) = found.build_tables()
     assert [cell.text for cell in table.rows[1]][2:5] == ["not checked", f"{ttc.value:.4g} or more", "-"]
     with pytest.raises(ValueError, match=r"1\.5 s are required, and encounter 'a' at 20 km/h .* lasts 1\.1\d s"):
         check(two, asked({**one, "ttc_s": 1.5}), vehicle=box)
@@ -332,12 +337,12 @@ def test_who_is_seen_from_the_beginning_may_have_been_before(box):
 )  # fmt: skip
 def test_the_examples_keep_what_they_require(name, rig_name, keys):
     found = check(rig_name, EXAMPLES / name / "needs.yaml", **keys)
-    assert found.is_met, found.tables()
+    assert found.is_met, found.build_tables()
 
 
 def test_a_camera_of_few_pixels_shows_nothing_even_if_they_were_points_enough(box):
     (one,) = Requirements.load("reversing_r158_cameras").requirements
-    far = one.model_copy(update={"at": BodyPlaces(points_m=((-3.5, 0.0),), relative_to="rear")})
+    far = one.model_copy(update={"at": TargetPositions(points_m=((-3.5, 0.0),), relative_to="rear")})
     coarse = {**CAMERA, "mount": {"x_m": -2.1, "z_m": 1.0, "yaw_deg": 180}, "width": 48, "height": 36, "stride": 1}
     points = far.model_copy(update={"pixels": None, "points": 5, "name": "as points"})
     pixels, as_points = check(rig(coarse), asked(far, points), vehicle=box).verdicts["small"]
@@ -351,7 +356,7 @@ def test_built_in_sets_say_where_they_are_from_and_that_they_are_no_homologation
     assert "geometry, no homologation" in found.description
     assert "In doubt: " in found.description
     bodies = [one for one in found.requirements if isinstance(one, TargetRequirement)]
-    assert all((one.points is None) == (one.by == ("camera",)) != (one.pixels is None) for one in bodies)
+    assert all((one.points is None) == (one.counted_sensors == ("camera",)) != (one.pixels is None) for one in bodies)
     assert "memory" not in found.description
 
 

@@ -7,8 +7,8 @@ from html.parser import HTMLParser
 import pytest
 
 import torchcover
-from torchcover.evaluation import save_targets, survey_target
-from torchcover.evaluation.result_page import rig_document
+from torchcover.evaluation import map_target_visibility, save_target_map
+from torchcover.evaluation.result_page import format_rig_yaml
 from torchcover.simulation import Rig
 from torchcover.targets import Raster
 
@@ -64,15 +64,15 @@ def test_the_page_has_what_was_asked_for(result):
 @pytest.mark.parametrize("name", ["edgar", "kitti_cameras", "place3d_pyramid", "waymo"])
 def test_the_rig_on_the_page_can_be_read_back(name, tmp_path):
     rig = Rig.load(name)
-    text = html.unescape(html.escape(rig_document(name, rig.sensors)))
+    text = html.unescape(html.escape(format_rig_yaml(name, rig.sensors)))
     (tmp_path / "rig.yaml").write_text(text, encoding="utf-8")
     again = Rig.load(tmp_path / "rig.yaml")
     assert [sensor.content() for sensor in again.sensors] == [sensor.content() for sensor in rig.sensors]
 
 
 def test_the_page_of_a_target_draws_where_it_is_first_seen(tmp_path):
-    seen = survey_target("front_roof_128", "dog", raster=Raster((-6.0, 6.0), (-4.0, 4.0), 1.0))
-    files = save_targets(seen, tmp_path, Rig.load("front_roof_128").sensors)
+    seen = map_target_visibility("front_roof_128", "dog", raster=Raster((-6.0, 6.0), (-4.0, 4.0), 1.0))
+    files = save_target_map(seen, tmp_path, Rig.load("front_roof_128").sensors)
     assert tmp_path / "report.html" in files
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     words = " ".join(Text(page).words)

@@ -8,12 +8,12 @@ import pytest
 
 from torchcover.coverage.quantity import detection
 from torchcover.estimation import ErrorModel
-from torchcover.evaluation import Settings, StudyPlan, Trial, error_against_time, evaluate
-from torchcover.evaluation.study import Studied, Study
+from torchcover.evaluation import Settings, StudyPlan, Trial, evaluate, measure_error_against_time
+from torchcover.evaluation.study import StudiedNumber, Study
 from torchcover.simulation import Rig
 
 DETECTION = detection(0.4)
-SMALL = Settings("front_roof_32", "courtyard", steps=8, cell_m=4.0, rays=256)
+SMALL = Settings("front_roof_32", "courtyard", num_frames=8, cell_m=4.0, num_rays=256)
 
 
 @pytest.fixture(autouse=True)
@@ -25,14 +25,14 @@ def no_command(monkeypatch):
 def study():
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("torchcover.evaluation.study.command_s", lambda plan: 100.0)
-        return error_against_time(StudyPlan(SMALL, ({"rays": 64}, {"reference": "paper", "rays": 1024})))
+        return measure_error_against_time(StudyPlan(SMALL, ({"rays": 64}, {"reference": "paper", "rays": 1024})))
 
 
 def trial(a, seconds=64.0, bias=0.0, options="", least=64):
     """64 steps of one number that is awaited, and of one that is not."""
     error = ErrorModel(a, bias)
-    other = Studied("3m", "ground", False, DETECTION, 0.5, ErrorModel(9.0), None, False)
-    own = Studied("20m", "ground", True, DETECTION, 0.5, error, None, False)
+    other = StudiedNumber("3m", "ground", False, DETECTION, 0.5, ErrorModel(9.0), None, False)
+    own = StudiedNumber("20m", "ground", True, DETECTION, 0.5, error, None, False)
     return Trial(options, 64, least, seconds, seconds, "ground", [own, other])
 
 
@@ -77,25 +77,25 @@ def test_times_are_those_of_a_whole_command(study):
 
 
 def test_the_worst_awaited_number_decides_and_what_prints_no_error_is_not_recommended():
-    assert trial(0.04).steps_for(0.01) == 400
-    assert trial(0.0004).steps_for(0.01) == 64  # fewer print no error
-    assert trial(0.0123456).steps_for(0.01) == 130  # in two digits, never fewer
-    assert trial(math.nan).steps_for(0.01) is None
-    assert trial(0.04, bias=0.02).steps_for(0.01) is None
+    assert trial(0.04).estimate_num_frames(0.01) == 400
+    assert trial(0.0004).estimate_num_frames(0.01) == 64  # fewer print no error
+    assert trial(0.0123456).estimate_num_frames(0.01) == 130  # in two digits, never fewer
+    assert trial(math.nan).estimate_num_frames(0.01) is None
+    assert trial(0.04, bias=0.02).estimate_num_frames(0.01) is None
 
 
 def test_another_setting_is_recommended_only_where_it_saves_a_fifth():
     plan = StudyPlan(SMALL)
     for seconds, expected in ((60.0, ""), (40.0, "--set rays=64")):
-        found = Study(plan, [trial(0.04), trial(0.04, seconds, options="--set rays=64")], 1.0).recommended(0.01)
+        found = Study(plan, [trial(0.04), trial(0.04, seconds, options="--set rays=64")], 1.0).find_recommended(0.01)
         assert (found[0].options, found[1]) == (expected, 400)
     biased = Study(plan, [trial(0.04), trial(0.04, 1.0, bias=0.02, options="--set rays=64")], 1.0)
-    assert biased.recommended(0.01)[0].options == ""
-    assert Study(plan, [trial(math.nan)], 1.0).recommended(0.01) is None
-    assert Study(plan, [trial(math.nan)], 1.0).advice(0.01) == (
+    assert biased.find_recommended(0.01)[0].options == ""
+    assert Study(plan, [trial(math.nan)], 1.0).find_recommended(0.01) is None
+    assert Study(plan, [trial(math.nan)], 1.0).format_recommendation(0.01) == (
         "For 1 percentage point of every detection: not known, for 64 steps say no error of 20m ground."
     )
-    assert Study(plan, [trial(0.04)], 1.0).advice(0.01) == (
+    assert Study(plan, [trial(0.04)], 1.0).format_recommendation(0.01) == (
         "For 1 percentage point of every detection: front_roof_32 --set scenario=courtyard --set cell_m=4.0 "
         "--set rays=256 --steps=400 (401 s)."
     )
@@ -122,12 +122,14 @@ def test_records_are_json_without_nan_and_the_files_are_written(study, tmp_path)
 
 
 def test_the_command_that_is_timed_has_every_option_that_is_not_as_usual():
-    settings = Settings("rig", "urban", cell_m=0.5, thresholds_m=(0.2, 1), every_s=5.0, steps=7, workers=2)
+    settings = Settings(
+        "rig", "urban", cell_m=0.5, thresholds_m=(0.2, 1), frame_interval_s=5.0, num_frames=7, num_workers=2
+    )
     assert StudyPlan(settings).command == [
         "evaluate", "rig", *("--set", "scenario=urban"), *("--set", "cell_m=0.5"), *("--set", "thresholds_m=0.2,1.0"),
         *("--set", "every_s=5.0"), *("--set", "workers=2"),
     ]  # fmt: skip
-    assert StudyPlan(replace(settings, steps=None)).each[""].steps == 512
+    assert StudyPlan(replace(settings, steps=None)).trial_settings[""].num_frames == 512
 
 
 @pytest.mark.parametrize("settings", [Settings(), Settings(Rig.load("front_roof_32"))])
@@ -142,4 +144,4 @@ def test_a_run_that_was_cut_short_is_no_study(monkeypatch):
 
     monkeypatch.setattr("torchcover.evaluation.observers.CoverageObserver.add", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        error_against_time(StudyPlan(SMALL))
+        measure_error_against_time(StudyPlan(SMALL))

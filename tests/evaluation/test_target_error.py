@@ -10,7 +10,14 @@ import pytest
 import torch
 
 from torchcover import BevGrid, CoverageMetric, Region
-from torchcover.evaluation import CoverageObserver, Standing, TargetError, TargetWatch, outcome, standings
+from torchcover.evaluation import (
+    ConvergenceStatus,
+    CoverageObserver,
+    TargetError,
+    TargetErrorRule,
+    compute_convergence,
+    summarize_target_error,
+)
 
 GRID = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-0.5, 0.5), "above": (0.5, 1.0)})
 REGIONS = (Region("near", (0.0, 1.0), (0.0, 1.0)), Region("far", (1.0, 2.0), (0.0, 1.0)))
@@ -58,7 +65,7 @@ def test_two_targets_in_one_unit_are_refused():
 
 def test_every_known_number_of_every_rig_and_every_difference_counts():
     coverages = {"a": filled(40).compute(), "b": filled(40, scale=0.5).compute(), "c": filled(40).compute()}
-    found = standings(TargetError(radius_m=0.1, detection=0.05), coverages, REGIONS)
+    found = compute_convergence(TargetError(radius_m=0.1, detection=0.05), coverages, REGIONS)
     names = ["a", "b", "c", "b minus a", "c minus a"]
     quantities = ["radius_m", "detection_0.4m", "detection_0.8m"]
     # Nothing is known above: nothing waits for it.
@@ -74,36 +81,36 @@ def test_every_known_number_of_every_rig_and_every_difference_counts():
     difference = coverages["b"].estimate(REGIONS[1], "all").minus(coverages["a"].estimate(REGIONS[1], "all"))
     assert by_name["b minus a", "far", "radius_m"] == float(difference.error[0]) > 0
     assert by_name["c minus a", "far", "radius_m"] == 0.0
-    only_radius = standings(TargetError(radius_m=0.1), coverages, REGIONS)
+    only_radius = compute_convergence(TargetError(radius_m=0.1), coverages, REGIONS)
     assert {one.quantity for one in only_radius} == {"radius_m"}
 
 
 def test_errors_fall_with_the_root_of_the_steps():
-    standing = Standing("a", "near", "all", "radius_m", error=0.3, target=0.1, steps=100)
-    assert not standing.reached
-    assert standing.steps_needed == pytest.approx(900, abs=1)
-    unknown = Standing("a", "near", "all", "radius_m", error=math.nan, target=0.1, steps=100)
-    assert (unknown.reached, unknown.steps_needed) == (False, None)
-    early = Standing("a", "near", "all", "radius_m", error=0.0, target=0.1, steps=63)
-    assert (early.reached, early.steps_needed) == (False, 64)
+    standing = ConvergenceStatus("a", "near", "all", "radius_m", error=0.3, target=0.1, num_frames=100)
+    assert not standing.is_reached
+    assert standing.frames_needed == pytest.approx(900, abs=1)
+    unknown = ConvergenceStatus("a", "near", "all", "radius_m", error=math.nan, target=0.1, num_frames=100)
+    assert (unknown.is_reached, unknown.frames_needed) == (False, None)
+    early = ConvergenceStatus("a", "near", "all", "radius_m", error=0.0, target=0.1, num_frames=63)
+    assert (early.is_reached, early.frames_needed) == (False, 64)
 
 
 def test_a_run_stops_once_every_error_is_small_enough_at_two_looks_in_a_row():
     target = TargetError(radius_m=0.025)
     metric = a_metric()
-    watch = TargetWatch(target, {"a": CoverageObserver(metric)}, REGIONS)
+    watch = TargetErrorRule(target, {"a": CoverageObserver(metric)}, REGIONS)
     looks, small, most = [], [], 4096
     for index in range(most):
         add(metric, index)
-        steps, before = index + 1, watch.next_look
-        assert watch.expected_steps(most) <= most
+        steps, before = index + 1, watch.next_check_frame
+        assert watch.estimate_num_frames(most) <= most
         if watch.is_reached(steps):
             break
-        if watch.next_look != before:
+        if watch.next_check_frame != before:
             looks.append(steps)
             small.append(watch.worst.error <= 0.025)
             assert watch.worst.region == "near"
-            assert steps < watch.expected_steps(most)
+            assert steps < watch.estimate_num_frames(most)
     # 0.29 / sqrt(steps) is the error of the mean of numbers in [0, 1).
     assert 0.5 * (0.289 / 0.025) ** 2 < steps < 2 * (0.289 / 0.025) ** 2
     assert looks[0] == 64
@@ -111,9 +118,9 @@ def test_a_run_stops_once_every_error_is_small_enough_at_two_looks_in_a_row():
     assert not any(first and second for first, second in itertools.pairwise(small))
     assert (np.diff([*looks, steps]) >= 3).all()
     assert len(looks) < 15
-    record, lines = outcome(target, {"a": metric.compute()}, REGIONS, confirmed=True)
+    record, lines = summarize_target_error(target, {"a": metric.compute()}, REGIONS, is_confirmed=True)
     assert record["reached"] is True
-    assert record["steps_needed"] == steps
+    assert record["frames_needed"] == steps
     assert record["unknown"] == ["near above", "far above"]
     assert lines == [
         f"Target error reached after {steps} steps.",
@@ -123,7 +130,7 @@ def test_a_run_stops_once_every_error_is_small_enough_at_two_looks_in_a_row():
 
 def test_small_enough_once_is_not_reached():
     coverages = {"a": filled(64, scale=0.01).compute()}
-    record, lines = outcome(TargetError(radius_m=1.0), coverages, REGIONS, confirmed=False)
+    record, lines = summarize_target_error(TargetError(radius_m=1.0), coverages, REGIONS, is_confirmed=False)
     assert all(number["reached"] for number in record["numbers"])
     assert record["reached"] is False
     assert lines[0].startswith("Target error not reached in 64 steps: every error is small enough now, but was not at")
@@ -131,9 +138,11 @@ def test_small_enough_once_is_not_reached():
 
 @pytest.mark.parametrize("steps", [5, 63])
 def test_however_good_it_looks_no_run_ends_before_64_steps(steps):
-    watch = TargetWatch(TargetError(radius_m=1e6), {"a": CoverageObserver(filled(steps))}, REGIONS)
+    watch = TargetErrorRule(TargetError(radius_m=1e6), {"a": CoverageObserver(filled(steps))}, REGIONS)
     assert not watch.is_reached(steps)
-    record, (first, *_) = outcome(watch.target, {"a": filled(steps).compute()}, REGIONS, confirmed=False)
+    record, (first, *_) = summarize_target_error(
+        watch.target, {"a": filled(steps).compute()}, REGIONS, is_confirmed=False
+    )
     assert record["reached"] is False
     assert first.startswith(f"Target error not reached in {steps} steps")
 
@@ -142,30 +151,32 @@ def test_nothing_known_is_not_good_enough():
     metric = a_metric()
     for index in range(64):
         metric.update(torch.zeros(1, 3), torch.tensor([[-9.0, 0.0, 0.0]]), place_in_time=index)
-    watch = TargetWatch(TargetError(radius_m=1.0), {"a": CoverageObserver(metric)}, REGIONS)
+    watch = TargetErrorRule(TargetError(radius_m=1.0), {"a": CoverageObserver(metric)}, REGIONS)
     assert not watch.is_reached(64)
-    assert watch.expected_steps(100) == 100
-    record, lines = outcome(watch.target, {"a": metric.compute()}, REGIONS, confirmed=False)
-    assert (record["reached"], record["steps_needed"], record["numbers"]) == (False, None, [])
+    assert watch.estimate_num_frames(100) == 100
+    record, lines = summarize_target_error(watch.target, {"a": metric.compute()}, REGIONS, is_confirmed=False)
+    assert (record["reached"], record["frames_needed"], record["numbers"]) == (False, None, [])
     assert lines[0] == "Target error not reached: no region has a known cell."
 
 
 def test_what_was_not_reached_is_told_for_each_region_with_the_steps_it_would_take():
     target = TargetError(radius_m=0.005, detection=0.5)
-    record, lines = outcome(target, {"a": filled(64, scale=0.01).compute()}, REGIONS, confirmed=False)
+    record, lines = summarize_target_error(target, {"a": filled(64, scale=0.01).compute()}, REGIONS, is_confirmed=False)
     assert re.fullmatch(
         r"  near all, radius_m of a: error 0\.03\d m \(target 0\.005 m\), about \d,\d00 different steps are needed",
         lines[1],
     )
     assert re.fullmatch(r"  far all, radius_m of a: error 0\.000\d+ m \(target 0\.005 m\), reached", lines[2])
     assert record["radius_m"] == 0.005
-    worst = max(record["numbers"], key=lambda number: number["steps_needed"])
-    assert record["steps_needed"] == worst["steps_needed"] == math.ceil(64 * (worst["error"] / 0.005) ** 2)
+    worst = max(record["numbers"], key=lambda number: number["frames_needed"])
+    assert record["frames_needed"] == worst["frames_needed"] == math.ceil(64 * (worst["error"] / 0.005) ** 2)
     json.dumps(record, allow_nan=False)
 
 
 def test_what_all_steps_say_alike_is_not_waited_for_and_named():
-    _, lines = outcome(TargetError(detection=0.5), {"a": filled(64).compute()}, REGIONS, confirmed=True)
+    _, lines = summarize_target_error(
+        TargetError(detection=0.5), {"a": filled(64).compute()}, REGIONS, is_confirmed=True
+    )
     assert [line for line in lines if "say the same" in line] == [
         "Not waited for, as all steps say the same, which proves nothing: far all, detection_0.4m of a; "
         "far all, detection_0.8m of a."
@@ -173,15 +184,17 @@ def test_what_all_steps_say_alike_is_not_waited_for_and_named():
 
 
 def test_without_an_error_no_number_of_steps_is_made_up():
-    record, lines = outcome(TargetError(radius_m=0.01), {"a": filled(5).compute()}, REGIONS, confirmed=False)
-    assert record["steps_needed"] is None
+    record, lines = summarize_target_error(
+        TargetError(radius_m=0.01), {"a": filled(5).compute()}, REGIONS, is_confirmed=False
+    )
+    assert record["frames_needed"] is None
     assert {number["error"] for number in record["numbers"]} == {None}
     assert lines[1] == "  near all, radius_m of a: not enough steps for an error"
     json.dumps(record, allow_nan=False)
 
 
 def test_without_a_target_nothing_is_said():
-    assert outcome(None, {"a": filled(5).compute()}, REGIONS, confirmed=False) == (None, [])
+    assert summarize_target_error(None, {"a": filled(5).compute()}, REGIONS, is_confirmed=False) == (None, [])
 
 
 @pytest.mark.parametrize(

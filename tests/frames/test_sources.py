@@ -155,8 +155,8 @@ def test_a_batch_has_weights_of_all_its_frames_or_of_none():
 
 def test_blocks_of_a_source_end_where_its_frames_show_something_else(tmp_path):
     traffic = SimulatedFrames("urban", "front_roof_32", steps=3, every_s=10.0, reference_sensor=PaperReference(4, 4))
-    ends = find_block_ends(traffic, most_blocks=4)
+    ends = find_block_ends(traffic, max_blocks=4)
     places = [traffic.place_in_time(index) for index in range(ends[-1] + 1)]
     assert ends == [places.index(number) for number in range(1, 5)]
-    assert find_block_ends(simulated(None), most_blocks=3) == [1, 2, 3]  # nothing moves: each frame has its reference
+    assert find_block_ends(simulated(None), max_blocks=3) == [1, 2, 3]  # nothing moves: each frame has its reference
     assert find_block_ends(recorded(tmp_path)) == [1, 2]

@@ -8,7 +8,7 @@ import pytest
 from tests.placement.worlds import EGO, LOT, held, lidar, rig
 from torchcover.evaluation.checking import check
 from torchcover.evaluation.requirements import Requirements
-from torchcover.evaluation.target_survey import free_space
+from torchcover.evaluation.target_survey import build_flat_ground
 from torchcover.placement import Objective, PlacementSearch, SearchPlan, SearchSpace, run_search
 from torchcover.targets import Target, survey_places
 
@@ -54,7 +54,7 @@ def searched(lot, out=None, *, objectives=None, resume=False, evaluations=8, **c
 def test_the_number_is_the_share_of_the_places_that_are_seen_well_enough_and_has_no_error():
     some = held(objectives={"near": Objective(region="20m"), "child": child(), "far": Objective(region="80m")})
     without = held(objectives={"near": Objective(region="20m"), "far": Objective(region="80m")})
-    empty, shares = free_space().model_copy(update={"ego": some._worlds[0].ego}), []
+    empty, shares = build_flat_ground().model_copy(update={"ego": some._worlds[0].ego}), []
     for each in (LEVEL, DOWN):
         estimate = some.score(each).estimate
         points = survey_places(each, empty, Target.load("child"), np.array(PLACES)).least_points
@@ -80,8 +80,8 @@ def test_of_encounters_those_count_that_are_kept_in_all_phases_on_the_vehicle_of
     of_rig = rig(lidar(channels=32, mount={"z_m": 3.2}), vehicle="suv")  # which is not what carries it there
     required = Requirements.model_validate({"requirements": [asked["requires"]]})
     (verdict,) = check(of_rig, required, vehicle="van").verdicts["small"]
-    assert verdict.count == 2
-    assert some.score(of_rig).estimate.value.tolist() == [(2 - verdict.failed - verdict.unknown) / 2]
+    assert verdict.total_count == 2
+    assert some.score(of_rig).estimate.value.tolist() == [(2 - verdict.not_met_count - verdict.undecided_count) / 2]
 
 
 def test_a_search_finds_where_the_child_is_seen_and_resumed_it_finds_the_same(lot, tmp_path):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.placement.surfaces import Surface, near_far, plan, space
-from torchcover.evaluation.checking import Checked
+from torchcover.evaluation.checking import CheckResult
 from torchcover.evaluation.requirements import Verdict
 from torchcover.files import BadFileError
 from torchcover.placement import OptimizerParams, PlacementSearch, SearchPlan, SearchSpace, run_search
@@ -126,7 +126,7 @@ def needing(pitch_deg):
         counts = 1, int(margin < 0), 0, ()
         state = "kept" if margin >= 0 else "not kept"
         verdict = Verdict(requirement.words, bound, state, 0, 0, 0, margin, *counts)
-        return Checked(required, {rig.name: [verdict]}, {})
+        return CheckResult(required, {rig.name: [verdict]}, {})
 
     return check
 
@@ -419,7 +419,7 @@ def test_a_real_search_does_not_depend_on_the_number_of_workers(tmp_path):
             "objectives": {"near": {"region": "20m"}},
         }
     )
-    small = {"worlds": 3, "fresh_worlds": 3, "per_world": 2, "every_s": 0.4, "rays": 512}
+    small = {"worlds": 3, "num_held_out_scenes": 3, "per_world": 2, "every_s": 0.4, "rays": 512}
     results = [run_search(PlacementSearch(of, evaluations=3, workers=workers, **small)) for workers in (0, 1)]
     assert contents(results[0].search) == contents(results[1].search)
     assert results[0].summary == results[1].summary

@@ -255,7 +255,7 @@ def test_one_bad_sweep_costs_its_own_frame():
     with pytest.raises(BadFrameError, match=r"^f2 \(frame 2\): f2.bin: truncated$"):
         frames[2]
     result = evaluate(frames=frames, skip_bad_frames=True, cell_m=8.0)
-    assert (result.run.steps, result.run.skipped) == (5, ["f2 (frame 2): f2.bin: truncated"])
+    assert (result.run.num_frames, result.run.skipped_frames) == (5, ["f2 (frame 2): f2.bin: truncated"])
     assert pickle.loads(pickle.dumps(frames.reference)).sweeps.skip_bad
     assert all(len(frames[each].reference) for each in (0, 1, 3, 5))
     assert frames[0].counts["reference_sweeps_skipped"] == 2  # both sensors

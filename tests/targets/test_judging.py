@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from torchcover.evaluation import free_space, save_targets, survey_target, target_record
+from torchcover.evaluation import build_flat_ground, build_target_record, map_target_visibility, save_target_map
 from torchcover.geometry import BoundingBox
 from torchcover.report.scene import UNSEEN
 from torchcover.simulation import with_ego
@@ -118,7 +118,7 @@ def test_the_worst_places_have_the_fewest_points_and_keep_apart():
 
 def test_the_files_hold_what_the_map_holds(tmp_path):
     seen = seen_where(lambda x, y: np.abs(x) + 0.5, raster=Raster((-3.0, 3.0), (-2.0, 2.0), 1.0))
-    names = [path.name for path in save_targets(seen, tmp_path)]
+    names = [path.name for path in save_target_map(seen, tmp_path)]
     assert names == ["targets.csv", "targets.npz", "report.html", "targets.png", "summary.json"]
     with np.load(tmp_path / "targets.npz") as arrays:
         np.testing.assert_array_equal(arrays["points"], seen.points)
@@ -131,7 +131,7 @@ def test_the_files_hold_what_the_map_holds(tmp_path):
     assert (rows[8]["state"], rows[8]["points"], rows[8]["side"]) == ("occupied", "", "")
     record = json.loads((tmp_path / "summary.json").read_text())
     assert record["cells"] == {"free": 16, "occupied": 8, "outside": 0, "share_unknown": 0}
-    assert target_record(replace(seen, state=np.ones_like(seen.state)))["sides"][0]["seen"] is None
+    assert build_target_record(replace(seen, state=np.ones_like(seen.state)))["sides"][0]["seen"] is None
 
 
 def test_the_picture_shows_cells_where_they_are():
@@ -160,7 +160,7 @@ def test_names_become_bodies(tmp_path):
     assert (post.name, post.solid.box.lower_m[2]) == ("post", 0.0)  # it stands on the ground
     (tmp_path / "plate.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
     assert Target.load(tmp_path / "plate.obj").solid.box.size_m == (1.0, 1.0, 1.0)
-    assert with_ego(free_space(), {}, tmp_path / "plate.obj").ego_box().size_m == (1.0, 1.0, 1.0)
+    assert with_ego(build_flat_ground(), {}, tmp_path / "plate.obj").ego_box().size_m == (1.0, 1.0, 1.0)
     (tmp_path / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 1 3 2\n")
     with pytest.raises(ValueError, match="lower < upper"):
         Target.load(tmp_path / "flat.obj")
@@ -180,7 +180,7 @@ def test_names_become_bodies(tmp_path):
 )
 def test_an_option_that_cannot_be_is_an_error(options, message):
     with pytest.raises((ValueError, FileNotFoundError), match=message):
-        survey_target("front_roof_32", **{"target": "child", **options})
+        map_target_visibility("front_roof_32", **{"target": "child", **options})
 
 
 @pytest.mark.parametrize(

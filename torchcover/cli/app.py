@@ -19,7 +19,7 @@ import typer
 from torchcover.cli import commands
 from torchcover.cli.evaluate import compare, evaluate
 from torchcover.evaluation.cores import set_threads
-from torchcover.evaluation.progress import terminable
+from torchcover.evaluation.progress import handle_termination
 
 
 class ExitCode(IntEnum):
@@ -68,13 +68,13 @@ def main() -> None:
     gc.set_threshold(OBJECTS_BETWEEN_LOOKS)
     signals: Sequence[int] = ()
     try:
-        with warnings.catch_warnings(), terminable(_on_signals()) as signals:
+        with warnings.catch_warnings(), handle_termination(_on_signals()) as signals:
             warnings.showwarning = _warn
             warnings.filterwarnings("ignore", "The run was cut short", RuntimeWarning)  # the last line says it
             code = run_command(sys.argv[1:])
             sys.stdout.flush()
     except (Exception, KeyboardInterrupt) as error:
-        code, message = judge_error(error, signals)
+        code, message = resolve_exit_code(error, signals)
         if code == ExitCode.INTERNAL_ERROR:
             traceback.print_exc()
         print_error(message)
@@ -98,7 +98,7 @@ def run_command(arguments: Sequence[str]) -> int:
     return ExitCode.SUCCESS
 
 
-def judge_error(error: BaseException, signals: Sequence[int] = ()) -> tuple[int, str]:
+def resolve_exit_code(error: BaseException, signals: Sequence[int] = ()) -> tuple[int, str]:
     """Decide how the program ends after an error.
 
     Args:
@@ -184,8 +184,8 @@ def _mistake(error: BaseException) -> str | None:
 
 
 @app.callback(invoke_without_command=True)
-def version(
-    show: Annotated[bool, typer.Option("--version", help="Print the version and stop.")] = False,
+def handle_global_options(
+    show_version: Annotated[bool, typer.Option("--version", help="Print the version and stop.")] = False,
     allow_links: Annotated[
         list[Path] | None,
         typer.Option("--allow-links", help="Folder that links in a recording may lead to; may be repeated."),
@@ -196,7 +196,7 @@ def version(
         from torchcover.files import common_link_roots  # with NumPy, which help does not need
 
         common_link_roots[:] = allow_links
-    if show:
+    if show_version:
         from torchcover import __version__
 
         typer.echo(__version__)

@@ -8,51 +8,57 @@ from typing import Annotated, Any, Literal
 import typer
 
 from torchcover.cli import options
-from torchcover.cli.options import of_criterion, of_evaluate, with_options
-from torchcover.evaluation.config import STUDY_SETTINGS, load_config, write_defaults
+from torchcover.cli.options import build_criterion_options, build_setting_options, with_options
+from torchcover.evaluation.config import STUDY_SETTINGS, format_defaults, load_config
 
 UNITS_S = {"s": 1.0, "min": 60.0, "h": 3600.0}
 
 
 @with_options(
-    of_evaluate("scenario", "vehicle", "ask", "thresholds_m", "reference", "rays", "seed", "device", "workers")
+    build_setting_options(
+        "scenario", "vehicle", "ask", "thresholds_m", "reference", "rays", "seed", "device", "workers"
+    )
 )
 def study(
-    rig: options.Rig,
-    steps: Annotated[
+    rig: options.RigArgument,
+    num_frames: Annotated[
         int, typer.Option(min=8, help="Steps of the first setting; the others see the first quarter of these instants.")
     ] = 512,
-    out: options.Out = Path("out"),
-    config: options.Config = None,
-    assignments: options.Assignments = None,
+    out: options.OutOption = Path("out"),
+    config: options.ConfigOption = None,
+    assignments: options.AssignmentsOption = None,
     **given: Any,  # noqa: ANN401
 ) -> None:
     """Find the setting for a wanted error: what each costs, how far it is off, and how many steps it needs."""
     from torchcover.cli.printing import print_study
-    from torchcover.evaluation import Settings, StudyPlan, error_against_time, rank_count
+    from torchcover.evaluation import Settings, StudyPlan, count_ranks, measure_error_against_time
     from torchcover.files import lock_folder
 
-    if rank_count() > 1:
+    if count_ranks() > 1:
         raise ValueError("study measures run times, which several ranks would change: run it without torchrun")
-    settings = load_config(config, assignments or (), options.changed(given)).config.settings()
+    settings = load_config(
+        config, assignments or (), options.find_changed_settings(given)
+    ).config.get_changed_settings()
     settings.pop("steps", None)
     if unused := settings.keys() - set(STUDY_SETTINGS):
         raise ValueError(f"study does not take {', '.join(sorted(unused))}; it takes {', '.join(STUDY_SETTINGS)}")
     fewer = "rays" not in settings and settings.get("reference") != "paper"
-    plan = StudyPlan(Settings(rig, steps=steps, **settings), StudyPlan.others if fewer else ())
+    plan = StudyPlan(Settings(rig, num_frames=num_frames, **settings), StudyPlan.variants if fewer else ())
     with lock_folder(out):
-        found = error_against_time(plan, progress=True)
+        found = measure_error_against_time(plan, show_progress=True)
         files = found.save(out)
     print_study(found, files, out)
 
 
-@with_options(of_evaluate("scenario", "seed", "vehicle", "sensor_model", "weather", "reference", "rays", "every_s"))
+@with_options(
+    build_setting_options("scenario", "seed", "vehicle", "sensor_model", "weather", "reference", "rays", "every_s")
+)
 def record(
-    rig: options.Rig,
+    rig: options.RigArgument,
     out: Annotated[
         Path, typer.Option("--out", help="Folder for the recording, new or empty.", callback=options.check_out)
     ],
-    steps: Annotated[int | None, typer.Option(min=1, help="Steps to simulate (64), a frame each.")] = None,
+    num_frames: Annotated[int | None, typer.Option(min=1, help="Steps to simulate (64), a frame each.")] = None,
     layout: Annotated[
         str, typer.Option("--format", help="`folder`, or `kitti`: KITTI's object layout, of a rig of one LiDAR.")
     ] = "folder",
@@ -63,11 +69,11 @@ def record(
 ) -> None:
     """Write what a simulated rig sees as a recording, for other tools and for `evaluate --frames`."""
     from torchcover.evaluation import Settings
-    from torchcover.evaluation.task import simulation
+    from torchcover.evaluation.task import build_simulation_task
     from torchcover.files import RECORDING, read_manifest
     from torchcover.simulation import Rig, write_recording
 
-    frames = simulation(Settings(Rig.load(rig), steps=steps, **settings), boxes=True).frames
+    frames = build_simulation_task(Settings(Rig.load(rig), num_frames=num_frames, **settings), needs_boxes=True).frames
     try:
         write_recording(frames, out, layout, resume=resume, progress=_with_a_bar)
     except BaseException:
@@ -80,7 +86,7 @@ def record(
 def _with_a_bar(steps: range) -> Iterator[int]:
     from torchcover.evaluation.progress import Progress
 
-    with Progress(steps.stop, "record", done=steps.start, shown=True) as bar:
+    with Progress(steps.stop, "record", num_done=steps.start, is_shown=True) as bar:
         for step in steps:
             yield step
             bar.advance(steps.stop)
@@ -88,7 +94,7 @@ def _with_a_bar(steps: range) -> Iterator[int]:
 
 def rig(
     frames: Annotated[Path, typer.Option("--frames", help="The recording, of any layout in docs/recordings.md.")],
-    assignments: options.Assignments = None,
+    assignments: options.AssignmentsOption = None,
     sensors: Annotated[
         list[str] | None,
         typer.Option("--sensors", help="Its sensors, as in `roof,left`. Not given: all of the recording."),
@@ -120,8 +126,10 @@ def world(
     out: Annotated[
         Path, typer.Option("--out", help="Folder for scenario.yaml and its files.", callback=options.check_out)
     ],
-    steps: Annotated[int | None, typer.Option(min=1, help="How many of its frames, from the first on (all).")] = None,
-    assignments: options.Assignments = None,
+    num_frames: Annotated[
+        int | None, typer.Option(min=1, help="How many of its frames, from the first on (all).")
+    ] = None,
+    assignments: options.AssignmentsOption = None,
     vehicle: Annotated[
         str | None, typer.Option(help="Vehicle that recorded it: a name, a file, or x0,x1,y0,y1,z0,z1 of its body.")
     ] = None,
@@ -130,13 +138,13 @@ def world(
     from torchcover.simulation import write_world
 
     opened = options.open_recording(recording, options.load_recording_settings(assignments), vehicle)
-    told = write_world(opened, out, steps=steps)
+    told = write_world(opened, out, steps=num_frames)
     typer.echo(f"{told}. Wrote {out}; try rigs in it: torchcover evaluate RIG --scenario {out / 'scenario.yaml'}")
 
 
 def config() -> None:
     """Print all settings of a run with defaults and comments, for `--config`: torchcover config > run.yaml."""
-    typer.echo(write_defaults(), nl=False)
+    typer.echo(format_defaults(), nl=False)
 
 
 def robot(
@@ -165,7 +173,7 @@ def calibrate(
         str,
         typer.Option(help="Rig that recorded it, whose LiDARs are called as there: a built-in name or a YAML file."),
     ],
-    assignments: options.Assignments = None,
+    assignments: options.AssignmentsOption = None,
     out: Annotated[Path, typer.Option("--out", help="YAML file for the rig with what was found.")] = Path("rig.yaml"),
 ) -> None:
     """Fit how far each LiDAR of a rig sees, and its noise, to a recording: from road that did or did not return."""
@@ -186,7 +194,7 @@ def _pair(text: str, option: str, example: str) -> tuple[str, str]:
     return name, value
 
 
-@with_options(of_evaluate("vehicle"))
+@with_options(build_setting_options("vehicle"))
 def show(
     name: Annotated[
         str, typer.Argument(help="Rig, scenario or vehicle: a built-in name (see `list`), a YAML file or a mesh.")
@@ -195,23 +203,27 @@ def show(
         str | None, typer.Option(help="For a rig: the scenario whose ego carries it and that it sees (courtyard).")
     ] = None,
     rig: Annotated[str | None, typer.Option(help="For a scenario: whose points to draw (front_roof_128).")] = None,
-    step: Annotated[int | None, typer.Option(min=0, help="Time step of the scenario or the depth images (0).")] = None,
+    frame_index: Annotated[
+        int | None, typer.Option(min=0, help="Time step of the scenario or the depth images (0).")
+    ] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the simulation, likewise (0).")] = None,
-    film: Annotated[
+    animation: Annotated[
         Path | None, typer.Option(help="For a scenario: 10 s of it from that step on, as a .gif or .mp4 (ffmpeg) file.")
     ] = None,
-    out: options.Out = Path("out"),
+    out: options.OutOption = Path("out"),
     **settings: Any,  # noqa: ANN401
 ) -> None:
     """Draw a rig and the depth images of its cameras, a frame of a scenario, or the mount regions of a vehicle."""
-    from torchcover.cli.show import run
+    from torchcover.cli.show import show_item
 
-    run(name, scenario=scenario, rig=rig, step=step, seed=seed, film=film, out=out, **settings)
+    show_item(
+        name, scenario=scenario, rig=rig, frame_index=frame_index, seed=seed, animation=animation, out=out, **settings
+    )
 
 
-@with_options(of_evaluate("vehicle", "sensor_model", "every_s", "seed"))
+@with_options(build_setting_options("vehicle", "sensor_model", "every_s", "seed"))
 def targets(
-    rig: options.Rig,
+    rig: options.RigArgument,
     target: Annotated[
         str,
         typer.Option(
@@ -222,7 +234,7 @@ def targets(
     scenario: Annotated[
         str | None, typer.Option(help="Scenario: a built-in name or a YAML file. Not given: flat ground, nothing else.")
     ] = None,
-    steps: Annotated[
+    num_frames: Annotated[
         int | None, typer.Option(min=1, help="Steps to average (16, or 1 where nothing moves and no sensor is noisy).")
     ] = None,
     raster: Annotated[
@@ -231,33 +243,33 @@ def targets(
     heading: Annotated[
         str, typer.Option(help="Side that it turns to the vehicle: narrow, wide, or its yaw in degrees.")
     ] = "narrow",
-    hits: Annotated[int, typer.Option(min=1, help="Points that are enough to see it.")] = 5,
+    detection_points: Annotated[int, typer.Option(min=1, help="Points that are enough to see it.")] = 5,
     threshold_m: Annotated[
         float, typer.Option("--threshold-m", help="Detection threshold in metres, for the share of its surface.")
     ] = 0.4,
-    out: options.Out = Path("out/targets"),
-    files: options.Files = options.ALL_FILES,
+    out: options.OutOption = Path("out/targets"),
+    files: options.FilesOption = options.ALL_FILES,
     **settings: Any,  # noqa: ANN401
 ) -> None:
     """Put a body at every place around the vehicle: how much of it is seen, and where not."""
-    from torchcover.cli.target_run import run
+    from torchcover.cli.target_run import run_targets_command
 
-    run(
+    run_targets_command(
         rig,
         target,
         scenario,
         raster=raster,
-        steps=steps,
-        hits=hits,
+        steps=num_frames,
+        hits=detection_points,
         threshold_m=threshold_m,
         heading=heading,
         out=out,
-        files=files,
+        file_kinds=files,
         **settings,
     )
 
 
-@with_options(of_evaluate("vehicle", "sensor_model", "seed", "workers"))
+@with_options(build_setting_options("vehicle", "sensor_model", "seed", "workers"))
 def report(
     rigs: Annotated[list[str], typer.Argument(help="Rigs: built-in names (see `list`) or YAML files; at most 8.")],
     scenario: Annotated[str, typer.Option(help="Traffic: a built-in name or a YAML file.")] = "urban",
@@ -270,12 +282,12 @@ def report(
     requirements: Annotated[
         str | None, typer.Option(help="What they must see, as of `check`. Not given: nothing.")
     ] = None,
-    steps: Annotated[int, typer.Option(min=1, help="Steps of the traffic.")] = 64,
+    num_frames: Annotated[int, typer.Option(min=1, help="Steps of the traffic.")] = 64,
     budget: Annotated[
         str | None, typer.Option(help="Time after which the traffic ends, as in 90s or 5min. Not given: all steps.")
     ] = None,
-    out: options.Out = Path("out/report"),
-    files: options.Files = "numbers,page",
+    out: options.OutOption = Path("out/report"),
+    files: options.FilesOption = "numbers,page",
     **settings: Any,  # noqa: ANN401
 ) -> None:
     """One page for a meeting: would it see a child, what fails with a sensor, how far does it see, and how soon."""
@@ -285,7 +297,7 @@ def report(
     from torchcover.report import Terminal
 
     if budget is not None:
-        settings["budget_s"] = parsed_budget(budget)
+        settings["budget_s"] = parse_budget_s(budget)
     with lock_folder(out):
         found = report(
             rigs,
@@ -293,11 +305,11 @@ def report(
             target,
             encounters=encounters,
             requirements=requirements,
-            steps=steps,
-            progress=True,
+            num_frames=num_frames,
+            show_progress=True,
             **settings,
         )
-        written = found.save(out, files=files)
+        written = found.save(out, file_kinds=files)
     console = Terminal()
     print_files(written, out, console)
     print_verdict(found.verdict, console)
@@ -305,7 +317,7 @@ def report(
         found.result.run.raise_failure()
 
 
-@with_options(of_evaluate("vehicle", "sensor_model", "steps", "seed", "workers"))
+@with_options(build_setting_options("vehicle", "sensor_model", "steps", "seed", "workers"))
 def check(
     rigs: Annotated[list[str], typer.Argument(help="Rigs: built-in names (see `list`) or YAML files.")],
     requirements: Annotated[str, typer.Option(help="What they must see: a built-in set or a YAML file.")],
@@ -315,7 +327,7 @@ def check(
             help="World in place of the file's (which has for regions the courtyard, for bodies flat ground)."
         ),
     ] = None,
-    out: options.Out = Path("out/check"),
+    out: options.OutOption = Path("out/check"),
     **settings: Any,  # noqa: ANN401
 ) -> None:
     """Check requirements, as in CI. Exit code 0: all are checked and met; 1: one is not met, or not checked."""
@@ -327,13 +339,13 @@ def check(
     with lock_folder(out):
         found = check(rigs, requirements, scenario, progress=True, **settings)
         written = found.save(out)
-    print_page_tables(found.tables())
+    print_page_tables(found.build_tables())
     print_files(written, out, Terminal())
     print_verdict(found.verdict, Terminal())
     raise typer.Exit(0 if found.is_met else 1)
 
 
-@with_options([*of_criterion(), *of_evaluate("vehicle", "sensor_model", "seed")])
+@with_options([*build_criterion_options(), *build_setting_options("vehicle", "sensor_model", "seed")])
 def encounter(
     context: typer.Context,
     rigs: Annotated[
@@ -349,25 +361,29 @@ def encounter(
     frames: Annotated[
         Path | None, typer.Option(help="Instead: whom it met in a recording with poses and labelled objects.")
     ] = None,
-    phases: Annotated[int, typer.Option(min=1, help="Of a set: at how many places of their period looks begin.")] = 10,
-    worlds: Annotated[int, typer.Option(min=1, help="Of a scenario: how many of its worlds are driven through.")] = 16,
-    film: Annotated[
+    num_start_offsets: Annotated[
+        int, typer.Option(min=1, help="Of a set: at how many places of their period looks begin.")
+    ] = 10,
+    num_scenes: Annotated[
+        int, typer.Option(min=1, help="Of a scenario: how many of its worlds are driven through.")
+    ] = 16,
+    animation: Annotated[
         Path | None, typer.Option(help="Of a set: film what the first rig detects latest, as a .gif or .mp4 file.")
     ] = None,
-    out: options.Out = Path("out/encounters"),
-    files: options.Files = options.ALL_FILES,
+    out: options.OutOption = Path("out/encounters"),
+    files: options.FilesOption = options.ALL_FILES,
     **settings: Any,  # noqa: ANN401
 ) -> None:
     """Would it see the child in time? Of crossings and other encounters: the time to collision at detection."""
     from torchcover.cli.printing import print_files, print_verdict
     from torchcover.encounters import Criterion
     from torchcover.evaluation import (
-        encounter,
-        encounter_film,
-        encounters_verdict,
-        met_in_recording,
-        met_in_traffic,
+        evaluate_encounters,
+        evaluate_recorded_encounters,
+        evaluate_traffic_encounters,
+        plot_encounter_animation,
         save_encounters,
+        summarize_encounters,
     )
     from torchcover.files import lock_folder
     from torchcover.report import Terminal, check_animation, print_page_tables, write_animation
@@ -383,48 +399,54 @@ def encounter(
         source = context.get_parameter_source(each.name or "")
         if each.name in unused and source is not None and source.name == "COMMANDLINE":
             raise ValueError(f"{each.opts[0]}: of no use with {what}; leave it out")
-    if film is not None:
-        check_animation(film)
+    if animation is not None:
+        check_animation(animation)
     with lock_folder(out):
         if frames is not None:
-            found = met_in_recording(frames, criterion)
+            found = evaluate_recorded_encounters(frames, criterion)
         elif scenario is not None:
-            found = met_in_traffic(rigs or (), scenario, criterion, worlds=worlds, progress=True, **settings)
+            found = evaluate_traffic_encounters(
+                rigs or (), scenario, criterion, num_scenes=num_scenes, progress=True, **settings
+            )
         else:
-            found = encounter(rigs or (), encounters, criterion, phases=phases, progress=True, **settings)
-        written = save_encounters(found, out, files=files)
-    if film is not None:
+            found = evaluate_encounters(
+                rigs or (), encounters, criterion, num_start_offsets=num_start_offsets, progress=True, **settings
+            )
+        written = save_encounters(found, out, file_kinds=files)
+    if animation is not None:
         told = {name: settings.get(name) for name in ("vehicle", "sensor_model")}
-        write_animation(film, encounter_film((rigs or [])[0], found, **told), frames_per_s=10)
+        write_animation(animation, plot_encounter_animation((rigs or [])[0], found, **told), frames_per_s=10)
     print_page_tables(found.tables())
     print_files(written, out, Terminal())
-    print_verdict(encounters_verdict(found), Terminal())
+    print_verdict(summarize_encounters(found), Terminal())
 
 
-@with_options(of_evaluate("sensor_model"))
+@with_options(build_setting_options("sensor_model"))
 def search(
     space: Annotated[Path, typer.Argument(help="YAML file of free variables, constraints and objectives.")],
     budget: Annotated[
         str | None, typer.Option(help="Time for all of it: 30min (if nothing is given), 90s, 2h; or --evaluations.")
     ] = None,
-    evaluations: Annotated[
+    num_evaluations: Annotated[
         int | None, typer.Option(min=1, help="Number of candidates instead of a time: the same ones on any machine.")
     ] = None,
-    estimate: Annotated[
+    average: Annotated[
         Literal["area", "known"],
         typer.Option(help="Average of a score: `area`, the visible surface, or `known`, the observed cells."),
     ] = "area",
-    worlds: Annotated[int | None, typer.Option(min=1, help="Worlds of each scenario to search in (6).")] = None,
-    fresh_worlds: Annotated[
+    num_scenes: Annotated[int | None, typer.Option(min=1, help="Worlds of each scenario to search in (6).")] = None,
+    num_held_out_scenes: Annotated[
         int | None, typer.Option(min=1, help="Held-out worlds of each scenario to test in (16).")
     ] = None,
-    per_world: Annotated[int | None, typer.Option(min=1, help="Frames of each world (3).")] = None,
-    every_s: Annotated[float | None, typer.Option("--every-s", help="Seconds between two of them (20).")] = None,
-    rays: Annotated[int | None, typer.Option(min=1, help="Reference rays of each frame (16384).")] = None,
+    frames_per_scene: Annotated[int | None, typer.Option(min=1, help="Frames of each world (3).")] = None,
+    frame_interval_s: Annotated[
+        float | None, typer.Option("--every-s", help="Seconds between two of them (20).")
+    ] = None,
+    num_rays: Annotated[int | None, typer.Option(min=1, help="Reference rays of each frame (16384).")] = None,
     seed: Annotated[
         int, typer.Option(min=0, help="Seed of the search and its worlds; held-out worlds have the next.")
     ] = 0,
-    workers: Annotated[
+    num_workers: Annotated[
         int | None, typer.Option(min=0, help="Processes that score; 0 scores in this one. Not given: as many as help.")
     ] = None,
     resume: Annotated[
@@ -434,38 +456,38 @@ def search(
             help="Continue the search whose journal is in --out.",
         ),
     ] = False,
-    out: options.Out = Path("out/search"),
-    files: options.Files = options.ALL_FILES,
+    out: options.OutOption = Path("out/search"),
+    files: options.FilesOption = options.ALL_FILES,
     **settings: Any,  # noqa: ANN401
 ) -> None:
     """Search for better mounting positions, or select sensors, and test the result on held-out worlds."""
-    from torchcover.cli.search_run import run
+    from torchcover.cli.search_run import run_search_command
 
-    if budget is not None and evaluations is not None:
+    if budget is not None and num_evaluations is not None:
         raise ValueError("--budget, --evaluations: one of them; both are given")
-    given = {"worlds": worlds, "fresh_worlds": fresh_worlds, "per_world": per_world, "every_s": every_s,
-             "rays": rays, "workers": workers, **settings}  # fmt: skip
-    run(
+    given = {"worlds": num_scenes, "num_held_out_scenes": num_held_out_scenes, "per_world": frames_per_scene, "every_s": frame_interval_s,
+             "rays": num_rays, "workers": num_workers, **settings}  # fmt: skip
+    run_search_command(
         space,
         out,
         resume=resume,
-        files=files,
-        evaluations=evaluations,
-        budget_s=None if budget is None else parsed_budget(budget),
-        estimate=estimate,
+        file_kinds=files,
+        evaluations=num_evaluations,
+        budget_s=None if budget is None else parse_budget_s(budget),
+        estimate=average,
         seed=seed,
         **{name: value for name, value in given.items() if value is not None},
     )
 
 
-def parsed_budget(text: str) -> float:
+def parse_budget_s(text: str) -> float:
     """Seconds.
 
     Raises:
         ValueError: No number with a unit.
 
     Example:
-        >>> parsed_budget("30min"), parsed_budget("1.5h"), parsed_budget("90 s")
+        >>> parse_budget_s("30min"), parse_budget_s("1.5h"), parse_budget_s("90 s")
         (1800.0, 5400.0, 90.0)
     """
     match = re.fullmatch(r"\s*(\d{1,9}(?:\.\d{1,9})?)\s*(s|min|h)\s*", text)
@@ -475,12 +497,12 @@ def parsed_budget(text: str) -> float:
 
 
 def list_builtin(
-    word: Annotated[
+    search_text: Annotated[
         str | None,
         typer.Argument(help="A kind, as `rigs`: what each is. Or any word: those with it, with all that is said."),
     ] = None,
 ) -> None:
     """List the built-in rigs, scenarios, LiDAR models, vehicles, materials, weather, encounters and requirements."""
-    from torchcover.cli.listing import run
+    from torchcover.cli.listing import print_builtin
 
-    run(word)
+    print_builtin(search_text)

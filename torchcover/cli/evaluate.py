@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from torchcover.cli import options
-from torchcover.cli.options import of_evaluate, parameters_of, with_options
+from torchcover.cli.options import build_setting_options, get_parameters, with_options
 from torchcover.evaluation.config import load_config
 from torchcover.evaluation.settings import Settings
 
@@ -41,8 +41,8 @@ def _measure(
             "--ask.",
         ),
     ] = None,
-    out: options.Out = Path("out"),
-    files: options.Files = options.ALL_FILES,
+    out: options.OutOption = Path("out"),
+    files: options.FilesOption = options.ALL_FILES,
     explain: Annotated[
         bool, typer.Option("--explain", help="Say what was left out because the scene did not need it.")
     ] = False,
@@ -54,16 +54,16 @@ def _measure(
             "--steps can follow.",
         ),
     ] = False,
-    config: options.Config = None,
-    assignments: options.Assignments = None,
+    config: options.ConfigOption = None,
+    assignments: options.AssignmentsOption = None,
     **given: Any,  # noqa: ANN401
 ) -> None:
     """Measure rigs in the same frames, save what was measured, and print it."""
     from torchcover.evaluation import evaluate as evaluate_
 
-    loaded = load_config(config, assignments or (), options.changed(given))
-    settings = {**loaded.config.settings(), "config_record": loaded.record}
-    recording = opened(frames, settings, loaded.config.recording, sensors)
+    loaded = load_config(config, assignments or (), options.find_changed_settings(given))
+    settings = {**loaded.config.get_changed_settings(), "config_record": loaded.record}
+    recording = open_frames(frames, settings, loaded.config.recording, sensors)
     named = list(rigs or (() if recording is None else recording.rigs))
     if len(named) == 1 and at_least > 1 and len(settings.get("weather") or ()) == 1:
         settings["weather"] = ["clear", *settings["weather"]]
@@ -72,11 +72,11 @@ def _measure(
             f"compare: at least two rigs are needed; got {named[0]} only (for one: `evaluate`; of a recording, each "
             "--sensors makes a rig)"
         )
-    if (asked := options.add_regions(settings.get("ask"), region)) is not None:
+    if (asked := options.combine_regions(settings.get("ask"), region)) is not None:
         settings["ask"] = asked
-    with sharing(out) as ranks:
-        log = logged(loaded.config.rerun, ranks)
-        checkpoint = checkpoint_in(out, Settings(scenario=settings.get("scenario")), resume=resume)
+    with join_run(out) as ranks:
+        log = open_rerun_log(loaded.config.rerun, ranks)
+        checkpoint = prepare_checkpoint(out, Settings(scenario=settings.get("scenario")), resume=resume)
         result = evaluate_(
             rigs,
             frames=recording,
@@ -86,12 +86,12 @@ def _measure(
             progress=True,
             **settings,
         )
-        finish(result, out, ranks, log, checkpoint, files=files, explain=explain)
+        save_and_print(result, out, ranks, log, checkpoint, file_kinds=files, explain=explain)
 
 
 MEASURING = [
-    *(each for each in parameters_of(_measure) if each.default is not inspect.Parameter.empty),
-    *of_evaluate(
+    *(each for each in get_parameters(_measure) if each.default is not inspect.Parameter.empty),
+    *build_setting_options(
         "scenario",
         "vehicle",
         "weather",
@@ -158,12 +158,12 @@ def _compare_saved(files: list[str], given: dict[str, Any], *, only: bool) -> No
             f"{files[0]} is measured already: compare coverage files with each other, without "
             f"{', '.join(changed) or 'rigs'}; or `evaluate` rigs in the same frames first"
         )
-    with sharing(given["out"]) as ranks:
+    with join_run(given["out"]) as ranks:
         result = compare(files)
-        finish(result, ranks=ranks, **{name: given[name] for name in SAVING})
+        save_and_print(result, ranks=ranks, **{name: given[name] for name in SAVING})
 
 
-def opened(
+def open_frames(
     frames: Path | None, settings: dict[str, Any], recording_settings: "RecordingSettings", sensors: list[str] | None
 ) -> "FrameSource | None":
     """The recording of a command line, if it names one; `vehicle` and `reference` are taken out of the settings then.
@@ -191,13 +191,15 @@ def opened(
     )
 
 
-def checkpoint_in(out: Path, settings: Settings, *, resume: bool) -> "Checkpoint":
+def prepare_checkpoint(out: Path, settings: Settings, *, resume: bool) -> "Checkpoint":
     """The checkpoint in the folder of the results; one line if it is not what the user may think."""
     from torchcover.evaluation import Checkpoint
     from torchcover.report import build_file_stems
 
     checkpoint = Checkpoint(out / "checkpoint.npz", resume, keep=resume)
-    for each in map(checkpoint.within, build_file_stems(list(settings.mixture))) if settings.mixture else [checkpoint]:
+    for each in (
+        map(checkpoint.in_folder, build_file_stems(list(settings.mixture))) if settings.mixture else [checkpoint]
+    ):
         if resume and not each.path.exists():
             typer.echo(f"torchcover: {each.path} is not there: the run starts with its first step", err=True)
         elif each.path.exists() and not resume and not _complete(out):
@@ -215,16 +217,16 @@ def _complete(out: Path) -> bool:
 
 
 @contextmanager
-def sharing(out: Path) -> "Iterator[Ranks | None]":
+def join_run(out: Path) -> "Iterator[Ranks | None]":
     """The folder, kept for this run; and the processes that share it, the first of which writes."""
-    from torchcover.evaluation import joined_ranks
+    from torchcover.evaluation import join_ranks
     from torchcover.files import lock_folder
 
-    with joined_ranks() as ranks, lock_folder(out) if ranks is None or ranks.rank == 0 else nullcontext():
+    with join_ranks() as ranks, lock_folder(out) if ranks is None or ranks.rank == 0 else nullcontext():
         yield ranks
 
 
-def logged(path: str | None, ranks: "Ranks | None") -> "RerunLog | None":
+def open_rerun_log(path: str | None, ranks: "Ranks | None") -> "RerunLog | None":
     """The recording for the Rerun viewer, if there is to be one.
 
     Raises:
@@ -242,14 +244,14 @@ def logged(path: str | None, ranks: "Ranks | None") -> "RerunLog | None":
         raise ValueError(f"rerun {error}") from error
 
 
-def finish(
+def save_and_print(
     result: "Result",
     out: Path,
     ranks: "Ranks | None",
-    log: "RerunLog | None" = None,
+    rerun_log: "RerunLog | None" = None,
     checkpoint: "Checkpoint | None" = None,
     *,
-    files: str,
+    file_kinds: str,
     explain: bool,
 ) -> None:
     """Results are safe before anything is printed; then the command ends as the run did."""
@@ -258,21 +260,23 @@ def finish(
     from torchcover.report import build_file_stems
 
     if ranks is None or ranks.rank == 0:
-        for world in result.worlds.values() if isinstance(result, MixedResult) else [result]:
-            if announcement := world.announce_pictures(files):
+        for world in result.scenario_results.values() if isinstance(result, MixedResult) else [result]:
+            if announcement := world.announce_pictures(file_kinds):
                 typer.echo(f"torchcover: {announcement}", err=True)
-        written = result.save(out, files=files)
+        written = result.save(out, file_kinds=file_kinds)
         print_result(result, written, out, explain=explain)
-        if log is not None and not isinstance(result, MixedResult):
-            log.finish(result)
+        if rerun_log is not None and not isinstance(result, MixedResult):
+            rerun_log.finish(result)
     if isinstance(result, MixedResult):  # complete, for else there was none
         for each in (
-            map(checkpoint.within, build_file_stems(list(result.worlds))) if checkpoint and not checkpoint.keep else ()
+            map(checkpoint.in_folder, build_file_stems(list(result.scenario_results)))
+            if checkpoint and not checkpoint.keep
+            else ()
         ):
             each.path.unlink(missing_ok=True)
         return
     if result.run is None:
         return
-    if checkpoint and result.run.complete and not checkpoint.keep:
-        checkpoint.of(ranks.rank if ranks else 0).path.unlink(missing_ok=True)
+    if checkpoint and result.run.is_complete and not checkpoint.keep:
+        checkpoint.for_rank(ranks.rank if ranks else 0).path.unlink(missing_ok=True)
     result.run.raise_failure()

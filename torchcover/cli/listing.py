@@ -13,11 +13,11 @@ import typer
 from torchcover.simulation import builtin_documents
 
 
-def run(word: str | None) -> None:
+def print_builtin(search_text: str | None) -> None:
     """Print what is built in: the names of each kind.
 
     Args:
-        word: A kind: what each of it consists of, and its first sentence. Or only those with it in a column, and all
+        search_text: A kind: what each of it consists of, and its first sentence. Or only those with it in a column, and all
             that is said of them.
 
     Raises:
@@ -36,10 +36,10 @@ def run(word: str | None) -> None:
     }
     found = False
     for kind, what_of in kinds.items():
-        if word in kinds and word != kind:
+        if search_text in kinds and search_text != kind:
             continue
         documents = builtin_documents(kind)
-        if word is None:
+        if search_text is None:
             names = textwrap.fill(", ".join(documents), width or 80, initial_indent="  ", subsequent_indent="  ")
             typer.echo(f"{kind} ({len(documents)})\n{names}\n")
             continue
@@ -47,15 +47,15 @@ def run(word: str | None) -> None:
         for name, document in documents.items():
             cells = [name, what_of(document)] if what_of else [name]
             description = " ".join(document["description"].split())
-            if word == kind or word.lower() in " ".join((*cells, description)).lower():
-                rows.append((*cells, _first_sentence(description) if word == kind else description))
+            if search_text == kind or search_text.lower() in " ".join((*cells, description)).lower():
+                rows.append((*cells, _first_sentence(description) if search_text == kind else description))
         if rows:
-            typer.echo("\n".join((kind, *_lines(rows, width, one_line_each=word == kind))) + "\n")
+            typer.echo("\n".join((kind, *_lines(rows, width, one_line_each=search_text == kind))) + "\n")
             found = True
-    if word is None:
+    if search_text is None:
         typer.echo("What each of a kind is: torchcover list rigs; all that is said of one: torchcover list NAME")
     elif not found:
-        raise ValueError(f"nothing built in with {word!r}; torchcover list prints all there is")
+        raise ValueError(f"nothing built in with {search_text!r}; torchcover list prints all there is")
 
 
 def _lines(rows: list[tuple[str, ...]], width: int | None, *, one_line_each: bool) -> Iterator[str]:

@@ -11,7 +11,7 @@ import typer
 
 from torchcover.encounters.criterion import Criterion
 from torchcover.evaluation.config import EvaluateConfig, load_config
-from torchcover.evaluation.settings import FILES, wanted_files
+from torchcover.evaluation.settings import FILES, parse_file_kinds
 
 if TYPE_CHECKING:
     from torchcover.recordings import Recording, RecordingSettings
@@ -25,7 +25,7 @@ PANELS = {
     "What": "scenario frames sensors vehicle sensor_model weather target heading encounters requirements "
     "redundancy thresholds_m threshold_m hits reference estimate phases worlds",
     "Where": "ask region raster",
-    "How exact": "steps rays every_s seed target_error budget evaluations fresh_worlds per_world",
+    "How exact": "steps rays every_s seed target_error budget evaluations num_held_out_scenes per_world",
     "Output": "out files explain film",
     "How it runs": "config assignments device workers resume",
 }
@@ -49,7 +49,7 @@ def with_options(parameters: Sequence[inspect.Parameter]) -> Callable[[Command],
     """A decorator: the command has these options, too, and gets those that were given as keywords.
 
     Args:
-        parameters: From `of_evaluate`, `of_criterion` or `parameters_of`.
+        parameters: From `build_setting_options`, `build_criterion_options` or `get_parameters`.
     """
     shared = {each.name for each in parameters}
 
@@ -57,7 +57,7 @@ def with_options(parameters: Sequence[inspect.Parameter]) -> Callable[[Command],
         def called(**given: Any) -> None:  # noqa: ANN401  (as typer has read them)
             command(**{name: value for name, value in given.items() if name not in shared or value is not None})
 
-        own = [each for each in parameters_of(command) if each.kind is not inspect.Parameter.VAR_KEYWORD]
+        own = [each for each in get_parameters(command) if each.kind is not inspect.Parameter.VAR_KEYWORD]
         update_wrapper(called, command)
         for each in (*own, *parameters):
             for said in get_args(each.annotation)[1:]:
@@ -70,12 +70,12 @@ def with_options(parameters: Sequence[inspect.Parameter]) -> Callable[[Command],
     return decorate
 
 
-def of_evaluate(*names: str) -> list[inspect.Parameter]:
+def build_setting_options(*names: str) -> list[inspect.Parameter]:
     """Options of settings of `EvaluateConfig`: their names there, with dashes for underscores."""
     return [_parameter(name) for name in names]
 
 
-def of_criterion() -> list[inspect.Parameter]:
+def build_criterion_options() -> list[inspect.Parameter]:
     """What `Criterion` declares."""
     return _of_document(Criterion)
 
@@ -91,7 +91,7 @@ def _of_document(document: type) -> list[inspect.Parameter]:
     return found
 
 
-def parameters_of(command: Command) -> list[inspect.Parameter]:
+def get_parameters(command: Command) -> list[inspect.Parameter]:
     """What a command takes."""
     hints = get_type_hints(command, include_extras=True)
     return [each.replace(annotation=hints[each.name]) for each in inspect.signature(command).parameters.values()]
@@ -130,15 +130,15 @@ def check_out(folder: Path) -> Path:
 
 
 def _check_files(files: str) -> str:
-    wanted_files(files)
+    parse_file_kinds(files)
     return files
 
 
-Rig = Annotated[str, typer.Argument(help="Rig: a built-in name (see `list`) or a YAML file.")]
-Config = Annotated[
+RigArgument = Annotated[str, typer.Argument(help="Rig: a built-in name (see `list`) or a YAML file.")]
+ConfigOption = Annotated[
     Path | None, typer.Option(help="YAML file of settings; `torchcover config` writes all of them with their defaults.")
 ]
-Assignments = Annotated[
+AssignmentsOption = Annotated[
     list[str] | None,
     typer.Option(
         "--set",
@@ -146,17 +146,17 @@ Assignments = Annotated[
         "recording.units=mm; may be repeated, and wins over --config.",
     ),
 ]
-Out = Annotated[Path, typer.Option(help="Folder for the results.", callback=check_out)]
+OutOption = Annotated[Path, typer.Option(help="Folder for the results.", callback=check_out)]
 ALL_FILES = ",".join(FILES)
-Files = Annotated[
+FilesOption = Annotated[
     str, typer.Option(help="What to write beside `summary.json`: any of numbers, maps, page.", callback=_check_files)
 ]
 
 
-def changed(given: Mapping[str, Any]) -> dict[str, Any]:
+def find_changed_settings(option_values: Mapping[str, Any]) -> dict[str, Any]:
     """The options that differ from their defaults, as values of `EvaluateConfig`."""
     fields = EvaluateConfig.model_fields
-    values = {name: str(value) if isinstance(value, Path) else value for name, value in given.items()}
+    values = {name: str(value) if isinstance(value, Path) else value for name, value in option_values.items()}
     values = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
     return {name: value for name, value in values.items() if value not in (None, fields[name].default)}
 
@@ -184,25 +184,25 @@ def open_recording(frames: Path, settings: "RecordingSettings", vehicle: str | N
     return recording
 
 
-def add_regions(file: Path | None, regions: Sequence[str] | None) -> "RegionsOfInterest | None":
+def combine_regions(regions_file: Path | None, regions: Sequence[str] | None) -> "RegionsOfInterest | None":
     """The regions of interest of a command line; None if it names none.
 
     Args:
-        file: YAML file of `RegionsOfInterest`; options replace its regions.
+        regions_file: YAML file of `RegionsOfInterest`; options replace its regions.
         regions: NAME:x0,x1,y0,y1 each.
 
     Raises:
         FileNotFoundError: No such file.
         ValueError: A text that cannot be read or makes no sense, or a name that is given twice.
     """
-    if file is None and not regions:
+    if regions_file is None and not regions:
         return None
     from pydantic import ValidationError
 
     from torchcover.simulation import RegionsOfInterest
     from torchcover.simulation.documents import explain
 
-    content = {} if file is None else RegionsOfInterest.load(file).model_dump(exclude_unset=True)
+    content = {} if regions_file is None else RegionsOfInterest.load(regions_file).model_dump(exclude_unset=True)
     if regions:
         sides = _named("--region", regions, ("x0", "x1", "y0", "y1"))
         content["regions"] = {name: {"x_m": side[:2], "y_m": side[2:]} for name, side in sides.items()}

@@ -8,7 +8,7 @@ from rich.markup import escape
 
 from torchcover.evaluation import MixedResult, Result, Study
 from torchcover.evaluation.mixed import MIXTURE
-from torchcover.evaluation.result_page import left_out_table
+from torchcover.evaluation.result_page import build_omissions_table
 from torchcover.evaluation.study import WANTED
 from torchcover.report import Terminal, print_page_tables, print_table
 
@@ -17,7 +17,7 @@ def print_result(result: Result, files: Sequence[Path], out: Path, *, explain: b
     """The tables, of several kinds of world one after the other, and where the files are."""
     console = Terminal()
     if isinstance(result, MixedResult):
-        for name, world in result.worlds.items():
+        for name, world in result.scenario_results.items():
             console.rule(escape(name))
             _print_world(world, console, explain=explain)
         console.rule(MIXTURE)
@@ -37,17 +37,17 @@ def print_verdict(sentences: Sequence[str], console: Terminal) -> None:
 def _print_world(result: Result, console: Terminal, *, explain: bool) -> None:
     print_table(result.table, console)
     if result.metrics:
-        print_page_tables(result.metrics.page_tables(parts=False))
-    if explain and result.left_out:
-        print_page_tables([left_out_table(result.left_out)])
+        print_page_tables(result.metrics.build_page_tables(include_parts=False))
+    if explain and result.omissions:
+        print_page_tables([build_omissions_table(result.omissions)])
     if explain and result.run:
-        frames_s = result.run.seconds - result.run.measuring_s
+        frames_s = result.run.duration_s - result.run.measurement_s
         console.print(
-            f"{frames_s:.1f} s for worlds and rays, {result.run.measuring_s:.1f} s for the search and the sums."
+            f"{frames_s:.1f} s for worlds and rays, {result.run.measurement_s:.1f} s for the search and the sums."
         )
-    for line in result.run.skipped if result.run else ():
+    for line in result.run.skipped_frames if result.run else ():
         console.print(f"skipped: {line}", style="yellow", markup=False)
-    for line in result.target_lines:
+    for line in result.target_error_lines:
         console.print(line, markup=False, soft_wrap=True)
 
 
@@ -66,5 +66,5 @@ def print_study(study: Study, files: Sequence[Path], out: Path) -> None:
     console = Terminal()
     print_page_tables(study.tables)
     for wanted in WANTED:
-        console.print(study.advice(wanted), markup=False, soft_wrap=True)
+        console.print(study.format_recommendation(wanted), markup=False, soft_wrap=True)
     print_files(files, out, console)

@@ -7,7 +7,7 @@ from typing import Any
 import typer
 
 from torchcover.cli.printing import print_files
-from torchcover.evaluation.cores import usual_workers
+from torchcover.evaluation.cores import compute_num_workers
 from torchcover.files import SUMMARY, lock_folder
 from torchcover.placement import (
     PlacementSearch,
@@ -31,12 +31,12 @@ BUDGET_S = 30 * 60.0
 FRAMES = 1000  # approximate number of frames that a search scores
 
 
-def run(
-    path: Path,
+def run_search_command(
+    space_file: Path,
     out: Path,
     *,
     resume: bool,
-    files: str,
+    file_kinds: str,
     **settings: Any,  # noqa: ANN401  (those of `SearchPlan`)
 ) -> None:
     """Search, write and print what was found: better values of what is free, or a choice of candidates.
@@ -45,11 +45,11 @@ def run(
         ValueError: A space, an option or a budget that cannot be used.
         FileNotFoundError: An unknown name or file.
     """
-    find = _chosen if CHOICE_KEY in read_mapping(path) else _searched
-    settings = {"workers": usual_workers(FRAMES, settings.get("worlds", WORLDS), whole=False), **settings}
+    find = _chosen if CHOICE_KEY in read_mapping(space_file) else _searched
+    settings = {"workers": compute_num_workers(FRAMES, settings.get("worlds", WORLDS), sends_frames=False), **settings}
     with lock_folder(out):
-        report = find(path, out, resume=resume, **settings).report
-        written = report.save(out, files=files)
+        report = find(space_file, out, resume=resume, **settings).report
+        written = report.save(out, files=file_kinds)
     print_page_tables(report.tables[:2])
     console = Terminal()
     print_files(written, out, console)

@@ -9,9 +9,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.progress import track
 
-from torchcover.evaluation import cameras_of, rig_pictures, scenario_pictures, vehicle_picture
+from torchcover.evaluation import list_cameras, plot_rig_figures, plot_scenario, plot_vehicle_figure
 from torchcover.evaluation.settings import DEFAULT_SCENARIO
-from torchcover.evaluation.task import as_called
+from torchcover.evaluation.task import load_named_rig
 from torchcover.files import BadFileError, write_atomically
 from torchcover.report import Terminal, check_animation, write_animation
 from torchcover.simulation import Scenario, builtin_names
@@ -30,15 +30,15 @@ FILM_S, PER_S = 10.0, 5.0
 SMALLEST_MOVE_M = 0.01
 
 
-def run(
+def show_item(
     name: str,
     *,
     scenario: str | None,
     rig: str | None,
     vehicle: str | None = None,
-    step: int | None,
+    frame_index: int | None,
     seed: int | None,
-    film: Path | None,
+    animation: Path | None,
     out: Path,
 ) -> None:
     """Print what it says of itself; draw it to `out/NAME.png`, what a rig's cameras measure to `out/NAME_depth.png`.
@@ -51,9 +51,9 @@ def run(
     """
     console, kind = Terminal(), _kind(name)
     if kind == "vehicle":
-        given = {"--scenario": scenario, "--rig": rig, "--vehicle": vehicle, "--step": step, "--seed": seed}
+        given = {"--scenario": scenario, "--rig": rig, "--vehicle": vehicle, "--step": frame_index, "--seed": seed}
         _refuse("rigs and scenarios", given, f"{name!r} is a vehicle")
-        _refuse("a scenario", {"--film": film}, f"{name!r} is a vehicle")
+        _refuse("a scenario", {"--film": animation}, f"{name!r} is a vehicle")
         shape = body_called(name)
         body = Vehicle.load(name) if isinstance(shape, VehicleShape) else _of_mesh(shape)
         _say(console, body.description)
@@ -65,34 +65,42 @@ def run(
             by = ", ".join(f"{axis} {metres:+.2f}" for axis, metres in zip("xyz", moved_m.round(2) + 0.0, strict=True))
             _say(console, f"Moved by {by} m: mounts are measured from the ground under the middle of its bounding box")
         _say(console, describe_windows(shape))
-        _write(console, out / Path(name).stem, [("", vehicle_picture(body))])
+        _write(console, out / Path(name).stem, [("", plot_vehicle_figure(body))])
         return
     if kind == "rig":
-        _refuse("a scenario", {"--rig": rig, "--film": film}, f"{name!r} is a rig")
-        shown = as_called(name)
-        if not cameras_of(shown):
-            _refuse("a scenario or cameras", {"--step": step, "--seed": seed}, f"{name!r} is a rig without cameras")
+        _refuse("a scenario", {"--rig": rig, "--film": animation}, f"{name!r} is a rig")
+        shown = load_named_rig(name)
+        if not list_cameras(shown):
+            _refuse(
+                "a scenario or cameras", {"--step": frame_index, "--seed": seed}, f"{name!r} is a rig without cameras"
+            )
         world = Scenario.load(scenario or DEFAULT_SCENARIO)
         _say(console, shown.description)
         ego = with_ego(world, {name: shown}, vehicle).ego_mesh()
         _say(console, describe_self_hits(shown.sensors, shown.own_mesh(ego)) or "No ray ends on the own vehicle.")
         _write(
-            console, out / Path(name).stem, rig_pictures(shown, world, vehicle=vehicle, step=step or 0, seed=seed or 0)
+            console,
+            out / Path(name).stem,
+            plot_rig_figures(shown, world, vehicle=vehicle, frame_index=frame_index or 0, seed=seed or 0),
         )
         return
     _refuse("a rig", {"--scenario": scenario}, f"{name!r} is a scenario")
-    if film is not None:
-        check_animation(film)
-    world, seen_by = Scenario.load(name), as_called(rig or DEFAULT_RIG)
-    steps = range(step or 0, (step or 0) + 1) if film is None else _steps_of_film(world, step or 0)
-    figures = scenario_pictures(world, seen_by, steps, vehicle=vehicle, seed=seed or 0)
+    if animation is not None:
+        check_animation(animation)
+    world, seen_by = Scenario.load(name), load_named_rig(rig or DEFAULT_RIG)
+    steps = (
+        range(frame_index or 0, (frame_index or 0) + 1)
+        if animation is None
+        else _steps_of_film(world, frame_index or 0)
+    )
+    figures = plot_scenario(world, seen_by, steps, vehicle=vehicle, seed=seed or 0)
     _say(console, world.description)
-    if film is None:
+    if animation is None:
         _write(console, out / Path(name).stem, (("", figure) for figure in figures))
         return
     drawn = track(figures, "pictures", total=len(steps), console=console)
-    write_animation(film, drawn, frames_per_s=1 / (world.step_s * steps.step))
-    console.print(f"Wrote {film}", markup=False, soft_wrap=True)
+    write_animation(animation, drawn, frames_per_s=1 / (world.step_s * steps.step))
+    console.print(f"Wrote {animation}", markup=False, soft_wrap=True)
 
 
 def _of_mesh(shape: MeshFile) -> Vehicle:

@@ -6,15 +6,15 @@ from pathlib import Path
 from typing import Any
 
 from torchcover.cli.printing import print_files, print_verdict
-from torchcover.evaluation import save_targets, survey_target
-from torchcover.evaluation.target_survey import places_table, sides_table, target_verdict
+from torchcover.evaluation import map_target_visibility, save_target_map
+from torchcover.evaluation.target_survey import build_positions_table, build_sides_table, summarize_target_maps
 from torchcover.files import lock_folder
 from torchcover.report import Terminal, print_page_tables
 from torchcover.simulation import Rig
 from torchcover.targets import Heading, Raster, TargetMap
 
 
-def run(
+def run_targets_command(
     rig: str,
     target: str,
     scenario: str | None,
@@ -22,8 +22,8 @@ def run(
     raster: str | None,
     heading: str,
     out: Path,
-    files: str,
-    **settings: Any,  # noqa: ANN401  (those of `survey_target`)
+    file_kinds: str,
+    **settings: Any,  # noqa: ANN401  (those of `map_target_visibility`)
 ) -> None:
     """Survey a target, write and print what is seen.
 
@@ -32,28 +32,28 @@ def run(
         FileNotFoundError: An unknown name or file.
     """
     with lock_folder(out):
-        seen = survey_target(
+        seen = map_target_visibility(
             rig,
             target,
             scenario,
-            raster=None if raster is None else parsed_raster(raster),
-            heading=parsed_heading(heading),
+            raster=None if raster is None else parse_raster(raster),
+            heading=parse_heading(heading),
             **settings,
         )
-        written = save_targets(seen, out, Rig.load(rig).sensors, files=files)
+        written = save_target_map(seen, out, Rig.load(rig).sensors, file_kinds=file_kinds)
     _print(seen)
     print_files(written, out, Terminal())
-    print_verdict(target_verdict({seen.rig: seen}), Terminal())
+    print_verdict(summarize_target_maps({seen.rig: seen}), Terminal())
 
 
-def parsed_raster(text: str) -> Raster:
+def parse_raster(text: str) -> Raster:
     """The raster of `x0,x1,y0,y1,step`, in metres; up to a step larger, with a warning, if the step does not divide it.
 
     Raises:
         ValueError: Other than five numbers, or what `Raster` refuses.
 
     Example:
-        >>> parsed_raster("-4,4,-3,3,0.5").shape
+        >>> parse_raster("-4,4,-3,3,0.5").shape
         (12, 16)
     """
     try:
@@ -69,7 +69,7 @@ def parsed_raster(text: str) -> Raster:
     return Raster((x0, x1), (y0, y1), step_m)
 
 
-def parsed_heading(text: str) -> Heading:
+def parse_heading(text: str) -> Heading:
     """`narrow`, `wide`, or degrees.
 
     Raises:
@@ -90,7 +90,7 @@ def _print(seen: TargetMap) -> None:
         markup=False,
         soft_wrap=True,
     )
-    worst = places_table(seen.worst(), "The places with the fewest points, 1 m apart")
-    print_page_tables([sides_table(seen), worst])
+    worst = build_positions_table(seen.worst(), "The places with the fewest points, 1 m apart")
+    print_page_tables([build_sides_table(seen), worst])
     if unknown := seen.counts["share_unknown"]:
         console.print(f"{unknown:,} places show no surface to any random place: their share is unknown.")

@@ -84,14 +84,15 @@ class MetricComparison:
         missing = [f"Without {name}: {why}" for name, why in (self.left_out or {}).items()]
         return [NOT_VALIDATED, *few, *warnings, *rays, *missing]
 
-    def page_tables(self, *, parts: bool = True) -> list[PageTable]:
+    def build_page_tables(self, *, include_parts: bool = True) -> list[PageTable]:
         """Return the table of numbers, and that of Kendall's tau if there are three rigs or more.
 
         Args:
-            parts: Whether numbers of a category or a region are rows too.
+            include_parts: Whether numbers of a category or a region are rows too.
         """
         rows = [
-            [TextCell(cell) for cell in _format_row(ranking)] for ranking in (self.rankings if parts else self.main)
+            [TextCell(cell) for cell in _format_row(ranking)]
+            for ranking in (self.rankings if include_parts else self.main)
         ]
         headings = ["metric", "unit", "better", *self.rigs]
         title = f"{TITLE} (rank)" if len(self.rigs) > 1 else TITLE

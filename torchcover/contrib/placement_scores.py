@@ -15,7 +15,7 @@ from torchcover.coverage import Coverage, Region
 from torchcover.coverage.measures import Measure
 from torchcover.estimation import Quantity
 from torchcover.evaluation.evaluating import evaluate
-from torchcover.evaluation.task import AnyRig, loaded
+from torchcover.evaluation.task import AnyRig, load_rig
 from torchcover.simulation import RegionsOfInterest, Scenario
 
 THRESHOLD_M = 0.4
@@ -96,15 +96,17 @@ def score_placements(
     """
     if len(rigs) < LEAST:
         raise ValueError(f"rigs: three or more are needed to speak of ranks; got {', '.join(rigs) or 'none'}")
-    carried = {name: loaded(rig).sensing(sensor_model).model_copy(update={"name": name}) for name, rig in rigs.items()}
+    carried = {
+        name: load_rig(rig).sensing(sensor_model).model_copy(update={"name": name}) for name, rig in rigs.items()
+    }
     region = circle() if region is None else region
     result = evaluate(
         list(carried.values()),
         scenario,
-        ask=_around(region),
+        regions=_around(region),
         thresholds_m=THRESHOLD_M,
         metrics=tuple(dict.fromkeys([*(PUBLISHED if metrics is None else metrics), COUNTS_POINTS])),
-        steps=steps,
+        num_frames=steps,
         seed=seed,
         **settings,
     )

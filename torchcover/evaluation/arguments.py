@@ -13,14 +13,14 @@ ReturnT = TypeVar("ReturnT")
 Arguments = ParamSpec("Arguments")
 
 
-class Read(Generic[GivenT, ValueT]):
+class ConvertedField(Generic[GivenT, ValueT]):
     """A field of a dataclass that takes more forms than one, and has one from then on.
 
     `read`: makes it of what was given; `default`: as it may be given.
     """
 
-    def __init__(self, read: Callable[[GivenT], ValueT], default: GivenT) -> None:
-        self._read = read
+    def __init__(self, convert: Callable[[GivenT], ValueT], default: GivenT) -> None:
+        self._read = convert
         self._default: Any = default
 
     def __set_name__(self, owner: type, name: str) -> None:
@@ -34,25 +34,25 @@ class Read(Generic[GivenT, ValueT]):
         vars(settings)[self._name] = self._read(given)
 
 
-def taking(
-    document: Callable[Arguments, DocumentT], descriptions: Mapping[str, str]
+def accept_fields(
+    settings_class: Callable[Arguments, DocumentT], descriptions: Mapping[str, str]
 ) -> Callable[[Callable[[DocumentT], ReturnT]], Callable[Arguments, ReturnT]]:
     """Decorate a function of one document: it is called with the document's fields, and documented with them.
 
     Args:
-        document: A dataclass; the annotation of a field may hold its description.
+        settings_class: A dataclass; the annotation of a field may hold its description.
         descriptions: Name of a field -> its description, for the others.
     """
 
     def decorate(function: Callable[[DocumentT], ReturnT]) -> Callable[Arguments, ReturnT]:
-        signature = inspect.signature(document)
+        signature = inspect.signature(settings_class)
 
         def called(*args: Arguments.args, **kwargs: Arguments.kwargs) -> ReturnT:
             try:
                 signature.bind(*args, **kwargs)
             except TypeError as error:
                 raise TypeError(f"{function.__name__}: {error}") from None
-            return function(document(*args, **kwargs))
+            return function(settings_class(*args, **kwargs))
 
         update_wrapper(called, function)
         parameters = [each.replace(annotation=_plain(each.annotation)) for each in signature.parameters.values()]
@@ -71,7 +71,7 @@ def taking(
 def _plain(annotation: Any) -> Any:  # noqa: ANN401  (a type)
     """What may be given, without the words about it."""
     kind = get_args(annotation)[0] if get_origin(annotation) is Annotated else annotation
-    given = get_args(kind)[0] if get_origin(kind) is Read else kind
+    given = get_args(kind)[0] if get_origin(kind) is ConvertedField else kind
     return getattr(given, "__forward_arg__", given)
 
 

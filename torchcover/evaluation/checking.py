@@ -14,21 +14,28 @@ from numpy.typing import NDArray
 from torchcover import __version__
 from torchcover.coverage import AGGREGATIONS, Coverage
 from torchcover.encounters import Staged
-from torchcover.evaluation.encountering import encounter
-from torchcover.evaluation.measuring import measured as measured_coverage
+from torchcover.evaluation.encountering import evaluate_encounters
+from torchcover.evaluation.measuring import measure_coverage as measured_coverage
 from torchcover.evaluation.requirements import (
-    BodyPlaces,
     EncounterRequirement,
     Readings,
     RegionRequirement,
     Requirements,
+    TargetPositions,
     TargetRequirement,
     Verdict,
-    verdicts,
+    judge_requirements,
 )
 from torchcover.evaluation.settings import DEFAULT_SCENARIO, Settings
-from torchcover.evaluation.target_survey import free_space, in_world
-from torchcover.evaluation.task import AnyRig, AnyScenario, distinct_names, loaded, spread_s, task_of
+from torchcover.evaluation.target_survey import build_flat_ground, load_rig_and_scenario
+from torchcover.evaluation.task import (
+    AnyRig,
+    AnyScenario,
+    build_task,
+    compute_frame_interval_s,
+    load_rig,
+    make_rig_names,
+)
 from torchcover.files import AtomicOutput
 from torchcover.report import PageTable, TextCell, to_json_record
 from torchcover.simulation import Rig, Scenario, with_ego
@@ -47,7 +54,7 @@ NOTE = (
 
 
 @dataclass(frozen=True)
-class Checked:
+class CheckResult:
     """What `check` returns.
 
     Args:
@@ -75,7 +82,7 @@ class Checked:
             told.append(", ".join([f"{rig} keeps {states.count('kept')}", *others]))
         return (f"Of the {len(each)} bounds of {self.requirements.name}: {'; '.join(told)}.",)
 
-    def tables(self) -> list[PageTable]:
+    def build_tables(self) -> list[PageTable]:
         """One for each rig, with what the requirements say about themselves."""
         asked, worlds = self.requirements, ", ".join(map(" ".join, self.settings["worlds"].items()))
         notes = [*filter(None, [asked.description]), f"Worlds: {worlds}.", NOTE]
@@ -98,12 +105,12 @@ class Checked:
             counts = {"tests": len(states), "failures": states.count("not kept"), "errors": states.count("not checked")}
             suite = ElementTree.SubElement(root, "testsuite", {"name": rig, **{k: str(v) for k, v in counts.items()}})
             for one in each:
-                name = f"{one.requirement}: {one.bound.words}"
+                name = f"{one.requirement}: {one.bound.text}"
                 case = ElementTree.SubElement(suite, "testcase", classname=rig, name=name)
                 if one.state != "kept":
                     words = "; ".join(map(": ".join, zip(HEADINGS[3:], _row(one)[3:], strict=True)))
                     kind = "failure" if one.state == "not kept" else "error"
-                    ElementTree.SubElement(case, kind, message=words).text = "\n".join(one.where)
+                    ElementTree.SubElement(case, kind, message=words).text = "\n".join(one.worst_locations)
         text = ElementTree.tostring(root, encoding="unicode", xml_declaration=True)
         return "".join(letter if letter.isprintable() or letter == "\n" else " " for letter in text)
 
@@ -116,16 +123,16 @@ class Checked:
 
 
 def _record(one: Verdict) -> dict[str, Any]:
-    bound = {"number": one.bound.key, "least" if one.bound.is_least else "most": one.bound.value}
+    bound = {"number": one.bound.key, "least" if one.bound.is_minimum else "most": one.bound.value}
     return {"requirement": one.requirement, **bound, **dict(zip(one._fields[2:], one[2:], strict=True))}
 
 
 def _row(one: Verdict) -> tuple[str, ...]:
     ends = " or more" if one.high == np.inf else f" ({one.low:.4g} to {one.high:.4g})" if one.low < one.high else ""
     numbers = ("-" if each.endswith("nan") else each for each in (f"{one.value:.4g}{ends}", f"{one.margin:+.4g}"))
-    counts = map(str, (one.failed, one.unknown, one.count, one.no_room))
-    where = one.where[0] if one.where else "nowhere"
-    return one.requirement, one.bound.words, one.state, *numbers, *counts, where
+    counts = map(str, (one.not_met_count, one.undecided_count, one.total_count, one.occupied_count))
+    where = one.worst_locations[0] if one.worst_locations else "nowhere"
+    return one.requirement, one.bound.text, one.state, *numbers, *counts, where
 
 
 def check(
@@ -135,11 +142,11 @@ def check(
     *,
     vehicle: str | Path | None = None,
     sensor_model: Literal["ideal", "real"] | None = None,
-    steps: int | None = None,
+    num_frames: int | None = None,
     seed: int = 0,
-    workers: int | None = None,
+    num_workers: int | None = None,
     progress: bool = False,
-) -> Checked:
+) -> CheckResult:
     """Whether rigs see what they must.
 
     Args:
@@ -148,9 +155,9 @@ def check(
         scenario: The world in place of the file's.
         vehicle: What carries the rigs, as for `evaluate`; else each is on its own vehicle.
         sensor_model: What sensors make of their hits; as for `evaluate`.
-        steps: Steps that are looked at, as for `evaluate` and `survey_target`.
+        num_frames: Steps that are looked at, as for `evaluate` and `map_target_visibility`.
         seed: Of the simulation.
-        workers: As of `evaluate`.
+        num_workers: As of `evaluate`.
         progress: Whether to show bars.
 
     Raises:
@@ -165,20 +172,20 @@ def check(
     """
     asked = requirements if isinstance(requirements, Requirements) else Requirements.load(requirements)
     given = [rigs] if isinstance(rigs, str | Path | Rig) else rigs
-    called = [loaded(rig).model_copy(update={"name": n}) for rig, n in zip(given, distinct_names(given), strict=True)]
+    called = [load_rig(rig).model_copy(update={"name": n}) for rig, n in zip(given, make_rig_names(given), strict=True)]
     if not called:
         raise ValueError("check: at least one rig is needed; got none")
     targets = {one.target: Target.load(one.target) for one in asked.requirements if isinstance(one, TargetRequirement)}
     for rig, one in product(called, asked.requirements):  # before the work, not after it
-        one.failing([sensor.name for sensor in rig.sensors])
+        one.find_failing_sensors([sensor.name for sensor in rig.sensors])
         if isinstance(one, TargetRequirement):
-            one.groups(rig.sensors)
+            one.group_sensors(rig.sensors)
         if isinstance(one, EncounterRequirement):
-            _check_lasts(one, with_ego(free_space(), {rig.name: rig}, vehicle))
+            _check_lasts(one, with_ego(build_flat_ground(), {rig.name: rig}, vehicle))
     own: dict[str, Any] = {"vehicle": vehicle, "sensor_model": sensor_model, "seed": seed}
     world, found = scenario or asked.scenario, dict[str, list[Verdict]]()
     for rig in called:
-        coverage = _coverage(asked, rig, world, steps=steps, workers=workers, progress=progress, **own)
+        coverage = _coverage(asked, rig, world, steps=num_frames, workers=num_workers, progress=progress, **own)
         measured = []
         for one in asked.requirements:
             if isinstance(one, RegionRequirement):
@@ -187,14 +194,14 @@ def check(
             elif isinstance(one, EncounterRequirement):
                 measured.append(_of_encounters(one, rig, progress=progress, **own))
             else:
-                place = asked.places[one.at] if isinstance(one.at, str) else one.at
-                measured.append(_of_target(one, place, targets[one.target], rig, world, steps=steps, **own))
-        found[rig.name] = verdicts(asked, measured)
-    name, free = world.name if isinstance(world, Scenario) else str(world or ""), free_space().name
+                place = asked.position_sets[one.positions] if isinstance(one.positions, str) else one.positions
+                measured.append(_of_target(one, place, targets[one.target], rig, world, steps=num_frames, **own))
+        found[rig.name] = judge_requirements(asked, measured)
+    name, free = world.name if isinstance(world, Scenario) else str(world or ""), build_flat_ground().name
     worlds = {"region": name or DEFAULT_SCENARIO, "target": name or free, "encounters": free}
     kinds = [kind for kind in worlds if any(hasattr(one, kind) for one in asked.requirements)]
-    told = {"worlds": {kind: worlds[kind] for kind in kinds}, "steps": steps, **own}
-    return Checked(asked, found, {k: str(v) if isinstance(v, Path) else v for k, v in told.items()})
+    told = {"worlds": {kind: worlds[kind] for kind in kinds}, "steps": num_frames, **own}
+    return CheckResult(asked, found, {k: str(v) if isinstance(v, Path) else v for k, v in told.items()})
 
 
 def _check_lasts(one: EncounterRequirement, world: Scenario) -> None:
@@ -215,12 +222,12 @@ def _coverage(asked: Requirements, rig: Rig, scenario: AnyScenario | None, **mor
     keys = {one.number for one in of_regions}
     thresholds_m = sorted({one.threshold_m for one in of_regions if one.threshold_m})
     aggregations = [one for kind in AGGREGATIONS if (one := kind.of_keys(keys))]
-    redundancy = any(one.without or one.number.startswith(("sensors", "seen")) for one in of_regions)
+    redundancy = any(one.failing_sensors or one.number.startswith(("sensors", "seen")) for one in of_regions)
     settings = Settings(
-        [rig], scenario, ask=asked, thresholds_m=thresholds_m or THRESHOLD_M, aggregations=aggregations,
-        redundancy=redundancy, probe="none", **more,
+        [rig], scenario, regions=asked, thresholds_m=thresholds_m or THRESHOLD_M, aggregations=aggregations,
+        redundancy=redundancy, test_targets="none", **more,
     )  # fmt: skip
-    result = measured_coverage(task_of(settings), settings)
+    result = measured_coverage(build_task(settings), settings)
     if result.run is not None:
         result.run.raise_failure()
     return result.coverage
@@ -229,7 +236,10 @@ def _coverage(asked: Requirements, rig: Rig, scenario: AnyScenario | None, **mor
 def _of_region(one: RegionRequirement, coverage: Coverage, rig: Rig) -> Readings:
     (region,) = (region for region in coverage.regions if region.name == one.region)
     ends, where = [], []
-    for words in ("", *(f"_without_{name}" for name in one.failing([sensor.name for sensor in rig.sensors]))):
+    for words in (
+        "",
+        *(f"_without_{name}" for name in one.find_failing_sensors([sensor.name for sensor in rig.sensors])),
+    ):
         estimate = coverage.estimate_of(one.number + words, region, one.height)
         (number,) = estimate.numbers().values()
         agreed = np.isnan(number.error) and estimate.has_intervals[0]  # all blocks say the same
@@ -241,10 +251,15 @@ def _of_region(one: RegionRequirement, coverage: Coverage, rig: Rig) -> Readings
 
 def _of_encounters(one: EncounterRequirement, rig: Rig, **given: Any) -> dict[str, Readings]:  # noqa: ANN401
     """Of each encounter the latest detection of all phases; or earlier, if it is seen from the beginning."""
-    found, names = encounter(rig, one.encounters, one.criterion, **given), [sensor.name for sensor in rig.sensors]
+    found, names = (
+        evaluate_encounters(rig, one.encounters, one.criterion, **given),
+        [sensor.name for sensor in rig.sensors],
+    )
     times_s, where = [], []
     for case, each in zip(one.encounters.encounters, found.sightings, strict=True):
-        lost = {f", without {name}": each.without_ttc_s[names.index(name)].min() for name in one.failing(names)}
+        lost = {
+            f", without {name}": each.without_ttc_s[names.index(name)].min() for name in one.find_failing_sensors(names)
+        }
         for words, ttc_s in ({"": each.ttc_s.min()} | lost).items():
             times_s.append((ttc_s, each.needed_s, np.inf if ttc_s >= each.open_s else ttc_s))
             where.append(f"{case.words}{words}")
@@ -254,13 +269,18 @@ def _of_encounters(one: EncounterRequirement, rig: Rig, **given: Any) -> dict[st
 
 
 def _of_target(
-    one: TargetRequirement, place: BodyPlaces, target: Target, given: Rig, scenario: AnyScenario | None, *,
+    one: TargetRequirement, place: TargetPositions, target: Target, given: Rig, scenario: AnyScenario | None, *,
     steps: int | None, vehicle: str | Path | None, sensor_model: Literal["ideal", "real"] | None, seed: int,
 ) -> dict[str, Readings]:  # fmt: skip
-    rig, world, usual_steps = in_world(given, scenario, vehicle, sensor_model)
-    at_m, groups = place.positions_m(world.ego_box()), one.groups(rig.sensors)
+    rig, world, usual_steps = load_rig_and_scenario(given, scenario, vehicle, sensor_model)
+    at_m, groups = place.compute_positions_m(world.ego_box()), one.group_sensors(rig.sensors)
     own_steps = (usual_steps > 1 and steps) or usual_steps
-    of_survey: dict[str, Any] = {"steps": own_steps, "every_s": spread_s(world, None), "seed": seed, "hits": one.hits}
+    of_survey: dict[str, Any] = {
+        "steps": own_steps,
+        "every_s": compute_frame_interval_s(world, None),
+        "seed": seed,
+        "hits": one.detection_points,
+    }
     survey = partial(survey_places, rig, world, target, at_m, **of_survey)
     values: dict[str, list[Float64]] = {bound.key: [] for bound in one.bounds}
     where: list[str] = []
@@ -280,7 +300,7 @@ def _of_target(
             away_m = np.hypot(*(at_m - (x_m, y_m)).T)
             low_m, high_m = (end_m[2] - z_m for end_m in (target.solid.box.lower_m, target.solid.box.upper_m))
             angle = np.arctan2(high_m, away_m) - np.arctan2(low_m, away_m)
-            angle_deg = np.where(points >= one.hits, np.rad2deg(angle), 0.0)
+            angle_deg = np.where(points >= one.detection_points, np.rad2deg(angle), 0.0)
             numbers["visual_angle_deg"] = np.fmax(numbers["visual_angle_deg"], angle_deg)
             if isinstance(sensor, CameraSensor):
                 numbers["pixels"] = np.fmax(numbers["pixels"], points)

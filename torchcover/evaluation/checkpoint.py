@@ -40,13 +40,13 @@ Array = NDArray[Any]
 State = Mapping[str, Any]
 
 
-class Progressing(Protocol):
+class RunState(Protocol):
     """What a checkpoint keeps of a run itself; a `Run`."""
 
-    steps: int
+    num_frames: int
     counts: Counter[str]
-    skipped: list[str]
-    seconds: float
+    skipped_frames: list[str]
+    duration_s: float
 
 
 @dataclass(frozen=True)
@@ -64,19 +64,19 @@ class Checkpoint:
     resume: bool = True
     keep: bool = True
 
-    def of(self, rank: int) -> Self:
+    def for_rank(self, rank: int) -> Self:
         """That of one of several processes that share a run: each has a file of its own."""
         return replace(self, path=self.path.with_stem(f"{self.path.stem}_rank{rank}")) if rank else self
 
-    def within(self, folder: str) -> Self:
+    def in_folder(self, folder: str) -> Self:
         """That of one of several runs whose results go to folders beside each other; kept until all are complete."""
         return replace(self, path=self.path.parent / folder / self.path.name, keep=True)
 
 
-class Journal:
+class CheckpointManager:
     """Keeps the checkpoint of one run.
 
-    `checkpoint`: where; `identity`: what defines the run; see `run_identity`; `states`: all that learns from frames, by
+    `checkpoint`: where; `identity`: what defines the run; see `build_run_identity`; `states`: all that learns from frames, by
     name. TypeError: something whose state cannot be kept.
     """
 
@@ -89,7 +89,7 @@ class Journal:
         self._due_s = time.monotonic() + EVERY_S
         self._complained = False
 
-    def restore(self, run: Progressing) -> None:
+    def restore(self, run: RunState) -> None:
         """Go on from the file, if there is one and that is wanted.
 
         ValueError: it is the checkpoint of another run; the message says in what. Or, as `BadFileError`, it is damaged.
@@ -97,7 +97,7 @@ class Journal:
         if not self.resume or not self.path.exists():
             return
         header = read_header(self.path)
-        if other := differences(self.identity, header["identity"]):
+        if other := describe_differences(self.identity, header["identity"]):
             raise ValueError(
                 f"{self.path}: a checkpoint of another run: {other}; resume with the settings of that run, or choose "
                 "another folder"
@@ -105,15 +105,15 @@ class Journal:
         for name, one in self._states.items():
             one.load_state_dict(read_state(self.path, header, name))
         done = header["run"]
-        run.steps, run.skipped, run.seconds = done["steps"], done["skipped"], done["seconds"]
+        run.num_frames, run.skipped_frames, run.duration_s = done["steps"], done["skipped"], done["seconds"]
         run.counts.update(done["counts"])
 
-    def write_if_due(self, run: Progressing) -> None:
+    def write_if_due(self, run: RunState) -> None:
         """Write, if the last time is long enough ago."""
         if time.monotonic() >= self._due_s:
             self.write(run)
 
-    def write(self, run: Progressing) -> None:
+    def write(self, run: RunState) -> None:
         """Write now; where there is no room, say so once, and leave the file that is there."""
         start_s = time.monotonic()
         done = {name: getattr(run, name) for name in RUN_KEYS}
@@ -143,15 +143,15 @@ def _checked(name: str, one: object) -> Stateful:
     return one
 
 
-def differences(here: Mapping[str, str], there: Mapping[str, str]) -> str:
+def describe_differences(current: Mapping[str, str], saved: Mapping[str, str]) -> str:
     """What two runs differ in, in words; empty where they do not.
 
     Example:
         >>> differences({"seed": "0", "scenario": "#17"}, {"seed": "1", "scenario": "#4"})
         'scenario (other content), seed (1 there, 0 here)'
     """
-    names = [name for name in sorted(here.keys() | there.keys()) if here.get(name) != there.get(name)]
-    return ", ".join(f"{name} {_change(here.get(name, 'none'), there.get(name, 'none'))}" for name in names)
+    names = [name for name in sorted(current.keys() | saved.keys()) if current.get(name) != saved.get(name)]
+    return ", ".join(f"{name} {_change(current.get(name, 'none'), saved.get(name, 'none'))}" for name in names)
 
 
 def _change(here: str, there: str) -> str:

@@ -28,7 +28,7 @@ class EvaluateConfig(BaseModel):
         "apart and then mixed: `urban,highway`, with weights `urban=0.7,highway=0.3` (equal if not given); in Python "
         "also a sequence, or a mapping to weights.",
     )
-    steps: Annotated[int, Field(ge=1, strict=True)] | None = Field(
+    num_frames: Annotated[int, Field(ge=1, strict=True)] | None = Field(
         None,
         description="Steps to simulate (64; with a target error at most, 4096), or frames of a recording to use at "
         "most (all).",
@@ -50,12 +50,12 @@ class EvaluateConfig(BaseModel):
         description="Weather in place of the scenario's: a built-in name as fog_100m (see `list`) or a YAML file. In "
         "several, every rig is measured in each; `compare` of one rig compares it with `clear`.",
     )
-    ask: str | None = Field(
+    regions: str | None = Field(
         None,
         description="YAML file of regions, also polygons, height bands and grid. Not given: the paper's regions in "
         "front, and the near field on the four sides of the vehicle.",
     )
-    probe: Names | None = Field(
+    test_targets: Names | None = Field(
         None,
         description="Test targets that are placed next to the vehicle, as of `targets`; `none` places none. Not given: "
         "child, adult, cyclist and pole where no regions are given.",
@@ -74,10 +74,10 @@ class EvaluateConfig(BaseModel):
         description="Reference sensor: `surface`, points sampled evenly on visible surfaces (default), or `paper`. Of "
         "a recording on the command line: `recorded`, or `accumulated` from the recording itself.",
     )
-    rays: Annotated[int, Field(ge=1, strict=True)] | None = Field(
+    num_rays: Annotated[int, Field(ge=1, strict=True)] | None = Field(
         None, description="Rays of the reference sensor per frame (surface: 16384; paper: 1048576, a square)."
     )
-    estimate: Literal["area", "known"] | None = Field(
+    average: Literal["area", "known"] | None = Field(
         None,
         description="Average of a region: `area`, over its visible surface (default; needs `surface`), or `known`, "
         "over its observed cells, as in the paper.",
@@ -87,7 +87,7 @@ class EvaluateConfig(BaseModel):
         description="Height bands are above the local `ground` (default) or z of the `vehicle` frame (`paper` and "
         "recordings without heights have no other).",
     )
-    every_s: StrictFloat | None = Field(
+    frame_interval_s: StrictFloat | None = Field(
         None,
         description="Seconds between frames; consecutive frames are correlated. Not given: 10 in traffic, which starts "
         "anew in another city every minute, else a value that spreads the frames over the scenario.",
@@ -112,7 +112,7 @@ class EvaluateConfig(BaseModel):
         "(docs/metrics.md).",
     )
     device: str = Field("cpu", description="Device of the search and the sums, with Warp of rays too: cpu, cuda, ...")
-    workers: Annotated[int, Field(ge=0, strict=True)] | None = Field(
+    num_workers: Annotated[int, Field(ge=0, strict=True)] | None = Field(
         None, description="Processes that make frames; 0 makes them in this one. Not given: as many as help."
     )
     no_cache: StrictBool = Field(
@@ -128,7 +128,7 @@ class EvaluateConfig(BaseModel):
         RecordingSettings(), description="How to read the recording; these win over `recording.yaml` in its folder."
     )
 
-    def settings(self) -> dict[str, Any]:
+    def get_changed_settings(self) -> dict[str, Any]:
         """The keyword arguments of `evaluate` that differ from their defaults."""
         given = {name: getattr(self, name) for name in type(self).model_fields if name not in ("rerun", "recording")}
         return {name: value for name, value in given.items() if value != type(self).model_fields[name].default}
@@ -225,7 +225,7 @@ def _assign(content: dict[str, Any], text: str) -> None:
         target[entry] = parse_yaml(value)
 
 
-def write_defaults() -> str:
+def format_defaults() -> str:
     """Return a YAML text of all settings with their defaults; a comment describes each."""
     return "\n".join(_describe_fields(EvaluateConfig)) + "\n"
 

@@ -27,7 +27,7 @@ SHARED_MEMORY = "/dev/shm"
 SHARED_BYTES = 256e6
 
 
-def cores() -> int:
+def count_cores() -> int:
     """Cores that this process may use: those that it is bound to, at most as many as its container is given."""
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     for files in CPU_QUOTAS:
@@ -48,10 +48,10 @@ def set_threads() -> None:
     if not _is_said():
         os.environ["OMP_WAIT_POLICY"] = "passive"
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    os.environ.setdefault("OMP_NUM_THREADS", str(cores()))
+    os.environ.setdefault("OMP_NUM_THREADS", str(count_cores()))
 
 
-def start_method() -> str:
+def get_start_method() -> str:
     """How workers start: as the program said, else forked where that can be, also since Python 3.14.
 
     A forked worker has what was loaded, and takes frames that cannot be pickled. What else is in its way, threads that
@@ -61,26 +61,28 @@ def start_method() -> str:
     return multiprocessing.get_start_method(allow_none=True) or usual
 
 
-def usual_workers(frames: int, worlds: int, *, whole: bool) -> int:
+def compute_num_workers(num_frames: int, num_scenes: int, *, sends_frames: bool) -> int:
     """Processes that make the frames of a simulation, if nobody says how many.
 
     None where a process can only be started anew: a program that is not made for that would start itself.
 
-    `frames`: how many; `worlds`: how many they are of; a world is built by one process; `whole`: whether frames are
+    `num_frames`: how many; `num_scenes`: how many they are of; a world is built by one process; `sends_frames`: whether frames are
     handed over, rather than sums of them.
     """
-    if start_method() != "fork" or multiprocessing.current_process().daemon:  # which may start none
+    if get_start_method() != "fork" or multiprocessing.current_process().daemon:  # which may start none
         return 0
-    workers = min(cores(), worlds, frames // LEAST_FRAMES, int(MOST_MEMORY * machine_bytes() / BYTES_PER_WORKER))
-    if whole and os.path.isdir(SHARED_MEMORY):
+    workers = min(
+        count_cores(), num_scenes, num_frames // LEAST_FRAMES, int(MOST_MEMORY * machine_bytes() / BYTES_PER_WORKER)
+    )
+    if sends_frames and os.path.isdir(SHARED_MEMORY):
         room = os.statvfs(SHARED_MEMORY)
         workers = min(workers, int(room.f_bavail * room.f_frsize / SHARED_BYTES))
     return workers if workers > 1 else 0
 
 
-def warn_of_spinning(threads: int) -> None:
+def warn_about_spinning(num_threads: int) -> None:
     """Tell, once a process, that threads of torch are about to spin: the environment does not say how they wait."""
-    if threads > 1 and not _is_said():
+    if num_threads > 1 and not _is_said():
         _warn_once()
 
 

@@ -15,11 +15,11 @@ from torchcover.encounters.result import ALL
 from torchcover.encounters.sighting import Looks, MountedRig
 from torchcover.encounters.staging import STEP_S, solid_of
 from torchcover.encounters.traffic import Drive, Eyes, approaches, sight_approach
-from torchcover.evaluation.progress import Progress, held_back
-from torchcover.evaluation.result_page import words_of
-from torchcover.evaluation.settings import FILES, wanted_files
-from torchcover.evaluation.target_survey import free_space
-from torchcover.evaluation.task import AnyRig, as_called
+from torchcover.evaluation.progress import Progress, defer_signals
+from torchcover.evaluation.result_page import format_facts
+from torchcover.evaluation.settings import FILES, parse_file_kinds
+from torchcover.evaluation.target_survey import build_flat_ground
+from torchcover.evaluation.task import AnyRig, load_named_rig
 from torchcover.files import AtomicOutput
 from torchcover.geometry import invert, outlines_at
 from torchcover.recordings import Recording, open_recording
@@ -31,14 +31,14 @@ from torchcover.simulation.bodies import called
 FILM_S, FILM_STEPS, FILM_AROUND_M = 3.0, 100, 3.0
 
 
-def encounter(
+def evaluate_encounters(
     rigs: AnyRig | Sequence[AnyRig],
     encounters: EncounterSet | str | Path = "crossing_like",
     criterion: Criterion | None = None,
     *,
     vehicle: str | Path | None = None,
     sensor_model: Literal["ideal", "real"] | None = None,
-    phases: int = 10,
+    num_start_offsets: int = 10,
     seed: int = 0,
     progress: bool = False,
 ) -> Sightings:
@@ -50,7 +50,7 @@ def encounter(
         criterion: What is detected, and what is in time.
         vehicle: What carries the rigs, as for `evaluate`; else each is on its own vehicle.
         sensor_model: What sensors make of their hits; as for `evaluate`.
-        phases: At how many places of their period the looks begin, in turn.
+        num_start_offsets: At how many places of their period the looks begin, in turn.
         seed: Of noise and drop-out.
         progress: Whether to show a bar.
 
@@ -64,25 +64,25 @@ def encounter(
         >>> [(row.encounter, row.in_time) for row in encounter("front_roof_32", one, phases=2).rows]
         [('a', 1.0)]
     """
-    for name, value, least in (("phases", phases, 1), ("seed", seed, 0)):
+    for name, value, least in (("phases", num_start_offsets, 1), ("seed", seed, 0)):
         if value < least:
             raise ValueError(f"{name}: a number >= {least} is needed; got {value}")
     criterion = Criterion() if criterion is None else criterion
     sensing = _sensing(rigs, sensor_model)
     these = encounters if isinstance(encounters, EncounterSet) else EncounterSet.load(encounters)
-    mounted = [MountedRig(rig, with_ego(free_space(), {name: rig}, vehicle)) for name, rig in sensing.items()]
+    mounted = [MountedRig(rig, with_ego(build_flat_ground(), {name: rig}, vehicle)) for name, rig in sensing.items()]
     # Their mistakes are told before the first look.
     staged = [(rig, Staged(one, rig.ego)) for rig in mounted for one in these.encounters]
     sightings = []
-    with Progress(len(staged), "encounters", shown=progress) as bar:
+    with Progress(len(staged), "encounters", is_shown=progress) as bar:
         for rig, one in staged:
-            sightings.append(sight_encounter(rig, one, criterion, phases=phases, seed=seed))
+            sightings.append(sight_encounter(rig, one, criterion, phases=num_start_offsets, seed=seed))
             bar.advance(len(staged))
-    return Sightings(these.name, criterion, phases, seed, _sensors(sensing), sightings)
+    return Sightings(these.name, criterion, num_start_offsets, seed, _sensors(sensing), sightings)
 
 
 def _sensing(rigs: AnyRig | Sequence[AnyRig], sensor_model: Literal["ideal", "real"] | None) -> dict[str, Rig]:
-    called = [as_called(rig) for rig in ([rigs] if isinstance(rigs, str | Path | Rig) else rigs)]
+    called = [load_named_rig(rig) for rig in ([rigs] if isinstance(rigs, str | Path | Rig) else rigs)]
     sensing = {rig.name: rig.sensing(sensor_model) for rig in called}
     if not called or len(sensing) < len(called):
         raise ValueError(f"rigs with different names are needed; got {', '.join(rig.name for rig in called) or 'none'}")
@@ -93,12 +93,12 @@ def _sensors(rigs: Mapping[str, Rig]) -> dict[str, tuple[str, ...]]:
     return {name: tuple(sensor.name for sensor in rig.sensors) for name, rig in rigs.items()}
 
 
-def met_in_traffic(
+def evaluate_traffic_encounters(
     rigs: AnyRig | Sequence[AnyRig],
     scenario: Scenario | str | Path = "urban",
     criterion: Criterion | None = None,
     *,
-    worlds: int = 16,
+    num_scenes: int = 16,
     vehicle: str | Path | None = None,
     sensor_model: Literal["ideal", "real"] | None = None,
     seed: int = 0,
@@ -110,7 +110,7 @@ def met_in_traffic(
         rigs: As for `encounter`, like all that is not named here.
         scenario: Its worlds: a scenario, a built-in name or a YAML file.
         criterion: Who is met, what is detected, and what is in time.
-        worlds: How many of them are driven through; 1 if it is always the same.
+        num_scenes: How many of them are driven through; 1 if it is always the same.
         vehicle: What carries the rigs.
         sensor_model: What sensors make of their hits.
         seed: Of the traffic, of noise and drop-out.
@@ -120,18 +120,18 @@ def met_in_traffic(
         FileNotFoundError: An unknown name or file.
         ValueError: What cannot be used, a number out of its bounds, a scenario in which nothing ever moves.
     """
-    if worlds < 1:
-        raise ValueError(f"worlds: a number >= 1 is needed; got {worlds}")
+    if num_scenes < 1:
+        raise ValueError(f"worlds: a number >= 1 is needed; got {num_scenes}")
     criterion, sensing = Criterion() if criterion is None else criterion, _sensing(rigs, sensor_model)
     world = with_ego(scenario if isinstance(scenario, Scenario) else Scenario.load(scenario), sensing, vehicle)
     if world.instants == 1:
         raise ValueError(f"scenario {world.name!r}: nothing ever moves in it, so nobody is met")
-    worlds = 1 if world.repeats else worlds
+    num_scenes = 1 if world.repeats else num_scenes
     nobody = Simulator(world, {}, PaperReference(rows=2, columns=2), seed=seed)
     alone = {name: nobody.with_rigs({name: rig}) for name, rig in sensing.items()}
     sightings, hours = [], {}
-    with Progress(worlds, "worlds", shown=progress) as bar:
-        for number in range(worlds):
+    with Progress(num_scenes, "worlds", is_shown=progress) as bar:
+        for number in range(num_scenes):
             first = number * world.steps
             drive = Drive.of_world(f"{world.name} {number}", nobody.scene_of(first)[0].world)
             hours[drive.name] = world.steps * world.step_s / 3600
@@ -139,12 +139,12 @@ def met_in_traffic(
             for name, simulator in alone.items():
                 eyes = Eyes.of_world(simulator, first, criterion)
                 sightings += [sight_approach(name, drive, one, eyes, criterion) for one in met]
-            bar.advance(worlds)
+            bar.advance(num_scenes)
     return Sightings(world.name, criterion, 1, seed, _sensors(sensing), sightings, hours)
 
 
-def met_in_recording(recording: Recording | str | Path, criterion: Criterion | None = None) -> Sightings:
-    """When the rigs of a recording first had enough points on those whom it met; as `met_in_traffic`.
+def evaluate_recorded_encounters(recording: Recording | str | Path, criterion: Criterion | None = None) -> Sightings:
+    """When the rigs of a recording first had enough points on those whom it met; as `evaluate_traffic_encounters`.
 
     Args:
         recording: One with poses, times and labelled objects, or its path.
@@ -164,9 +164,9 @@ def met_in_recording(recording: Recording | str | Path, criterion: Criterion | N
     return Sightings(drive.name, criterion, 1, 0, {n: tuple(of) for n, of in opened.rigs.items()}, sightings, hours)
 
 
-def encounter_film(
+def plot_encounter_animation(
     rig: AnyRig,
-    found: Sightings,
+    encounter_results: Sightings,
     *,
     vehicle: str | Path | None = None,
     sensor_model: Literal["ideal", "real"] | None = None,
@@ -175,22 +175,24 @@ def encounter_film(
 
     Args:
         rig: One of those that were asked about.
-        found: What they had, of a set.
+        encounter_results: What they had, of a set.
         vehicle: What carries the rig, as it was told.
         sensor_model: As it was told.
     """
     ((name, sensing),) = _sensing(rig, sensor_model).items()
-    latest = min((one for one in found.sightings if one.rig == name), key=lambda one: one.ttc_s.min() - one.needed_s)
+    latest = min(
+        (one for one in encounter_results.sightings if one.rig == name), key=lambda one: one.ttc_s.min() - one.needed_s
+    )
     case, without_s = cast(Encounter, latest.encounter), latest.without_ttc_s.min(axis=1)
-    mounted = MountedRig(sensing, with_ego(free_space(), {name: sensing}, vehicle))
+    mounted = MountedRig(sensing, with_ego(build_flat_ground(), {name: sensing}, vehicle))
     staged = Staged(case, mounted.ego)
-    scene, looks = staged.scene(mounted.solids, whole=True), Looks(mounted, staged, found.seed)
-    sensors, names = mounted.mounted(case, scene), found.sensors[name]
+    scene, looks = staged.scene(mounted.solids, whole=True), Looks(mounted, staged, encounter_results.seed)
+    sensors, names = mounted.mounted(case, scene), encounter_results.sensors[name]
     first, worst = latest.sensor_ttc_s.mean(axis=1).argmax(), without_s.argmin()
     told = f"{case.words}: detected {latest.ttc_s.min():.2f} s before, needed {latest.needed_s:.2f} s"
     told += f"; first {names[first]}, without {names[worst]} {without_s[worst]:.2f} s" if len(names) > 1 else ""
     if case.speed_is_swept:
-        kmh = found.up_to_kmh()[case.name, name]
+        kmh = encounter_results.up_to_kmh()[case.name, name]
         told += "; in time at none of the speeds" if math.isnan(kmh) else f"; in time up to {kmh:g} km/h"
     steps = np.arange(max(int((staged.contact_s - FILM_S) / STEP_S), 0), int(staged.contact_s / STEP_S), FILM_STEPS)
     times_s = STEP_S * steps.astype(np.float64)
@@ -216,58 +218,60 @@ def encounter_film(
         )
 
 
-def save_encounters(found: Sightings, folder: str | Path, *, files: str | Iterable[str] = FILES) -> list[Path]:
+def save_encounters(
+    encounter_results: Sightings, folder: str | Path, *, file_kinds: str | Iterable[str] = FILES
+) -> list[Path]:
     """Write the files of the command line.
 
     Args:
-        found: From `encounter`.
-        folder: Where to write `encounters.csv`, `report.html`, `encounters.png` and `summary.json`; as `save_targets`.
-        files: What to write beside `summary.json`, as in `Result.save`; "maps" is the picture.
+        encounter_results: From `encounter`.
+        folder: Where to write `encounters.csv`, `report.html`, `encounters.png` and `summary.json`; as `save_target_map`.
+        file_kinds: What to write beside `summary.json`, as in `Result.save`; "maps" is the picture.
     """
-    wanted = wanted_files(files)
-    record = {"verdict": list(encounters_verdict(found)), **found.record()}
+    wanted = parse_file_kinds(file_kinds)
+    record = {"verdict": list(summarize_encounters(encounter_results)), **encounter_results.record()}
     with AtomicOutput(Path(folder)) as written:
-        with held_back():
+        with defer_signals():
             if "numbers" in wanted:
-                written.add("encounters.csv", found.write_csv)
+                written.add("encounters.csv", encounter_results.write_csv)
             written.publish(record)
         if "page" in wanted:
-            written.add_text("report.html", render_page(encounters_page(found)))
-        if "maps" in wanted and not found.hours:
-            written.add_figure("encounters.png", found.plot())
+            written.add_text("report.html", render_page(build_encounters_page(encounter_results)))
+        if "maps" in wanted and not encounter_results.hours:
+            written.add_figure("encounters.png", encounter_results.plot())
         written.publish(record)
     return written.paths
 
 
-def encounters_verdict(found: Sightings) -> tuple[str, ...]:
+def summarize_encounters(encounter_results: Sightings) -> tuple[str, ...]:
     """In how many of the encounters each rig is in time, in a sentence; of traffic, who was met when too late."""
-    rows = [row for row in found.rows if row.encounter != ALL and row.to_brake]
-    of_rigs = {rig: [row for row in rows if row.rig == rig] for rig in found.sensors}
+    rows = [row for row in encounter_results.rows if row.encounter != ALL and row.to_brake]
+    of_rigs = {rig: [row for row in rows if row.rig == rig] for rig in encounter_results.sensors}
     if not rows:
         return ("Nobody was met for whom the vehicle had to brake.",)
-    if found.hours:
+    if encounter_results.hours:
         late = {rig: round(sum((1 - row.in_time) * row.to_brake for row in of)) for rig, of in of_rigs.items()}
         most = max(sum(row.to_brake for row in of) for of in of_rigs.values())
         told = "; ".join(f"{rig} {count}" for rig, count in late.items())
         return (f"Of {most} for whom the vehicle had to brake, detected too late: {told}.",)
     told = "; ".join(f"{rig} {sum(row.in_time == 1 for row in of)}" for rig, of in of_rigs.items())
     count = max(map(len, of_rigs.values()))
-    return (f"Of {count} encounters of {found.name}, each speed counted, always in time: {told}.",)
+    return (f"Of {count} encounters of {encounter_results.name}, each speed counted, always in time: {told}.",)
 
 
-def encounters_page(found: Sightings) -> Page:
+def build_encounters_page(encounter_results: Sightings) -> Page:
     """All of it on one page."""
     pictures = []
-    if not found.hours:
+    if not encounter_results.hours:
         png = BytesIO()
-        found.plot().savefig(png, format="png")
+        encounter_results.plot().savefig(png, format="png")
         pictures = [PagePicture("Time to collision at detection against the speed", png.getvalue())]
     return Page(
-        title=f"In time? {', '.join(found.sensors)}",
-        lead=f"The encounters of {found.name}, measured by torchcover. In time is geometry: what was seen when, with "
+        title=f"In time? {', '.join(encounter_results.sensors)}",
+        lead=f"The encounters of {encounter_results.name}, measured by torchcover. In time is geometry: what was seen when, with "
         "the brakes and the latency that were assumed.",
-        findings=encounters_verdict(found),
-        tables=found.tables(),
+        findings=summarize_encounters(encounter_results),
+        tables=encounter_results.tables(),
         pictures=pictures,
-        facts={"Settings": words_of(found.settings()), "Run": {"torchcover": __version__}},
+        facts={"Settings": format_facts(encounter_results.settings()), "Run": {"torchcover": __version__}},
     )

@@ -5,20 +5,20 @@ from pathlib import Path
 from typing import Any
 
 from torchcover.coverage import Coverage
-from torchcover.evaluation.arguments import taking
+from torchcover.evaluation.arguments import accept_fields
 from torchcover.evaluation.config import DESCRIPTIONS
-from torchcover.evaluation.measuring import measured
-from torchcover.evaluation.mixed import MixedResult, measured_in_each
+from torchcover.evaluation.measuring import measure_coverage
+from torchcover.evaluation.mixed import MixedResult, measure_scenarios
 from torchcover.evaluation.result import Result
 from torchcover.evaluation.settings import Settings
-from torchcover.evaluation.task import distinct, task_of
+from torchcover.evaluation.task import build_task, make_unique_names
 
 SAVED = ".npz"
 # What `evaluate` calls its file in any folder, so that the folder tells more.
 USUAL_STEM = "coverage"
 
 
-@taking(Settings, DESCRIPTIONS)
+@accept_fields(Settings, DESCRIPTIONS)
 def evaluate(settings: Settings) -> Result:
     """Measure the coverage of a rig, or of several in the same frames, as `torchcover evaluate` does.
 
@@ -39,8 +39,8 @@ def evaluate(settings: Settings) -> Result:
         (2, ['160m', '20m', '80m', 'front_3m', 'left_3m', 'rear_3m', 'right_3m'])
     """
     if settings.mixture is not None:
-        return measured_in_each(settings)
-    return measured(task_of(settings), settings)
+        return measure_scenarios(settings)
+    return measure_coverage(build_task(settings), settings)
 
 
 def compare(results: Result | str | Path | Sequence[Result | str | Path]) -> Result:
@@ -72,13 +72,15 @@ def compare(results: Result | str | Path | Sequence[Result | str | Path]) -> Res
             raise ValueError(
                 "compare: results of the same scenarios with the same weights are needed, or none of several"
             )
-        return MixedResult.of({name: _compared([one.worlds[name] for one in mixed]) for name in weights}, weights)
+        return MixedResult.from_results(
+            {name: _compared([one.scenario_results[name] for one in mixed]) for name in weights}, weights
+        )
     return _compared(each)
 
 
 def _compared(each: Sequence[Result | str | Path]) -> Result:
     measured_already = [one for given in each for one in _coverages(given)]
-    names = distinct([name for name, *_ in measured_already])
+    names = make_unique_names([name for name, *_ in measured_already])
     if len(names) < 2:
         raise ValueError(f"a comparison needs at least two measured rigs; got {', '.join(names) or 'none'} only")
     coverages = {name: coverage for name, (_, coverage, *_) in zip(names, measured_already, strict=True)}
@@ -96,7 +98,7 @@ def _compared(each: Sequence[Result | str | Path]) -> Result:
         source=source,
         reference_record=None,
         device=None,
-        inputs=[given for given in given_as if isinstance(given, Path)],
+        input_files=[given for given in given_as if isinstance(given, Path)],
     )
 
 

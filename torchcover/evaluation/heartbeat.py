@@ -15,12 +15,12 @@ class HeartbeatParams:
     """Times of the signs of life.
 
     Args:
-        every_s: Seconds between two signs of life of a rank.
-        silent_s: A rank without one for so long is reported; longer than the interpreter is ever held by one call.
+        interval_s: Seconds between two signs of life of a rank.
+        timeout_s: A rank without one for so long is reported; longer than the interpreter is ever held by one call.
     """
 
-    every_s: float = 3.0
-    silent_s: float = 20.0
+    interval_s: float = 3.0
+    timeout_s: float = 20.0
 
 
 class Heartbeat:
@@ -33,20 +33,20 @@ class Heartbeat:
         params: Times.
     """
 
-    def __init__(self, store: Store, rank: int, size: int, params: HeartbeatParams) -> None:
+    def __init__(self, store: Store, rank: int, num_ranks: int, params: HeartbeatParams) -> None:
         self._store, self._rank, self._params = store, rank, params
-        self._signs = {other: b"" for other in range(size) if other != rank}
+        self._signs = {other: b"" for other in range(num_ranks) if other != rank}
         now_s = time.monotonic()
         self._changed_s = dict.fromkeys(self._signs, now_s)
         self._exchanged_s = now_s
         self._reported: set[int] = set()
         self._ended = Event()
 
-    def exchange(self) -> None:
+    def exchange_heartbeats(self) -> None:
         """Send signs of life and read those of the others, until the rank leaves; the last sign is "left"."""
         with suppress(RuntimeError):  # the store has ended
             count = 0
-            while not self._ended.wait(self._params.every_s):
+            while not self._ended.wait(self._params.interval_s):
                 count += 1
                 self._store.set(f"alive {self._rank}", str(count))
                 for other, sign in self._signs.items():
@@ -60,15 +60,15 @@ class Heartbeat:
     def watch(self) -> None:
         """Warn about ranks without signs of life, until the rank leaves."""
         looked_s = time.monotonic()
-        while not self._ended.wait(self._params.every_s):
+        while not self._ended.wait(self._params.interval_s):
             now_s = time.monotonic()
-            if now_s - looked_s > 2 * self._params.every_s:  # this process itself was stopped
+            if now_s - looked_s > 2 * self._params.interval_s:  # this process itself was stopped
                 self._exchanged_s, self._changed_s = now_s, dict.fromkeys(self._signs, now_s)
             looked_s = now_s
             for other in self.find_silent(now_s):
                 self._reported.add(other)
                 warnings.warn(
-                    f"rank {other} has been silent for {self._params.silent_s:g} s, and the others wait for it: it is "
+                    f"rank {other} has been silent for {self._params.timeout_s:g} s, and the others wait for it: it is "
                     "stopped or dead; continue it, or end all ranks",
                     RuntimeWarning,
                     stacklevel=2,
@@ -76,33 +76,35 @@ class Heartbeat:
 
     def find_silent(self, now_s: float) -> list[int]:
         """Find the ranks without signs of life that were not reported; rank 0 if the store does not answer."""
-        latest_s = now_s - self._params.silent_s
+        latest_s = now_s - self._params.timeout_s
         if self._exchanged_s < latest_s:
             return [] if self._rank == 0 or 0 in self._reported else [0]
         return [other for other, at_s in self._changed_s.items() if at_s < latest_s and other not in self._reported]
 
-    def end(self) -> None:
+    def stop(self) -> None:
         """End both loops."""
         self._ended.set()
 
 
 @contextmanager
-def reporting_silent_ranks(store: Store, rank: int, size: int, params: HeartbeatParams | None = None) -> Iterator[None]:
+def report_silent_ranks(
+    store: Store, rank: int, num_ranks: int, params: HeartbeatParams | None = None
+) -> Iterator[None]:
     """Send signs of life to the other ranks, and warn about those that send none.
 
     Args:
         store: The store of the ranks, which rank 0 keeps.
         rank: This rank.
-        size: Number of ranks.
+        num_ranks: Number of ranks.
         params: Times; the defaults if not given.
     """
-    heartbeat = Heartbeat(store, rank, size, params or HeartbeatParams())
-    threads = [Thread(target=loop, daemon=True) for loop in (heartbeat.exchange, heartbeat.watch)]
+    heartbeat = Heartbeat(store, rank, num_ranks, params or HeartbeatParams())
+    threads = [Thread(target=loop, daemon=True) for loop in (heartbeat.exchange_heartbeats, heartbeat.watch)]
     for thread in threads:
         thread.start()
     try:
         yield
     finally:
-        heartbeat.end()
+        heartbeat.stop()
         for thread in threads:
             thread.join(timeout=1.0)

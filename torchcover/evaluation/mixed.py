@@ -12,12 +12,12 @@ from matplotlib.figure import Figure
 
 from torchcover.coverage import Coverage, Mixture
 from torchcover.evaluation.checkpoint import Checkpoint
-from torchcover.evaluation.measuring import measured
-from torchcover.evaluation.progress import held_back
+from torchcover.evaluation.measuring import measure_coverage
+from torchcover.evaluation.progress import defer_signals
 from torchcover.evaluation.result import Result
-from torchcover.evaluation.result_page import page_tables
-from torchcover.evaluation.settings import FILES, Settings, wanted_files
-from torchcover.evaluation.task import task_of
+from torchcover.evaluation.result_page import build_result_tables
+from torchcover.evaluation.settings import FILES, Settings, parse_file_kinds
+from torchcover.evaluation.task import build_task
 from torchcover.files import SUMMARY, AtomicOutput, csv_text
 from torchcover.report import RENDERERS, CoverageTable, PageTable, build_file_stems, merge_notes, render_page
 from torchcover.report.records import build_records
@@ -29,25 +29,28 @@ MIXTURE = "mixture"
 class MixedResult(Result):
     """What `evaluate` and `compare` return of several scenarios: the numbers of their mixture.
 
-    Coverages, maps, and metrics of others are of one kind of world each: those of `worlds`.
+    Coverages, maps, and metrics of others are of one kind of world each: those of `scenario_results`.
 
     Args:
-        worlds: By the name of the scenario, what was measured there: the same rigs in all of them.
+        scenario_results: By the name of the scenario, what was measured there: the same rigs in all of them.
         weights: By the same names, how much each counts in the mixture; they sum to 1.
     """
 
-    worlds: Mapping[str, Result] = field(default_factory=dict)
+    scenario_results: Mapping[str, Result] = field(default_factory=dict)
     weights: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, worlds: Mapping[str, Result], weights: Mapping[str, float]) -> "MixedResult":
+    def from_results(cls, scenario_results: Mapping[str, Result], weights: Mapping[str, float]) -> "MixedResult":
         """Mix results.
 
         Raises:
             ValueError: They were not asked about the same.
         """
-        first = next(iter(worlds.values()))
-        told = {key: _agreed({name: world.source.get(key) for name, world in worlds.items()}) for key in first.source}
+        first = next(iter(scenario_results.values()))
+        told = {
+            key: _agreed({name: world.source.get(key) for name, world in scenario_results.items()})
+            for key in first.source
+        }
         mixed = cls(
             coverages={},
             regions=first.regions,
@@ -58,7 +61,7 @@ class MixedResult(Result):
             device=first.device,
             sensors=first.sensors,
             ego_outline_m=first.ego_outline_m if told["vehicle"] == first.source["vehicle"] else None,
-            worlds=worlds,
+            scenario_results=scenario_results,
             weights=weights,
         )
         _ = mixed.table  # what cannot be mixed is refused now
@@ -71,12 +74,12 @@ class MixedResult(Result):
         Raises:
             ValueError: Always: a mixture has numbers only.
         """
-        raise ValueError(f"a mixture has no maps: use worlds[name].coverage, of {', '.join(self.worlds)}")
+        raise ValueError(f"a mixture has no maps: use worlds[name].coverage, of {', '.join(self.scenario_results)}")
 
     @cached_property
     def mixtures(self) -> Mapping[str, Mixture]:
         """Name of each rig -> its numbers, for any region, with what they become without one block after the other."""
-        counted = [(name, weight, self.worlds[name]) for name, weight in self.weights.items() if weight > 0.0]
+        counted = [(name, weight, self.scenario_results[name]) for name, weight in self.weights.items() if weight > 0.0]
         rigs = counted[0][2].coverages
         return {rig: Mixture({name: (weight, of.coverages[rig]) for name, weight, of in counted}) for rig in rigs}
 
@@ -89,43 +92,46 @@ class MixedResult(Result):
             "within each of them, and say nothing of other kinds or other weights. What is unknown in one of them is "
             "unknown; maps are of one of them each."
         )
-        of_kinds = merge_notes({name: world.notes for name, world in self.worlds.items()})
+        of_kinds = merge_notes({name: world.notes for name, world in self.scenario_results.items()})
         return CoverageTable.from_coverages(self.mixtures, self.regions, [note, *of_kinds], self.source)
 
     @property
     def record(self) -> dict[str, Any]:
         """What stands in `summary.json`: the numbers of the mixture, and under `worlds` the record of each."""
-        worlds = {name: {"weight": self.weights[name], **world.record} for name, world in self.worlds.items()}
-        runs = [world.run for world in self.worlds.values() if world.run]
-        seconds = round(sum(run.seconds for run in runs), 3) if runs else None
-        skipped = [line for run in runs for line in run.skipped]
-        complete = all(run.complete for run in runs)
+        worlds = {name: {"weight": self.weights[name], **world.record} for name, world in self.scenario_results.items()}
+        runs = [world.run for world in self.scenario_results.values() if world.run]
+        seconds = round(sum(run.duration_s for run in runs), 3) if runs else None
+        skipped = [line for run in runs for line in run.skipped_frames]
+        complete = all(run.is_complete for run in runs)
         run = {"seconds": seconds, "complete": complete, "skipped_frames": skipped}
         return {**super().record, **run, "worlds": worlds}
 
     @property
     def tables(self) -> list[PageTable]:
         """Those of the mixture, then those of each kind of world."""
-        each = {MIXTURE: page_tables(self.table), **{name: world.tables for name, world in self.worlds.items()}}
+        each = {
+            MIXTURE: build_result_tables(self.table),
+            **{name: world.tables for name, world in self.scenario_results.items()},
+        }
         return [replace(one, title=f"{name}: {one.title}".rstrip(": ")) for name, of in each.items() for one in of]
 
-    def maps(self, layer: str | None = None) -> Iterator[tuple[str, Figure]]:
+    def plot_maps(self, layer: str | None = None) -> Iterator[tuple[str, Figure]]:
         """Those of each kind of world; its name is the first part of the stems."""
-        for name, world in self.worlds.items():
-            yield from ((f"{name}/{stem}", figure) for stem, figure in world.maps(layer))
+        for name, world in self.scenario_results.items():
+            yield from ((f"{name}/{stem}", figure) for stem, figure in world.plot_maps(layer))
 
-    def save(self, folder: str | Path, *, files: str | Iterable[str] = FILES) -> list[Path]:
+    def save(self, folder: str | Path, *, file_kinds: str | Iterable[str] = FILES) -> list[Path]:
         """Write the files of each kind of world to a folder of its own, as `Result.save`, and those of the mixture.
 
         Args:
             folder: Where to write: `NAME/...`; `summary.csv`, with the rows of all worlds and of the mixture,
                 `report.html` and `summary.json`.
-            files: As in `Result.save`.
+            file_kinds: As in `Result.save`.
         """
-        wanted, record = wanted_files(files), self.record
-        worlds = dict(zip(build_file_stems(list(self.worlds)), self.worlds.values(), strict=True))
+        wanted, record = parse_file_kinds(file_kinds), self.record
+        worlds = dict(zip(build_file_stems(list(self.scenario_results)), self.scenario_results.values(), strict=True))
         with AtomicOutput(Path(folder)) as written:
-            with held_back():  # the numbers are safe before anything ends this
+            with defer_signals():  # the numbers are safe before anything ends this
                 for stem, world in worlds.items():
                     if "numbers" in wanted:
                         world.add_numbers(written, f"{stem}/")
@@ -141,17 +147,17 @@ class MixedResult(Result):
         return written.paths
 
     def _csv(self) -> str:
-        tables = {**{name: world.table for name, world in self.worlds.items()}, MIXTURE: self.table}
+        tables = {**{name: world.table for name, world in self.scenario_results.items()}, MIXTURE: self.table}
         rows = [{"world": name, **row} for name, table in tables.items() for row in build_records(table)]
         columns = list(dict.fromkeys(chain.from_iterable(rows)))
         return csv_text([columns, *([row.get(column, "") for column in columns] for row in rows)])
 
     @property
     def _about(self) -> str:
-        return f"Mixture of {', '.join(self.worlds)}: {', '.join(self.rigs)}"
+        return f"Mixture of {', '.join(self.scenario_results)}: {', '.join(self.rigs)}"
 
     def __str__(self) -> str:
-        tables = {**{name: world.table for name, world in self.worlds.items()}, MIXTURE: self.table}
+        tables = {**{name: world.table for name, world in self.scenario_results.items()}, MIXTURE: self.table}
         return "\n".join(f"{name}\n{RENDERERS['text'](table)}" for name, table in tables.items())
 
 
@@ -165,7 +171,7 @@ def _agreed(each: Mapping[str, Any]) -> object:
     return ", ".join(f"{name} {one}" for name, one in each.items())
 
 
-def measured_in_each(settings: Settings) -> MixedResult:
+def measure_scenarios(settings: Settings) -> MixedResult:
     """Measure in one kind of world after the other.
 
     `settings`: of `evaluate`, with several scenarios. ValueError: a recording among them, other regions in one than in
@@ -183,10 +189,10 @@ def measured_in_each(settings: Settings) -> MixedResult:
         checkpoint = settings.checkpoint
         if checkpoint is not None:
             checkpoint = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(Path(checkpoint))
-            checkpoint = checkpoint.within(stem)
+            checkpoint = checkpoint.in_folder(stem)
         of_one = replace(settings, scenario=scenario, checkpoint=checkpoint)
-        tasks[name] = task_of(of_one), of_one  # all of them before the first is measured, which may take hours
-    asked = [tasks[name][0].asked.regions for name, (_, weight) in settings.mixture.items() if weight > 0.0]
+        tasks[name] = build_task(of_one), of_one  # all of them before the first is measured, which may take hours
+    asked = [tasks[name][0].query_plan.regions for name, (_, weight) in settings.mixture.items() if weight > 0.0]
     if any(regions != asked[0] for regions in asked):
         raise ValueError(
             f"{', '.join(tasks)} cannot be mixed: the regions around their egos differ; give `vehicle`, or ask about "
@@ -194,7 +200,7 @@ def measured_in_each(settings: Settings) -> MixedResult:
         )
     worlds = {}
     for name in settings.mixture:
-        worlds[name] = measured(*tasks.pop(name))
+        worlds[name] = measure_coverage(*tasks.pop(name))
         if (run := worlds[name].run) is not None:
             run.raise_failure()
-    return MixedResult.of(worlds, {name: weight for name, (_, weight) in settings.mixture.items()})
+    return MixedResult.from_results(worlds, {name: weight for name, (_, weight) in settings.mixture.items()})

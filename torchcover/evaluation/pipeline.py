@@ -15,10 +15,10 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch.utils.data import DataLoader, Dataset, get_worker_info
 
-from torchcover.evaluation.checkpoint import Journal
-from torchcover.evaluation.cores import cores, start_method, warn_of_spinning
+from torchcover.evaluation.checkpoint import CheckpointManager
+from torchcover.evaluation.cores import count_cores, get_start_method, warn_about_spinning
 from torchcover.evaluation.observers import AnyObserver, CoverageObserver
-from torchcover.evaluation.progress import ENDS, Progress, held_back
+from torchcover.evaluation.progress import ENDS, Progress, defer_signals
 from torchcover.evaluation.ranks import Ranks
 from torchcover.files import end_with_parent, is_stopped, reporting_stopped
 from torchcover.frames import BadFrameError, Frame, FrameSource, worlds_of
@@ -34,26 +34,26 @@ class Run:
     """How a run went.
 
     Args:
-        steps: Frames that all observers have seen.
+        num_frames: Frames that all observers have seen.
         counts: Sums of the frames' counts.
-        skipped: What was wrong with the frames that were skipped.
-        reached: Whether what was waited for ended it.
+        skipped_frames: What was wrong with the frames that were skipped.
+        is_target_reached: Whether what was waited for ended it.
         failure: What ended it before its time, if anything did: a bad frame, Ctrl-C, a worker that was killed, an error
             of an observer.
-        seconds: How long it took.
-        measuring_s: That part of it that went into the observers.
+        duration_s: How long it took.
+        measurement_s: That part of it that went into the observers.
     """
 
-    steps: int = 0
+    num_frames: int = 0
     counts: Counter[str] = field(default_factory=Counter)
-    skipped: list[str] = field(default_factory=list)
-    reached: bool = False
+    skipped_frames: list[str] = field(default_factory=list)
+    is_target_reached: bool = False
     failure: Exception | KeyboardInterrupt | None = None
-    seconds: float = 0.0
-    measuring_s: float = 0.0
+    duration_s: float = 0.0
+    measurement_s: float = 0.0
 
     @property
-    def complete(self) -> bool:
+    def is_complete(self) -> bool:
         """Whether nothing but the end of the frames, or of what was waited for, ended it."""
         return self.failure is None
 
@@ -72,7 +72,7 @@ class MeasuredFrame(NamedTuple):
     frame: Frame | None
     counts: Mapping[str, int]
     sums: Mapping[Any, Any]
-    measuring_s: float
+    measurement_s: float
 
 
 class MeasuredFrames:
@@ -99,16 +99,16 @@ class MeasuredFrames:
 
 
 class StoppingRule(Protocol):
-    """Ends a run before its frames do; see `TargetWatch`."""
+    """Ends a run before its frames do; see `TargetErrorRule`."""
 
-    def is_reached(self, steps: int) -> bool:
+    def is_reached(self, num_frames: int) -> bool:
         """Whether the run may end after so many steps."""
 
-    def expected_steps(self, most: int) -> int:
+    def estimate_num_frames(self, max_frames: int) -> int:
         """Steps that the run is thought to take, of so many at most."""
 
     @property
-    def words(self) -> str:
+    def progress_text(self) -> str:
         """How far it is, for the progress bar."""
 
 
@@ -116,15 +116,15 @@ def observe(
     frames: Frames,
     observers: Iterable[AnyObserver],
     *,
-    steps: int | None = None,
-    workers: int = 0,
+    num_frames: int | None = None,
+    num_workers: int = 0,
     device: torch.device | str = "cpu",
     skip_bad_frames: bool = False,
-    until: StoppingRule | None = None,
-    progress: bool = False,
+    stopping_rule: StoppingRule | None = None,
+    show_progress: bool = False,
     title: str = "steps",
     keep_partial: bool = False,
-    journal: Journal | None = None,
+    journal: CheckpointManager | None = None,
     ranks: Ranks | None = None,
 ) -> Run:
     """Feed observers with frames. Whatever ends the run, all of them have seen the same frames.
@@ -134,12 +134,12 @@ def observe(
     Args:
         frames: A source of frames, or any map-style dataset or list of them.
         observers: What looks at them.
-        steps: Only so many frames, from the first on; all if not given.
-        workers: Processes that make frames; 0 makes them in this one.
+        num_frames: Only so many frames, from the first on; all if not given.
+        num_workers: Processes that make frames; 0 makes them in this one.
         device: Where the observers get the frames' tensors.
         skip_bad_frames: Skip and note frames that cannot be used, instead of ending with the first.
-        until: Ends the run early.
-        progress: Whether to show a bar.
+        stopping_rule: Ends the run early.
+        show_progress: Whether to show a bar.
         title: What stands before the bar.
         keep_partial: After the first step, what ends the run is noted in it and not raised: for who looks at
             `Run.complete`.
@@ -169,49 +169,60 @@ def observe(
         (2, ['f0', 'f1'])
     """
     run, observers = Run(), list(observers)
-    most = len(frames) if steps is None else min(steps, len(frames))  # type: ignore[arg-type]  # map-style: has one
+    most = len(frames) if num_frames is None else min(num_frames, len(frames))  # type: ignore[arg-type]  # map-style: has one
     if journal:
         journal.restore(run)
-    world_of = int if workers < 2 and ranks is None else worlds_of(frames)
-    todo = iter(range(most)) if ranks is None else ranks.share(range(most), world_of)
+    world_of = int if num_workers < 2 and ranks is None else worlds_of(frames)
+    todo = iter(range(most)) if ranks is None else ranks.iterate_share(range(most), world_of)
     todo = _left(todo, run, skip_bad_frames=skip_bad_frames)
-    start = time.perf_counter() - run.seconds
+    start = time.perf_counter() - run.duration_s
     consistent = True  # all observers and the rule know of the same frames
-    run.reached = until is not None and run.steps > 0 and until.is_reached(run.steps)
-    share = most if ranks is None else -(-most // ranks.size)
+    run.is_target_reached = (
+        stopping_rule is not None and run.num_frames > 0 and stopping_rule.is_reached(run.num_frames)
+    )
+    share = most if ranks is None else -(-most // ranks.num_ranks)
     try:
-        with _threads_beside(workers), Progress(share, title, done=run.steps, shown=progress, workers=workers) as bar:
-            tasks = made_together(() if run.reached else todo, world_of if workers > 1 else int)
+        with (
+            _threads_beside(num_workers),
+            Progress(share, title, num_done=run.num_frames, is_shown=show_progress, num_workers=num_workers) as bar,
+        ):
+            tasks = group_by_scene(() if run.is_target_reached else todo, world_of if num_workers > 1 else int)
             apart = MeasuredFrames(frames, observers, device)
-            for seen in _each(apart, tasks, workers, run, skip_bad_frames=skip_bad_frames):
+            for seen in _each(apart, tasks, num_workers, run, skip_bad_frames=skip_bad_frames):
                 if ranks:
-                    ranks.check_others()
-                with held_back():
+                    ranks.check_failures()
+                with defer_signals():
                     consistent = False
                     _feed(seen, observers, run, device)
-                    run.reached = until is not None and until.is_reached(run.steps)
+                    run.is_target_reached = stopping_rule is not None and stopping_rule.is_reached(run.num_frames)
                     consistent = True
-                run.seconds = time.perf_counter() - start
-                expected = share if until is None else run.steps if run.reached else until.expected_steps(share)
-                bar.advance(expected, until.words if until else "")
-                if run.reached:
+                run.duration_s = time.perf_counter() - start
+                expected = (
+                    share
+                    if stopping_rule is None
+                    else run.num_frames
+                    if run.is_target_reached
+                    else stopping_rule.estimate_num_frames(share)
+                )
+                bar.advance(expected, stopping_rule.progress_text if stopping_rule else "")
+                if run.is_target_reached:
                     break
                 if journal:
                     journal.write_if_due(run)
     except (Exception, KeyboardInterrupt) as error:  # hours of work are not lost to any of them
-        with held_back() as signals:
+        with defer_signals() as signals:
             clear_frames(error.__traceback__)  # which would keep the workers alive
-            killed = killed_worker(error, workers, run.steps)
+            killed = find_killed_worker(error, num_workers, run.num_frames)
             # Whoever ends workers too, as schedulers do, may have ended them first.
             run.failure = KeyboardInterrupt() if killed and not set(signals).isdisjoint(ENDS) else killed or error
             signals.clear()
-    run.seconds = time.perf_counter() - start
-    if journal and run.steps and consistent and (run.failure or journal.keep):
-        with held_back():
+    run.duration_s = time.perf_counter() - start
+    if journal and run.num_frames and consistent and (run.failure or journal.keep):
+        with defer_signals():
             journal.write(run)
-    if not (keep_partial and (run.steps or ranks)):
+    if not (keep_partial and (run.num_frames or ranks)):
         run.raise_failure()
-    if not (run.steps or ranks):
+    if not (run.num_frames or ranks):
         raise ValueError("no frame could be used, so there is no result")
     return run
 
@@ -220,25 +231,27 @@ def observe(
 def _threads_beside(workers: int) -> Iterator[None]:
     before = torch.get_num_threads()
     if workers:
-        torch.set_num_threads(max(1, min(before, cores() - workers)))
-    warn_of_spinning(torch.get_num_threads())
+        torch.set_num_threads(max(1, min(before, count_cores() - workers)))
+    warn_about_spinning(torch.get_num_threads())
     try:
         yield
     finally:
         torch.set_num_threads(before)
 
 
-def killed_worker(error: BaseException, workers: int, steps: int) -> ChildProcessError | None:
+def find_killed_worker(error: BaseException, num_workers: int, num_frames: int) -> ChildProcessError | None:
     """What torch says, wherever this process is, when a worker dies; as an error that a user can do something about."""
     told = isinstance(error, RuntimeError) and str(error).startswith("DataLoader worker (pid")
     # Or its last frame could not be fetched; what a worker itself raises is "Caught ... in DataLoader worker process".
-    cut_off = workers > 0 and isinstance(error, EOFError | ConnectionError) and not str(error).startswith("Caught ")
+    cut_off = num_workers > 0 and isinstance(error, EOFError | ConnectionError) and not str(error).startswith("Caught ")
     if not (told or cut_off):
         return None
     # A process that is not forked imports the program, which then starts workers of its own, and may not.
-    forked = start_method() == "fork"
+    forked = get_start_method() == "fork"
     why = "for want of memory" + ("" if forked else ', or of `if __name__ == "__main__":` around what the program runs')
-    return ChildProcessError(f"a worker was killed after step {steps:,}, perhaps {why}; use fewer workers ({error!r})")
+    return ChildProcessError(
+        f"a worker was killed after step {num_frames:,}, perhaps {why}; use fewer workers ({error!r})"
+    )
 
 
 def _feed(seen: MeasuredFrame, observers: Sequence[AnyObserver], run: Run, device: torch.device | str) -> None:
@@ -249,26 +262,26 @@ def _feed(seen: MeasuredFrame, observers: Sequence[AnyObserver], run: Run, devic
             observer.add(seen.sums[number])  # type: ignore[attr-defined]  # who has `sums_of` has it
         elif frame is not None:
             observer.update(frame)
-    run.measuring_s += seen.measuring_s + time.perf_counter() - start
+    run.measurement_s += seen.measurement_s + time.perf_counter() - start
     run.counts.update(seen.counts)
-    run.steps += 1
+    run.num_frames += 1
 
 
 def _left(indices: Iterator[int], run: Run, *, skip_bad_frames: bool) -> Iterator[int]:
-    done = run.steps + len(run.skipped)
+    done = run.num_frames + len(run.skipped_frames)
     if (most := sum(1 for _ in islice(indices, done))) < done:
         raise ValueError(f"steps: {done} are done in the checkpoint; got {most}, which is less")
-    if run.skipped and not skip_bad_frames:
+    if run.skipped_frames and not skip_bad_frames:
         raise ValueError(
-            f"{len(run.skipped)} bad frames were skipped before the checkpoint, such as {run.skipped[0]}; go on "
+            f"{len(run.skipped_frames)} bad frames were skipped before the checkpoint, such as {run.skipped_frames[0]}; go on "
             "skipping them (--set skip_bad_frames=true)"
         )
     return indices
 
 
-def made_together(indices: Iterable[int], world_of: Callable[[int], int]) -> Iterator[list[int]]:
+def group_by_scene(indices: Iterable[int], get_scene_id: Callable[[int], int]) -> Iterator[list[int]]:
     """Which frames a worker makes in a row: those of one world, so that only one worker builds it."""
-    for _, of_world in groupby(indices, world_of):
+    for _, of_world in groupby(indices, get_scene_id):
         while together := list(islice(of_world, MOST_TOGETHER)):
             yield together
 
@@ -294,7 +307,7 @@ class FramesOrErrors(Dataset[Any]):
 def _each(
     frames: MeasuredFrames, tasks: Iterable[list[int]], workers: int, run: Run, *, skip_bad_frames: bool
 ) -> Iterator[MeasuredFrame]:
-    method = start_method()
+    method = get_start_method()
     loader = DataLoader(
         FramesOrErrors(frames),
         batch_sampler=tasks,
@@ -305,17 +318,17 @@ def _each(
         multiprocessing_context=method if workers else None,
         prefetch_factor=1 if workers else None,  # what is made ahead waits in shared memory
     )
-    for batch in batches_of(loader):
+    for batch in iterate_batches(loader):
         for made in batch:
             if isinstance(made, MeasuredFrame):
                 yield made
             elif skip_bad_frames and isinstance(made, BadFrameError):
-                run.skipped.append(str(made))
+                run.skipped_frames.append(str(made))
             else:
                 raise made
 
 
-def batches_of(loader: DataLoader[Any]) -> Iterator[Any]:
+def iterate_batches(loader: DataLoader[Any]) -> Iterator[Any]:
     """Iterate over the batches of a loader, with a warning about each of its workers that is stopped.
 
     Whatever ends the loop early kills workers that are stopped, for which the end of the program would wait.

@@ -32,11 +32,11 @@ class Progress:
         workers: Processes that make the steps, whose first ones arrive together.
     """
 
-    def __init__(self, steps: int, title: str, *, done: int = 0, shown: bool, workers: int = 0) -> None:
+    def __init__(self, total: int, title: str, *, num_done: int = 0, is_shown: bool, num_workers: int = 0) -> None:
         self._rich = None
         # The rate is a mean over several rounds of all workers; before those, since the run began.
-        self._times_s = deque([time.monotonic()], maxlen=1 + max(20, 4 * workers))
-        if not shown:
+        self._times_s = deque([time.monotonic()], maxlen=1 + max(20, 4 * num_workers))
+        if not is_shown:
             return
         # rich takes 0.1 s to import, which nobody should wait for who wants no bar.
         from rich import progress
@@ -52,7 +52,7 @@ class Progress:
             progress.TextColumn("{task.fields[left]}"),
             console=Terminal(stderr=True),
         )
-        self._task = self._rich.add_task(title, total=steps, completed=done, rate="", words="", left="")
+        self._task = self._rich.add_task(title, total=total, completed=num_done, rate="", words="", left="")
 
     def __enter__(self) -> Self:
         if self._rich:
@@ -63,31 +63,31 @@ class Progress:
         if self._rich:
             self._rich.stop()
 
-    def advance(self, expected_steps: int, words: str = "") -> None:
+    def advance(self, expected_total: int, status: str = "") -> None:
         """A step is done.
 
         Args:
-            expected_steps: Steps that the run is thought to have in all.
-            words: How good its numbers are, if anybody looks.
+            expected_total: Steps that the run is thought to have in all.
+            status: How good its numbers are, if anybody looks.
         """
         if self._rich:
             self._times_s.append(time.monotonic())
             rate = (len(self._times_s) - 1) / max(self._times_s[-1] - self._times_s[0], 1e-9)
             self._rich.advance(self._task)
-            seconds = max(0.0, expected_steps - self._rich.tasks[0].completed) / rate
+            seconds = max(0.0, expected_total - self._rich.tasks[0].completed) / rate
             left = f"{timedelta(seconds=math.ceil(seconds))} left"
-            self._rich.update(self._task, total=expected_steps, rate=f"{rate:.2f} steps/s", words=words, left=left)
+            self._rich.update(self._task, total=expected_total, rate=f"{rate:.2f} steps/s", words=status, left=left)
 
 
 @contextmanager
-def showing_wait(title: str, *, shown: bool) -> Iterator[None]:
+def show_wait(title: str, *, is_shown: bool) -> Iterator[None]:
     """Show on stderr, if that is a terminal, for how long a block without steps has run.
 
     Args:
         title: What the block does.
-        shown: Whether anybody sees it.
+        is_shown: Whether anybody sees it.
     """
-    if not shown:
+    if not is_shown:
         yield
         return
     from rich import progress
@@ -105,21 +105,21 @@ def showing_wait(title: str, *, shown: bool) -> Iterator[None]:
 
 
 @contextmanager
-def terminable(told: Callable[[Sequence[int]], object]) -> Iterator[list[int]]:
+def handle_termination(on_signal: Callable[[Sequence[int]], object]) -> Iterator[list[int]]:
     """Treat SIGTERM, as a scheduler or `docker stop` sends it, and SIGHUP, of a lost connection, as Ctrl-C.
 
     For a program: a library leaves them alone. What is ignored stays so, as under `nohup`.
 
-    `told`: called whenever one comes, at once, with all that have come. Returns a list of those that have come.
+    `on_signal`: called whenever one comes, at once, with all that have come. Returns a list of those that have come.
     """
-    program = _Program(told)
+    program = _Program(on_signal)
     taken = [number for number in ENDS if signal.getsignal(number) not in (signal.SIG_IGN, None)]
     with _handled(taken, program):
         yield program.arrived
 
 
 @contextmanager
-def held_back() -> Iterator[list[int]]:
+def defer_signals() -> Iterator[list[int]]:
     """Hold them back until the block is done: no frame may count for some observers, or some sums, only.
 
     Returns a list of those that have come; who clears it has them forgotten.

@@ -16,8 +16,8 @@ from torch import Tensor
 from torch.distributed.distributed_c10d import Store
 from torch.distributed.rendezvous import rendezvous
 
-from torchcover.evaluation.checkpoint import differences
-from torchcover.evaluation.heartbeat import reporting_silent_ranks
+from torchcover.evaluation.checkpoint import describe_differences
+from torchcover.evaluation.heartbeat import report_silent_ranks
 from torchcover.evaluation.observers import AnyObserver
 
 Payload = TypeVar("Payload")
@@ -40,31 +40,31 @@ class Ranks:
     Args:
         store: Through which they tell each other everything.
         rank: Which one this is.
-        size: How many there are.
+        num_ranks: How many there are.
     """
 
-    def __init__(self, store: Store, rank: int, size: int) -> None:
+    def __init__(self, store: Store, rank: int, num_ranks: int) -> None:
         self.store = store
         self.rank = rank
-        self.size = size
+        self.num_ranks = num_ranks
         self._letters = Counter[tuple[int, int]]()
 
-    def share(self, indices: Sequence[int], world_of: Callable[[int], int]) -> Iterator[int]:
+    def iterate_share(self, indices: Sequence[int], get_scene_id: Callable[[int], int]) -> Iterator[int]:
         """The frames that are this rank's: those of whole worlds, dealt in turns, so that more steps change no share.
 
         Args:
             indices: All frames, in order.
-            world_of: Which world a frame is of.
+            get_scene_id: Which world a frame is of.
         """
-        for number, (_, of_world) in enumerate(groupby(indices, world_of)):
-            if number % self.size == self.rank:
+        for number, (_, of_world) in enumerate(groupby(indices, get_scene_id)):
+            if number % self.num_ranks == self.rank:
                 yield from of_world
 
-    def device(self, name: str) -> str:
+    def get_device(self, name: str) -> str:
         """Where this rank computes: of several GPUs, one each."""
         return f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if name == "cuda" else name
 
-    def check_same(self, identity: Mapping[str, str]) -> None:
+    def check_identity(self, identity: Mapping[str, str]) -> None:
         """Find out whether all ranks are about the same run.
 
         Raises:
@@ -74,10 +74,10 @@ class Ranks:
             self.store.set(IDENTITY, json.dumps(dict(identity)))
             return
         self._wait_for([IDENTITY])
-        if other := differences(identity, json.loads(self.store.get(IDENTITY))):
+        if other := describe_differences(identity, json.loads(self.store.get(IDENTITY))):
             raise ValueError(f"rank {self.rank} is about another run than rank 0: {other}; start all with the same")
 
-    def check_others(self) -> None:
+    def check_failures(self) -> None:
         """Between two frames: whether this rank is to go on.
 
         Raises:
@@ -92,19 +92,19 @@ class Ranks:
         """Which rank has failed first, and how, in words."""
         return self.store.get(FAILED).decode() if self.store.check([FAILED]) else None
 
-    def tell(self, failure: BaseException, key: str = FAILED) -> None:
+    def report_failure(self, error: BaseException, key: str = FAILED) -> None:
         """Tell the others that this rank has failed, if it is the first, so that they stop."""
-        words = " ".join(str(failure).split())
-        said = ": ".join([f"rank {self.rank}", type(failure).__name__, *[words] * bool(words)])
+        words = " ".join(str(error).split())
+        said = ": ".join([f"rank {self.rank}", type(error).__name__, *[words] * bool(words)])
         self.store.compare_set(key, "", said)
 
     @contextmanager
-    def aborting(self) -> Iterator[None]:
+    def abort_on_error(self) -> Iterator[None]:
         """Whatever leaves the block as an error ends all ranks, and nothing is added up."""
         try:
             yield
         except BaseException as error:
-            self.tell(error, ABORTED)
+            self.report_failure(error, ABORTED)
             raise
 
     def merge(self, observers: Sequence[AnyObserver]) -> list[AnyObserver]:
@@ -120,17 +120,17 @@ class Ranks:
 
     def gather(self, value: Payload) -> list[Payload]:
         """What each rank has, in their order; every rank gets all of it."""
-        values = [value, *(self._receive(rank) for rank in range(1, self.size))] if self.rank == 0 else []
+        values = [value, *(self._receive(rank) for rank in range(1, self.num_ranks))] if self.rank == 0 else []
         if self.rank:
             self._send(value, 0)
         return self._from_first(values)
 
-    def part(self) -> None:
+    def shut_down(self) -> None:
         """Wait for rank 0, which writes the results: who ends with an error is the end of all of them."""
         with suppress(RuntimeError):  # the store ends with the process that keeps it
             if self.rank == 0:
                 self.store.set(PARTED, "")
-                self._wait_for([f"{PARTED} {rank}" for rank in range(1, self.size)], at_most_s=PARTING_S)
+                self._wait_for([f"{PARTED} {rank}" for rank in range(1, self.num_ranks)], at_most_s=PARTING_S)
             else:
                 self._wait_for([PARTED])
                 self.store.set(f"{PARTED} {self.rank}", "")
@@ -138,8 +138,8 @@ class Ranks:
     def _merged(self, observer: AnyObserver) -> AnyObserver:
         """In rank 0 that of all: in pairs of neighbours, then in pairs of pairs, so that no rank merges many."""
         apart = 1
-        while apart < self.size and self.rank % (2 * apart) == 0:
-            if self.rank + apart < self.size:
+        while apart < self.num_ranks and self.rank % (2 * apart) == 0:
+            if self.rank + apart < self.num_ranks:
                 observer.merge_state(self._receive(self.rank + apart))
             apart *= 2
         if self.rank:
@@ -161,7 +161,7 @@ class Ranks:
         return received
 
     def _send(self, value: object, to: int) -> None:
-        letter, data = self._letter(self.rank, to), packed(value)
+        letter, data = self._letter(self.rank, to), serialize(value)
         for start in range(0, len(data), PART_BYTES):
             part = data[start : start + PART_BYTES]
             self.store.set(f"{letter} {start}", part)  # type: ignore[arg-type]  # it takes bytes, too
@@ -182,7 +182,7 @@ class Ranks:
         return f"{rank} to {to}: {self._letters[rank, to]}"
 
 
-def packed(value: object) -> bytes:
+def serialize(value: object) -> bytes:
     """Any object that can be pickled, its tensors on the CPU."""
     stream = io.BytesIO()
     _OnTheCpu(stream, protocol=pickle.HIGHEST_PROTOCOL).dump(value)
@@ -196,7 +196,7 @@ class _OnTheCpu(pickle.Pickler):
         return NotImplemented
 
 
-def rank_count() -> int:
+def count_ranks() -> int:
     """How many processes `torchrun` has started, this one among them; 1 without it.
 
     Raises:
@@ -206,19 +206,19 @@ def rank_count() -> int:
 
 
 @contextmanager
-def joined_ranks() -> Iterator[Ranks | None]:
+def join_ranks() -> Iterator[Ranks | None]:
     """The ranks that `torchrun` has started, this process one of them; None where it has started one or none.
 
     Raises:
         ValueError: The environment of a rank is not whole.
     """
-    if rank_count() < 2:
+    if count_ranks() < 2:
         yield None
         return
     store, rank, size = next(iter(rendezvous("env://", timeout=timedelta(minutes=5))))
     ranks = Ranks(store, rank, size)
-    with reporting_silent_ranks(store, rank, size):
+    with report_silent_ranks(store, rank, size):
         try:
             yield ranks
         finally:
-            ranks.part()
+            ranks.shut_down()

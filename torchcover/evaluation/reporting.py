@@ -10,22 +10,22 @@ from typing import Any, Literal
 
 from torchcover.encounters import EncounterSet, Sightings
 from torchcover.estimation import MIN_BLOCKS
-from torchcover.evaluation.checking import Checked, check
-from torchcover.evaluation.encountering import encounter, encounters_page
-from torchcover.evaluation.measuring import measured
-from torchcover.evaluation.progress import Progress, held_back
+from torchcover.evaluation.checking import CheckResult, check
+from torchcover.evaluation.encountering import build_encounters_page, evaluate_encounters
+from torchcover.evaluation.measuring import measure_coverage
+from torchcover.evaluation.progress import Progress, defer_signals
 from torchcover.evaluation.requirements import Requirements
 from torchcover.evaluation.result import Result
-from torchcover.evaluation.settings import DEFAULT_STEPS, FILES, Settings, wanted_files
+from torchcover.evaluation.settings import DEFAULT_STEPS, FILES, Settings, parse_file_kinds
 from torchcover.evaluation.target_survey import (
-    free_space,
-    sides_table,
-    survey_target,
-    target_page,
-    target_record,
-    target_verdict,
+    build_flat_ground,
+    build_sides_table,
+    build_target_page,
+    build_target_record,
+    map_target_visibility,
+    summarize_target_maps,
 )
-from torchcover.evaluation.task import AnyRig, AnyScenario, distinct_names, loaded, simulation
+from torchcover.evaluation.task import AnyRig, AnyScenario, build_simulation_task, load_rig, make_rig_names
 from torchcover.files import AtomicOutput
 from torchcover.notebooks import small_html
 from torchcover.report import (
@@ -52,36 +52,36 @@ class Report:
     Args:
         result: What the rigs see in traffic, with bodies beside them, and what is lost with each sensor.
         targets: By the name of the rig, where it sees the body in free space.
-        steps: How many steps of traffic were asked for; fewer are measured if the budget was over.
+        num_frames: How many steps of traffic were asked for; fewer are measured if the budget was over.
         encounters: When they see whom they are about to collide with; None if that was not asked.
-        checked: Whether they see what they must; likewise.
+        check_result: Whether they see what they must; likewise.
     """
 
     result: Result
     targets: Mapping[str, TargetMap]
-    steps: int
+    num_frames: int
     encounters: Sightings | None = None
-    checked: Checked | None = None
+    check_result: CheckResult | None = None
 
     @property
     def verdict(self) -> tuple[str, ...]:
         """The answer in sentences, the first of which says most; each has its rule, and none tells what is chance."""
-        first, *losses = target_verdict(self.targets)
+        first, *losses = summarize_target_maps(self.targets)
         range_words = describe_range(self.result.table) or explain_missing_intervals(self.result.table, "ranges")
-        asked = [*self._met.findings, *(self.checked.verdict if self.checked else ())]
-        told = [first, range_words, *self.result.mixed_models, *losses, *asked, self.cut_short]
+        asked = [*self._met.findings, *(self.check_result.verdict if self.check_result else ())]
+        told = [first, range_words, *self.result.sensor_model_notes, *losses, *asked, self.cut_short]
         return tuple(filter(None, told))
 
     @property
     def cut_short(self) -> str:
         """That fewer steps were measured than asked for; no words where all were."""
         done = self.result.table.first_conditions.counts["steps"]
-        over = f"The budget was over after {done:,} of {self.steps:,} steps of traffic." * (done < self.steps)
+        over = f"The budget was over after {done:,} of {self.num_frames:,} steps of traffic." * (done < self.num_frames)
         return self.result.cut_short or over
 
     @property
     def _met(self) -> Page:
-        return encounters_page(self.encounters) if self.encounters else Page("", "")
+        return build_encounters_page(self.encounters) if self.encounters else Page("", "")
 
     @property
     def page(self) -> Page:
@@ -89,11 +89,17 @@ class Report:
         target, *_ = self.targets.values()
         steps = f"{self.result.table.first_conditions.counts['steps']:,} steps of {self.result.source['scenario']}"
         lead = f"{target.target}, {target.hits} points or more, on flat ground with nothing else; {steps}."
-        of_targets = [target_page(one) for one in self.targets.values()]
+        of_targets = [build_target_page(one) for one in self.targets.values()]
         sides = [
-            replace(sides_table(one), title=f"{rig}: {sides_table(one).title}") for rig, one in self.targets.items()
+            replace(build_sides_table(one), title=f"{rig}: {build_sides_table(one).title}")
+            for rig, one in self.targets.items()
         ]
-        tables = [*self._met.tables, *(self.checked.tables() if self.checked else ()), *sides, *self.result.tables]
+        tables = [
+            *self._met.tables,
+            *(self.check_result.build_tables() if self.check_result else ()),
+            *sides,
+            *self.result.tables,
+        ]
         return replace(
             self.result.page,
             lead=lead,
@@ -120,33 +126,33 @@ class Report:
             "verdict": list(self.verdict),
             "complete": not self.cut_short,
             "traffic": self.result.record,
-            "targets": {rig: target_record(one) for rig, one in self.targets.items()},
+            "targets": {rig: build_target_record(one) for rig, one in self.targets.items()},
             "encounters": self.encounters.record() if self.encounters else None,
-            "requirements": self.checked.record if self.checked else None,
+            "requirements": self.check_result.record if self.check_result else None,
         }
 
-    def save(self, folder: str | Path, *, files: str | Iterable[str] = FILES) -> list[Path]:
+    def save(self, folder: str | Path, *, file_kinds: str | Iterable[str] = FILES) -> list[Path]:
         """Write the files of the command line: the numbers first, then the page.
 
         Args:
             folder: Where to write `report.html`, `report.md` with the verdict, `summary.json`, and the files that
                 `evaluate`, `targets`, `encounter` and `check` write. Made if it does not exist; files of an earlier run
                 that its `summary.json` lists are deleted.
-            files: What to write beside `summary.json` and `report.md`, as in `Result.save`.
+            file_kinds: What to write beside `summary.json` and `report.md`, as in `Result.save`.
 
         Returns:
             The files.
         """
-        wanted, record = wanted_files(files), self.record
+        wanted, record = parse_file_kinds(file_kinds), self.record
         with AtomicOutput(Path(folder)) as written:
-            with held_back():  # the numbers are safe before anything ends this
+            with defer_signals():  # the numbers are safe before anything ends this
                 if "numbers" in wanted:
                     self._add_numbers(written)
                 written.add_text("report.md", self.markdown)
                 written.publish(record)
             if "page" in wanted:
                 written.add_text("report.html", render_page(self.page))
-            for stem, figure in self.result.maps() if "maps" in wanted else ():
+            for stem, figure in self.result.plot_maps() if "maps" in wanted else ():
                 written.add_figure(f"maps/{stem}.png", figure)
             written.publish(record)
         return written.paths
@@ -158,8 +164,8 @@ class Report:
             files.add(f"targets/{stem}.npz", partial(write_arrays, one))
         if self.encounters:
             files.add("encounters.csv", self.encounters.write_csv)
-        if self.checked:
-            files.add_text("junit.xml", self.checked.junit)
+        if self.check_result:
+            files.add_text("junit.xml", self.check_result.junit)
 
 
 def report(
@@ -171,27 +177,27 @@ def report(
     requirements: Requirements | str | Path | None = None,
     vehicle: str | Path | None = None,
     sensor_model: Literal["ideal", "real"] | None = None,
-    steps: int = DEFAULT_STEPS,
+    num_frames: int = DEFAULT_STEPS,
     seed: int = 0,
-    workers: int | None = None,
+    num_workers: int | None = None,
     budget_s: float = math.inf,
-    progress: bool = False,
+    show_progress: bool = False,
 ) -> Report:
     """Measure what a meeting asks about rigs: where a body beside them is seen, what fails, how far, how soon.
 
     Args:
         rigs: A rig or several, at most 8: each one itself, its built-in name, or its YAML file.
         scenario: The traffic: one kind of world, as for `evaluate`.
-        target: What is put beside the vehicle, in free space, as for `survey_target`.
+        target: What is put beside the vehicle, in free space, as for `map_target_visibility`.
         encounters: A set of encounters, as for `encounter`; none if not given.
         requirements: What the rigs must see, as for `check`; likewise.
         vehicle: What carries the rigs, as for `evaluate`.
         sensor_model: As for `evaluate`.
-        steps: Of the traffic.
+        num_frames: Of the traffic.
         seed: Of the simulation.
-        workers: As for `evaluate`.
+        num_workers: As for `evaluate`.
         budget_s: Seconds: traffic, which comes last, ends when they are over, but not before it has intervals.
-        progress: Whether to show a bar.
+        show_progress: Whether to show a bar.
 
     Returns:
         Its answer in `verdict`; `save` writes the page.
@@ -211,31 +217,33 @@ def report(
         raise ValueError(f"report: 1 to {MOST_RIGS} rigs fit on a page; got {len(given)}: choose, or use `compare`")
     if not budget_s > 0:
         raise ValueError(f"budget: seconds above 0 are needed; got {budget_s}")
-    called = [loaded(rig).model_copy(update={"name": n}) for rig, n in zip(given, distinct_names(given), strict=True)]
+    called = [load_rig(rig).model_copy(update={"name": n}) for rig, n in zip(given, make_rig_names(given), strict=True)]
     own: dict[str, Any] = {"vehicle": vehicle, "sensor_model": sensor_model}
-    settings = Settings(called, scenario, steps=steps, seed=seed, redundancy=True, workers=workers, **own)
+    settings = Settings(
+        called, scenario, num_frames=num_frames, seed=seed, redundancy=True, num_workers=num_workers, **own
+    )
     if settings.mixture is not None:
         raise ValueError("report: one kind of world is needed; for several use `compare`")
-    task = simulation(settings)
+    task = build_simulation_task(settings)
     body = target if isinstance(target, Target) else Target.load(target)
     carrier = task.frames.scenario.ego
     assert carrier is not None  # simulated
-    ground = free_space().model_copy(update={"ego": Mover(shape=carrier.shape)})
-    whole = len(called) + (encounters is not None) + (requirements is not None) + steps
-    with Progress(whole, "report", shown=progress) as bar:
+    ground = build_flat_ground().model_copy(update={"ego": Mover(shape=carrier.shape)})
+    whole = len(called) + (encounters is not None) + (requirements is not None) + num_frames
+    with Progress(whole, "report", is_shown=show_progress) as bar:
         seen = {}
         for rig in called:
-            seen[rig.name] = survey_target(rig, body, ground, sensor_model=sensor_model, seed=seed)
+            seen[rig.name] = map_target_visibility(rig, body, ground, sensor_model=sensor_model, seed=seed)
             bar.advance(whole)
         met = checked = None
         if encounters is not None:
-            met = encounter(called, encounters, seed=seed, **own)
+            met = evaluate_encounters(called, encounters, seed=seed, **own)
             bar.advance(whole)
         if requirements is not None:
-            checked = check(called, requirements, seed=seed, workers=workers, **own)
+            checked = check(called, requirements, seed=seed, num_workers=num_workers, **own)
             bar.advance(whole)
-        result = measured(task, settings, _Pace(bar, whole, start_s + budget_s))
-    return Report(result, seen, steps, met, checked)
+        result = measure_coverage(task, settings, _Pace(bar, whole, start_s + budget_s))
+    return Report(result, seen, num_frames, met, checked)
 
 
 @dataclass(frozen=True)
@@ -245,11 +253,11 @@ class _Pace:
     bar: Progress
     whole: int
     until_s: float
-    words: str = ""
+    progress_text: str = ""
 
-    def is_reached(self, steps: int) -> bool:
+    def is_reached(self, num_frames: int) -> bool:
         self.bar.advance(self.whole)
-        return steps >= MIN_BLOCKS and time.monotonic() >= self.until_s
+        return num_frames >= MIN_BLOCKS and time.monotonic() >= self.until_s
 
-    def expected_steps(self, most: int) -> int:
-        return most
+    def estimate_num_frames(self, max_frames: int) -> int:
+        return max_frames

@@ -55,34 +55,34 @@ class Bound(NamedTuple):
 
     key: str
     value: float
-    is_least: bool = True
+    is_minimum: bool = True
 
     @property
-    def words(self) -> str:
+    def text(self) -> str:
         """As in `points >= 5`."""
-        return f"{CALLED.get(self.key, self.key)} {'>=' if self.is_least else '<='} {self.value:g}"
+        return f"{CALLED.get(self.key, self.key)} {'>=' if self.is_minimum else '<='} {self.value:g}"
 
 
 class Readings(NamedTuple):
     """(N,) values of a number, NaN where unknown, the ends of their 95 % intervals, and where each was measured.
 
     Both ends are the value where it is exact, and NaN where there is no interval; inf if it may be anything above. In
-    `no_room` other places there was no room for a body.
+    `occupied_count` other places there was no room for a body.
     """
 
     value: Float64
     low: Float64
     high: Float64
-    where: Sequence[str]
-    no_room: int = 0
+    locations: Sequence[str]
+    occupied_count: int = 0
 
 
 class Verdict(NamedTuple):
     """Whether a bound is kept.
 
     `value`, `low` and `high` are of the worst that is known; `margin` is what it has beyond the bound, in its unit:
-    what it lacks if negative, and NaN if that is not checked. Of `count` places, regions or encounters, `failed` do not
-    keep it and `unknown` are not checked; `where` names the worst of them, else of all. Others had `no_room`.
+    what it lacks if negative, and NaN if that is not checked. Of `total_count` places, regions or encounters, `not_met_count` do not
+    keep it and `undecided_count` are not checked; `worst_locations` names the worst of them, else of all. Others had `occupied_count`.
     """
 
     requirement: str
@@ -92,19 +92,19 @@ class Verdict(NamedTuple):
     low: float
     high: float
     margin: float
-    count: int  # type: ignore[assignment]  # hides tuple.count
-    failed: int
-    unknown: int
-    where: tuple[str, ...]
-    no_room: int = 0
+    total_count: int
+    not_met_count: int
+    undecided_count: int
+    worst_locations: tuple[str, ...]
+    occupied_count: int = 0
 
 
-def verdicts(requirements: "Requirements", measured: Sequence[Mapping[str, Readings]]) -> list[Verdict]:
+def judge_requirements(requirements: "Requirements", readings: Sequence[Mapping[str, Readings]]) -> list[Verdict]:
     """Judge every bound: kept if all of every interval keeps it, not kept if all of one does not, else not checked.
 
     Args:
         requirements: What is required.
-        measured: Of each requirement in turn, the numbers of its bounds, by key; with none in it, nothing is checked.
+        readings: Of each requirement in turn, the numbers of its bounds, by key; with none in it, nothing is checked.
 
     Example:
         >>> child = {"target": "child", "at": {"within_m": 2.0}, "points": 5}
@@ -113,22 +113,22 @@ def verdicts(requirements: "Requirements", measured: Sequence[Mapping[str, Readi
         >>> one.state, one.margin, one.where
         ('not kept', -2.0, ('behind',))
     """
-    pairs = zip(requirements.requirements, measured, strict=True)
-    return [_judged(one.words, bound, numbers[bound.key]) for one, numbers in pairs for bound in one.bounds]
+    pairs = zip(requirements.requirements, readings, strict=True)
+    return [_judged(one.text, bound, numbers[bound.key]) for one, numbers in pairs for bound in one.bounds]
 
 
 def _judged(words: str, bound: Bound, measured: Readings) -> Verdict:
-    sign = 1.0 if bound.is_least else -1.0
+    sign = 1.0 if bound.is_minimum else -1.0
     beyond, *ends = (sign * (each - bound.value) for each in measured[:3])
     kept, failed = np.minimum(*ends) >= -ROUNDING, np.maximum(*ends) < -ROUNDING  # NaN is neither
     unknown, order = ~(kept | failed), np.argsort(beyond, kind="stable")  # NaN is last
     told = order[(failed if failed.any() else unknown if unknown.any() else kept)[order]][:TOLD].tolist()
     of_worst = (float(each[order[0]]) if len(order) else np.nan for each in (*measured[:3], beyond))
     state: State = "not kept" if failed.any() else "kept" if len(kept) and kept.all() else "not checked"
-    (value, low, high, margin), where = of_worst, tuple(measured.where[k] for k in told)
+    (value, low, high, margin), where = of_worst, tuple(measured.locations[k] for k in told)
     margin = np.nan if state == "not checked" else margin
     counts = len(kept), int(failed.sum()), int(unknown.sum())
-    return Verdict(words, bound, state, value, low, high, margin, *counts, where, measured.no_room)
+    return Verdict(words, bound, state, value, low, high, margin, *counts, where, measured.occupied_count)
 
 
 def _check_called(what: str, given: Iterable[str], known: Iterable[str]) -> None:
@@ -141,7 +141,7 @@ def _check_called(what: str, given: Iterable[str], known: Iterable[str]) -> None
             raise ValueError(f"no {what} is called {name!r}; {meant}")
 
 
-class BodyPlaces(Document):
+class TargetPositions(Document):
     """Where the middle of a body is put: one of five, in metres.
 
     Args:
@@ -153,11 +153,11 @@ class BodyPlaces(Document):
         line_m: Corners x, y of a line.
         points_m: Points x, y, at each of which there must be room.
         relative_to: The side of the vehicle's box from whose middle all x and y count; if not given, from its origin.
-        step_m: How far apart bodies are put.
+        spacing_m: How far apart bodies are put.
 
     Example:
         >>> car = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))
-        >>> BodyPlaces(x_m=(-1.0, -0.2), relative_to="rear", step_m=2.0).positions_m(car).tolist()
+        >>> TargetPositions(x_m=(-1.0, -0.2), relative_to="rear", step_m=2.0).positions_m(car).tolist()
         [[-3.0, -1.0], [-2.2, -1.0], [-3.0, 1.0], [-2.2, 1.0]]
     """
 
@@ -169,7 +169,7 @@ class BodyPlaces(Document):
     line_m: Annotated[Corners, Field(min_length=2)] | None = None
     points_m: Annotated[Corners, Field(min_length=1)] | None = None
     relative_to: Side | None = None
-    step_m: Annotated[float, Field(ge=0.01)] = 0.2
+    spacing_m: Annotated[float, Field(ge=0.01)] = 0.2
 
     @model_validator(mode="after")
     def _check_one_of(self) -> Self:
@@ -180,10 +180,10 @@ class BodyPlaces(Document):
             raise ValueError("sides are of within_m, and relative_to is of the others")
         if self.polygon_m and not shapely.Polygon(self.polygon_m).is_valid:
             raise ValueError("polygon_m: its sides cross, or lie on each other")
-        self.positions_m(SOME_VEHICLE)  # not too many
+        self.compute_positions_m(SOME_VEHICLE)  # not too many
         return self
 
-    def positions_m(self, vehicle: BoundingBox) -> Float64:
+    def compute_positions_m(self, vehicle: BoundingBox) -> Float64:
         """(P, 2) in the frame of a vehicle. ValueError: more than 1000 to a side."""
         low_m, high_m = np.array(vehicle.lower_m[:2]), np.array(vehicle.upper_m[:2])
         towards = {None: (0, 0), "front": (1, 0), "rear": (-1, 0), "left": (0, 1), "right": (0, -1)}[self.relative_to]
@@ -207,9 +207,9 @@ class BodyPlaces(Document):
 
     def _between(self, low_m: float, high_m: float) -> Float64:
         """Both ends, and as many steps in between as it takes."""
-        steps = int(np.ceil((high_m - low_m) / self.step_m - ROUNDING))
+        steps = int(np.ceil((high_m - low_m) / self.spacing_m - ROUNDING))
         if steps > MOST_STEPS:
-            raise ValueError(f"a place of {high_m - low_m:g} m in steps of {self.step_m:g} m; take a larger step_m")
+            raise ValueError(f"a place of {high_m - low_m:g} m in steps of {self.spacing_m:g} m; take a larger step_m")
         return np.linspace(low_m, high_m, steps + 1)
 
 
@@ -221,11 +221,11 @@ class _Requirement(Document):
 
     Args:
         name: What tables call it.
-        without: Sensors that may fail, one at a time: a name or several, or "any".
+        failing_sensors: Sensors that may fail, one at a time: a name or several, or "any".
     """
 
     name: str = ""
-    without: Names = ()
+    failing_sensors: Names = ()
 
     @property
     def bounds(self) -> list[Bound]:
@@ -238,15 +238,15 @@ class _Requirement(Document):
             raise ValueError("nothing is required: give a number that it must have")
         return self
 
-    def told(self, words: str) -> str:
+    def format_text(self, text: str) -> str:
         """What it says, after its own name."""
-        lost = f", also without {' or '.join(self.without)}" * bool(self.without)
-        return f"{self.name}: " * bool(self.name) + words + lost
+        lost = f", also without {' or '.join(self.failing_sensors)}" * bool(self.failing_sensors)
+        return f"{self.name}: " * bool(self.name) + text + lost
 
-    def failing(self, sensors: Sequence[str]) -> list[str]:
+    def find_failing_sensors(self, sensor_names: Sequence[str]) -> list[str]:
         """Those of a rig's sensors that may fail. ValueError: the rig has none of a name."""
-        _check_called("sensor", self.without, [*sensors, ANY])
-        return list(sensors if ANY in self.without else self.without)
+        _check_called("sensor", self.failing_sensors, [*sensor_names, ANY])
+        return list(sensor_names if ANY in self.failing_sensors else self.failing_sensors)
 
 
 def _target(given: str, info: ValidationInfo) -> str:
@@ -261,9 +261,9 @@ class TargetRequirement(_Requirement):
 
     Args:
         target: "child", a built-in vehicle, the YAML file of one, or a mesh, as of `torchcover targets`.
-        at: A place, or the name of one of the file's.
-        by: Only these sensors count: a name or a kind ("lidar", "camera", "radar"), or several; all if not given.
-        hits: Points that are enough for `sensors` and `visual_angle_deg`.
+        positions: A place, or the name of one of the file's.
+        counted_sensors: Only these sensors count: a name or a kind ("lidar", "camera", "radar"), or several; all if not given.
+        detection_points: Points that are enough for `sensors` and `visual_angle_deg`.
         points: Least number of points on it, in every step.
         pixels: Least number of pixels of the full image of one camera, in every step.
         sensors: Least number of sensors with enough points each, in every step.
@@ -272,12 +272,12 @@ class TargetRequirement(_Requirement):
     """
 
     target: Annotated[str, AfterValidator(_target)]
-    at: Annotated[
-        Annotated[str, Tag("(name)")] | Annotated[BodyPlaces, Tag("(place)")],
+    positions: Annotated[
+        Annotated[str, Tag("(name)")] | Annotated[TargetPositions, Tag("(place)")],
         Discriminator(lambda given: "(name)" if isinstance(given, str) else "(place)"),
     ]
-    by: Annotated[Names, Field(min_length=1)] = KINDS
-    hits: PositiveInt = HITS
+    counted_sensors: Annotated[Names, Field(min_length=1)] = KINDS
+    detection_points: PositiveInt = HITS
     points: PositiveFloat | None = None
     pixels: PositiveFloat | None = None
     sensors: PositiveInt | None = None
@@ -292,27 +292,29 @@ class TargetRequirement(_Requirement):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        left = len(set(self.by)) - any(one in (ANY, *self.by) for one in self.without)
-        few = (self.sensors or 1) > left and not set(KINDS).intersection(self.by)
-        if few or (self.pixels and {"lidar", "radar"}.issuperset(self.by)):
-            both = ", ".join(bound.words for bound in self.bounds)
-            raise ValueError(f"requirements contradict each other: {self.words}: {both}")
+        left = len(set(self.counted_sensors)) - any(one in (ANY, *self.counted_sensors) for one in self.failing_sensors)
+        few = (self.sensors or 1) > left and not set(KINDS).intersection(self.counted_sensors)
+        if few or (self.pixels and {"lidar", "radar"}.issuperset(self.counted_sensors)):
+            both = ", ".join(bound.text for bound in self.bounds)
+            raise ValueError(f"requirements contradict each other: {self.text}: {both}")
         return self
 
     @property
-    def words(self) -> str:
+    def text(self) -> str:
         """Of what, where, by which sensors."""
-        place = {} if isinstance(self.at, str) else self.at.model_dump(exclude_unset=True, mode="json")
-        at = " ".join(f"{key} {value}" for key, value in place.items()) or self.at
-        by = f", by {', '.join(self.by)}" * (self.by != KINDS) + f", hits {self.hits}" * (self.hits != HITS)
-        return self.told(f"{Path(TARGETS.get(self.target, self.target)).stem}, {at}{by}")
+        place = {} if isinstance(self.positions, str) else self.positions.model_dump(exclude_unset=True, mode="json")
+        at = " ".join(f"{key} {value}" for key, value in place.items()) or self.positions
+        by = f", by {', '.join(self.counted_sensors)}" * (
+            self.counted_sensors != KINDS
+        ) + f", hits {self.detection_points}" * (self.detection_points != HITS)
+        return self.format_text(f"{Path(TARGETS.get(self.target, self.target)).stem}, {at}{by}")
 
-    def groups(self, sensors: Sequence[Sensor]) -> dict[str, list[int]]:
+    def group_sensors(self, sensors: Sequence[Sensor]) -> dict[str, list[int]]:
         """Numbers of the sensors that count, and of those without each that may fail; by what is then said of where."""
-        _check_called("sensor", self.by, [*(one.name for one in sensors), *KINDS])
-        of_kinds = tuple(of for kind, of in SENSORS.items() if kind in self.by)
-        counts = [k for k, one in enumerate(sensors) if one.name in self.by or isinstance(one, of_kinds)]
-        names = self.failing([one.name for one in sensors])
+        _check_called("sensor", self.counted_sensors, [*(one.name for one in sensors), *KINDS])
+        of_kinds = tuple(of for kind, of in SENSORS.items() if kind in self.counted_sensors)
+        counts = [k for k, one in enumerate(sensors) if one.name in self.counted_sensors or isinstance(one, of_kinds)]
+        names = self.find_failing_sensors([one.name for one in sensors])
         lost = [k for k in counts if sensors[k].name in names]  # the others change nothing
         return {"": counts} | {f", without {sensors[k].name}": [each for each in counts if each != k] for k in lost}
 
@@ -324,20 +326,20 @@ class RegionRequirement(_Requirement):
         region: As the file's `regions` call it; without these, as the usual table: "20m", "front_3m", ...
         height: Of the height band.
         number: By the name of its column in `summary.csv`: "detection_0.4m", "radius_m", "seen_by_two_0.4m", ...
-        least: What it must not be below, if more of it is better.
-        most: What it must not be above, if less of it is.
+        min_value: What it must not be below, if more of it is better.
+        max_value: What it must not be above, if less of it is.
     """
 
     region: str
     height: str
     number: str
-    least: float | None = None
-    most: float | None = None
+    min_value: float | None = None
+    max_value: float | None = None
 
     @property
     def bounds(self) -> list[Bound]:
         """What is required."""
-        both = (self.least, True), (self.most, False)
+        both = (self.min_value, True), (self.max_value, False)
         return [Bound(self.number, value, is_least) for value, is_least in both if value is not None]
 
     @property
@@ -359,26 +361,26 @@ class RegionRequirement(_Requirement):
             raise ValueError(f"{wrong}: of {self.number} {better} is better; {right} is meant")
         most = 1.0 if quantity.unit == "share" else np.inf
         if any(not 0.0 < bound.value <= most for bound in self.bounds):
-            raise ValueError(f"{self.bounds[0].words}: it is above 0{' and at most 1' * (most == 1)}")
-        if self.without and quantity not in both:
+            raise ValueError(f"{self.bounds[0].text}: it is above 0{' and at most 1' * (most == 1)}")
+        if self.failing_sensors and quantity not in both:
             raise ValueError(f"without: radius_m and detections are known without a sensor; got {self.number}")
         return self
 
     @property
-    def words(self) -> str:
+    def text(self) -> str:
         """Where."""
-        return self.told(f"{self.region} {self.height}")
+        return self.format_text(f"{self.region} {self.height}")
 
 
-class InTime(Document):
+class BrakingModel(Document):
     """What braking needs: v / (2 x deceleration) + latency_s.
 
     Args:
-        deceleration: Of the brakes, in m/s2.
+        deceleration_mps2: Of the brakes, in m/s2.
         latency_s: From the detection to the brakes.
     """
 
-    deceleration: PositiveFloat = 9.0
+    deceleration_mps2: PositiveFloat = 9.0
     latency_s: Annotated[float, Field(ge=0, le=MOST_LATENCY_S)] = 0.5
 
 
@@ -388,37 +390,39 @@ class EncounterRequirement(_Requirement):
     Args:
         encounters: A set, built in or a YAML file, as of `torchcover encounter`.
         ttc_s: Least time to collision at detection.
-        in_time: So early that braking still prevents it.
-        points: So many points on the other, `pixels` and `looks` are a detection, as of `Criterion`.
+        braking: So early that braking still prevents it.
+        points: So many points on the other, `pixels` and `consecutive_scans` are a detection, as of `Criterion`.
         pixels: Of a camera.
-        looks: In a row.
+        consecutive_scans: In a row.
     """
 
     encounters: Annotated[EncounterSet, by_name(EncounterSet)]
     ttc_s: PositiveFloat | None = None
-    in_time: InTime | None = None
+    braking: BrakingModel | None = None
     points: PositiveInt = Criterion.points
     pixels: PositiveInt = Criterion.pixels
-    looks: PositiveInt = Criterion.looks
+    consecutive_scans: PositiveInt = Criterion.looks
 
     @property
     def bounds(self) -> list[Bound]:
         """What is required: `spare_s` is what the time to collision has beyond what braking needs."""
         ttc = [] if self.ttc_s is None else [Bound("ttc_s", self.ttc_s)]
-        return ttc if self.in_time is None else [*ttc, Bound("spare_s", 0.0)]
+        return ttc if self.braking is None else [*ttc, Bound("spare_s", 0.0)]
 
     @property
     def criterion(self) -> Criterion:
         """What is detected, and what is in time."""
-        brakes = self.in_time or InTime()
-        return Criterion(self.points, self.pixels, self.looks, brakes.deceleration, brakes.latency_s)
+        brakes = self.braking or BrakingModel()
+        return Criterion(self.points, self.pixels, self.consecutive_scans, brakes.deceleration_mps2, brakes.latency_s)
 
     @property
-    def words(self) -> str:
+    def text(self) -> str:
         """In which encounters, and by what."""
         given: dict[str, float] = self.model_dump(include=self.model_fields_set & {"points", "pixels", "looks"})
-        given |= self.in_time.model_dump() if self.in_time else {}
-        return self.told(", ".join((self.encounters.name, *(f"{key} {value:g}" for key, value in given.items()))))
+        given |= self.braking.model_dump() if self.braking else {}
+        return self.format_text(
+            ", ".join((self.encounters.name, *(f"{key} {value:g}" for key, value in given.items())))
+        )
 
 
 def _kind(content: Any) -> str | None:  # noqa: ANN401
@@ -441,7 +445,7 @@ class Requirements(BuiltIn, RegionsOfInterest):
         name: What tables call them.
         description: What they are, and where their numbers come from.
         scenario: The world; not given, regions are in that of `evaluate`, and bodies on flat ground.
-        places: By name.
+        position_sets: By name.
         requirements: All of them must be kept.
     """
 
@@ -451,7 +455,7 @@ class Requirements(BuiltIn, RegionsOfInterest):
     name: str = "requirements"
     description: str = ""
     scenario: NameOrFile | None = None
-    places: dict[str, BodyPlaces] = Field(default_factory=dict)
+    position_sets: dict[str, TargetPositions] = Field(default_factory=dict)
     requirements: Annotated[tuple[AnyRequirement, ...], Field(min_length=1)]
 
     @model_validator(mode="after")
@@ -459,12 +463,12 @@ class Requirements(BuiltIn, RegionsOfInterest):
         with warnings.catch_warnings(action="ignore"):  # of what lies within a vehicle, which is not known yet
             asked = self.around(SOME_VEHICLE.outline_m)
         for one in self.requirements:
-            if isinstance(one, TargetRequirement) and isinstance(one.at, str):
-                _check_called("place", [one.at], self.places)
+            if isinstance(one, TargetRequirement) and isinstance(one.positions, str):
+                _check_called("place", [one.positions], self.position_sets)
             if isinstance(one, RegionRequirement):
                 _check_called("region", [one.region], [region.name for region in asked.regions])
                 _check_called("height band", [one.height], asked.grid.heights)
-        told = Counter(f"{one.words}: {bound.words}" for one in self.requirements for bound in one.bounds)
+        told = Counter(f"{one.text}: {bound.text}" for one in self.requirements for bound in one.bounds)
         if (twice := told.most_common(1)[0])[1] > 1:
             raise ValueError(f"several requirements read {twice[0]!r}; give each a name, or leave all but one out")
         return self

@@ -57,7 +57,7 @@ class RerunLog:
         for rig, cloud in frame.clouds.items():
             self._stream.log([rig, "points"], rr.Points3D(_few(frame.landed(rig)), colors=[70, 120, 190]))
             radius = blind_spot_radius(frame.reference, cloud, max_radius=FAR_M)
-            colours = coloured(_few(radius), ColorScale("radius", "m", "viridis_r", 0.0, FAR_M))
+            colours = apply_colormap(_few(radius), ColorScale("radius", "m", "viridis_r", 0.0, FAR_M))
             self._stream.log([rig, "reference by radius"], rr.Points3D(_few(frame.reference), colors=colours))
         if frame.boxes is not None:
             self._stream.log("boxes", _boxes(frame.boxes))
@@ -80,14 +80,14 @@ class RerunLog:
         """Write the rigs and the maps of the radius, and close the file."""
         import rerun as rr
 
-        from torchcover.evaluation.result_page import sensor_views
+        from torchcover.evaluation.result_page import build_sensor_views
 
         if (outline_m := result.ego_outline_m) is not None:
             around = _on_ground(np.vstack([outline_m, outline_m[:1]]))
             self._stream.log("ego", rr.LineStrips3D([around]), static=True)
         for rig, sensors in result.sensors.items():
-            for view in sensor_views(sensors):
-                self._stream.log([rig, "sensors", view.name], rr.LineStrips3D(frustum(view)), static=True)
+            for view in build_sensor_views(sensors):
+                self._stream.log([rig, "sensors", view.name], rr.LineStrips3D(compute_frustum_lines(view)), static=True)
         coverages = result.coverages
         key = (by_area(RADIUS) if result.table.average == "area" else RADIUS).key
         for rig, coverage in coverages.items():
@@ -99,7 +99,7 @@ class RerunLog:
         write_atomically(self._path, self._unfinished.replace)
 
 
-def frustum(view: SensorView) -> list[NDArray[np.float64]]:
+def compute_frustum_lines(view: SensorView) -> list[NDArray[np.float64]]:
     """Lines around a field of view, in the vehicle frame: two rims, and edges from the sensor where it is no full turn.
 
     Example:
@@ -128,11 +128,11 @@ def _cells(values: NDArray[Any], grid: BevGrid, scale: ColorScale) -> Any:  # no
     corners = (low[:, None] + grid.cell * around).reshape(-1, 2)
     two_triangles = np.array([[0, 1, 2], [0, 2, 3]])
     faces = (4 * np.arange(len(row))[:, None, None] + two_triangles).reshape(-1, 3)
-    colours = coloured(values[row, column], scale).repeat(4, axis=0)
+    colours = apply_colormap(values[row, column], scale).repeat(4, axis=0)
     return rr.Mesh3D(vertex_positions=_on_ground(corners), triangle_indices=faces, vertex_colors=colours)
 
 
-def coloured(values: NDArray[Any], scale: ColorScale) -> NDArray[np.uint8]:
+def apply_colormap(values: NDArray[Any], scale: ColorScale) -> NDArray[np.uint8]:
     """(N, 3) colours of values."""
     share = np.clip((np.minimum(values, scale.high) - scale.low) / (scale.high - scale.low), 0.0, 1.0)
     return np.asarray(colormaps[scale.colormap](share, bytes=True)[:, :3])

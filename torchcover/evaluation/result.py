@@ -16,19 +16,19 @@ from torchcover.coverage import Coverage, Region
 from torchcover.coverage.quantity import by_area
 from torchcover.estimation import MIN_BLOCKS
 from torchcover.evaluation.pipeline import Run
-from torchcover.evaluation.progress import held_back
+from torchcover.evaluation.progress import defer_signals
 from torchcover.evaluation.result_page import (
     Omission,
-    facts_of,
-    left_out_table,
-    page_tables,
-    region_line,
-    rig_document,
-    sensor_views,
-    words_of,
+    build_omissions_table,
+    build_region_outline,
+    build_result_tables,
+    build_sensor_views,
+    collect_facts,
+    format_facts,
+    format_rig_yaml,
 )
-from torchcover.evaluation.settings import FILES, wanted_files
-from torchcover.evaluation.target_error import TargetError, outcome
+from torchcover.evaluation.settings import FILES, parse_file_kinds
+from torchcover.evaluation.target_error import TargetError, summarize_target_error
 from torchcover.files import AtomicOutput
 from torchcover.notebooks import data_frame, small_html
 from torchcover.report import (
@@ -68,22 +68,22 @@ class PictureCosts:
         bytes_per_cell: Memory of a cell of a rig, whatever is drawn.
         bytes_per_value: Memory of a cell of a rig for each quantity: its value and its error.
         seconds_per_panel: Time to draw one map; a rig has three in each height band for each quantity.
-        least_s: Shorter times are not announced.
-        least_bytes: Less memory is not announced.
+        min_announced_s: Shorter times are not announced.
+        min_announced_bytes: Less memory is not announced.
     """
 
     bytes_per_cell: int = 40
     bytes_per_value: int = 20
     seconds_per_panel: float = 0.1
-    least_s: float = 60.0
-    least_bytes: float = 2e9
+    min_announced_s: float = 60.0
+    min_announced_bytes: float = 2e9
 
 
 class MetricReport(Protocol):
     """Numbers of metrics of others, as `torchcover.contrib` compares them."""
 
-    def page_tables(self, *, parts: bool = True) -> list[PageTable]:
-        """Return the tables of the page; without `parts` only numbers about everything."""
+    def build_page_tables(self, *, include_parts: bool = True) -> list[PageTable]:
+        """Return the tables of the page; without `include_parts` only numbers about everything."""
 
     @property
     def record(self) -> dict[str, Any]:
@@ -107,13 +107,13 @@ class Result:
         reference_record: Where the reference comes from, as `FrameSource.reference_record` says; None if unknown.
         device: Where it ran; None if unknown.
         target_error: What was aimed at.
-        awaited: The regions that it was about.
+        target_regions: The regions that it was about.
         sensors: The sensors of the rigs that they are known of, for the maps.
         ego_outline_m: (K, 2) corners x, y of the ego in metres, for the maps.
-        observed: What the user's own observers computed, by their names.
+        observer_results: What the user's own observers computed, by their names.
         metrics: What metrics of others say of the rigs; None if none was asked for.
-        left_out: What the run left out because the scene did not need it.
-        inputs: Coverage files that it was made from.
+        omissions: What the run left out because the scene did not need it.
+        input_files: Coverage files that it was made from.
         block_ends: Frames of the source after which one block of time after the other is complete, as far as is known.
     """
 
@@ -125,13 +125,13 @@ class Result:
     reference_record: Mapping[str, Any] | None
     device: str | None
     target_error: TargetError | None = None
-    awaited: Sequence[Region] = ()
+    target_regions: Sequence[Region] = ()
     sensors: Mapping[str, Sequence[Sensor]] = field(default_factory=dict)
     ego_outline_m: NDArray[Any] | None = None
-    observed: Mapping[str, Any] = field(default_factory=dict)
+    observer_results: Mapping[str, Any] = field(default_factory=dict)
     metrics: MetricReport | None = None
-    left_out: Sequence[Omission] = ()
-    inputs: Sequence[Path] = ()
+    omissions: Sequence[Omission] = ()
+    input_files: Sequence[Path] = ()
     block_ends: Sequence[int] = ()
 
     @property
@@ -164,19 +164,19 @@ class Result:
     @property
     def verdict(self) -> tuple[str, ...]:
         """The answer in sentences, the first of which says most; none tells what may be chance."""
-        return (*summarize_findings(self.table), *self.mixed_models, *scan_period_words(self.sensors))
+        return (*summarize_findings(self.table), *self.sensor_model_notes, *describe_scan_periods(self.sensors))
 
     @property
-    def mixed_models(self) -> list[str]:
+    def sensor_model_notes(self) -> list[str]:
         """That rigs were measured with different sensor models, in words; none where all had the same."""
         of_rigs = self.source.get("sensor_model")
         differ = isinstance(of_rigs, Mapping) and len(set(of_rigs.values())) > 1
-        return sensor_model_words(of_rigs) if differ else []
+        return describe_sensor_models(of_rigs) if differ else []
 
     @property
     def tables(self) -> list[PageTable]:
         """The tables of the page."""
-        return [*page_tables(self.table), *(self.metrics.page_tables() if self.metrics else [])]
+        return [*build_result_tables(self.table), *(self.metrics.build_page_tables() if self.metrics else [])]
 
     @property
     def summary(self) -> list[dict[str, Any]]:
@@ -185,7 +185,7 @@ class Result:
         return rows
 
     @property
-    def target_lines(self) -> list[str]:
+    def target_error_lines(self) -> list[str]:
         """What was reached of the target error, in words."""
         return self._outcome[1]
 
@@ -213,18 +213,18 @@ class Result:
         """All that it knows, on one page: tables, maps and rigs, under which settings, and where they come from."""
         rigs = {name: self.sensors.get(name, ()) for name in self.rigs}
         place = self.source.get("frames") or self.source.get("scenario") or "runs that were saved"
-        where = ", on ".join(words_of({"place": place, "vehicle": self.vehicle}).values())
+        where = ", on ".join(format_facts({"place": place, "vehicle": self.vehicle}).values())
         return Page(
             title=" against ".join(rigs) if len(rigs) == 2 else ", ".join(rigs),
             lead=f"Blind spots and coverage in {where}, measured by torchcover.",
             findings=self.verdict,
             tables=self.tables,
             maps=list(build_page_maps(self.coverages)) if self.coverages else [],
-            rigs=[PageRig(name, sensor_views(of), rig_document(name, of)) for name, of in rigs.items()],
+            rigs=[PageRig(name, build_sensor_views(of), format_rig_yaml(name, of)) for name, of in rigs.items()],
             ego_outline_m=self.ego_outline_m,
-            outlines=[region_line(region) for region in self.regions],
-            facts=facts_of(self.record, self.rigs, self.table.first_conditions.counts["steps"]),
-            more_tables=[left_out_table(self.left_out)] if self.left_out else [],
+            outlines=[build_region_outline(region) for region in self.regions],
+            facts=collect_facts(self.record, self.rigs, self.table.first_conditions.counts["steps"]),
+            more_tables=[build_omissions_table(self.omissions)] if self.omissions else [],
         )
 
     def _repr_html_(self) -> str:
@@ -245,7 +245,7 @@ class Result:
         """
         first = get_main_quantity(self.table)
         key = layer or (by_area(first) if self.table.average == "area" else first).key
-        for _, figure in self.maps(key):
+        for _, figure in self.plot_maps(key):
             return figure
         raise ValueError(f"layer: no map shows {key!r}")
 
@@ -257,7 +257,7 @@ class Result:
         """
         return data_frame(build_records(self.table))
 
-    def maps(self, layer: str | None = None) -> Iterator[tuple[str, Figure]]:
+    def plot_maps(self, layer: str | None = None) -> Iterator[tuple[str, Figure]]:
         """Draw the maps, one by one; several rigs side by side, and their differences to the first.
 
         Args:
@@ -266,12 +266,12 @@ class Result:
         Returns:
             The stem of the file name, and a figure of its own, outside pyplot.
         """
-        views = {name: sensor_views(sensors) for name, sensors in self.sensors.items()}
+        views = {name: build_sensor_views(sensors) for name, sensors in self.sensors.items()}
         return plot_maps(
             self.coverages, ego_outline_m=self.ego_outline_m, sensors=views, vehicle=self.vehicle, quantity_key=layer
         )
 
-    def save(self, folder: str | Path, *, files: str | Iterable[str] = FILES) -> list[Path]:
+    def save(self, folder: str | Path, *, file_kinds: str | Iterable[str] = FILES) -> list[Path]:
         """Write the files of the command line: first the numbers, then the maps.
 
         At any time `summary.json` lists files of one run; those of an earlier one stay until the new numbers are there.
@@ -281,17 +281,17 @@ class Result:
                 `maps/STEM.png`, `summary.json`; with metrics of others `metrics.csv` and `metrics_tau.csv`. Made if it
                 does not exist. Files of an earlier run that this one does not write are deleted: those that its
                 `summary.json` lists.
-            files: What to write beside `summary.json`: "numbers", "maps", "page", or a text as in "numbers,page".
+            file_kinds: What to write beside `summary.json`: "numbers", "maps", "page", or a text as in "numbers,page".
 
         Raises:
             ValueError: The folder is that of a file which is compared, or files that there are not.
         """
-        wanted = wanted_files(files)
-        for path in self.inputs:
+        wanted = parse_file_kinds(file_kinds)
+        for path in self.input_files:
             if path.resolve().parent in (Path(folder).resolve(), Path(folder).resolve() / "coverage"):
                 raise ValueError(f"{folder}: holds {path}, which is compared, and would lose it; choose another folder")
         with AtomicOutput(Path(folder)) as written:
-            with held_back():  # the numbers are safe before anything ends this, and before the maps are drawn
+            with defer_signals():  # the numbers are safe before anything ends this, and before the maps are drawn
                 if "numbers" in wanted:
                     self.add_numbers(written)
                 summary = self.record
@@ -300,51 +300,53 @@ class Result:
             written.publish(summary)
         return written.paths
 
-    def estimate_pictures(self, wanted: Container[str], costs: PictureCosts = PictureCosts()) -> tuple[float, float]:
+    def estimate_pictures(
+        self, file_kinds: Container[str], costs: PictureCosts = PictureCosts()
+    ) -> tuple[float, float]:
         """Estimate the memory in bytes and the time in seconds that the page and the maps take, if they are wanted."""
         first, rigs = self._first, len(self.coverages)
         quantities, cells = len(list_map_quantities(first)), first.grid.cells
         needed_bytes = float(rigs * cells * (costs.bytes_per_cell + costs.bytes_per_value * quantities))
-        seconds = 3 * costs.seconds_per_panel * rigs * quantities * len(first.grid.heights) * ("maps" in wanted)
-        return needed_bytes * ("maps" in wanted or "page" in wanted), seconds
+        seconds = 3 * costs.seconds_per_panel * rigs * quantities * len(first.grid.heights) * ("maps" in file_kinds)
+        return needed_bytes * ("maps" in file_kinds or "page" in file_kinds), seconds
 
-    def announce_pictures(self, files: str | Iterable[str], costs: PictureCosts = PictureCosts()) -> str:
+    def announce_pictures(self, file_kinds: str | Iterable[str], costs: PictureCosts = PictureCosts()) -> str:
         """Say what the page and the maps of many rigs will take; no words where that is little."""
-        needed_bytes, seconds = self.estimate_pictures(wanted_files(files), costs)
-        if needed_bytes < costs.least_bytes and seconds < costs.least_s:
+        needed_bytes, seconds = self.estimate_pictures(parse_file_kinds(file_kinds), costs)
+        if needed_bytes < costs.min_announced_bytes and seconds < costs.min_announced_s:
             return ""
         return (
             f"page and maps of {len(self.coverages)} rigs take about {needed_bytes / 1e9:.2g} GB of memory and "
             f"{math.ceil(seconds / 60)} min, after the numbers are saved; `--files numbers` leaves them out"
         )
 
-    def add_pictures(self, files: AtomicOutput, wanted: Container[str], folder: str = "") -> None:
+    def add_pictures(self, output: AtomicOutput, file_kinds: Container[str], folder: str = "") -> None:
         """Write the page and the maps, if they are wanted; `folder` is a prefix that ends with a slash.
 
         ValueError: there is not enough memory for them.
         """
         advice = "the numbers are saved; leave the others out by `--files numbers`, or compare fewer rigs"
-        needed_bytes, _ = self.estimate_pictures(wanted)
+        needed_bytes, _ = self.estimate_pictures(file_kinds)
         check_fits(f"page and maps of {len(self.coverages)} rigs", needed_bytes, advice)
-        if "page" in wanted:
-            files.add_text(f"{folder}report.html", render_page(self.page))
-        for stem, figure in self.maps() if "maps" in wanted else ():
-            files.add_figure(f"{folder}maps/{stem}.png", figure)
+        if "page" in file_kinds:
+            output.add_text(f"{folder}report.html", render_page(self.page))
+        for stem, figure in self.plot_maps() if "maps" in file_kinds else ():
+            output.add_figure(f"{folder}maps/{stem}.png", figure)
 
-    def add_numbers(self, files: AtomicOutput, folder: str = "") -> None:
+    def add_numbers(self, output: AtomicOutput, folder: str = "") -> None:
         """Write the files of numbers; `folder` is a prefix that ends with a slash. Names of rigs become file names."""
         stems = build_file_stems(list(self.coverages)) if self.is_comparison else ["coverage"]
         for stem, coverage in zip(stems, self.coverages.values(), strict=True):
-            files.add(f"{folder}coverage/{stem}.npz" if self.is_comparison else f"{folder}coverage.npz", coverage.save)
-        files.add_text(f"{folder}summary.csv", RENDERERS["csv"](self.table))
+            output.add(f"{folder}coverage/{stem}.npz" if self.is_comparison else f"{folder}coverage.npz", coverage.save)
+        output.add_text(f"{folder}summary.csv", RENDERERS["csv"](self.table))
         if self.metrics is not None:
             for name, text in self.metrics.files.items():
-                files.add_text(f"{folder}{name}", text)
+                output.add_text(f"{folder}{name}", text)
 
     @property
     def _outcome(self) -> tuple[dict[str, Any] | None, list[str]]:
-        confirmed = self.run is not None and self.run.reached
-        return outcome(self.target_error, self.coverages, self.awaited, confirmed=confirmed)
+        confirmed = self.run is not None and self.run.is_target_reached
+        return summarize_target_error(self.target_error, self.coverages, self.target_regions, is_confirmed=confirmed)
 
     @property
     def _first(self) -> Coverage:
@@ -355,7 +357,13 @@ class Result:
         run = self.run
         if run is None:
             return dict.fromkeys(RUN_KEYS)
-        known = (round(run.seconds, 3), run.complete, dict(run.counts), run.skipped, list(map(asdict, self.left_out)))
+        known = (
+            round(run.duration_s, 3),
+            run.is_complete,
+            dict(run.counts),
+            run.skipped_frames,
+            list(map(asdict, self.omissions)),
+        )
         return dict(zip(RUN_KEYS, known, strict=True))
 
     @property
@@ -364,7 +372,7 @@ class Result:
         record = self.reference_record
         if self.run is None or record is None:
             return None
-        rays = self.run.counts["reference_rays"] // self.run.steps
+        rays = self.run.counts["reference_rays"] // self.run.num_frames
         return {**record, "rays_per_step": rays} if "every_s" in record else record
 
     @property
@@ -372,8 +380,8 @@ class Result:
         """What ended the run before its time, what was measured, and the reference sensor in words, for a caption."""
         record, told = self._reference_used, [self.cut_short] if self.cut_short else []
         told += [f"Vehicle: {self.vehicle}."] if self.vehicle else []
-        told += sensor_model_words(self.source.get("sensor_model")) + weather_words(self.source.get("weather"))
-        told += perfect_depth_words(self.sensors) + scan_period_words(self.sensors) + self._on_bodies
+        told += describe_sensor_models(self.source.get("sensor_model")) + describe_weather(self.source.get("weather"))
+        told += describe_perfect_depth(self.sensors) + describe_scan_periods(self.sensors) + self._on_bodies
         if record is None:
             return told
         if "every_s" not in record:
@@ -420,7 +428,7 @@ class Result:
     @property
     def _on_repetitions(self) -> list[str]:
         """That a scenario was seen again, which is no news; nothing where every step showed an instant of its own."""
-        steps, again = (self.run.steps, self.run.counts["repeated_instants"]) if self.run else (0, 0)
+        steps, again = (self.run.num_frames, self.run.counts["repeated_instants"]) if self.run else (0, 0)
         if not again:
             return []
         if steps - again == 1:
@@ -436,7 +444,7 @@ class Result:
 
     @property
     def _about(self) -> str:
-        cut_short = ", cut short" if self.run is not None and not self.run.complete else ""
+        cut_short = ", cut short" if self.run is not None and not self.run.is_complete else ""
         return f"Result of {', '.join(self.coverages)}: {self._first.counts['steps']} steps{cut_short}"
 
     def __repr__(self) -> str:
@@ -446,23 +454,25 @@ class Result:
         return f"{self._about}\n{RENDERERS['text'](self.table)}"
 
 
-def sensor_model_words(of_rigs: object) -> list[str]:
+def describe_sensor_models(model_by_rig: object) -> list[str]:
     """What sensors make of their hits, in words; none where that is unknown.
 
     Example:
-        >>> sensor_model_words({"kitti": "real"})
+        >>> describe_sensor_models({"kitti": "real"})
         ['Sensor model: real, what returns too little light is no point.']
     """
-    if not isinstance(of_rigs, Mapping) or not of_rigs:
+    if not isinstance(model_by_rig, Mapping) or not model_by_rig:
         return []
     means = {"real": "what returns too little light is no point", "ideal": "every hit is a point"}
-    if len(set(of_rigs.values())) == 1:
-        (model,) = set(of_rigs.values())
+    if len(set(model_by_rig.values())) == 1:
+        (model,) = set(model_by_rig.values())
         return [f"Sensor model: {model}, {means[model]}."]
-    return [f"Sensor models: {', '.join(f'{rig} {model}' for rig, model in of_rigs.items())}: differences are of both."]
+    return [
+        f"Sensor models: {', '.join(f'{rig} {model}' for rig, model in model_by_rig.items())}: differences are of both."
+    ]
 
 
-def perfect_depth_words(sensors: Mapping[str, Sequence[Sensor]]) -> list[str]:
+def describe_perfect_depth(sensors: Mapping[str, Sequence[Sensor]]) -> list[str]:
     """Name the cameras whose depth counts as exact, since no error of it is given.
 
     Args:
@@ -474,9 +484,9 @@ def perfect_depth_words(sensors: Mapping[str, Sequence[Sensor]]) -> list[str]:
     Example:
         >>> from torchcover.simulation import CameraSensor
         >>> front = CameraSensor(name="front", width=64, height=48, fov_deg=90, max_range_m=100)
-        >>> perfect_depth_words({"van": [front]})[0][:54]
+        >>> describe_perfect_depth({"van": [front]})[0][:54]
         'Perfect depth is assumed for cameras of van (front): a'
-        >>> perfect_depth_words({"van": [front.model_copy(update={"range_noise_share": 0.02})]})
+        >>> describe_perfect_depth({"van": [front.model_copy(update={"range_noise_share": 0.02})]})
         []
     """
     cameras = {
@@ -492,7 +502,7 @@ def perfect_depth_words(sensors: Mapping[str, Sequence[Sensor]]) -> list[str]:
     ]
 
 
-def scan_period_words(sensors: Mapping[str, Sequence[Sensor]]) -> list[str]:
+def describe_scan_periods(sensors: Mapping[str, Sequence[Sensor]]) -> list[str]:
     """Warn of a comparison of rigs whose sensors take different times for a scan.
 
     Args:
@@ -505,7 +515,7 @@ def scan_period_words(sensors: Mapping[str, Sequence[Sensor]]) -> list[str]:
         >>> from torchcover.simulation import CameraSensor
         >>> camera = CameraSensor(name="front", width=64, height=48, fov_deg=90, max_range_m=100)
         >>> rolling = CameraSensor(**camera.model_dump() | {"scan": {"period_s": 0.05}})
-        >>> scan_period_words({"global": [camera], "rolling": [rolling]})[0][:58]
+        >>> describe_scan_periods({"global": [camera], "rolling": [rolling]})[0][:58]
         'Scan periods differ: global at once, rolling 0.05 s. Motio'
     """
     known = {rig: of_rig for rig, of_rig in sensors.items() if of_rig}
@@ -526,12 +536,12 @@ def _scan_period_s(sensor: Sensor) -> float:
     return timing.period_s if timing else 0.0
 
 
-def weather_words(of_rigs: object) -> list[str]:
+def describe_weather(weather_by_rig: object) -> list[str]:
     """What the rigs were measured in, in words; none where that is clear air or unknown.
 
     Example:
-        >>> weather_words({"kitti, clear": "clear", "kitti, fog_100m": "fog_100m"}), weather_words({"kitti": "clear"})
+        >>> describe_weather({"kitti, clear": "clear", "kitti, fog_100m": "fog_100m"}), describe_weather({"kitti": "clear"})
         (['Weather: clear, fog_100m.'], [])
     """
-    names = dict.fromkeys(of_rigs.values()) if isinstance(of_rigs, Mapping) else {}
+    names = dict.fromkeys(weather_by_rig.values()) if isinstance(weather_by_rig, Mapping) else {}
     return [f"Weather: {', '.join(names)}."] if names and list(names) != ["clear"] else []

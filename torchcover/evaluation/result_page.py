@@ -40,24 +40,24 @@ class Omission:
     """Something that a run left out.
 
     Args:
-        what: What it is, and why it could be left out.
+        description: What it is, and why it could be left out.
         count: How often; None where there is nothing to count.
-        of: Of how many; likewise.
+        total: Of how many; likewise.
     """
 
-    what: str
+    description: str
     count: int | None = None
-    of: int | None = None
+    total: int | None = None
 
 
-def left_out(
+def list_omissions(
     frame_counts: Mapping[str, int],
     coverages: Sequence[Coverage],
     aggregations: Sequence[Aggregation] = (),
     sensors: Sequence[Sensor] = (),
     *,
-    workers: int = 0,
-    ranks: int = 1,
+    num_workers: int = 0,
+    num_ranks: int = 1,
 ) -> list[Omission]:
     """List what was left out of a run, at its end: later, other modules may have been imported for other reasons.
 
@@ -66,13 +66,13 @@ def left_out(
         coverages: What the metrics gave, one for each rig.
         aggregations: Those that were asked for.
         sensors: Those that are known of all rigs.
-        workers: Processes that made the frames of each rank. What they have imported is unknown.
-        ranks: Ranks that shared the run.
+        num_workers: Processes that made the frames of each rank. What they have imported is unknown.
+        num_ranks: Ranks that shared the run.
     """
     steps = max((coverage.counts["steps"] for coverage in coverages), default=0)
     is_static = 0 < frame_counts.get("sensor_rays", 0) == frame_counts.get("sensor_rays_reused", 0)
     # Where nothing moves, each process casts the rays of its first step.
-    first_steps = min(steps, ranks * max(workers, 1)) if is_static else 0
+    first_steps = min(steps, num_ranks * max(num_workers, 1)) if is_static else 0
     found = []
     for what, count, of in COUNTED:
         omitted = frame_counts.get(count, 0)
@@ -88,21 +88,21 @@ def left_out(
     others = [aggregation.words for aggregation in AGGREGATIONS if aggregation.name not in asked_for]
     if others:
         found.append(Omission(f"{', '.join(others)}: not asked for, not kept"))
-    used = set(HEAVY) if workers else set(sys.modules)
+    used = set(HEAVY) if num_workers else set(sys.modules)
     if any(isinstance(sensor, CameraSensor) and sensor.lens != "pinhole" for sensor in sensors):
         used.add("kornia")
     unused = [package for package in HEAVY if package not in used]
     return found + [Omission(f"{package}, for {HEAVY[package]}: not imported") for package in unused]
 
 
-def page_tables(table: CoverageTable) -> list[PageTable]:
+def build_result_tables(table: CoverageTable) -> list[PageTable]:
     """The parts of a table, with its notes below the last."""
     marks = [f"{BOLD_MARKS[mark]}: {meaning}" for mark, meaning in explain_marks(table).items()]
     *parts, last = build_page_tables(table)
     return [*parts, replace(last, notes=[*marks, *list_notes(table)])]
 
 
-def sensor_views(sensors: Sequence[Sensor]) -> list[SensorView]:
+def build_sensor_views(sensors: Sequence[Sensor]) -> list[SensorView]:
     """Where sensors are and what they see."""
     return [
         SensorView(
@@ -129,7 +129,7 @@ def check_drawable(sensors: Sequence[Sensor]) -> None:
             )
 
 
-def rig_document(name: str, sensors: Sequence[Sensor]) -> str:
+def format_rig_yaml(name: str, sensors: Sequence[Sensor]) -> str:
     """A rig as YAML that `Rig.load` reads; empty if its sensors are not known, or are not of ours."""
     known = [sensor.model_dump(mode="json", exclude_unset=True) for sensor in sensors if isinstance(sensor, BaseModel)]
     if not known or len(known) < len(sensors):
@@ -137,22 +137,24 @@ def rig_document(name: str, sensors: Sequence[Sensor]) -> str:
     return as_yaml({"name": name, "sensors": known})
 
 
-def region_line(region: Region) -> MapLine:
+def build_region_outline(region: Region) -> MapLine:
     """Its outline on the maps."""
     (left, right), (low, high) = region.x, region.y
     return MapLine(region.name, np.array(region.corners_m or [[left, low], [right, low], [right, high], [left, high]]))
 
 
-def facts_of(record: Mapping[str, Any], rigs: Mapping[str, str | None], steps: int) -> dict[str, dict[str, str]]:
+def collect_facts(
+    record: Mapping[str, Any], rigs: Mapping[str, str | None], num_frames: int
+) -> dict[str, dict[str, str]]:
     """Under which settings, and how the run went.
 
-    `record`: what stands in `summary.json`; `rigs`: what the user called each rig, by its name; `steps`: steps that
+    `record`: what stands in `summary.json`; `rigs`: what the user called each rig, by its name; `num_frames`: steps that
     were measured.
     """
     settings = {name: value for name, value in record.items() if name not in (*OF_THE_RUN, *ELSEWHERE)}
     run = {name: record[name] for name in OF_THE_RUN} | {"python": platform.python_version()} | _versions()
     named = {f"rig {name}": str(given) for name, given in rigs.items() if given is not None}
-    return {"Settings": named | words_of({"steps": steps} | settings), "Run": words_of(run)}
+    return {"Settings": named | format_facts({"steps": num_frames} | settings), "Run": format_facts(run)}
 
 
 def _versions() -> dict[str, str]:
@@ -165,7 +167,7 @@ def _versions() -> dict[str, str]:
     return found
 
 
-def words_of(facts: Mapping[str, Any]) -> dict[str, str]:
+def format_facts(facts: Mapping[str, Any]) -> dict[str, str]:
     """Facts of a record as a page says them; without those that are unknown."""
     return {name.replace("_", " "): words for name, value in facts.items() if (words := _value(value))}
 
@@ -182,13 +184,13 @@ def _value(value: object) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def left_out_table(omissions: Sequence[Omission]) -> PageTable:
+def build_omissions_table(omissions: Sequence[Omission]) -> PageTable:
     """What a run left out."""
     rows = [tuple(map(TextCell, _omission(one))) for one in omissions]
     return PageTable("Left out, for this run did not need it", ("what", "count", "of", "share"), rows)
 
 
 def _omission(one: Omission) -> tuple[str, ...]:
-    if one.count is None or one.of is None:
-        return one.what, "", "", ""
-    return one.what, f"{one.count:,}", f"{one.of:,}", f"{one.count / one.of:.1%}"
+    if one.count is None or one.total is None:
+        return one.description, "", "", ""
+    return one.description, f"{one.count:,}", f"{one.total:,}", f"{one.count / one.total:.1%}"

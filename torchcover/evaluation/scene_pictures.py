@@ -6,7 +6,7 @@ import numpy as np
 import shapely
 from matplotlib.figure import Figure
 
-from torchcover.evaluation.result_page import sensor_views
+from torchcover.evaluation.result_page import build_sensor_views
 from torchcover.geometry import BoundingBox, invert, transform
 from torchcover.geometry.rigid import Matrix
 from torchcover.report import ActorMark, SkinPatch, StaticFaces, plot_depth_images, plot_rig, plot_scene, plot_vehicle
@@ -22,13 +22,13 @@ FLAT = 0.9  # the least cosine between a face's normal and z
 REFERENCE = PaperReference(rows=256, columns=512)
 
 
-def cameras_of(rig: Rig) -> list[CameraSensor]:
+def list_cameras(rig: Rig) -> list[CameraSensor]:
     """Those of its sensors that make images."""
     return [sensor for sensor in rig.sensors if isinstance(sensor, CameraSensor)]
 
 
-def rig_pictures(
-    rig: Rig, scenario: Scenario, *, vehicle: str | None = None, step: int = 0, seed: int = 0
+def plot_rig_figures(
+    rig: Rig, scenario: Scenario, *, vehicle: str | None = None, frame_index: int = 0, seed: int = 0
 ) -> Iterator[tuple[str, Figure]]:
     """A rig on the ego of a scenario, and the depth images of its cameras, if it has any.
 
@@ -36,19 +36,19 @@ def rig_pictures(
         rig: The rig.
         scenario: Whose ego carries it, and what its cameras see.
         vehicle: What carries it instead.
-        step: Time step of the depth images.
+        frame_index: Time step of the depth images.
         seed: Seed of the traffic.
 
     Returns:
         What to add to the name of the rig, ``""`` or ``"_depth"``, and the figure.
     """
-    frames = _frames(scenario, rig, vehicle, step, seed)
-    scene, step_of_world = frames.simulator.scene_of(step)
+    frames = _frames(scenario, rig, vehicle, frame_index, seed)
+    scene, step_of_world = frames.simulator.scene_of(frame_index)
     ego = scene.world.ego.mesh
     length, width, height = scene.ego_box.size_m
     subtitle = f"on {frames.scenario.ego_name} in {scenario.name}, {length:.2f} x {width:.2f} x {height:.2f} m"
-    yield "", plot_rig(ego.vertices_m, ego.faces, sensor_views(rig.sensors), title=rig.name, subtitle=subtitle)
-    if cameras := cameras_of(rig):
+    yield "", plot_rig(ego.vertices_m, ego.faces, build_sensor_views(rig.sensors), title=rig.name, subtitle=subtitle)
+    if cameras := list_cameras(rig):
         instant = scene.at(step_of_world)
         images = {
             camera.name: instant.range_image(
@@ -57,25 +57,25 @@ def rig_pictures(
             for camera in cameras
         }
         time_s = step_of_world * scene.world.time_step_s
-        when = f"on {frames.scenario.ego_name} in {scenario.name}, step {step}, t = {time_s:g} s, seed {seed}"
+        when = f"on {frames.scenario.ego_name} in {scenario.name}, step {frame_index}, t = {time_s:g} s, seed {seed}"
         yield "_depth", plot_depth_images(images, title=f"{rig.name}: distance along the ray", subtitle=when)
 
 
-def scenario_pictures(
-    scenario: Scenario, rig: Rig, steps: Sequence[int], *, vehicle: str | None = None, seed: int = 0
+def plot_scenario(
+    scenario: Scenario, rig: Rig, frame_indices: Sequence[int], *, vehicle: str | None = None, seed: int = 0
 ) -> Iterator[Figure]:
     """Frames of a scenario from above: its actors, the points of a rig, those of the reference.
 
     Args:
         scenario: The scenario.
         rig: Whose points.
-        steps: The frames.
+        frame_indices: The frames.
         vehicle: What carries it, instead of the scenario's ego.
         seed: Seed of the simulation.
     """
-    frames = _frames(scenario, rig, vehicle, max(steps), seed)
+    frames = _frames(scenario, rig, vehicle, max(frame_indices), seed)
     x_m, y_m = frames.scenario.room_m() or (GRID_X_M, GRID_Y_M)
-    for step in steps:
+    for step in frame_indices:
         frame = frames[step]
         scene, step_of_world = frames.simulator.scene_of(step)
         time_s, ego = step_of_world * scene.world.time_step_s, scene.world.ego.trajectory
@@ -93,7 +93,7 @@ def scenario_pictures(
         )
 
 
-def vehicle_picture(vehicle: Vehicle) -> Figure:
+def plot_vehicle_figure(vehicle: Vehicle) -> Figure:
     """A vehicle from all sides, with its mount regions.
 
     Raises:

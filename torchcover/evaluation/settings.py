@@ -9,7 +9,7 @@ from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, cast
 
-from torchcover.evaluation.arguments import Read
+from torchcover.evaluation.arguments import ConvertedField
 from torchcover.evaluation.config import EvaluateConfig
 from torchcover.simulation.memory import check_fits
 
@@ -37,18 +37,18 @@ BYTES_PER_WORKER = 300e6
 FILES = ("numbers", "maps", "page")
 
 
-def wanted_files(given: str | Iterable[str]) -> frozenset[str]:
+def parse_file_kinds(file_kinds: str | Iterable[str]) -> frozenset[str]:
     """What is to be written of a result.
 
-    `given`: of `FILES`: names, or a text as in `numbers,page`. ValueError: another name, or none.
+    `file_kinds`: of `FILES`: names, or a text as in `numbers,page`. ValueError: another name, or none.
 
     Example:
-        >>> sorted(wanted_files("page, numbers"))
+        >>> sorted(parse_file_kinds("page, numbers"))
         ['numbers', 'page']
     """
-    names = [name.strip() for name in given.split(",")] if isinstance(given, str) else list(given)
+    names = [name.strip() for name in file_kinds.split(",")] if isinstance(file_kinds, str) else list(file_kinds)
     if not names or not set(names).issubset(FILES):
-        raise ValueError(f"files: {', '.join(FILES)}, one or more of them, are needed; got {given!r}")
+        raise ValueError(f"files: {', '.join(FILES)}, one or more of them, are needed; got {file_kinds!r}")
     return frozenset(names)
 
 
@@ -186,41 +186,49 @@ class Settings:
     """
 
     rigs: Annotated[
-        Read["AnyRig | Sequence[AnyRig] | None", "tuple[AnyRig, ...]"],
+        ConvertedField["AnyRig | Sequence[AnyRig] | None", "tuple[AnyRig, ...]"],
         "A rig, the name of a built-in one, or the path of a YAML file; or several, which are measured in the same "
         "frames against the same reference, and of which the others are compared with the first. With `frames`: which "
         "of its rigs, all if not given; or what its only one is, so that the maps show its sensors.",
-    ] = Read(_rigs, None)
+    ] = ConvertedField(_rigs, None)
     scenario: "AnyScenario | Sequence[AnyScenario] | Mapping[str, float] | None" = None
     _: KW_ONLY
     frames: Annotated[
         "FrameSource | str | Path | None", "A recording, or any source of frames, instead of a scenario."
     ] = None
-    steps: int | None = None
+    num_frames: int | None = None
     seed: int = DEFAULTS.seed
     vehicle: str | Path | None = None
     sensor_model: Literal["ideal", "real"] | None = None
-    weather: Read["Weather | str | Path | Sequence[Weather | str | Path]", "tuple[Weather, ...]"] = Read(
-        _weather, DEFAULTS.weather
+    weather: ConvertedField["Weather | str | Path | Sequence[Weather | str | Path]", "tuple[Weather, ...]"] = (
+        ConvertedField(_weather, DEFAULTS.weather)
     )
-    ask: Read["RegionsOfInterest | str | Path | None", "RegionsOfInterest | None"] = Read(_asked, None)
-    probe: Read["str | Path | Iterable[str | Path] | None", "tuple[str | Path, ...] | None"] = Read(_probes, None)
+    regions: ConvertedField["RegionsOfInterest | str | Path | None", "RegionsOfInterest | None"] = ConvertedField(
+        _asked, None
+    )
+    test_targets: ConvertedField["str | Path | Iterable[str | Path] | None", "tuple[str | Path, ...] | None"] = (
+        ConvertedField(_probes, None)
+    )
     cell_m: float | None = None
-    thresholds_m: Read[float | Iterable[float], tuple[float, ...]] = Read(_thresholds, DEFAULTS.thresholds_m)
-    aggregations: Read["str | Sequence[Aggregation | str]", "tuple[Aggregation, ...]"] = Read(
+    thresholds_m: ConvertedField[float | Iterable[float], tuple[float, ...]] = ConvertedField(
+        _thresholds, DEFAULTS.thresholds_m
+    )
+    aggregations: ConvertedField["str | Sequence[Aggregation | str]", "tuple[Aggregation, ...]"] = ConvertedField(
         _aggregations, DEFAULTS.aggregations
     )
     reference: str | None = None
-    rays: int | None = None
-    estimate: Literal["area", "known"] | None = None
+    num_rays: int | None = None
+    average: Literal["area", "known"] | None = None
     band_frame: Literal["ground", "vehicle"] | None = None
-    every_s: float | None = None
-    target_error: Read["TargetError | str | Sequence[str] | None", "TargetError | None"] = Read(_target, None)
+    frame_interval_s: float | None = None
+    target_error: ConvertedField["TargetError | str | Sequence[str] | None", "TargetError | None"] = ConvertedField(
+        _target, None
+    )
     only_detection: bool = DEFAULTS.only_detection
     redundancy: bool = DEFAULTS.redundancy
-    metrics: Read[str | Iterable[str], tuple[str, ...]] = Read(_metrics, DEFAULTS.metrics)
-    device: Read["str | torch.device", str] = Read(str, DEFAULTS.device)
-    workers: int | None = None
+    metrics: ConvertedField[str | Iterable[str], tuple[str, ...]] = ConvertedField(_metrics, DEFAULTS.metrics)
+    device: ConvertedField["str | torch.device", str] = ConvertedField(str, DEFAULTS.device)
+    num_workers: int | None = None
     no_cache: bool = DEFAULTS.no_cache
     skip_bad_frames: bool = DEFAULTS.skip_bad_frames
     observers: Annotated[
@@ -235,7 +243,7 @@ class Settings:
     ] = None
     ranks: Annotated[
         "Ranks | None",
-        "Processes that share the run, from `joined_ranks()`; all of them call this, and get the same result.",
+        "Processes that share the run, from `join_ranks()`; all of them call this, and get the same result.",
     ] = None
     progress: Annotated[bool, "Whether to show a bar."] = False
     config_record: Annotated[
@@ -243,11 +251,11 @@ class Settings:
     ] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.steps is not None and self.steps < 1:
-            raise ValueError(f"steps: at least 1 is needed; got {self.steps}")
-        check_fits(f"{self.workers or 0:,} workers", BYTES_PER_WORKER * (self.workers or 0), "use fewer")
-        if self.estimate not in (None, "area", "known"):
-            raise ValueError(f"estimate {self.estimate}: `area` or `known` is needed")
+        if self.num_frames is not None and self.num_frames < 1:
+            raise ValueError(f"steps: at least 1 is needed; got {self.num_frames}")
+        check_fits(f"{self.num_workers or 0:,} workers", BYTES_PER_WORKER * (self.num_workers or 0), "use fewer")
+        if self.average not in (None, "area", "known"):
+            raise ValueError(f"estimate {self.average}: `area` or `known` is needed")
         if self.band_frame not in (None, "ground", "vehicle"):
             raise ValueError(f"band_frame {self.band_frame}: `ground` or `vehicle` is needed")
         if self.sensor_model not in (None, "ideal", "real"):
@@ -268,7 +276,7 @@ class Settings:
         return _mixture(self.scenario)
 
     @property
-    def one_scenario(self) -> "AnyScenario":
+    def single_scenario(self) -> "AnyScenario":
         """The scenario, for what is done in one world.
 
         Raises:
@@ -298,7 +306,7 @@ class Settings:
             raise ValueError("only_detection: for simulations; a recording has all its points")
         if self.vehicle is not None and not isinstance(self.frames, str | Path):
             raise ValueError("vehicle: for simulations and paths of recordings; frames have their own (recording.body)")
-        if self.probe:
+        if self.test_targets:
             raise ValueError("probe: not for recordings, which have no scene to put a body into")
-        if any(setting is not None for setting in (self.reference, self.rays, self.every_s)):
+        if any(setting is not None for setting in (self.reference, self.num_rays, self.frame_interval_s)):
             raise ValueError("reference, rays and every_s are for simulations; a recording has its reference points")

@@ -20,10 +20,10 @@ from torchcover.coverage import Coverage, Region, shown_places
 from torchcover.coverage.grid import BandFrame
 from torchcover.estimation import MIN_BLOCKS, ROUND_OFF, Difference, ErrorModel, Estimate, Quantity, blocks_needed
 from torchcover.evaluation.config import STUDY_SETTINGS
-from torchcover.evaluation.measuring import measured
+from torchcover.evaluation.measuring import measure_coverage
 from torchcover.evaluation.settings import Settings
-from torchcover.evaluation.target_error import MIN_STEPS, rounded_up
-from torchcover.evaluation.task import simulation
+from torchcover.evaluation.target_error import MIN_STEPS, round_up_frames
+from torchcover.evaluation.task import build_simulation_task
 from torchcover.files import AtomicOutput, end_with_parent, reporting_stopped
 from torchcover.report import (
     PageTable,
@@ -67,32 +67,32 @@ class StudyPlan:
     Args:
         settings: Of `evaluate`: one rig and a scenario, by names or paths; 512 steps if not given. The others are held
             against it on the first quarter of them.
-        others: What each other setting has different, by the name of the argument of `evaluate`.
+        variants: What each other setting has different, by the name of the argument of `evaluate`.
 
     Raises:
         ValueError: Not one rig by its name.
     """
 
     settings: Settings
-    others: tuple[Mapping[str, Any], ...] = FEWER_RAYS
+    variants: tuple[Mapping[str, Any], ...] = FEWER_RAYS
 
     def __post_init__(self) -> None:
-        if not all(isinstance(one, str | Path) for one in self.named) or len(self.settings.rigs) != 1:
+        if not all(isinstance(one, str | Path) for one in self.input_names) or len(self.settings.rigs) != 1:
             raise ValueError(
                 "study: one rig and a scenario are needed, by names or paths: a command is timed with them"
             )
 
     @property
-    def named(self) -> tuple[Any, ...]:
+    def input_names(self) -> tuple[Any, ...]:
         """What the rig and the scenario were called."""
-        return (*self.settings.rigs, self.settings.one_scenario)
+        return (*self.settings.rigs, self.settings.single_scenario)
 
     @property
-    def each(self) -> dict[str, Settings]:
+    def trial_settings(self) -> dict[str, Settings]:
         """Options -> settings of every trial, that without any first."""
         # What it takes to build worlds counts: who uses what is found has others.
-        first = replace(self.settings, steps=self.settings.steps or DEFAULT_STEPS, no_cache=True)
-        return {"": first} | {" ".join(_options(other)): replace(first, **other) for other in self.others}
+        first = replace(self.settings, num_frames=self.settings.num_frames or DEFAULT_STEPS, no_cache=True)
+        return {"": first} | {" ".join(_options(other)): replace(first, **other) for other in self.variants}
 
     @property
     def command(self) -> list[str]:
@@ -100,7 +100,7 @@ class StudyPlan:
         defaults = Settings()
         given = {name: getattr(self.settings, name) for name in STUDY_SETTINGS}
         others = {name: value for name, value in given.items() if value != getattr(defaults, name)}
-        return ["evaluate", str(self.named[0]), *_options(others)]
+        return ["evaluate", str(self.input_names[0]), *_options(others)]
 
 
 def _options(settings: Mapping[str, Any]) -> Iterator[str]:
@@ -109,15 +109,15 @@ def _options(settings: Mapping[str, Any]) -> Iterator[str]:
         yield from ("--set", f"{name}={text.lower() if isinstance(value, bool) else text}")
 
 
-class Studied(NamedTuple):
+class StudiedNumber(NamedTuple):
     """A number as one setting has it: value, what its error becomes, and difference to the first on the same instants.
 
-    `awaited` says whether `--target-error` waits for it, `is_biased` whether the difference is beyond chance.
+    `has_target` says whether `--target-error` waits for it, `is_biased` whether the difference is beyond chance.
     """
 
     region: str
     height: str
-    awaited: bool
+    has_target: bool
     quantity: Quantity
     value: float
     error: ErrorModel
@@ -131,40 +131,42 @@ class Trial:
 
     Args:
         options: What is different from the first, as on the command line; empty for the first.
-        steps: How many were measured.
-        least_steps: The fewest that print an error of every number that is awaited.
-        seconds: What they took.
-        processor_s: What it took of all processors, those of workers too.
+        num_frames: How many were measured.
+        min_frames: The fewest that print an error of every number that is awaited.
+        duration_s: What they took.
+        cpu_s: What it took of all processors, those of workers too.
         band_frame: What the bands are over.
         numbers: Of all regions and bands.
     """
 
     options: str
-    steps: int
-    least_steps: int
-    seconds: float
-    processor_s: float
+    num_frames: int
+    min_frames: int
+    duration_s: float
+    cpu_s: float
     band_frame: BandFrame
-    numbers: Sequence[Studied]
+    numbers: Sequence[StudiedNumber]
 
-    def of(self, unit: str) -> list[Studied]:
+    def select_numbers(self, unit: str) -> list[StudiedNumber]:
         """The awaited numbers of a unit, but for those that are unknown."""
-        return [one for one in self.numbers if one.awaited and one.quantity.unit == unit and not math.isnan(one.value)]
+        return [
+            one for one in self.numbers if one.has_target and one.quantity.unit == unit and not math.isnan(one.value)
+        ]
 
-    def error_after(self, steps: int, unit: str) -> float:
+    def estimate_error(self, num_frames: int, unit: str) -> float:
         """The largest error of a unit after so many steps; NaN if one is unknown."""
-        errors = [one.error.error_after(steps) for one in self.of(unit)]
+        errors = [one.error.error_after(num_frames) for one in self.select_numbers(unit)]
         return math.nan if any(map(math.isnan, errors)) else max(errors, default=math.nan)
 
-    def steps_for(self, error: float) -> int | None:
+    def estimate_num_frames(self, error: float) -> int | None:
         """Steps after which every detection is this good, in two digits; None if there are none, or that is unknown."""
-        needed = [one.error.steps_for(error) for one in self.of("share")]
+        needed = [one.error.steps_for(error) for one in self.select_numbers("share")]
         known = [steps for steps in needed if steps is not None]
-        return rounded_up(max(self.least_steps, *known)) if known and len(known) == len(needed) else None
+        return round_up_frames(max(self.min_frames, *known)) if known and len(known) == len(needed) else None
 
-    def seconds_for(self, steps: int, start_s: float) -> float:
+    def estimate_duration_s(self, num_frames: int, startup_s: float) -> float:
         """What a command of so many steps takes."""
-        return start_s + self.seconds * steps / self.steps
+        return startup_s + self.duration_s * num_frames / self.num_frames
 
 
 @dataclass(frozen=True)
@@ -174,17 +176,17 @@ class Study:
     Args:
         plan: What it was about.
         trials: What was tried, the first first.
-        start_s: What a command takes whatever its steps: Python, imports, maps and files. It is in all times.
+        startup_s: What a command takes whatever its steps: Python, imports, maps and files. It is in all times.
     """
 
     plan: StudyPlan
     trials: Sequence[Trial]
-    start_s: float
+    startup_s: float
 
-    def recommended(self, error: float) -> tuple[Trial, int] | None:
+    def find_recommended(self, error: float) -> tuple[Trial, int] | None:
         """The setting to use for an error of every detection, and its steps; None if none is good enough."""
-        reached = [(trial, steps) for trial in self.trials if (steps := trial.steps_for(error)) is not None]
-        times = [trial.seconds_for(steps, self.start_s) for trial, steps in reached]
+        reached = [(trial, steps) for trial in self.trials if (steps := trial.estimate_num_frames(error)) is not None]
+        times = [trial.estimate_duration_s(steps, self.startup_s) for trial, steps in reached]
         if not reached:
             return None
         first = reached[0][0] is self.trials[0] and WORTH * times[0] <= min(times)
@@ -198,8 +200,8 @@ class Study:
     def _settings(self) -> PageTable:
         rows = []
         for trial in self.trials:
-            needed = [_steps_words(trial, trial.steps_for(error), self.start_s) for error in WANTED]
-            times = [f"{1000 * s / trial.steps:.0f}" for s in (trial.seconds, trial.processor_s)]
+            needed = [_steps_words(trial, trial.estimate_num_frames(error), self.startup_s) for error in WANTED]
+            times = [f"{1000 * s / trial.num_frames:.0f}" for s in (trial.duration_s, trial.cpu_s)]
             rows.append(list(map(TextCell, [trial.options or "as given", *times, _bias(trial), *needed])))
         return PageTable(
             "Every detection in front to so many percentage points",
@@ -213,37 +215,38 @@ class Study:
         for one in first.numbers:
             steps = [one.error.steps_for(error) for error in WANTED] if one.quantity.unit == "share" else [None] * 3
             words = [
-                _steps_words(first, each and rounded_up(max(each, first.least_steps)), self.start_s) for each in steps
+                _steps_words(first, each and round_up_frames(max(each, first.min_frames)), self.startup_s)
+                for each in steps
             ]
-            error = format_error(one.error.error_after(first.steps), one.quantity.unit)
+            error = format_error(one.error.error_after(first.num_frames), one.quantity.unit)
             place = f"{one.region} {one.height}"
             rows.append(list(map(TextCell, [place, format_difference_heading(one.quantity), error, *words])))
-        headings = ("place", "number", f"error after {first.steps:,}", *STEPS_HEADINGS)
+        headings = ("place", "number", f"error after {first.num_frames:,}", *STEPS_HEADINGS)
         return PageTable("Each number, as given", headings, rows)
 
-    def advice(self, error: float) -> str:
+    def format_recommendation(self, error: float) -> str:
         """The options of `evaluate` that reach an error."""
-        found = self.recommended(error)
+        found = self.find_recommended(error)
         if found is None:
             first = self.trials[0]
-            unknown = [f"{one.region} {one.height}" for one in first.of("share") if math.isnan(one.error.a)]
-            why = f"not known, for {first.steps:,} steps say no error of {', '.join(unknown) or 'any'}"
+            unknown = [f"{one.region} {one.height}" for one in first.select_numbers("share") if math.isnan(one.error.a)]
+            why = f"not known, for {first.num_frames:,} steps say no error of {', '.join(unknown) or 'any'}"
             return f"For {_points(error)} of every detection: {why}."
         trial, steps = found
         options = " ".join([*self.plan.command[1:], *([trial.options] if trial.options else []), f"--steps={steps}"])
-        return f"For {_points(error)} of every detection: {options} ({trial.seconds_for(steps, self.start_s):.0f} s)."
+        return f"For {_points(error)} of every detection: {options} ({trial.estimate_duration_s(steps, self.startup_s):.0f} s)."
 
     @property
     def record(self) -> dict[str, Any]:
         """All of it: what stands in `summary.json`."""
-        rig, scenario = map(str, self.plan.named)
-        found = {error: self.recommended(error) for error in WANTED}
+        rig, scenario = map(str, self.plan.input_names)
+        found = {error: self.find_recommended(error) for error in WANTED}
         return {
             "torchcover": __version__,
             "rig": rig,
             "scenario": scenario,
             "seed": self.plan.settings.seed,
-            "start_s": self.start_s,
+            "start_s": self.startup_s,
             "trials": [_record(trial) for trial in self.trials],
             "recommended": [
                 {"error": error, "options": one and one[0].options, "steps": one and one[1]}
@@ -251,23 +254,23 @@ class Study:
             ],
         }
 
-    def draw(self) -> Figure:
+    def plot(self) -> Figure:
         """The diagram of error against run time: the largest error of each unit."""
         panels = {}
         for quantity in list(dict.fromkeys(one.quantity for one in self.trials[0].numbers))[:2]:
             lines = {}
             for trial in self.trials:
-                steps = [trial.least_steps << doubling for doubling in range(DOUBLINGS + 1)]
+                steps = [trial.min_frames << doubling for doubling in range(DOUBLINGS + 1)]
                 factor = get_display_unit(quantity.unit).factor
-                errors = [factor * trial.error_after(each, quantity.unit) for each in steps]
-                times = [trial.seconds_for(each, self.start_s) for each in steps]
+                errors = [factor * trial.estimate_error(each, quantity.unit) for each in steps]
+                times = [trial.estimate_duration_s(each, self.startup_s) for each in steps]
                 lines[trial.options or "as given"] = list(zip(times, errors, strict=True))
             panels[f"largest error of the {format_difference_heading(quantity)}"] = lines
-        return plot_work_precision(panels, title=" in ".join(map(str, self.plan.named)), legend_title="setting")
+        return plot_work_precision(panels, title=" in ".join(map(str, self.plan.input_names)), legend_title="setting")
 
     def save(self, folder: str | Path) -> list[Path]:
         """Write `work_precision.png` and `summary.json` into a folder, which is made if need be."""
-        figure = self.draw()
+        figure = self.plot()
         with AtomicOutput(Path(folder)) as files:
             files.add("work_precision.png", figure.savefig)
             files.publish(self.record)
@@ -275,11 +278,11 @@ class Study:
 
 
 def _steps_words(trial: Trial, steps: int | None, start_s: float) -> str:
-    return "-" if steps is None else f"{steps:,} ({trial.seconds_for(steps, start_s):.0f} s)"
+    return "-" if steps is None else f"{steps:,} ({trial.estimate_duration_s(steps, start_s):.0f} s)"
 
 
 def _bias(trial: Trial) -> str:
-    known = [one for one in trial.of("share") if one.difference and not math.isnan(one.difference.value)]
+    known = [one for one in trial.select_numbers("share") if one.difference and not math.isnan(one.difference.value)]
     if not known:
         return "-" if trial.options else ""
     most = max(known, key=lambda one: (one.is_biased, abs(one.difference.value if one.difference else 0.0)))
@@ -296,31 +299,33 @@ def _record(trial: Trial) -> dict[str, Any]:
         numbers.append(
             to_json_record({**own, "a": one.error.a, "bias": one.error.bias, "difference": to_json_record(told)})
         )
-    names = ("options", "steps", "least_steps", "seconds", "processor_s", "band_frame")
+    names = ("options", "steps", "min_frames", "seconds", "processor_s", "band_frame")
     return {**{name: getattr(trial, name) for name in names}, "numbers": numbers}
 
 
-def error_against_time(plan: StudyPlan, *, progress: bool = False) -> Study:
+def measure_error_against_time(plan: StudyPlan, *, show_progress: bool = False) -> Study:
     """Measure what each setting costs and how far it is off, all of them on the same instants.
 
     Args:
         plan: What to try.
-        progress: Whether to show bars.
+        show_progress: Whether to show bars.
 
     Raises:
         ValueError: A plan that makes no sense.
         FileNotFoundError: An unknown name or file.
     """
-    for settings in plan.each.values():
-        simulation(settings)  # fails before anything runs
+    for settings in plan.trial_settings.values():
+        build_simulation_task(settings)  # fails before anything runs
     trials: list[Trial] = []
     first: Coverage | None = None
-    for options, settings in plan.each.items():
-        steps = settings.steps if first is None else _first_steps(first)
-        trial, coverage = _tried(options, replace(settings, steps=steps, probe="none", progress=progress), first)
+    for options, settings in plan.trial_settings.items():
+        steps = settings.num_frames if first is None else _first_steps(first)
+        trial, coverage = _tried(
+            options, replace(settings, num_frames=steps, test_targets="none", progress=show_progress), first
+        )
         trials.append(trial)
         first = first or coverage
-    return Study(plan, trials, max(0.0, command_s(plan) - trials[0].seconds / trials[0].steps))
+    return Study(plan, trials, max(0.0, measure_command_s(plan) - trials[0].duration_s / trials[0].num_frames))
 
 
 def _first_steps(coverage: Coverage) -> int:
@@ -330,12 +335,12 @@ def _first_steps(coverage: Coverage) -> int:
 
 
 def _tried(options: str, settings: Settings, first: Coverage | None) -> tuple[Trial, Coverage]:
-    task, before_s = simulation(settings), sum(os.times()[:4])
-    result = measured(task, settings)
+    task, before_s = build_simulation_task(settings), sum(os.times()[:4])
+    result = measure_coverage(task, settings)
     processor_s = sum(os.times()[:4]) - before_s
     assert result.run is not None  # it was not loaded
     result.run.raise_failure()
-    coverage, awaited = result.coverage, task.asked.awaited
+    coverage, awaited = result.coverage, task.query_plan.awaited
     places = shown_places(result.regions, coverage.grid)
     count, steps, worlds = len(places) * len(coverage.quantities), coverage.counts["steps"], math.inf
     numbers = []
@@ -354,9 +359,9 @@ def _tried(options: str, settings: Settings, first: Coverage | None) -> tuple[Tr
             is_biased = difference is not None and difference.p * count < LEVEL
             bias = abs(difference.value) if difference and (is_biased or math.isnan(difference.value)) else 0.0
             place = region.name, height, region in awaited
-            numbers.append(Studied(*place, quantity, value, ErrorModel(own, bias), difference, is_biased))
+            numbers.append(StudiedNumber(*place, quantity, value, ErrorModel(own, bias), difference, is_biased))
     least = max(MIN_STEPS, blocks_needed(steps, worlds) if worlds > 0 else steps)
-    times = result.run.seconds, processor_s
+    times = result.run.duration_s, processor_s
     return Trial(options, steps, least, *times, coverage.band_frame, numbers), coverage
 
 
@@ -374,7 +379,7 @@ def _paired(first: Coverage, coverage: Coverage, region: Region, height: str) ->
     return against if against.steps.tolist() == own.steps.tolist() else None
 
 
-def command_s(plan: StudyPlan) -> float:
+def measure_command_s(plan: StudyPlan) -> float:
     """How long `torchcover evaluate` takes for one step, from its start to its end. ValueError: it fails."""
     words = [*plan.command, "--steps=1"]
     start = time.perf_counter()

@@ -45,7 +45,7 @@ class TargetError:
                 raise ValueError(f"target error: {name} must be positive and finite; got {size}")
 
     @classmethod
-    def parse(cls, words: str | Sequence[str]) -> "TargetError | None":
+    def parse(cls, text: str | Sequence[str]) -> "TargetError | None":
         """Read numbers with their units; None for no words.
 
         Raises:
@@ -56,11 +56,11 @@ class TargetError:
             >>> TargetError.parse(["0.1%", "0.02m"])
             TargetError(radius_m=0.02, detection=0.001)
         """
-        each = [words] if isinstance(words, str) else words
+        each = [text] if isinstance(text, str) else text
         if not isinstance(each, Sequence) or not all(isinstance(word, str) for word in each):
             raise TypeError(
                 f'target error: numbers with their units are needed, "0.1%" or ["0.1%", "0.02m"], or a '
-                f"TargetError; got {words!r}"
+                f"TargetError; got {text!r}"
             )
         found: dict[str, float] = {}
         for word in each:
@@ -82,7 +82,7 @@ class TargetError:
 
 
 @dataclass(frozen=True)
-class Standing:
+class ConvergenceStatus:
     """How far a number is from the error that is good enough.
 
     Args:
@@ -92,7 +92,7 @@ class Standing:
         quantity: As in the columns of `summary.csv`.
         error: Standard error now, in metres or as a share; NaN if there are not enough steps.
         target: What is good enough.
-        steps: Steps so far.
+        num_frames: Steps so far.
     """
 
     rig: str
@@ -101,12 +101,12 @@ class Standing:
     quantity: str
     error: float
     target: float
-    steps: int
+    num_frames: int
 
     @property
-    def reached(self) -> bool:
+    def is_reached(self) -> bool:
         """Whether it is good enough, and known well enough to say so."""
-        return self.steps >= MIN_STEPS and self.error <= self.target
+        return self.num_frames >= MIN_STEPS and self.error <= self.target
 
     @property
     def excess(self) -> float:
@@ -114,21 +114,26 @@ class Standing:
         return math.inf if math.isnan(self.error) else self.error / self.target
 
     @property
-    def steps_needed(self) -> int | None:
+    def frames_needed(self) -> int | None:
         """Steps after which it should be good enough, for errors fall as 1 / sqrt(steps); None if there is no error."""
         if math.isinf(self.excess):
             return None
         return max(
-            MIN_STEPS, self.steps if self.reached else ErrorModel.of(self.error, self.steps).steps_for(self.target) or 0
+            MIN_STEPS,
+            self.num_frames
+            if self.is_reached
+            else ErrorModel.of(self.error, self.num_frames).steps_for(self.target) or 0,
         )
 
     @property
-    def words(self) -> str:
+    def text(self) -> str:
         """Error and target."""
         return f"error {_measure(self.error, self.quantity)} (target {_measure(self.target, self.quantity)})"
 
 
-def standings(target: TargetError, coverages: Mapping[str, Coverage], regions: Sequence[Region]) -> list[Standing]:
+def compute_convergence(
+    target: TargetError, coverages: Mapping[str, Coverage], regions: Sequence[Region]
+) -> list[ConvergenceStatus]:
     """How far every number is: those of each rig, and the differences to the first rig.
 
     A number that is unknown, for want of a known cell, has no error, and nothing waits for it.
@@ -150,11 +155,11 @@ def standings(target: TargetError, coverages: Mapping[str, Coverage], regions: S
                 good = target.radius_m if quantity.unit == "m" else target.detection
                 if good is not None and not math.isnan(value):
                     where = (name, region.name, height, quantity.key)
-                    found.append(Standing(*where, error, good, first.counts["steps"]))
+                    found.append(ConvergenceStatus(*where, error, good, first.counts["steps"]))
     return found
 
 
-class TargetWatch:
+class TargetErrorRule:
     """Looks at the errors of a run now and then: what `observe` takes as `until`.
 
     Args:
@@ -169,55 +174,55 @@ class TargetWatch:
         self.target = target
         self.observers = observers
         self.regions = regions
-        self.next_look = MIN_STEPS
-        self.worst: Standing | None = None
+        self.next_check_frame = MIN_STEPS
+        self.worst: ConvergenceStatus | None = None
         self._good_looks = 0
 
-    def is_reached(self, steps: int) -> bool:
+    def is_reached(self, num_frames: int) -> bool:
         """Whether the run may end after so many steps. Between two looks: no."""
-        if steps < self.next_look:
+        if num_frames < self.next_check_frame:
             return False
         coverages = {name: observer.compute() for name, observer in self.observers.items()}
-        found = standings(self.target, coverages, self.regions)
+        found = compute_convergence(self.target, coverages, self.regions)
         self.worst = max(found, key=lambda standing: standing.excess, default=None)
-        self._good_looks = self._good_looks + 1 if self.worst is not None and self.worst.reached else 0
+        self._good_looks = self._good_looks + 1 if self.worst is not None and self.worst.is_reached else 0
         if self._good_looks >= LOOKS_IN_A_ROW:
             return True
-        needed = math.inf if self.worst is None else self.worst.steps_needed or math.inf
-        self.next_look = math.ceil(min(max(needed, MIN_GROWTH * steps), MAX_GROWTH * steps))
+        needed = math.inf if self.worst is None else self.worst.frames_needed or math.inf
+        self.next_check_frame = math.ceil(min(max(needed, MIN_GROWTH * num_frames), MAX_GROWTH * num_frames))
         return False
 
     def state_dict(self) -> dict[str, Any]:
         """When it looks again, and what the last looks said."""
         return {
-            "next_look": self.next_look,
+            "next_check_frame": self.next_check_frame,
             "good_looks": self._good_looks,
             "worst": None if self.worst is None else asdict(self.worst),
         }
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Go on as another one would have."""
-        self.next_look, self._good_looks = state_dict["next_look"], state_dict["good_looks"]
-        self.worst = None if state_dict["worst"] is None else Standing(**state_dict["worst"])
+        self.next_check_frame, self._good_looks = state_dict["next_check_frame"], state_dict["good_looks"]
+        self.worst = None if state_dict["worst"] is None else ConvergenceStatus(**state_dict["worst"])
 
-    def expected_steps(self, most: int) -> int:
+    def estimate_num_frames(self, max_frames: int) -> int:
         """Steps that the run is thought to take, of so many at most."""
-        if self.worst is None or self.worst.steps_needed is None:
-            return most
-        return min(most, max(self.worst.steps_needed, self.next_look))
+        if self.worst is None or self.worst.frames_needed is None:
+            return max_frames
+        return min(max_frames, max(self.worst.frames_needed, self.next_check_frame))
 
     @property
-    def words(self) -> str:
+    def progress_text(self) -> str:
         """The worst error and its target."""
-        return self.worst.words if self.worst else ""
+        return self.worst.text if self.worst else ""
 
 
 def _measure(error: float, quantity: str) -> str:
     return f"{error:.2g} m" if quantity == "radius_m" else f"{100 * error:.2g} %"
 
 
-def outcome(
-    target: TargetError | None, coverages: Mapping[str, Coverage], regions: Sequence[Region], *, confirmed: bool
+def summarize_target_error(
+    target: TargetError | None, coverages: Mapping[str, Coverage], regions: Sequence[Region], *, is_confirmed: bool
 ) -> tuple[dict[str, Any] | None, list[str]]:
     """What was aimed at and what was reached at the end of a run.
 
@@ -225,66 +230,66 @@ def outcome(
         target: What is good enough; None if nothing was aimed at.
         coverages: As in `standings`.
         regions: Regions within the grid.
-        confirmed: Whether the run has ended because every number was good enough at two looks in a row.
+        is_confirmed: Whether the run has ended because every number was good enough at two looks in a row.
 
     Returns:
         A record for `summary.json`, with errors in metres or as shares, and lines for the terminal.
     """
     if target is None:
         return None, []
-    found, first = standings(target, coverages, regions), next(iter(coverages.values()))
+    found, first = compute_convergence(target, coverages, regions), next(iter(coverages.values()))
     blank = [f"{row.region} {row.height}" for row in first.summary(regions) if not row.known_cells]
-    lines = _lines(found, first.counts["steps"], confirmed=confirmed)
+    lines = _lines(found, first.counts["steps"], confirmed=is_confirmed)
     if blank:
         lines.append(f"Not waited for, as no cell of it is known: {', '.join(blank)}.")
     if alike := [f"{one.region} {one.height}, {one.quantity} of {one.rig}" for one in found if one.error <= ROUND_OFF]:
         lines.append(f"Not waited for, as all steps say the same, which proves nothing: {'; '.join(alike)}.")
-    return {**_record(target, found), "reached": confirmed, "unknown": blank}, lines
+    return {**_record(target, found), "reached": is_confirmed, "unknown": blank}, lines
 
 
-def _record(target: TargetError, found: Sequence[Standing]) -> dict[str, Any]:
-    needed = [standing.steps_needed for standing in found]
+def _record(target: TargetError, found: Sequence[ConvergenceStatus]) -> dict[str, Any]:
+    needed = [standing.frames_needed for standing in found]
     known = [steps for steps in needed if steps is not None]
     numbers = []
     for standing, steps in zip(found, needed, strict=True):
         record = {name: value for name, value in asdict(standing).items() if name != "steps"}
-        numbers.append(to_json_record({**record, "reached": standing.reached, "steps_needed": steps}))
+        numbers.append(to_json_record({**record, "reached": standing.is_reached, "frames_needed": steps}))
     return {
         **asdict(target),
-        "steps_needed": max(known) if known and len(known) == len(needed) else None,
+        "frames_needed": max(known) if known and len(known) == len(needed) else None,
         "numbers": numbers,
     }
 
 
-def _lines(found: Sequence[Standing], steps: int, *, confirmed: bool) -> list[str]:
+def _lines(found: Sequence[ConvergenceStatus], steps: int, *, confirmed: bool) -> list[str]:
     """That it was reached, or the worst number of each region and band and what it would take."""
     if not found:
         return ["Target error not reached: no region has a known cell."]
     if confirmed:
         return [f"Target error reached after {steps:,} steps."]
     after = f"Target error not reached in {steps:,} step{'s' * (steps != 1)}"
-    if all(standing.reached for standing in found):
+    if all(standing.is_reached for standing in found):
         return [f"{after}: every error is small enough now, but was not at two looks in a row; take more steps."]
     lines = [f"{after}; the largest of each region:"]
     for (region, height), group in groupby(found, key=lambda standing: (standing.region, standing.height)):
         worst = max(group, key=lambda standing: standing.excess)
         where = f"  {region} {height}, {worst.quantity} of {worst.rig}"
-        if worst.steps_needed is None:
+        if worst.frames_needed is None:
             lines.append(f"{where}: not enough steps for an error")
-        elif worst.reached:
-            lines.append(f"{where}: {worst.words}, reached")
+        elif worst.is_reached:
+            lines.append(f"{where}: {worst.text}, reached")
         else:
-            needed = f"about {rounded_up(worst.steps_needed):,} different steps are needed"
-            lines.append(f"{where}: {worst.words}, {needed}")
+            needed = f"about {round_up_frames(worst.frames_needed):,} different steps are needed"
+            lines.append(f"{where}: {worst.text}, {needed}")
     return lines
 
 
-def rounded_up(steps: int) -> int:
+def round_up_frames(num_frames: int) -> int:
     """Steps in two digits, never fewer.
 
     Example:
-        >>> rounded_up(99), rounded_up(1234)
+        >>> round_up_frames(99), round_up_frames(1234)
         (99, 1300)
     """
-    unit: int = 10 ** max(0, len(str(steps)) - 2)
-    return -(-steps // unit) * unit
+    unit: int = 10 ** max(0, len(str(num_frames)) - 2)
+    return -(-num_frames // unit) * unit

@@ -9,10 +9,10 @@ from typing import Any, Literal
 import numpy as np
 
 from torchcover import __version__
-from torchcover.evaluation.progress import held_back
-from torchcover.evaluation.result_page import rig_document, sensor_views, words_of
-from torchcover.evaluation.settings import FILES, wanted_files
-from torchcover.evaluation.task import AnyRig, AnyScenario, as_called, spread_s
+from torchcover.evaluation.progress import defer_signals
+from torchcover.evaluation.result_page import build_sensor_views, format_facts, format_rig_yaml
+from torchcover.evaluation.settings import FILES, parse_file_kinds
+from torchcover.evaluation.task import AnyRig, AnyScenario, compute_frame_interval_s, load_named_rig
 from torchcover.files import AtomicOutput
 from torchcover.report import (
     ColorScale,
@@ -49,15 +49,15 @@ NEAR_M = 2.0
 ALIKE = 0.9
 
 
-def survey_target(
+def map_target_visibility(
     rig: AnyRig,
     target: Target | str | Path = "child",
     scenario: Scenario | str | Path | None = None,
     *,
     vehicle: str | Path | None = None,
     sensor_model: Literal["ideal", "real"] | None = None,
-    steps: int | None = None,
-    every_s: float | None = None,
+    num_frames: int | None = None,
+    frame_interval_s: float | None = None,
     **settings: Any,  # noqa: ANN401  (those of `survey`)
 ) -> TargetMap:
     """Put a target at every place around a vehicle, and see what its rig gets of it.
@@ -68,8 +68,8 @@ def survey_target(
         scenario: The world: a scenario, a built-in name or a YAML file; flat ground with nothing on it if not given.
         vehicle: What carries the rig, as for `evaluate`, or a mesh file.
         sensor_model: What sensors make of their hits; as for `evaluate`.
-        steps: How many steps are averaged; 1 where all are alike, else 16.
-        every_s: Time between two of them; as for `evaluate` if not given.
+        num_frames: How many steps are averaged; 1 where all are alike, else 16.
+        frame_interval_s: Time between two of them; as for `evaluate` if not given.
         settings: Others of `torchcover.targets.survey`: `raster`, `seed`, `hits`, `threshold_m`, `heading`.
 
     Returns:
@@ -81,33 +81,33 @@ def survey_target(
 
     Example:
         >>> from torchcover.targets import Raster
-        >>> seen = survey_target("front_roof_128", "dog", raster=Raster((3.0, 7.0), (-1.0, 1.0), 1.0))
+        >>> seen = map_target_visibility("front_roof_128", "dog", raster=Raster((3.0, 7.0), (-1.0, 1.0), 1.0))
         >>> seen.target, seen.counts["free"]
         ('dog_57cm', 8)
     """
-    rig, world, usual_steps = in_world(rig, scenario, vehicle, sensor_model)
+    rig, world, usual_steps = load_rig_and_scenario(rig, scenario, vehicle, sensor_model)
     return survey(
         rig,
         world,
         target if isinstance(target, Target) else Target.load(target),
-        steps=usual_steps if steps is None else steps,
-        every_s=spread_s(world, every_s),
+        steps=usual_steps if num_frames is None else num_frames,
+        every_s=compute_frame_interval_s(world, frame_interval_s),
         **settings,
     )
 
 
-def in_world(
+def load_rig_and_scenario(
     rig: AnyRig, scenario: AnyScenario | None, vehicle: str | Path | None, sensor_model: Literal["ideal", "real"] | None
 ) -> tuple[Rig, Scenario, int]:
-    """The rig, the world whose ego carries it, and how many steps are usual; as `survey_target` is asked."""
-    rig = as_called(rig).sensing(sensor_model)
-    world = free_space() if scenario is None else scenario
+    """The rig, the world whose ego carries it, and how many steps are usual; as `map_target_visibility` is asked."""
+    rig = load_named_rig(rig).sensing(sensor_model)
+    world = build_flat_ground() if scenario is None else scenario
     world = with_ego(world if isinstance(world, Scenario) else Scenario.load(world), {rig.name: rig}, vehicle)
     alike = world.instants == 1 and all(sensor.is_exact for sensor in rig.sensors)
     return rig, world, 1 if alike else DEFAULT_STEPS
 
 
-def free_space() -> Scenario:
+def build_flat_ground() -> Scenario:
     """Flat ground with nothing on it but what carries the rig.
 
     Example:
@@ -118,95 +118,99 @@ def free_space() -> Scenario:
     return Scenario(name="free space", ego=Mover(), bodies=(ground,))
 
 
-def save_targets(
-    seen: TargetMap, folder: str | Path, sensors: Sequence[Sensor] = (), *, files: str | Iterable[str] = FILES
+def save_target_map(
+    target_map: TargetMap,
+    folder: str | Path,
+    sensors: Sequence[Sensor] = (),
+    *,
+    file_kinds: str | Iterable[str] = FILES,
 ) -> list[Path]:
     """Write the files of the command line: the numbers first, then the page and the picture.
 
     Args:
-        seen: From `survey_target`.
+        target_map: From `map_target_visibility`.
         folder: Where to write `targets.csv`, `targets.npz`, `report.html`, `targets.png` and `summary.json`. Made if it
             does not exist; files of an earlier run that its `summary.json` lists are deleted.
         sensors: Those of the rig, for the page.
-        files: What to write beside `summary.json`, as in `Result.save`; "maps" is the picture.
+        file_kinds: What to write beside `summary.json`, as in `Result.save`; "maps" is the picture.
     """
-    wanted = wanted_files(files)
-    record = target_record(seen)
+    wanted = parse_file_kinds(file_kinds)
+    record = build_target_record(target_map)
     with AtomicOutput(Path(folder)) as written:
-        with held_back():  # the numbers are safe before anything ends this
+        with defer_signals():  # the numbers are safe before anything ends this
             if "numbers" in wanted:
-                written.add("targets.csv", lambda path: write_csv(seen, path))
-                written.add("targets.npz", lambda path: write_arrays(seen, path))
+                written.add("targets.csv", lambda path: write_csv(target_map, path))
+                written.add("targets.npz", lambda path: write_arrays(target_map, path))
             written.publish(record)
         if "page" in wanted:
-            written.add_text("report.html", render_page(target_page(seen, sensors)))
+            written.add_text("report.html", render_page(build_target_page(target_map, sensors)))
         if "maps" in wanted:
-            written.add_figure("targets.png", seen.plot())
+            written.add_figure("targets.png", target_map.plot())
         written.publish(record)
     return written.paths
 
 
-def target_record(seen: TargetMap) -> dict[str, Any]:
+def build_target_record(target_map: TargetMap) -> dict[str, Any]:
     """Settings, counts, shares of the sides and worst places, for JSON; None for what is unknown."""
     return {
-        **seen.settings(),
-        "cells": seen.counts,
-        "sides": [to_json_record(side._asdict()) for side in seen.sides()],
-        "unseen_to_m": to_json_record(seen.unseen_to_m()),
-        "worst": [to_json_record(place._asdict()) for place in seen.worst()],
+        **target_map.settings(),
+        "cells": target_map.counts,
+        "sides": [to_json_record(side._asdict()) for side in target_map.sides()],
+        "unseen_to_m": to_json_record(target_map.unseen_to_m()),
+        "worst": [to_json_record(place._asdict()) for place in target_map.worst()],
     }
 
 
-def target_page(seen: TargetMap, sensors: Sequence[Sensor] = ()) -> Page:
-    """All that is known of a target, on one page. `seen`: from `survey_target`; `sensors`: those of the rig."""
+def build_target_page(target_map: TargetMap, sensors: Sequence[Sensor] = ()) -> Page:
+    """All that is known of a target, on one page. `target_map`: from `map_target_visibility`; `sensors`: those of the rig."""
     return Page(
-        title=f"{seen.rig}: would it see {seen.target}?",
-        lead=f"In {seen.scenario}, sensor model {seen.sensor_model}, measured by torchcover.",
-        findings=target_verdict({seen.rig: seen}),
-        target_maps=[plan_of(seen)],
-        tables=[sides_table(seen), places_table(seen.worst(), "The worst places")],
-        maps=_maps(seen),
-        rigs=[PageRig(seen.rig, sensor_views(sensors), rig_document(seen.rig, sensors))],
-        ego_outline_m=seen.vehicle_outline_m,
-        facts={"Settings": words_of(seen.settings()), "Run": {"torchcover": __version__}},
+        title=f"{target_map.rig}: would it see {target_map.target}?",
+        lead=f"In {target_map.scenario}, sensor model {target_map.sensor_model}, measured by torchcover.",
+        findings=summarize_target_maps({target_map.rig: target_map}),
+        target_maps=[build_target_plan(target_map)],
+        tables=[build_sides_table(target_map), build_positions_table(target_map.worst(), "The worst places")],
+        maps=_maps(target_map),
+        rigs=[PageRig(target_map.rig, build_sensor_views(sensors), format_rig_yaml(target_map.rig, sensors))],
+        ego_outline_m=target_map.vehicle_outline_m,
+        facts={"Settings": format_facts(target_map.settings()), "Run": {"torchcover": __version__}},
     )
 
 
-def plan_of(seen: TargetMap) -> TargetVisibilityMap:
+def build_target_plan(target_map: TargetMap) -> TargetVisibilityMap:
     """Where it is seen, and what is lost with each sensor, as a page shows it."""
-    by = np.where(seen.enough, np.maximum(np.nan_to_num(seen.least_sensors), 1), 0).astype(np.int64)
-    near = seen.free & (seen.distance_m <= NEAR_M)
-    count, unseen = int(near.sum()), int((near & ~seen.enough).sum())
-    m2 = format_square_meters(unseen * seen.raster.step_m**2)
+    by = np.where(target_map.enough, np.maximum(np.nan_to_num(target_map.least_sensors), 1), 0).astype(np.int64)
+    near = target_map.free & (target_map.distance_m <= NEAR_M)
+    count, unseen = int(near.sum()), int((near & ~target_map.enough).sum())
+    m2 = format_square_meters(unseen * target_map.raster.step_m**2)
     return TargetVisibilityMap(
-        rig=seen.rig,
+        rig=target_map.rig,
         title=f"Not seen at {unseen:,} of {count:,} places within {NEAR_M:g} m, {m2} m².",
-        x=seen.raster.x,
-        y=seen.raster.y,
-        cell_m=seen.raster.step_m,
-        sensor_counts=np.where(seen.free, by, -1),
-        vehicle_box_m=seen.vehicle.outline_m,
-        vehicle_outline_m=seen.vehicle_outline_m,
+        x=target_map.raster.x,
+        y=target_map.raster.y,
+        cell_m=target_map.raster.step_m,
+        sensor_counts=np.where(target_map.free, by, -1),
+        vehicle_box_m=target_map.vehicle.outline_m,
+        vehicle_outline_m=target_map.vehicle_outline_m,
         max_distance_m=NEAR_M,
-        failure_effects_m2=seen.losses_m2(NEAR_M) if len(seen.sensor_names) > 1 else {},
+        failure_effects_m2=target_map.losses_m2(NEAR_M) if len(target_map.sensor_names) > 1 else {},
     )
 
 
-def target_verdict(seen: Mapping[str, TargetMap]) -> tuple[str, ...]:
+def summarize_target_maps(target_maps: Mapping[str, TargetMap]) -> tuple[str, ...]:
     """Where rigs, by name, see the same body on the same places, and on which sensor most hangs, in sentences."""
-    shares = {rig: one.share_seen(NEAR_M) for rig, one in seen.items()}
+    shares = {rig: one.share_seen(NEAR_M) for rig, one in target_maps.items()}
     known = sorted((rig for rig in shares if not math.isnan(shares[rig])), key=lambda rig: -shares[rig])
     if not known:
         return (f"No place within {NEAR_M:g} m is free: what is seen there is unknown.",)
     alike = [(share, ", ".join(rigs)) for share, rigs in groupby(known, lambda rig: format_whole_percent(shares[rig]))]
     (most, best), *others = alike
-    first = seen[known[0]]
+    first = target_maps[known[0]]
     height = f", {first.target_bottom_m:.2f} m above the ground," if first.target_bottom_m else ""
     body = f"{format_target_name(first.target)} of {first.target_size_m[2]:.2f} m{height}"
     seen_words = f"is seen ({first.hits} points or more)"
     told = [f"{capitalize(body)} {seen_words} at {most} % of the places within {NEAR_M:g} m by {best}"]
     told += [f"at {share} % by {rigs}" for share, rigs in others]
-    return (f"{', '.join(told)}.", *(_on_loss(rig, seen[rig]) for rig in known))
+    return (f"{', '.join(told)}.", *(_on_loss(rig, target_maps[rig]) for rig in known))
 
 
 def _on_loss(rig: str, seen: TargetMap) -> str:
@@ -251,9 +255,9 @@ def _maps(seen: TargetMap) -> list[PageMap]:
     ]
 
 
-def sides_table(seen: TargetMap) -> PageTable:
+def build_sides_table(target_map: TargetMap) -> PageTable:
     """The share of the places on each side that have enough points, and how far out one has not."""
-    sides, unseen_to_m = seen.sides(), seen.unseen_to_m()
+    sides, unseen_to_m = target_map.sides(), target_map.unseen_to_m()
     within = list(dict.fromkeys(side.within_m for side in sides))
     rows = []
     for name in dict.fromkeys(side.side for side in sides):
@@ -261,15 +265,15 @@ def sides_table(seen: TargetMap) -> PageTable:
         to_m = unseen_to_m[name]
         unseen = "-" if np.isnan(to_m) else f"{to_m:.2f}" if to_m else "nowhere"
         rows.append(tuple(map(TextCell, (name, *shares, unseen))))
-    of_steps = ", mean over the steps" if seen.step_count > 1 else ""
+    of_steps = ", mean over the steps" if target_map.step_count > 1 else ""
     headings = ("side", *(f"within {limit_m:g} m\n(%)" for limit_m in within), "unseen to\n(m)")
-    return PageTable(f"Free places with {seen.hits} points or more{of_steps}", headings, rows)
+    return PageTable(f"Free places with {target_map.hits} points or more{of_steps}", headings, rows)
 
 
-def places_table(places: Sequence[Place], title: str) -> PageTable:
+def build_positions_table(positions: Sequence[Place], title: str) -> PageTable:
     """Where places are, and how much of a target is seen there."""
     headings = ("side", "x\n(m)", "y\n(m)", "distance\n(m)", "points", "sensors", "surface\n(%)")
-    rows = [tuple(map(TextCell, _place(place))) for place in places]
+    rows = [tuple(map(TextCell, _place(place))) for place in positions]
     return PageTable(title, headings, rows)
 
 

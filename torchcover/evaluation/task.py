@@ -16,7 +16,7 @@ from torchcover import __version__
 from torchcover.coverage import Region
 from torchcover.evaluation.config import DESCRIPTIONS
 from torchcover.evaluation.observers import AnyObserver
-from torchcover.evaluation.progress import showing_wait
+from torchcover.evaluation.progress import show_wait
 from torchcover.evaluation.settings import DEFAULT_STEPS, MAX_STEPS, Settings
 from torchcover.frames import ChosenRigs, FrameSource
 from torchcover.recordings import RecordedFrames, open_recording
@@ -58,23 +58,23 @@ MAX_TOLD = 40
 class Task(NamedTuple, Generic[SourceT]):
     """Which rigs are measured in which frames, under the names that they have in tables and files.
 
-    `given` is what the user called each rig, None if it was not named; `sensors` its sensors, where they are known;
-    `steps` how many frames to use at most.
+    `rig_sources` is what the user called each rig, None if it was not named; `sensors` its sensors, where they are known;
+    `num_frames` how many frames to use at most.
     """
 
     frames: SourceT
-    given: Mapping[str, str | None]
+    rig_sources: Mapping[str, str | None]
     sensors: Mapping[str, Sequence[Sensor]]
     description: Mapping[str, object]
-    asked: Asked
-    steps: int | None = None
+    query_plan: Asked
+    num_frames: int | None = None
 
     @property
     def rigs(self) -> tuple[str, ...]:
         """What the rigs are called in tables and files."""
-        return tuple(self.given)
+        return tuple(self.rig_sources)
 
-    def sensor_names(self) -> Mapping[str, Sequence[str]]:
+    def get_sensor_names(self) -> Mapping[str, Sequence[str]]:
         """Name of each rig -> names of its sensors. ValueError: it is unknown which points are of which sensor."""
         known = self.frames.sensor_names
         if unknown := [rig for rig in self.rigs if rig not in known]:
@@ -82,7 +82,7 @@ class Task(NamedTuple, Generic[SourceT]):
         return known
 
 
-def task_of(settings: Settings) -> Task[FrameSource]:
+def build_task(settings: Settings) -> Task[FrameSource]:
     """Simulate a scenario, or read a recording.
 
     Raises:
@@ -99,8 +99,8 @@ def task_of(settings: Settings) -> Task[FrameSource]:
     frames = settings.frames
     if frames is None:
         is_first = settings.ranks is None or settings.ranks.rank == 0
-        with showing_wait("preparing the scene", shown=settings.progress and is_first):  # meshes may be large
-            return simulation(settings)
+        with show_wait("preparing the scene", is_shown=settings.progress and is_first):  # meshes may be large
+            return build_simulation_task(settings)
     if settings.scenario is not None:
         raise ValueError("scenario and frames exclude each other: simulate a scenario or read a recording")
     settings.check_recording()
@@ -119,51 +119,51 @@ def task_of(settings: Settings) -> Task[FrameSource]:
         )
     if settings.skip_bad_frames and isinstance(source, RecordedFrames):
         source.skip_unreadable_sweeps()
-    for doubt in source.doubts(settings.steps):
+    for doubt in source.doubts(settings.num_frames):
         warnings.warn(doubt, stacklevel=CALLER)
     return _recording(source, settings)
 
 
-def simulation(settings: Settings, *, boxes: bool = False) -> Task[SimulatedFrames]:
+def build_simulation_task(settings: Settings, *, needs_boxes: bool = False) -> Task[SimulatedFrames]:
     """Simulate a scenario.
 
     Args:
         settings: Of `evaluate`.
-        boxes: Whether frames are to have objects, even if no metric is about them.
+        needs_boxes: Whether frames are to have objects, even if no metric is about them.
 
     Raises:
-        ValueError, FileNotFoundError: As `task_of`.
+        ValueError, FileNotFoundError: As `build_task`.
     """
-    rigs, scenario = settings.rigs, settings.one_scenario
+    rigs, scenario = settings.rigs, settings.single_scenario
     if not rigs:
         raise ValueError("which rig? Give a built-in name (see `torchcover list`) or a YAML file, or a recording")
-    names = distinct_names(rigs)
+    names = make_rig_names(rigs)
     sensor_model = settings.sensor_model or ("ideal" if settings.reference == "paper" else None)
-    carried = {name: loaded(rig).sensing(sensor_model) for name, rig in zip(names, rigs, strict=True)}
-    given = {name: given_as(rig) for name, rig in zip(names, rigs, strict=True)}
+    carried = {name: load_rig(rig).sensing(sensor_model) for name, rig in zip(names, rigs, strict=True)}
+    given = {name: format_rig_source(rig) for name, rig in zip(names, rigs, strict=True)}
     if settings.weather:
         carried, given = _in_weather(carried, given, settings.weather)
     loaded_world = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
     world = with_ego(loaded_world, carried, settings.vehicle)
     band_frame = settings.band_frame or ("vehicle" if settings.reference == "paper" else DEFAULT_BAND_FRAME)
-    asked = (settings.ask or RegionsOfInterest()).around(
+    asked = (settings.regions or RegionsOfInterest()).around(
         world.ego_box().outline_m, settings.cell_m, band_frame, _within(world, carried)
     )
     few = settings.only_detection and settings.reference in (None, DEFAULT_REFERENCE)
-    rays = FEW_RAYS if few and settings.rays is None else settings.rays
+    rays = FEW_RAYS if few and settings.num_rays is None else settings.num_rays
     most = DEFAULT_STEPS if settings.target_error is None else MAX_STEPS
     frames = SimulatedFrames(
         world,
         rigs=carried,
-        steps=most if settings.steps is None else settings.steps,
+        steps=most if settings.num_frames is None else settings.num_frames,
         seed=settings.seed,
-        every_s=spread_s(world, settings.every_s),
+        every_s=compute_frame_interval_s(world, settings.frame_interval_s),
         reference_sensor=reference_called(settings.reference, rays, asked),
-        boxes=boxes or settings.needs_boxes,
+        boxes=needs_boxes or settings.needs_boxes,
         within_m=max(settings.thresholds_m) if settings.only_detection else None,
         kept_bytes=0.0,  # steps come in order: no world is needed again
         no_cache=settings.no_cache,
-        device=casting_device(settings),
+        device=find_ray_device(settings),
     )
     frames.simulator.check_run(frames.steps)
     # A path says more than the name within the file.
@@ -172,14 +172,14 @@ def simulation(settings: Settings, *, boxes: bool = False) -> Task[SimulatedFram
     return Task(frames, given, frames.sensors, description, asked, _most_steps(frames, settings))
 
 
-def casting_device(settings: Settings) -> str | None:
+def find_ray_device(settings: Settings) -> str | None:
     """The GPU that casts rays, if that of the run can: workers are forked, and cast by Embree."""
-    device = settings.ranks.device(settings.device) if settings.ranks else settings.device
-    on_a_gpu = device.startswith("cuda") and not settings.workers and find_spec("warp")
-    return str(usable_device(device)) if on_a_gpu else None
+    device = settings.ranks.get_device(settings.device) if settings.ranks else settings.device
+    on_a_gpu = device.startswith("cuda") and not settings.num_workers and find_spec("warp")
+    return str(get_device(device)) if on_a_gpu else None
 
 
-def usable_device(name: str) -> torch.device:
+def get_device(name: str) -> torch.device:
     """The device of this name. ValueError: it cannot be used here."""
     try:
         device = torch.device(name)
@@ -208,25 +208,25 @@ def _in_weather(
 def _most_steps(frames: SimulatedFrames, settings: Settings) -> int | None:
     """Where a target error ends a run at the latest: what repeats and moves has no more to say than its instants."""
     distinct = frames.simulator.distinct_steps
-    if settings.steps is not None or settings.target_error is None or distinct in (None, 1):
+    if settings.num_frames is not None or settings.target_error is None or distinct in (None, 1):
         return None
     return max(DEFAULT_STEPS, distinct)
 
 
 def _recording(frames: FrameSource, settings: Settings) -> Task[FrameSource]:
     rigs = settings.rigs
-    names = distinct_names(rigs or list(frames.rigs))
+    names = make_rig_names(rigs or list(frames.rigs))
     only_one = len(names) == len(frames.rigs) == 1  # which goes by any name
     chosen = ChosenRigs(frames, dict(zip(names, frames.rigs if only_one else names, strict=True)))
     named = dict(zip(names, rigs, strict=True)) if rigs else {}
-    given = {name: given_as(named[name]) if named else None for name in names}
+    given = {name: format_rig_source(named[name]) if named else None for name in names}
     # A name that is in the recording may be a name only; any other has to be that of a rig.
-    documents = {name: rig for name, rig in named.items() if is_document(rig) or name not in frames.rigs}
-    sensors = {**chosen.sensors, **{name: loaded(rig).sensors for name, rig in documents.items()}}
+    documents = {name: rig for name, rig in named.items() if is_rig_document(rig) or name not in frames.rigs}
+    sensors = {**chosen.sensors, **{name: load_rig(rig).sensors for name, rig in documents.items()}}
     band_frame = settings.band_frame or ("ground" if frames.has_heights() else "vehicle")
-    asked = (settings.ask or RegionsOfInterest()).around(frames.ego_outline_m, settings.cell_m, band_frame)
+    asked = (settings.regions or RegionsOfInterest()).around(frames.ego_outline_m, settings.cell_m, band_frame)
     description = {**frames.description, **({"config": settings.config_record} if settings.config_record else {})}
-    return Task(chosen, given, sensors, description, asked, settings.steps)
+    return Task(chosen, given, sensors, description, asked, settings.num_frames)
 
 
 def _within(world: Scenario, rigs: Mapping[str, Rig]) -> Region | None:
@@ -244,14 +244,14 @@ def _within(world: Scenario, rigs: Mapping[str, Rig]) -> Region | None:
     return Region("room" if within == room else "range", *within)
 
 
-def spread_s(scenario: Scenario, given_s: float | None) -> float:
+def compute_frame_interval_s(scenario: Scenario, frame_interval_s: float | None) -> float:
     """Time between two steps: what was given, else 10 s in traffic, else what spreads the steps over the scenario.
 
     That is the golden share of its instants, round and round: any number of steps lies evenly over all of it, and no
     instant comes again before all have been seen.
     """
-    if given_s is not None:
-        return given_s
+    if frame_interval_s is not None:
+        return frame_interval_s
     if scenario.instants is None:
         return EVERY_S_IN_TRAFFIC
     share = (math.sqrt(5) - 1) / 2 * scenario.instants
@@ -259,12 +259,12 @@ def spread_s(scenario: Scenario, given_s: float | None) -> float:
     return min(each_once, key=lambda steps: abs(steps - share)) * scenario.step_s
 
 
-def distinct_names(rigs: Sequence[AnyRig]) -> list[str]:
+def make_rig_names(rigs: Sequence[AnyRig]) -> list[str]:
     """What the columns are called: the rigs' names; numbered where two would be the same."""
-    return distinct([_name(rig) for rig in rigs])
+    return make_unique_names([_name(rig) for rig in rigs])
 
 
-def distinct(stems: Sequence[str]) -> list[str]:
+def make_unique_names(stems: Sequence[str]) -> list[str]:
     """Names of which no two are the same, for no file system; numbered where they would be.
 
     Example:
@@ -280,39 +280,39 @@ def distinct(stems: Sequence[str]) -> list[str]:
     return names
 
 
-def loaded(rig: AnyRig) -> Rig:
+def load_rig(rig: AnyRig) -> Rig:
     """The rig itself. FileNotFoundError: no such file or built-in name. ValueError: the file is not a rig."""
     return rig if isinstance(rig, Rig) else Rig.load(rig)
 
 
-def as_called(rig: AnyRig) -> Rig:
+def load_named_rig(rig: AnyRig) -> Rig:
     """The rig itself, under the name that tables and files of every command have for it.
 
     FileNotFoundError: as `loaded`. ValueError: as `loaded`.
     """
-    return loaded(rig).model_copy(update={"name": _name(rig)})
+    return load_rig(rig).model_copy(update={"name": _name(rig)})
 
 
-def is_document(rig: AnyRig) -> bool:
+def is_rig_document(rig: AnyRig) -> bool:
     """Whether there is more to it than a name: a rig, the path of one, or the name of a built-in one."""
     return isinstance(rig, Rig) or _is_file(rig) or str(rig) in builtin_names("rigs")
 
 
-def given_as(rig: AnyRig) -> str:
+def format_rig_source(rig: AnyRig) -> str:
     """What the user called it."""
     return rig.name if isinstance(rig, Rig) else str(rig)
 
 
 def _name(rig: AnyRig) -> str:
-    return loaded(rig).name if isinstance(rig, Rig) or _is_file(rig) else str(rig)
+    return load_rig(rig).name if isinstance(rig, Rig) or _is_file(rig) else str(rig)
 
 
 def _is_file(rig: str | Path) -> bool:
     return Path(rig).suffix in (".yaml", ".yml")
 
 
-def run_identity(
-    task: Task[FrameSource], settings: Settings, others: Mapping[str, AnyObserver], ranks: int = 1
+def build_run_identity(
+    task: Task[FrameSource], settings: Settings, others: Mapping[str, AnyObserver], num_ranks: int = 1
 ) -> dict[str, str]:
     """All that the result of a run depends on, by name: not the steps, of which there may be more later, nor who works.
 
@@ -323,10 +323,10 @@ def run_identity(
         "torchcover": __version__,
         **task.frames.content,
         "rigs": task.rigs,
-        **_asked(task.asked),
+        **_asked(task.query_plan),
         **{name: getattr(settings, name) for name in DESCRIPTIONS if name not in TOLD_OTHERWISE},
         "observers": kinds,
-        "ranks": ranks,
+        "ranks": num_ranks,
     }
     return {name: _told(value) for name, value in everything.items()}
 

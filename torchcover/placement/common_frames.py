@@ -10,8 +10,8 @@ from torch.utils.data import DataLoader, Dataset
 from torchcover.coverage import Measure
 from torchcover.estimation import Estimate
 from torchcover.evaluation import CoverageObserver
-from torchcover.evaluation.cores import start_method
-from torchcover.evaluation.pipeline import FramesOrErrors, MeasuredFrame, batches_of, killed_worker
+from torchcover.evaluation.cores import get_start_method
+from torchcover.evaluation.pipeline import FramesOrErrors, MeasuredFrame, find_killed_worker, iterate_batches
 from torchcover.frames import Frame
 from torchcover.placement.host_vehicle import HostVehicle
 from torchcover.placement.objective import Objective
@@ -220,7 +220,7 @@ class CommonFrames:
             batch_sampler=self._batches,
             collate_fn=list,
             num_workers=self._processes,
-            multiprocessing_context=start_method() if self._processes else None,
+            multiprocessing_context=get_start_method() if self._processes else None,
             prefetch_factor=1 if workers else None,
             persistent_workers=workers > 0,
         )
@@ -305,10 +305,10 @@ class CommonFrames:
         self._batches[:] = [[FrameRequest(rig, number, is_measured) for number in share] for share in shares]
         made: dict[int, Frame | MeasuredFrame | ValueError] = {}
         try:
-            for share, batch in zip(shares, batches_of(self._loader), strict=True):
+            for share, batch in zip(shares, iterate_batches(self._loader), strict=True):
                 made |= zip(share, batch, strict=True)
         except Exception as error:
-            if killed := killed_worker(error, self._processes, steps=len(made)):
+            if killed := find_killed_worker(error, self._processes, num_frames=len(made)):
                 raise killed from error
             raise
         frames = []

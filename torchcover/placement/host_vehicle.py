@@ -112,9 +112,9 @@ class PlacementSpace(Readable):
                     "there; leave heights out, or check what was found"
                 )
             region = {one.region: required.regions[one.region]} if one.region in required.regions else one.region
-            for key in (one.number, *(f"{one.number}_without_{name}" for name in one.without)):
+            for key in (one.number, *(f"{one.number}_without_{name}" for name in one.failing_sensors)):
                 each = Objective(number=key, region=region, band=one.height)
-                numbers |= {f"{REQUIRED}{each.description}, {bound.words}": (each, bound.value) for bound in one.bounds}
+                numbers |= {f"{REQUIRED}{each.description}, {bound.text}": (each, bound.value) for bound in one.bounds}
         return numbers
 
     @cached_property

@@ -13,7 +13,7 @@ from torchcover.coverage.grid import PAPER_HEIGHTS
 from torchcover.estimation import Estimate, Quantity
 from torchcover.evaluation.checking import check
 from torchcover.evaluation.requirements import AnyRequirement, RegionRequirement, Requirements, Verdict
-from torchcover.evaluation.target_survey import free_space
+from torchcover.evaluation.target_survey import build_flat_ground
 from torchcover.simulation import Document, Rig, Scenario
 from torchcover.simulation.regions_of_interest import RegionOfInterest
 
@@ -29,7 +29,7 @@ def check_requirements(
 ) -> Sequence[Verdict]:
     """Check requirements of targets and encounters for a rig on the ego of a world, in free space or their scenario."""
     ego: Any = scenario.ego
-    where = requirements.scenario or free_space().model_copy(update={"ego": ego})
+    where = requirements.scenario or build_flat_ground().model_copy(update={"ego": ego})
     vehicle = getattr(ego.shape, "vehicle", None)
     (found,) = check(rig, requirements, where, vehicle=vehicle, sensor_model=sensor_model).verdicts.values()
     return found
@@ -91,7 +91,7 @@ class Objective(Document):
         if isinstance(one, RegionRequirement):
             raise ValueError("requires: of a region give its number, band and region instead")
         if one is not None and len(one.bounds) > 1:
-            raise ValueError(f"requires: one number is needed; got {', '.join(each.words for each in one.bounds)}")
+            raise ValueError(f"requires: one number is needed; got {', '.join(each.text for each in one.bounds)}")
         if isinstance(at := getattr(one, "at", None), str):
             raise ValueError(f"requires.at: write the place out, as in within_m: 3; got the name {at!r}")
         return self
@@ -103,7 +103,11 @@ class Objective(Document):
         (one,) = check_requirements(
             rig, Requirements.model_validate({"requirements": [self.requirement]}), scenario, sensor_model
         )
-        share = (one.count - one.failed - one.unknown) / one.count if one.count else math.nan
+        share = (
+            (one.total_count - one.not_met_count - one.undecided_count) / one.total_count
+            if one.total_count
+            else math.nan
+        )
         quantity = Quantity(self.key, self.description, "share", lower_is_better=False)
         return Estimate.of([quantity], torch.tensor([share], dtype=torch.float64, device="cpu"))
 
@@ -123,7 +127,7 @@ class Objective(Document):
             ('80m', 'radius_m, 20m, ground')
         """
         if self.requirement is not None:
-            return f"{self.requirement.words}, {self.requirement.bounds[0].words}"
+            return f"{self.requirement.text}, {self.requirement.bounds[0].text}"
         plain = self.key == f"detection_{THRESHOLD_M:g}m"
         bands = (self.band,) if isinstance(self.band, str) else self.band or ()
         regions = (self.region,) if isinstance(self.region, str) else self.region or ()

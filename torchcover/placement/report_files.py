@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 from matplotlib.figure import Figure
 
 from torchcover import __version__
-from torchcover.evaluation import sensor_views
-from torchcover.evaluation.progress import held_back
-from torchcover.evaluation.result_page import rig_document, words_of
-from torchcover.evaluation.settings import FILES, wanted_files
+from torchcover.evaluation import build_sensor_views
+from torchcover.evaluation.progress import defer_signals
+from torchcover.evaluation.result_page import format_facts, format_rig_yaml
+from torchcover.evaluation.settings import FILES, parse_file_kinds
 from torchcover.files import AtomicOutput, csv_text
 from torchcover.geometry.arrays import Float64
 from torchcover.notebooks import data_frame, small_html
@@ -55,10 +55,10 @@ class PlacementReport:
         A folder is made if it does not exist; files of an earlier run that its `summary.json` lists are deleted.
         `files` is as in `Result.save`; "maps" are the pictures.
         """
-        wanted = wanted_files(files)
+        wanted = parse_file_kinds(files)
         summary = {"torchcover": __version__, "complete": True, "sentence": self.summary}
         with AtomicOutput(Path(folder)) as written:
-            with held_back():  # what was found is safe before anything ends this
+            with defer_signals():  # what was found is safe before anything ends this
                 if "numbers" in wanted:
                     self._add_numbers(written)
                 written.publish(summary)
@@ -92,11 +92,11 @@ class PlacementReport:
             tables=self.tables,
             pictures=pictures,
             rigs=[
-                PageRig(f"{what}: {rig.name}", sensor_views(rig.sensors), rig_document(rig.name, rig.sensors))
+                PageRig(f"{what}: {rig.name}", build_sensor_views(rig.sensors), format_rig_yaml(rig.name, rig.sensors))
                 for what, rig in self.page_rigs.items()
             ],
             ego_outline_m=self.ego_outline_m,
-            facts={title: words_of({name: record[name] for name in names}) for title, names in facts.items()},
+            facts={title: format_facts({name: record[name] for name in names}) for title, names in facts.items()},
         )
 
 

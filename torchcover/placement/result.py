@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from torchcover.evaluation.result import sensor_model_words
+from torchcover.evaluation.result import describe_sensor_models
 from torchcover.placement.free_sensor import FreeNumber
 from torchcover.placement.report_files import OF_THE_RUN, PlacementReport, ReportMixin
 from torchcover.placement.search import OPTIMIZER, RANDOM, START, Evaluation, PlacementSearch
@@ -127,7 +127,9 @@ class SearchResult(ReportMixin):
         yield self._compare_random()
         rigs = {"start": search.space.start, **{finalist.role: finalist.rig for finalist in self.finalists}}
         is_ideal = search.plan.sensor_model == "ideal"
-        yield from sensor_model_words({name: "ideal" if is_ideal else rig.sensor_model for name, rig in rigs.items()})
+        yield from describe_sensor_models(
+            {name: "ideal" if is_ideal else rig.sensor_model for name, rig in rigs.items()}
+        )
 
     def _find_bounds(self, evaluation: Evaluation) -> list[str]:
         """Return the numbers of a candidate that lie at an end of their range."""
@@ -170,7 +172,7 @@ class SearchResult(ReportMixin):
         search, settings = self.search, self.search.plan.collect_settings(self.search.space)
         ends = [finalist for finalist in self.finalists[1:] if finalist.role != RANDOM]
         best_of = zip(build_file_stems([finalist.role for finalist in ends]), ends, strict=True)
-        of_plan = {name: getattr(search.plan, name) for name in ("evaluations", "budget_s", "fresh_worlds")}
+        of_plan = {name: getattr(search.plan, name) for name in ("evaluations", "budget_s", "num_held_out_scenes")}
         rigs = {finalist.role: finalist.rig for finalist in self.finalists}
         return PlacementReport(
             title=f"{search.space.name}: where should the sensors go?",

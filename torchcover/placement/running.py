@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from torchcover.evaluation.checkpoint import differences
-from torchcover.evaluation.progress import Progress, held_back
+from torchcover.evaluation.checkpoint import describe_differences
+from torchcover.evaluation.progress import Progress, defer_signals
 from torchcover.files import BadFileError, check_memory, lock_folder, reads
 from torchcover.placement.plan import build_distributions, import_optuna, run_quietly
 from torchcover.placement.result import Finalist, SearchResult
@@ -73,7 +73,7 @@ def _run(search: PlacementSearch, out: Path | None, resume: bool, progress: bool
         search.evaluate(start)
     budget = _Budget(search, clock, began_s - earlier_s, frame_s[1] / frame_s[0])
     budget.check()
-    with Progress(budget.expected, search.space.name, done=len(search.evaluations), shown=progress) as bar:
+    with Progress(budget.expected, search.space.name, num_done=len(search.evaluations), is_shown=progress) as bar:
         _spend(search, budget, journal, bar.advance)
     finalists, test, untested = _validate(search, _pick_finalists(search))
     return SearchResult(search, finalists, test, untested, clock() - began_s + earlier_s)
@@ -218,7 +218,7 @@ class SearchJournal:
             return
         search = self._search
         self._study, evaluations, settings = load_study(self.path)
-        if other := differences(self._settings, settings):
+        if other := describe_differences(self._settings, settings):
             raise ValueError(
                 f"{self.path}: the journal of another search: {other}; resume with the settings of that search, or "
                 "choose another folder"
@@ -236,7 +236,7 @@ class SearchJournal:
 
     def write(self) -> None:
         """Append all evaluations that are not in the file yet."""
-        with held_back():
+        with defer_signals():
             if self._study is None:
                 self.path.unlink(missing_ok=True)
                 self._study = self._create()

@@ -271,8 +271,8 @@ class PlacementSearch:
                 continue
             margin = -verdict.margin / (abs(verdict.bound.value) or 1.0)
             worst = 1.0 if math.isnan(margin) else max(margin, 0.0)
-            failed_share = (verdict.failed + verdict.unknown) / max(verdict.count, 1)
-            shortfalls[f"{verdict.requirement}, {verdict.bound.words}"] = (worst + failed_share) / 2
+            failed_share = (verdict.not_met_count + verdict.undecided_count) / max(verdict.total_count, 1)
+            shortfalls[f"{verdict.requirement}, {verdict.bound.text}"] = (worst + failed_share) / 2
         return shortfalls
 
     def _propose(self, number: int) -> tuple[str, dict[str, VariableValue] | None]:

@@ -15,7 +15,7 @@ from torchcover.coverage.quantity import detection
 from torchcover.coverage.regions import Places
 from torchcover.estimation import Number
 from torchcover.evaluation.progress import Progress
-from torchcover.evaluation.result import sensor_model_words
+from torchcover.evaluation.result import describe_sensor_models
 from torchcover.frames import Frame
 from torchcover.geometry.arrays import Bools, Float64
 from torchcover.neighbors import nearest
@@ -133,7 +133,7 @@ class SelectionResult(ReportMixin):
             gap = f"at most {100 * self.best.gap:.2f} points below" if len(self.selections) == 1 else "not proven to be"
             kind = f"{gap} the best"
         found = f"{', '.join(self.get_sensor_names(self.best.selected))}: {values}, {kind}"
-        (model,) = sensor_model_words({self.rig.name: self.sensor_model})
+        (model,) = describe_sensor_models({self.rig.name: self.sensor_model})
         if self.test is None:
             return f"{found}; not tested in held-out worlds: {self.no_test_reason}. {model}"
         asked = self.improvements[: len(self.space.objectives)]
@@ -365,7 +365,7 @@ def _mount_candidates(
     seen: list[Bools] = []
     refused: dict[str, str] = {}
     most = space.constraints.max_self_hit_share
-    with Progress(len(space.sensors), space.name, shown=progress) as bar:
+    with Progress(len(space.sensors), space.name, is_shown=progress) as bar:
         for sensor in space.sensors:
             bar.advance(len(space.sensors), sensor.name)
             if space.is_too_close(sensor):

@@ -12,7 +12,7 @@ from torchcover.coverage.grid import PAPER_HEIGHTS
 from torchcover.coverage.quantity import detection
 from torchcover.estimation import Difference, Estimate, Quantity
 from torchcover.estimation.errors import ROUND_OFF
-from torchcover.evaluation.target_survey import free_space
+from torchcover.evaluation.target_survey import build_flat_ground
 from torchcover.placement.common_frames import CommonFrames
 from torchcover.placement.host_vehicle import NOT_WORSE
 from torchcover.placement.objective import THRESHOLD_M, Objective
@@ -255,7 +255,7 @@ def _of_targets(rig: Rig, start: Rig, searched: CommonFrames) -> dict[str, Diffe
     for target in TARGETS:
         ends = []
         for one in (rig, start):
-            empty = with_ego(free_space().model_copy(update={"ego": searched.scenarios[0].ego}), {one.name: one})
+            empty = with_ego(build_flat_ground().model_copy(update={"ego": searched.scenarios[0].ego}), {one.name: one})
             raster = Raster.around(empty.ego_box(), WITHIN_M, STEP_M)
             seen = survey(one.sensing("ideal"), empty, Target.load(target), raster)
             there = seen.free & (seen.distance_m <= WITHIN_M)

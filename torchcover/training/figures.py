@@ -49,7 +49,7 @@ def log_result(result: Any, logger: Any, *, step: int = 0, tag: str = "torchcove
     """Hand the rows and the picture of a result to a logger: `TAG/rows` and `TAG/picture`.
 
     Args:
-        result: Any with `to_dataframe()` and `plot()`: what `evaluate`, `survey_target`, `encounter` or a search gave.
+        result: Any with `to_dataframe()` and `plot()`: what `evaluate`, `map_target_visibility`, `encounter` or a search gave.
         logger: TensorBoard's `SummaryWriter`, a run of Weights & Biases, the module `mlflow` with an active run, or
             Lightning's logger of one of them.
         step: Where on the logger's axis.

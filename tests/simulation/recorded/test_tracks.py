@@ -23,7 +23,7 @@ from tests.simulation.recorded.drives import (
     write_nuscenes,
 )
 from torchcover import Rig, Scenario
-from torchcover.evaluation.task import spread_s
+from torchcover.evaluation.task import compute_frame_interval_s
 from torchcover.geometry import BoundingBox, invert, rigid
 from torchcover.simulation import PaperReference, SimulatedFrames, Simulator
 from torchcover.simulation.builtin import builtin_folder, builtin_names
@@ -111,7 +111,7 @@ def test_a_run_is_as_long_as_the_recording_and_then_the_same_again(written, kind
     assert simulator.distinct_steps == 41
     assert [simulator.place_in_time(index) for index in (0, 1, 13, 14, 41)] == [0, 3, 39, 1, 0]
     assert simulator.run_of(1000) == 0
-    assert round(spread_s(drive, None) / 0.1) == 25  # the golden share of its instants
+    assert round(compute_frame_interval_s(drive, None) / 0.1) == 25  # the golden share of its instants
 
 
 def test_an_instant_that_is_seen_again_is_counted_and_seen_as_before(written):
