@@ -68,7 +68,7 @@ class RecordingSettings(BaseModel):
         None, description="Seconds over which `reference: accumulated` adds up the scans of all sensors (2)."
     )
 
-    @field_validator("lag_s")
+    @field_validator("time_offset_s")
     @classmethod
     def _check_lag(cls, lag_s: float) -> float:
         # The two nearest poses are extrapolated before the first and after the last, which a second allows.
