@@ -26,6 +26,7 @@ from torchcover.evaluation.requirements import (
     Verdict,
     judge_requirements,
 )
+from torchcover.evaluation.result import describe_perfect_depth
 from torchcover.evaluation.settings import DEFAULT_SCENARIO, Settings
 from torchcover.evaluation.target_survey import build_flat_ground, load_rig_and_scenario
 from torchcover.evaluation.task import (
@@ -85,7 +86,7 @@ class CheckResult:
     def build_tables(self) -> list[PageTable]:
         """One for each rig, with what the requirements say about themselves."""
         asked, worlds = self.requirements, ", ".join(map(" ".join, self.settings["worlds"].items()))
-        notes = [*filter(None, [asked.description]), f"Worlds: {worlds}.", NOTE]
+        notes = [*filter(None, [asked.description]), f"Worlds: {worlds}.", *self.settings["notes"], NOTE]
         rows = {rig: [tuple(map(TextCell, _row(one))) for one in each] for rig, each in self.verdicts.items()}
         return [PageTable(f"{rig}: {asked.name}", HEADINGS, each, notes=notes) for rig, each in rows.items()]
 
@@ -201,6 +202,7 @@ def check(
     worlds = {"region": name or DEFAULT_SCENARIO, "target": name or free, "encounters": free}
     kinds = [kind for kind in worlds if any(hasattr(one, kind) for one in asked.requirements)]
     told = {"worlds": {kind: worlds[kind] for kind in kinds}, "steps": num_frames, **own}
+    told["notes"] = describe_perfect_depth({rig.name: rig.sensors for rig in called}) if "region" in kinds else []
     return CheckResult(asked, found, {k: str(v) if isinstance(v, Path) else v for k, v in told.items()})
 
 
