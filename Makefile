@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 
 demo: STEPS ?= 64
 demo: $(VENV)/.ready  ## evaluate a built-in rig in city traffic; writes to out/demo
-	$(BIN)/torchcover evaluate front_roof_128 --scenario urban --steps $(STEPS) --workers 2 --out out/demo
+	$(BIN)/torchcover evaluate front_roof_128 --scenario urban --num-frames $(STEPS) --num-workers 2 --out out/demo
 
 # Whoever forbids Python to keep what it has compiled has every process of the tests compile all of it again.
 unexport PYTHONDONTWRITEBYTECODE
@@ -42,9 +42,9 @@ measured: $(VENV)/.ready  ## the tables and pictures of docs/measured that are o
 
 paper: STEPS ?= 128
 paper: $(VENV)/.ready  ## the paper's experiments, with the assumed LiDARs and both fits (docs/measured/paper.md)
-	$(BIN)/python -m examples.paper --steps $(STEPS)
+	$(BIN)/python -m examples.paper --num-frames $(STEPS)
 	$(BIN)/python -m examples.paper tables --rigs 'paper_fit_b_{}' --reference-range 120 --origin -1.4 \
-	  --steps $(STEPS) --out out/paper_b
+	  --num-frames $(STEPS) --out out/paper_b
 
 clean:
 	rm -rf $(VENV) out build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -121,7 +121,7 @@ def simulated(scenario, cities, seed):
         both = radii.amin(dim=0)
         rows = [torch.ones_like(m2), radii[0], seen[0], radii[1], seen[1], both, both <= THRESHOLD_M]
         values = m2 * torch.stack([row.double() for row in (*rows, seen.sum(dim=0), seen.sum(dim=0) >= 2)])
-        city.append(frame.place_in_time)
+        city.append(frame.block_index)
         sums.append([_within(points, height, values, *place) for place in places])
     names = [f"{region.name} {height}" for region in task.query_plan.regions for height in task.query_plan.grid.heights]
     return {"city": np.array(city), "S": np.array(sums), "places": np.array(names)}
@@ -254,15 +254,15 @@ class Replay:
     def stops(self):
         """After how many steps."""
         watch = TargetErrorRule(TargetError(detection=TARGET), {"roof": self}, forward_regions())
-        while self.counts["steps"] < self.most:
-            self.counts["steps"] = watch.next_check_frame
+        while self.counts["frames"] < self.most:
+            self.counts["frames"] = watch.next_check_frame
             if watch.is_reached(watch.next_check_frame):
                 break
-        return self.counts["steps"]
+        return self.counts["frames"]
 
     def compute(self):
         """Itself, with what the steps so far say."""
-        cities, rest = divmod(min(self.counts["steps"], self.most), STEPS_OF_A_CITY)
+        cities, rest = divmod(min(self.counts["frames"], self.most), STEPS_OF_A_CITY)
         parts = self.pool.sums[self.order[: cities + (rest > 0)]].clone()
         lengths = torch.full((len(parts),), STEPS_OF_A_CITY)
         if rest:
@@ -347,7 +347,7 @@ def of_estimator(row):
 
 def of_draws(scenario):
     """How far draws of few points are from those of many points that the same places see."""
-    frames = frames_of(scenario, cities=1, every_s=60.0)
+    frames = frames_of(scenario, cities=1, frame_interval_s=60.0)
     sums = np.zeros((2, DRAWS, len(REGIONS) * len(HEIGHTS), 3))
     for index, cloud in enumerate(rig_clouds(frames)):
         for draw in range(DRAWS):
@@ -395,11 +395,13 @@ def shown(pair):
     return "{:.2f} / {:.1f}".format(*pair)
 
 
-def frames_of(scenario, *, cities=BUDGET_CITIES, seed=0, vehicle=None, every_s=EVERY_S):
+def frames_of(scenario, *, cities=BUDGET_CITIES, seed=0, vehicle=None, frame_interval_s=EVERY_S):
     """All instants of whole cities, or of a scenario that repeats itself; no rig is in them."""
-    few = SimulatedFrames(scenario, rigs={}, steps=1, seed=seed, every_s=every_s, vehicle=vehicle)
+    few = SimulatedFrames(scenario, rigs={}, steps=1, seed=seed, frame_interval_s=frame_interval_s, vehicle=vehicle)
     steps = few.simulator.distinct_steps or STEPS_OF_A_CITY * cities
-    return SimulatedFrames(scenario, rigs={}, steps=steps, seed=seed, every_s=every_s, vehicle=vehicle)
+    return SimulatedFrames(
+        scenario, rigs={}, steps=steps, seed=seed, frame_interval_s=frame_interval_s, vehicle=vehicle
+    )
 
 
 def rig_clouds(frames, rig=RIG):

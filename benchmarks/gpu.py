@@ -32,7 +32,7 @@ def main(arguments=()):
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--device", default="cuda:0", help="`cpu` tries the benchmark where there is no GPU")
     parser.add_argument("--points", type=int, default=10**6, help="of the largest search")
-    parser.add_argument("--steps", type=int, default=24, help="that are timed as a whole")
+    parser.add_argument("--num-frames", type=int, default=24, help="that are timed as a whole")
     parser.add_argument("--tests", action="store_true", help="run the tests that need a GPU before")
     options = parser.parse_args(arguments)
     device = torch.device(options.device)
@@ -69,7 +69,7 @@ def wall_ms(function, device):
 
 def frames_of(device=None, steps=1, rays=16_384):
     reference = reference_called(rays=rays)
-    return SimulatedFrames(SCENARIO, RIG, steps=steps, every_s=10.0, reference_sensor=reference, device=device)
+    return SimulatedFrames(SCENARIO, RIG, steps=steps, frame_interval_s=10.0, reference_sensor=reference, device=device)
 
 
 def searches(device, most):

@@ -50,24 +50,34 @@ cost: {small: 1}
 objectives: {near: {detection: 1.0, band: ground, region: 20m}}
 """
 WORLD = ("--scenario", "yard.yaml")
-SMALL = (*WORLD, "--rays", "64", "--set", "cell_m=8", "--steps", "2")
+SMALL = (*WORLD, "--num-rays", "64", "--set", "cell_m=8", "--num-frames", "2")
 RESULTS = {
     "evaluate": ("evaluate", "rig.yaml", *SMALL),
     "evaluate --resume": ("evaluate", "rig.yaml", *SMALL, "--resume"),
     "compare": ("compare", "rig.yaml", "other.yaml", *SMALL),
     "targets": ("targets", "rig.yaml", "--raster", "3,5,-1,1,1"),
-    "search": ("search", "space.yaml", "--evaluations", "2"),
-    "search, a choice": ("search", "choice.yaml", "--rays", "256", "--per-world", "1"),
-    "study": ("study", "rig.yaml", *WORLD, "--rays", "64", "--rays", "32", "--steps", "8"),
+    "search": ("search", "space.yaml", "--num-evaluations", "2"),
+    "search, a choice": ("search", "choice.yaml", "--num-rays", "256", "--frames-per-scene", "1"),
+    "study": ("study", "rig.yaml", *WORLD, "--num-rays", "64", "--num-rays", "32", "--num-frames", "8"),
 }
 RECORDINGS = {
-    "record": ("record", "rig.yaml", *WORLD, "--rays", "64", "--steps", "2"),
-    "record --format kitti": ("record", "rig.yaml", *WORLD, "--rays", "64", "--steps", "2", "--format", "kitti"),
+    "record": ("record", "rig.yaml", *WORLD, "--num-rays", "64", "--num-frames", "2"),
+    "record --format kitti": (
+        "record",
+        "rig.yaml",
+        *WORLD,
+        "--num-rays",
+        "64",
+        "--num-frames",
+        "2",
+        "--format",
+        "kitti",
+    ),
 }
 # How an earlier result differs.
-EARLIER = {"evaluate --resume": ("--steps", "1")}
+EARLIER = {"evaluate --resume": ("--num-frames", "1")}
 OTHERWISE = ("--seed", "1")
-REAL = ("evaluate", "front_roof_32", "--scenario", "urban", "--steps", "4", "--workers", "2")
+REAL = ("evaluate", "front_roof_32", "--scenario", "urban", "--num-frames", "4", "--num-workers", "2")
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 VERDICTS = ("the earlier", "the new", "incomplete", "mixed")
 DOCUMENTS = {

@@ -28,7 +28,7 @@ from torchcover.placement.selection_solver import CandidateCoverage, SelectionLi
 from torchcover.simulation import Rig
 
 NEAR = ("front_3m", "rear_3m", "left_3m", "right_3m")
-FRAMES = {"worlds": 4, "per_world": 1, "every_s": 5.0, "rays": 4096}
+FRAMES = {"worlds": 4, "per_world": 1, "frame_interval_s": 5.0, "rays": 4096}
 
 
 def roof_lidar(name, vehicle, model, **mounts):
@@ -196,7 +196,7 @@ def main(arguments=()):
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("part", choices=("optimizer", "pairs", "selections", "nothing"))
     parser.add_argument("--seeds", type=int, default=10)
-    parser.add_argument("--evaluations", type=int, default=25)
+    parser.add_argument("--num-evaluations", type=int, default=25)
     parser.add_argument("--processes", type=int, default=2)
     options = parser.parse_args(arguments)
     if options.part == "optimizer":

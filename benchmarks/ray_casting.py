@@ -167,7 +167,12 @@ def totals():
     rows = []
     for scenario, rig in (("urban", "front_roof_128"), ("urban", "kitti"), ("courtyard", "front_roof_128")):
         frames = SimulatedFrames(
-            scenario, rig, steps=10, seed=0, every_s=1.0, reference_sensor=PaperReference(rows=256, columns=256)
+            scenario,
+            rig,
+            steps=10,
+            seed=0,
+            frame_interval_s=1.0,
+            reference_sensor=PaperReference(rows=256, columns=256),
         )
         counts = Counter()
         for index in range(len(frames)):
@@ -178,7 +183,7 @@ def totals():
 
 COUNTS = {
     "moving bodies out of range": ("moving_bodies_out_of_range", "moving_bodies"),
-    "pairs of ray and body not cast": ("ray_body_pairs_left_out", "ray_body_pairs"),
+    "pairs of ray and body not cast": ("ray_body_pairs_omitted", "ray_body_pairs"),
     "rig's rays reused": ("sensor_rays_reused", "sensor_rays"),
     "self hits reused": ("sensor_self_hits_reused", "sensor_self_hits"),
 }

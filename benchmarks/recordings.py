@@ -252,7 +252,7 @@ def drive(options):
         rigs={sensor.name: Rig(name=sensor.name, sensors=[sensor]) for sensor in lidars},
         steps=1_000_000,
         seed=options.seed,
-        every_s=EVERY_S,
+        frame_interval_s=EVERY_S,
         reference_sensor=PaperReference(rows=4, columns=4),
         boxes=True,
     )

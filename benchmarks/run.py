@@ -16,7 +16,7 @@ from importlib import import_module
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-COMMAND = ["evaluate", "front_roof_128", "--scenario", "urban", "--steps", "64"]
+COMMAND = ["evaluate", "front_roof_128", "--scenario", "urban", "--num-frames", "64"]
 ROUNDS = 2
 START, WORLDS, RIG, REFERENCE, MOVING = "start", "worlds", "rig rays", "reference", "what moves"
 SEARCH, SUMS, BODIES, MAPS, FILES = "search", "sums", "bodies beside the vehicle", "maps", "other files"
@@ -172,7 +172,7 @@ def parts(folder):
     raycaster.EmbreeScene = Scene
     search_of = choice._search_of
     choice._search_of = lambda backend: timed(search_of(backend), BARE_SEARCH)
-    sys.argv = ["torchcover", *COMMAND, "--workers", "0", "--out", folder]
+    sys.argv = ["torchcover", *COMMAND, "--num-workers", "0", "--out", folder]
     try:
         command_line()
     except SystemExit as end:

@@ -42,7 +42,17 @@ RANKS = (4, 16, 64)
 MANY_RIGS, MANY_SCENARIOS, STEPS = 1000, 100, 64
 RIGS_TOGETHER = 8
 RESUMED_STEPS = 150
-COMMAND = ("evaluate", "front_roof_32", "--rays", "256", "--set", "cell_m=8", "--resume", "--steps", str(RESUMED_STEPS))
+COMMAND = (
+    "evaluate",
+    "front_roof_32",
+    "--num-rays",
+    "256",
+    "--set",
+    "cell_m=8",
+    "--resume",
+    "--num-frames",
+    str(RESUMED_STEPS),
+)
 OFTEN = """
 import sys
 from torchcover.evaluation import checkpoint
@@ -54,7 +64,7 @@ main()
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--worlds", type=int, default=2, help="worlds of six steps each, for every row")
+    parser.add_argument("--num-scenes", type=int, default=2, help="worlds of six steps each, for every row")
     parser.add_argument("--ranks", action="store_true", help="wall times of ranks and workers too: on a quiet machine")
     parser.add_argument("--kills", type=int, help="kill and resume runs this often instead")
     parser.add_argument("--seed", type=int, default=0, help="of the times of the kills")
@@ -94,7 +104,7 @@ def main():
 def frames_of(steps, *, rays=16_384, rigs=1, scenario=SCENARIO):
     rigs = {f"rig {number}": RIG for number in range(rigs)}
     reference = reference_called(rays=rays)
-    return SimulatedFrames(scenario, rigs=rigs, steps=steps, every_s=EVERY_S, reference_sensor=reference)
+    return SimulatedFrames(scenario, rigs=rigs, steps=steps, frame_interval_s=EVERY_S, reference_sensor=reference)
 
 
 def observers_of(frames, cell_m=0.25):
@@ -158,7 +168,7 @@ def by_ranks(steps):
         for city in range(size):
             (observer,) = observers_of(frames)
             for number in range(STEPS_A_WORLD):
-                observer.update(replace(seen[(city + number) % steps], place_in_time=city))
+                observer.update(replace(seen[(city + number) % steps], block_index=city))
             ranks.append(observer)
         sent_mb = len(serialize(ranks[-1])) / 1e6
         while apart < size:
@@ -194,7 +204,7 @@ def command_s(rigs, steps=1):
     """Processor seconds of a command from its start to its end."""
     verb = ("evaluate", RIG) if rigs == 1 else ("compare", *([RIG] * rigs))
     with tempfile.TemporaryDirectory() as out:
-        command = [sys.executable, "-m", "torchcover", *verb, "--scenario", SCENARIO, "--steps", str(steps)]
+        command = [sys.executable, "-m", "torchcover", *verb, "--scenario", SCENARIO, "--num-frames", str(steps)]
         return ended([*command, "--out", out])[1]
 
 
@@ -232,11 +242,11 @@ def extrapolated(cost):
 
 def by_processes(steps=48):
     """Wall and processor time by the number of workers and of ranks."""
-    arguments = ["torchcover", "evaluate", RIG, "--scenario", SCENARIO, "--steps", str(steps)]
+    arguments = ["torchcover", "evaluate", RIG, "--scenario", SCENARIO, "--num-frames", str(steps)]
     launch = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node"]
     runs = {
         "one": [sys.executable, "-m", *arguments],
-        "2 workers": [sys.executable, "-m", *arguments, "--workers", "2"],
+        "2 workers": [sys.executable, "-m", *arguments, "--num-workers", "2"],
         "2 ranks": [*launch, "2", "-m", *arguments],
     }
     for name, command in runs.items():

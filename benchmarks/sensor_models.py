@@ -309,7 +309,7 @@ def show_imperfections():
     """Print detection within 80 m, by area, of sensors with noise and drop-out."""
     torch.set_num_threads(1)
     rigs = {f"{name}: {words(keys)}": imperfect(name, keys) for name, each in IMPERFECT.items() for keys in each}
-    frames = SimulatedFrames("urban", rigs=rigs, steps=NUM_FRAMES, every_s=EVERY_S, seed=0)
+    frames = SimulatedFrames("urban", rigs=rigs, steps=NUM_FRAMES, frame_interval_s=EVERY_S, seed=0)
     metrics = {(rig, landed): CoverageMetric(GRID, square_metres=True) for rig in rigs for landed in (False, True)}
     for frame in frames:
         for (rig, landed), metric in metrics.items():

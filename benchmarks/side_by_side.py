@@ -24,32 +24,32 @@ import numpy as np
 ROOT = Path(__file__).parents[1]
 # `CHECKOUT` is the folder of the checkout that runs, `RECORDING` is made here, `DRIVE` by each checkout.
 RUNS = {
-    "courtyard": "evaluate front_roof_128 --scenario courtyard --steps 9",
-    "paper_pattern": "evaluate front_grille_128 --steps 2 --reference paper --rays 65536",
-    "urban": "evaluate front_roof_32 --scenario urban --steps 10 --thresholds-m 1",
-    "workers": "evaluate nuscenes_cameras --scenario highway --steps 2 --workers 2",
+    "courtyard": "evaluate front_roof_128 --scenario courtyard --num-frames 9",
+    "paper_pattern": "evaluate front_grille_128 --num-frames 2 --reference paper --num-rays 65536",
+    "urban": "evaluate front_roof_32 --scenario urban --num-frames 10 --thresholds-m 1",
+    "workers": "evaluate nuscenes_cameras --scenario highway --num-frames 2 --num-workers 2",
     "recording": "evaluate --frames RECORDING",
-    "comparison": "compare front_roof_32 front_grille_128 --scenario urban --steps 9",
-    "thresholds": "compare kitti hu2022_line --steps 8 --thresholds-m 0.4 --thresholds-m 0.1",
-    "redundancy": "evaluate edgar --scenario parking --steps 8 --redundancy --set aggregations=maximum",
-    "weather": "evaluate front_roof_32 --scenario urban --steps 8 --weather fog_50m",
-    "mixture": "evaluate front_roof_32 --scenario courtyard,highway --steps 4",
-    "radars": "evaluate nuscenes_radars --scenario highway --steps 2",
-    "sumo": "evaluate front_roof_32 --scenario sumo_random --steps 2",
-    "tracks_table": "evaluate front_roof_32 --scenario tracks_table --steps 2",
-    "tracks_commonroad": "evaluate front_roof_32 --scenario tracks_commonroad --steps 2",
-    "tracks_nuscenes": "evaluate front_roof_32 --scenario tracks_nuscenes --steps 2",
-    "tracks_argoverse2": "evaluate front_roof_32 --scenario tracks_argoverse2 --steps 2",
+    "comparison": "compare front_roof_32 front_grille_128 --scenario urban --num-frames 9",
+    "thresholds": "compare kitti hu2022_line --num-frames 8 --thresholds-m 0.4 --thresholds-m 0.1",
+    "redundancy": "evaluate edgar --scenario parking --num-frames 8 --redundancy --set aggregations=maximum",
+    "weather": "evaluate front_roof_32 --scenario urban --num-frames 8 --weather fog_50m",
+    "mixture": "evaluate front_roof_32 --scenario courtyard,highway --num-frames 4",
+    "radars": "evaluate nuscenes_radars --scenario highway --num-frames 2",
+    "sumo": "evaluate front_roof_32 --scenario sumo_random --num-frames 2",
+    "tracks_table": "evaluate front_roof_32 --scenario tracks_table --num-frames 2",
+    "tracks_commonroad": "evaluate front_roof_32 --scenario tracks_commonroad --num-frames 2",
+    "tracks_nuscenes": "evaluate front_roof_32 --scenario tracks_nuscenes --num-frames 2",
+    "tracks_argoverse2": "evaluate front_roof_32 --scenario tracks_argoverse2 --num-frames 2",
     "accumulated": "evaluate --frames DRIVE --reference accumulated --set recording.window_s=1",
     "targets": "targets edgar --target child --raster -6,6,-6,6,0.5",
-    "targets_in_traffic": "targets front_roof_32 --target pole --scenario urban --steps 2 --raster -6,6,-6,6,1",
-    "encounter_set": "encounter front_roof_128 front_corners_16 --phases 2",
-    "encounter_traffic": "encounter front_roof_32 --scenario urban --worlds 1",
-    "check": "check front_roof_128 --requirements reversing_r158_detection --steps 2",
-    "search": "search CHECKOUT/examples/placement/roof.yaml --evaluations 3 --worlds 2 --fresh-worlds 2",
-    "selection": "search CHECKOUT/examples/placement/robot_corners.yaml --rays 2048 --per-world 1",
-    "record": "record kitti --scenario urban --steps 2",
-    "record_kitti": "record kitti --scenario urban --steps 2 --format kitti",
+    "targets_in_traffic": "targets front_roof_32 --target pole --scenario urban --num-frames 2 --raster -6,6,-6,6,1",
+    "encounter_set": "encounter front_roof_128 front_corners_16 --num-start-offsets 2",
+    "encounter_traffic": "encounter front_roof_32 --scenario urban --num-scenes 1",
+    "check": "check front_roof_128 --requirements reversing_r158_detection --num-frames 2",
+    "search": "search CHECKOUT/examples/placement/roof.yaml --num-evaluations 3 --num-scenes 2 --num-held-out-scenes 2",
+    "selection": "search CHECKOUT/examples/placement/robot_corners.yaml --num-rays 2048 --frames-per-scene 1",
+    "record": "record kitti --scenario urban --num-frames 2",
+    "record_kitti": "record kitti --scenario urban --num-frames 2 --format kitti",
     "world": "world DRIVE",
     "rig": "rig --frames DRIVE",
 }
@@ -107,7 +107,7 @@ def main():
         write_recording(Path(folder, "recording"))
         checkouts = {"old": options.old.resolve(), "new": options.new.resolve()}
         for side, checkout in checkouts.items():  # each in its own format
-            drive = "record kitti --scenario urban --steps 40 --every-s 0.1"
+            drive = "record kitti --scenario urban --num-frames 40 --frame-interval-s 0.1"
             run(checkout, [*drive.split(), "--out", f"{folder}/{side}/drive"], folder)
         for name in options.runs:
             results = []

@@ -87,13 +87,13 @@ class Scene(NamedTuple):
     world: World | None = None
 
     @classmethod
-    def of_world(cls, world, every_s=1.0):
+    def of_world(cls, world, frame_interval_s=1.0):
         """What a scenario builds."""
         ego, *others = (_body(actor) for actor in (world.ego, *world.objects))
-        return cls(ego, others, np.arange(0.0, max(world.duration_s, 1e-6), every_s), world)
+        return cls(ego, others, np.arange(0.0, max(world.duration_s, 1e-6), frame_interval_s), world)
 
     @classmethod
-    def of_recording(cls, objects, every_s=1.0):
+    def of_recording(cls, objects, frame_interval_s=1.0):
         """What was recorded, while its own ego was there."""
         ego = objects.egos[0]
         drive = Trajectory.from_poses(ego.times_s, ego.world_T_ego @ ego.ego_T_vehicle)
@@ -102,7 +102,9 @@ class Scene(NamedTuple):
             Body(t.name, KINDS.get(t.vehicle_class or "", OTHER), np.array(t.size_m), t.trajectory)
             for t in objects.tracks
         ]
-        return cls(Body("ego", "car", size_m, drive), others, np.arange(ego.times_s[0], ego.times_s[-1], every_s))
+        return cls(
+            Body("ego", "car", size_m, drive), others, np.arange(ego.times_s[0], ego.times_s[-1], frame_interval_s)
+        )
 
 
 def _body(actor):
@@ -154,17 +156,20 @@ def met(scene, deeper_m=0.05, within_m=80.0):
     return found
 
 
-def accelerations(trajectory, every_s=0.2):
+def accelerations(trajectory, frame_interval_s=0.2):
     """(K,) times, (K,) speeds, (K,) accelerations ahead and (K,) to the left: of the middle, by three places each.
 
-    They are `every_s` apart: no closer than what made the trajectory knows, else its straight pieces have kinks.
+    They are `frame_interval_s` apart: no closer than what made the trajectory knows, else its straight pieces have kinks.
     """
-    times_s = np.arange(trajectory.times_s[0], trajectory.times_s[-1] + 1e-9, every_s)
+    times_s = np.arange(trajectory.times_s[0], trajectory.times_s[-1] + 1e-9, frame_interval_s)
     if len(times_s) < 3:
         return np.empty(0), np.empty(0), np.empty(0), np.empty(0)
     places_m = trajectory.positions_at(np.minimum(times_s, trajectory.times_s[-1]))[:, :2]
     ways_m = np.diff(places_m, axis=0)
-    velocity, change = (ways_m[:-1] + ways_m[1:]) / (2 * every_s), np.diff(ways_m, axis=0) / every_s**2
+    velocity, change = (
+        (ways_m[:-1] + ways_m[1:]) / (2 * frame_interval_s),
+        np.diff(ways_m, axis=0) / frame_interval_s**2,
+    )
     speed = np.linalg.norm(velocity, axis=1)
     heading = velocity / np.maximum(speed, 1e-9)[:, None]
     ahead = (change * heading).sum(axis=1)
@@ -172,14 +177,14 @@ def accelerations(trajectory, every_s=0.2):
     return times_s[1:-1], speed, ahead, left
 
 
-def motion(scene, every_s=0.2):
+def motion(scene, frame_interval_s=0.2):
     """Figures of a drive: pairs that overlap, who accelerates more than tyres allow, people, and the ego."""
     hard = {"car": 0, "lorry or bus": 0, "two wheels": 0}
     count, fastest_mps, runners, people = dict.fromkeys(hard, 0), 0.0, 0, 0
     for body in scene.others:
         if not body.ever_moves:
             continue
-        _, speed, ahead, left = accelerations(body.trajectory, every_s)
+        _, speed, ahead, left = accelerations(body.trajectory, frame_interval_s)
         if not len(speed):
             continue
         if body.kind == "person":
@@ -190,7 +195,7 @@ def motion(scene, every_s=0.2):
             count[body.kind] += 1
             hard[body.kind] += np.hypot(ahead, left).max() > HARD_MPS2
     pairs = met(scene)
-    _, _, ahead, left = accelerations(scene.ego.trajectory, every_s)
+    _, _, ahead, left = accelerations(scene.ego.trajectory, frame_interval_s)
     return {
         "pairs that overlap": len(pairs),
         "deepest (m)": max(pairs.values(), default=0.0),
@@ -335,8 +340,10 @@ def sight(points_m):
 def simulated(world, rig, runs=RUNS, seed=0):
     """`sight` of what a rig sees in several runs of a world."""
     rig, scenario = Rig.load(rig), Scenario.load(world)
-    every_s = None if scenario.repeats else EVERY_S
-    simulator = Simulator(scenario, {"rig": rig}, PaperReference(rows=2, columns=2), seed=seed, every_s=every_s)
+    frame_interval_s = None if scenario.repeats else EVERY_S
+    simulator = Simulator(
+        scenario, {"rig": rig}, PaperReference(rows=2, columns=2), seed=seed, frame_interval_s=frame_interval_s
+    )
     return [
         sight(np.concatenate([scan.points for scan in simulator.scans(index)["rig"]]))
         for index in range(1 if scenario.repeats else runs)
@@ -403,7 +410,7 @@ def main():
         "--sweeps", nargs="*", default=[], metavar="RIG=PATH", help="real sweeps of the LiDARs of a rig"
     )
     parser.add_argument("--logs", nargs="*", default=[], metavar="PATH", help="recorded objects with an ego")
-    parser.add_argument("--worlds", nargs="*", default=[*WORLDS, *TRACKS])
+    parser.add_argument("--num-scenes", nargs="*", default=[*WORLDS, *TRACKS])
     parser.add_argument("--runs", type=int, default=RUNS)
     options = parser.parse_args()
     pairs = [pair.partition("=")[::2] for pair in options.sweeps]

@@ -76,7 +76,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--calibrations", type=Path)
     parser.add_argument("--camera", default=GOPRO["id"])
-    parser.add_argument("--steps", type=int, default=48)
+    parser.add_argument("--num-frames", type=int, default=48)
     parser.add_argument("--out", type=Path, default=Path("out/camera_coverage"))
     options = parser.parse_args()
 

@@ -218,7 +218,7 @@ def main(arguments=None):
     parser.add_argument("--frames", type=int, default=100)
     parser.add_argument("--every", type=int, default=20, help="ticks from a frame to the next, at least 2")
     parser.add_argument("--tick-s", type=float, default=0.05)
-    parser.add_argument("--rays", type=int, default=1024, help="rows, and columns, of the reference LiDAR")
+    parser.add_argument("--num-rays", type=int, default=1024, help="rows, and columns, of the reference LiDAR")
     parser.add_argument("--vehicle", default="vehicle.tesla.model3")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--host", default="localhost")

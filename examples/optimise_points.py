@@ -55,7 +55,7 @@ def main():
     """Optimise; print the numbers, draw the picture."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--points", type=int, default=400, help="free points")
-    parser.add_argument("--steps", type=int, default=200, help="steps of gradient descent")
+    parser.add_argument("--num-frames", type=int, default=200, help="steps of gradient descent")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("out/optimise_points.png"))
     options = parser.parse_args()

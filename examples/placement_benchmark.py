@@ -89,7 +89,7 @@ def simulate(rigs, steps, seed, name):
         rigs=rigs,
         steps=steps,
         seed=seed,
-        every_s=SECONDS_APART,
+        frame_interval_s=SECONDS_APART,
         reference_sensor=PaperReference(rows=1, columns=1),  # which nobody looks at
         boxes=True,
     )
@@ -239,7 +239,7 @@ def main():
     parser.add_argument("--train", type=int, default=192, help="frames to train on")
     parser.add_argument("--validate", type=int, default=96, help="held-out frames, 4 from a drive")
     parser.add_argument("--epochs", type=int, default=10)
-    parser.add_argument("--steps", type=int, default=96, help="steps that the metrics are measured in")
+    parser.add_argument("--num-frames", type=int, default=96, help="steps that the metrics are measured in")
     parser.add_argument("--metrics", default="all", help="metrics of others, as in `k_cover,point_density`")
     parser.add_argument("--seed", type=int, default=0, help="of the placements and of the traffic")
     parser.add_argument("--reduced", action="store_true", help=f"no more than a trial: {REDUCED}")
@@ -260,7 +260,7 @@ def main():
         metrics=metric_names(options.metrics),
         steps=options.steps,
         seed=options.seed + 2,
-        every_s=WORLD_S,
+        frame_interval_s=WORLD_S,
         progress=True,
     )
     text = page(judged, scores, options)

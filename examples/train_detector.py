@@ -78,7 +78,7 @@ def simulate(steps, seed, reference, name, keep_clouds):
     """Frames with both rigs, 4 from each drive of a minute; `network RIG` is what the detector is fed."""
     rigs = {rig: rig for rig in RIGS}
     frames = SimulatedFrames(
-        "urban", rigs=rigs, steps=steps, seed=seed, every_s=15.0, reference_sensor=reference, boxes=True
+        "urban", rigs=rigs, steps=steps, seed=seed, frame_interval_s=15.0, reference_sensor=reference, boxes=True
     )
     kept = []
     for index in track(range(steps), description=f"simulating {name}"):
@@ -315,7 +315,7 @@ def compare_labels(options, console):
     }
     visible = list(VisibleTargets(frames["training"], LEAST_VISIBLE, rig=rig))
     cars = sum(len(frame.boxes) for frame in visible)
-    left_out = sum(frame.counts["targets_left_out"] for frame in visible)
+    left_out = sum(frame.counts["targets_omitted"] for frame in visible)
     console.print(f"{cars} cars are visible, {left_out} are left out: below {LEAST_VISIBLE:.0%}, or unknown")
     found = {"all cars": [], "visible cars": []}
     for seed in range(options.labels):

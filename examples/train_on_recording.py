@@ -43,7 +43,9 @@ def write_small_recording(folder):
     rig = Rig.model_validate({"name": "kitti", "sensors": [LIDAR]})
     unused = PaperReference(rows=1, columns=1)
     write_recording(
-        SimulatedFrames("urban", rig, steps=50, every_s=0.2, reference_sensor=unused, boxes=True), folder, "folder"
+        SimulatedFrames("urban", rig, steps=50, frame_interval_s=0.2, reference_sensor=unused, boxes=True),
+        folder,
+        "folder",
     )
 
 
@@ -66,7 +68,7 @@ def report(module, coverage, path, console):
     for line in coverage.summary(REGIONS):
         seen = line.numbers["detection_0.4m"].value
         console.print(
-            f"{line.region}: {seen:.1%} within 0.4 m, of the {line.known_share:.1%} of the cells that are known"
+            f"{line.region}: {seen:.1%} within 0.4 m, of the {line.observed_share:.1%} of the cells that are known"
         )
     recall = module.counts.over("visibility").recall
     table = Table("visibility", "cars", "recall", "95 % interval", title=f"recall at score {OPERATING_SCORE}")

@@ -23,6 +23,4 @@ def test_loops_over_frames_pass_the_weights_of_their_reference_points():
 def test_a_loop_that_forgets_them_is_found():
     told = "metric.update(sensor_of(frame), frame.reference, weights=frame.reference_weights)"
     assert forgetful(told) == []
-    assert (
-        len(forgetful(told + "\nmetric.update(\n    frame.cloud_of('a'), batch.reference, place_in_time=[0]\n)")) == 1
-    )
+    assert len(forgetful(told + "\nmetric.update(\n    frame.cloud_of('a'), batch.reference, block_index=[0]\n)")) == 1

@@ -124,7 +124,7 @@ def test_a_run_imports_what_it_needs_only(loaded):
 
 def test_the_command_line_never_loads_torchmetrics(tmp_path):
     """Which takes as much processor time as torch does."""
-    options = "--set metrics=object_coverage,k_cover --redundancy --steps 2 --rays 512 --set cell_m=1"
+    options = "--set metrics=object_coverage,k_cover --redundancy --num-frames 2 --num-rays 512 --set cell_m=1"
     run = f"evaluate front_roof_32 {options} --out {tmp_path}/result"
     loaded = set(python(ASKED, run).splitlines()[-1].split())
     assert "torchcover.coverage.sums" in loaded

@@ -60,7 +60,7 @@ def coverage():
 def row(coverage, rig, x, y=(-8.0, 8.0), height="ground"):
     rows = coverage[rig].summary([Region("here", x, y)])
     (found,) = [row for row in rows if row.height == height]
-    assert found.known_cells > 0
+    assert found.observed_cells > 0
     return Here(found.numbers["radius_m"].value, found.numbers["detection_0.4m"].value)
 
 

@@ -211,7 +211,7 @@ def test_pieces_merge_to_what_one_run_with_a_block_for_each_says(paper, square_m
             clouds = [4 * torch.rand((count, 3), generator=random) - torch.tensor([0, 2, 0.5]) for count in (3, 9)]
             weights = torch.rand(9, generator=random) + 0.1
             for metric in (whole, piece):
-                metric.update(*clouds, weights=weights, place_in_time=index)
+                metric.update(*clouds, weights=weights, block_index=index)
         folder = tmp_path / f"{first:05d}"
         paper.pieces.save_piece(folder, {("my/rig.yaml", "known"): piece.compute()})
         pieces.append(folder)
@@ -313,7 +313,7 @@ def test_figure_2_is_four_panels_of_one_frame_with_a_colour_bar_for_each_row(pap
 @pytest.fixture(scope="module")
 def options(tmp_path_factory):
     out = tmp_path_factory.mktemp("paper")
-    run = ["--steps", "2", "--piece", "1", "--every", "0.1", "--rays", "1024", "--scenario", "courtyard"]
+    run = ["--num-frames", "2", "--piece", "1", "--every", "0.1", "--num-rays", "1024", "--scenario", "courtyard"]
     return [*run, "--rigs", "paper_fit_b_{}", "--origin", "-1.4", "--reference-range", "120", "--out", str(out)]
 
 
@@ -391,11 +391,11 @@ def test_pieces_that_are_there_are_not_measured_again(paper, out, options, monke
     ("given", "message"),
     [
         (["moon"], "no experiment moon; there are tables, cameras"),
-        (["--steps", "10"], "steps: a multiple of the piece of 16 is needed; got 10"),
+        (["--num-frames", "10"], "steps: a multiple of the piece of 16 is needed; got 10"),
         (["--rigs", "mine"], "rigs: {} must stand where the LiDARs differ; got mine"),
         (["--rigs", "mine_{}"], "'mine_grille_128' is neither a .yaml file nor one of the built-in rigs"),
-        (["--rays", "-1"], "nonnegative"),
-        (["--every", "0.15"], "every_s: a positive multiple of the time step"),
+        (["--num-rays", "-1"], "nonnegative"),
+        (["--every", "0.15"], "frame_interval_s: a positive multiple of the time step"),
     ],
 )
 def test_a_mistake_is_said_in_a_line(paper, monkeypatch, capsys, given, message):

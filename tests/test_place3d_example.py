@@ -162,7 +162,7 @@ def test_the_notes_say_what_the_data_say(example, study):
 
 
 def test_a_small_run_is_a_page_with_boards_among_the_metrics(example, tmp_path, monkeypatch, capsys):
-    arguments = ["place3d", "--scenario", "courtyard", "--metrics", "point_density", "--steps", "1"]
+    arguments = ["place3d", "--scenario", "courtyard", "--metrics", "point_density", "--num-frames", "1"]
     monkeypatch.setattr(sys, "argv", [*arguments, "--out", str(tmp_path)])
     example.main.main()
     page = (tmp_path / "agreement.md").read_text()

@@ -59,8 +59,8 @@ def html_of(text: str) -> str:
     """Escape text for HTML and mark words between backticks as code.
 
     Example:
-        >>> html_of("more `--steps` <b>")
-        'more <code>--steps</code> &lt;b&gt;'
+        >>> html_of("more `--num-frames` <b>")
+        'more <code>--num-frames</code> &lt;b&gt;'
     """
     return CODE.sub(r"<code>\1</code>", escape(text))
 
@@ -69,8 +69,8 @@ def attribute_of(text: str) -> str:
     """Escape text for an HTML attribute or title, which holds no markup: backticks around words are dropped.
 
     Example:
-        >>> attribute_of('more `--steps` "now"')
-        'more --steps &quot;now&quot;'
+        >>> attribute_of('more `--num-frames` "now"')
+        'more --num-frames &quot;now&quot;'
     """
     return CODE.sub(r"\1", escape(text))
 

@@ -1,4 +1,4 @@
-"""The experiments of "Can You See Me Now?": `python -m examples.paper [experiment ...] --steps 256`.
+"""The experiments of "Can You See Me Now?": `python -m examples.paper [experiment ...] --num-frames 256`.
 
 tables       one LiDAR in the grille or on the roof, with 32, 64 or 128 rows: Tables 1 and 2, beside the paper's numbers
 cameras      three cameras: blind spots within 10 m and 40 m, and Figure 2
@@ -23,10 +23,10 @@ def main():
     parser.add_argument(
         "experiments", nargs="*", metavar="experiment", help=f"of {', '.join(EXPERIMENTS)}; all if none"
     )
-    parser.add_argument("--steps", type=int, default=256)
+    parser.add_argument("--num-frames", type=int, default=256)
     parser.add_argument("--piece", type=int, default=16, help="steps in a piece; from 8 pieces on there are errors")
     parser.add_argument("--every", type=float, default=2.0, help="seconds between steps")
-    parser.add_argument("--rays", type=int, default=1024 * 1024, help="of the paper's reference at each step")
+    parser.add_argument("--num-rays", type=int, default=1024 * 1024, help="of the paper's reference at each step")
     parser.add_argument("--reference-range", type=float, default=250.0, help="of both references, in metres")
     parser.add_argument("--ego-points", action="store_true", help="the paper's reference keeps its points on the ego")
     parser.add_argument(

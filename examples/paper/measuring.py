@@ -38,7 +38,7 @@ class Measurement:
             rigs=rigs,
             steps=options.steps,
             seed=options.seed,
-            every_s=options.every,
+            frame_interval_s=options.every,
             reference_sensor=rays,
         )
         self.surface_frames = self.frames.with_reference_sensor(SurfaceReference(areas, max_range_m=reach_m))
@@ -64,13 +64,13 @@ class Measurement:
             frame, surface = self.frames[index], self.surface_frames[index]
             reference = thinned(frame.reference, self.grid, POINTS_PER_CELL, seed=index)
             for rig, cloud in frame.clouds.items():
-                known[rig].update(cloud, reference, place_in_time=index)
+                known[rig].update(cloud, reference, block_index=index)
                 area[rig].update(
                     cloud,
                     surface.reference,
                     weights=surface.reference_weights,
                     height=surface.reference_heights_m,
-                    place_in_time=index,
+                    block_index=index,
                 )
             for observer in also:
                 observer.update(frame)

@@ -58,7 +58,7 @@ def merged(pieces):
     Args:
         pieces: Coverages of the same grid over different steps, without blocks of their own.
     """
-    first, steps = pieces[0], torch.tensor([piece.counts["steps"] for piece in pieces])
+    first, steps = pieces[0], torch.tensor([piece.counts["frames"] for piece in pieces])
     every = [piece.known for piece in pieces]
     counts = [torch.stack([known.at, known.points, known.probed_steps], dim=1).double() for known in every]
     means = [torch.stack([piece.listed[one.key].values for one in first.quantities]) for piece in pieces]

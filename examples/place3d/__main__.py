@@ -1,4 +1,4 @@
-"""Do metrics rank the placements of Place3D as its detectors do: `python -m examples.place3d --steps 200 --every-s 10`.
+"""Do metrics rank the placements of Place3D as its detectors do: `python -m examples.place3d --num-frames 200 --frame-interval-s 10`.
 
 Its rigs `place3d2024_*` in the same frames, by torchcover's numbers, by those of others, and by the LiDAR occupancy
 boards (LOB) of Kim and Park 2020, which hang on the rig alone: a page in Markdown.
@@ -32,10 +32,10 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenario", default="urban", help="name or YAML file")
     parser.add_argument("--metrics", default="all", help="metrics of others, as in `k_cover,point_density`")
-    parser.add_argument("--steps", type=int, default=64)
-    parser.add_argument("--every-s", type=float, help="seconds between steps")
+    parser.add_argument("--num-frames", type=int, default=64)
+    parser.add_argument("--frame-interval-s", type=float, help="seconds between steps")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--workers", type=int, default=0)
+    parser.add_argument("--num-workers", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("out/place3d"))
     options = parser.parse_args()
     study = agree(
@@ -43,7 +43,7 @@ def main():
         metrics=metric_names(options.metrics),
         steps=options.steps,
         seed=options.seed,
-        every_s=options.every_s,
+        frame_interval_s=options.frame_interval_s,
         workers=options.workers,
         progress=True,
     )

@@ -142,15 +142,15 @@ def options() -> Iterator[Case]:
     refused = {
         "--set": (
             *(f"cell_m={value}" for value in ("20", "1e-310", "0.001", "nan", "inf", "-1", "1e300", "x")),
-            *(f"every_s={value}" for value in ("1e308", "nan", "inf", "0", "1e-300", "-1")),
+            *(f"frame_interval_s={value}" for value in ("1e308", "nan", "inf", "0", "1e-300", "-1")),
             *("estimate=[/x]", "cells_m=1", "cell_m", "=", "recording.units=km", "recording=1", "seed=true"),
         ),
         "--thresholds-m": ("inf", "nan", "-1", "1e9", "x"),
-        "--rays": ("99999999999", "9" * 30, "0", "-1", "1e9"),
-        "--steps": ("9" * 20, "0", "1.5"),
+        "--num-rays": ("99999999999", "9" * 30, "0", "-1", "1e9"),
+        "--num-frames": ("9" * 20, "0", "1.5"),
         "--seed": ("-1", "x"),
         "--device": ("meta", "abacus", "cuda:99", ""),
-        "--workers": ("-1", "1000000", "9" * 20),
+        "--num-workers": ("-1", "1000000", "9" * 20),
         "--target-error": ("0%", "nan%", "infm", "1e400%", "5", ""),
         "--reference": ("", "[/x]"),
         "--scenario": ("", "[/x]", ".", "/", "none.yaml", "x" * 5000),
@@ -173,7 +173,7 @@ def _case(
 ) -> Case:
     rig = "camera.yaml" if "camera" in changed else "rig.yaml"
     scenario = ("--scenario", "town.yaml") if "town" in changed else ()
-    return Case(name, _evaluate(rig, *scenario, "--steps", str(steps)), _files(changed), prepare)
+    return Case(name, _evaluate(rig, *scenario, "--num-frames", str(steps)), _files(changed), prepare)
 
 
 def _files(changed: dict[str, str]) -> dict[str, str]:
@@ -181,7 +181,7 @@ def _files(changed: dict[str, str]) -> dict[str, str]:
 
 
 def _evaluate(rig: str, *more: str) -> tuple[str, ...]:
-    quick = ("--scenario", "yard.yaml", "--steps", "1", "--set", "cell_m=4", "--rays", "64", "--out", "out")
+    quick = ("--scenario", "yard.yaml", "--num-frames", "1", "--set", "cell_m=4", "--num-rays", "64", "--out", "out")
     return ("evaluate", rig, *quick, *more)
 
 

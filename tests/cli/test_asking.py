@@ -10,7 +10,7 @@ import pytest
 import torchcover as package
 from torchcover import Coverage, Region, RegionsOfInterest
 
-SMALL = ["--steps", 9, "--set", "cell_m=0.5", "--thresholds-m", 2, "--rays", 1024]
+SMALL = ["--num-frames", 9, "--set", "cell_m=0.5", "--thresholds-m", 2, "--num-rays", 1024]
 REGIONS = "{behind: {x_m: [-6, -2], y_m: [-2, 2]}, ahead: {x_m: [2, 6], y_m: [-2, 2]}}"
 HEIGHTS = "{dog: [-0.1, 0.5], child: [-0.1, 1.1]}"
 GRID = "{x_m: [-10, 10], y_m: [-10, 10]}"
@@ -19,7 +19,7 @@ GRID = "{x_m: [-10, 10], y_m: [-10, 10]}"
 def write_regions(folder, regions=REGIONS, heights=HEIGHTS, grid=GRID):
     path = folder / "ask.yaml"
     path.write_text(f"regions: {regions}\nheights: {heights}\ngrid: {grid}\n")
-    return ["--ask", path]
+    return ["--regions", path]
 
 
 @pytest.fixture
@@ -44,7 +44,7 @@ def test_what_is_asked_on_the_command_line_in_a_file_and_in_python_is_the_same(e
     assert [(row["region"], row["height"]) for row in rows] == [
         (region, height) for region in ("behind", "ahead") for height in ("dog", "child")
     ]
-    assert float(rows[0]["known_share"]) == 1.0  # the reference is aimed at it
+    assert float(rows[0]["observed_share"]) == 1.0  # the reference is aimed at it
     asked = write_regions(worlds, regions="{other: {x_m: [2, 6], y_m: [-2, 2]}}")
     options = ("--region", "behind:-6,-2,-2,2", "--region", "ahead:2,6,-2,2")
     assert evaluate(*asked, *options, out="file")[0] == 0
@@ -113,7 +113,7 @@ def test_a_run_goes_on_with_the_same_question_only(evaluate, worlds):
         (["--region", "a:nan,1,0,1"], "regions.a.x_m.0: Input should be"),
         (["--region", "a:0,1,0,1", "--region", "a:0,2,0,1"], "the name 'a' is given already"),
         (["--region", "a:0,0.1,0,1"], "region 'a' holds no cell centre; use smaller cells than 0.5 m"),
-        (["--ask", "nowhere.yaml"], "nowhere.yaml"),
+        (["--regions", "nowhere.yaml"], "nowhere.yaml"),
     ],
 )
 def test_what_asks_nothing_ends_in_one_line(evaluate, options, message):
@@ -149,7 +149,7 @@ def test_a_region_within_the_vehicle_is_unknown_and_a_line_says_why(evaluate, wo
     code, _, said = evaluate("--region", "hold:-1,1,-0.5,0.5")
     assert code == 0
     assert "warning: region 'hold' lies within the vehicle (x = -2 to 2 m, y = -1 to 1 m)" in said
-    assert [(row["detection_2m"], row["known_cells"]) for row in rows_of(worlds / "out")] == [("", "0")] * 2
+    assert [(row["detection_2m"], row["observed_cells"]) for row in rows_of(worlds / "out")] == [("", "0")] * 2
 
 
 def test_where_nothing_was_seen_no_sensor_is_called_dispensable(evaluate, worlds):
@@ -160,7 +160,7 @@ def test_where_nothing_was_seen_no_sensor_is_called_dispensable(evaluate, worlds
 
 
 def test_where_nothing_is_detected_no_sensor_is_called_dispensable_either(torchcover, worlds):
-    scene = ("--scenario", worlds / "yard.yaml", "--out", worlds / "out", "--steps", 2, "--rays", 1024)
+    scene = ("--scenario", worlds / "yard.yaml", "--out", worlds / "out", "--num-frames", 2, "--num-rays", 1024)
     asked = ("--set", "cell_m=0.5", "--region", "ahead:2,6,-2,2", "--thresholds-m", 2e-3, "--redundancy")
     code, printed, _ = torchcover("evaluate", worlds / "both.yaml", *scene, *asked)
     assert (code, "Nothing of what was asked about is detected" in " ".join(printed.split())) == (0, True)
@@ -171,7 +171,7 @@ def test_bands_over_the_ground_and_over_z_agree_on_level_ground(torchcover, eval
     rows = {}
     spans = {"ground": ("-0.5 to 0.5 m above ground",), "vehicle": ("z -0.5 to 0.5 m", "--set", "band_frame=vehicle")}
     for band_frame, (words, *options) in spans.items():
-        code, printed, _ = evaluate(*options, "--rays", 16_384, out=band_frame)
+        code, printed, _ = evaluate(*options, "--num-rays", 16_384, out=band_frame)
         assert code == 0
         assert f"cells of 0.5 m; ground {words}" in " ".join(printed.split())
         assert json.loads((worlds / band_frame / "summary.json").read_text())["band_frame"] == band_frame

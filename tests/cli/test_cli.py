@@ -47,13 +47,13 @@ def test_a_recording_is_evaluated_and_the_files_agree(drawn_maps, torchcover, re
     row = coverage.radius[0, 160, 160:200]
     np.testing.assert_allclose(row, 0.25 * np.arange(40), atol=1e-6)
     assert coverage.thresholds == (0.4, 1.0)
-    assert coverage.counts["steps"] == 4
+    assert coverage.counts["frames"] == 4
     summary = json.loads((out / "summary.json").read_text())
     assert summary["complete"] is True
     assert summary["counts"]["steps"] == 4
     first = coverage.summary()[0]
     assert summary["rows"][0]["radius_m"] == pytest.approx(first.numbers["radius_m"].value)
-    assert summary["rows"][0]["known_cells"] == 40
+    assert summary["rows"][0]["observed_cells"] == 40
     with (out / "summary.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 6
@@ -68,19 +68,19 @@ def test_a_recording_is_evaluated_and_the_files_agree(drawn_maps, torchcover, re
 
 
 def test_steps_limits_a_recording(torchcover, recording, tmp_path):
-    assert torchcover("evaluate", "--frames", recording, "--out", tmp_path / "o", "--steps", 3)[0] == 0
-    assert Coverage.load(tmp_path / "o" / "coverage.npz").counts["steps"] == 3
+    assert torchcover("evaluate", "--frames", recording, "--out", tmp_path / "o", "--num-frames", 3)[0] == 0
+    assert Coverage.load(tmp_path / "o" / "coverage.npz").counts["frames"] == 3
 
 
 @pytest.mark.parametrize("workers", [0, 2])
 def test_a_bad_frame_stops_the_run_by_name_and_what_was_done_is_written(torchcover, recording, tmp_path, workers):
     (recording / "reference" / "f10.npy").write_bytes(b"rubbish")
     out = tmp_path / "out"
-    code, _, error = torchcover("evaluate", "--frames", recording, "--out", out, "--workers", workers)
+    code, _, error = torchcover("evaluate", "--frames", recording, "--out", out, "--num-workers", workers)
     assert code == 2
     assert "torchcover: f10 (frame 2): " in error
     assert "Traceback" not in error
-    assert Coverage.load(out / "coverage.npz").counts["steps"] == 2
+    assert Coverage.load(out / "coverage.npz").counts["frames"] == 2
     assert json.loads((out / "summary.json").read_text())["complete"] is False
 
 
@@ -88,7 +88,7 @@ def test_a_bad_frame_stops_the_run_by_name_and_what_was_done_is_written(torchcov
 def test_bad_frames_can_be_skipped_and_are_counted(torchcover, recording, tmp_path, workers):
     (recording / "reference" / "f10.npy").write_bytes(b"rubbish")
     out = tmp_path / "out"
-    code, printed, _ = torchcover("evaluate", "--frames", recording, "--out", out, *SKIPPING, "--workers", workers)
+    code, printed, _ = torchcover("evaluate", "--frames", recording, "--out", out, *SKIPPING, "--num-workers", workers)
     assert code == 0
     assert "skipped: f10" in printed
     summary = json.loads((out / "summary.json").read_text())
@@ -113,13 +113,13 @@ def test_a_simulation_is_evaluated_and_repeats_itself(torchcover, tmp_path):
     )
     for out in ("a", "b"):
         arguments = [
-            "--steps",
+            "--num-frames",
             1,
             "--set",
             "cell_m=1",
             "--reference",
             "paper",
-            "--rays",
+            "--num-rays",
             16384,
             "--out",
             tmp_path / out,
@@ -129,21 +129,26 @@ def test_a_simulation_is_evaluated_and_repeats_itself(torchcover, tmp_path):
     np.testing.assert_array_equal(a.radius, b.radius)
     assert a.grid.cell == 1.0
     assert a.max_radius == pytest.approx(a.grid.diagonal_m)
-    assert 0 < a.summary()[0].known_share <= 1
+    assert 0 < a.summary()[0].observed_share <= 1
     summary = json.loads((tmp_path / "a" / "summary.json").read_text())
     assert summary["frame_counts"]["reference_rays"] == 128 * 128
     # Every ray that the frame counts as ended by the ego is named beside its sensor.
     self_hits = summary["frame_counts"]["sensor_self_hits"]
     notes = [f"Rays that end on the own vehicle: top {self_hits} of 720 ({self_hits / 720:.1%})."]
     assert self_hits > 50
-    assert summary["reference"] == {"sensor": "paper", "rays_per_step": 128 * 128, "every_s": 0.1, "notes": notes}
+    assert summary["reference"] == {
+        "sensor": "paper",
+        "rays_per_frame": 128 * 128,
+        "frame_interval_s": 0.1,
+        "notes": notes,
+    }
 
 
 def test_the_weights_of_the_surface_reference_reach_the_metric(torchcover, worlds, monkeypatch):
     given = []
 
     def noted(self, sensor, reference, **more):
-        given.append((len(reference), more["weights"], more["place_in_time"]))
+        given.append((len(reference), more["weights"], more["block_index"]))
         return sums_of(self, sensor, reference, **more)
 
     sums_of = CoverageSums.sums_of
@@ -151,11 +156,11 @@ def test_the_weights_of_the_surface_reference_reach_the_metric(torchcover, world
     options = [
         "--scenario",
         worlds / "yard.yaml",
-        "--steps",
+        "--num-frames",
         2,
         "--set",
         "cell_m=4",
-        "--rays",
+        "--num-rays",
         4096,
         "--out",
         worlds / "out",
@@ -174,11 +179,11 @@ def test_every_reference_sensor_has_its_measure_and_is_named_in_the_help(torchco
     options = [
         "--scenario",
         worlds / "yard.yaml",
-        "--steps",
+        "--num-frames",
         1,
         "--set",
         "cell_m=4",
-        "--rays",
+        "--num-rays",
         1024,
         "--out",
         worlds / "out",
@@ -192,7 +197,7 @@ def test_every_reference_sensor_has_its_measure_and_is_named_in_the_help(torchco
 
 
 def test_the_mean_over_known_cells_is_the_same_whether_it_heads_the_result_or_not(torchcover, worlds):
-    options = ["--scenario", worlds / "yard.yaml", "--steps", 2, "--set", "cell_m=4", "--rays", 1024, "--out"]
+    options = ["--scenario", worlds / "yard.yaml", "--num-frames", 2, "--set", "cell_m=4", "--num-rays", 1024, "--out"]
     rows = {}
     for measure in ("area", "known"):
         assert (
@@ -203,8 +208,8 @@ def test_the_mean_over_known_cells_is_the_same_whether_it_heads_the_result_or_no
         assert summary["measure"] == measure
         rows[measure] = summary["rows"]
     for area, known in zip(rows["area"], rows["known"], strict=True):
-        assert area["known_radius_m"] == known["radius_m"]
-        assert area["known_share"] == known["known_share"]
+        assert area["cells_radius_m"] == known["radius_m"]
+        assert area["observed_share"] == known["observed_share"]
     assert any(area["radius_m"] != known["radius_m"] for area, known in zip(rows["area"], rows["known"], strict=True))
 
 
@@ -214,7 +219,7 @@ def test_frames_that_are_skipped_leave_their_place_in_time(torchcover, recording
     monkeypatch.setattr(
         CoverageSums,
         "sums_of",
-        lambda self, *clouds, **more: given.append(more["place_in_time"]) or sums_of(self, *clouds, **more),
+        lambda self, *clouds, **more: given.append(more["block_index"]) or sums_of(self, *clouds, **more),
     )
     assert torchcover("evaluate", "--frames", recording, *SKIPPING, "--out", tmp_path / "out")[0] == 0
     assert given == [0, 2, 3]
@@ -226,7 +231,7 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
     assert "In brackets" not in printed
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert (summary["reference"]["sensor"], summary["target_error"]) == ("recorded", None)
-    assert (summary["blocks"], summary["steps_per_block"]) == (4, 1)
+    assert (summary["blocks"], summary["frames_per_block"]) == (4, 1)
     assert summary["rows"][0]["radius_m_error"] is None
 
 
@@ -247,14 +252,20 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
         ),
         (["evaluate", "front_roof_128", "--set", "cell_m=1e-310"], "x: inf cells of 1e-310 m, over 100,000,000"),
         (["evaluate", "front_roof_128", "--thresholds-m", "inf"], "thresholds"),
-        (["evaluate", "front_roof_128", "--rays", "99999999999"], "rays a step (230,400 of the rig's sensors, 99,999"),
-        (["evaluate", "front_roof_128", "--steps", "9" * 20], "steps: a number from 1 to 1,000,000,000 is needed"),
-        (["evaluate", "front_roof_128", "--workers", "1000000"], "1,000,000 workers: 3e+05 GB of memory are needed"),
+        (
+            ["evaluate", "front_roof_128", "--num-rays", "99999999999"],
+            "rays a step (230,400 of the rig's sensors, 99,999",
+        ),
+        (["evaluate", "front_roof_128", "--num-frames", "9" * 20], "steps: a number from 1 to 1,000,000,000 is needed"),
+        (
+            ["evaluate", "front_roof_128", "--num-workers", "1000000"],
+            "1,000,000 workers: 3e+05 GB of memory are needed",
+        ),
         (["evaluate", "front_roof_128", "--device", "meta"], "device meta: cannot be used here"),
         (["evaluate", "front_roof_128", "--set", "cell_m=-1"], "cell: a positive length"),
         (["evaluate", "front_roof_128", "--thresholds-m", "-1"], "thresholds: finite distances >= 0"),
-        (["evaluate", "front_roof_128", "--steps", "0"], "--steps"),
-        (["evaluate", "front_roof_128", "--steps", "many"], "--steps"),
+        (["evaluate", "front_roof_128", "--num-frames", "0"], "--num-frames"),
+        (["evaluate", "front_roof_128", "--num-frames", "many"], "--num-frames"),
         (["evaluate", "front_roof_128", "--seed", "-1"], "--seed"),
         (["evaluate", "front_roof_128", "--device", "abacus"], "device abacus: cannot be used here"),
         (["evaluate", "front_roof_128", "--device", "cuda:99"], "device cuda:99: cannot be used here"),
@@ -272,11 +283,14 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
             "--set estimate: 'area' or 'known' is needed; got 'best'",
         ),
         (
-            ["evaluate", "front_roof_128", "--reference", "paper", "--set", "estimate=area"],
+            ["evaluate", "front_roof_128", "--reference", "paper", "--set", "average=area"],
             "estimate area: it needs the",
         ),
-        (["evaluate", "front_roof_128", "--rays", "0"], "--rays"),
-        (["evaluate", "--frames", "recording", "--rays", "9"], "reference, rays and every_s are for simulations"),
+        (["evaluate", "front_roof_128", "--num-rays", "0"], "--num-rays"),
+        (
+            ["evaluate", "--frames", "recording", "--num-rays", "9"],
+            "reference, rays and frame_interval_s are for simulations",
+        ),
         (["evaluate", "--frames", "recording", "--reference", "paper"], "for a recording `recorded` or `accumulated`"),
         (["evaluate", "--frames", "recording", "--reference", "accumulated"], "does not say when its scans were made"),
         (["evaluate", "--frames", "recording", "--sensors", "roof"], "which has sensor, reference; got roof"),
@@ -418,4 +432,4 @@ def test_out_of_memory_on_a_gpu_ends_in_one_line_and_keeps_what_was_measured(
     assert code == 2
     assert complaints.splitlines()[-1].startswith("torchcover: there is not enough memory (")
     assert told in complaints.splitlines()[-1]
-    assert Coverage.load(tmp_path / "out" / "coverage.npz").counts["steps"] == 2
+    assert Coverage.load(tmp_path / "out" / "coverage.npz").counts["frames"] == 2

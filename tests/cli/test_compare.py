@@ -23,7 +23,7 @@ def compare(torchcover, worlds, *rigs, steps=1, out="out", options=()):
     arguments = [
         "--scenario",
         worlds / "yard.yaml",
-        "--steps",
+        "--num-frames",
         steps,
         "--set",
         "cell_m=4",
@@ -32,7 +32,7 @@ def compare(torchcover, worlds, *rigs, steps=1, out="out", options=()):
         "--out",
         folder,
     ]
-    arguments += ["--rays", 4096, "--set", "probe=none", *options]
+    arguments += ["--num-rays", 4096, "--set", "probe=none", *options]
     return *torchcover("compare", *paths, *arguments), folder
 
 
@@ -57,7 +57,7 @@ def test_files_agree_with_each_other_and_with_evaluate(torchcover, worlds):
     options = [
         "--scenario",
         worlds / "yard.yaml",
-        "--steps",
+        "--num-frames",
         2,
         "--set",
         "cell_m=4",
@@ -66,7 +66,7 @@ def test_files_agree_with_each_other_and_with_evaluate(torchcover, worlds):
         "--out",
         alone,
     ]
-    assert torchcover("evaluate", worlds / "both.yaml", *options, "--rays", 4096, *QUICK)[0] == 0
+    assert torchcover("evaluate", worlds / "both.yaml", *options, "--num-rays", 4096, *QUICK)[0] == 0
     np.testing.assert_array_equal(Coverage.load(alone / "coverage.npz").radius, coverages["both"].radius)
 
 
@@ -77,7 +77,7 @@ def test_fog_never_makes_a_rig_better(torchcover, worlds):
     rows = json.loads((out / "summary.json").read_text())["rows"]
     in_fog = {(row["region"], row["height"]): row for row in rows if row["rig"] == "both, fog_50m"}
     pairs = [(row, in_fog[row["region"], row["height"]]) for row in rows if row["rig"] == "both, clear"]
-    known = [(clear, fog) for clear, fog in pairs if clear["known_cells"]]
+    known = [(clear, fog) for clear, fog in pairs if clear["observed_cells"]]
     assert known
     assert all(fog["radius_m"] >= clear["radius_m"] for clear, fog in known)
     lost = [clear["detection_2m"] - fog["detection_2m"] for clear, fog in known]
@@ -88,7 +88,7 @@ def test_fog_never_makes_a_rig_better(torchcover, worlds):
 def test_one_more_sensor_never_makes_it_worse(torchcover, worlds):
     *_, out = compare(torchcover, worlds, "low", "both")
     rows = [row for row in json.loads((out / "summary.json").read_text())["rows"] if row["rig"] == "both"]
-    known = [row for row in rows if row["known_cells"]]
+    known = [row for row in rows if row["observed_cells"]]
     assert known
     for row in known:
         assert row["radius_m_difference"] <= 0 <= row["detection_2m_difference"]
@@ -107,7 +107,7 @@ def test_rigs_with_one_name_get_columns_and_files_of_their_own(torchcover, world
     summary = json.loads((out / "summary.json").read_text())
     assert summary["rigs"]["low_2"] == str(worlds / "other" / "low.yaml")
     for row in summary["rows"]:
-        if row["rig"] == "low_3" and row["known_cells"]:
+        if row["rig"] == "low_3" and row["observed_cells"]:
             assert row["radius_m_difference"] == 0.0
 
 
@@ -127,7 +127,7 @@ def test_maps_are_side_by_side_and_as_differences(torchcover, worlds):
 def test_differences_come_with_their_errors(torchcover, worlds):
     *_, out = compare(torchcover, worlds, "low", "both", steps=9)
     summary = json.loads((out / "summary.json").read_text())
-    assert (summary["blocks"], summary["steps_per_block"]) == (9, 1)
+    assert (summary["blocks"], summary["frames_per_block"]) == (9, 1)
     known = [row for row in summary["rows"] if row["rig"] == "both" and row["height"] == "ground"][:3]
     assert len(known) == 3
     for row in known:
@@ -143,7 +143,7 @@ def test_the_reference_sensor_is_the_one_that_was_asked_for_and_is_named(torchco
     summary = json.loads((out / "summary.json").read_text())
     (ground,) = summary["reference"].pop("notes")
     assert ground.startswith("Ground: level faces under the ego")
-    assert summary["reference"] == {"sensor": "paper", "rays_per_step": 64 * 64, "every_s": 0.1}
+    assert summary["reference"] == {"sensor": "paper", "rays_per_frame": 64 * 64, "frame_interval_s": 0.1}
     assert summary["frame_counts"]["reference_rays"] == 2 * 64 * 64
     assert "Reference sensor: paper, 4,096 rays a step; a step every 0.1 s." in " ".join(printed.split())
 
@@ -179,7 +179,7 @@ def test_the_rigs_of_a_recording_are_compared(torchcover, recording, tmp_path, r
         "recorded",
         True,
     )
-    found = {row["rig"]: row["radius_m"] for row in summary["rows"] if row["region"] == "20m" and row["known_cells"]}
+    found = {row["rig"]: row["radius_m"] for row in summary["rows"] if row["region"] == "20m" and row["observed_cells"]}
     assert found == pytest.approx(radii)
 
 
@@ -214,7 +214,7 @@ def test_what_is_not_in_a_recording_is_told_with_what_is(torchcover, recording, 
         (["front_roof_128", "front_roof_64", "--set", "cell_m=0.3"], "not a multiple of the cell"),
         (["front_roof_128", "front_roof_64", "--thresholds-m", "-1"], "thresholds: finite distances >= 0"),
         (["front_roof_128", "front_roof_64", "--device", "abacus"], "device abacus: cannot be used here"),
-        (["front_roof_128", "front_roof_64", "--steps", "0"], "--steps"),
+        (["front_roof_128", "front_roof_64", "--num-frames", "0"], "--num-frames"),
         (
             ["front_roof_128", "front_roof_64", "--target-error", "10cm"],
             "target error 10cm: a positive number with its unit",

@@ -83,7 +83,7 @@ def test_what_is_no_pair_of_coverage_files_is_said(torchcover, worlds, saved):
         ([file], "at least two measured rigs"),
         ([file, worlds / "missing.npz"], "no such file; a saved coverage is needed"),
         ([file, worlds / "rubbish.npz"], "not a coverage file"),
-        ([file, file, "--steps", 3], "measured already"),
+        ([file, file, "--num-frames", 3], "measured already"),
         ([file, worlds / "both.yaml"], "compare coverage files with each other, without rigs"),
     ):
         code, _, complaint = torchcover("compare", *arguments, "--out", worlds / "out")

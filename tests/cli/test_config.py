@@ -79,7 +79,7 @@ def test_an_assignment_that_is_no_setting_is_refused(text):
 def test_a_run_reads_a_file_and_its_result_has_it(torchcover, worlds):
     path = worlds / "run.yaml"
     path.write_text(f"scenario: {worlds / 'yard.yaml'}\ncell_m: 4\nrays: 64\nsteps: 3\nprobe: [none]\n")
-    options = ("--config", path, "--steps", 2, "--files", "numbers", "--out", worlds / "out")
+    options = ("--config", path, "--num-frames", 2, "--files", "numbers", "--out", worlds / "out")
     code, _, complaints = torchcover("evaluate", worlds / "both.yaml", *options)
     assert code == 0, complaints
     summary = json.loads((worlds / "out" / "summary.json").read_text())

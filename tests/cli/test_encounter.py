@@ -15,7 +15,18 @@ encounters:
 def test_rigs_side_by_side_in_words_and_files(torchcover, worlds, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")  # so that no cell is folded
     (worlds / "two.yaml").write_text(SET)
-    arguments = ("--set", worlds / "two.yaml", "--phases", "2", "--points", "1", "--looks", "1", "--vehicle", "suv")
+    arguments = (
+        "--set",
+        worlds / "two.yaml",
+        "--num-start-offsets",
+        "2",
+        "--points",
+        "1",
+        "--consecutive-scans",
+        "1",
+        "--vehicle",
+        "suv",
+    )
     ended, printed, _ = torchcover("encounter", worlds / "low.yaml", worlds / "both.yaml", *arguments)
     assert ended == 0
     for words in (
@@ -50,15 +61,15 @@ def test_rigs_side_by_side_in_words_and_files(torchcover, worlds, monkeypatch):
         (SET, ["--latency-s", "-1"], "latency_s: 0 to 10 seconds"),
         (SET, ["--latency-s", "300"], "latency_s: 0 to 10 seconds are needed; got 300, is that milliseconds?"),
         (SET, ["--set", "crosing_like"], "is 'crossing_like' meant?"),
-        (SET, ["--film", "a.png"], "a film is a .gif or .mp4 file"),
-        (SET, ["--worlds", "16"], "--worlds: of no use with a set; leave it out"),
-        (SET, ["--within-s", "4"], "--within-s: of no use with a set"),
+        (SET, ["--animation", "a.png"], "a film is a .gif or .mp4 file"),
+        (SET, ["--num-scenes", "16"], "--num-scenes: of no use with a set; leave it out"),
+        (SET, ["--max-ttc-s", "4"], "--max-ttc-s: of no use with a set"),
         (SET, ["--scenario", "urban"], "--set: of no use with --scenario"),
     ],
 )
 def test_a_mistake_is_one_line(torchcover, worlds, text, arguments, message):
     (worlds / "two.yaml").write_text(text)
-    given = ("--set", worlds / "two.yaml", "--phases", "1", "--vehicle", "suv", *arguments)
+    given = ("--set", worlds / "two.yaml", "--num-start-offsets", "1", "--vehicle", "suv", *arguments)
     ended, _, error = torchcover("encounter", worlds / "low.yaml", *given)
     assert ended == 2
     assert message in error.strip().splitlines()[-1]
@@ -68,8 +79,11 @@ def test_a_mistake_is_one_line(torchcover, worlds, text, arguments, message):
     ("arguments", "message"),
     [
         (["low.yaml", "--scenario", "courtyard"], "nothing ever moves in it"),
-        (["low.yaml", "--scenario", "urban", "--film", "a.gif"], "--film: of no use with --scenario"),
-        (["low.yaml", "--scenario", "urban", "--phases", "10"], "--phases: of no use with --scenario"),
+        (["low.yaml", "--scenario", "urban", "--animation", "a.gif"], "--animation: of no use with --scenario"),
+        (
+            ["low.yaml", "--scenario", "urban", "--num-start-offsets", "10"],
+            "--num-start-offsets: of no use with --scenario",
+        ),
         (["low.yaml", "--frames", "drive"], "rigs: of no use with --frames, which has rigs and traffic of its own"),
         (["--frames", "drive", "--scenario", "urban"], "--scenario: of no use with --frames"),
         (["--frames", "drive", "--vehicle", "suv"], "--vehicle: of no use with --frames"),

@@ -55,7 +55,7 @@ def test_every_command_works_with_closed_streams(arguments, code, closed):
 
 
 def test_a_run_with_closed_streams_writes_its_results_and_nothing_into_them(worlds):
-    settings = f"--scenario {worlds}/yard.yaml --set cell_m=4 --rays 1024 --steps 2 --workers 1"
+    settings = f"--scenario {worlds}/yard.yaml --set cell_m=4 --num-rays 1024 --num-frames 2 --num-workers 1"
     command = f"exec {' '.join(PROGRAM)} evaluate {worlds}/low.yaml {settings} --files numbers <&- >&- 2>&-"
     assert subprocess.run(["sh", "-c", command], check=False, cwd=worlds).returncode == 0
     assert {path.name for path in (worlds / "out").iterdir()} >= {"summary.json", "coverage.npz", "summary.csv"}

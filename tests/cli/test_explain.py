@@ -2,7 +2,7 @@
 
 import json
 
-RAYS = ["--rays", "256", "--set", "cell_m=1"]
+RAYS = ["--num-rays", "256", "--set", "cell_m=1"]
 
 
 def whats(folder):
@@ -10,7 +10,7 @@ def whats(folder):
 
 
 def test_a_scene_in_which_nothing_moves_reuses_its_scan(torchcover, worlds):
-    options = ["--scenario", worlds / "yard.yaml", "--steps", "3", *RAYS, "--explain", "--out", worlds / "out"]
+    options = ["--scenario", worlds / "yard.yaml", "--num-frames", "3", *RAYS, "--explain", "--out", worlds / "out"]
     code, text, complaints = torchcover("evaluate", worlds / "low.yaml", *options)
     assert code == 0, complaints
     assert "Left out, for this run did not need it" in text
@@ -22,7 +22,7 @@ def test_a_scene_in_which_nothing_moves_reuses_its_scan(torchcover, worlds):
 
 
 def test_without_the_option_it_stands_in_the_summary_only(torchcover, worlds):
-    options = ["--scenario", worlds / "yard.yaml", "--steps", "2", *RAYS, "--out", worlds / "out"]
+    options = ["--scenario", worlds / "yard.yaml", "--num-frames", "2", *RAYS, "--out", worlds / "out"]
     code, text, _ = torchcover("compare", worlds / "low.yaml", worlds / "both.yaml", *options)
     assert code == 0
     assert "Left out" not in text

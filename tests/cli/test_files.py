@@ -2,7 +2,7 @@
 
 import pytest
 
-SMALL = ("--set", "cell_m=8", "--rays", 256, "--steps", 1)
+SMALL = ("--set", "cell_m=8", "--num-rays", 256, "--num-frames", 1)
 NUMBERS = {"coverage.npz", "summary.csv"}
 
 

@@ -15,13 +15,13 @@ def run(torchcover, worlds, *rigs, command="compare", options=(), out="out", ste
     arguments = [
         "--scenario",
         worlds / "yard.yaml",
-        "--steps",
+        "--num-frames",
         steps,
         "--set",
         "cell_m=4",
         "--thresholds-m",
         2,
-        "--rays",
+        "--num-rays",
         4096,
     ]
     paths = [worlds / f"{rig}.yaml" for rig in rigs]
@@ -46,11 +46,11 @@ def test_three_rigs_have_ranks_and_taus_in_every_file(torchcover, worlds):
         rows = list(csv.DictReader(file))
     assert len(rows) == len(summary["metrics"]["numbers"])
     assert {row["rig"] for row in rows} == {"low", "both", "low_2"}
-    with (out / "metrics_tau.csv").open() as file:
+    with (out / "metrics_rank_correlation.csv").open() as file:
         taus = list(csv.DictReader(file))
     assert len(taus) == len(summary["metrics"]["tau"]) > 50
     assert all(tau["low"] == "" for tau in taus)  # two instants are too few to draw again
-    assert {"metrics.csv", "metrics_tau.csv"} <= set(summary["files"])
+    assert {"metrics.csv", "metrics_rank_correlation.csv"} <= set(summary["files"])
     page = (out / "report.html").read_text()
     assert "Metrics of others" in page
     assert "tau-b" in page
@@ -92,7 +92,7 @@ def test_a_run_goes_on_from_its_checkpoint_with_its_metrics(torchcover, worlds):
 @pytest.mark.filterwarnings("ignore:.*edited since it was recorded")
 def test_a_recording_without_boxes_has_the_metrics_that_need_none(torchcover, worlds):
     torchcover(
-        "record", worlds / "both.yaml", "--out", worlds / "drive", "--scenario", worlds / "yard.yaml", "--steps", 2
+        "record", worlds / "both.yaml", "--out", worlds / "drive", "--scenario", worlds / "yard.yaml", "--num-frames", 2
     )
     shutil.rmtree(worlds / "drive" / "boxes")
     code, printed, error = torchcover(

@@ -8,7 +8,18 @@ def test_several_scenarios_are_measured_apart_and_mixed(torchcover, worlds):
     (worlds / "out" / "yard").mkdir(parents=True)
     mixture = f"{worlds / 'yard.yaml'}=3,{worlds / 'plain.yaml'}=1"
     rigs = [worlds / f"{rig}.yaml" for rig in ("low", "both")]
-    options = ["--scenario", mixture, "--steps", 2, "--set", "cell_m=4", "--rays", 512, "--out", worlds / "out"]
+    options = [
+        "--scenario",
+        mixture,
+        "--num-frames",
+        2,
+        "--set",
+        "cell_m=4",
+        "--num-rays",
+        512,
+        "--out",
+        worlds / "out",
+    ]
     code, printed, told = torchcover("compare", *rigs, *options, "--files", "numbers", "--resume")
     assert code == 0
     assert told.count("checkpoint.npz is not there") == 2

@@ -11,7 +11,7 @@ RADAR = (
 )
 FRONT = f"  - {{type: radar, name: front, mount: {{x_m: 2.05, z_m: 0.6}}, {RADAR}}}\n"
 REAR = f"  - {{type: radar, name: rear, mount: {{x_m: -2.05, z_m: 0.6, yaw_deg: 180}}, {RADAR}}}\n"
-SMALL = ("--steps", 3, "--set", "cell_m=0.5", "--rays", 2048, "--redundancy")
+SMALL = ("--num-frames", 3, "--set", "cell_m=0.5", "--num-rays", 2048, "--redundancy")
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def test_a_search_moves_a_radar(torchcover, rigs):
         "name: nose\nstart: radars.yaml\nscenario: yard.yaml\nobjectives: {near: {region: 20m}}\n"
         "free: {front: {z_m: [0.3, 0.9], pitch_deg: [-10, 10]}}\n"
     )
-    assert torchcover("search", rigs / "space.yaml", "--evaluations", 4, "--out", rigs / "found")[0] == 0
+    assert torchcover("search", rigs / "space.yaml", "--num-evaluations", 4, "--out", rigs / "found")[0] == 0
     start, best = Rig.load(rigs / "radars.yaml"), Rig.load(rigs / "found" / "best.yaml")
     assert best.sensors[1] == start.sensors[1]
     assert best.sensors[0].model_copy(update={"mount": start.sensors[0].mount}) == start.sensors[0]
@@ -49,7 +49,7 @@ def test_a_search_moves_a_radar(torchcover, rigs):
 
 
 def test_targets_count_the_points_of_a_radar_and_not_its_rays(torchcover, rigs):
-    place = ("--scenario", rigs / "yard.yaml", "--target", "adult", "--raster=4,6,-1,1,1", "--steps", 1)
+    place = ("--scenario", rigs / "yard.yaml", "--target", "adult", "--raster=4,6,-1,1,1", "--num-frames", 1)
     for rays_m in (1.0, 0.05):
         rig = f"name: fine\nsensors:\n{FRONT.replace('ray_spacing_m: 1.0', f'ray_spacing_m: {rays_m}')}"
         (rigs / "fine.yaml").write_text(rig)

@@ -10,7 +10,7 @@ from torchcover.simulation import writing
 
 
 def test_a_recording_has_the_numbers_of_the_simulation(torchcover, worlds, tmp_path):
-    options = ("--scenario", worlds / "yard.yaml", "--steps", 3, "--seed", 2, "--rays", 1024)
+    options = ("--scenario", worlds / "yard.yaml", "--num-frames", 3, "--seed", 2, "--num-rays", 1024)
     measured, read, recording = (tmp_path / name for name in ("simulated", "read", "recording"))
     code, printed, told = torchcover("record", worlds / "both.yaml", *options, "--out", recording)
     assert "record" in told
@@ -40,7 +40,7 @@ def test_a_recording_has_the_numbers_of_the_simulation(torchcover, worlds, tmp_p
 def test_what_record_refuses(torchcover, worlds, tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "a").write_text("")
-    low, both, yard = worlds / "low.yaml", worlds / "both.yaml", ("--scenario", worlds / "yard.yaml", "--steps", 1)
+    low, both, yard = worlds / "low.yaml", worlds / "both.yaml", ("--scenario", worlds / "yard.yaml", "--num-frames", 1)
     code, _, error = torchcover("record", low, *yard, "--out", tmp_path / "out")
     assert (code, len(error.splitlines())) == (2, 1)
     assert "not empty; a new or empty folder is needed" in error
@@ -51,7 +51,7 @@ def test_what_record_refuses(torchcover, worlds, tmp_path):
 
 def test_a_recording_that_was_ended_is_not_evaluated_and_gone_on_with(torchcover, worlds, monkeypatch):
     out, step = worlds / "drive", writing._step
-    command = ("record", worlds / "low.yaml", "--scenario", worlds / "yard.yaml", "--steps", 3, "--rays", 64)
+    command = ("record", worlds / "low.yaml", "--scenario", worlds / "yard.yaml", "--num-frames", 3, "--num-rays", 64)
     monkeypatch.setattr(writing, "_step", lambda *given: (given[1] == 1 and signal.raise_signal(2)) or step(*given))
     code, _, said = torchcover(*command, "--out", out)
     assert code == 130

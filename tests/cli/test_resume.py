@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-SMALL = ("--set", "cell_m=8", "--rays", 256)
+SMALL = ("--set", "cell_m=8", "--num-rays", 256)
 
 
 def files_of(folder):
@@ -21,20 +21,20 @@ def files_of(folder):
 def test_a_run_goes_on_to_the_same_files(torchcover, worlds, monkeypatch, command):
     monkeypatch.chdir(worlds)
     arguments = [*command, "--scenario", "yard.yaml", *SMALL]
-    assert torchcover(*arguments, "--steps", 5, "--out", "whole")[0] == 0
-    code, _, said = torchcover(*arguments, "--steps", 2, "--out", "parts", "--resume")
+    assert torchcover(*arguments, "--num-frames", 5, "--out", "whole")[0] == 0
+    code, _, said = torchcover(*arguments, "--num-frames", 2, "--out", "parts", "--resume")
     assert (code, "parts/checkpoint.npz is not there: the run starts with its first step" in said) == (0, True)
-    code, _, said = torchcover(*arguments, "--steps", 5, "--out", "parts", "--resume")
+    code, _, said = torchcover(*arguments, "--num-frames", 5, "--out", "parts", "--resume")
     assert (code, "is not there" in said, "replaced" in said) == (0, False, False)
     assert files_of(worlds / "parts") == files_of(worlds / "whole")
     assert [path.parent.name for path in worlds.glob("*/checkpoint.npz")] == ["parts"]
-    code, _, said = torchcover(*arguments, "--steps", 5, "--out", "parts", "--resume", "--seed", 1)
+    code, _, said = torchcover(*arguments, "--num-frames", 5, "--out", "parts", "--resume", "--seed", 1)
     assert code == 2
     assert "parts/checkpoint.npz: a checkpoint of another run: seed (0 there, 1 here); resume with the" in said
     (worlds / "parts" / "summary.json").unlink()  # as if it had been killed
-    code, _, said = torchcover(*arguments, "--steps", 1, "--out", "parts")  # anew
+    code, _, said = torchcover(*arguments, "--num-frames", 1, "--out", "parts")  # anew
     assert (code, "parts/checkpoint.npz will be replaced; to go on from it, stop now" in said) == (0, True)
-    code, _, said = torchcover(*arguments, "--steps", 1, "--out", "parts")
+    code, _, said = torchcover(*arguments, "--num-frames", 1, "--out", "parts")
     assert (code, "will be replaced" in said) == (0, False)  # the one before was complete
     assert files_of(worlds / "parts") != files_of(worlds / "whole")
     # A run that has come to its end keeps none, unless going on was asked for.

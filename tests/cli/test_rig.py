@@ -8,7 +8,7 @@ from torchcover import Rig
 
 def test_a_recorded_rig_is_found_again(torchcover, worlds, tmp_path):
     recording, found = tmp_path / "recording", tmp_path / "found.yaml"
-    few = ("--scenario", worlds / "yard.yaml", "--steps", 2, "--rays", 64)
+    few = ("--scenario", worlds / "yard.yaml", "--num-frames", 2, "--num-rays", 64)
     torchcover("record", worlds / "both.yaml", *few, "--out", recording)
     code, printed, error = torchcover("rig", "--frames", recording)
     assert (code, error) == (0, "")

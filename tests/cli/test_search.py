@@ -34,16 +34,16 @@ def space(tmp_path, monkeypatch):
 
 def test_a_search_ends_with_its_gain_and_that_of_random_candidates(torchcover, space, tmp_path):
     out = tmp_path / "found"
-    code, printed, _ = torchcover("search", space, "--evaluations", 12, "--out", out, "--seed", 3)
+    code, printed, _ = torchcover("search", space, "--num-evaluations", 12, "--out", out, "--seed", 3)
     assert code == 0
     last = printed.splitlines()[-1]
     assert last.startswith("near: ")
     assert "random candidates" in last
     assert last.endswith("Sensor model: ideal, every hit is a point.")
     assert (out / "best.yaml").exists()
-    code, again, _ = torchcover("search", space, "--evaluations", 12, "--out", out, "--seed", 3, "--resume")
+    code, again, _ = torchcover("search", space, "--num-evaluations", 12, "--out", out, "--seed", 3, "--resume")
     assert again.splitlines()[-1] == last
-    code, _, said = torchcover("search", space, "--evaluations", 12, "--out", out, "--resume")
+    code, _, said = torchcover("search", space, "--num-evaluations", 12, "--out", out, "--resume")
     assert code == 2
     assert "the journal of another search: seed (3 there, 0 here)" in said
 
@@ -52,8 +52,8 @@ def test_a_search_ends_with_its_gain_and_that_of_random_candidates(torchcover, s
     ("options", "message"),
     [
         (("--budget", "30"), "--budget: a time is needed, as in 90s, 30min or 2h; got '30'"),
-        (("--budget", "1h", "--evaluations", "3"), "one of them; both are given"),
-        (("--evaluations", "3", "--sensor-model", "real"), "no LiDAR of the rig 'front_roof_32' has a range_at_10"),
+        (("--budget", "1h", "--num-evaluations", "3"), "one of them; both are given"),
+        (("--num-evaluations", "3", "--sensor-model", "real"), "no LiDAR of the rig 'front_roof_32' has a range_at_10"),
         (("--budget", "0s"), "more than 0 s is needed; got 0"),
         (("--budget", "0.00001s"), "are less than two evaluations"),
     ],
@@ -81,7 +81,7 @@ def test_an_objective_that_no_result_has_is_one_line(torchcover, tmp_path, objec
     assert said.count("\n") == 1
 
 
-@pytest.mark.parametrize("options", [("--budget", "5s"), ("--evaluations", "3"), ("--resume",)])
+@pytest.mark.parametrize("options", [("--budget", "5s"), ("--num-evaluations", "3"), ("--resume",)])
 def test_a_choice_has_no_budget(torchcover, tmp_path, options):
     code, _, said = torchcover("search", CHOICE, "--out", tmp_path / "found", *options)
     assert code == 2
@@ -94,6 +94,6 @@ def test_times():
 
 def test_a_search_without_optuna_is_one_line(torchcover, space, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "optuna", None)
-    code, _, said = torchcover("search", space, "--evaluations", 3, "--out", tmp_path / "found")
+    code, _, said = torchcover("search", space, "--num-evaluations", 3, "--out", tmp_path / "found")
     assert code == 2
     assert said == "torchcover: a placement search needs Optuna: pip install 'torchcover[search]'\n"

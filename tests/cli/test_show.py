@@ -244,7 +244,7 @@ def test_every_built_in_rig_has_fields_of_view_within_bounds(name):
         ),
         (["courtyard", "--scenario", "urban"], "--scenario: for a rig only, and 'courtyard' is a scenario"),
         (["suv", "--step", "1"], "--step: for rigs and scenarios only, and 'suv' is a vehicle"),
-        (["suv", "--film", "x.gif"], "--film: for a scenario only, and 'suv' is a vehicle"),
+        (["suv", "--animation", "x.gif"], "--animation: for a scenario only, and 'suv' is a vehicle"),
         (["courtyard", "--rig", "moon"], "built-in rigs; is "),
         (["kitti", "--scenario", "moon"], "built-in scenarios; is "),
         (["courtyard", "--step", "-1"], "--step"),
@@ -319,7 +319,7 @@ def test_it_prints_where_the_numbers_of_a_rig_come_from(torchcover, tmp_path):
 def test_a_film_shows_what_follows(torchcover, worlds, monkeypatch):
     monkeypatch.setattr(show, "FILM_S", 0.3)
     code, printed, _ = torchcover(
-        "show", worlds / "yard.yaml", "--rig", worlds / "low.yaml", "--film", worlds / "new" / "a.gif", "--step", 1
+        "show", worlds / "yard.yaml", "--rig", worlds / "low.yaml", "--animation", worlds / "new" / "a.gif", "--step", 1
     )
     assert (code, "a.gif" in printed) == (0, True)
     with Image.open(worlds / "new" / "a.gif") as film:
@@ -337,9 +337,9 @@ def test_a_film_shows_what_follows(torchcover, worlds, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("yard.yaml", "--film", "a.avi"), "a film is a .gif or .mp4 file; got 'a.avi'"),
-        (("low.yaml", "--film", "a.gif"), "--film: for a scenario only"),
-        (("yard.yaml", "--film", "a.mp4"), "the program ffmpeg is needed for .mp4 and is not there; write a .gif"),
+        (("yard.yaml", "--animation", "a.avi"), "a film is a .gif or .mp4 file; got 'a.avi'"),
+        (("low.yaml", "--animation", "a.gif"), "--animation: for a scenario only"),
+        (("yard.yaml", "--animation", "a.mp4"), "the program ffmpeg is needed for .mp4 and is not there; write a .gif"),
     ],
 )
 def test_a_film_that_cannot_be_written_is_refused_at_once(options, message, torchcover, worlds, monkeypatch):

@@ -30,9 +30,9 @@ def arguments(worlds, *, steps=3):
         "cell_m=4",
         "--thresholds-m",
         2,
-        "--rays",
+        "--num-rays",
         4096,
-        "--steps",
+        "--num-frames",
         steps,
     ]
     return ["compare", *rigs, *settings, "--out", worlds / "out"]
@@ -73,7 +73,7 @@ def send(number, times=1):
 def steps_of(out):
     """The steps of each rig, whether the run is complete, and how many maps there are."""
     summary = json.loads((out / "summary.json").read_text())
-    counts = [Coverage.load(out / "coverage" / f"{name}.npz").counts["steps"] for name in ("low", "both")]
+    counts = [Coverage.load(out / "coverage" / f"{name}.npz").counts["frames"] for name in ("low", "both")]
     assert counts == [of_rig["steps"] for of_rig in summary["counts"].values()]
     return counts, summary["complete"], sum(name.startswith("maps/") for name in summary["files"])
 

@@ -41,7 +41,7 @@ def test_a_small_study_writes_tables_a_diagram_and_an_advice(torchcover, tmp_pat
     codes = []
     monkeypatch.setattr("torchcover.evaluation.study.subprocess", SimpleNamespace(Popen=Timed, DEVNULL=None, PIPE=None))
     out = tmp_path / "out"
-    options = ["--rays", "256", "--set", "cell_m=4", "--steps", "8"]
+    options = ["--num-rays", "256", "--set", "cell_m=4", "--num-frames", "8"]
     code, text, complaints = torchcover("study", "front_roof_32", "--scenario", "courtyard", *options, "--out", out)
     assert code == 0, complaints
     assert "…" not in text
@@ -56,14 +56,14 @@ def test_a_small_study_writes_tables_a_diagram_and_an_advice(torchcover, tmp_pat
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--rays", "0"], "rays"),
+        (["--num-rays", "0"], "rays"),
         (["--set", "cell_m=0.3"], "multiple of the cell"),
-        (["--set", "every_s=0.15"], "every_s: a positive multiple of the time step"),
+        (["--set", "frame_interval_s=0.15"], "frame_interval_s: a positive multiple of the time step"),
         (["--scenario", "nowhere"], "nowhere"),
     ],
 )
 def test_what_makes_no_sense_ends_in_one_line(torchcover, tmp_path, options, message):
-    code, _, complaints = torchcover("study", "front_roof_32", *options, "--steps", "8", "--out", tmp_path / "out")
+    code, _, complaints = torchcover("study", "front_roof_32", *options, "--num-frames", "8", "--out", tmp_path / "out")
     assert code == 2
     assert message in complaints
     assert len(complaints.strip().splitlines()) == 1

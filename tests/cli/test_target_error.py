@@ -26,7 +26,7 @@ def long_recording(tmp_path):
 
 @pytest.mark.parametrize("workers", [0, 2])
 def test_evaluate_stops_when_it_is_good_enough(torchcover, long_recording, tmp_path, workers):
-    arguments = ["--frames", long_recording, "--set", "cell_m=4", "--out", tmp_path / "out", "--workers", workers]
+    arguments = ["--frames", long_recording, "--set", "cell_m=4", "--out", tmp_path / "out", "--num-workers", workers]
     code, printed, _ = torchcover("evaluate", *arguments, "--target-error", "0.05m", "--target-error", "20%")
     assert code == 0
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
@@ -34,14 +34,14 @@ def test_evaluate_stops_when_it_is_good_enough(torchcover, long_recording, tmp_p
     assert 32 <= steps < 150
     assert f"Target error reached after {steps} steps." in printed
     assert (summary["complete"], summary["target_error"]["reached"]) == (True, True)
-    assert all(row["radius_m_error"] <= 0.05 for row in summary["rows"] if row["known_cells"])
+    assert all(row["radius_m_error"] <= 0.05 for row in summary["rows"] if row["observed_cells"])
     assert re.search(r"0\.\d+  \[0\.\d+, 0\.\d+\]", printed)
 
 
 def test_a_target_beyond_the_steps_ends_the_run_as_ever_and_says_what_it_would_take(
     torchcover, long_recording, tmp_path
 ):
-    arguments = ["--frames", long_recording, "--set", "cell_m=4", "--out", tmp_path / "out", "--steps", 40]
+    arguments = ["--frames", long_recording, "--set", "cell_m=4", "--out", tmp_path / "out", "--num-frames", 40]
     code, printed, _ = torchcover("evaluate", *arguments, "--target-error", "1e-3m")
     assert code == 0
     assert "Target error not reached in 40 steps" in printed
@@ -49,7 +49,7 @@ def test_a_target_beyond_the_steps_ends_the_run_as_ever_and_says_what_it_would_t
     target = json.loads((tmp_path / "out" / "summary.json").read_text())["target_error"]
     assert target["reached"] is False
     assert 1_000 < target["frames_needed"] < 1_000_000
-    assert Coverage.load(tmp_path / "out" / "coverage.npz").counts["steps"] == 40
+    assert Coverage.load(tmp_path / "out" / "coverage.npz").counts["frames"] == 40
 
 
 def test_compare_stops_when_rigs_and_differences_are_good_enough(torchcover, worlds):
@@ -60,7 +60,7 @@ def test_compare_stops_when_rigs_and_differences_are_good_enough(torchcover, wor
         "cell_m=4",
         "--thresholds-m",
         2,
-        "--rays",
+        "--num-rays",
         512,
         "--out",
         worlds / "out",

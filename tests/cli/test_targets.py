@@ -39,7 +39,7 @@ def test_what_is_seen_is_said_and_written(call, worlds):
         (["--raster", "1,2,3"], "--raster: x0,x1,y0,y1,step in metres"),
         (["--raster", "-1000,1000,-1000,1000,0.5"], "16,000,000 cells"),
         (["--heading", "up"], "--heading: narrow, wide or degrees"),
-        (["--hits", "0"], "--hits"),
+        (["--detection-points", "0"], "--detection-points"),
     ],
 )
 def test_a_mistake_is_one_line_and_exit_code_2(call, worlds, monkeypatch, arguments, message):

@@ -24,11 +24,11 @@ def run(torchcover, free, command, *arguments):
     settings = (
         "--scenario",
         free / "free.yaml",
-        "--steps",
+        "--num-frames",
         1,
         "--set",
         "cell_m=2",
-        "--rays",
+        "--num-rays",
         64,
         "--out",
         free / "out",
@@ -61,7 +61,7 @@ def test_pictures_and_recordings_are_of_the_vehicle_too(torchcover, free, monkey
     shown = ("show", free / "low.yaml", "--scenario", free / "free.yaml", "--vehicle", "suv", "--out", free)
     assert torchcover(*shown)[0] == 0
     assert titles[0]["subtitle"] == "on suv in free, 4.90 x 1.94 x 1.63 m"
-    recorded = ("record", free / "low.yaml", "--scenario", free / "free.yaml", "--steps", 1, "--rays", 64)
+    recorded = ("record", free / "low.yaml", "--scenario", free / "free.yaml", "--num-frames", 1, "--num-rays", 64)
     assert torchcover(*recorded, "--vehicle", "suv", "--out", free / "drive")[0] == 0
     assert '"lower_m": [-2.45' in (free / "drive" / "frames.yaml").read_text()
     dropped = []

@@ -6,7 +6,7 @@ from torchcover.data import Frame
 from torchcover.detection import Boxes
 
 
-def frame_of(cloud, reference=(), boxes=(), categories=(), *, index=0, weights=None, sensors=None, place_in_time=None):
+def frame_of(cloud, reference=(), boxes=(), categories=(), *, index=0, weights=None, sensors=None, block_index=None):
     """A frame of one rig called `rig`, from lists; `sensors` says how many points are of each."""
     cloud, reference = (torch.tensor(points, dtype=torch.float32).view(-1, 3) for points in (cloud, reference))
     rows = torch.tensor(boxes, dtype=torch.float32).view(-1, 7)
@@ -18,7 +18,7 @@ def frame_of(cloud, reference=(), boxes=(), categories=(), *, index=0, weights=N
         reference_weights=None if weights is None else torch.tensor(weights, dtype=torch.float32),
         boxes=Boxes.from_rows(rows, categories=tuple(categories) or ("",) * len(rows)),
         sensor_points=None if sensors is None else {"rig": sensors},
-        place_in_time=place_in_time,
+        block_index=block_index,
     )
 
 

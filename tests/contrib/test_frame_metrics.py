@@ -222,7 +222,7 @@ def test_errors_are_those_of_a_mean_over_worlds():
 def test_frames_of_one_world_are_no_more_worlds():
     metric = PointDensity(GRID, ())
     for index in range(40):
-        metric.update(frame_of([[0.5, 0.5, 0.0]] * (index % 5), index=index, place_in_time=index // 6))
+        metric.update(frame_of([[0.5, 0.5, 0.0]] * (index % 5), index=index, block_index=index // 6))
     assert all(math.isnan(number.error) for number in metric.compute())  # 7 of them
 
 
@@ -257,7 +257,7 @@ def test_without_a_world_it_is_what_the_other_frames_say_and_errors_come_from_th
     case = CASES[name]
     telling = [step["frame"] for step in case.steps if case.over([step]).compute()[0].known]
     frames = [
-        replace(frame, place_in_time=world) for world, frame in zip(range(10), itertools.cycle(telling), strict=False)
+        replace(frame, block_index=world) for world, frame in zip(range(10), itertools.cycle(telling), strict=False)
     ]
 
     def over(some):

@@ -101,7 +101,7 @@ def test_occupancy_and_its_blocks_are_those_of_a_slow_twin():
     found = occupancy_of(metric.boxes.numpy(), 0, grid, 16)
     counts = np.zeros((16, *grid.shape), dtype=int)
     for one in frames:
-        counts[one.place_in_time // 2] += slowly(one.boxes, grid)  # 20 places: two in a block
+        counts[one.block_index // 2] += slowly(one.boxes, grid)  # 20 places: two in a block
     assert np.array_equal(found.voxels, np.flatnonzero(counts.sum(axis=0)))
     assert np.array_equal(found.counts[found.pattern].T, counts.reshape(16, -1)[:, found.voxels])
     assert found.steps.tolist() == [4, 5, *[4] * 8, *[0] * 6]

@@ -54,6 +54,6 @@ def frame(index, objects, *, reference=None, clouds=None, place=None):
         index=index,
         name=f"frame {index}",
         boxes=objects,
-        place_in_time=place,
+        block_index=place,
         sensor_points={"rig": {name: len(cloud) for name, cloud in clouds.items()}},
     )

@@ -128,7 +128,7 @@ EVERY = (Maximum(), PooledMean(), Quantiles((0.5, 0.9)), StepQuantiles((0.5,)))
 def in_regions(steps, first=0, **options):
     metric = CoverageMetric(FOUR, blocks=8, aggregations=EVERY, regions=[NEAR, ALL], max_radius=9.0, **options)
     for index, (sensor, reference, weights) in enumerate(steps, first):
-        metric.update(sensor, reference, weights=weights, place_in_time=index)
+        metric.update(sensor, reference, weights=weights, block_index=index)
     return metric
 
 
@@ -206,12 +206,12 @@ def test_any_number_of_a_result_has_an_estimate():
             FOUR, aggregations=EVERY, regions=[NEAR], sensors=["a", "b"], square_metres=True, blocks=8, max_radius=9.0
         )
         for world, (seen, reference, weights) in enumerate(random_steps(3)):
-            metric.update({"a": seen[:2] + shift, "b": seen[2:]}, reference, weights=weights, place_in_time=world)
+            metric.update({"a": seen[:2] + shift, "b": seen[2:]}, reference, weights=weights, block_index=world)
         return metric.compute()
 
     one, other = measured(0.0), measured(0.1)
     keys = [quantity.key for quantity in one.every_quantity]
-    assert {"known_radius_m", "radius_m_without_a", "radius_q0.9_m", "seen_by_two_0.4m"} < set(keys)
+    assert {"cells_radius_m", "radius_m_without_a", "radius_q0.9_m", "seen_by_two_0.4m"} < set(keys)
     row = one.summary()[0]
     values = {**row.numbers, **{f"known_{key}": number for key, number in row.known.items()}, **row.redundancy.seen_by}
     for key in keys:
@@ -253,7 +253,7 @@ def test_an_aggregation_of_ones_own_has_a_map_numbers_errors_and_a_place_in_ever
     steps = list(random_steps(16))
     metric = CoverageMetric(FOUR, blocks=16, aggregations=[Blind()], regions=[NEAR])
     for index, (sensor, reference, _) in enumerate(steps):
-        metric.update(sensor, reference, place_in_time=index)
+        metric.update(sensor, reference, block_index=index)
     found = metric.compute()
     blind = [(radii_in(NEAR, *step)[0] > 0.5) for step in steps]
     base, sums = (
@@ -297,7 +297,7 @@ def test_what_is_known_of_means_only_is_told_of_means_only():
         metric.update({"a": sensor}, reference, weights=weights)
     table = CoverageTable.from_coverages({"rig": metric.compute()}, [NEAR])
     columns = RENDERERS["csv"](table).splitlines()[0].split(",")
-    assert {"blind_share", "blind_share_error", "known_radius_m", "radius_m_without_a"} < set(columns)
+    assert {"blind_share", "blind_share_error", "cells_radius_m", "radius_m_without_a"} < set(columns)
     assert not {"known_blind_share", "blind_share_without_a"} & set(columns)
     text = " ".join(RENDERERS["text"](table).split())
     assert "Change of mean blind spot radius (m) when one sensor fails" in text
@@ -308,7 +308,7 @@ def test_an_aggregation_of_ones_own_is_measured_merged_saved_and_loaded(tmp_path
     grid = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)})
     one, other = (CoverageMetric(grid, aggregations=[Minimum()], blocks=8) for _ in range(2))
     one.update(ORIGIN, points_at(0.5, 0.25))
-    other.update(ORIGIN, points_at(0.75, 0.125), place_in_time=1)
+    other.update(ORIGIN, points_at(0.75, 0.125), block_index=1)
     one.merge_state(other)
     one.compute().save(tmp_path / "coverage.npz")
     layer = Coverage.load(tmp_path / "coverage.npz").layers["radius_minimum_m"]

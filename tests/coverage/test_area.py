@@ -35,7 +35,7 @@ def steps_of(count, seed=0, points=40):
 def metric_over(steps, index=None, cell=1.0, **options):
     metric = CoverageMetric(grid(cell), (0.4, 0.8), square_metres=True, **options)
     for number, (sensor, reference, m2) in zip(index or range(len(steps)), steps, strict=True):
-        metric.update(sensor, reference, weights=m2, place_in_time=number)
+        metric.update(sensor, reference, weights=m2, block_index=number)
     return metric
 
 
@@ -108,7 +108,7 @@ def of_odd(steps, index=None, regions=ODD):
     odd = BevGrid(x=(0.0, 8.0), y=(0.0, 6.4), cell=0.32, heights=HEIGHTS)
     metric = CoverageMetric(odd, (0.4, 0.8), square_metres=True, blocks=8, regions=regions)
     for number, (sensor, reference, m2) in zip(index or range(len(steps)), steps, strict=True):
-        metric.update(sensor, reference, weights=m2, place_in_time=number)
+        metric.update(sensor, reference, weights=m2, block_index=number)
     return metric
 
 
@@ -224,7 +224,7 @@ def simulated(region, reference_sensor, steps):
     """Height -> (value, error) of the radius and of the detection."""
     metric = CoverageMetric(BevGrid(x=region.x, y=region.y, cell=0.5), max_radius=50.0, blocks=16, square_metres=True)
     for frame in SimulatedFrames("courtyard", "front_roof_32", steps=steps, reference_sensor=reference_sensor):
-        metric.update(frame.sensor, frame.reference, weights=frame.reference_weights, place_in_time=frame.index)
+        metric.update(frame.sensor, frame.reference, weights=frame.reference_weights, block_index=frame.index)
     coverage = metric.compute()
     estimates = {height: coverage.estimate(region, height, "area") for height in ("ground", "obstacle")}
     return {

@@ -91,7 +91,7 @@ def test_a_step_without_points_needs_no_heights():
     metric = CoverageMetric(GROUND)
     metric.update([], [], weights=[])
     metric.update(ON_RAMP, torch.zeros(0, 3))
-    assert metric.compute().counts["empty_reference_steps"] == 1
+    assert metric.compute().counts["empty_reference_frames"] == 1
 
 
 def test_results_of_two_band_frames_are_neither_merged_nor_compared(tmp_path):

@@ -38,7 +38,7 @@ def random_steps(count: int, seed: int = 0, *, dyadic: bool = False, weighted: b
         else:
             radii = {int(cell): random.random(random.integers(1, 4)).tolist() for cell in cells}
         weights = {cell: (random.random(len(own)) + 0.1).tolist() for cell, own in radii.items()}
-        more = {"place_in_time": index}
+        more = {"block_index": index}
         if weighted:
             more["weights"] = torch.tensor([weight for own in weights.values() for weight in own], dtype=torch.float64)
         steps.append({"radii": radii, "weights": weights, "clouds": clouds_of(radii), "more": more})
@@ -54,14 +54,14 @@ def metric_over(steps, *, blocks=16, **options) -> CoverageMetric:
 
 def slow_blocks(steps, blocks: int, *, weighted: bool = False) -> dict[str, np.ndarray]:
     """The sums in blocks in plain loops."""
-    last = max(step["more"]["place_in_time"] for step in steps)
+    last = max(step["more"]["block_index"] for step in steps)
     length = 1
     while last // length >= blocks:
         length *= 2
     sums = {name: np.zeros((blocks, CELLS)) for name in ("probed_steps", "radius", "detection")}
     sums["steps"] = np.zeros(blocks)
     for step in steps:
-        block = step["more"]["place_in_time"] // length
+        block = step["more"]["block_index"] // length
         sums["steps"][block] += 1
         for cell, own in step["radii"].items():
             weights = step["weights"][cell] if weighted else [1.0] * len(own)
@@ -120,7 +120,7 @@ def test_unequal_blocks_are_weighed_as_in_plain_loops(seed):
 
 def test_blocks_that_all_say_the_same_do_not_say_how_exact_they_are():
     coverage = metric_over(
-        [{"clouds": clouds_of({0: [0.25]}), "more": {"place_in_time": at}} for at in range(40)]
+        [{"clouds": clouds_of({0: [0.25]}), "more": {"block_index": at}} for at in range(40)]
     ).compute()
     (row,) = coverage.summary([EVERYWHERE])
     assert row.numbers["radius_m"].value == 0.25
@@ -132,7 +132,7 @@ def test_blocks_that_all_say_the_same_do_not_say_how_exact_they_are():
 def test_no_error_of_a_cell_is_zero_however_much_its_blocks_agree(radius, detection_error):
     """Ten blocks that all say the same, and two more in which all is seen, or nothing: 12 values about a mean of 10."""
     coverage = metric_over(
-        [{"clouds": clouds_of({0: [radius]}), "more": {"place_in_time": at}} for at in range(40)]
+        [{"clouds": clouds_of({0: [radius]}), "more": {"block_index": at}} for at in range(40)]
     ).compute()
     each = math.sqrt(12 / 11) / 12
     assert float(coverage.errors["detection_0.5m"].flatten()[0]) == pytest.approx(each * detection_error)
@@ -143,7 +143,7 @@ def test_no_error_of_a_cell_is_zero_however_much_its_blocks_agree(radius, detect
 def test_one_step_a_block_gives_the_textbook_error_in_a_region():
     radii = np.random.default_rng(0).random(16).astype(np.float32)
     steps = [
-        {"clouds": clouds_of({2: [float(radius)]}), "more": {"place_in_time": at}} for at, radius in enumerate(radii)
+        {"clouds": clouds_of({2: [float(radius)]}), "more": {"block_index": at}} for at, radius in enumerate(radii)
     ]
     coverage = metric_over(steps).compute()
     expected = radii.astype(float).std(ddof=1) / 4
@@ -180,7 +180,7 @@ def test_the_error_in_a_cell_is_that_of_a_ratio_of_sums_with_two_more_blocks():
 
 
 def test_no_error_is_told_from_fewer_than_8_blocks_nor_in_a_cell_that_fewer_probed():
-    steps = [{"clouds": clouds_of({0: [at / 32], **({1: [0.1]} if at < 7 else {})}), "more": {"place_in_time": at}}
+    steps = [{"clouds": clouds_of({0: [at / 32], **({1: [0.1]} if at < 7 else {})}), "more": {"block_index": at}}
              for at in range(8)]  # fmt: skip
     (few,), (enough,) = (metric_over(steps[:count]).compute().summary([EVERYWHERE]) for count in (7, 8))
     assert math.isnan(few.numbers["radius_m"].error)
@@ -203,7 +203,7 @@ def test_the_error_of_a_difference_is_that_of_the_paired_values():
     shared, own = 2 * random.random(16), 0.02 * random.random(16)
     estimates = []
     for radii in (shared, shared + own):
-        steps = [{"clouds": clouds_of({0: [r]}), "more": {"place_in_time": at}} for at, r in enumerate(radii.tolist())]
+        steps = [{"clouds": clouds_of({0: [r]}), "more": {"block_index": at}} for at, r in enumerate(radii.tolist())]
         estimates.append(metric_over(steps).compute().estimate(EVERYWHERE, "all"))
     difference = estimates[1].minus(estimates[0])
     assert float(difference.value[0]) == pytest.approx(own.mean(), rel=1e-4)
@@ -300,7 +300,7 @@ def test_fine_blocks_are_worlds_as_long_as_there_is_room_and_parts_merge_to_them
         )
         for place in some:
             point = torch.tensor([[0.5, 0.5, 0.0]])
-            metric.update(point, point, weights=torch.tensor([1.0 + place]), place_in_time=place)
+            metric.update(point, point, weights=torch.tensor([1.0 + place]), block_index=place)
         return metric
 
     whole, merged = over(places), over(places[3:])
@@ -327,7 +327,7 @@ def test_blocks_change_no_number(aggregations):
 
 def test_a_step_far_ahead_makes_room_and_leaves_a_gap():
     steps = random_steps(3, dyadic=True)
-    steps[2]["more"]["place_in_time"] = 1_000_000
+    steps[2]["more"]["block_index"] = 1_000_000
     coverage = metric_over(steps).compute()
     assert coverage.blocks.steps.tolist() == [2] + [0] * 14 + [1]
     assert math.isnan(coverage.summary([EVERYWHERE])[0].numbers["radius_m"].error)
@@ -339,7 +339,7 @@ def test_a_step_far_ahead_makes_room_and_leaves_a_gap():
 )
 def test_numbers_of_steps_that_make_no_sense_are_refused(index, message):
     with pytest.raises(ValueError, match=message):
-        CoverageMetric(GRID, blocks=16).update(*clouds_of({0: [0.5]}), place_in_time=index)
+        CoverageMetric(GRID, blocks=16).update(*clouds_of({0: [0.5]}), block_index=index)
 
 
 # Weights
@@ -361,7 +361,7 @@ def test_weighted_means_are_those_of_plain_loops():
 def test_equal_weights_change_nothing_and_their_scale_in_a_step_neither():
     steps = random_steps(20, seed=6, weighted=True)
     options = {"aggregations": [Maximum(), Quantiles((0.1, 0.5))]}
-    plain = [{**step, "more": {"place_in_time": step["more"]["place_in_time"]}} for step in steps]
+    plain = [{**step, "more": {"block_index": step["more"]["block_index"]}} for step in steps]
     factors = [2.0 ** (at % 5) for at in range(20)]
 
     def with_weights(of) -> Coverage:

@@ -28,7 +28,7 @@ def steps_of(count, seed=0, points=12):
 def metric_over(steps, index=None, **options):
     metric = CoverageMetric(GRID, (0.4, 0.8), **options)
     for number, (sensor, reference) in zip(index or range(len(steps)), steps, strict=True):
-        metric.update(sensor, reference, place_in_time=number)
+        metric.update(sensor, reference, block_index=number)
     return metric
 
 
@@ -95,7 +95,7 @@ def test_numbers_of_worlds_that_are_drawn_again_are_those_of_a_run_over_them(mea
         metric = CoverageMetric(GRID, (0.4, 0.8), blocks=16, square_metres=True)
         for number in numbers:
             sensor, reference, m2 = steps[number]
-            metric.update(sensor, reference, weights=m2, place_in_time=number)
+            metric.update(sensor, reference, weights=m2, block_index=number)
         return metric.compute().estimate(PART, "low", measure)
 
     drawn = [0, 0, 3, 3, 3, 4, 5, 7, 8, 9]
@@ -111,7 +111,7 @@ def test_numbers_of_worlds_that_are_drawn_again_are_those_of_a_run_over_them(mea
 def test_numbers_without_maps_are_those_of_the_result_to_the_last_bit(measure):
     metric = CoverageMetric(GRID, (0.4, 0.8), blocks=16, square_metres=True)
     for number, (sensor, reference) in enumerate(steps_of(40)):
-        metric.update(sensor, reference, weights=reference[:, 0] + 0.1, place_in_time=number)
+        metric.update(sensor, reference, weights=reference[:, 0] + 0.1, block_index=number)
     places = [(PART, height) for height in GRID.heights]
     for place, found in zip(places, metric.estimates(places, measure), strict=True):
         expected = metric.compute().estimate(*place, measure)

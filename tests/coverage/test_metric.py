@@ -147,7 +147,7 @@ def test_a_step_in_which_the_rig_saw_nothing_is_blind_not_missing():
     )
     assert (result.radius.item(), map_of(result, "radius_maximum_m").item()) == (math.inf, math.inf)
     assert (result.detection.item(), result.probed_steps.item()) == (0.5, 2)
-    assert result.counts["empty_sensor_steps"] == 1
+    assert result.counts["empty_sensor_frames"] == 1
 
 
 def test_an_empty_sensor_cloud_gives_max_radius():
@@ -165,8 +165,8 @@ def test_a_blind_step_detects_nothing_even_at_a_threshold_of_max_radius():
 def test_an_empty_reference_cloud_says_nothing():
     result = coverage([(ORIGIN, NOTHING), (ORIGIN, points_at(0.5)), (NOTHING, NOTHING)], **OPTIONS)
     assert (result.radius.item(), result.probed_steps.item()) == (0.5, 1)
-    assert (result.counts["steps"], result.counts["empty_reference_steps"]) == (3, 2)
-    assert result.counts["empty_sensor_steps"] == 1
+    assert (result.counts["frames"], result.counts["empty_reference_frames"]) == (3, 2)
+    assert result.counts["empty_sensor_frames"] == 1
 
 
 def test_everything_that_happened_is_counted():
@@ -178,8 +178,8 @@ def test_everything_that_happened_is_counted():
     ]
     assert coverage(steps, ONE_CELL, (0.4,), max_radius=0.5).counts == {
         "steps": 4,
-        "empty_sensor_steps": 1,
-        "empty_reference_steps": 1,
+        "empty_sensor_frames": 1,
+        "empty_reference_frames": 1,
         "saturated_points": 4,
         "inside_points": 5,
         "outside_points": 2,
@@ -253,7 +253,7 @@ def test_types_that_are_too_coarse_for_cells_or_thresholds_are_refused(dtype, ce
     for clouds in ((cloud.to(dtype), cloud.double()), (cloud.double(), cloud.to(dtype))):
         with pytest.raises(ValueError, match=rf"{dtype}"[6:] + r" coordinates are .* apart at 80 m, .* wider type"):
             metric.update(*clouds)
-    assert metric.compute().counts["steps"] == 0
+    assert metric.compute().counts["frames"] == 0
     metric.update(cloud.double(), cloud.double())
 
 
@@ -343,7 +343,7 @@ def test_errors_are_those_of_all_sensors_one_after_the_other():
     ]
     blind = CoverageMetric(ONE_CELL, (3.0,), max_radius=9.0)
     blind.update(points, reference, error=torch.full((40,), 0.5))
-    assert int(blind.empty_sensor_steps) == 1
+    assert int(blind.empty_sensor_frames) == 1
     assert (float(blind.compute().radius), float(blind.compute().detection)) == (9.0, 1.0)
 
 
@@ -414,24 +414,24 @@ def test_what_is_no_sequence_of_thresholds_is_refused(thresholds):
         (
             10**20,
             ValueError,
-            r"place_in_time\[0\]: a number from 0 to 1,000,000,000,000,000 is needed; got 1000000000000000000",
+            r"block_index\[0\]: a number from 0 to 1,000,000,000,000,000 is needed; got 1000000000000000000",
         ),
-        (-1, ValueError, r"place_in_time\[0\]: a number from 0"),
-        (1.5, TypeError, "place_in_time: a whole number, or a list with one for each step, is needed; got 1.5"),
-        (["1"], TypeError, "place_in_time: a whole number"),
+        (-1, ValueError, r"block_index\[0\]: a number from 0"),
+        (1.5, TypeError, "block_index: a whole number, or a list with one for each step, is needed; got 1.5"),
+        (["1"], TypeError, "block_index: a whole number"),
     ],
 )
 def test_a_number_of_a_step_that_is_none_is_refused(index, error, message):
     metric = CoverageMetric(ONE_CELL, blocks=8)
     with pytest.raises(error, match=message):
-        metric.update(ORIGIN, ORIGIN, place_in_time=index)
+        metric.update(ORIGIN, ORIGIN, block_index=index)
     assert int(metric.steps) == 0
 
 
 def test_the_largest_number_of_a_step_has_its_block():
     metric = CoverageMetric(ONE_CELL, blocks=8)
-    metric.update(ORIGIN, ORIGIN, place_in_time=np.int64(3))
-    metric.update(ORIGIN, ORIGIN, place_in_time=10**15)
+    metric.update(ORIGIN, ORIGIN, block_index=np.int64(3))
+    metric.update(ORIGIN, ORIGIN, block_index=10**15)
     assert metric.block_steps.sum() == 2
     assert 8 * int(metric.block_length) > 10**15
 

@@ -108,7 +108,7 @@ def test_a_plot_shows_the_values():
     ("which", "message"),
     [
         (("detection_2m", NEAR, "low"), r"quantity: one of radius_m, detection_0.4m, detection_1m is needed; got"),
-        (("known_share", NEAR, "low"), r"quantity: one of radius_m"),
+        (("observed_share", NEAR, "low"), r"quantity: one of radius_m"),
         (("radius_m", NEAR, "ground"), r"height: one of low, high is needed; got 'ground'"),
         (("radius_m", Region("wide", (0.0, 9.0), (-2.0, 2.0)), "low"), r"region 'wide' spans"),
     ],

@@ -16,7 +16,7 @@ def measured(*, weighed=False, steps=(0, 1), radius=1.0, more=0, blocks=8):
     for at in steps:
         reference = torch.tensor([[0.5, 0.5, 0.0], [3.5, 0.5, 0.0], [3.6, 0.5, 0.0]])[: 2 + more]
         weights = {"weights": torch.ones(len(reference))} if weighed else {}
-        metric.update(reference - torch.tensor([0.0, 0.0, radius]), reference, **weights, place_in_time=at)
+        metric.update(reference - torch.tensor([0.0, 0.0, radius]), reference, **weights, block_index=at)
     return metric.compute()
 
 
@@ -51,7 +51,7 @@ def test_significant_is_what_a_paired_t_test_calls_so(shift, seed):
     for name, own in radii.items():
         metric = CoverageMetric(SQUARE, blocks=16)
         for at, radius in enumerate(own.tolist()):
-            metric.update(torch.tensor([[0.5, 0.5, -radius]]), torch.tensor([[0.5, 0.5, 0.0]]), place_in_time=at)
+            metric.update(torch.tensor([[0.5, 0.5, -radius]]), torch.tensor([[0.5, 0.5, 0.0]]), block_index=at)
         coverages[name] = metric.compute()
     itself, other = differences(coverages, NEAR, "ground").values()
     found = other["radius_m"]

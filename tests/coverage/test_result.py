@@ -60,8 +60,8 @@ def test_a_regions_number_is_the_unweighted_mean_over_its_known_cells(region):
         ]
         known = [cell for cell in inside if result.probed_steps[(band, *cell)] > 0]
         assert 0 < len(known) < len(inside)
-        assert (row.cells, row.known_cells) == (len(inside), len(known))
-        assert row.known_share == len(known) / len(inside)
+        assert (row.cells, row.observed_cells) == (len(inside), len(known))
+        assert row.observed_share == len(known) / len(inside)
         assert row.numbers["radius_m"].value == pytest.approx(np.mean([result.radius[(band, *cell)] for cell in known]))
         assert list(row.numbers) == ["radius_m", "detection_0.4m", "detection_0.8m"]
         for at, number in enumerate(list(row.numbers.values())[1:]):
@@ -71,7 +71,7 @@ def test_a_regions_number_is_the_unweighted_mean_over_its_known_cells(region):
 def test_a_region_of_which_nothing_is_known_is_unknown():
     result = a_coverage(frames=torch.zeros(GRID.shape, dtype=torch.int64))
     row = result.summary([Region("r", (0.0, 2.0), (-1.0, 1.0))])[0]
-    assert (row.known_cells, row.known_share) == (0, 0.0)
+    assert (row.observed_cells, row.observed_share) == (0, 0.0)
     assert all(math.isnan(number.value) for number in row.numbers.values())
 
 
@@ -111,11 +111,11 @@ def test_scalars_are_the_summary_laid_flat():
         "radius_m/20m/ground": ground.numbers["radius_m"].value,
         "detection_0.4m/20m/ground": ground.numbers["detection_0.4m"].value,
         "detection_0.8m/20m/ground": ground.numbers["detection_0.8m"].value,
-        "known_share/20m/ground": ground.known_share,
+        "observed_share/20m/ground": ground.observed_share,
         "radius_m/20m/obstacle": obstacle.numbers["radius_m"].value,
         "detection_0.4m/20m/obstacle": obstacle.numbers["detection_0.4m"].value,
         "detection_0.8m/20m/obstacle": obstacle.numbers["detection_0.8m"].value,
-        "known_share/20m/obstacle": obstacle.known_share,
+        "observed_share/20m/obstacle": obstacle.observed_share,
     }
     assert all(type(value) is float for value in flat.values())
 
@@ -141,7 +141,7 @@ def test_without_a_block_of_one_step_a_pooled_mean_is_that_of_the_others():
     region, radii = Region("one", grid.x, grid.y), [3.0, 1.0, 4.0, 1.5, 9.0, 2.0, 6.0, 5.0]
     metric = CoverageMetric(grid, aggregations=[PooledMean()], regions=[region], blocks=8)
     for at, radius in enumerate(radii):
-        metric.update(torch.tensor([[0.5, 0.5, -radius]]), torch.tensor([[0.5, 0.5, 0.0]]), place_in_time=at)
+        metric.update(torch.tensor([[0.5, 0.5, -radius]]), torch.tensor([[0.5, 0.5, 0.0]]), block_index=at)
     found = metric.compute().estimate_aggregated(region, "all")
     without = [(sum(radii) - radius) / 7 for radius in radii]
     assert found.left_out[:, 0].tolist() == pytest.approx(without)
@@ -384,4 +384,4 @@ def test_torch_loads_plain_objects_without_running_what_a_file_says():
     assert loaded[:2] == [grid, region]
     assert loaded[2].scalars() == metric.compute().scalars()
     assert torch.equal(loaded[3].boxes.rows, boxes.rows)
-    assert loaded[4].place_in_time == [3]
+    assert loaded[4].block_index == [3]

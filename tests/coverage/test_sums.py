@@ -35,7 +35,7 @@ def test_the_state_is_a_few_numbers_for_each_cell_that_a_step_has_touched(cell):
     grid = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=cell, heights={"all": (-1.0, 1.0)})
     metric = CoverageMetric(grid, blocks=8)
     for at in range(16):
-        metric.update(*clouds(at), place_in_time=at)
+        metric.update(*clouds(at), block_index=at)
     assert len(metric.cells) <= min(8 * grid.cells, 16 * 300)
     assert sum(value.numel() for value in metric.metric_state.values()) < 5 * len(metric.cells) + 250
 
@@ -46,7 +46,7 @@ def test_when_rows_are_added_up_changes_no_bit_and_a_state_has_no_order():
     every = [CoverageMetric(grid, blocks=8, aggregations=[Maximum(), PooledMean()]) for _ in range(3)]
     for at in range(40):
         for number, metric in enumerate(every):
-            metric.update(*clouds(at, points=60), place_in_time=at)
+            metric.update(*clouds(at, points=60), block_index=at)
             if number == 1 or (number == 2 and at % 7 == 0):
                 assert (metric.cells[:, 0].diff() > 0).all()
     for metric in every[1:]:
@@ -73,7 +73,7 @@ def test_no_step_holds_on_to_its_graph():
     result = metric(sensor, reference)
     assert not any(value.requires_grad for value in metric.metric_state.values())
     assert not result.radius.requires_grad
-    assert copy.deepcopy(metric).compute().counts["steps"] == 2
+    assert copy.deepcopy(metric).compute().counts["frames"] == 2
 
 
 @pytest.mark.parametrize("maxima", [0, 2])

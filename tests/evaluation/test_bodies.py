@@ -52,13 +52,21 @@ def test_rows_of_bodies_take_the_place_of_those_of_traffic_in_the_near_field(bot
     bands = [(region, "ground") for region in SIDES if (region, "ground") in near]
     assert near == [*bands, *((region, "pole_100cm") for region in SIDES)]
     for row in of_bodies(both):
-        assert 0 < row["known_cells"] <= row["cells"] == 8 * 3
-        assert 0 <= row["surface_0.4m"] <= 1
+        assert 0 < row["observed_cells"] <= row["cells"] == 8 * 3
+        assert 0 <= row["target_surface_0.4m"] <= 1
         assert (row["radius_m"], row["z_min_m"]) == (None, None)
     (roof,), (grille,) = (of_bodies(both, rig=name, region="front_3m") for name in ("roof", "grille"))
-    assert grille["places_5_points_difference"] == pytest.approx(grille["places_5_points"] - roof["places_5_points"])
+    assert grille["target_positions_5_points_difference"] == pytest.approx(
+        grille["target_positions_5_points"] - roof["target_positions_5_points"]
+    )
     (front,) = of_bodies(both, rig="grille", region="front_3m")
-    assert 0 <= front["places_5_points_low"] < front["places_5_points"] < front["places_5_points_high"] <= 1
+    assert (
+        0
+        <= front["target_positions_5_points_low"]
+        < front["target_positions_5_points"]
+        < front["target_positions_5_points_high"]
+        <= 1
+    )
     text = RENDERERS["text"](both.table)
     assert "Free places with 5 points or more (%)" in text
     assert "Bodies: at 8 steps" in " ".join(text.split())
@@ -72,7 +80,10 @@ def test_files_keep_them_and_compare_reads_them(both, tmp_path):
     loaded = Coverage.load(tmp_path / "coverage" / "roof.npz")
     scalars = both.coverages["roof"].scalars()
     assert loaded.scalars() == pytest.approx(scalars, rel=0, abs=0, nan_ok=True)
-    assert scalars["places_5_points/left_3m/pole_100cm"] == of_bodies(both, rig="roof")[2]["places_5_points"]
+    assert (
+        scalars["target_positions_5_points/left_3m/pole_100cm"]
+        == of_bodies(both, rig="roof")[2]["target_positions_5_points"]
+    )
     rows = list(csv.DictReader((tmp_path / "summary.csv").read_text().splitlines()))
     assert [row["region"] for row in rows if row["height"] == "pole_100cm"] == SIDES * 2
     assert json.loads((tmp_path / "summary.json").read_text())["rows"] == both.summary
@@ -95,9 +106,9 @@ def test_a_mixture_is_the_weighted_mean(both):
     other = evaluate(RIGS, yard("other"), **{**SMALL, "seed": 1})
     mixed = MixedResult.from_results({"yard": both, "other": other}, {"yard": 0.75, "other": 0.25})
     for row, first, second in zip(of_bodies(mixed), of_bodies(both), of_bodies(other), strict=True):
-        value = 0.75 * first["places_5_points"] + 0.25 * second["places_5_points"]
-        assert row["places_5_points"] == pytest.approx(value)
-        assert row["known_cells"] == first["known_cells"] + second["known_cells"]
+        value = 0.75 * first["target_positions_5_points"] + 0.25 * second["target_positions_5_points"]
+        assert row["target_positions_5_points"] == pytest.approx(value)
+        assert row["observed_cells"] == first["observed_cells"] + second["observed_cells"]
     without = evaluate(RIGS, yard("other"), **{**SMALL, "steps": 1, "probe": "none"})
     with pytest.raises(ValueError, match="other bodies"):
         _ = MixedResult.from_results({"yard": both, "other": without}, {"yard": 0.75, "other": 0.25})

@@ -78,7 +78,7 @@ def test_one_rig(tmp_path):
     result = torchcover.evaluate("front_roof_32", observers={"points": PointCount()}, **SMALL)
     assert result.observer_results["points"] > 1000
     assert result.coverage is result.coverages["front_roof_32"]
-    assert result.coverage.counts["steps"] == result.run.num_frames == 2
+    assert result.coverage.counts["frames"] == result.run.num_frames == 2
     # Of the near field, two sides hold a centre of such large cells, and of that the ground is asked about.
     places = [(row["region"], row["height"]) for row in result.summary]
     assert places[:6:2] == [("20m", "ground"), ("80m", "ground"), ("160m", "ground")]
@@ -98,11 +98,11 @@ def test_one_rig(tmp_path):
     assert summary["rows"] == result.summary
     assert summary["reference"] == {
         "sensor": DEFAULT_REFERENCE,
-        "rays_per_step": result.run.counts["reference_rays"] // 2,
-        "every_s": 0.1,
+        "rays_per_frame": result.run.counts["reference_rays"] // 2,
+        "frame_interval_s": 0.1,
         "notes": ["Rays that end on the own vehicle: roof 3,380 of 57,600 (5.9%)."],
     }
-    assert 0.5 * SMALL["rays"] < summary["reference"]["rays_per_step"] < 1.5 * SMALL["rays"]
+    assert 0.5 * SMALL["rays"] < summary["reference"]["rays_per_frame"] < 1.5 * SMALL["rays"]
     loaded = Coverage.load(tmp_path / "new" / "out" / "coverage.npz")
     np.testing.assert_array_equal(loaded.radius, result.coverage.radius)
 
@@ -236,7 +236,7 @@ def test_a_rig_may_be_called_what_no_file_can_be(tmp_path):
     result.save(tmp_path)
     stems = [path.stem for path in sorted((tmp_path / "coverage").iterdir())]
     assert len(stems) == 2
-    assert Coverage.load(tmp_path / "coverage" / f"{stems[0]}.npz").counts["steps"] == 1
+    assert Coverage.load(tmp_path / "coverage" / f"{stems[0]}.npz").counts["frames"] == 1
 
 
 def test_settings_have_one_form_whatever_they_are_given_as():
@@ -318,7 +318,7 @@ def test_every_argument_is_declared_once_and_stands_in_the_signature_and_in_the_
 def test_aggregations_are_measured_drawn_and_saved(tmp_path):
     result = torchcover.evaluate(frames=Single(), cell_m=8.0, steps=1, aggregations=["maximum", Quantiles((0.5,))])
     assert all(
-        row["radius_q0.5_m"] <= 1.13 * row["radius_maximum_m"] + 0.01 for row in result.summary if row["known_cells"]
+        row["radius_q0.5_m"] <= 1.13 * row["radius_maximum_m"] + 0.01 for row in result.summary if row["observed_cells"]
     )
     (quantity,) = [layer.quantity for layer in result.coverage.layers.values() if "maximum" in layer.quantity.key]
     files = result.save(tmp_path)
@@ -345,9 +345,9 @@ def test_of_detections_alone_the_same_is_known_and_of_radii_nothing():
             np.testing.assert_array_equal(less[1:], one[1:])
             assert less[0].isnan()
     spared = {one.description: one.count for one in some.omissions if "near a reference point" in one.description}
-    assert list(spared.values()) == [some.run.counts["sensor_rays_spared"]]
-    assert some.run.counts["sensor_rays_spared"] > 0.3 * some.run.counts["sensor_rays"]
-    assert every.run.counts["sensor_rays_spared"] == 0
+    assert list(spared.values()) == [some.run.counts["sensor_rays_omitted"]]
+    assert some.run.counts["sensor_rays_omitted"] > 0.3 * some.run.counts["sensor_rays"]
+    assert every.run.counts["sensor_rays_omitted"] == 0
 
 
 def test_what_a_run_left_out_is_told_as_it_was_at_its_end(monkeypatch):

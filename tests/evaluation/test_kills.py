@@ -47,7 +47,7 @@ def test_a_kill_at_any_file_operation_leaves_the_earlier_or_the_new_result(tmp_p
             with pytest.raises(BadFileError, match="an incomplete result"):
                 Coverage.load(out / "coverage.npz")
             continue
-        steps.append(Coverage.load(out / "coverage.npz").counts["steps"])
+        steps.append(Coverage.load(out / "coverage.npz").counts["frames"])
         assert summary["counts"]["steps"] == steps[-1]
         assert [name for name in summary["files"] if not os.path.isfile(out / name)] == []
     assert steps == sorted(steps)

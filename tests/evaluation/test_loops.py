@@ -65,7 +65,7 @@ def test_going_round_again_makes_no_error_smaller(drive):
     known = errors(once) > 0
     assert np.median(errors(often)[known] / errors(once)[known]) > 0.75
     assert often.coverage.blocks.steps.tolist() == [4] * 8 + [0] * 8
-    assert often.record["frame_counts"]["repeated_instants"] == 8 * 3
+    assert often.record["frame_counts"]["repeated_frames"] == 8 * 3
     assert "8 different instants in 32 steps: the scenario was seen again, which intervals know." in often.table.notes
     assert "seen again" not in " ".join(once.table.notes)
 
@@ -104,16 +104,16 @@ def test_nothing_is_said_of_errors_where_there_are_none(drive):
 def test_the_steps_of_a_city_are_never_in_two_blocks():
     city = {"name": "urban", "traffic": {"type": "urban", "duration_s": 2.0, "time_step_s": 0.5}}
     few = PaperReference(rows=2, columns=2)
-    frames = SimulatedFrames(Scenario.model_validate(city), RIG, steps=12, every_s=1.0, reference_sensor=few)
-    places = [frames.simulator.place_in_time(index) for index in range(12)]
+    frames = SimulatedFrames(Scenario.model_validate(city), RIG, steps=12, frame_interval_s=1.0, reference_sensor=few)
+    places = [frames.simulator.block_index(index) for index in range(12)]
     assert places == [0, 0, 0, 1, 1, 2, 2, 2, 3, 3, 4, 4]
-    assert (frames[3].place_in_time, frames[3].counts["repeated_instants"]) == (1, 0)
+    assert (frames[3].block_index, frames[3].counts["repeated_frames"]) == (1, 0)
 
 
 @pytest.mark.parametrize("every_steps", [1, 2, 3, 7, 12])
 def test_distinct_instants_are_those_that_were_seen(drive, every_steps):
-    frames = SimulatedFrames(drive(12), RIG, steps=30, every_s=every_steps * 1.0)
-    seen = [frames.simulator.place_in_time(index) for index in range(30)]
+    frames = SimulatedFrames(drive(12), RIG, steps=30, frame_interval_s=every_steps * 1.0)
+    seen = [frames.simulator.block_index(index) for index in range(30)]
     assert seen == [index * every_steps % 12 for index in range(30)]
     assert frames.simulator.distinct_steps == len(set(seen)) == 12 // math.gcd(12, every_steps)
 

@@ -114,7 +114,7 @@ def test_all_weight_on_one_is_that_one(yards):
     paths = [str(yards / f"{name}.yaml") for name in ("near", "far")]
     only = evaluate(RIGS, dict(zip(paths, (0.0, 2.0), strict=True)), **SMALL)
     for row, same in zip(only.summary, only.worlds["far"].summary, strict=True):
-        for key in (*NUMBERS, "radius_m_low", "radius_m_difference_high", "known_radius_m_error"):
+        for key in (*NUMBERS, "radius_m_low", "radius_m_difference_high", "cells_radius_m_error"):
             assert row[key] == pytest.approx(same[key])
 
 

@@ -103,9 +103,7 @@ def test_coverage_is_that_of_the_metric_with_weights_and_places_in_time(frames):
     for rig, observer in observers.items():
         metric = CoverageMetric(GRID, blocks=16)
         for frame in frames:
-            metric.update(
-                frame.clouds[rig], frame.reference, weights=frame.reference_weights, place_in_time=frame.index
-            )
+            metric.update(frame.clouds[rig], frame.reference, weights=frame.reference_weights, block_index=frame.index)
         assert torch.equal(observer.compute().radius, metric.compute().radius)
         assert torch.equal(observer.compute().blocks.listed, metric.compute().blocks.listed)
     assert (run.num_frames, dict(run.counts), run.is_complete) == (6, {"seen": 15}, True)
@@ -149,7 +147,7 @@ def test_what_cannot_be_measured_ends_the_run_with_what_was_seen_before(frames, 
 
 
 def test_of_several_workers_one_makes_the_frames_of_a_world_and_all_come_in_order():
-    spread = SimulatedFrames("urban", "front_roof_32", steps=15, every_s=10.0)
+    spread = SimulatedFrames("urban", "front_roof_32", steps=15, frame_interval_s=10.0)
     tasks = list(group_by_scene(range(15), spread.world_of))
     assert tasks == [[*range(7)], [*range(7, 13)], [13, 14]]
     assert [{spread.simulator.run_of(index) for index in task} for task in tasks] == [{0}, {1}, {2}]
@@ -182,7 +180,7 @@ class Told(Wrapped):
 
 
 def test_whoever_wraps_frames_keeps_their_worlds():
-    frames = SimulatedFrames("urban", "front_roof_32", steps=15, every_s=10.0)
+    frames = SimulatedFrames("urban", "front_roof_32", steps=15, frame_interval_s=10.0)
     chosen, told = ChosenRigs(frames, {"mine": "front_roof_32"}), Told(frames)
     part = Subset(Told(chosen), [14, 0, 6, 7])
     worlds = [frames.world_of(index) for index in range(15)]
@@ -193,7 +191,7 @@ def test_whoever_wraps_frames_keeps_their_worlds():
 
 def test_each_world_is_built_by_one_worker_whoever_gives_the_frames(monkeypatch, tmp_path):
     few = PaperReference(rows=4, columns=4)
-    frames = SimulatedFrames("parking", "front_roof_32", steps=4, every_s=35.0, reference_sensor=few)
+    frames = SimulatedFrames("parking", "front_roof_32", steps=4, frame_interval_s=35.0, reference_sensor=few)
     build = Scenario.world
 
     def world(self, seed, run, *rest):

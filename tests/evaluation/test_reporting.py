@@ -113,14 +113,14 @@ def test_areas_of_the_plan_are_those_of_its_cells(found):
 
 def test_a_budget_ends_the_traffic_once_it_has_intervals():
     found = report(ONE, "courtyard", num_frames=64, budget_s=0.01, num_workers=0)
-    assert found.result.table.first_conditions.counts["steps"] == 8
+    assert found.result.table.first_conditions.counts["frames"] == 8
     assert found.verdict[-1] == "The budget was over after 8 of 64 steps of traffic."
     assert not found.record["complete"]
 
 
 def test_of_too_few_steps_no_range_is_told_but_how_many_are_needed():
     words = "Not enough frames for ranges: 4 form 4 blocks of time, intervals need about 11, which are 11 frames"
-    assert f"{words} (`--steps`)." in report(ONE, "courtyard", num_frames=4, num_workers=0).verdict
+    assert f"{words} (`--num-frames`)." in report(ONE, "courtyard", num_frames=4, num_workers=0).verdict
 
 
 def test_where_no_place_is_free_nothing_is_claimed(found):

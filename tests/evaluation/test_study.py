@@ -97,7 +97,7 @@ def test_another_setting_is_recommended_only_where_it_saves_a_fifth():
     )
     assert Study(plan, [trial(0.04)], 1.0).format_recommendation(0.01) == (
         "For 1 percentage point of every detection: front_roof_32 --set scenario=courtyard --set cell_m=4.0 "
-        "--set rays=256 --steps=400 (401 s)."
+        "--set rays=256 --num-frames=400 (401 s)."
     )
 
 
@@ -127,7 +127,7 @@ def test_the_command_that_is_timed_has_every_option_that_is_not_as_usual():
     )
     assert StudyPlan(settings).command == [
         "evaluate", "rig", *("--set", "scenario=urban"), *("--set", "cell_m=0.5"), *("--set", "thresholds_m=0.2,1.0"),
-        *("--set", "every_s=5.0"), *("--set", "workers=2"),
+        *("--set", "frame_interval_s=5.0"), *("--set", "workers=2"),
     ]  # fmt: skip
     assert StudyPlan(replace(settings, steps=None)).trial_settings[""].num_frames == 512
 

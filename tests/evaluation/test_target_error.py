@@ -32,7 +32,7 @@ def add(metric: CoverageMetric, index: int, scale: float = 0.3) -> None:
     radius = np.random.default_rng(index).random()
     reference = torch.tensor([[0.5, 0.5, 0.0], [1.5, 0.5, 0.0]])
     metric.update(
-        reference - torch.tensor([[0.0, 0.0, radius], [0.0, 0.0, scale * radius]]), reference, place_in_time=index
+        reference - torch.tensor([[0.0, 0.0, radius], [0.0, 0.0, scale * radius]]), reference, block_index=index
     )
 
 
@@ -150,7 +150,7 @@ def test_however_good_it_looks_no_run_ends_before_64_steps(steps):
 def test_nothing_known_is_not_good_enough():
     metric = a_metric()
     for index in range(64):
-        metric.update(torch.zeros(1, 3), torch.tensor([[-9.0, 0.0, 0.0]]), place_in_time=index)
+        metric.update(torch.zeros(1, 3), torch.tensor([[-9.0, 0.0, 0.0]]), block_index=index)
     watch = TargetErrorRule(TargetError(radius_m=1.0), {"a": CoverageObserver(metric)}, REGIONS)
     assert not watch.is_reached(64)
     assert watch.estimate_num_frames(100) == 100

@@ -31,7 +31,7 @@ def written(folder):
 
 
 def content(folder, **settings):
-    settings = {"steps": 2, "every_s": 0.1, **settings}
+    settings = {"steps": 2, "frame_interval_s": 0.1, **settings}
     return json.dumps(SimulatedFrames(folder / "road.yaml", folder / "low.yaml", **settings).content)
 
 
@@ -46,7 +46,12 @@ def test_of_a_simulation_it_is_what_stands_in_the_files(tmp_path):
         (tmp_path / name).write_text((tmp_path / name).read_text().replace(old, new))
         assert content(tmp_path) != before, name
         assert content(written(tmp_path)) == before
-    for changed in ({"seed": 1}, {"every_s": 0.2}, {"reference_sensor": reference_called(rays=999)}, {"boxes": True}):
+    for changed in (
+        {"seed": 1},
+        {"frame_interval_s": 0.2},
+        {"reference_sensor": reference_called(rays=999)},
+        {"boxes": True},
+    ):
         assert content(tmp_path, **changed) != before
     assert content(tmp_path, steps=9) == before
 

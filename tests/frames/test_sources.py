@@ -60,7 +60,7 @@ def test_a_source_is_a_map_style_dataset_that_knows_whose_frames_they_are(tmp_pa
     assert len(source) == 2
     for index in range(2):
         frame = source[index]
-        assert (frame.index, frame.place_in_time) == (index, source.place_in_time(index))
+        assert (frame.index, frame.block_index) == (index, source.block_index(index))
         assert list(frame.clouds) == list(source.rigs)
         assert (frame.reference_weights is not None) == source.square_metres
         heights_m = frame.reference_heights_m
@@ -76,7 +76,7 @@ def test_a_source_is_a_map_style_dataset_that_knows_whose_frames_they_are(tmp_pa
     assert set(source.sensors) <= set(source.rigs)
     assert set(source.description) >= {"scenario", "vehicle", "frames", "seed"}
     simulated = source.description["scenario"] is not None
-    assert {"sensor", "notes"} | ({"every_s"} if simulated else set()) == set(source.reference_record)
+    assert {"sensor", "notes"} | ({"frame_interval_s"} if simulated else set()) == set(source.reference_record)
     if source.ego_outline_m is not None:
         assert source.ego_outline_m.shape[1] == 2
     torch.testing.assert_close(pickle.loads(pickle.dumps(source))[1].reference, source[1].reference)
@@ -154,9 +154,11 @@ def test_a_batch_has_weights_of_all_its_frames_or_of_none():
 
 
 def test_blocks_of_a_source_end_where_its_frames_show_something_else(tmp_path):
-    traffic = SimulatedFrames("urban", "front_roof_32", steps=3, every_s=10.0, reference_sensor=PaperReference(4, 4))
+    traffic = SimulatedFrames(
+        "urban", "front_roof_32", steps=3, frame_interval_s=10.0, reference_sensor=PaperReference(4, 4)
+    )
     ends = find_block_ends(traffic, max_blocks=4)
-    places = [traffic.place_in_time(index) for index in range(ends[-1] + 1)]
+    places = [traffic.block_index(index) for index in range(ends[-1] + 1)]
     assert ends == [places.index(number) for number in range(1, 5)]
     assert find_block_ends(simulated(None), max_blocks=3) == [1, 2, 3]  # nothing moves: each frame has its reference
     assert find_block_ends(recorded(tmp_path)) == [1, 2]

@@ -34,7 +34,7 @@ def test_what_is_less_visible_or_unknown_is_left_out_and_counted(least, kept):
     (frame,) = VisibleTargets([a_frame()], least, threshold_m=0.1)
     assert frame.boxes.centre_m[:, 0].tolist() == list(kept)
     assert frame.boxes.visibility.tolist() == [{10.0: 0.75, 20.0: 0.25, 40.0: 0.0}[x] for x in kept]
-    assert frame.counts == {"seen": 1, "targets_left_out": 4 - len(kept)}
+    assert frame.counts == {"seen": 1, "targets_omitted": 4 - len(kept)}
     assert len(frame.boxes.hits["rig"]) == len(frame.boxes.categories) == len(kept)
 
 
@@ -46,7 +46,7 @@ def test_shares_go_with_their_boxes_through_loaders_and_augmentation():
 
 
 def test_of_a_simulation_they_are_those_of_box_visibility():
-    frames = SimulatedFrames("urban", "front_roof_32", steps=2, every_s=15.0, boxes=True)
+    frames = SimulatedFrames("urban", "front_roof_32", steps=2, frame_interval_s=15.0, boxes=True)
     for frame, kept in zip(frames, VisibleTargets(frames, 0.3), strict=True):
         seen = box_visibility(frame.sensor, frame.reference, frame.boxes, reference_weights=frame.reference_weights)
         expected = [name for name, share in zip(frame.boxes.ids, seen.share.tolist(), strict=True) if share >= 0.3]

@@ -109,7 +109,7 @@ def coverage_step(index: int) -> Step:
         "sensor": sensor,
         "reference": reference,
         "weights": torch.rand(60, generator=generator) + 0.1,
-        "place_in_time": index,
+        "block_index": index,
     }
 
 
@@ -117,7 +117,7 @@ def coverage(steps: int, changes: Mapping[str, Step], **options: Any) -> Case:
     return Case(
         lambda **changed: CoverageMetric(**{**COVERAGE, **options, **changed}),
         [coverage_step(index) for index in range(steps)],
-        {"sensor": torch.zeros(1, 3), "reference": torch.empty(0, 3), "weights": torch.empty(0), "place_in_time": 0},
+        {"sensor": torch.zeros(1, 3), "reference": torch.empty(0, 3), "weights": torch.empty(0), "block_index": 0},
         {
             "grid": {"grid": BevGrid(**{**SHAPE, "x": (-1.0, 3.0)}, heights=BANDS)},
             "grid, bands in another order": {"grid": BevGrid(**SHAPE, heights=dict(reversed(BANDS.items())))},

@@ -32,14 +32,16 @@ def same(a, b):
 
 @pytest.mark.parametrize("scenario", [LOT, yard(WALL)])
 def test_another_rig_sees_what_it_would_see_in_frames_of_its_own(scenario):
-    frames = SimulatedFrames(scenario, TWO, steps=8, every_s=0.4, seed=3)
-    other = Simulator(scenario, {"first": rig()}, SurfaceReference((((0, 9), (-3, 3)),), rays=64), seed=3, every_s=0.4)
+    frames = SimulatedFrames(scenario, TWO, steps=8, frame_interval_s=0.4, seed=3)
+    other = Simulator(
+        scenario, {"first": rig()}, SurfaceReference((((0, 9), (-3, 3)),), rays=64), seed=3, frame_interval_s=0.4
+    )
     candidate = other.with_rigs({"candidate": TWO})
     for index in (4, 0, 3, 0):
         scans = candidate.scans(index)["candidate"]
         np.testing.assert_array_equal(np.concatenate([scan.points for scan in scans]), frames[index].sensor.numpy())
     # And who was there first sees no more and no less for it.
-    alone = SimulatedFrames(scenario, rig(), steps=8, every_s=0.4, seed=3)
+    alone = SimulatedFrames(scenario, rig(), steps=8, frame_interval_s=0.4, seed=3)
     np.testing.assert_array_equal(other.step(3).clouds["first"], alone[3].sensor.numpy())
 
 
@@ -69,7 +71,7 @@ def test_numbers_are_those_of_evaluate_on_the_same_frames_to_the_last_bit():
         found._worlds[0],
         TWO,
         steps=max(index.frame_index for index in found.indices) + 1,
-        every_s=0.4,
+        frame_interval_s=0.4,
         reference_sensor=found.queries.build_reference_sensor(1024),
     )
     steps = [index.frame_index for index in found.indices]
@@ -169,7 +171,7 @@ def test_a_world_without_traffic_shows_each_instant_once():
         ({"objectives": {}}, "objectives: at least one"),
         ({"worlds": 0}, "worlds: at least 1"),
         ({"per_world": 4}, "per_world: a run of 'lot' has 3 frames that are 0.4 s apart; got 4"),
-        ({"every_s": 0.3}, "every_s: a positive multiple"),
+        ({"frame_interval_s": 0.3}, "frame_interval_s: a positive multiple"),
         ({"workers": -1}, "workers: a number >= 0"),
         ({"seed": -1}, "seed: a number >= 0"),
         ({"budget_bytes": 1000.0}, "budget_bytes: 3 worlds .* in which 0 fit; use fewer worlds"),
@@ -231,7 +233,9 @@ def test_threads_make_no_difference(frames):
 
 
 def test_a_recording_is_one_world_for_any_seed_and_none_of_it_is_fresh():
-    with held(["tracks_table"], {"near": Objective(region="20m", band="ground")}, worlds=3, every_s=0.5) as recorded:
+    with held(
+        ["tracks_table"], {"near": Objective(region="20m", band="ground")}, worlds=3, frame_interval_s=0.5
+    ) as recorded:
         assert [index.scene_id for index in recorded.indices] == [0, 0]
         with pytest.raises(ValueError, match="one whose worlds are drawn is needed; 'tracks_table' is the same"):
             recorded.resample(9, 3, {})

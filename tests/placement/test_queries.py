@@ -122,7 +122,7 @@ def test_a_number_without_any_sensor_says_so(several):
 
 
 def test_numbers_that_are_by_no_choice_of_estimate_are_the_same_by_both():
-    alone = {"known": Objective(number="known_radius_m", region="20m")}
+    alone = {"known": Objective(number="cells_radius_m", region="20m")}
     for asked in (NUMBERS, alone):
         by_area, by_cells = (
             held(objectives=asked, estimate=one).score(TWO).estimate.value for one in ("area", "known")

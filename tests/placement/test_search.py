@@ -419,7 +419,7 @@ def test_a_real_search_does_not_depend_on_the_number_of_workers(tmp_path):
             "objectives": {"near": {"region": "20m"}},
         }
     )
-    small = {"worlds": 3, "num_held_out_scenes": 3, "per_world": 2, "every_s": 0.4, "rays": 512}
+    small = {"worlds": 3, "num_held_out_scenes": 3, "per_world": 2, "frame_interval_s": 0.4, "rays": 512}
     results = [run_search(PlacementSearch(of, evaluations=3, workers=workers, **small)) for workers in (0, 1)]
     assert contents(results[0].search) == contents(results[1].search)
     assert results[0].summary == results[1].summary

@@ -71,11 +71,11 @@ def test_worlds_that_know_nothing_of_a_part_count_for_nothing(measure):
     walled = {"name": "walled", "ego": EGO, "bodies": [FLOOR, WALL]}
     scenarios = [type(LOT).model_validate(one) for one in (yard, walled)]
     asked = {"a": Objective(region="20m", band="obstacle")}
-    with held(scenarios, asked, per_world=1, every_s=0.1, estimate=measure) as two:
+    with held(scenarios, asked, per_world=1, frame_interval_s=0.1, estimate=measure) as two:
         value = float(two.score(rig()).estimate.value[0])
         assert compute_point_weights(two)[0] @ observe_points(rig(), two)[0] == pytest.approx(value, rel=1e-12)
     with (
-        held(scenarios[:1], asked, per_world=1, every_s=0.1) as one,
+        held(scenarios[:1], asked, per_world=1, frame_interval_s=0.1) as one,
         pytest.raises(ValueError, match="no frame shows any surface of obstacle in 20m"),
     ):
         compute_point_weights(one)

@@ -52,7 +52,7 @@ def test_pairing_takes_out_what_a_world_does_to_all():
 
 def test_a_number_that_is_by_no_choice_of_estimate_is_tested_once():
     low, high = rig(lidar(mount={"z_m": 1.6}), name="low"), rig(lidar(mount={"z_m": 2.4}), name="high")
-    keys = {"near": "radius_m", "largest": "radius_maximum_m", "cells": "known_radius_m"}
+    keys = {"near": "radius_m", "largest": "radius_maximum_m", "cells": "cells_radius_m"}
     objectives = {name: Objective(number=key, region="20m") for name, key in keys.items()}
     with held(objectives=objectives, estimate="known", worlds=2) as searched:
         found = validate({"higher": high}, low, searched, test_seed=1, num_scenes=2).improvements["higher"]

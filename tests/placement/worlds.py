@@ -41,7 +41,9 @@ def rig(*sensors, name="small", **keys):
 
 
 def held(scenarios=(LOT,), objectives=OBJECTIVES, **keys):
-    return CommonFrames(scenarios, objectives, **{"worlds": 3, "per_world": 2, "every_s": 0.4, "rays": 1024} | keys)
+    return CommonFrames(
+        scenarios, objectives, **{"worlds": 3, "per_world": 2, "frame_interval_s": 0.4, "rays": 1024} | keys
+    )
 
 
 def estimate_of(values, world, lower_is_better=()):

@@ -221,7 +221,17 @@ def test_what_the_recorder_writes_is_read_with_the_numbers_of_the_world(recorder
     ]
     (tmp_path / "sensors.json").write_text(str(sensors).replace("'", '"'))
     out = tmp_path / "drive"
-    arguments = [str(out), "--sensors", str(tmp_path / "sensors.json"), "--frames", "3", "--every", "2", "--rays", "8"]
+    arguments = [
+        str(out),
+        "--sensors",
+        str(tmp_path / "sensors.json"),
+        "--frames",
+        "3",
+        "--every",
+        "2",
+        "--num-rays",
+        "8",
+    ]
     carla_recorder.main(arguments)
     assert "torchcover evaluate --frames" in capsys.readouterr().out
     assert not world.settings.synchronous_mode

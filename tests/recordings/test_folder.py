@@ -91,10 +91,10 @@ def test_bad_weights_are_a_bad_frame(tmp_path, arrays, message):
 
 def test_frames_that_are_no_news_to_each_other_share_an_instant(tmp_path):
     driven(clouds(tmp_path, sensor=CLOUD, reference=CLOUD))
-    assert [frame.place_in_time for frame in RecordedFrames(tmp_path)] == [0, 1]
+    assert [frame.block_index for frame in RecordedFrames(tmp_path)] == [0, 1]
     text = (tmp_path / "poses.csv").read_text().splitlines()
     (tmp_path / "poses.csv").write_text("\n".join([text[0] + ",instant", *(line + ",7" for line in text[1:])]))
-    assert [frame.place_in_time for frame in RecordedFrames(tmp_path)] == [7, 7]
+    assert [frame.block_index for frame in RecordedFrames(tmp_path)] == [7, 7]
     (tmp_path / "poses.csv").write_text("\n".join([text[0] + ",instant", *(line + ",7.5" for line in text[1:])]))
     with pytest.raises(ValueError, match=r"poses\.csv: instant: whole numbers are needed; got 7\.5"):
         RecordedFrames(tmp_path)

@@ -283,7 +283,7 @@ def test_frames_of_one_window_share_a_place_in_time():
         for name, value in changed.items():
             setattr(drive, name, value)
         frames = RecordedFrames(drive, reference=AccumulatedReference(window_s))
-        return [frames[index].place_in_time for index in range(len(frames))]
+        return [frames[index].block_index for index in range(len(frames))]
 
     assert places(0.5) == [index // 5 for index in range(30)]
     assert places(5.0) == [0] * 30  # too short for an error

@@ -32,7 +32,7 @@ REAR = {"name": "a rear", "mount": {"x_m": -2.6, "z_m": 0.9, "yaw_deg": 170}, **
 def simulated(*sensors, scenario="parking", steps=2, **others):
     rig = Rig.model_validate({"name": "both", "sensors": sensors})
     reference_sensor = SurfaceReference((((-20.0, 40.0), (-10.0, 10.0)),), rays=512)
-    others = {"boxes": True, "every_s": 45.0, "reference_sensor": reference_sensor, **others}
+    others = {"boxes": True, "frame_interval_s": 45.0, "reference_sensor": reference_sensor, **others}
     return SimulatedFrames(scenario, rig, steps=steps, seed=5, **others)
 
 
@@ -64,7 +64,7 @@ def test_a_plain_folder_gives_the_frames_that_were_written(both, tmp_path):
         # Of what was written it is unknown where it truly is: a point may leave a box that it was on.
         hits = [next(iter(frame.boxes.hits.values())) for frame in (read, written)]
         assert (hits[0] - hits[1]).abs().max() <= 0.2 * max(hits[1].max(), 5)
-        assert read.place_in_time == written.place_in_time
+        assert read.block_index == written.block_index
         assert sum(read.counts.values()) == 0  # nothing was lost on the way
 
 
@@ -268,7 +268,7 @@ def test_a_recording_has_the_frames_that_were_written(tmp_path):
 
 
 def test_a_kill_at_any_file_operation_costs_a_frame_at_most(tmp_path, monkeypatch):
-    frames = simulated(FRONT, scenario="courtyard", steps=2, every_s=0.1, boxes=False)
+    frames = simulated(FRONT, scenario="courtyard", steps=2, frame_interval_s=0.1, boxes=False)
     made, content = [writing._step(frames, index) for index in range(2)], frames.content
     monkeypatch.setattr(writing, "_step", lambda _, index: made[index])
     monkeypatch.setattr(SimulatedFrames, "content", content)

@@ -27,7 +27,7 @@ def over_steps(size: int, seed: int, steps: int, **options) -> Coverage:
     """One cloud of the rig a step, against reference points of that step."""
     metric = CoverageMetric(GRID, blocks=16, **options)
     for index in range(steps):
-        metric.update(cloud(size, seed * 100 + index), cloud(100, 1000 + index), place_in_time=index)
+        metric.update(cloud(size, seed * 100 + index), cloud(100, 1000 + index), block_index=index)
     return metric.compute()
 
 
@@ -36,7 +36,7 @@ def over_surface(size: int, seed: int, steps: int) -> Coverage:
     metric = CoverageMetric(GRID, blocks=16, square_metres=True)
     for index in range(steps):
         m2 = 0.1 + 0.8 * torch.rand(100, generator=torch.Generator().manual_seed(index))
-        metric.update(cloud(size, seed * 100 + index), cloud(100, 1000 + index), weights=m2, place_in_time=index)
+        metric.update(cloud(size, seed * 100 + index), cloud(100, 1000 + index), weights=m2, block_index=index)
     return metric.compute()
 
 

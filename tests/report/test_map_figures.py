@@ -33,7 +33,7 @@ def blocked(steps: int) -> Coverage:
     metric = CoverageMetric(SQUARE, blocks=16)
     for index in range(steps):
         points = [[0.5, 0.5, 0.0]] if index % 8 else [[0.5, 0.5, 0.0], [9.5, 0.5, 0.0]]
-        metric.update(torch.tensor([[0.5, 0.5, -0.3 - 0.02 * (index % 16)]]), torch.tensor(points), place_in_time=index)
+        metric.update(torch.tensor([[0.5, 0.5, -0.3 - 0.02 * (index % 16)]]), torch.tensor(points), block_index=index)
     return metric.compute()
 
 

@@ -74,9 +74,9 @@ def test_a_column_says_in_words_what_it_says_in_files(measure, table, trio, regi
 def test_files_have_both_measures_each_under_its_name():
     wall, nothing = records(CoverageTable.from_coverages({"rig": two_cells()}, [WALL, NOTHING]))
     assert (wall["measure"], wall["visible_m2"], nothing["visible_m2"]) == ("area", 2.0, 0.0)
-    assert (wall["radius_m"], wall["known_radius_m"]) == (0.25, 0.5)
-    assert (wall["detection_0.4m"], wall["known_detection_0.4m"]) == (0.75, 0.5)
-    assert (nothing["radius_m"], nothing["known_radius_m"]) == (None, None)
+    assert (wall["radius_m"], wall["cells_radius_m"]) == (0.25, 0.5)
+    assert (wall["detection_0.4m"], wall["cells_detection_0.4m"]) == (0.75, 0.5)
+    assert (nothing["radius_m"], nothing["cells_radius_m"]) == (None, None)
 
 
 @pytest.mark.parametrize("band_frame", ["ground", "vehicle"])
@@ -91,7 +91,7 @@ def test_every_row_of_a_file_names_what_its_band_is_over(band_frame):
 def test_records_are_those_of_the_summary(table, surface_pair, regions):
     rows = [row for coverage in surface_pair.values() for row in coverage.summary(regions)]
     for record, row in zip(records(table), rows, strict=True):
-        for key in KEYS if row.known_cells else ():
+        for key in KEYS if row.observed_cells else ():
             assert tuple(record[f"{key}{end}"] for end in ("", "_error", "_low", "_high")) == row.numbers[key][1:5]
             assert tuple(record[f"known_{key}{end}"] for end in ("", "_error", "_low", "_high")) == row.known[key][1:5]
             assert record[key] != record[f"known_{key}"]

@@ -153,7 +153,7 @@ def over_surface(size: int, points) -> Coverage:
     metric = CoverageMetric(GRID, blocks=16, square_metres=True)
     for index in range(16):
         m2 = 0.1 + 0.8 * torch.rand(400, generator=torch.Generator().manual_seed(index))
-        metric.update(points(size, 100 + index), points(400, 1000 + index), weights=m2, place_in_time=index)
+        metric.update(points(size, 100 + index), points(400, 1000 + index), weights=m2, block_index=index)
     return metric.compute()
 
 
@@ -441,15 +441,15 @@ def test_cells_taken_together_have_their_mean_by_weight_and_the_page_says_so():
 
 
 def test_words_between_backticks_are_code_everywhere():
-    told = "Add `--steps`; 5 % of <b> are `a<b`."
+    told = "Add `--num-frames`; 5 % of <b> are `a<b`."
     table = PageTable(told, (told, told), [[TextCell(told), TextCell(told)]], notes=[told])
     parts = {"tables": [table], "more_tables": [table], "pictures": [PagePicture(told, b"png")]}
     rigs = [PageRig(told, [replace(SENSOR, name=told)], "name: rig")]
     page = Page(told, told, findings=(told, told), rigs=rigs, facts={told: {told: told}}, **parts)
     text = render_page(page).partition('<script type="application/json"')[0]
-    assert text.count("Add <code>--steps</code>; 5&nbsp;% of &lt;b&gt; are <code>a&lt;b</code>.") == 23
-    assert "<title>Add --steps; 5 % of &lt;b&gt; are a&lt;b.</title>" in text
-    assert 'alt="Add --steps; 5 % of &lt;b&gt; are a&lt;b."' in text
+    assert text.count("Add <code>--num-frames</code>; 5&nbsp;% of &lt;b&gt; are <code>a&lt;b</code>.") == 23
+    assert "<title>Add --num-frames; 5 % of &lt;b&gt; are a&lt;b.</title>" in text
+    assert 'alt="Add --num-frames; 5 % of &lt;b&gt; are a&lt;b."' in text
     assert "`" not in text.partition("</style>")[2]
 
 

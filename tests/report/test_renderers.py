@@ -72,7 +72,10 @@ def test_csv_reads_back_as_json_and_json_as_the_table(table):
     assert csv_rows(table) == [{name: as_field(value) for name, value in row.items()} for row in rows]
     for record, row in zip(rows, [row for rows in table.rows.values() for row in rows], strict=True):
         assert (record["rig"], record["region"], record["height"]) == (row.rig, row.region.name, row.summary.height)
-        assert (record["known_cells"], record["known_share"]) == (row.summary.known_cells, row.summary.known_share)
+        assert (record["observed_cells"], record["observed_share"]) == (
+            row.summary.observed_cells,
+            row.summary.observed_share,
+        )
         for key, number in row.summary.numbers.items():
             expected = to_json_record({part: getattr(number, part) for part in ("value", "error", "low", "high")})
             assert [record[key], *(record[f"{key}_{part}"] for part in ("error", "low", "high"))] == [
@@ -127,9 +130,9 @@ def test_files_hold_the_bounds_and_the_blocks(trio, regions):
     table = CoverageTable.from_coverages(trio, regions)
     row = csv_rows(table)[3]
     assert [float(row[f"{axis}_{end}_m"]) for axis in "xyz" for end in ("min", "max")] == [-8, -6, -5, 5, 0.5, 2]
-    assert (row["steps"], row["blocks"], row["steps_per_block"], row["cell_m"]) == ("24", "12", "2", "1.0")
+    assert (row["steps"], row["blocks"], row["frames_per_block"], row["cell_m"]) == ("24", "12", "2", "1.0")
     content = json_of(table)
-    assert (content["blocks"], content["steps_per_block"], content["thresholds_m"]) == (12, 2, [0.4])
+    assert (content["blocks"], content["frames_per_block"], content["thresholds_m"]) == (12, 2, [0.4])
     assert content["grid"] == {
         "x_m": [-8.0, 12.0],
         "y_m": [-5.0, 5.0],
@@ -142,7 +145,7 @@ def test_files_hold_the_bounds_and_the_blocks(trio, regions):
 
 def test_without_blocks_there_are_none_in_files(pair, regions):
     content = build_table_dict(CoverageTable.from_coverages(pair, regions))
-    assert (content["blocks"], content["steps_per_block"]) == (None, None)
+    assert (content["blocks"], content["frames_per_block"]) == (None, None)
     assert {row["radius_m_error"] for row in content["rows"]} == {None}
 
 

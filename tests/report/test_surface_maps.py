@@ -33,7 +33,7 @@ def measured(steps: int = 16, points: int = 400):
         reference = torch.rand(points, 3, generator=random) ** torch.tensor([3.0, 3.0, 1.0]) * size
         reference[:, 0] *= 0.6
         m2 = 10 ** (-3 * torch.rand(points, generator=random))
-        metric.update(torch.rand(60, 3, generator=random) * size, reference, weights=m2, place_in_time=index)
+        metric.update(torch.rand(60, 3, generator=random) * size, reference, weights=m2, block_index=index)
     return metric.compute()
 
 
@@ -157,7 +157,7 @@ def test_small_cells_are_drawn_in_squares_with_the_same_numbers(cell, drawn_m):
     for seed in range(16):
         random = torch.Generator().manual_seed(seed)
         rig, reference = (torch.rand(99, 3, generator=random) * torch.tensor([7.0, 4.0, 2.0]) for _ in range(2))
-        metric.update(rig, reference, weights=torch.rand(99, generator=random) + 0.1, place_in_time=seed)
+        metric.update(rig, reference, weights=torch.rand(99, generator=random) + 0.1, block_index=seed)
     whole = metric.compute()
     drawn = downsample_coverage(whole)
     assert (drawn.grid.cell, drawn is whole) == (pytest.approx(drawn_m), drawn_m == cell)

@@ -90,8 +90,8 @@ def test_the_best_is_marked_where_its_lead_over_the_next_is_more_than_chance(tri
 
 def test_remarks_are_made_of_what_did_happen_only(blind, trios, regions):
     table = CoverageTable.from_coverages(blind, regions)
-    assert "empty_sensor_steps" not in names(table, "seeing")
-    (remark,) = [remark for remark in collect_table_notes(table, "blind") if remark.name == "empty_sensor_steps"]
+    assert "empty_sensor_frames" not in names(table, "seeing")
+    (remark,) = [remark for remark in collect_table_notes(table, "blind") if remark.name == "empty_sensor_frames"]
     assert (remark.count, remark.total) == (1, 1)
     assert "unknown_cells" in names(table, "seeing")
     assert names(CoverageTable.from_coverages({"few": trios(5)["few"]}, ()), "few") == {"no_region", "too_few_blocks"}

@@ -20,7 +20,7 @@ ORIGIN = torch.zeros(1, 3)
 @pytest.fixture(autouse=True)
 def no_other_columns(monkeypatch):
     """But how much the numbers are means over: rows are as these tests say whatever else the table has."""
-    kept = tuple(column for column in COLUMNS if column.key in ("visible_m2", "known_share"))
+    kept = tuple(column for column in COLUMNS if column.key in ("visible_m2", "observed_share"))
     monkeypatch.setattr("torchcover.report.layout.COLUMNS", kept)
 
 
@@ -42,7 +42,7 @@ def over_steps(steps: int) -> Coverage:
     radii = torch.rand(steps, generator=torch.Generator().manual_seed(0))
     for index, radius in enumerate(radii):
         place = torch.tensor([[0.5 + index % 2, 0.5 + index // 2 % 2, 0.0]])
-        coverage.update(place - torch.tensor([0.0, 0.0, float(radius)]), place, place_in_time=index)
+        coverage.update(place - torch.tensor([0.0, 0.0, float(radius)]), place, block_index=index)
     return coverage.compute()
 
 
@@ -120,7 +120,7 @@ def test_brackets_are_explained_where_there_are_any(differ):
     coverage, place = metric(blocks=16), torch.tensor([[0.5, 0.5, 0.0]])
     for index in range(16):
         radius_m = torch.tensor([0.0, 0.0, 0.1 + 0.05 * index * differ])
-        coverage.update(place - radius_m, place, place_in_time=index)
+        coverage.update(place - radius_m, place, block_index=index)
     text = text_of(coverage.compute(), NEAR)
     assert ("[" in text, "In brackets: 95 % intervals, from 16 blocks of a step." in text) == (differ, differ)
     assert ("In brackets" in text) == differ
@@ -130,7 +130,7 @@ def test_a_region_that_one_block_alone_has_probed_has_a_number_without_error():
     coverage = metric(blocks=16)
     for index in range(16):
         x = 2.5 if index == 3 else 0.5
-        coverage.update(torch.tensor([[x, 0.5, -0.2]]), torch.tensor([[x, 0.5, 0.0]]), place_in_time=index)
+        coverage.update(torch.tensor([[x, 0.5, -0.2]]), torch.tensor([[x, 0.5, 0.0]]), block_index=index)
     text = text_of(coverage.compute(), NEAR, FAR)
     assert cells_of(text, "near")[2] == "0.20"
     assert cells_of(text, "far")[2] == "0.20"
@@ -241,7 +241,7 @@ def test_with_many_sensors_each_has_a_row_and_eighty_columns_are_enough():
         generator = torch.Generator().manual_seed(index)
         size_m = torch.tensor([4.0, 2.0, 0.2])
         clouds = {name: size_m * torch.rand(4, 3, generator=generator) for name in sensors}
-        coverage.update(clouds, size_m * torch.rand(400, 3, generator=generator), place_in_time=index)
+        coverage.update(clouds, size_m * torch.rand(400, 3, generator=generator), block_index=index)
     computed = {"rig": coverage.compute()}
     narrow, wide = (printed(computed, (NEAR, FAR), width).partition("Change of")[2] for width in (80, 400))
     assert max(map(len, narrow.splitlines())) <= 80

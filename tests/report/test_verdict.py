@@ -58,7 +58,7 @@ def test_without_errors_nothing_is_told(pair, blind, trios, regions):
     (sentence,) = summarize_findings(CoverageTable.from_coverages(trios(4), AHEAD))
     assert sentence == (
         "Not enough frames for an answer: 4 form 4 blocks of time, intervals need about 9, which are 9 frames "
-        "(`--steps`)."
+        "(`--num-frames`)."
     )
     assert summarize_findings(CoverageTable.from_coverages(pair, regions[1:])) == ()
 
@@ -71,7 +71,7 @@ def test_the_advised_number_of_frames_gives_intervals(points, frames):
         metric = CoverageMetric(BevGrid(x=(-8.0, 12.0), y=(-5.0, 5.0), cell=1.0), blocks=16, square_metres=True)
         for index in range(count):
             m2 = torch.full((100,), 0.2 + 0.8 * (index % 5 > 1))
-            metric.update(points(40, index), points(100, 1000 + index), weights=m2, place_in_time=index // 3)
+            metric.update(points(40, index), points(100, 1000 + index), weights=m2, block_index=index // 3)
         return CoverageTable.from_coverages({"one": metric.compute()}, AHEAD, block_ends=range(3, 300, 3))
 
     table = table_of(frames)
@@ -124,7 +124,7 @@ def test_a_single_point_of_failure_costs_a_tenth_or_more_beyond_chance(alone, bl
     for index in range(blocks):
         reference = torch.rand(100, 3, generator=torch.Generator().manual_seed(index)) * torch.tensor([4.0, 4.0, 0.2])
         seen = {"roof": reference[: 60 + alone(index)], "rear": reference[:60]}
-        metric.update(seen, reference, weights=torch.full((100,), 0.1), place_in_time=index)
+        metric.update(seen, reference, weights=torch.full((100,), 0.1), block_index=index)
     table = CoverageTable.from_coverages({"rig": metric.compute()}, AHEAD[:1])
     assert describe_single_point_of_failure(table, "rig").startswith(sentence)
     assert any(words.startswith(sentence) for words in summarize_findings(table))

@@ -31,7 +31,7 @@ def test_counts_say_what_was_left_out_in_traffic():
         in_range = counts["moving_bodies"] - counts["moving_bodies_out_of_range"]
         assert in_range >= 1
         assert counts["ray_body_pairs"] == in_range * (counts["sensor_rays"] + counts["reference_rays"])
-        assert 0.8 < counts["ray_body_pairs_left_out"] / counts["ray_body_pairs"] < 1
+        assert 0.8 < counts["ray_body_pairs_omitted"] / counts["ray_body_pairs"] < 1
         assert counts["sensor_rays_reused"] == 0
         assert counts["sensor_self_hits_reused"] == counts["sensor_self_hits"] > 0
 
@@ -40,7 +40,7 @@ def test_counts_say_what_was_left_out_where_nothing_moves():
     counts = simulator("courtyard").step(5).counts
     assert counts["sensor_rays_reused"] == counts["sensor_rays"] == 16 * 90
     assert counts["sensor_self_hits_reused"] == counts["sensor_self_hits"] > 0
-    assert counts["moving_bodies"] == counts["ray_body_pairs"] == counts["ray_body_pairs_left_out"] == 0
+    assert counts["moving_bodies"] == counts["ray_body_pairs"] == counts["ray_body_pairs_omitted"] == 0
 
 
 @pytest.mark.parametrize("keys", [{}, {"range_noise_m": 0.05, "dropout": 0.2}])

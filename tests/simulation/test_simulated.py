@@ -26,7 +26,7 @@ def same(a, b):
 def test_rays_of_warp_end_where_those_of_embree_do(scenario, device):
     """But for rounding, and for rays that pass an edge on the other side."""
     by_embree, by_warp = (
-        SimulatedFrames(scenario, "kitti", steps=2, every_s=1.0, device=each)[1] for each in (None, device)
+        SimulatedFrames(scenario, "kitti", steps=2, frame_interval_s=1.0, device=each)[1] for each in (None, device)
     )
     for one, other in ((by_embree.sensor, by_warp.sensor), (by_embree.reference, by_warp.reference)):
         for queries, points in ((one, other), (other, one)):
@@ -142,8 +142,8 @@ def test_dropout_takes_its_share_of_the_points():
 def test_a_reference_pose_inside_a_wall_is_drawn_again_and_counted():
     close = SimulatedFrames(scenario(wall_x=4.05), lidar(), steps=40, reference_sensor=SMALL)
     wide = SimulatedFrames(scenario(wall_x=50.0), lidar(), steps=40, reference_sensor=SMALL)
-    assert sum(close[index].counts["reference_poses_redrawn"] for index in range(40)) > 0
-    assert sum(wide[index].counts["reference_poses_redrawn"] for index in range(40)) == 0
+    assert sum(close[index].counts["reference_poses_resampled"] for index in range(40)) > 0
+    assert sum(wide[index].counts["reference_poses_resampled"] for index in range(40)) == 0
     for index in range(40):
         points = close[index].reference
         inside = ((points - torch.tensor([4.05, 0.0, 2.0])).abs() < 1.99).all(dim=1)
@@ -165,13 +165,15 @@ def test_traffic_plays_the_same_in_any_order_and_starts_anew_at_its_end(name):
 def test_a_longer_time_between_frames_shows_the_same_world_later():
     few = PaperReference(rows=2, columns=2)
     each = SimulatedFrames("parking", "front_roof_32", steps=1301, seed=1, reference_sensor=few)
-    spread = SimulatedFrames("parking", "front_roof_32", steps=3, seed=1, reference_sensor=few, every_s=65.0)
-    assert (each.every_s, spread.every_s) == (0.1, 65.0)
+    spread = SimulatedFrames("parking", "front_roof_32", steps=3, seed=1, reference_sensor=few, frame_interval_s=65.0)
+    assert (each.frame_interval_s, spread.frame_interval_s) == (0.1, 65.0)
     for index in range(3):  # the last one plays in another world
         assert torch.equal(spread[index].sensor, each[650 * index].sensor)
 
 
-@pytest.mark.parametrize("every_s", [0.0, -0.1, 0.05, 0.15, float("nan"), float("inf")])
-def test_a_time_between_frames_that_is_no_multiple_of_the_time_step_is_refused(every_s):
-    with pytest.raises(ValueError, match=r"every_s: a positive multiple of the time step of .urban., 0.1 s, is needed"):
-        SimulatedFrames("urban", "front_roof_32", steps=1, every_s=every_s)
+@pytest.mark.parametrize("frame_interval_s", [0.0, -0.1, 0.05, 0.15, float("nan"), float("inf")])
+def test_a_time_between_frames_that_is_no_multiple_of_the_time_step_is_refused(frame_interval_s):
+    with pytest.raises(
+        ValueError, match=r"frame_interval_s: a positive multiple of the time step of .urban., 0.1 s, is needed"
+    ):
+        SimulatedFrames("urban", "front_roof_32", steps=1, frame_interval_s=frame_interval_s)

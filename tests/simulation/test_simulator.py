@@ -54,11 +54,11 @@ def test_a_step_depends_on_seed_and_index_only_and_survives_pickling():
 
 
 def test_another_reference_sensor_sees_the_same_bodies_and_leaves_the_first_as_it_is():
-    base = simulator(every_s=0.5)
+    base = simulator(frame_interval_s=0.5)
     other = base.with_reference_sensor(SURFACE)
     assert other.scene_of(3)[0] is base.scene_of(3)[0]
     assert (base.reference_sensor, other.reference_sensor) == (SMALL, SURFACE)
-    assert (base.every_s, other.every_s) == (0.5, 0.5)
+    assert (base.frame_interval_s, other.frame_interval_s) == (0.5, 0.5)
     assert len(other.step(1).reference_weights) == len(other.step(1).reference)
 
 
@@ -80,7 +80,7 @@ def test_without_a_rig_there_is_the_reference_alone():
     ("ask", "message"),
     [
         (lambda: simulator(seed=-1), "seed: a number >= 0 is needed; got -1"),
-        (lambda: simulator(every_s=0.03), "every_s: a positive multiple"),
+        (lambda: simulator(frame_interval_s=0.03), "frame_interval_s: a positive multiple"),
         (lambda: simulator().step(-1), "index: a number >= 0 is needed; got -1"),
         (lambda: simulator().labels(-2), "index: a number >= 0 is needed; got -2"),
     ],

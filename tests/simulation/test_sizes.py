@@ -114,7 +114,7 @@ def test_an_actor_that_will_get_into_the_ego_is_known_before_the_run(tmp_path):
     with pytest.raises(ValueError, match=r"at t = 9 s"):
         simulator.step(9)
     # 0, 3, 6, and then 9.
-    every_third = Simulator(scenario, {}, PaperReference(rows=4, columns=4), every_s=3.0)
+    every_third = Simulator(scenario, {}, PaperReference(rows=4, columns=4), frame_interval_s=3.0)
     every_third.check_run(3)
     with pytest.raises(ValueError, match=r"at t = 9 s"):
         every_third.check_run(4)

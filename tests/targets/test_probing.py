@@ -110,9 +110,9 @@ def test_parts_and_other_processes_add_up_to_the_whole(tmp_path):
 def test_where_nothing_is_free_the_number_is_unknown_with_a_count():
     probes = probed(simulated(world(BLOCK), steps=8), body="child", places=3)
     left, right = probes.seen_by("small").summary()[LEFT:]
-    assert (left.cells, left.known_cells, left.visible_m2) == (24, 0, pytest.approx(np.nan, nan_ok=True))
+    assert (left.cells, left.observed_cells, left.visible_m2) == (24, 0, pytest.approx(np.nan, nan_ok=True))
     assert all(np.isnan([one.value, one.error]).all() and one.count == 0 for one in left.numbers.values())
-    assert 0 < right.known_cells == next(iter(right.numbers.values())).count
+    assert 0 < right.observed_cells == next(iter(right.numbers.values())).count
 
 
 def test_rays_that_were_cast_for_the_clouds_end_where_they_are_cast_again(tmp_path, monkeypatch):

@@ -164,7 +164,7 @@ def test_mmengine_needs_the_square_metres_that_the_metric_wants():
         without.evaluate(1)
     metric.process([replace(frame, reference_weights=torch.ones(9))], [{}])
     metric.evaluate(1)
-    assert metric.coverage.counts["steps"] == 1
+    assert metric.coverage.counts["frames"] == 1
 
 
 def test_mmengine_evaluates_it_as_any_of_its_metrics():
@@ -205,7 +205,7 @@ def test_mmengine_padding_is_left_out_by_the_size_of_the_dataset(monkeypatch, sa
         scalars = metric.evaluate(samples)
         assert all(name.startswith("rig/") for name in scalars)
         own = [k for position, k in enumerate(dealt) if position % processes == rank and position < samples]
-        assert metric.coverage.counts["steps"] == len(own)
+        assert metric.coverage.counts["frames"] == len(own)
         for sensor, reference in pairs(own):
             total.update(sensor[:, :3], reference[:, :3])
     assert total.steps == samples
@@ -275,4 +275,4 @@ def test_a_frame_counts_once_whatever_kind_of_number_its_index_is():
     once = CountOnce()
     frames = [Frame({"rig": torch.zeros(5, 3)}, torch.zeros(9, 3), index=index, name="a") for index in KINDS_OF_THREE]
     assert len(once.new(frames)) == 1
-    assert {type(frame.index) for frame in frames} == {type(frame.place_in_time) for frame in frames} == {int}
+    assert {type(frame.index) for frame in frames} == {type(frame.block_index) for frame in frames} == {int}

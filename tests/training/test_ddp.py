@@ -49,7 +49,7 @@ def test_two_processes_give_the_numbers_of_one(tmp_path):
 
     metric = CoverageMetric(BevGrid(**GRID), max_radius=9.0, blocks=8)
     for index, (sensor, reference) in enumerate(frames):
-        metric.update(sensor, reference, place_in_time=index)
+        metric.update(sensor, reference, block_index=index)
     truth = metric.compute()
     for name in ("whole", "resumed"):
         for rank in range(2):

@@ -34,7 +34,9 @@ def test_free_points_end_in_the_median_of_what_they_are_nearest_to():
 
 def test_the_example_lowers_the_mean_radius_and_draws_a_picture(tmp_path, monkeypatch, capsys):
     picture = tmp_path / "points.png"
-    monkeypatch.setattr(sys, "argv", ["optimise_points.py", "--points", "60", "--steps", "15", "--out", str(picture)])
+    monkeypatch.setattr(
+        sys, "argv", ["optimise_points.py", "--points", "60", "--num-frames", "15", "--out", str(picture)]
+    )
     runpy.run_path(str(EXAMPLE), run_name="__main__")
     said = capsys.readouterr().out
     before, after = (float(said.split(f"{when}: mean radius ")[1].split(" m")[0]) for when in ("before", "after"))

@@ -85,7 +85,7 @@ def make_metric(**options):
 def expected(frames):
     metric = make_metric()
     for frame in frames:
-        metric.update(frame.sensor, frame.reference, place_in_time=frame.index)
+        metric.update(frame.sensor, frame.reference, block_index=frame.index)
     return metric.compute()
 
 
@@ -255,7 +255,7 @@ def test_the_sums_are_where_the_model_is_even_if_no_frame_is_new(tmp_path):
         make_trainer(tmp_path, callback, use_distributed_sampler=False).fit(
             Validated(), loader(2), loader(1, sampler=padding)
         )
-    assert callback.coverage.counts["steps"] == 0
+    assert callback.coverage.counts["frames"] == 0
     assert set(callback.metric.devices) == {"cpu"}
 
 
@@ -266,7 +266,7 @@ def test_the_weights_of_reference_points_count(tmp_path):
     make_trainer(tmp_path, callback).fit(Validated(), loader(2), loader(frames))
     metric = make_metric()
     for frame in frames:
-        metric.update(frame.sensor, frame.reference, weights=weights, place_in_time=frame.index)
+        metric.update(frame.sensor, frame.reference, weights=weights, block_index=frame.index)
     assert_same(callback.coverage, metric.compute())
     assert not torch.equal(callback.coverage.radius, expected(frames).radius)
 
@@ -426,8 +426,8 @@ def test_frames_without_reference_points_are_unknown_and_said_so_once(tmp_path):
         trainer.fit(Validated(), loader(2), loader(RandomFrames(3, reference_points=0)))
     assert sum("no reference point lies in the grid" in str(warning.message) for warning in caught) == 1
     assert math.isnan(trainer.callback_metrics["coverage/val/radius_m/all/ground"])
-    assert trainer.callback_metrics["coverage/val/known_share/all/ground"] == 0
-    assert callback.coverage.counts["empty_reference_steps"] == 3
+    assert trainer.callback_metrics["coverage/val/observed_share/all/ground"] == 0
+    assert callback.coverage.counts["empty_reference_frames"] == 3
 
 
 class Save(pl.Callback):

@@ -15,7 +15,7 @@ def measured(frames: SimulatedFrames | RecordedFrames | ChosenRigs) -> Coverage:
     """A loop over any source of frames."""
     metric = CoverageMetric(BevGrid(x=(0.0, 20.0), y=(-5.0, 5.0)), max_radius=25.0)
     for frame in frames:
-        metric.update(frame.sensor, frame.reference, weights=frame.reference_weights, place_in_time=frame.place_in_time)
+        metric.update(frame.sensor, frame.reference, weights=frame.reference_weights, block_index=frame.block_index)
     return metric.compute()
 
 

@@ -16,7 +16,7 @@ UNITS_S = {"s": 1.0, "min": 60.0, "h": 3600.0}
 
 @with_options(
     build_setting_options(
-        "scenario", "vehicle", "ask", "thresholds_m", "reference", "rays", "seed", "device", "workers"
+        "scenario", "vehicle", "regions", "thresholds_m", "reference", "num_rays", "seed", "device", "num_workers"
     )
 )
 def study(
@@ -39,10 +39,10 @@ def study(
     settings = load_config(
         config, assignments or (), options.find_changed_settings(given)
     ).config.get_changed_settings()
-    settings.pop("steps", None)
+    settings.pop("num_frames", None)
     if unused := settings.keys() - set(STUDY_SETTINGS):
         raise ValueError(f"study does not take {', '.join(sorted(unused))}; it takes {', '.join(STUDY_SETTINGS)}")
-    fewer = "rays" not in settings and settings.get("reference") != "paper"
+    fewer = "num_rays" not in settings and settings.get("reference") != "paper"
     plan = StudyPlan(Settings(rig, num_frames=num_frames, **settings), StudyPlan.variants if fewer else ())
     with lock_folder(out):
         found = measure_error_against_time(plan, show_progress=True)
@@ -51,7 +51,9 @@ def study(
 
 
 @with_options(
-    build_setting_options("scenario", "seed", "vehicle", "sensor_model", "weather", "reference", "rays", "every_s")
+    build_setting_options(
+        "scenario", "seed", "vehicle", "sensor_model", "weather", "reference", "num_rays", "frame_interval_s"
+    )
 )
 def record(
     rig: options.RigArgument,
@@ -221,7 +223,7 @@ def show(
     )
 
 
-@with_options(build_setting_options("vehicle", "sensor_model", "every_s", "seed"))
+@with_options(build_setting_options("vehicle", "sensor_model", "frame_interval_s", "seed"))
 def targets(
     rig: options.RigArgument,
     target: Annotated[
@@ -269,7 +271,7 @@ def targets(
     )
 
 
-@with_options(build_setting_options("vehicle", "sensor_model", "seed", "workers"))
+@with_options(build_setting_options("vehicle", "sensor_model", "seed", "num_workers"))
 def report(
     rigs: Annotated[list[str], typer.Argument(help="Rigs: built-in names (see `list`) or YAML files; at most 8.")],
     scenario: Annotated[str, typer.Option(help="Traffic: a built-in name or a YAML file.")] = "urban",
@@ -317,7 +319,7 @@ def report(
         found.result.run.raise_failure()
 
 
-@with_options(build_setting_options("vehicle", "sensor_model", "steps", "seed", "workers"))
+@with_options(build_setting_options("vehicle", "sensor_model", "num_frames", "seed", "num_workers"))
 def check(
     rigs: Annotated[list[str], typer.Argument(help="Rigs: built-in names (see `list`) or YAML files.")],
     requirements: Annotated[str, typer.Option(help="What they must see: a built-in set or a YAML file.")],
@@ -389,12 +391,12 @@ def encounter(
     from torchcover.report import Terminal, check_animation, print_page_tables, write_animation
 
     criterion = Criterion(**{name: settings.pop(name) for name in Criterion.__annotations__})
-    what, unused = "a set", {"worlds", "within_s"}
+    what, unused = "a set", {"num_scenes", "max_ttc_s"}
     if frames is not None:
         what = "--frames, which has rigs and traffic of its own"
-        unused = {"rigs", "encounters", "scenario", "phases", "worlds", "film", "pixels", *settings}
+        unused = {"rigs", "encounters", "scenario", "num_start_offsets", "num_scenes", "animation", "pixels", *settings}
     elif scenario is not None:
-        what, unused = "--scenario, whose traffic nobody stages", {"encounters", "phases", "film"}
+        what, unused = "--scenario, whose traffic nobody stages", {"encounters", "num_start_offsets", "animation"}
     for each in context.command.params:
         source = context.get_parameter_source(each.name or "")
         if each.name in unused and source is not None and source.name == "COMMANDLINE":
@@ -425,13 +427,13 @@ def encounter(
 def search(
     space: Annotated[Path, typer.Argument(help="YAML file of free variables, constraints and objectives.")],
     budget: Annotated[
-        str | None, typer.Option(help="Time for all of it: 30min (if nothing is given), 90s, 2h; or --evaluations.")
+        str | None, typer.Option(help="Time for all of it: 30min (if nothing is given), 90s, 2h; or --num-evaluations.")
     ] = None,
     num_evaluations: Annotated[
         int | None, typer.Option(min=1, help="Number of candidates instead of a time: the same ones on any machine.")
     ] = None,
     average: Annotated[
-        Literal["area", "known"],
+        Literal["area", "cells"],
         typer.Option(help="Average of a score: `area`, the visible surface, or `known`, the observed cells."),
     ] = "area",
     num_scenes: Annotated[int | None, typer.Option(min=1, help="Worlds of each scenario to search in (6).")] = None,
@@ -440,7 +442,7 @@ def search(
     ] = None,
     frames_per_scene: Annotated[int | None, typer.Option(min=1, help="Frames of each world (3).")] = None,
     frame_interval_s: Annotated[
-        float | None, typer.Option("--every-s", help="Seconds between two of them (20).")
+        float | None, typer.Option("--frame-interval-s", help="Seconds between two of them (20).")
     ] = None,
     num_rays: Annotated[int | None, typer.Option(min=1, help="Reference rays of each frame (16384).")] = None,
     seed: Annotated[
@@ -464,9 +466,9 @@ def search(
     from torchcover.cli.search_run import run_search_command
 
     if budget is not None and num_evaluations is not None:
-        raise ValueError("--budget, --evaluations: one of them; both are given")
-    given = {"worlds": num_scenes, "num_held_out_scenes": num_held_out_scenes, "per_world": frames_per_scene, "every_s": frame_interval_s,
-             "rays": num_rays, "workers": num_workers, **settings}  # fmt: skip
+        raise ValueError("--budget, --num-evaluations: one of them; both are given")
+    given = {"num_scenes": num_scenes, "num_held_out_scenes": num_held_out_scenes, "frames_per_scene": frames_per_scene, "frame_interval_s": frame_interval_s,
+             "num_rays": num_rays, "num_workers": num_workers, **settings}  # fmt: skip
     run_search_command(
         space,
         out,

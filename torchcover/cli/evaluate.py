@@ -38,7 +38,7 @@ def _measure(
         list[str] | None,
         typer.Option(
             help="Region NAME:x0,x1,y0,y1 in metres, forward and to the left; may be repeated, and replaces those of "
-            "--ask.",
+            "--regions.",
         ),
     ] = None,
     out: options.OutOption = Path("out"),
@@ -51,7 +51,7 @@ def _measure(
         typer.Option(
             "--resume",
             help="Go on from the checkpoint in --out, whatever ended that run, and keep it at the end, so that more "
-            "--steps can follow.",
+            "--num-frames can follow.",
         ),
     ] = False,
     config: options.ConfigOption = None,
@@ -72,8 +72,8 @@ def _measure(
             f"compare: at least two rigs are needed; got {named[0]} only (for one: `evaluate`; of a recording, each "
             "--sensors makes a rig)"
         )
-    if (asked := options.combine_regions(settings.get("ask"), region)) is not None:
-        settings["ask"] = asked
+    if (asked := options.combine_regions(settings.get("regions"), region)) is not None:
+        settings["regions"] = asked
     with join_run(out) as ranks:
         log = open_rerun_log(loaded.config.rerun, ranks)
         checkpoint = prepare_checkpoint(out, Settings(scenario=settings.get("scenario")), resume=resume)
@@ -95,16 +95,16 @@ MEASURING = [
         "scenario",
         "vehicle",
         "weather",
-        "ask",
+        "regions",
         "thresholds_m",
         "reference",
         "redundancy",
-        "steps",
-        "rays",
+        "num_frames",
+        "num_rays",
         "seed",
         "target_error",
         "device",
-        "workers",
+        "num_workers",
     ),
 ]
 DEFAULTS = {each.name: each.default for each in MEASURING}

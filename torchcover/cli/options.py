@@ -23,24 +23,24 @@ Command = Callable[..., None]
 # The groups of `--help`, by the names of options; what is in none stands under "Options".
 PANELS = {
     "What": "scenario frames sensors vehicle sensor_model weather target heading encounters requirements "
-    "redundancy thresholds_m threshold_m hits reference estimate phases worlds",
-    "Where": "ask region raster",
-    "How exact": "steps rays every_s seed target_error budget evaluations num_held_out_scenes per_world",
-    "Output": "out files explain film",
-    "How it runs": "config assignments device workers resume",
+    "redundancy thresholds_m threshold_m detection_points reference average num_start_offsets num_scenes",
+    "Where": "regions region raster",
+    "How exact": "num_frames num_rays frame_interval_s seed target_error budget num_evaluations num_held_out_scenes frames_per_scene",
+    "Output": "out files explain animation",
+    "How it runs": "config assignments device num_workers resume",
 }
 # Types of options that are no texts.
 OPTION_TYPES: dict[str, Any] = {
-    "steps": int,
-    "rays": int,
-    "workers": int,
-    "every_s": float,
-    "ask": Path,
+    "num_frames": int,
+    "num_rays": int,
+    "num_workers": int,
+    "frame_interval_s": float,
+    "regions": Path,
     "weather": list[str],
     "thresholds_m": list[float],
     "target_error": list[str],
     "sensor_model": Literal["ideal", "real"],
-    "estimate": Literal["area", "known"],
+    "average": Literal["area", "cells"],
 }
 PANEL_OF = {name: panel for panel, names in PANELS.items() for name in names.split()}
 
@@ -106,7 +106,7 @@ def _parameter(name: str) -> inspect.Parameter:
     field = EvaluateConfig.model_fields[name]
     default = field.default if type(field.default) in (bool, int, str) else None
     kind: Any = OPTION_TYPES.get(name, type(default) if default is not None else str)
-    minimum = 0 if name in ("seed", "workers") else 1 if kind is int else None
+    minimum = 0 if name in ("seed", "num_workers") else 1 if kind is int else None
     option = typer.Option(f"--{name.replace('_', '-')}", help=shorten_help(field.description or ""), min=minimum)
     annotation: Any = Annotated[kind if default is not None else kind | None, option]
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)

@@ -46,7 +46,10 @@ def run_search_command(
         FileNotFoundError: An unknown name or file.
     """
     find = _chosen if CHOICE_KEY in read_mapping(space_file) else _searched
-    settings = {"workers": compute_num_workers(FRAMES, settings.get("worlds", WORLDS), sends_frames=False), **settings}
+    settings = {
+        "num_workers": compute_num_workers(FRAMES, settings.get("num_scenes", WORLDS), sends_frames=False),
+        **settings,
+    }
     with lock_folder(out):
         report = find(space_file, out, resume=resume, **settings).report
         written = report.save(out, files=file_kinds)
@@ -57,7 +60,7 @@ def run_search_command(
 
 
 def _searched(path: Path, out: Path, *, resume: bool, **settings: Any) -> SearchResult:  # noqa: ANN401
-    if settings["budget_s"] is None and settings["evaluations"] is None:
+    if settings["budget_s"] is None and settings["num_evaluations"] is None:
         settings["budget_s"] = BUDGET_S
     search = PlacementSearch(SearchSpace.load(path), SearchPlan(**settings))
     journal = out / JOURNAL
@@ -71,7 +74,7 @@ def _searched(path: Path, out: Path, *, resume: bool, **settings: Any) -> Search
 def _chosen(path: Path, out: Path, *, resume: bool, **settings: Any) -> SelectionResult:  # noqa: ANN401
     asked = {
         "--budget": settings["budget_s"] is not None,
-        "--evaluations": settings["evaluations"] is not None,
+        "--num-evaluations": settings["num_evaluations"] is not None,
         "--resume": resume,
     }
     if useless := [option for option, given in asked.items() if given]:

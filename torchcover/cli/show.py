@@ -53,7 +53,7 @@ def show_item(
     if kind == "vehicle":
         given = {"--scenario": scenario, "--rig": rig, "--vehicle": vehicle, "--step": frame_index, "--seed": seed}
         _refuse("rigs and scenarios", given, f"{name!r} is a vehicle")
-        _refuse("a scenario", {"--film": animation}, f"{name!r} is a vehicle")
+        _refuse("a scenario", {"--animation": animation}, f"{name!r} is a vehicle")
         shape = body_called(name)
         body = Vehicle.load(name) if isinstance(shape, VehicleShape) else _of_mesh(shape)
         _say(console, body.description)
@@ -68,7 +68,7 @@ def show_item(
         _write(console, out / Path(name).stem, [("", plot_vehicle_figure(body))])
         return
     if kind == "rig":
-        _refuse("a scenario", {"--rig": rig, "--film": animation}, f"{name!r} is a rig")
+        _refuse("a scenario", {"--rig": rig, "--animation": animation}, f"{name!r} is a rig")
         shown = load_named_rig(name)
         if not list_cameras(shown):
             _refuse(

@@ -111,7 +111,7 @@ class MetricComparison:
             record["parameters"] = json.dumps(record["parameters"], sort_keys=True)
             lines.append([record[name] for name in COLUMNS])
         taus = [record.values() for record in self._tau_records()]
-        return {"metrics.csv": csv_text(lines), "metrics_tau.csv": csv_text([Tau._fields, *taus])}
+        return {"metrics.csv": csv_text(lines), "metrics_rank_correlation.csv": csv_text([Tau._fields, *taus])}
 
     def _number_records(self) -> list[dict[str, Any]]:
         return [{**to_json_record(row), "parameters": to_json_record(row["parameters"])} for row in self.rows()]

@@ -297,7 +297,7 @@ def said(key: str, unit: str, count_of: str, *, lower_is_better: bool = False, *
 
 
 class WorldRatios(SumsInBlocks, FrameMetric):
-    """Ratios S / A of sums over frames, kept in 16 blocks of contiguous worlds (`Frame.place_in_time`).
+    """Ratios S / A of sums over frames, kept in 16 blocks of contiguous worlds (`Frame.block_index`).
 
     A metric gives its `ratios`, and in `_of_frame` what a frame adds to each: a_j, s_j, and how many these are. Errors
     are the block jackknife's, as those of regions in `Coverage`; a ratio that fewer than 8 blocks know has none, nor
@@ -326,7 +326,7 @@ class WorldRatios(SumsInBlocks, FrameMetric):
 
     def _add_frame(self, frame: Frame) -> None:
         base, sums, counts = self._of_frame(frame)  # before anything is added
-        block = self._block_of(frame.place_in_time)
+        block = self._block_of(frame.block_index)
         self.base[block] += base.to(self.base)
         self.sums[block] += sums.to(self.sums)
         self.counts += counts.to(self.counts)

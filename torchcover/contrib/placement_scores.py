@@ -21,7 +21,7 @@ from torchcover.simulation import RegionsOfInterest, Scenario
 THRESHOLD_M = 0.4
 CELL_M = 1.0
 RADIUS_M = 50.0
-MEASURES: Mapping[Measure, str] = {"area": "visible surface", "known": "known cells"}
+MEASURES: Mapping[Measure, str] = {"area": "visible surface", "cells": "observed cells"}
 # Counts what any metric has to beat: how many points there are.
 COUNTS_POINTS, POINTS = "point_density", "points"
 # Of the parts of a number, those about what detectors are judged on.
@@ -82,7 +82,7 @@ def score_placements(
         steps: Steps.
         seed: Seed of the traffic.
         sensor_model: What sensors make of their hits; as for `evaluate`.
-        settings: Others of `evaluate`: `every_s`, `workers`, `progress`.
+        settings: Others of `evaluate`: `frame_interval_s`, `workers`, `progress`.
 
     Raises:
         ValueError: Fewer rigs, an unknown metric, or as `evaluate`.

@@ -102,7 +102,7 @@ class MSog(SumsInBlocks, FrameMetric):
     def _add_frame(self, frame: Frame) -> None:
         check_cloud(frame.reference, "reference")
         labels = self.sights.once(frame, ("labels", self.category, self.grid), lambda: self._labels(frame))
-        block = self._block_of(frame.place_in_time)
+        block = self._block_of(frame.block_index)
         for label, voxels in enumerate(labels):
             self.labelled[block, label, voxels.to(self.labelled.device)] += 1
 

@@ -44,7 +44,7 @@ FRAME = -1.0
 ROUNDING_M = 1e-5
 
 
-def occupancy_rows(boxes: Boxes, place_in_time: int, categories: Sequence[str], region: BoundingBox) -> Tensor:
+def occupancy_rows(boxes: Boxes, block_index: int, categories: Sequence[str], region: BoundingBox) -> Tensor:
     """(1 + K, 10) rows of a table for a frame: its own, and those of its boxes near the region."""
     boxes = boxes.of_category(*categories)
     rows = boxes.rows.double().cpu()
@@ -60,7 +60,7 @@ def occupancy_rows(boxes: Boxes, place_in_time: int, categories: Sequence[str], 
     table: Tensor = torch.unique(listed, dim=0)
     # Frames of the same place and content are the same frame, seen again; 48 bits are exact in float64.
     table[:, CONTENT] = int.from_bytes(hashlib.sha256(table.numpy().tobytes()).digest()[:6], "big")
-    table[:, PLACE] = place_in_time
+    table[:, PLACE] = block_index
     return table
 
 
@@ -289,7 +289,7 @@ class SMig(FrameMetric):
         rows = self.sights.once(
             frame,
             ("occupancy", self.categories, self.grid.region),
-            lambda: occupancy_rows(boxes, frame.place_in_time, self.categories, self.grid.region),
+            lambda: occupancy_rows(boxes, frame.block_index, self.categories, self.grid.region),
         )
         if self.occlusion:
             crossed = crossed_on_the_way(self.sensors, frame, self.rig, self.grid)

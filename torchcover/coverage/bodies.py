@@ -47,8 +47,8 @@ class BodySums:
         seen = f"free places with {self.hits} points or more"
         near = f"surface within {self.threshold_m:g} m of a point"
         return (
-            Quantity(f"places_{self.hits}_points", seen, "share", lower_is_better=False),
-            Quantity(f"surface_{self.threshold_m:g}m", near, "share", lower_is_better=False),
+            Quantity(f"target_positions_{self.hits}_points", seen, "share", lower_is_better=False),
+            Quantity(f"target_surface_{self.threshold_m:g}m", near, "share", lower_is_better=False),
         )
 
     @property
@@ -68,7 +68,7 @@ class BodySums:
             tried, free, _, visible_m2, _ = self._of(region, body).sum(dim=0).tolist()
             numbers = self.estimate(region, body).numbers(count=int(free), count_of="free places")
             m2 = visible_m2 / free if free else math.nan
-            rows.append(RegionSummary(region.name, body, int(tried), int(free), "places", numbers, {}, m2))
+            rows.append(RegionSummary(region.name, body, int(tried), int(free), "target_positions", numbers, {}, m2))
         return rows
 
     def stored(self) -> dict[str, Any]:
@@ -95,8 +95,8 @@ class BodyMixture(NamedTuple):
         """As `BodySums.summary`; places are those of all kinds together."""
         rows = []
         for place, *each in zip(self.places, *(part.summary() for _, part in self.parts), strict=True):
-            tried, free = (sum(getattr(row, name) for row in each) for name in ("cells", "known_cells"))
+            tried, free = (sum(getattr(row, name) for row in each) for name in ("cells", "observed_cells"))
             numbers = self.estimate(*place).numbers(count=free, count_of="free places")
             m2 = sum(weight * row.visible_m2 for (weight, _), row in zip(self.parts, each, strict=True))
-            rows.append(replace(each[0], cells=tried, known_cells=free, numbers=numbers, visible_m2=m2))
+            rows.append(replace(each[0], cells=tried, observed_cells=free, numbers=numbers, visible_m2=m2))
         return rows

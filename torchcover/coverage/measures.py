@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from torchcover.coverage.result import Coverage
 
 # What the number of a region is a mean over: its visible surface, its known cells, or places of a body.
-Measure = Literal["area", "known", "places"]
+Measure = Literal["area", "cells", "target_positions"]
 
 
 def estimate_known(coverage: "Coverage", region: Region, height: str) -> Estimate:

@@ -45,7 +45,7 @@ class CoverageMetric(MergeableMetric, CoverageSums):
         *,
         weights: Clouds | None = None,
         height: Clouds | None = None,
-        place_in_time: int | Sequence[int] | None = None,
+        block_index: int | Sequence[int] | None = None,
         error: Clouds | None = None,
     ) -> None:
         """Add steps as `CoverageSums.update` does, which says what it takes and refuses.
@@ -53,7 +53,7 @@ class CoverageMetric(MergeableMetric, CoverageSums):
         Warns:
             UserWarning: Once, of square metres that the metric does not average over.
         """
-        given = {"weights": weights, "height": height, "place_in_time": place_in_time, "error": error}
+        given = {"weights": weights, "height": height, "block_index": block_index, "error": error}
         CoverageSums.update(self, sensor, reference, **given)  # type: ignore[arg-type]  # each of its own type
         self._is_updated = True
         if weights is not None and len(weights) and not self.square_metres:
@@ -65,9 +65,9 @@ class CoverageMetric(MergeableMetric, CoverageSums):
 
     def forward(self, sensor: SensorClouds, reference: Clouds, **given: Any) -> Coverage:  # noqa: ANN401
         """Add steps as `update` does, which takes the same, and return the coverage of these steps alone."""
-        if given.get("place_in_time") is None:  # torchmetrics adds steps to an empty state: counting would start at 0
+        if given.get("block_index") is None:  # torchmetrics adds steps to an empty state: counting would start at 0
             steps = range(len(as_list(reference, "reference")))
-            given["place_in_time"] = [int(self.steps) + step for step in steps]
+            given["block_index"] = [int(self.steps) + step for step in steps]
         return super().forward(sensor, reference, **given)  # type: ignore[no-any-return]
 
     def compute(self) -> Coverage:

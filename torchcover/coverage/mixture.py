@@ -60,16 +60,16 @@ class Mixture:
 
     def _row(self, place: tuple[Region, str], rows: Sequence[RegionSummary]) -> RegionSummary:
         weights = [weight for weight, _ in self.parts]
-        known_cells = round(sum(weight * row.known_cells for weight, row in zip(weights, rows, strict=True)))
-        estimates = self.estimate(*place), self.estimate_aggregated(*place), self.estimate(*place, "known")
-        numbers = [estimate.numbers(count=known_cells, count_of="known cells") for estimate in estimates]
+        observed_cells = round(sum(weight * row.observed_cells for weight, row in zip(weights, rows, strict=True)))
+        estimates = self.estimate(*place), self.estimate_aggregated(*place), self.estimate(*place, "cells")
+        numbers = [estimate.numbers(count=observed_cells, count_of="known cells") for estimate in estimates]
         redundancy = None
         if sensors := rows[0].redundancy and tuple(rows[0].redundancy.without):
             each = [(weight, estimate_redundancy(part, *place)) for weight, part in self.parts]
             redundancy = region_redundancy(sensors, self.thresholds, Estimate.mixed(each))
         return replace(
             rows[0],
-            known_cells=known_cells,
+            observed_cells=observed_cells,
             numbers=numbers[0] | numbers[1],
             known=numbers[2],
             visible_m2=sum(weight * row.visible_m2 for weight, row in zip(weights, rows, strict=True)),

@@ -46,7 +46,7 @@ def check_paired(coverages: Mapping[str, Coverage]) -> None:
 
 def _same_steps(a: Coverage, b: Coverage) -> bool:
     same = torch.equal(a.known.at, b.known.at) and torch.equal(a.known.points, b.known.points)
-    same = same and a.counts["steps"] == b.counts["steps"]
+    same = same and a.counts["frames"] == b.counts["frames"]
     if a.blocks is None or b.blocks is None:
         return same and a.blocks is b.blocks
     return same and torch.equal(a.blocks.steps, b.blocks.steps)

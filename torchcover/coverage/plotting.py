@@ -25,7 +25,7 @@ def draw_coverage(coverage: object, ax: "Axes", layer: str | None, height: str |
         raise TypeError(f"val: one Coverage, as compute() returns it, is needed; got {type(coverage).__name__}")
     bands = list(coverage.grid.heights)
     first = coverage.quantities[min(1, len(coverage.thresholds))]
-    first = first if coverage.measure == "known" else by_area(first)
+    first = first if coverage.measure == "cells" else by_area(first)
     key = first.key if layer is None else layer
     band = bands[0] if height is None else height
     for name, given, there in (("layer", key, list(coverage.layers)), ("height", band, bands)):
@@ -54,7 +54,7 @@ def draw_coverage(coverage: object, ax: "Axes", layer: str | None, height: str |
         aspect="equal",
         xlabel="x forward (m)",
         ylabel="y left (m)",
-        title=f"{quantity.title}, {band}, {coverage.counts['steps']} steps (grey: unknown)",
+        title=f"{quantity.title}, {band}, {coverage.counts['frames']} steps (grey: unknown)",
     )
     label = f"{quantity.title} (m)" if quantity.unit == "m" else quantity.title
     ax.figure.colorbar(mesh, ax=ax, label=label, shrink=0.7, extend="max" if (values > highest).any() else "neither")

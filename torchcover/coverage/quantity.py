@@ -62,9 +62,9 @@ def over_known(quantity: Quantity) -> Quantity:
 
     Example:
         >>> over_known(RADIUS).key
-        'known_radius_m'
+        'cells_radius_m'
     """
-    return quantity._replace(key=f"known_{quantity.key}", title=f"{quantity.title}, over known cells")
+    return quantity._replace(key=f"cells_{quantity.key}", title=f"{quantity.title}, over known cells")
 
 
 RADIUS = radius()

@@ -61,8 +61,8 @@ class Coverage:
 
     COUNTS: ClassVar[tuple[str, ...]] = (
         "steps",
-        "empty_sensor_steps",
-        "empty_reference_steps",
+        "empty_sensor_frames",
+        "empty_reference_frames",
         "saturated_points",
         "inside_points",
         "outside_points",
@@ -103,7 +103,7 @@ class Coverage:
 
     def __repr__(self) -> str:
         known = f"{len(self.known.at) / self.grid.cells:.1%} of the cells known"
-        return f"Coverage({self.grid.shape} cells, {self.counts['steps']} steps, {known})"
+        return f"Coverage({self.grid.shape} cells, {self.counts['frames']} steps, {known})"
 
     def _repr_html_(self) -> str:
         return small_html([repr(self)], self.plot())
@@ -223,8 +223,8 @@ class Coverage:
 
     @property
     def measure(self) -> Measure:
-        """What its numbers are means over: "area" if the reference points had square metres, else "known"."""
-        return "known" if self.area is None else "area"
+        """What its numbers are means over: "area" if the reference points had square metres, else "cells"."""
+        return "cells" if self.area is None else "area"
 
     def estimate(self, region: Region, height: str, measure: Measure | None = None) -> Estimate:
         """The numbers of one region in one band with what they become without each block, for errors of differences.
@@ -233,7 +233,7 @@ class Coverage:
             region: A region within the grid.
             height: Name of the band.
             measure: "area", the mean over the visible surface (`torchcover.coverage.measures.area_in_blocks`), or
-                "known", the paper's unweighted mean over the known cells. Not given: that of this result.
+                "cells", the paper's unweighted mean over the known cells. Not given: that of this result.
 
         Returns:
             That of `quantities`.
@@ -264,7 +264,7 @@ class Coverage:
         """Any one number, by the name of its column in `summary.csv`.
 
         Args:
-            key: "radius_m", "detection_0.4m"; "known_detection_0.4m" over the known cells of a result by area;
+            key: "radius_m", "detection_0.4m"; "cells_detection_0.4m" over the known cells of a result by area;
                 "radius_maximum_m" of an aggregation; "radius_m_without_roof" and "seen_by_two_0.4m" of redundancy.
             region: A region within the grid.
             height: Name of the band.
@@ -291,7 +291,7 @@ class Coverage:
         if self.aggregated is not None:
             estimators[self.aggregated.quantities] = self.estimate_aggregated
         if self.measure == "area":
-            estimators[tuple(map(over_known, self.quantities))] = partial(self.estimate, measure="known")
+            estimators[tuple(map(over_known, self.quantities))] = partial(self.estimate, measure="cells")
         if self.redundancy is not None:
             own = redundancy_quantities(self.redundancy.sensors, self.thresholds)
             estimators[own] = lambda *place: estimate_redundancy(self, *place)[len(self.quantities) :]
@@ -301,7 +301,7 @@ class Coverage:
         """The summary as a flat dict for a logger, of the regions that `summary` takes.
 
         Returns:
-            `"radius_m/20m/ground"`, `"detection_0.4m/20m/ground"`, `"known_share/20m/ground"` and so on, and
+            `"radius_m/20m/ground"`, `"detection_0.4m/20m/ground"`, `"observed_share/20m/ground"` and so on, and
             `"visible_m2/20m/ground"` if the reference points had square metres.
         """
         rows = self._rows(regions)

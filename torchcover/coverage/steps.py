@@ -63,10 +63,10 @@ class StepSums(NamedTuple):
     """What one step adds to the sums of a `CoverageMetric`; it is small, and travels between processes.
 
     `cells` (1 + C, K) float64 are those of the grid that it touches, and what it adds to their columns; `places` the
-    same of regions in bands. `place_in_time` decides about its block, `counts` says how much each count grows.
+    same of regions in bands. `block_index` decides about its block, `counts` says how much each count grows.
     """
 
-    place_in_time: int
+    block_index: int
     counts: Mapping[str, int]
     cells: Tensor
     places: Tensor
@@ -106,7 +106,7 @@ def checked_steps(
     reference: Clouds,
     weights: Clouds | None,
     height: Clouds | None,
-    place_in_time: int | Sequence[int] | None,
+    block_index: int | Sequence[int] | None,
     error: Clouds | None,
     *,
     grid: BevGrid,
@@ -127,7 +127,7 @@ def checked_steps(
     count = len(references)
     every_weights: Sequence[Tensor | None] = [None] * count if weights is None else as_list(weights, "weights")
     every_height: Sequence[Tensor | None] = [None] * count if height is None else as_list(height, "height")
-    numbers = list(range(first, first + count)) if place_in_time is None else _numbers(place_in_time)
+    numbers = list(range(first, first + count)) if block_index is None else _numbers(block_index)
     if len(sensors) != count:
         raise ValueError(f"{len(sensors)} sensor clouds for {count} reference clouds; one pair a step")
     errors: Sequence[Tensor | None] = [None] * count if error is None else as_list(error, "error")
@@ -149,7 +149,7 @@ def checked_steps(
         check_weights(step.weights, len(step.reference), f"weights[{at}]")
         _check_height(step.height, step.reference, grid, f"height[{at}]")
         if not 0 <= step.number <= MAX_NUMBER:
-            raise ValueError(f"place_in_time[{at}]: a number from 0 to {MAX_NUMBER:,} is needed; got {step.number}")
+            raise ValueError(f"block_index[{at}]: a number from 0 to {MAX_NUMBER:,} is needed; got {step.number}")
     return steps
 
 
@@ -204,13 +204,13 @@ def _by_name(rig: Any, names: Sequence[str]) -> Mapping[str, Tensor]:  # noqa: A
     return {name: rig[name] for name in names}
 
 
-def _numbers(place_in_time: Any) -> list[int]:  # noqa: ANN401  (whatever the caller gave)
-    each = place_in_time if isinstance(place_in_time, Sequence) else [place_in_time]
+def _numbers(block_index: Any) -> list[int]:  # noqa: ANN401  (whatever the caller gave)
+    each = block_index if isinstance(block_index, Sequence) else [block_index]
     try:
         return [operator.index(number) for number in each]
     except (TypeError, ValueError) as error:
         raise TypeError(
-            f"place_in_time: a whole number, or a list with one for each step, is needed; got {place_in_time!r}"
+            f"block_index: a whole number, or a list with one for each step, is needed; got {block_index!r}"
         ) from error
 
 

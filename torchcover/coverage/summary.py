@@ -44,8 +44,8 @@ class RegionSummary:
         region: Name of the region.
         height: Name of the height band.
         cells: Number of cells in the region.
-        known_cells: How many of them a reference point has probed.
-        measure: What `numbers` are means over: "area", the visible surface, "known", the known cells, or "places" of a
+        observed_cells: How many of them a reference point has probed.
+        measure: What `numbers` are means over: "area", the visible surface, "cells", the known cells, or "target_positions" of a
             body, which is then the `height`, the places that were tried the cells, and the free ones the known ones.
         numbers: Key of the quantity, such as `"radius_m"` or `"detection_0.4m"` -> its number, those of other
             aggregations last; the error is NaN if it was not asked for, or if there are not enough steps.
@@ -59,7 +59,7 @@ class RegionSummary:
     region: str
     height: str
     cells: int
-    known_cells: int
+    observed_cells: int
     measure: Measure
     numbers: Mapping[str, Number]
     known: Mapping[str, Number]
@@ -67,9 +67,9 @@ class RegionSummary:
     redundancy: RegionRedundancy | None = None
 
     @property
-    def known_share(self) -> float:
+    def observed_share(self) -> float:
         """Share of the region's cells that are known. `known` is about this share, and biased when it is low."""
-        return self.known_cells / self.cells if self.cells else math.nan
+        return self.observed_cells / self.cells if self.cells else math.nan
 
     def scalars(self, *, errors: bool) -> dict[str, float]:
         """As `Coverage.scalars` has them, with or without errors."""
@@ -82,7 +82,7 @@ class RegionSummary:
             flat[key] = number.value
             if errors:
                 flat[f"{key}_error"] = number.error
-        flat["known_share"] = self.known_share
+        flat["observed_share"] = self.observed_share
         if self.measure == "area":
             flat["visible_m2"] = self.visible_m2
         return flat
@@ -90,9 +90,9 @@ class RegionSummary:
 
 def summarise(coverage: "Coverage", region: Region, height: str) -> RegionSummary:
     """The numbers of one region in one band."""
-    cells, known_cells = (int(each.sum()) for each in (coverage.cells_of(region), coverage.known_in(region, height)))
-    numbers = partial(Estimate.numbers, count=known_cells, count_of="known cells")
-    by_area, steps = coverage.measure == "area", coverage.counts["steps"]
+    cells, observed_cells = (int(each.sum()) for each in (coverage.cells_of(region), coverage.known_in(region, height)))
+    numbers = partial(Estimate.numbers, count=observed_cells, count_of="known cells")
+    by_area, steps = coverage.measure == "area", coverage.counts["frames"]
     redundancy = None  # by area it is known of the regions only that the metric was told of
     if coverage.redundancy is not None and (not by_area or region in coverage.regions):
         estimate = estimate_redundancy(coverage, region, height)
@@ -101,10 +101,10 @@ def summarise(coverage: "Coverage", region: Region, height: str) -> RegionSummar
         region=region.name,
         height=height,
         cells=cells,
-        known_cells=known_cells,
+        observed_cells=observed_cells,
         measure=coverage.measure,
         numbers=numbers(coverage.estimate(region, height)) | numbers(coverage.estimate_aggregated(region, height)),
-        known=numbers(coverage.estimate(region, height, "known")),
+        known=numbers(coverage.estimate(region, height, "cells")),
         visible_m2=float(area_in_blocks(coverage, region, height)[1][:, 0].sum()) / steps
         if by_area and steps
         else math.nan,

@@ -83,8 +83,8 @@ class CoverageSums(SumsInBlocks):
 
     cells = TouchedSums()
     places = TouchedSums()
-    empty_sensor_steps: Tensor
-    empty_reference_steps: Tensor
+    empty_sensor_frames: Tensor
+    empty_reference_frames: Tensor
     saturated_points: Tensor
     inside_points: Tensor
     outside_points: Tensor
@@ -146,7 +146,7 @@ class CoverageSums(SumsInBlocks):
         *,
         weights: Clouds | None = None,
         height: Clouds | None = None,
-        place_in_time: int | Sequence[int] | None = None,
+        block_index: int | Sequence[int] | None = None,
         error: Clouds | None = None,
     ) -> None:
         """Add one step, or one step for each entry of two lists.
@@ -163,7 +163,7 @@ class CoverageSums(SumsInBlocks):
             height: (M,) height of each reference point above the local ground (`frame.reference_heights_m`), or a list
                 of the same length, for a grid whose `band_frame` is "ground", and no other. NaN, where there is no
                 ground at or below a point: it is in no band, and counted.
-            place_in_time: Number of the step, 10^15 at most, or a list of them (`frame.place_in_time`); it decides
+            block_index: Number of the step, 10^15 at most, or a list of them (`frame.block_index`); it decides
                 about the block, so that steps of one number, as of an instant that is seen again, share one. Not
                 given: counted on from the steps so far.
             error: (N,) by how many metres each point of the rig was measured off its place, along its ray, those of
@@ -175,7 +175,7 @@ class CoverageSums(SumsInBlocks):
                 heights, places in time or errors as `torchcover.coverage.steps.checked_steps` refuses them.
             TypeError: A cloud is not a floating-point tensor, a place in time not a whole number.
         """
-        given = {"weights": weights, "height": height, "place_in_time": place_in_time, "error": error}
+        given = {"weights": weights, "height": height, "block_index": block_index, "error": error}
         for sums in self.sums_of(sensor, reference, **given):
             self.add(sums)
 
@@ -184,7 +184,7 @@ class CoverageSums(SumsInBlocks):
 
         It takes and refuses what `update` does.
         """
-        given = dict.fromkeys(("weights", "height", "place_in_time", "error")) | given
+        given = dict.fromkeys(("weights", "height", "block_index", "error")) | given
         sensor, reference, given = map_tensors((sensor, reference, given), with_float64)
         parameters: dict[str, Any] = {name: getattr(self, name) for name in ("grid", "thresholds", "square_metres")}
         parameters |= {"names": self.sensors, "first": int(self.steps)}
@@ -192,7 +192,7 @@ class CoverageSums(SumsInBlocks):
 
     @torch.no_grad()  # the sums would hold on to every step's graph
     def _sums_of(self, step: CheckedStep) -> StepSums:
-        _, _, reference, weights, height, place_in_time = step
+        _, _, reference, weights, height, block_index = step
         inside, of, cell = self.grid.bins(reference, height)
         # Only the reference may be cropped: the nearest sensor point may lie outside the grid.
         of_sensors = self._distances(reference[inside], step)
@@ -201,16 +201,16 @@ class CoverageSums(SumsInBlocks):
         weights = None if weights is None else weights.to(reference.device)[inside[of]]
         place, point = self._places.of_points(points, cell)
         counts = {
-            "steps": 1,
-            "empty_sensor_steps": int(step.is_blind),
-            "empty_reference_steps": int(len(reference) == 0),
+            "frames": 1,
+            "empty_sensor_frames": int(step.is_blind),
+            "empty_reference_frames": int(len(reference) == 0),
             "saturated_points": int((distance >= self.max_radius).sum()) if self.radii else 0,
             "inside_points": len(distance),
             "outside_points": len(reference) - len(distance),
             "no_ground_points": 0 if height is None else int(height.isnan().sum()),
         }
         return StepSums(
-            place_in_time,
+            block_index,
             counts,
             self._columns.of_step(cell, values, weights),
             self._columns.of_step(place, values[:, point], None if weights is None else weights[point]),
@@ -218,7 +218,7 @@ class CoverageSums(SumsInBlocks):
 
     def add(self, sums: StepSums) -> None:
         """Add a step that `sums_of` a metric of the same parameters has measured."""
-        block, fine = self._block_of(sums.place_in_time), self._fine_block_of(sums.place_in_time)
+        block, fine = self._block_of(sums.block_index), self._fine_block_of(sums.block_index)
         self.add_touched("cells", block, sums.cells)
         self.add_touched("places", fine, sums.places)
         for name, count in sums.counts.items():

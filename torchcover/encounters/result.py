@@ -226,7 +226,7 @@ class Sightings:
             f"{60 * sum(self.hours.values()):.0f} minutes. Detected before that, with a 95 % interval over "
             f"{len(self.hours)} worlds (of 8 or more), or at the least time to collision, or never.",
             f"{self.criterion.words} Braking was needed for {rows[-1].to_brake} of them; too late: before detection.",
-            *([] if self.sightings else ["Nobody was met: drive longer (--worlds), or elsewhere."]),
+            *([] if self.sightings else ["Nobody was met: drive longer (--num-scenes), or elsewhere."]),
         ]
         return PageTable("Met, and detected before", ("who", "met", "an hour", *rigs), cells, notes=notes)
 

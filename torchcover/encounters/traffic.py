@@ -182,7 +182,7 @@ class Eyes(NamedTuple):
             ]
 
         sensors = rig.sensors
-        every = [max(1, round(1 / (one.rate_hz * simulator.every_s))) for one in sensors]
+        every = [max(1, round(1 / (one.rate_hz * simulator.frame_interval_s))) for one in sensors]
         enough, counts_as = [enough_of(criterion, one) for one in sensors], [one.counts_as for one in sensors]
         periods = [steps if isinstance(one, Lidar) else None for one, steps in zip(sensors, every, strict=True)]
         return cls(periods, enough, counts_as, every, clouds)

@@ -201,7 +201,7 @@ def check(
     name, free = world.name if isinstance(world, Scenario) else str(world or ""), build_flat_ground().name
     worlds = {"region": name or DEFAULT_SCENARIO, "target": name or free, "encounters": free}
     kinds = [kind for kind in worlds if any(hasattr(one, kind) for one in asked.requirements)]
-    told = {"worlds": {kind: worlds[kind] for kind in kinds}, "steps": num_frames, **own}
+    told = {"worlds": {kind: worlds[kind] for kind in kinds}, "num_frames": num_frames, **own}
     told["notes"] = describe_perfect_depth({rig.name: rig.sensors for rig in called}) if "region" in kinds else []
     return CheckResult(asked, found, {k: str(v) if isinstance(v, Path) else v for k, v in told.items()})
 
@@ -278,10 +278,10 @@ def _of_target(
     at_m, groups = place.compute_positions_m(world.ego_box()), one.group_sensors(rig.sensors)
     own_steps = (usual_steps > 1 and steps) or usual_steps
     of_survey: dict[str, Any] = {
-        "steps": own_steps,
-        "every_s": compute_frame_interval_s(world, None),
+        "num_frames": own_steps,
+        "frame_interval_s": compute_frame_interval_s(world, None),
         "seed": seed,
-        "hits": one.detection_points,
+        "detection_points": one.detection_points,
     }
     survey = partial(survey_places, rig, world, target, at_m, **of_survey)
     values: dict[str, list[Float64]] = {bound.key: [] for bound in one.bounds}

@@ -34,7 +34,7 @@ HEADER = "header"
 # Of NumPy's types: numbers that are real, and truth.
 KINDS = "fiub"
 # What the header has of the run.
-RUN_KEYS = ("steps", "counts", "skipped", "seconds")
+RUN_KEYS = ("num_frames", "counts", "skipped_frames", "duration_s")
 
 Array = NDArray[Any]
 State = Mapping[str, Any]
@@ -105,7 +105,11 @@ class CheckpointManager:
         for name, one in self._states.items():
             one.load_state_dict(read_state(self.path, header, name))
         done = header["run"]
-        run.num_frames, run.skipped_frames, run.duration_s = done["steps"], done["skipped"], done["seconds"]
+        run.num_frames, run.skipped_frames, run.duration_s = (
+            done["num_frames"],
+            done["skipped_frames"],
+            done["duration_s"],
+        )
         run.counts.update(done["counts"])
 
     def write_if_due(self, run: RunState) -> None:

@@ -77,7 +77,7 @@ class EvaluateConfig(BaseModel):
     num_rays: Annotated[int, Field(ge=1, strict=True)] | None = Field(
         None, description="Rays of the reference sensor per frame (surface: 16384; paper: 1048576, a square)."
     )
-    average: Literal["area", "known"] | None = Field(
+    average: Literal["area", "cells"] | None = Field(
         None,
         description="Average of a region: `area`, over its visible surface (default; needs `surface`), or `known`, "
         "over its observed cells, as in the paper.",
@@ -137,8 +137,8 @@ class EvaluateConfig(BaseModel):
 DESCRIPTIONS = {name: field.description or "" for name, field in EvaluateConfig.model_fields.items()}
 # Settings that `torchcover study` takes: those that change what one run of a simulation costs or how exact it is.
 STUDY_SETTINGS = (
-    "scenario", "seed", "vehicle", "sensor_model", "ask", "cell_m", "thresholds_m", "reference", "rays", "estimate",
-    "band_frame", "every_s", "only_detection", "device", "workers",
+    "scenario", "seed", "vehicle", "sensor_model", "regions", "cell_m", "thresholds_m", "reference", "num_rays", "average",
+    "band_frame", "frame_interval_s", "only_detection", "device", "num_workers",
 )  # fmt: skip
 
 
@@ -217,7 +217,7 @@ def _assign(content: dict[str, Any], text: str) -> None:
         )
         raise ValueError(f"--set {text}: KEY=VALUE is needed, with one of these keys: {known}")
     target, entry = (content["recording"], name) if dot else (content, key)
-    is_list = isinstance(fields[entry].default, tuple) or entry == "probe"
+    is_list = isinstance(fields[entry].default, tuple) or entry == "test_targets"
     if is_list and not value.startswith("["):
         parts = [part.strip() for part in value.split(",")]
         target[entry] = [parse_yaml(part) for part in parts] if entry == "thresholds_m" else parts

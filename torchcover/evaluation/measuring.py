@@ -51,7 +51,7 @@ def measure_coverage(task: Task[FrameSource], settings: Settings, stopping_rule:
     if isinstance(probes := seen.get(BODIES), Probes):
         for name, one in coverages.items():
             one.bodies = probes.seen_by(name)
-    if len({coverage.counts["steps"] for coverage in coverages.values()}) > 1:
+    if len({coverage.counts["frames"] for coverage in coverages.values()}) > 1:
         run.raise_failure()  # within a step: the rigs have not seen the same
     report = None
     if metrics is not None:
@@ -100,7 +100,7 @@ def find_block_ends(frames: FrameSource, max_blocks: int = 80, max_frames: int =
     places, ends, index = set[int](), list[int](), 0
     with suppress(IndexError):
         while index < max_frames and len(ends) < max_blocks:
-            place = frames.place_in_time(index)
+            place = frames.block_index(index)
             if place not in places and places:
                 ends.append(index)
             places.add(place)
@@ -155,7 +155,7 @@ def _observed(
     if ranks:
         if target:
             raise ValueError("target error: every rank sees its share only; leave it out, or run without torchrun")
-        ranks.check_identity({**identity, "steps": str(task.num_frames or len(task.frames))})
+        ranks.check_identity({**identity, "num_frames": str(task.num_frames or len(task.frames))})
     with ExitStack() as stack:
         journal = None
         if checkpoint is not None:
@@ -241,7 +241,7 @@ def build_metric(
         regions=query_plan.regions,
         sensors=sensors,
         radii=not settings.only_detection,
-        square_metres=has_area_weights and settings.average != "known",
+        square_metres=has_area_weights and settings.average != "cells",
     )
     check_fits(f"maps of {grid.cells:,} cells", BYTES_A_CELL * grid.cells, "use larger cells, or a smaller grid")
     return metric.to(device)

@@ -100,11 +100,11 @@ class MixedResult(Result):
         """What stands in `summary.json`: the numbers of the mixture, and under `worlds` the record of each."""
         worlds = {name: {"weight": self.weights[name], **world.record} for name, world in self.scenario_results.items()}
         runs = [world.run for world in self.scenario_results.values() if world.run]
-        seconds = round(sum(run.duration_s for run in runs), 3) if runs else None
+        duration_s = round(sum(run.duration_s for run in runs), 3) if runs else None
         skipped = [line for run in runs for line in run.skipped_frames]
         complete = all(run.is_complete for run in runs)
-        run = {"seconds": seconds, "complete": complete, "skipped_frames": skipped}
-        return {**super().record, **run, "worlds": worlds}
+        run = {"duration_s": duration_s, "complete": complete, "skipped_frames": skipped}
+        return {**super().record, **run, "scenarios": worlds}
 
     @property
     def tables(self) -> list[PageTable]:

@@ -95,7 +95,7 @@ class CoverageObserver:
             error=frame.error_of(self.rig),
             weights=frame.reference_weights,
             height=frame.heights_in(self.metric.grid.band_frame),
-            place_in_time=frame.place_in_time,
+            block_index=frame.block_index,
         )
 
     def add(self, sums: Sequence[StepSums]) -> None:

@@ -57,7 +57,7 @@ if TYPE_CHECKING:
 # Where more places of the reference sensor are refused, something is wrong with the scene.
 REFUSED_SHARE = 0.2
 # What `summary.json` says of how the run went.
-RUN_KEYS = ("seconds", "complete", "frame_counts", "skipped_frames", "left_out")
+RUN_KEYS = ("duration_s", "complete", "frame_counts", "skipped_frames", "omissions")
 
 
 @dataclass(frozen=True)
@@ -201,7 +201,7 @@ class Result:
             "device": self.device,
             **self._run_record,
             "target_error": self._outcome[0],
-            "measure": self.table.average,
+            "average": self.table.average,
             "verdict": list(self.verdict),
             "notes": list(self.table.notes),
             **build_table_dict(self.table),
@@ -223,7 +223,7 @@ class Result:
             rigs=[PageRig(name, build_sensor_views(of), format_rig_yaml(name, of)) for name, of in rigs.items()],
             ego_outline_m=self.ego_outline_m,
             outlines=[build_region_outline(region) for region in self.regions],
-            facts=collect_facts(self.record, self.rigs, self.table.first_conditions.counts["steps"]),
+            facts=collect_facts(self.record, self.rigs, self.table.first_conditions.counts["frames"]),
             more_tables=[build_omissions_table(self.omissions)] if self.omissions else [],
         )
 
@@ -278,7 +278,7 @@ class Result:
 
         Args:
             folder: Where to write: `coverage.npz`, or `coverage/RIG.npz` for several; `summary.csv`, `report.html`,
-                `maps/STEM.png`, `summary.json`; with metrics of others `metrics.csv` and `metrics_tau.csv`. Made if it
+                `maps/STEM.png`, `summary.json`; with metrics of others `metrics.csv` and `metrics_rank_correlation.csv`. Made if it
                 does not exist. Files of an earlier run that this one does not write are deleted: those that its
                 `summary.json` lists.
             file_kinds: What to write beside `summary.json`: "numbers", "maps", "page", or a text as in "numbers,page".
@@ -373,7 +373,7 @@ class Result:
         if self.run is None or record is None:
             return None
         rays = self.run.counts["reference_rays"] // self.run.num_frames
-        return {**record, "rays_per_step": rays} if "every_s" in record else record
+        return {**record, "rays_per_frame": rays} if "frame_interval_s" in record else record
 
     @property
     def notes(self) -> list[str]:
@@ -384,10 +384,10 @@ class Result:
         told += describe_perfect_depth(self.sensors) + describe_scan_periods(self.sensors) + self._on_bodies
         if record is None:
             return told
-        if "every_s" not in record:
+        if "frame_interval_s" not in record:
             return [*told, *record["notes"]]
-        rays, every_s = record["rays_per_step"], record["every_s"]
-        sensor = f"Reference sensor: {record['sensor']}, {rays:,} rays a step; a step every {every_s:g} s."
+        rays, frame_interval_s = record["rays_per_frame"], record["frame_interval_s"]
+        sensor = f"Reference sensor: {record['sensor']}, {rays:,} rays a step; a step every {frame_interval_s:g} s."
         return [*told, sensor, *record["notes"], *self._on_refused, *self._on_repetitions]
 
     @property
@@ -404,7 +404,7 @@ class Result:
     def _on_refused(self) -> list[str]:
         """That many places of the reference sensor were refused: then it looked from few of those that it should."""
         assert self.run is not None  # asked of a reference that was used
-        refused, drawn = self.run.counts["reference_poses_redrawn"], self.run.counts["reference_poses"]
+        refused, drawn = self.run.counts["reference_poses_resampled"], self.run.counts["reference_poses"]
         if refused < REFUSED_SHARE * drawn:
             return []
         return [
@@ -418,7 +418,7 @@ class Result:
         failure = None if self.run is None else self.run.failure
         if failure is None:
             return ""
-        steps = self._first.counts["steps"]
+        steps = self._first.counts["frames"]
         after = f"The run was cut short after {steps:,} step{'s' * (steps != 1)}"
         if isinstance(failure, KeyboardInterrupt):
             return f"{after}: interrupted."
@@ -428,7 +428,7 @@ class Result:
     @property
     def _on_repetitions(self) -> list[str]:
         """That a scenario was seen again, which is no news; nothing where every step showed an instant of its own."""
-        steps, again = (self.run.num_frames, self.run.counts["repeated_instants"]) if self.run else (0, 0)
+        steps, again = (self.run.num_frames, self.run.counts["repeated_frames"]) if self.run else (0, 0)
         if not again:
             return []
         if steps - again == 1:
@@ -445,7 +445,7 @@ class Result:
     @property
     def _about(self) -> str:
         cut_short = ", cut short" if self.run is not None and not self.run.is_complete else ""
-        return f"Result of {', '.join(self.coverages)}: {self._first.counts['steps']} steps{cut_short}"
+        return f"Result of {', '.join(self.coverages)}: {self._first.counts['frames']} steps{cut_short}"
 
     def __repr__(self) -> str:
         return "\n".join([self._about, *self.verdict])

@@ -19,15 +19,15 @@ from torchcover.simulation import CameraSensor, Sensor, vertical_fov_deg
 
 # What decides about the numbers, with this package.
 PACKAGES = ("torch", "numpy", "embreex", "trimesh", "pykdtree", "kornia")
-OF_THE_RUN = ("torchcover", "seconds", "complete", "device", "skipped_frames")
-ELSEWHERE = ("verdict", "notes", "rows", "worlds", "metrics", "counts", "frame_counts", "left_out", "rig", "rigs")
+OF_THE_RUN = ("torchcover", "duration_s", "complete", "device", "skipped_frames")
+ELSEWHERE = ("verdict", "notes", "rows", "scenarios", "metrics", "counts", "frame_counts", "omissions", "rig", "rigs")
 # What it is, how often it was left out, and of how many; the counts are those of the frames, added up.
 COUNTED = (
     ("moving bodies out of every sensor's range: not placed", "moving_bodies_out_of_range", "moving_bodies"),
-    ("road users of SUMO or a recording where bodies cannot be: not there", "road_users_left_out", "moving_bodies"),
-    ("pairs of a ray and a moving body that cannot meet: not cast", "ray_body_pairs_left_out", "ray_body_pairs"),
+    ("road users of SUMO or a recording where bodies cannot be: not there", "road_users_omitted", "moving_bodies"),
+    ("pairs of a ray and a moving body that cannot meet: not cast", "ray_body_pairs_omitted", "ray_body_pairs"),
     ("rays of sensors where nothing moves: cast once, for all steps", "sensor_rays_reused", "sensor_rays"),
-    ("rays of sensors that hit nothing near a reference point: not cast", "sensor_rays_spared", "sensor_rays"),
+    ("rays of sensors that hit nothing near a reference point: not cast", "sensor_rays_omitted", "sensor_rays"),
     ("rays that end on the ego itself: known from the first scan", "sensor_self_hits_reused", "sensor_self_hits"),
 )
 # Packages that take long to import, and what would have needed them; not all lenses with distortion need kornia, but
@@ -69,7 +69,7 @@ def list_omissions(
         num_workers: Processes that made the frames of each rank. What they have imported is unknown.
         num_ranks: Ranks that shared the run.
     """
-    steps = max((coverage.counts["steps"] for coverage in coverages), default=0)
+    steps = max((coverage.counts["frames"] for coverage in coverages), default=0)
     is_static = 0 < frame_counts.get("sensor_rays", 0) == frame_counts.get("sensor_rays_reused", 0)
     # Where nothing moves, each process casts the rays of its first step.
     first_steps = min(steps, num_ranks * max(num_workers, 1)) if is_static else 0
@@ -154,7 +154,7 @@ def collect_facts(
     settings = {name: value for name, value in record.items() if name not in (*OF_THE_RUN, *ELSEWHERE)}
     run = {name: record[name] for name in OF_THE_RUN} | {"python": platform.python_version()} | _versions()
     named = {f"rig {name}": str(given) for name, given in rigs.items() if given is not None}
-    return {"Settings": named | format_facts({"steps": num_frames} | settings), "Run": format_facts(run)}
+    return {"Settings": named | format_facts({"num_frames": num_frames} | settings), "Run": format_facts(run)}
 
 
 def _versions() -> dict[str, str]:

@@ -218,7 +218,7 @@ class Settings:
     )
     reference: str | None = None
     num_rays: int | None = None
-    average: Literal["area", "known"] | None = None
+    average: Literal["area", "cells"] | None = None
     band_frame: Literal["ground", "vehicle"] | None = None
     frame_interval_s: float | None = None
     target_error: ConvertedField["TargetError | str | Sequence[str] | None", "TargetError | None"] = ConvertedField(
@@ -254,7 +254,7 @@ class Settings:
         if self.num_frames is not None and self.num_frames < 1:
             raise ValueError(f"steps: at least 1 is needed; got {self.num_frames}")
         check_fits(f"{self.num_workers or 0:,} workers", BYTES_PER_WORKER * (self.num_workers or 0), "use fewer")
-        if self.average not in (None, "area", "known"):
+        if self.average not in (None, "area", "cells"):
             raise ValueError(f"estimate {self.average}: `area` or `known` is needed")
         if self.band_frame not in (None, "ground", "vehicle"):
             raise ValueError(f"band_frame {self.band_frame}: `ground` or `vehicle` is needed")
@@ -309,4 +309,6 @@ class Settings:
         if self.test_targets:
             raise ValueError("probe: not for recordings, which have no scene to put a body into")
         if any(setting is not None for setting in (self.reference, self.num_rays, self.frame_interval_s)):
-            raise ValueError("reference, rays and every_s are for simulations; a recording has its reference points")
+            raise ValueError(
+                "reference, rays and frame_interval_s are for simulations; a recording has its reference points"
+            )

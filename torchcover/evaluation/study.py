@@ -40,9 +40,9 @@ DEFAULT_STEPS = 512
 # Of the blocks of the first setting, which alone says how errors fall, the others see so many.
 SHARE_OF_OTHERS = 4
 FEWER_RAYS: tuple[Mapping[str, Any], ...] = (
-    {"rays": 4096},
+    {"num_rays": 4096},
     {"only_detection": True},
-    {"only_detection": True, "rays": 512},
+    {"only_detection": True, "num_rays": 512},
 )
 # Errors of the detection that settings are recommended for.
 WANTED = (0.02, 0.01, 0.005)
@@ -233,7 +233,9 @@ class Study:
             why = f"not known, for {first.num_frames:,} steps say no error of {', '.join(unknown) or 'any'}"
             return f"For {_points(error)} of every detection: {why}."
         trial, steps = found
-        options = " ".join([*self.plan.command[1:], *([trial.options] if trial.options else []), f"--steps={steps}"])
+        options = " ".join(
+            [*self.plan.command[1:], *([trial.options] if trial.options else []), f"--num-frames={steps}"]
+        )
         return f"For {_points(error)} of every detection: {options} ({trial.estimate_duration_s(steps, self.startup_s):.0f} s)."
 
     @property
@@ -249,7 +251,7 @@ class Study:
             "start_s": self.startup_s,
             "trials": [_record(trial) for trial in self.trials],
             "recommended": [
-                {"error": error, "options": one and one[0].options, "steps": one and one[1]}
+                {"error": error, "options": one and one[0].options, "num_frames": one and one[1]}
                 for error, one in found.items()
             ],
         }
@@ -299,7 +301,7 @@ def _record(trial: Trial) -> dict[str, Any]:
         numbers.append(
             to_json_record({**own, "a": one.error.a, "bias": one.error.bias, "difference": to_json_record(told)})
         )
-    names = ("options", "steps", "min_frames", "seconds", "processor_s", "band_frame")
+    names = ("options", "num_frames", "min_frames", "duration_s", "processor_s", "band_frame")
     return {**{name: getattr(trial, name) for name in names}, "numbers": numbers}
 
 
@@ -342,7 +344,7 @@ def _tried(options: str, settings: Settings, first: Coverage | None) -> tuple[Tr
     result.run.raise_failure()
     coverage, awaited = result.coverage, task.query_plan.awaited
     places = shown_places(result.regions, coverage.grid)
-    count, steps, worlds = len(places) * len(coverage.quantities), coverage.counts["steps"], math.inf
+    count, steps, worlds = len(places) * len(coverage.quantities), coverage.counts["frames"], math.inf
     numbers = []
     for region, height in places:
         estimate = coverage.estimate(region, height)
@@ -352,7 +354,7 @@ def _tried(options: str, settings: Settings, first: Coverage | None) -> tuple[Tr
             worlds = min(worlds, float(estimate.effective.min()))
         a = _known(estimate.error).square() * steps
         if against and first:  # who has more steps knows it better; on the same instants the ratio is known well
-            more = _known(first.estimate(region, height).error).square() * first.counts["steps"]
+            more = _known(first.estimate(region, height).error).square() * first.counts["frames"]
             a = torch.where(more.isnan(), a, more * (estimate.error / _known(against.error)).square())
         for quantity, value, own in zip(estimate.quantities, estimate.value.tolist(), a.tolist(), strict=True):
             difference = None if first is None else differences.get(quantity.key, Difference(quantity, math.nan))
@@ -381,7 +383,7 @@ def _paired(first: Coverage, coverage: Coverage, region: Region, height: str) ->
 
 def measure_command_s(plan: StudyPlan) -> float:
     """How long `torchcover evaluate` takes for one step, from its start to its end. ValueError: it fails."""
-    words = [*plan.command, "--steps=1"]
+    words = [*plan.command, "--num-frames=1"]
     start = time.perf_counter()
     with TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "torchcover", *words, f"--out={folder}"]

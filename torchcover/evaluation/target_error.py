@@ -155,7 +155,7 @@ def compute_convergence(
                 good = target.radius_m if quantity.unit == "m" else target.detection
                 if good is not None and not math.isnan(value):
                     where = (name, region.name, height, quantity.key)
-                    found.append(ConvergenceStatus(*where, error, good, first.counts["steps"]))
+                    found.append(ConvergenceStatus(*where, error, good, first.counts["frames"]))
     return found
 
 
@@ -238,8 +238,8 @@ def summarize_target_error(
     if target is None:
         return None, []
     found, first = compute_convergence(target, coverages, regions), next(iter(coverages.values()))
-    blank = [f"{row.region} {row.height}" for row in first.summary(regions) if not row.known_cells]
-    lines = _lines(found, first.counts["steps"], confirmed=is_confirmed)
+    blank = [f"{row.region} {row.height}" for row in first.summary(regions) if not row.observed_cells]
+    lines = _lines(found, first.counts["frames"], confirmed=is_confirmed)
     if blank:
         lines.append(f"Not waited for, as no cell of it is known: {', '.join(blank)}.")
     if alike := [f"{one.region} {one.height}, {one.quantity} of {one.rig}" for one in found if one.error <= ROUND_OFF]:

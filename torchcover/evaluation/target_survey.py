@@ -91,7 +91,7 @@ def map_target_visibility(
         world,
         target if isinstance(target, Target) else Target.load(target),
         steps=usual_steps if num_frames is None else num_frames,
-        every_s=compute_frame_interval_s(world, frame_interval_s),
+        frame_interval_s=compute_frame_interval_s(world, frame_interval_s),
         **settings,
     )
 

@@ -48,8 +48,27 @@ FEW_RAYS = 2048
 # Where warnings point to: the call of `evaluate`, beyond its own function, the one around that, and ours.
 CALLER = 4
 # Options that frames, what is asked and observers say by what they are, and those that change no result.
-TOLD_OTHERWISE = {"scenario", "seed", "vehicle", "reference", "rays", "every_s", "ask", "cell_m", "band_frame"}
-TOLD_OTHERWISE |= {"sensor_model", "weather", "metrics", "steps", "device", "workers", "no_cache", "skip_bad_frames"}
+TOLD_OTHERWISE = {
+    "scenario",
+    "seed",
+    "vehicle",
+    "reference",
+    "num_rays",
+    "frame_interval_s",
+    "regions",
+    "cell_m",
+    "band_frame",
+}
+TOLD_OTHERWISE |= {
+    "sensor_model",
+    "weather",
+    "metrics",
+    "num_frames",
+    "device",
+    "num_workers",
+    "no_cache",
+    "skip_bad_frames",
+}
 TOLD_OTHERWISE |= {"recording", "rerun"}
 # Of an identity, what is longer is told by its hash.
 MAX_TOLD = 40
@@ -157,7 +176,7 @@ def build_simulation_task(settings: Settings, *, needs_boxes: bool = False) -> T
         rigs=carried,
         steps=most if settings.num_frames is None else settings.num_frames,
         seed=settings.seed,
-        every_s=compute_frame_interval_s(world, settings.frame_interval_s),
+        frame_interval_s=compute_frame_interval_s(world, settings.frame_interval_s),
         reference_sensor=reference_called(settings.reference, rays, asked),
         boxes=needs_boxes or settings.needs_boxes,
         within_m=max(settings.thresholds_m) if settings.only_detection else None,

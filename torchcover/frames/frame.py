@@ -48,7 +48,7 @@ class Frame:
         boxes: The objects of that instant; None if they are unknown, which is not the same as none being there.
         sensor_points: Name of each rig -> name of each of its sensors -> how many of the rig's points are its own, in
             their order; None if it is unknown which points are whose.
-        place_in_time: Number of what it shows, for standard errors: frames that share it, as of an instant that is
+        block_index: Number of what it shows, for standard errors: frames that share it, as of an instant that is
             seen again or of one city, do not count as independent. Not given: `index`, every frame is its own.
         measured: Name of a rig -> what its sensors made of its points, if they err; the others land where they are.
     """
@@ -60,7 +60,7 @@ class Frame:
     counts: Mapping[str, int] = field(default_factory=dict)
     reference_weights: Tensor | None = None
     boxes: Boxes | None = None
-    place_in_time: int = None  # type: ignore[assignment]  # filled in at once
+    block_index: int = None  # type: ignore[assignment]  # filled in at once
     sensor_points: Mapping[str, Mapping[str, int]] | None = None
     reference_heights_m: Tensor | None = None
     measured: Mapping[str, Measured] = field(default_factory=dict)
@@ -69,7 +69,7 @@ class Frame:
 
     def __post_init__(self) -> None:
         # Plain numbers: those of NumPy would not be equal to them as text, nor load with `weights_only=True`.
-        for name in ("index", "place_in_time"):
+        for name in ("index", "block_index"):
             number = getattr(self, name)
             object.__setattr__(self, name, self.index if number is None else operator.index(number))
         for rig in self.measured.keys() & self.clouds.keys():
@@ -214,7 +214,7 @@ class FrameBatch:
     model nor takes their sizes for the size of the batch: give `self.log(..., batch_size=len(batch))`.
 
     `metric.update(batch.sensor, batch.reference, error=batch.errors_of(), weights=batch.weights,
-    height=batch.heights_in(grid.band_frame), place_in_time=batch.place_in_time)`.
+    height=batch.heights_in(grid.band_frame), block_index=batch.block_index)`.
     """
 
     def __init__(self, frames: Sequence[Frame]) -> None:
@@ -286,9 +286,9 @@ class FrameBatch:
         return [heights_m for heights_m in given if heights_m is not None] or None
 
     @property
-    def place_in_time(self) -> list[int]:
+    def block_index(self) -> list[int]:
         """That of each frame."""
-        return [frame.place_in_time for frame in self.frames]
+        return [frame.block_index for frame in self.frames]
 
     @property
     def boxes(self) -> list[Boxes]:

@@ -77,7 +77,7 @@ class FrameSource(Protocol):
     def reference_record(self) -> Mapping[str, object] | None:
         """Where the reference comes from, for `summary.json`: `sensor` and its settings; None if unknown.
 
-        It has `notes`, sentences that a reader of the numbers has to know, and if it was simulated `every_s`.
+        It has `notes`, sentences that a reader of the numbers has to know, and if it was simulated `frame_interval_s`.
         """
 
     @property
@@ -94,8 +94,8 @@ class FrameSource(Protocol):
         The index itself where nothing has to be built, so that any process may make any frame.
         """
 
-    def place_in_time(self, index: int, /) -> int:
-        """`Frame.place_in_time` of a frame, without making it; of a simulation beyond its last frame, too.
+    def block_index(self, index: int, /) -> int:
+        """`Frame.block_index` of a frame, without making it; of a simulation beyond its last frame, too.
 
         IndexError: there is no such frame.
         """
@@ -156,7 +156,7 @@ class FrameDataset(Dataset[Frame]):
         """Nothing: which points are of which sensor is unknown."""
         return {}
 
-    def place_in_time(self, index: int) -> int:
+    def block_index(self, index: int) -> int:
         """The index: no two frames are known to be alike. IndexError: there is no such frame."""
         return range(len(self))[index]
 
@@ -249,9 +249,9 @@ class ChosenRigs(FrameDataset):
         """As there."""
         return self.frames.world_of(index)
 
-    def place_in_time(self, index: int) -> int:
+    def block_index(self, index: int) -> int:
         """As there."""
-        return self.frames.place_in_time(index)
+        return self.frames.block_index(index)
 
     def has_boxes(self) -> bool:
         """As there."""

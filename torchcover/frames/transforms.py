@@ -149,7 +149,7 @@ def _times(matrix: Tensor, vectors: Tensor) -> Tensor:
 class VisibleTargets(Dataset[Frame]):
     """Frames without the objects that a rig could hardly show, and with `boxes.visibility` of the others, as weights.
 
-    What is hidden, or of unknown visibility, is left out too; `counts["targets_left_out"]` says how many in all. It
+    What is hidden, or of unknown visibility, is left out too; `counts["targets_omitted"]` says how many in all. It
     is measured each time that a frame is asked for: `list(VisibleTargets(...))` does so once.
 
     Args:
@@ -170,7 +170,7 @@ class VisibleTargets(Dataset[Frame]):
         >>> frame = Frame({"rig": torch.tensor([[8.0, 0.0, 0.6]])}, reference, index=0, name="a", boxes=boxes)
         >>> (seen,) = VisibleTargets([frame], least=0.2)
         >>> len(seen.boxes), seen.boxes.visibility, seen.counts
-        (1, tensor([0.5000], dtype=torch.float64), {'targets_left_out': 1})
+        (1, tensor([0.5000], dtype=torch.float64), {'targets_omitted': 1})
     """
 
     def __init__(
@@ -201,5 +201,5 @@ class VisibleTargets(Dataset[Frame]):
         )
         boxes = replace(frame.boxes, visibility=seen.share.to(frame.boxes.yaw_rad.device))
         kept = boxes.select(boxes.visibility >= self.least)
-        left_out = frame.counts.get("targets_left_out", 0) + len(boxes) - len(kept)
-        return replace(frame, boxes=kept, counts={**frame.counts, "targets_left_out": left_out})
+        left_out = frame.counts.get("targets_omitted", 0) + len(boxes) - len(kept)
+        return replace(frame, boxes=kept, counts={**frame.counts, "targets_omitted": left_out})

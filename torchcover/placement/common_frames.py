@@ -26,7 +26,7 @@ EVERY_S = 20.0
 RAYS = 16_384
 BATCH = 3  # frames with their clouds that are in memory together
 BUDGET_BYTES = 2e9
-MEASURES: tuple[Measure, Measure] = ("area", "known")
+MEASURES: tuple[Measure, Measure] = ("area", "cells")
 MANY = 10**9  # steps of a simulation, of which a few of many worlds are used
 
 AnyScenario = Scenario | str | Path
@@ -117,7 +117,7 @@ class CachedFrames(Dataset[Frame | MeasuredFrame]):
             reference_weights=frame.reference_weights[mask],
             reference_heights_m=None if heights_m is None else heights_m[mask],
             index=number,
-            place_in_time=index.scene_id,
+            block_index=index.scene_id,
             counts={"world_bytes": frames.simulator.scene_of(index.frame_index)[0].bytes},
         )
 
@@ -144,10 +144,10 @@ class CommonFrames:
             scenario's own ego, else an SUV.
         worlds: Worlds of each scenario that has traffic; any other scenario is one world.
         per_world: Frames in each.
-        every_s: Time between them.
+        frame_interval_s: Time between them.
         seed: Seed of the traffic and of the reference.
         rays: Approximate number of reference rays of each frame.
-        average: Average of the numbers: "area", the visible surface, or "known", the observed cells.
+        average: Average of the numbers: "area", the visible surface, or "cells", the observed cells.
         sensor_model: "ideal", or else each rig as it is, as in `evaluate`.
         budget_bytes: What all worlds may take, about 35 MB for one of `urban`. All are held: to build one again takes
             five times as long as to score a rig on three frames of it.
@@ -201,7 +201,7 @@ class CommonFrames:
         self._settings: dict[str, Any] = {
             "vehicle": vehicle,
             "per_world": frames_per_scene,
-            "every_s": frame_interval_s,
+            "frame_interval_s": frame_interval_s,
             "rays": rays,
         }
         self._settings |= {"estimate": average, "sensor_model": sensor_model}
@@ -209,7 +209,12 @@ class CommonFrames:
         self._vehicles: set[str | None] = {None}  # that were found to be that of these worlds
         self._worlds = [with_ego(one, {}, vehicle) for one in self.scenarios]
         self.queries = Queries.from_objectives(HostVehicle.from_scenarios(self._worlds).outline_m, objectives)
-        shown: dict[str, Any] = {"steps": MANY, "seed": seed, "every_s": frame_interval_s, "kept_bytes": float("inf")}
+        shown: dict[str, Any] = {
+            "steps": MANY,
+            "seed": seed,
+            "frame_interval_s": frame_interval_s,
+            "kept_bytes": float("inf"),
+        }
         shown |= {"reference_sensor": self.queries.build_reference_sensor(rays)}
         simulations = [SimulatedFrames(one, rigs={}, **shown) for one in self._worlds]
         self.indices = _index_frames([simulation.simulator for simulation in simulations], num_scenes, frames_per_scene)
@@ -233,7 +238,7 @@ class CommonFrames:
         for first in range(0, worlds, together):
             some = [at for at, one in enumerate(self.indices) if first <= one.scene_id < first + together]
             for frame in self.iterate_frames(None, some):
-                bytes_of[frame.place_in_time] = frame.counts["world_bytes"]
+                bytes_of[frame.block_index] = frame.counts["world_bytes"]
             largest = max(bytes_of.values())
             expected = sum(bytes_of.values()) + largest * (worlds - len(bytes_of))
             if expected > budget_bytes:
@@ -361,7 +366,7 @@ def _steps(simulator: Simulator, worlds: int, per_world: int) -> list[list[int]]
         index += 1
     if (fewest := min(map(len, of_worlds))) < per_world:
         raise ValueError(
-            f"per_world: a run of {simulator.scenario.name!r} has {fewest} frames that are {simulator.every_s:g} s "
+            f"per_world: a run of {simulator.scenario.name!r} has {fewest} frames that are {simulator.frame_interval_s:g} s "
             f"apart; got {per_world}"
         )
     return of_worlds

@@ -39,7 +39,7 @@ class Objective(Document):
     """A number of a rig that is made better: a mean over some regions and height bands, each weighing the same.
 
     Args:
-        number: "radius_m", "detection_0.4m"; "known_radius_m" over known cells whatever the search is by;
+        number: "radius_m", "detection_0.4m"; "cells_radius_m" over known cells whatever the search is by;
             "radius_maximum_m" of an aggregation; "seen_by_two_0.4m" or "detection_0.4m_without_roof" of redundancy,
             where "any" stands for the sensor whose failure is worst. Whether more or less of it is better, it knows
             itself.
@@ -147,15 +147,15 @@ class Objective(Document):
         """What its number is a mean over where that is no choice.
 
         Returns:
-            "known" of a number over known cells, "-" of an aggregation or what is required; else empty: "area" or
-            "known", as a search is asked.
+            "cells" of a number over observed cells, "-" of an aggregation or what is required; else empty: "area" or
+            "cells", as a search is asked.
 
         Example:
-            >>> [Objective(number=key, region="20m").own_estimate for key in ("known_radius_m", "radius_maximum_m")]
+            >>> [Objective(number=key, region="20m").own_estimate for key in ("cells_radius_m", "radius_maximum_m")]
             ['known', '-']
         """
         if self.key.startswith("known_"):
-            return "known"
+            return "cells"
         return "" if CHOSEN.match(self.key) else "-"
 
     @property

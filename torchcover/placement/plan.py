@@ -37,7 +37,7 @@ class OptimizerParams:
 
 def make_common_frames(space: PlacementSpace, plan: "SearchPlan", seed: int, num_scenes: int) -> CommonFrames:
     """Return frames of the scenarios of a space, for a seed and a number of worlds."""
-    names = ("per_world", "every_s", "rays", "estimate", "sensor_model", "workers")
+    names = ("per_world", "frame_interval_s", "rays", "estimate", "sensor_model", "workers")
     settings: dict[str, Any] = {name: getattr(plan, name) for name in names}
     return CommonFrames(space.scenarios, space.scored_objectives, num_scenes=num_scenes, seed=seed, **settings)
 
@@ -50,7 +50,7 @@ class SearchPlan:
         num_evaluations: Number of candidates after the start; or
         budget_s: seconds for the whole search with its frames and the test on held-out worlds. One of both is needed.
         seed: Seed of the worlds that candidates are scored in and of the candidates; held-out worlds have the next.
-        average: Average of a score: "area", the visible surface, or "known", the mean of the observed cells.
+        average: Average of a score: "area", the visible surface, or "cells", the mean of the observed cells.
         sensor_model: "ideal" or "real"; if not given, real where the rig's range limits are known.
         num_scenes: Worlds of each scenario to search in.
         num_held_out_scenes: Held-out worlds of each scenario to test in.
@@ -111,7 +111,7 @@ class SearchPlan:
             "estimate": self.average,
             "sensor_model": space.start.sensing(self.sensor_model).sensor_model,
             "band_frame": DEFAULT_BAND_FRAME,
-            **{name: getattr(self, name) for name in ("seed", "worlds", "per_world", "every_s", "rays")},
+            **{name: getattr(self, name) for name in ("seed", "worlds", "per_world", "frame_interval_s", "rays")},
         }
 
 

@@ -348,7 +348,7 @@ def _weights_in(place: tuple[str, str], name: str, frames: CommonFrames, referen
     weights = []
     for frame, (points, weight, cell) in zip(reference, of_frames, strict=True):
         share = weight / m2.sum()
-        if frames.average == "known":
+        if frames.average == "cells":
             of_cell = torch.bincount(cell, weights=weight, minlength=grid.cells)
             share = weight / of_cell[cell] / probed[cell] / (probed > 0).sum()
         weights.append(

@@ -35,7 +35,7 @@ class HeldOutImprovement(NamedTuple):
 
     Args:
         objective: Its name.
-        average: Average of the number, "area" or "known"; "-" where the number has no such choice.
+        average: Average of the number, "area" or "cells"; "-" where the number has no such choice.
         difference: Paired difference on held-out worlds.
         search_improvement: The same difference on the frames of the search.
     """

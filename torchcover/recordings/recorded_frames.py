@@ -123,9 +123,9 @@ class RecordedFrames(FrameDataset):
         """The index: nothing has to be built."""
         return index
 
-    def place_in_time(self, index: int) -> int:
+    def block_index(self, index: int) -> int:
         """The window of a frame; frames of one window share most of their reference points."""
-        return self._places_in_time[index]
+        return self._block_indices[index]
 
     def has_boxes(self) -> bool:
         """Whether the first frame whose boxes can be read has any, or says that there are none."""
@@ -237,7 +237,7 @@ class RecordedFrames(FrameDataset):
             reference_weights=None if reference.weights is None else torch.from_numpy(reference.weights),
             reference_heights_m=None if heights_m is None else torch.from_numpy(heights_m),
             boxes=boxes,
-            place_in_time=self._places_in_time[position],
+            block_index=self._block_indices[position],
             sensor_points={
                 rig: {sensor: len(scans[sensor].points_m) for sensor in of} for rig, of in self.sensors_by_rig.items()
             },
@@ -249,7 +249,7 @@ class RecordedFrames(FrameDataset):
         return tuple(dict.fromkeys(sensor for of in self.sensors_by_rig.values() for sensor in of))
 
     @cached_property
-    def _places_in_time(self) -> Sequence[int]:
+    def _block_indices(self) -> Sequence[int]:
         """Of each frame; those within one window share most of their reference points, and so a place."""
         frames, recording, window_s = list(self.recording.key_frames), self.recording, self._sweeps.window_s
         places = (

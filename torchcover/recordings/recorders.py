@@ -100,7 +100,7 @@ class FolderRecorder:
             self._add(f"{BOXES}/{record.name}.csv", partial(write_boxes, boxes=frame.boxes))
         pose = record.world_T_vehicle
         wxyz = quaternion_from_rotation(pose[:3, :3])
-        return [record.name, record.time_s, *pose[:3, 3].tolist(), *wxyz.tolist(), frame.place_in_time]
+        return [record.name, record.time_s, *pose[:3, 3].tolist(), *wxyz.tolist(), frame.block_index]
 
     def finish(self, frame_entries: Sequence[Sequence[Any]]) -> None:
         """Write `poses.csv` and `frames.yaml`."""

@@ -150,7 +150,7 @@ class Recording(Protocol):
 
     @property
     def block_indices(self) -> Sequence[int] | None:
-        """`Frame.place_in_time` of each instant, for standard errors; None: no two of them are known to be alike."""
+        """`Frame.block_index` of each instant, for standard errors; None: no two of them are known to be alike."""
 
     def read_scan(self, sensor: str, index: int, /) -> Scan:
         """Read what a sensor recorded at an instant.

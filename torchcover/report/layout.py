@@ -141,7 +141,7 @@ def _part(
     for (row, *_), cells in zip(places, numbers, strict=True):
         last = [TextCell(column.format_value(column.get_value(table, row))) for column in shown]
         rows.append((TextCell(row.summary.region), TextCell(row.summary.height), *cells, *last))
-    first = BODY_HEADINGS if measure == "places" else PLACE_HEADINGS
+    first = BODY_HEADINGS if measure == "target_positions" else PLACE_HEADINGS
     every = [*first, *headings, *(column.heading for column in shown)]
     return PageTable(title, every, rows, PLACES)
 

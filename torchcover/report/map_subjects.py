@@ -265,7 +265,7 @@ def _of_surface(coverages: Mapping[str, Coverage]) -> Iterator[MapLayer]:
     areas = {name: coverage.area for name, coverage in coverages.items() if coverage.area is not None}
     sides = compute_square_sides(first.points, first.grid.cell)
     # The rigs share the reference points, and so the square metres.
-    opacity = compute_opacity(next(iter(areas.values())), first.counts["steps"], sides, first.grid.cell)
+    opacity = compute_opacity(next(iter(areas.values())), first.counts["frames"], sides, first.grid.cell)
     each = {name: compute_ratios(area, sides) for name, area in areas.items()}
     for at, quantity in enumerate(map(by_area, first.quantities)):
         values = {name: values[at] for name, values in each.items()}
@@ -273,7 +273,7 @@ def _of_surface(coverages: Mapping[str, Coverage]) -> Iterator[MapLayer]:
 
 
 def _conditions(coverage: Coverage) -> str:
-    return format_resolution(coverage.counts["steps"], coverage.grid)
+    return format_resolution(coverage.counts["frames"], coverage.grid)
 
 
 def _subject(

@@ -40,7 +40,9 @@ def _sensor_model(table: CoverageTable, row: Row) -> object:
 NO_BAND = math.nan, math.nan
 COLUMNS = (
     Column(
-        "measure", "what numbers are means over: `area`, `known`, `places` of a body", lambda _, r: r.summary.measure
+        "average",
+        "average of the numbers: `area`, `cells`, or `target_positions` of a test target",
+        lambda _, r: r.summary.measure,
     ),
     Column(
         "visible_m2",
@@ -51,25 +53,25 @@ COLUMNS = (
         "area",
     ),
     Column(
-        "known_share",
+        "observed_share",
         "share of the cells that are known",
-        lambda _, row: row.summary.known_share,
+        lambda _, row: row.summary.observed_share,
         "known cells\n(%)",
         format_percent,
-        "known",
+        "cells",
     ),
     Column(
-        "known_cells",
+        "observed_cells",
         "how many are known; of a body, places with room",
-        lambda _, row: row.summary.known_cells,
+        lambda _, row: row.summary.observed_cells,
         "free places",
-        average="places",
+        average="target_positions",
     ),
     Column("cells", "of the region; of a body, places that were tried", lambda _, row: row.summary.cells),
     Column("cell_m", "side of a cell", lambda table, _: table.grid.cell),
-    Column("steps", "how many were measured", lambda table, row: table.conditions[row.rig].counts["steps"]),
+    Column("num_frames", "number of measured frames", lambda table, row: table.conditions[row.rig].counts["frames"]),
     Column("blocks", "how many the errors come from", lambda table, row: table.conditions[row.rig].blocks),
-    Column("steps_per_block", "of a full one", lambda table, row: table.conditions[row.rig].frames_per_block),
+    Column("frames_per_block", "of a full one", lambda table, row: table.conditions[row.rig].frames_per_block),
     Column("vehicle", "what carries the rig; empty if unknown", lambda table, _: table.source.get("vehicle")),
     Column("sensor_model", "what sensors make of their hits: `ideal` or `real`; empty if unknown", _sensor_model),
     Column("x_min_m", "where the region begins", lambda _, row: row.region.x[0]),
@@ -200,7 +202,7 @@ def build_table_dict(table: CoverageTable) -> dict[str, Any]:
         "thresholds_m": list(table.thresholds_m),
         "max_radius_m": _json_number(table.max_radius_m),
         "blocks": table.first_conditions.blocks,
-        "steps_per_block": table.first_conditions.frames_per_block,
+        "frames_per_block": table.first_conditions.frames_per_block,
         "counts": counts if len(counts) > 1 else counts[table.rigs[0]],
         "rows": [to_json_record(record) for record in build_records(table)],
     }

@@ -167,7 +167,7 @@ def _looked_at(table: CoverageTable, rig: str) -> Iterator[TableNote]:
         seen = "Means over the square metres that the reference sees."
         yield TableNote("visible_surface", len(summaries), len(summaries), seen)
     else:
-        cells, known = sum(one.cells for one in summaries), sum(one.known_cells for one in summaries)
+        cells, known = sum(one.cells for one in summaries), sum(one.observed_cells for one in summaries)
         flattered = "Means over the known cells only; the fewer are known, the more the numbers may flatter the rig."
         yield TableNote("unknown_cells", cells - known, cells, flattered)
     yield from _on_errors(table, rig)
@@ -177,8 +177,8 @@ def _looked_at(table: CoverageTable, rig: str) -> Iterator[TableNote]:
     doubt = " Is the ground at z = 0, and x ahead?" if outside > MOSTLY * every else ""
     some = {**counts, "outside_points": outside}
     for name, of, words in (
-        ("empty_sensor_steps", counts["steps"], "steps had no sensor point: they count as blind, not as missing."),
-        ("empty_reference_steps", counts["steps"], "steps had no reference point: they say nothing."),
+        ("empty_sensor_frames", counts["frames"], "steps had no sensor point: they count as blind, not as missing."),
+        ("empty_reference_frames", counts["frames"], "steps had no reference point: they say nothing."),
         ("saturated_points", inside, f"reference points count as {far}: no sensor point was nearer."),
         ("outside_points", every, f"reference points lie outside the grid: left out.{doubt}"),
         ("no_ground_points", every, "reference points have no known ground at or below them: in no band."),
@@ -210,7 +210,7 @@ def _on_errors(table: CoverageTable, rig: str) -> Iterator[TableNote]:
 def list_notes(table: CoverageTable) -> list[str]:
     """What the numbers hold under and what went wrong, a sentence each; what is about one rig only begins with it."""
     of_rigs = merge_notes({rig: _of_rig(table, rig) for rig in table.rigs})
-    shared = {"known": "they know the same cells", "area": "they are asked about the same square metres"}[table.average]
+    shared = {"cells": "they know the same cells", "area": "they are asked about the same square metres"}[table.average]
     paired = [f"All rigs were measured against the same reference points, so {shared}."]
     return [*(paired if len(table.rigs) > 1 else []), *of_rigs, *table.notes]
 
@@ -238,7 +238,7 @@ def explain_marks(table: CoverageTable) -> dict[str, str]:
 
 def _of_rig(table: CoverageTable, rig: str) -> list[str]:
     bands = ", ".join(f"{name} {format_height_band(table.grid, name)}" for name in table.grid.heights)
-    first = f"{format_resolution(table.conditions[rig].counts['steps'], table.grid)}; {bands}."
+    first = f"{format_resolution(table.conditions[rig].counts['frames'], table.grid)}; {bands}."
     sentences = (remark.sentence for remark in collect_table_notes(table, rig))
     failure = describe_single_point_of_failure(table, rig)
     return [first, *sentences, *([failure] if failure else [])]
@@ -276,7 +276,7 @@ def explain_missing_intervals(table: CoverageTable, subject: str) -> str:
     Returns:
         A sentence; empty where some number has an interval, or where none was asked for.
     """
-    steps, blocks = table.first_conditions.counts["steps"], table.first_conditions.blocks
+    steps, blocks = table.first_conditions.counts["frames"], table.first_conditions.blocks
     if blocks is None or table.has_intervals:
         return ""
     needed, ends = blocks_needed(blocks, table.first_conditions.effective_blocks[0]), table.block_ends
@@ -284,7 +284,7 @@ def explain_missing_intervals(table: CoverageTable, subject: str) -> str:
     if ends and len(ends) < needed:
         return f"{begin}intervals need about {needed}, and this source has {len(ends)} in all."
     frames = ends[needed - 1] if ends else needed * (table.first_conditions.frames_per_block or 1)
-    return f"{begin}intervals need about {needed}, which are {frames:,} frames (`--steps`)."
+    return f"{begin}intervals need about {needed}, which are {frames:,} frames (`--num-frames`)."
 
 
 def describe_near_field(table: CoverageTable) -> str:
@@ -342,7 +342,7 @@ def surface_words(table: CoverageTable, row: Row) -> str:
     surface = BANDS.get(row.summary.height, row.summary.height)
     if table.average == "area":
         return f"{format_square_meters(row.summary.visible_m2)} m² of visible {surface}"
-    return f"{row.summary.known_cells:,} observed cells of {surface}"
+    return f"{row.summary.observed_cells:,} observed cells of {surface}"
 
 
 def find_forward_region(table: CoverageTable) -> Region | None:

@@ -64,7 +64,7 @@ class CoverageTable:
         grid: Cells and height bands.
         thresholds_m: Detection thresholds in metres.
         max_radius_m: Saturation of the radius in metres.
-        average: What the numbers of the rows are means over: "area", the visible surface, or "known", the known cells.
+        average: What the numbers of the rows are means over: "area", the visible surface, or "cells", the known cells.
         rows: Name of the rig -> its rows in the order of the regions, then of the bands.
         conditions: Name of the rig -> what its numbers hold under.
         notes: What else they hold under, in words of the caller.

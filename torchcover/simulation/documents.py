@@ -49,7 +49,7 @@ KINDS = {
     SETTINGS_KIND: (
         "",
         "scenario steps seed vehicle sensor_model weather ask probe cell_m thresholds_m aggregations reference rays "
-        "estimate band_frame every_s target_error only_detection redundancy metrics device workers no_cache "
+        "estimate band_frame frame_interval_s target_error only_detection redundancy metrics device workers no_cache "
         "skip_bad_frames rerun recording",
     ),
     "a rig": ("sensors", "vehicle weather bodies"),

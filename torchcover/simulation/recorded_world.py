@@ -115,7 +115,7 @@ def write_world(recording: Recording, folder: Path, *, steps: int | None = None)
         raise ValueError(
             f"{recording.path}: nothing is recorded for {np.diff(times_s)[gaps[0]]:,.1f} s after "
             f"{recording.frame_names[gaps[0]]}, and a world needs a frame at least every {WINDOW_S:g} s; record more often, "
-            f"or make a world of the frames before (--steps {before})"
+            f"or make a world of the frames before (--num-frames {before})"
         )
     poses = np.array(
         [reference.sweep_window.compute_local_T_vehicle(recording, instant) for instant in range(last + 1)]
@@ -175,7 +175,7 @@ def _seen(
         if skipped := sweeps.count_skipped_frames(recording, index):
             raise ValueError(
                 f"{recording.path}: the poses jump within {WINDOW_S / 2:g} s of {recording.frame_names[index]}, by which "
-                f"{skipped} instants are lost, and a world does not; mend them, or make one of fewer frames (--steps)"
+                f"{skipped} instants are lost, and a world does not; mend them, or make one of fewer frames (--num-frames)"
             )
         parts = [standing_m]
         for (sensor, instant), (points_m, told) in sorted(reference.classify_points(recording, index).items()):
@@ -205,7 +205,7 @@ class _Field:
         if rows * columns > MOST_SQUARES:
             raise ValueError(
                 f"the drive covers {columns * SQUARE_M / 1000:.1f} x {rows * SQUARE_M / 1000:.1f} km, too much for one "
-                "world; make one of fewer frames (--steps)"
+                "world; make one of fewer frames (--num-frames)"
             )
         self._heights_m, self._away_m = np.full((2, rows, columns), np.nan)
         self._away_m[:] = np.inf

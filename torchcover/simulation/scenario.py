@@ -203,7 +203,7 @@ class Scenario(BuiltIn):
         steps = round(time_s / time_step_s) if math.isfinite(time_s / time_step_s) else 0
         if steps < 1 or not math.isclose(steps * time_step_s, time_s, rel_tol=1e-6):
             raise ValueError(
-                f"every_s: a positive multiple of the time step of {self.name!r}, {time_step_s:g} s, is needed; "
+                f"frame_interval_s: a positive multiple of the time step of {self.name!r}, {time_step_s:g} s, is needed; "
                 f"got {time_s:g}"
             )
         return steps

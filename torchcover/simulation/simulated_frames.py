@@ -50,12 +50,12 @@ class SimulatedFrames(FrameDataset):
         rig: The sensors, the name of a built-in rig, or the path of a YAML file.
         rigs: Several rigs instead, by the name under which `Frame.clouds` has their clouds; `{}`: the reference alone.
         steps: Number of frames. Beyond the end of a scenario its traffic starts anew with other random numbers; without
-            traffic, the same instants are seen again, which `Frame.place_in_time` and `Frame.counts` say.
+            traffic, the same instants are seen again, which `Frame.block_index` and `Frame.counts` say.
         seed: Seed of the traffic and of the reference sensor's poses.
         reference_sensor: The reference sensor, such as `PaperReference()`. If not given, a `SurfaceReference` that is
             aimed at the usual regions: `reference_called`, and `reference_of_objects` with boxes, at up to twice the
             time.
-        every_s: Time between one frame and the next, a multiple of the scenario's time step; that step if not given.
+        frame_interval_s: Time between one frame and the next, a multiple of the scenario's time step; that step if not given.
             Steps that follow each other are alike: with the same number of frames, a longer time shows more, and in
             traffic, which starts anew, the frames are spread over more cities.
         boxes: Whether frames have `boxes`: one for each object within the reference's range, with how many points each
@@ -89,7 +89,7 @@ class SimulatedFrames(FrameDataset):
         steps: int,
         seed: int = 0,
         reference_sensor: ReferenceSensor | None = None,
-        every_s: float | None = None,
+        frame_interval_s: float | None = None,
         boxes: bool = False,
         vehicle: str | Path | None = None,
         kept_bytes: float | None = None,
@@ -109,7 +109,7 @@ class SimulatedFrames(FrameDataset):
             carried,
             _fit_to_rigs(reference_sensor, carried, world),
             seed=seed,
-            every_s=every_s,
+            frame_interval_s=frame_interval_s,
             kept_bytes=kept_bytes,
             within_m=within_m,
             no_cache=no_cache,
@@ -139,9 +139,9 @@ class SimulatedFrames(FrameDataset):
         return self.simulator.seed
 
     @property
-    def every_s(self) -> float:
+    def frame_interval_s(self) -> float:
         """Time between one frame and the next."""
-        return self.simulator.every_s
+        return self.simulator.frame_interval_s
 
     @property
     def sensors(self) -> Mapping[str, Sequence[Sensor]]:
@@ -157,9 +157,9 @@ class SimulatedFrames(FrameDataset):
         """Which world a frame is of; of one that plays again and again every process has it whole: the index."""
         return index if self.scenario.repeats else self.simulator.run_of(index)
 
-    def place_in_time(self, index: int) -> int:
-        """As `Simulator.place_in_time`."""
-        return self.simulator.place_in_time(index)
+    def block_index(self, index: int) -> int:
+        """As `Simulator.block_index`."""
+        return self.simulator.block_index(index)
 
     def has_boxes(self) -> bool:
         """Whether they were asked for."""
@@ -205,7 +205,11 @@ class SimulatedFrames(FrameDataset):
         for name, rig in self.rigs.items():
             self_hits = describe_self_hits(rig.sensors, rig.own_mesh(ego))
             words.append(f"{name}: {self_hits}" if self_hits and len(self.rigs) > 1 else self_hits)
-        return {"sensor": self.reference_sensor.name, "every_s": self.every_s, "notes": list(filter(None, words))}
+        return {
+            "sensor": self.reference_sensor.name,
+            "frame_interval_s": self.frame_interval_s,
+            "notes": list(filter(None, words)),
+        }
 
     @property
     def content(self) -> Mapping[str, object]:
@@ -221,7 +225,7 @@ class SimulatedFrames(FrameDataset):
             **{f"rig {name}": rig.content() for name, rig in self.rigs.items()},
             "reference sensor": pattern,
             "seed": self.seed,
-            "every_s": self.every_s,
+            "frame_interval_s": self.frame_interval_s,
             "boxes": self.boxes,
             "within_m": self.simulator.within_m,
         }
@@ -250,7 +254,7 @@ class SimulatedFrames(FrameDataset):
             index=index,
             name=f"{self.scenario.name} step {index}",
             counts=seen.counts,
-            place_in_time=self.simulator.place_in_time(index),
+            block_index=self.simulator.block_index(index),
         )
         return with_boxes(frame, self._boxes(index, seen.drawn), self.rigs) if self.boxes else frame
 

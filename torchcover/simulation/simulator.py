@@ -63,7 +63,7 @@ class Simulator:
         rigs: The sensors, by the name under which `Observation.clouds` has their points.
         reference_sensor: The reference sensor.
         seed: Seed of the traffic, of the reference sensor, and of noise and drop-out.
-        every_s: Time between one step and the next, a multiple of the scenario's time step; that step if not given.
+        frame_interval_s: Time between one step and the next, a multiple of the scenario's time step; that step if not given.
         kept_bytes: What the worlds that are kept, in case they are needed again, may take; a small share of the
             machine's memory if not given.
         within_m: Only points of the rigs that lie so near to one of the reference are asked for, as detections up to
@@ -93,7 +93,7 @@ class Simulator:
         reference_sensor: ReferenceSensor,
         *,
         seed: int = 0,
-        every_s: float | None = None,
+        frame_interval_s: float | None = None,
         kept_bytes: float | None = None,
         within_m: float | None = None,
         no_cache: bool = False,
@@ -106,12 +106,12 @@ class Simulator:
         self.reference_sensor = reference_sensor
         self.seed = seed
         self.within_m = within_m
-        self._every_steps = 1 if every_s is None else scenario.steps_in(every_s)
+        self._every_steps = 1 if frame_interval_s is None else scenario.steps_in(frame_interval_s)
         self._stages = Stages(Scenes(scenario, seed, kept_bytes, no_cache=no_cache, device=device), rigs)
         self._check_size()
 
     @property
-    def every_s(self) -> float:
+    def frame_interval_s(self) -> float:
         """Time between one step and the next."""
         return self._every_steps * self.scenario.step_s
 
@@ -121,7 +121,7 @@ class Simulator:
         instants = self.scenario.instants
         return None if instants is None else instants // math.gcd(instants, self._every_steps)
 
-    def place_in_time(self, index: int) -> int:
+    def block_index(self, index: int) -> int:
         """The number by which standard errors tell a step from others; steps that share it are alike.
 
         Where each run has a world of its own, that is the number of the run: its steps share a city. In a scenario that
@@ -202,7 +202,7 @@ class Simulator:
             drawn=reference.drawn,
             counts={
                 **_counts_of(stage.scene, instant, of_all_rigs, reference),
-                "repeated_instants": int(self.distinct_steps is not None and index >= self.distinct_steps),
+                "repeated_frames": int(self.distinct_steps is not None and index >= self.distinct_steps),
             },
         )
 
@@ -334,13 +334,13 @@ def _counts_of(scene: Scene, instant: Instant, scans: Sequence[SensorScan], refe
         "reference_rays": reference.rays,
         "reference_self_hits": reference.self_hits,
         "reference_poses": reference.places + reference.redrawn,
-        "reference_poses_redrawn": reference.redrawn,
+        "reference_poses_resampled": reference.redrawn,
         "moving_bodies": len(instant.moving) + instant.out_of_range,
         "moving_bodies_out_of_range": instant.out_of_range,
-        "road_users_left_out": scene.world.left_out,
+        "road_users_omitted": scene.world.left_out,
         "ray_body_pairs": pairs,
-        "ray_body_pairs_left_out": pairs - reference.body_casts - sum(scan.body_casts for scan in scans),
+        "ray_body_pairs_omitted": pairs - reference.body_casts - sum(scan.body_casts for scan in scans),
         "sensor_rays_reused": 0 if scene.moves else rays,
-        "sensor_rays_spared": sum(scan.rays_spared for scan in scans),
+        "sensor_rays_omitted": sum(scan.rays_spared for scan in scans),
         "sensor_self_hits_reused": self_hits if scene.knows_self_hits else 0,
     }

@@ -117,10 +117,10 @@ def _step(frames: SimulatedFrames, index: int) -> FrameRecord:
     landed = [scan.points if scan.landed is None else scan.landed for scan in seen.scans[name]]
     scene, step = frames.simulator.scene_of(index)
     world = scene.world
-    played = round(index * frames.every_s / world.time_step_s) // world.steps if world.steps > 1 else 0
+    played = round(index * frames.frame_interval_s / world.time_step_s) // world.steps if world.steps > 1 else 0
     return FrameRecord(
         _name(index),
-        index * frames.every_s + played * APART_S,
+        index * frames.frame_interval_s + played * APART_S,
         world.ego.trajectory.at(step * world.time_step_s),
         {sensor.name: cloud for sensor, cloud in zip(rig.sensors, landed, strict=True)},
         frames.frame_of(seen, index),

@@ -75,7 +75,7 @@ class Probe(NamedTuple):
 class StepProbes(NamedTuple):
     """What one step adds, of each rig to `BodySums`; it is small, and travels between processes."""
 
-    place_in_time: int
+    block_index: int
     sums: Tensor
     cells: Tensor
 
@@ -140,13 +140,13 @@ class Probes(SumsInBlocks):
                 each = np.stack([np.zeros(len(some)), seen.steps, seen.seen, *m2], axis=1)
                 np.add.at(sums[rig, number], probe.region[some], each)
                 np.add.at(cells[rig, number], probe.cell[some], each[:, [FREE, SEEN]])
-        return StepProbes(simulator.place_in_time(index), torch.from_numpy(sums), torch.from_numpy(cells))
+        return StepProbes(simulator.block_index(index), torch.from_numpy(sums), torch.from_numpy(cells))
 
     def add(self, step: StepProbes | None) -> None:
         """Add what `sums_of` gives."""
         if step is not None:
-            self._block_of(step.place_in_time)
-            self.sums[self._fine_block_of(step.place_in_time)] += step.sums
+            self._block_of(step.block_index)
+            self.sums[self._fine_block_of(step.block_index)] += step.sums
             self.cells += step.cells
             self.steps += 1
             self._follow_steps()

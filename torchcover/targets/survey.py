@@ -32,7 +32,7 @@ def survey(
     raster: Raster | None = None,
     *,
     steps: int = 1,
-    every_s: float | None = None,
+    frame_interval_s: float | None = None,
     seed: int = 0,
     hits: int = HITS,
     threshold_m: float = THRESHOLD_M,
@@ -53,7 +53,7 @@ def survey(
             `OUTSIDE`.
         raster: Where; within 5 m of the vehicle in steps of 0.2 m if not given.
         steps: How many steps are averaged.
-        every_s: Time between two of them; the scenario's time step if not given.
+        frame_interval_s: Time between two of them; the scenario's time step if not given.
         seed: Of traffic, random places, noise and drop-out.
         hits: How many points are enough to see it.
         threshold_m: How near a measured point on the target must be to a point of its surface, for the share.
@@ -75,7 +75,7 @@ def survey(
     _check_size(target, raster)
     spots = survey_places(
         rig, scenario, target, raster.positions_m,
-        steps=steps, every_s=every_s, seed=seed, hits=hits, threshold_m=threshold_m, heading=heading,
+        steps=steps, frame_interval_s=frame_interval_s, seed=seed, hits=hits, threshold_m=threshold_m, heading=heading,
     )  # fmt: skip
     return TargetMap(
         rig=rig.name,
@@ -106,7 +106,7 @@ def survey_places(
     counting: Sequence[int] | None = None,
     *,
     steps: int = 1,
-    every_s: float | None = None,
+    frame_interval_s: float | None = None,
     seed: int = 0,
     hits: int = HITS,
     threshold_m: float = THRESHOLD_M,
@@ -126,7 +126,7 @@ def survey_places(
     for sensor in rig.sensors:
         occupied |= holding(box, vehicle_T_target, sensor.mount.matrix()[:3, 3])
     surface, elsewhere = Surface.of(target), np.flatnonzero(~occupied)
-    every_steps = 1 if every_s is None else scenario.steps_in(every_s)
+    every_steps = 1 if frame_interval_s is None else scenario.steps_in(frame_interval_s)
     around = vehicle_T_target[elsewhere]
     run = Steps(rig, scenario, target, surface, around, steps=steps, every_steps=every_steps, seed=seed)
     some = range(len(rig.sensors)) if counting is None else counting

@@ -139,7 +139,7 @@ class CoverageCallback(Callback):
             error=new.errors_of(self.rig),
             weights=new.weights,
             height=new.heights_in(self.metric.grid.band_frame),
-            place_in_time=None if UNKNOWN_INDEX in indices else new.place_in_time,
+            block_index=None if UNKNOWN_INDEX in indices else new.block_index,
         )
 
     def _shard(self, trainer: Trainer, loader_index: int) -> Shard | None:
@@ -178,7 +178,7 @@ class CoverageCallback(Callback):
         return coverage
 
     def _scalars(self, coverage: Coverage) -> dict[str, float]:
-        scalars = {**coverage.scalars(self.regions), "steps": float(coverage.counts["steps"])}
+        scalars = {**coverage.scalars(self.regions), "steps": float(coverage.counts["frames"])}
         return {f"{self._prefix}/{name}": value for name, value in scalars.items()}
 
     def _log_maps(self, trainer: Trainer, coverage: Coverage) -> None:

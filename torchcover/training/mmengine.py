@@ -104,14 +104,14 @@ class MMEngineCoverage(BaseMetric):  # type: ignore[misc]  # MMEngine has no typ
     def _add(self, frames: Sequence[Frame], size: int | None) -> None:
         rank, processes = get_dist_info()
         for frame in self._once.new(frames, Shard(rank, processes, size)):
-            index = None if frame.index == UNKNOWN_INDEX else frame.place_in_time
+            index = None if frame.index == UNKNOWN_INDEX else frame.block_index
             self.metric.update(
                 frame.sensor,
                 frame.reference,
                 error=frame.error_of(),
                 weights=frame.reference_weights,
                 height=frame.heights_in(self.metric.grid.band_frame),
-                place_in_time=index,
+                block_index=index,
             )
 
     def compute_metrics(self, results: list[Any]) -> dict[str, float]:

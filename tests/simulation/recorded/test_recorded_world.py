@@ -55,7 +55,7 @@ def drive(tmp_path_factory):
         Scenario.load(folder / "street.yaml"),
         Rig(name="one", sensors=[LIDAR]),
         steps=round(SECONDS / 0.1) + 1,
-        every_s=0.1,
+        frame_interval_s=0.1,
         boxes=True,
     )
     write_recording(frames, folder / "recording")
@@ -139,7 +139,7 @@ def test_what_no_world_can_be_made_of_is_told():
     gap = Drive(steps=8)
     gap.times_s = gap.times_s + 60.0 * (np.arange(8) > 3)
     with pytest.raises(
-        ValueError, match=r"nothing is recorded for 60\.1 s after f3, and a world needs .* 5 s; .*\(--steps 4\)"
+        ValueError, match=r"nothing is recorded for 60\.1 s after f3, and a world needs .* 5 s; .*\(--num-frames 4\)"
     ):
         write_world(gap, gap.path)
     jumping = Drive(steps=8)

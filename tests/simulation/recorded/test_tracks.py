@@ -107,9 +107,9 @@ def test_a_run_is_as_long_as_the_recording_and_then_the_same_again(written, kind
     assert drive.repeats
     assert (drive.steps, drive.instants) == (41, 41)
     assert [drive.locate(index) for index in (0, 40, 41, 100)] == [(0, 0), (0, 40), (0, 0), (0, 18)]
-    simulator = Simulator(drive, {"rig": RIG}, FEW, every_s=0.3)
+    simulator = Simulator(drive, {"rig": RIG}, FEW, frame_interval_s=0.3)
     assert simulator.distinct_steps == 41
-    assert [simulator.place_in_time(index) for index in (0, 1, 13, 14, 41)] == [0, 3, 39, 1, 0]
+    assert [simulator.block_index(index) for index in (0, 1, 13, 14, 41)] == [0, 3, 39, 1, 0]
     assert simulator.run_of(1000) == 0
     assert round(compute_frame_interval_s(drive, None) / 0.1) == 25  # the golden share of its instants
 
@@ -118,7 +118,7 @@ def test_an_instant_that_is_seen_again_is_counted_and_seen_as_before(written):
     drive, *_ = opened(written, "table")
     simulator = Simulator(drive, {"rig": RIG}, FEW)
     first, again = simulator.step(3), simulator.step(3 + 41)
-    assert (first.counts["repeated_instants"], again.counts["repeated_instants"]) == (0, 1)
+    assert (first.counts["repeated_frames"], again.counts["repeated_frames"]) == (0, 1)
     np.testing.assert_array_equal(first.clouds["rig"], again.clouds["rig"])
     assert not np.array_equal(first.reference, again.reference)
 

@@ -106,7 +106,7 @@ class PoseTable:
     """A pose for every frame, in their order, and where the table says so, its time.
 
     Its columns are `frame, x_m, y_m, z_m, qw, qx, qy, qz`, and `time_s` if it is `timed`; `instant` may be there too, a
-    whole number that frames share which are no news to each other (`Frame.place_in_time`).
+    whole number that frames share which are no news to each other (`Frame.block_index`).
     """
 
     def __init__(self, path: Path, frame_names: Sequence[str], *, has_times: bool) -> None:

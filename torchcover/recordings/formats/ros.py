@@ -288,9 +288,9 @@ class RosBag(RecordingBase):
     def _cloud(self, sensor: str, index: int) -> tuple[CloudMessage, int]:
         logged_ns, first_ns = int(self._logged_ns[sensor][index]), self._stamped_ns[self.sensors[0]]
         apart_s = abs(int(self._stamped_ns[sensor][index]) - int(first_ns[index])) * 1e-9
-        every_s = float(np.median(np.diff(first_ns))) * 1e-9 if len(first_ns) > 1 else np.inf
+        frame_interval_s = float(np.median(np.diff(first_ns))) * 1e-9 if len(first_ns) > 1 else np.inf
         with naming(self.path, f"a cloud of {sensor}"):
-            if apart_s > FARTHEST_SCAN * every_s:
+            if apart_s > FARTHEST_SCAN * frame_interval_s:
                 raise ValueError(f"the scan of {sensor} nearest to {first_ns[index]} is {apart_s:.3f} s off")
             cloud = parse_cloud(self._bag.read_message(self._topic(sensor), logged_ns), self._point_times[sensor])
         stamp_ns = cloud.stamp_ns or logged_ns

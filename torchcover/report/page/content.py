@@ -278,7 +278,7 @@ def _weights(first: Coverage) -> CellWeights | None:
         return None
     m2 = [_nan_where_none(one) for one in first.area.totals()[0]]
     sides = [one.cpu().numpy() for one in compute_square_sides(first.points, first.grid.cell)]
-    return CellWeights(m2, "m² of surface seen in all steps", first.counts["steps"] * first.grid.cell**2, sides)
+    return CellWeights(m2, "m² of surface seen in all steps", first.counts["frames"] * first.grid.cell**2, sides)
 
 
 def _nan_where_none(counts: Tensor) -> Array:
