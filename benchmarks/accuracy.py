@@ -17,7 +17,12 @@ import torch
 
 from benchmarks import table
 from torchcover import BevGrid, CoverageMetric, forward_regions, nearest
-from torchcover.coverage.quantity import RADIUS, detection, seen_by_two, sensors_seeing
+from torchcover.coverage.quantity import (
+    RADIUS,
+    make_detection_quantity,
+    make_redundancy_quantity,
+    make_sensor_count_quantity,
+)
 from torchcover.data import SimulatedFrames
 from torchcover.estimation import ErrorModel, Estimate
 from torchcover.evaluation import CoverageObserver, Settings, TargetError, TargetErrorRule
@@ -28,8 +33,8 @@ SCENARIOS = {"urban": 50, "highway": 35}
 RIGS = ("front_roof_128", "front_grille_128")
 THRESHOLD_M, STEPS_OF_A_CITY, LENGTHS = 0.4, 6, (64, 256)
 # What is summed up of each point, each as one rig has it, or both as one.
-VALUES = [*((rig, what) for rig in ("roof", "grille", "both") for what in (RADIUS, detection(THRESHOLD_M))),
-          ("both", sensors_seeing(THRESHOLD_M)), ("both", seen_by_two(THRESHOLD_M))]  # fmt: skip
+VALUES = [*((rig, what) for rig in ("roof", "grille", "both") for what in (RADIUS, make_detection_quantity(THRESHOLD_M))),
+          ("both", make_sensor_count_quantity(THRESHOLD_M)), ("both", make_redundancy_quantity(THRESHOLD_M))]  # fmt: skip
 # A rig against another: roof and grille as a comparison has them, each against both as a sensor that fails.
 DIFFERENCES = {"difference": [("grille", "roof")], "loss": [("roof", "both"), ("grille", "both")]}
 # Where one city has more than this of the variance, it alone decides about the truth.
@@ -39,7 +44,7 @@ TARGET = 0.01
 
 RIG = "front_roof_128"
 REGIONS = forward_regions()
-AREAS = tuple((region.x, region.y) for region in REGIONS)
+AREAS = tuple((region.x_m, region.y_m) for region in REGIONS)
 HEIGHTS = ("ground", "obstacle")
 EVERY_S = 10.0
 RAYS = (1024, 4096, 16_384, 65_536, 262_144, 1_048_576)
@@ -179,7 +184,7 @@ class Cities:
             for rig, what in VALUES
             for place in self.places
         ]
-        return Estimate.of_ratios(quantities, base.flatten(1), each.flatten(1), lengths)
+        return Estimate.from_ratios(quantities, base.flatten(1), each.flatten(1), lengths)
 
     def judged(self, random, steps, runs):
         """Kind, name, share of one city, share of intervals that cover (0: most runs have none), relative width."""
@@ -187,7 +192,7 @@ class Cities:
         for gain, many, every in (("", steps, 1), ("gain", 48, 2))[: 1 + (steps == LENGTHS[0])]:
             whole, found = self.over_all(every), self._rows(self.drawn(random, many, runs, every))
             truths = self._rows(whole)
-            tops = self._rows(replace(whole, left_out=whole.left_out - whole.value), _share_of_one_city)
+            tops = self._rows(replace(whole, left_out=whole.jackknife_values - whole.value), _share_of_one_city)
             for (kind, name), each in found.items():
                 if not gain or kind == "difference":
                     yield gain or kind, name, float(tops[kind, name][0]), *_covered(each, truths[kind, name][0, 0])
@@ -229,14 +234,16 @@ class Cities:
         """Steps that the target needs, by which number; where runs stopped, and what studies named."""
         six = range(2 * len(forward_regions()))
         whole = self.part(self.whole, "roof", 1)
-        models = [ErrorModel.of(float(whole.error[at]), STEPS_OF_A_CITY * len(self.sums)) for at in six]
-        needed = [model.steps_for(TARGET) for model in models]
+        models = [ErrorModel.from_error(float(whole.error[at]), STEPS_OF_A_CITY * len(self.sums)) for at in six]
+        needed = [model.estimate_num_frames(TARGET) for model in models]
         most = max(needed)
         ends = np.array([Replay(self, random, 4 * most).stops() for _ in range(runs)])
         named = []
         for _ in range(studies):
             run = self.part(self.drawn(random, studied), "roof", 1)
-            named.append(max(ErrorModel.of(float(run.error[at]), studied).steps_for(TARGET) for at in six))
+            named.append(
+                max(ErrorModel.from_error(float(run.error[at]), studied).estimate_num_frames(TARGET) for at in six)
+            )
         ratio = np.array(named) / np.median(named)
         near = np.mean((ratio < 1.3) & (ratio > 1 / 1.3))
         good = np.mean((ends >= 0.8 * most) & (ends <= 1.3 * most))
@@ -249,20 +256,20 @@ class Replay:
     def __init__(self, pool, random, most):
         self.pool, self.grid = pool, SimpleNamespace(heights=("ground", "obstacle"))
         self.order = random.integers(len(pool.sums), size=-(-most // STEPS_OF_A_CITY))
-        self.most, self.counts, self.quantities = most, {"steps": 0}, (RADIUS, detection(THRESHOLD_M))
+        self.most, self.counts, self.quantities = most, {"steps": 0}, (RADIUS, make_detection_quantity(THRESHOLD_M))
 
     def stops(self):
         """After how many steps."""
         watch = TargetErrorRule(TargetError(detection=TARGET), {"roof": self}, forward_regions())
-        while self.counts["frames"] < self.most:
-            self.counts["frames"] = watch.next_check_frame
+        while self.counts["num_frames"] < self.most:
+            self.counts["num_frames"] = watch.next_check_frame
             if watch.is_reached(watch.next_check_frame):
                 break
-        return self.counts["frames"]
+        return self.counts["num_frames"]
 
     def compute(self):
         """Itself, with what the steps so far say."""
-        cities, rest = divmod(min(self.counts["frames"], self.most), STEPS_OF_A_CITY)
+        cities, rest = divmod(min(self.counts["num_frames"], self.most), STEPS_OF_A_CITY)
         parts = self.pool.sums[self.order[: cities + (rest > 0)]].clone()
         lengths = torch.full((len(parts),), STEPS_OF_A_CITY)
         if rest:
@@ -325,7 +332,9 @@ def of_estimator(row):
     """The distances of an estimator with few rays to its own value with a million."""
     name, measure, band_frame = row
     frames = frames_of("urban", cities=BUDGET_CITIES)
-    grid = BevGrid(x=(0.0, 160.0), y=(-40.0, 40.0), cell=0.25 if measure == "known" else 1.0, band_frame=band_frame)
+    grid = BevGrid(
+        x_m=(0.0, 160.0), y_m=(-40.0, 40.0), cell_m=0.25 if measure == "known" else 1.0, band_frame=band_frame
+    )
     looks, observers = {}, {}
     for rays in RAYS:
         of_paper = PaperReference(rows=int(rays**0.5), columns=int(rays**0.5))
@@ -375,7 +384,7 @@ def sums_of(frame, cloud):
     x_m, y_m = frame.reference[:, 0], frame.reference[:, 1]
     found = []
     for region in REGIONS:
-        inside = (x_m >= region.x[0]) & (x_m < region.x[1]) & (y_m >= region.y[0]) & (y_m < region.y[1])
+        inside = (x_m >= region.x_m[0]) & (x_m < region.x_m[1]) & (y_m >= region.y_m[0]) & (y_m < region.y_m[1])
         for low_m, high_m in ((-0.5, 0.5), (0.5, 2.0)):
             height_m = frame.reference_heights_m
             found.append(each[inside & (height_m >= low_m) & (height_m < high_m)].sum(dim=0))

@@ -132,7 +132,7 @@ def observer_on(device):
 def rays(device):
     """From the vehicle's roof, all around, at what never moves: of a scan, and of the paper's reference."""
     scene, _ = frames_of().simulator.scene_of(0)
-    origin_m = scene.world.ego.trajectory.at(0.0)[:3, 3] + (0.0, 0.0, 1.9)
+    origin_m = scene.world.ego.trajectory.interpolate(0.0)[:3, 3] + (0.0, 0.0, 1.9)
     casters = [RayCaster(scene.world.static, where) for where in (None, str(device))]
     for size in (480, 1024):
         directions = PaperReference(rows=size, columns=size).directions().reshape(3, -1).astype(np.float32)

@@ -30,7 +30,7 @@ from tests.placement.surfaces import Surface
 from torchcover.cli import app, search_run
 from torchcover.data import open_recording
 from torchcover.evaluation import result
-from torchcover.files import SUMMARY, BadFileError, read_manifest, reads
+from torchcover.files import SUMMARY, BadFileError, guard_reader, read_manifest
 from torchcover.placement import SearchPlan
 
 SPACE = """name: roof
@@ -196,7 +196,7 @@ def killed_at_random(kills):
     return [(one.name, each.total(), *(each[name] for name in VERDICTS)) for one, each in found.items()]
 
 
-@reads("a file of a result")
+@guard_reader("a file of a result")
 def content(path):
     """What a reader finds."""
     return path.read_bytes()

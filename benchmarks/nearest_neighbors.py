@@ -100,7 +100,7 @@ def cases():
             "urban", rigs={rig: rig for rig in RIGS}, steps=1, reference_sensor=sensor, vehicle="suv"
         )[0]
         for rig in RIGS:
-            yield f"{rig}, {name}", frame.reference.numpy(), frame.cloud_of(rig).numpy()
+            yield f"{rig}, {name}", frame.reference.numpy(), frame.get_cloud(rig).numpy()
     random = np.random.default_rng(0)
     for size in SIZES:
         query, points = (random.uniform(-50, 50, (n, 3)).astype(np.float32) for n in (min(size, MOST_QUERIES), size))

@@ -186,7 +186,9 @@ def count_false_alarms(searches):
     results = [run_search(PlacementSearch(space, seed=2 * seed, **given)) for seed in range(searches)]
     tests = [result.test for result in results if result.test is not None]
     worse = sum(any(change.is_worse for change in test.side_effects) for test in tests)
-    gained = sum(result.best.improvements[0].difference.significant for result in results if result.best.improvements)
+    gained = sum(
+        result.best.improvements[0].difference.is_significant for result in results if result.best.improvements
+    )
     numbers = max((len(test.side_effects) for test in tests), default=0)
     table(("searches", "tested", "numbers each", "report worse", "report a gain or loss"),
           [(len(results), len(tests), numbers, worse, gained)])  # fmt: skip

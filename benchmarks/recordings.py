@@ -29,15 +29,15 @@ from torchcover.data import (
     SimulatedFrames,
     reference_called,
 )
-from torchcover.detection import points_in_boxes
-from torchcover.geometry import invert, rigid, rotation_from_euler, transform
+from torchcover.detection import find_points_in_boxes
+from torchcover.geometry import build_transform, convert_euler_to_rotation, invert, transform_points
 from torchcover.recordings.movers import COMPARED_S, WITHIN_M, find_moving_clusters
 from torchcover.simulation import Lidar, PaperReference, Rig, Scenario
 
 EVERY_S = 0.1
 # Scans before and after the window look at what is in it, too.
 MARGIN_S = 1.0
-GRID = BevGrid(x=(0.0, 160.0), y=(-40.0, 40.0), cell=0.25, band_frame="ground")
+GRID = BevGrid(x_m=(0.0, 160.0), y_m=(-40.0, 40.0), cell_m=0.25, band_frame="ground")
 TRUTH_RAYS = 65_536
 REGIONS = forward_regions()
 JUDGED = Rig.load("front_roof_128").sensors[0].model_copy(update={"columns": 900})
@@ -77,7 +77,7 @@ class SimulatedDrive:
     """A `Recording` of sweeps around one instant, which is its only frame; scans are kept."""
 
     reference_sensors = ()
-    square_metres = False
+    has_area_weights = False
     block_indices = None
     path = Path("simulated")
 
@@ -96,7 +96,7 @@ class SimulatedDrive:
 
     def read_scan(self, sensor, index):
         mount = MOUNTS[sensor]
-        points_m = transform(invert(mount), self._sweeps[index].clouds[sensor].numpy().astype(np.float64))
+        points_m = transform_points(invert(mount), self._sweeps[index].clouds[sensor].numpy().astype(np.float64))
         if self.imperfect:
             range_m = np.linalg.norm(points_m, axis=1, keepdims=True)
             points_m *= 1 + np.random.default_rng(index).normal(0, NOISE_M, range_m.shape) / range_m
@@ -106,7 +106,9 @@ class SimulatedDrive:
         if not self.imperfect:
             return self._poses[index]
         random = np.random.default_rng(index)
-        off = rigid(rotation_from_euler(*random.normal(0, POSE_ERROR_DEG, 3)), random.normal(0, POSE_ERROR_M, 3))
+        off = build_transform(
+            convert_euler_to_rotation(*random.normal(0, POSE_ERROR_DEG, 3)), random.normal(0, POSE_ERROR_M, 3)
+        )
         return self._poses[index] @ off
 
     def read_boxes(self, index):
@@ -204,7 +206,7 @@ def found_movers(recording, reference, frame):
     time_s, loose_m, apart_s = recording.times_s[instant], [], []
     vehicle_T_local = invert(reference.sweeps.local_T_vehicle(recording, instant))
     for (_, index), (points_m, told) in reference.told_apart(recording, instant).items():
-        own_m = transform(vehicle_T_local, points_m[told > 0])
+        own_m = transform_points(vehicle_T_local, points_m[told > 0])
         since_s = recording.times_s[index] - time_s
         if abs(since_s) <= COMPARED_S:
             loose_m.append(own_m[np.linalg.norm(own_m[:, :2], axis=1) < WITHIN_M])
@@ -214,13 +216,13 @@ def found_movers(recording, reference, frame):
     whose = np.repeat(np.arange(len(found)), [len(of.points_m) for of in found])
     boxes = recording.true_boxes(instant)
     cloud = torch.cat([frame.clouds[sensor] for sensor in reference.sensors])
-    count = torch.bincount(points_in_boxes(cloud, boxes).box, minlength=len(boxes))
-    inside, off_mps = points_in_boxes(places_m, boxes), []
+    count = torch.bincount(find_points_in_boxes(cloud, boxes).box_indices, minlength=len(boxes))
+    inside, off_mps = find_points_in_boxes(places_m, boxes), []
     for number in np.flatnonzero(count >= POINTS):
         velocity_mps, far_m = boxes.velocity_mps[number].numpy(), np.linalg.norm(boxes.centre_m[number, :2])
         moves = np.linalg.norm(velocity_mps) > MOVES_MPS and boxes.size_m[number, 0] > LEAST_LENGTH_M
         if moves and far_m < WITHIN_M:
-            own = whose[inside.point[inside.box == number].numpy()]
+            own = whose[inside.point_indices[inside.box_indices == number].numpy()]
             of = found[np.bincount(own).argmax()].velocity_mps if len(own) else np.inf
             off_mps.append(float(np.linalg.norm(of - velocity_mps)))
     return off_mps
@@ -277,7 +279,7 @@ def heights(sweeps, options):
             (frame,) = frames
             true_m = true_heights_m(sweeps, instant, frame.reference.numpy().astype(np.float64))
             for metric_of, heights_m in ((found, frame.reference_heights_m), (known, torch.from_numpy(true_m))):
-                metric_of.update(frame.sensor, frame.reference, height=heights_m)
+                metric_of.update(frame.sensor, frame.reference, heights_m=heights_m)
             range_m = torch.linalg.vector_norm(frame.reference[:, :2], dim=1).numpy()
             seen.append(np.stack([range_m, frame.reference_heights_m.numpy(), true_m]))
         rows += [(name, *row) for row in by_range(*np.concatenate(seen, axis=1), grid)]
@@ -293,7 +295,7 @@ def heights(sweeps, options):
 def true_heights_m(sweeps, instant, points_m):
     """(N,) of points in the vehicle frame above the ground of the world."""
     scene, step = sweeps.simulator.scene_of(instant)
-    placed_m = transform(scene.world.ego.trajectory.at(step * scene.world.time_step_s), points_m)
+    placed_m = transform_points(scene.world.ego.trajectory.at(step * scene.world.time_step_s), points_m)
     return scene.ground.heights_m(placed_m + np.array([0.0, 0.0, LIFT_M]), np.eye(4)) - np.float32(LIFT_M)
 
 

@@ -156,7 +156,7 @@ def by_cells(steps):
             taken_s = time.process_time() - begin_s
             size_mb = path.stat().st_size / 1e6
         grid = observer.metric.grid
-        yield cell_m, grid.cells, steps_s / steps, sums_mb, taken_s, size_mb, len(serialize(observer)) / 1e6
+        yield cell_m, grid.num_cells, steps_s / steps, sums_mb, taken_s, size_mb, len(serialize(observer)) / 1e6
 
 
 def by_ranks(steps):

@@ -16,7 +16,7 @@ import torch
 from benchmarks import table
 from torchcover import BevGrid, CoverageMetric
 from torchcover.data import SimulatedFrames, open_recording
-from torchcover.geometry import invert, transform
+from torchcover.geometry import invert, transform_points
 from torchcover.recordings.in_vehicle import transform_to_vehicle
 from torchcover.simulation import Lidar, Material, PaperReference, Rig, Scenario, Simulator
 from torchcover.simulation.recorded_returns import HALF_LANES_M, fit_returns, ground_rays, road_profile
@@ -47,7 +47,7 @@ PLAIN = {
 }
 NUM_FRAMES = 12
 EVERY_S = 15.0
-GRID = BevGrid(x=(0.0, 80.0), y=(-20.0, 20.0), band_frame="ground")
+GRID = BevGrid(x_m=(0.0, 80.0), y_m=(-20.0, 20.0), band_frame="ground")
 LIDAR, CAMERAS = "front_roof_128", "three_cameras"
 IMPERFECT = {
     LIDAR: [{}, *({"range_noise_m": sigma_m} for sigma_m in (0.03, 0.1, 0.5, 3.0)), {"dropout": 0.3}],
@@ -99,7 +99,7 @@ def as_cast(points_m, lidar):
     Moved along x by what the vehicle drove, in proportion to the azimuth and with a jump where the turn begins, rows
     are no more cones about the axis: that tells how far.
     """
-    in_sensor_m, rows_deg = transform(invert(lidar.mount.matrix()), points_m), np.sort(lidar.rows_deg())
+    in_sensor_m, rows_deg = transform_points(invert(lidar.mount.matrix()), points_m), np.sort(lidar.rows_deg())
     x, y, z = in_sensor_m.T
     flat_m, azimuth_deg = np.hypot(x, y), np.rad2deg(np.arctan2(y, x))
     gap_rad = np.deg2rad(np.interp(np.rad2deg(np.arctan2(z, flat_m)), rows_deg, np.gradient(rows_deg)))
@@ -125,7 +125,7 @@ def as_cast(points_m, lidar):
         shift_m = moved_m[0] + moved_m[1] * turn
     if abs(moved_m[1]) < LEAST_WAY_M:
         return points_m
-    return transform(lidar.mount.matrix(), in_sensor_m + np.outer(shift_m, [1.0, 0.0, 0.0]))
+    return transform_points(lidar.mount.matrix(), in_sensor_m + np.outer(shift_m, [1.0, 0.0, 0.0]))
 
 
 def nearest_road(points_m, place_m):
@@ -141,7 +141,7 @@ def nearest_road(points_m, place_m):
 
 def blocked(points_m, lidar, turns):
     """Azimuths in the frame of the LiDAR in which less than 60 % of the rays that look down return, in words."""
-    in_sensor_m = transform(invert(lidar.mount.matrix()), points_m)
+    in_sensor_m = transform_points(invert(lidar.mount.matrix()), points_m)
     down = np.sign(lidar.mount.matrix()[2, 2])
     elevation_deg = down * np.rad2deg(np.arcsin(in_sensor_m[:, 2] / np.linalg.norm(in_sensor_m, axis=1)))
     rows_deg = down * lidar.rows_deg()
@@ -185,7 +185,7 @@ def at_sides(points_m, boxes, lidar):
     """For each part (K, 3) of its rays: range and cosine at the side of a box, and whether that returned."""
     found = {part: [np.empty((0, 3))] for part in PARTS}
     mount = lidar.mount.matrix()
-    cloud_m = transform(invert(mount), points_m)
+    cloud_m = transform_points(invert(mount), points_m)
     rows_deg, columns = np.sort(lidar.rows_deg()), lidar.columns
     range_m = np.linalg.norm(cloud_m, axis=1)
     elevation_deg = np.rad2deg(np.arctan2(cloud_m[:, 2], np.hypot(cloud_m[:, 0], cloud_m[:, 1])))
@@ -313,9 +313,11 @@ def show_imperfections():
     metrics = {(rig, landed): CoverageMetric(GRID, square_metres=True) for rig in rigs for landed in (False, True)}
     for frame in frames:
         for (rig, landed), metric in metrics.items():
-            points, error = (frame.landed(rig), None) if landed else (frame.cloud_of(rig), frame.error_of(rig))
+            points, error = (
+                (frame.get_measured_points(rig), None) if landed else (frame.get_cloud(rig), frame.get_errors_m(rig))
+            )
             surface = {"weights": frame.reference_weights, "height": frame.reference_heights_m}
-            metric.update(points, frame.reference, error=error, **surface)
+            metric.update(points, frame.reference, errors_m=error, **surface)
     percent = {key: [f"{100 * value:.1f}" for value in detection(metric)] for key, metric in metrics.items()}
     rows = [(*rig.split(": ", 1), *percent[rig, False], *percent[rig, True]) for rig in rigs]
     table(

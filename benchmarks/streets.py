@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks import table
 from torchcover.data import open_recording, read_cloud, read_objects
-from torchcover.geometry import BoundingBox, transform
+from torchcover.geometry import BoundingBox, transform_points
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings.ground_model import GroundModel, extract_low_surfaces
 from torchcover.recordings.in_vehicle import transform_to_vehicle
@@ -69,7 +69,7 @@ class Body(NamedTuple):
     def there(self, times_s):
         """(T, 3) places and (T,) yaw in radians; NaN where it is not there."""
         own_s, yaw = self.trajectory.times_s, np.unwrap(np.deg2rad(self.trajectory.angles_deg[:, 0]))
-        places_m = self.trajectory.positions_at(times_s)
+        places_m = self.trajectory.interpolate_positions_m(times_s)
         return places_m, np.where(np.isnan(places_m[:, 0]), np.nan, np.interp(times_s, own_s, yaw))
 
     @property
@@ -108,7 +108,7 @@ class Scene(NamedTuple):
 
 
 def _body(actor):
-    size_m = np.array(BoundingBox.around(actor.mesh.vertices_m).size_m)
+    size_m = np.array(BoundingBox.from_points(actor.mesh.vertices_m).size_m)
     return Body(actor.name, KINDS.get(actor.category, OTHER), size_m, actor.trajectory)
 
 
@@ -296,7 +296,7 @@ def wheels_m(world, looks=12):
         low_m = low_m[low_m[:, 2] < 0.02]
         own_s = actor.trajectory.times_s
         for time_s in np.linspace(own_s[0], own_s[-1], looks) if len(low_m) else ():
-            above_m = ground.heights_m(transform(actor.trajectory.at(time_s), low_m) + UP_M) - UP_M[2]
+            above_m = ground.heights_m(transform_points(actor.trajectory.at(time_s), low_m) + UP_M) - UP_M[2]
             worst_m = max(worst_m, float(np.abs(above_m[np.isfinite(above_m)]).max(initial=0.0)))
     return worst_m
 

@@ -38,7 +38,7 @@ GOPRO = {
     },
 }
 REGIONS = (Region("10m ahead", (2.5, 12.5), (-10.0, 10.0)), Region("40m ahead", (2.5, 40.0), (-20.0, 20.0)))
-GRID = BevGrid(x=(-10.0, 40.0), y=(-20.0, 20.0), cell=0.25)
+GRID = BevGrid(x_m=(-10.0, 40.0), y_m=(-20.0, 20.0), cell_m=0.25)
 
 
 def rig_of(name, calibration, lens):

@@ -22,7 +22,7 @@ import carla
 import numpy as np
 from PIL import Image
 
-from torchcover.geometry import euler_from_rotation, invert
+from torchcover.geometry import convert_rotation_to_euler, invert
 from torchcover.recordings.formats.carla import (
     DEPTH,
     EXTENT,
@@ -132,7 +132,7 @@ def random_pose(vehicle, generator):
     """x, y, z, roll, pitch, yaw of the paper's reference sensor on the actor, in CARLA's axes."""
     drawn = PaperReference().vehicle_T_reference(vehicle.body, generator)
     actor_T_reference = invert(vehicle.vehicle_T_actor) @ drawn
-    yaw, pitch, roll = euler_from_rotation(actor_T_reference[:3, :3])
+    yaw, pitch, roll = convert_rotation_to_euler(actor_T_reference[:3, :3])
     x, y, z = actor_T_reference[:3, 3]
     return [float(number) for number in (x, -y, z, roll, -pitch, -yaw)]
 

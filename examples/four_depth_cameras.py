@@ -31,9 +31,9 @@ def clouds_of(images, fov_deg, location_m):
 
 def detected(sensor, reference):
     """Share of the reference in each height band that has a sensor point within 0.4 m, a mean over cells of 0.25 m."""
-    metric = CoverageMetric(BevGrid(x=REGION.x, y=REGION.y, cell=0.25))
+    metric = CoverageMetric(BevGrid(x_m=REGION.x_m, y_m=REGION.y_m, cell_m=0.25))
     metric.update(sensor, reference)
-    return {row.height: row.known["detection_0.4m"].value for row in metric.compute().summary([REGION])}
+    return {row.band: row.cell_averages["detection_0.4m"].value for row in metric.compute().summary([REGION])}
 
 
 def main(arguments=None):

@@ -33,7 +33,13 @@ from examples.train_detector import (
     thinned,
 )
 from torchcover import Region
-from torchcover.contrib import Judged, agreement_of, lead, metric_names, score_placements
+from torchcover.contrib import (
+    PlacementRatings,
+    compare_correlations,
+    correlate_rankings,
+    parse_metric_names,
+    score_placements,
+)
 from torchcover.contrib.ranks import LEAST
 from torchcover.data import Augmentation, SimulatedFrames
 from torchcover.detection import RecallByVisibility
@@ -96,7 +102,7 @@ def simulate(rigs, steps, seed, name):
     kept = []
     for index in track(range(steps), description=f"simulating {name}", console=Console(stderr=True)):
         frame = frames[index]
-        clouds = {rig: thinned(frame.landed(rig)) for rig in frame.clouds}
+        clouds = {rig: thinned(frame.get_measured_points(rig)) for rig in frame.clouds}
         kept.append(replace(frame, clouds=clouds, measured={}, boxes=in_region(frame.boxes), sensor_points=None))
     return kept
 
@@ -113,7 +119,7 @@ def trained(rig, frames, epochs, seed):
         order = torch.randperm(len(mine))[: batches * BATCH].view(batches, BATCH).tolist()
         for numbers in order:
             batch = [augment(mine[number], epoch) for number in numbers]
-            truth = [frame.boxes.select(frame.boxes.hits[rig] >= MIN_HITS).rows for frame in batch]
+            truth = [frame.boxes.select(frame.boxes.points_in_box[rig] >= MIN_HITS).rows for frame in batch]
             loss = loss_of(*detector([frame.clouds[rig] for frame in batch]), truth)
             optimizer.zero_grad()
             loss.backward()
@@ -208,25 +214,27 @@ def page(judged, scores, options):
 
 def ranks(judged, rankings):
     """The table of some placements, and what it is worth."""
-    found = agreement_of(rankings, judged, placements=True)
+    found = correlate_rankings(rankings, judged, resample_placements=True)
     (height,) = (one for one in rankings if one.name == "mean mounting height")
     ceiling = f"{judged.ceiling:.2f}" if len(judged.judges) > 1 else "an unknown amount, for there is one of each,"
     text = (
         f"The trainings agree with each other by {ceiling} on {len(judged.placements)} placements, whose "
-        f"average precision is {judged.mean.min():.3f} to {judged.mean.max():.3f}. Of {found.looked_at} metrics the "
-        f"best is `{found.best}`, p = {found.best_p:.2g} as the best of so many; one of twenty times chance alone "
-        f"gives the best more than {found.by_chance:.2f}.\n\n"
+        f"average precision is {judged.mean.min():.3f} to {judged.mean.max():.3f}. Of {found.metric_count} metrics the "
+        f"best is `{found.best_metric}`, p = {found.best_p_value:.2g} as the best of so many; one of twenty times chance alone "
+        f"gives the best more than {found.chance_threshold:.2f}.\n\n"
         "| metric | Spearman | tau-b | p | lead |\n|---|---:|---:|---:|---:|\n"
     )
-    order = sorted(zip(found.ranked, rankings, strict=True), key=lambda pair: -np.nan_to_num(pair[0].spearman.value))
+    order = sorted(
+        zip(found.correlations, rankings, strict=True), key=lambda pair: -np.nan_to_num(pair[0].spearman.value)
+    )
     leads = []
     for row, one in order:
         if np.isnan(row.spearman.value):
             continue
-        above = lead(one, height, judged, placements=True)
+        above = compare_correlations(one, height, judged, resample_placements=True)
         leads += [one.name] if above.low > 0 else []
-        name = f"{row.metric}{'' if row.over_worlds else ' *'}"
-        text += f"| {name} | {row.spearman.words} | {row.kendall.words} | {row.p:.2g} | {above.words} |\n"
+        name = f"{row.metric}{'' if row.resamples_scenes else ' *'}"
+        text += f"| {name} | {row.spearman.text} | {row.kendall.text} | {row.p_value:.2g} | {above.text} |\n"
     ahead = ", ".join(f"`{name}`" for name in leads) or "No metric"
     return f"{text}\n{ahead}: ahead of the mean mounting height with an interval above 0.\n"
 
@@ -252,13 +260,13 @@ def main():
     rigs = placements(options.placements, options.seed)
     values = train_all(rigs, options, options.out / "trainings.jsonl")
     judges = tuple(f"seed {seed}" for seed in range(options.seeds))
-    judged = Judged("average precision", tuple(rigs), judges, values)
+    judged = PlacementRatings("average precision", tuple(rigs), judges, values)
     scores = score_placements(
         rigs,
         "urban",
         region=Region("seen by the detector", X_M, Y_M),
-        metrics=metric_names(options.metrics),
-        steps=options.steps,
+        metrics=parse_metric_names(options.metrics),
+        num_frames=options.steps,
         seed=options.seed + 2,
         frame_interval_s=WORLD_S,
         progress=True,

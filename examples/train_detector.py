@@ -31,8 +31,8 @@ from torch.nn import functional
 from torch.utils.data import DataLoader
 
 from torchcover import BevGrid, CoverageMetric, Region
-from torchcover.data import Augmentation, SimulatedFrames, VisibleTargets, collate_frames
-from torchcover.detection import RecallByVisibility, box_visibility, match
+from torchcover.data import Augmentation, SimulatedFrames, VisibleBoxes, collate_frames
+from torchcover.detection import RecallByVisibility, match_detections, measure_box_visibility
 from torchcover.report import format_number
 from torchcover.simulation import PaperReference, SurfaceReference
 from torchcover.training import CoverageCallback
@@ -83,7 +83,7 @@ def simulate(steps, seed, reference, name, keep_clouds):
     kept = []
     for index in track(range(steps), description=f"simulating {name}"):
         frame = frames[index]
-        fed = {f"network {rig}": thinned(frame.landed(rig)) for rig in frame.clouds}
+        fed = {f"network {rig}": thinned(frame.get_measured_points(rig)) for rig in frame.clouds}
         clouds = {**frame.clouds, **fed} if keep_clouds else fed
         kept.append(replace(frame, clouds=clouds, boxes=in_region(frame.boxes)))
     return kept
@@ -222,7 +222,7 @@ class Training(lightning.LightningModule):
         """The loss of augmented frames."""
         frames = [self.augment(frame, self.current_epoch) for frame in batch.frames]
         heat, boxes = self.detector([frame.clouds[f"network {self.rig}"] for frame in frames])
-        truth = [frame.boxes.select(frame.boxes.hits[self.rig] >= self.least_hits).rows for frame in frames]
+        truth = [frame.boxes.select(frame.boxes.points_in_box[self.rig] >= self.least_hits).rows for frame in frames]
         loss = loss_of(heat, boxes, truth)
         self.log("loss", loss, batch_size=len(batch), prog_bar=True)
         return loss
@@ -238,7 +238,7 @@ class Training(lightning.LightningModule):
             rows, scores = decode(frame_heat, frame_boxes)
             seen = self.visibility[frame.index]
             self.recall.update(rows, frame.boxes, seen, scores)
-            chosen = match(rows, scores, frame.boxes.rows, "distance", MATCH_M)
+            chosen = match_detections(rows, scores, frame.boxes.rows, "distance", MATCH_M)
             found = torch.zeros(len(frame.boxes))
             found[chosen[chosen >= 0]] = scores.cpu()[chosen >= 0]
             columns = [frame.boxes.centre_m[:, 0], frame.boxes.centre_m[:, 1], seen.share.cpu(), found]
@@ -249,7 +249,7 @@ class Training(lightning.LightningModule):
         """Log average precision and recall beside the coverage."""
         self.counts = self.recall.compute()
         row = SCORES.index(OPERATING_SCORE)
-        curve = self.counts.over("visibility")
+        curve = self.counts.compute_curve("visibility")
         scalars = {
             f"val/recall/visibility {name}": float(r)
             for name, r in zip(curve.bins, curve.recall.value[row], strict=True)
@@ -267,7 +267,7 @@ class Training(lightning.LightningModule):
 def coverage_metric(*, square_metres):
     """The metric of the region; with the defaults as many blocks as drives, which know nothing of each other."""
     band_frame = "ground" if square_metres else "vehicle"
-    grid = BevGrid(x=X_M, y=Y_M, cell=1.6, heights={"body": (0.3, 2.0)}, band_frame=band_frame)
+    grid = BevGrid(x_m=X_M, y_m=Y_M, cell_m=1.6, heights={"body": (0.3, 2.0)}, band_frame=band_frame)
     return CoverageMetric(grid, max_radius=grid.diagonal_m, blocks=16, square_metres=square_metres)
 
 
@@ -278,9 +278,9 @@ def train(rig, training_frames, validation_frames, metric, options, console, **o
         DataLoader(training_frames, batch_size=8, shuffle=True, drop_last=True, collate_fn=collate_frames),
         DataLoader(validation_frames, batch_size=8, collate_fn=collate_frames),
     ]
-    coverage = metric and CoverageCallback(metric, regions=REGIONS, rig=rig, fixed_frames=True)
+    coverage = metric and CoverageCallback(metric, regions=REGIONS, rig_name=rig, has_fixed_frames=True)
     visibility = {
-        f.index: box_visibility(f.clouds[rig], f.reference, f.boxes, reference_weights=f.reference_weights)
+        f.index: measure_box_visibility(f.clouds[rig], f.reference, f.boxes, reference_weights=f.reference_weights)
         for f in validation_frames
     }
     module = Training(rig, visibility, steps=options.epochs * len(loaders[0]), seed=options.seed, **of_training)
@@ -313,7 +313,7 @@ def compare_labels(options, console):
         name: simulate(steps, seed, surface, f"{name} frames", keep_clouds=True)
         for name, steps, seed in (("training", options.train, 0), ("validation", options.validate, 1))
     }
-    visible = list(VisibleTargets(frames["training"], LEAST_VISIBLE, rig=rig))
+    visible = list(VisibleBoxes(frames["training"], LEAST_VISIBLE, rig_name=rig))
     cars = sum(len(frame.boxes) for frame in visible)
     left_out = sum(frame.counts["targets_omitted"] for frame in visible)
     console.print(f"{cars} cars are visible, {left_out} are left out: below {LEAST_VISIBLE:.0%}, or unknown")
@@ -322,7 +322,7 @@ def compare_labels(options, console):
         seeded = argparse.Namespace(**{**vars(options), "seed": seed})
         for name, labelled in zip(found, (frames["training"], visible), strict=True):
             module, _ = train(rig, labelled, frames["validation"], None, seeded, console, least_hits=0)
-            bins = module.counts.over("visibility").bins
+            bins = module.counts.compute_curve("visibility").bins
             of_bins = [average_precision(module.counts, at) for at in range(len(bins))]
             found[name].append([average_precision(module.counts), *of_bins])
     report_labels(np.array(list(found.values())), ["all", *bins], module.counts, console)

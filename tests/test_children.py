@@ -20,7 +20,7 @@ from tests.files import apart_readers
 from torchcover.data import Frame
 from torchcover.evaluation import observe
 from torchcover.evaluation.heartbeat import Heartbeat, HeartbeatParams, report_silent_ranks
-from torchcover.files import end_with_parent, isolated, reporting_stopped
+from torchcover.files import end_with_parent, isolated, report_stopped_processes
 from torchcover.simulation.sumo import simulating
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs Linux, which ends processes with their parent")
@@ -107,7 +107,7 @@ def test_it_ends_though_its_parent_had_ended_before():
 
 def test_what_makes_frames_ends_though_it_is_in_the_middle_of_one(alive):
     class Drive:
-        world_of = int
+        get_scene_id = int
 
         def __len__(self):
             return 4
@@ -140,14 +140,16 @@ def stopped(monkeypatch):
 
     monkeypatch.setattr("torchcover.files.processes.warnings.warn", warn)
     for place in ("evaluation.pipeline", "files.isolated", "simulation.sumo.simulating"):
-        monkeypatch.setattr(f"torchcover.{place}.reporting_stopped", partial(reporting_stopped, look_every_s=0.1))
+        monkeypatch.setattr(
+            f"torchcover.{place}.reporting_stopped", partial(report_stopped_processes, look_every_s=0.1)
+        )
     return reported
 
 
 class StoppingDrive:
     """Four frames, the second of which stops the worker that makes it."""
 
-    world_of = int
+    get_scene_id = int
 
     def __len__(self):
         return 4

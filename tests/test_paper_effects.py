@@ -15,7 +15,7 @@ RIGS = ("front_grille_128", "front_roof_128", "front_roof_64", "front_roof_32")
 # 40 degrees wide: no wall comes into their view before x = 24 m.
 FITTED = ("paper_fit_grille_128", "paper_fit_roof_128", "paper_fit_roof_64", "paper_fit_roof_32")
 LEADER_X_M = 13.0
-GRID = BevGrid(x=(0.0, 80.0), y=(-10.0, 10.0), cell=0.5)
+GRID = BevGrid(x_m=(0.0, 80.0), y_m=(-10.0, 10.0), cell_m=0.5)
 ROAD = Scenario.model_validate(
     {
         "name": "road",

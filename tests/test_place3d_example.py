@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from tests.contrib.voxel_frames import beam, place3d
-from torchcover.contrib import agreement_of, read_results
-from torchcover.contrib.ranks import spearman
-from torchcover.simulation import Lidar, Pose, Rig, builtin_folder
+from torchcover.contrib import correlate_rankings, read_results
+from torchcover.contrib.ranks import compute_spearman
+from torchcover.simulation import Lidar, Pose, Rig, get_builtin_folder
 
 ROOT = Path(__file__).parents[1]
 
@@ -97,17 +97,17 @@ def test_boards_that_cannot_be_are_refused(example, options, message):
 def test_two_papers_contradict_each_other_on_the_placements_that_both_have(example):
     li = read_results(ROOT / "examples" / "place3d" / "li_2024.csv")
     cars = li["map", "car"]
-    place3d = read_results(builtin_folder("published") / "place3d_2024.csv")["map", "car"]
+    place3d = read_results(get_builtin_folder("published") / "place3d_2024.csv")["map", "car"]
     both = [name for name in place3d.placements if name in cars.placements]
     assert len(both) == 4
-    rho = float(spearman(place3d.of(both).mean, cars.of(both).mean))
+    rho = float(compute_spearman(place3d.select(both).mean, cars.select(both).mean))
     assert (
         f"the same four placements ({', '.join(both)}) with a Spearman correlation of {rho:.2f}"
         in example.study.NOTES[1]
     )
     # The metric of Li et al. ranks as their own detectors do, and every placement is a rig.
     for category in ("car", "bicycle", "pedestrian"):
-        assert spearman(li["s_mig_1e3", category].mean, li["map", category].mean) == pytest.approx(1.0)
+        assert compute_spearman(li["s_mig_1e3", category].mean, li["map", category].mean) == pytest.approx(1.0)
     for judged in li.values():
         assert all(Rig.load(f"hu2022_{placement}").sensors for placement in judged.placements)
 
@@ -146,7 +146,7 @@ def test_a_reading_takes_its_own_rigs(study):
     found = study.found["car mAP", "degrees"]
     tilted = ("line_roll", "pyramid_roll", "optimised_detection")
     named = [f"place3d2024_{each}{'_degrees' * (each in tilted)}" for each in found.judged.placements]
-    assert str(agreement_of(study.scores.of(named), found.judged).ranked) == str(found.ranked)
+    assert str(correlate_rankings(study.scores.of(named), found.judged).correlations) == str(found.ranked)
     assert str(study.found["car mAP", "radians"].ranked) != str(found.ranked)
 
 

@@ -27,7 +27,7 @@ def has_float64(device: torch.device) -> bool:
     return True
 
 
-def through_cpu(function: Callable[ParamsT, ResultT]) -> Callable[ParamsT, ResultT]:
+def run_with_float64(function: Callable[ParamsT, ResultT]) -> Callable[ParamsT, ResultT]:
     """Run a function on the CPU where an argument is on a device without float64.
 
     Tensors among the arguments and the results, also within tuples, lists and mappings, are moved there and back;
@@ -41,18 +41,18 @@ def through_cpu(function: Callable[ParamsT, ResultT]) -> Callable[ParamsT, Resul
         if not narrow:
             return function(*args, **kwargs)
         result = function(*map_tensors(args, Tensor.cpu), **map_tensors(kwargs, Tensor.cpu))
-        return map_tensors(result, lambda tensor: move(tensor, narrow[0]))  # type: ignore[no-any-return]
+        return map_tensors(result, lambda tensor: move_tensor(tensor, narrow[0]))  # type: ignore[no-any-return]
 
     return run
 
 
-def move(tensor: Tensor, device: torch.device | str) -> Tensor:
+def move_tensor(value: Tensor, device: torch.device | str) -> Tensor:
     """Move a tensor to a device; as float32 if it is of float64, which that device lacks."""
-    is_too_wide = tensor.dtype == torch.float64 and not has_float64(torch.device(device))
-    return (tensor.float() if is_too_wide else tensor).to(device)
+    is_too_wide = value.dtype == torch.float64 and not has_float64(torch.device(device))
+    return (value.float() if is_too_wide else value).to(device)
 
 
-def with_float64(tensor: Tensor) -> Tensor:
+def ensure_float64(tensor: Tensor) -> Tensor:
     """The tensor itself, or on the CPU if its device has no float64."""
     return tensor if has_float64(tensor.device) else tensor.cpu()
 
@@ -67,13 +67,13 @@ def _tensors_in(values: Iterable[Any]) -> Iterator[Tensor]:
             yield from _tensors_in(value.values())
 
 
-def map_tensors(value: Any, change: Callable[[Tensor], Tensor]) -> Any:  # noqa: ANN401
+def map_tensors(value: Any, function: Callable[[Tensor], Tensor]) -> Any:  # noqa: ANN401
     """Change the tensors within tuples, lists and mappings."""
     if isinstance(value, Tensor):
-        return change(value)
+        return function(value)
     if isinstance(value, Mapping):
-        return {name: map_tensors(entry, change) for name, entry in value.items()}
+        return {name: map_tensors(entry, function) for name, entry in value.items()}
     if isinstance(value, list | tuple):
-        entries = [map_tensors(entry, change) for entry in value]
+        entries = [map_tensors(entry, function) for entry in value]
         return type(value)(*entries) if hasattr(value, "_fields") else type(value)(entries)
     return value

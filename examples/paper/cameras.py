@@ -10,10 +10,10 @@ from torchcover.evaluation import build_sensor_views
 from torchcover.report import RENDERERS, CoverageTable, plot_maps, print_table, write_figures
 
 RIG = "three_cameras"
-GRID = BevGrid(x=(-40.0, 40.0), y=(-40.0, 40.0), cell=0.25)
+GRID = BevGrid(x_m=(-40.0, 40.0), y_m=(-40.0, 40.0), cell_m=0.25)
 REGIONS = (Region("10m around", (-10.0, 10.0), (-10.0, 10.0)), Region("40m around", (-40.0, 40.0), (-40.0, 40.0)))
 # Figure 2 shows the part within 20 m.
-NEARBY = BevGrid(x=(-20.0, 20.0), y=(-20.0, 20.0), cell=GRID.cell)
+NEARBY = BevGrid(x_m=(-20.0, 20.0), y_m=(-20.0, 20.0), cell_m=GRID.cell_m)
 BLOCKS = 16  # for standard errors
 # One band that holds every point of a rig.
 ANY_HEIGHT = {"any": (-100.0, 100.0)}
@@ -35,7 +35,7 @@ def run(options):
         write_figures(figures, out / "maps" / measure)
         coverage.save(out / f"{RIG}_{measure}.npz")
     (out / "table.md").write_text("\n".join(texts), encoding="utf-8")
-    near = Region("nearby", NEARBY.x, NEARBY.y).mask(GRID)
+    near = Region("nearby", NEARBY.x_m, NEARBY.y_m).mask_cells(GRID)
     figure = draw_four_views(
         coverages[RIG, "known"].radius[:, near].reshape(NEARBY.shape),
         points.counts.reshape(GRID.shape[1:])[near].reshape(NEARBY.shape[1:]),
@@ -52,9 +52,9 @@ class PointCount:
     """How many points of the rig lie in each cell, at any height."""
 
     def __init__(self):
-        self.grid = BevGrid(GRID.x, GRID.y, GRID.cell, ANY_HEIGHT)
-        self.counts = torch.zeros(self.grid.cells, dtype=torch.int64)
+        self.grid = BevGrid(GRID.x_m, GRID.y_m, GRID.cell_m, ANY_HEIGHT)
+        self.counts = torch.zeros(self.grid.num_cells, dtype=torch.int64)
 
     def update(self, frame):
-        cells = self.grid.cell_of(frame.cloud_of(RIG))
-        self.counts += torch.bincount(cells[cells >= 0], minlength=self.grid.cells)
+        cells = self.grid.find_cells(frame.cloud_of(RIG))
+        self.counts += torch.bincount(cells[cells >= 0], minlength=self.grid.num_cells)

@@ -69,7 +69,7 @@ class Measurement:
                     cloud,
                     surface.reference,
                     weights=surface.reference_weights,
-                    height=surface.reference_heights_m,
+                    heights_m=surface.reference_heights_m,
                     block_index=index,
                 )
             for observer in also:

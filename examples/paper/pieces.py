@@ -10,9 +10,9 @@ import torch
 
 from torchcover import Coverage
 from torchcover.coverage import Layer
-from torchcover.coverage.blocks import BlockSums, KnownCells
-from torchcover.coverage.region_sums import PlaceSums
-from torchcover.metrics import added_up
+from torchcover.coverage.blocks import BlockSums, ObservedCells
+from torchcover.coverage.region_sums import RegionSums
+from torchcover.metrics import sum_rows
 
 
 def check_conditions(folder, conditions):
@@ -58,12 +58,12 @@ def merged(pieces):
     Args:
         pieces: Coverages of the same grid over different steps, without blocks of their own.
     """
-    first, steps = pieces[0], torch.tensor([piece.counts["frames"] for piece in pieces])
+    first, steps = pieces[0], torch.tensor([piece.counts["num_frames"] for piece in pieces])
     every = [piece.known for piece in pieces]
     counts = [torch.stack([known.at, known.points, known.probed_steps], dim=1).double() for known in every]
     means = [torch.stack([piece.listed[one.key].values for one in first.quantities]) for piece in pieces]
     sums = [known.probed_steps * own for known, own in zip(every, means, strict=True)]
-    whole = added_up(torch.cat([torch.cat([one, own.T], dim=1) for one, own in zip(counts, sums, strict=True)])).T
+    whole = sum_rows(torch.cat([torch.cat([one, own.T], dim=1) for one, own in zip(counts, sums, strict=True)])).T
     at, points, probed_steps = whole[:3].long()
     blocks = [
         BlockSums(steps[:1], (1, *first.grid.shape), known.at, known.probed_steps, own)
@@ -71,17 +71,17 @@ def merged(pieces):
     ]
     return Coverage(
         grid=first.grid,
-        thresholds=first.thresholds,
-        max_radius=first.max_radius,
-        known=KnownCells(first.grid.shape, at, probed_steps, points),
+        thresholds_m=first.thresholds,
+        max_radius_m=first.max_radius,
+        observed_cells=ObservedCells(first.grid.shape, at, probed_steps, points),
         layers=map(Layer, first.quantities, whole[3:] / probed_steps),
         counts={name: sum(piece.counts[name] for piece in pieces) for name in Coverage.COUNTS},
-        blocks=_side_by_side(blocks, steps),
-        area=None if first.area is None else _side_by_side([piece.area for piece in pieces], steps),
+        block_sums=_side_by_side(blocks, steps),
+        area_sums=None if first.area is None else _side_by_side([piece.area for piece in pieces], steps),
         regions=first.regions,
-        places=None
+        region_sums=None
         if first.places is None
-        else PlaceSums(steps, *map(torch.cat, zip(*(piece.places[1:] for piece in pieces), strict=True))),
+        else RegionSums(steps, *map(torch.cat, zip(*(piece.places[1:] for piece in pieces), strict=True))),
     )
 
 

@@ -20,8 +20,8 @@ def run(options):
     """Measure the pieces that are missing; print and write what all of them say."""
     sets = {pattern: {lidar: pattern.replace("{}", lidar) for lidar in LIDARS} for pattern in options.rigs}
     x0_m = options.origin
-    grid = BevGrid(x=(x0_m, x0_m + 160.0), y=(-40.0, 40.0), cell=0.25)
-    regions = [Region(each.name, (x0_m, x0_m + each.x[1]), each.y) for each in forward_regions()]
+    grid = BevGrid(x_m=(x0_m, x0_m + 160.0), y_m=(-40.0, 40.0), cell_m=0.25)
+    regions = [Region(each.name, (x0_m, x0_m + each.x_m[1]), each.y_m) for each in forward_regions()]
     measurement = Measurement({rig: rig for rigs in sets.values() for rig in rigs.values()}, grid, regions, options)
     pieces = measured_pieces(measurement, options)
     results = {

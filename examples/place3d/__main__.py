@@ -11,7 +11,7 @@ from pathlib import Path
 from examples.place3d.boards import DISTANCES_M, cells_hit
 from examples.place3d.page import page
 from examples.place3d.study import agree, agreements
-from torchcover.contrib import Ranking, metric_names
+from torchcover.contrib import Ranking, parse_metric_names
 from torchcover.estimation import Quantity
 from torchcover.simulation import Rig
 
@@ -22,7 +22,7 @@ def with_boards(study):
     for distance_m in DISTANCES_M:
         shares = [float(cells_hit(rig.sensors, distance_m).mean()) for rig in rigs]
         name = f"lob_{distance_m:g}m"
-        boards.append(Ranking.of_values(Quantity(name, name, "share", lower_is_better=False), shares, "lob"))
+        boards.append(Ranking.from_values(Quantity(name, name, "share", lower_is_better=False), shares, "lob"))
     scores = replace(study.scores, rankings=(*study.scores.rankings, *boards))
     return study._replace(scores=scores, found=agreements(scores))
 
@@ -40,7 +40,7 @@ def main():
     options = parser.parse_args()
     study = agree(
         scenario=options.scenario,
-        metrics=metric_names(options.metrics),
+        metrics=parse_metric_names(options.metrics),
         steps=options.steps,
         seed=options.seed,
         frame_interval_s=options.frame_interval_s,

@@ -2,8 +2,8 @@
 
 from typing import NamedTuple
 
-from torchcover.contrib import Judged, agreement_of, read_results, score_placements
-from torchcover.simulation import builtin_folder, builtin_names
+from torchcover.contrib import PlacementRatings, correlate_rankings, read_results, score_placements
+from torchcover.simulation import builtin_names, get_builtin_folder
 
 PAPER = "place3d2024"
 # Quantity and class in `datasets/published/place3d_2024.csv`, and what it is called here.
@@ -40,14 +40,14 @@ def agree(scenario="urban", *, seed=0, **settings):
 
 def agreements(scores):
     """What detectors say, and how the rolls are read -> how metrics rank the placements."""
-    results = read_results(builtin_folder("published") / "place3d_2024.csv")
+    results = read_results(get_builtin_folder("published") / "place3d_2024.csv")
     found = {}
     for key, words in TRUTHS.items():
         judged = results[key]
-        truth = Judged(words, judged.placements, judged.judges, judged.values)
+        truth = PlacementRatings(words, judged.placements, judged.raters, judged.values)
         for reading, ending in READINGS.items():
             named = [rig_of(placement, ending, scores.rigs) for placement in judged.placements]
-            found[words, reading] = agreement_of(scores.of(named), truth)
+            found[words, reading] = correlate_rankings(scores.of(named), truth)
     return found
 
 

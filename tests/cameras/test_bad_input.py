@@ -67,7 +67,7 @@ def test_points_that_are_none(points):
 
 def test_pixels_that_are_none():
     with pytest.raises(ValueError, match=r"pixels are floats \(..., 2\)"):
-        Camera(**PLAIN).compute_rays(torch.ones(3))
+        Camera(**PLAIN).rays(torch.ones(3))
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import torch
 
 from torchcover.cameras import Camera, convert_carla_pose
 from torchcover.files import BadFileError
-from torchcover.geometry import invert, rotation_from_euler, transform
+from torchcover.geometry import convert_euler_to_rotation, invert, transform_points
 
 MATRIX = np.array([[520.0, 0.0, 318.0], [0.0, 510.0, 242.0], [0.0, 0.0, 1.0]])
 
@@ -185,7 +185,7 @@ def row(values):
 def test_kitti_sees_lidar_points_where_its_own_matrices_do(tmp_path, layout):
     P = MATRIX @ np.array([[1.0, 0.0, 0.0, 0.06], [0.0, 1.0, 0.0, -0.01], [0.0, 0.0, 1.0, 0.003]])
     velodyne = np.array([[0.0, -1.0, 0.0, 0.01], [0.0, 0.0, -1.0, -0.07], [1.0, 0.0, 0.0, -0.27]])
-    rectify = rotation_from_euler(0.5, -0.3, 0.2) if layout == "object" else np.eye(3)
+    rectify = convert_euler_to_rotation(0.5, -0.3, 0.2) if layout == "object" else np.eye(3)
     key = "Tr_velo_to_cam" if layout == "object" else "Tr"
     r0 = f"R0_rect: {row(rectify)}\n" if layout == "object" else ""
     (tmp_path / "c.txt").write_text(f"P0: {row(MATRIX @ np.eye(3, 4))}\nP2: {row(P)}\n{r0}{key}: {row(velodyne)}\n\n")
@@ -293,7 +293,7 @@ def test_a_matrix(tmp_path):
 def test_the_field_of_view_runs_from_edge_to_edge():
     camera = Camera.from_fov(500, 420, 110.0)
     edges = torch.tensor([[-0.5, 209.5], [499.5, 209.5]], dtype=torch.float64)
-    left, right = camera.compute_rays(edges)[0]
+    left, right = camera.rays(edges)[0]
     assert torch.rad2deg(torch.arccos(left @ right)).item() == pytest.approx(110.0, abs=1e-12)
 
 
@@ -318,7 +318,7 @@ def test_carlas_pose_is_carlas_own_matrix_with_y_turned_over(angles):
     location = [1.5, 0.4, 2.8]
     in_camera = np.random.default_rng(0).uniform(-5.0, 5.0, (20, 3))  # x right, y down, z forward
     in_carla = np.c_[in_camera[:, 2], in_camera[:, 0], -in_camera[:, 1]]  # x forward, y right, z up
-    expected = transform(carla_matrix(location, pitch, yaw, roll), in_carla) * [1.0, -1.0, 1.0]
+    expected = transform_points(carla_matrix(location, pitch, yaw, roll), in_carla) * [1.0, -1.0, 1.0]
     pose = convert_carla_pose(location, pitch_deg=pitch, yaw_deg=yaw, roll_deg=roll)
-    np.testing.assert_allclose(transform(pose, in_camera), expected, atol=1e-12)
+    np.testing.assert_allclose(transform_points(pose, in_camera), expected, atol=1e-12)
     np.testing.assert_allclose(pose @ invert(pose), np.eye(4), atol=1e-12)

@@ -84,7 +84,7 @@ def test_gradients_are_finite_everywhere(camera):
     intrinsics = camera.intrinsics.clone().requires_grad_()
     coefficients = camera.coefficients.clone().requires_grad_(len(camera.coefficients) > 0)
     twin = Camera(camera.width, camera.height, *intrinsics, camera.model, coefficients)
-    rays, valid = twin.compute_rays(dtype=torch.float64)
+    rays, valid = twin.rays(dtype=torch.float64)
     rays[valid].sum().backward()
     assert intrinsics.grad.isfinite().all()
     assert intrinsics.grad.abs().sum() > 0
@@ -93,7 +93,7 @@ def test_gradients_are_finite_everywhere(camera):
 
 def test_second_derivatives_are_refused_not_wrong():
     coefficients = vector([-0.28, 0.07, 0.0, 0.0])
-    rays, _ = Camera(96, 72, 60.0, 60.0, 47.0, 35.0, "brown_conrady", coefficients).compute_rays(PIXELS)
+    rays, _ = Camera(96, 72, 60.0, 60.0, 47.0, 35.0, "brown_conrady", coefficients).rays(PIXELS)
     (first,) = torch.autograd.grad(rays.sum(), coefficients, create_graph=True)
     with pytest.raises(RuntimeError, match="once_differentiable"):
         first.sum().backward()
@@ -103,5 +103,5 @@ def test_a_table_made_without_gradients_is_not_served_to_those_who_want_them():
     focal = torch.tensor(60.0, dtype=torch.float64, requires_grad=True)
     camera = Camera(8, 6, focal, focal, 4.0, 3.0)
     with torch.no_grad():
-        assert not camera.compute_rays()[0].requires_grad
-    assert camera.compute_rays()[0].requires_grad
+        assert not camera.rays()[0].requires_grad
+    assert camera.rays()[0].requires_grad

@@ -49,7 +49,7 @@ def test_single_pixels_equal_the_table(camera):
 def test_float32_rays_hold_a_thousandth_of_a_pixel_at_4k():
     camera = Camera(3840, 2160, 1900.0, 1900.0, 1925.0, 1070.0, "brown_conrady", [-0.16, -0.02, 1e-4, 5e-4, 0.04])
     pixels = grid(camera)[::40, ::40].float()
-    rays, valid = camera.compute_rays(pixels)
+    rays, valid = camera.rays(pixels)
     assert rays.dtype == torch.float32
     assert valid.all()
     assert (camera.project(rays.reshape(-1, 3))[0] - pixels.reshape(-1, 2)).abs().max() <= 1e-3
@@ -91,7 +91,7 @@ def test_a_bracketing_solver_finds_nothing_that_newton_misses(name):
     camera = Camera(100, 100, 100.0, 100.0, 0.0, 0.0, model, coefficients)
     lens = camera._optics._solver
     columns = torch.linspace(0.0, 220.0, 111, dtype=torch.float64)
-    rays, valid = camera.compute_rays(torch.stack((columns, torch.zeros_like(columns)), dim=1))
+    rays, valid = camera.rays(torch.stack((columns, torch.zeros_like(columns)), dim=1))
     a, b, _ = lens.chart.project(*rays.unbind(1))
     for column, found, answered in zip(columns.tolist(), a.tolist(), valid.tolist(), strict=True):
         truth = bracketed(lens.distortion.distort_radius, column / 100.0, lens.chart.limit)
@@ -208,7 +208,7 @@ def test_a_fisheye_sees_behind_itself_and_a_pinhole_does_not(make_camera):
 def test_where_kornia_diverges_the_answer_is_right():
     # kornia issue 4285: k1 = 0.5, off by 288 px
     camera = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, "brown_conrady", [0.5, 0.0, 0.0, 0.0])
-    rays, valid = camera.compute_rays(grid(camera)[::16, ::16])
+    rays, valid = camera.rays(grid(camera)[::16, ::16])
     assert valid.all()
     assert (camera.project(rays.reshape(-1, 3))[0] - grid(camera)[::16, ::16].reshape(-1, 2)).abs().max() <= 1e-9
 

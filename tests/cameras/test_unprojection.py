@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchcover.cameras import Camera, convert_carla_pose
-from torchcover.geometry import transform
+from torchcover.geometry import transform_points
 
 INF, NAN = float("inf"), float("nan")
 
@@ -95,7 +95,7 @@ def test_the_cloud_has_the_dtype_of_the_depth(make_camera, dtype):
 
 def test_a_pickled_camera_is_small_and_the_same():
     camera = Camera(320, 240, 200.0, 200.0, 159.5, 119.5, "brown_conrady", [-0.28, 0.07, 2e-4, 2e-5])
-    table = camera.compute_rays()[0]
+    table = camera.rays()[0]
     payload = pickle.dumps(camera)
     assert len(payload) < table.nbytes / 2
     assert torch.equal(pickle.loads(payload).rays()[0], table)
@@ -106,5 +106,5 @@ def test_points_move_between_camera_and_vehicle():
     camera = Camera.from_fov(6, 4, 90.0, vehicle_T_camera=pose)
     points = camera.unproject(torch.full((4, 6), 3.0, dtype=torch.float64))
     moved = camera.to_vehicle(points)
-    np.testing.assert_allclose(moved.numpy(), transform(pose, points.numpy()), atol=1e-12)
+    np.testing.assert_allclose(moved.numpy(), transform_points(pose, points.numpy()), atol=1e-12)
     torch.testing.assert_close(camera.to_camera(moved), points)

@@ -46,8 +46,8 @@ def test_a_recording_is_evaluated_and_the_files_agree(drawn_maps, torchcover, re
     # Cell k along the line is k cells from the only sensor point.
     row = coverage.radius[0, 160, 160:200]
     np.testing.assert_allclose(row, 0.25 * np.arange(40), atol=1e-6)
-    assert coverage.thresholds == (0.4, 1.0)
-    assert coverage.counts["frames"] == 4
+    assert coverage.thresholds_m == (0.4, 1.0)
+    assert coverage.counts["num_frames"] == 4
     summary = json.loads((out / "summary.json").read_text())
     assert summary["complete"] is True
     assert summary["counts"]["steps"] == 4
@@ -69,7 +69,7 @@ def test_a_recording_is_evaluated_and_the_files_agree(drawn_maps, torchcover, re
 
 def test_steps_limits_a_recording(torchcover, recording, tmp_path):
     assert torchcover("evaluate", "--frames", recording, "--out", tmp_path / "o", "--num-frames", 3)[0] == 0
-    assert Coverage.load(tmp_path / "o" / "coverage.npz").counts["frames"] == 3
+    assert Coverage.load(tmp_path / "o" / "coverage.npz").counts["num_frames"] == 3
 
 
 @pytest.mark.parametrize("workers", [0, 2])
@@ -80,7 +80,7 @@ def test_a_bad_frame_stops_the_run_by_name_and_what_was_done_is_written(torchcov
     assert code == 2
     assert "torchcover: f10 (frame 2): " in error
     assert "Traceback" not in error
-    assert Coverage.load(out / "coverage.npz").counts["frames"] == 2
+    assert Coverage.load(out / "coverage.npz").counts["num_frames"] == 2
     assert json.loads((out / "summary.json").read_text())["complete"] is False
 
 
@@ -127,8 +127,8 @@ def test_a_simulation_is_evaluated_and_repeats_itself(torchcover, tmp_path):
         assert torchcover("evaluate", tmp_path / "rig.yaml", *arguments)[0] == 0
     a, b = (Coverage.load(tmp_path / out / "coverage.npz") for out in "ab")
     np.testing.assert_array_equal(a.radius, b.radius)
-    assert a.grid.cell == 1.0
-    assert a.max_radius == pytest.approx(a.grid.diagonal_m)
+    assert a.grid.cell_m == 1.0
+    assert a.max_radius_m == pytest.approx(a.grid.diagonal_m)
     assert 0 < a.summary()[0].observed_share <= 1
     summary = json.loads((tmp_path / "a" / "summary.json").read_text())
     assert summary["frame_counts"]["reference_rays"] == 128 * 128
@@ -151,7 +151,7 @@ def test_the_weights_of_the_surface_reference_reach_the_metric(torchcover, world
         given.append((len(reference), more["weights"], more["block_index"]))
         return sums_of(self, sensor, reference, **more)
 
-    sums_of = CoverageSums.sums_of
+    sums_of = CoverageSums.compute_sums
     monkeypatch.setattr(CoverageSums, "sums_of", noted)
     options = [
         "--scenario",
@@ -190,9 +190,9 @@ def test_every_reference_sensor_has_its_measure_and_is_named_in_the_help(torchco
     ]
     assert torchcover("evaluate", worlds / "low.yaml", *options, "--reference", name)[0] == 0
     summary = json.loads((worlds / "out" / "summary.json").read_text())
-    by_area = REFERENCE_SENSORS[name].square_metres
+    by_area = REFERENCE_SENSORS[name].has_area_weights
     assert (summary["reference"]["sensor"], summary["measure"]) == (name, "area" if by_area else "known")
-    assert Coverage.load(worlds / "out" / "coverage.npz").measure == summary["measure"]
+    assert Coverage.load(worlds / "out" / "coverage.npz").average == summary["measure"]
     assert name in torchcover("evaluate", "--help")[1]
 
 
@@ -215,7 +215,7 @@ def test_the_mean_over_known_cells_is_the_same_whether_it_heads_the_result_or_no
 
 def test_frames_that_are_skipped_leave_their_place_in_time(torchcover, recording, tmp_path, monkeypatch):
     (recording / "reference" / "f2.npy").write_bytes(b"rubbish")
-    sums_of, given = CoverageSums.sums_of, []
+    sums_of, given = CoverageSums.compute_sums, []
     monkeypatch.setattr(
         CoverageSums,
         "sums_of",
@@ -432,4 +432,4 @@ def test_out_of_memory_on_a_gpu_ends_in_one_line_and_keeps_what_was_measured(
     assert code == 2
     assert complaints.splitlines()[-1].startswith("torchcover: there is not enough memory (")
     assert told in complaints.splitlines()[-1]
-    assert Coverage.load(tmp_path / "out" / "coverage.npz").counts["frames"] == 2
+    assert Coverage.load(tmp_path / "out" / "coverage.npz").counts["num_frames"] == 2

@@ -69,7 +69,7 @@ def test_one_rig_has_its_numbers_and_its_coverage_is_what_it_is_without(torchcov
     *_, plain = run(torchcover, worlds, "both", command="evaluate", out="plain")
     with_metrics, without = (Coverage.load(folder / "coverage.npz") for folder in (out, plain))
     np.testing.assert_array_equal(with_metrics.radius, without.radius)
-    np.testing.assert_array_equal(with_metrics.points, without.points)
+    np.testing.assert_array_equal(with_metrics.point_counts, without.point_counts)
 
 
 def test_a_name_that_is_none_is_told_with_those_that_are(torchcover, worlds):

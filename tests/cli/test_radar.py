@@ -31,7 +31,9 @@ def test_what_is_left_without_a_radar_is_the_other_alone(torchcover, rigs):
     alone = evaluate(rigs / "alone.yaml", rigs / "yard.yaml", **given)
     for row, rest in zip(both.coverage.summary(), alone.coverage.summary(), strict=True):
         for key, number in rest.numbers.items():
-            assert row.redundancy.without["front"][key].value == pytest.approx(number.value, rel=1e-12, nan_ok=True)
+            assert row.redundancy.failure_numbers["front"][key].value == pytest.approx(
+                number.value, rel=1e-12, nan_ok=True
+            )
     seen = [found.coverage.summary()[0].numbers["detection_0.4m"].value for found in (both, alone)]
     assert seen[0] > seen[1]
 

@@ -27,8 +27,8 @@ def test_a_recording_has_the_numbers_of_the_simulation(torchcover, worlds, tmp_p
     code, _, told = torchcover("evaluate", "--frames", recording, "--set", "probe=child", "--out", read)
     assert (code, "probe: not for recordings" in told) == (2, True)
     first, second = (Coverage.load(folder / "coverage.npz") for folder in (measured, read))
-    assert first.measure == second.measure == "area"
-    for name in ("radius", "detection", "probed_steps", "points"):
+    assert first.average == second.average == "area"
+    for name in ("radius", "detection", "observed_frames", "points"):
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name), err_msg=name)
     np.testing.assert_array_equal(first.errors["radius_m"], second.errors["radius_m"])
     rows = [json.loads((folder / "summary.json").read_text())["rows"] for folder in (measured, read)]

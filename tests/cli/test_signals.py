@@ -52,7 +52,7 @@ def at_update(monkeypatch):
     """Have something done before a rig sees a frame: number 3 is the first rig in the second step."""
 
     def have(number, act):
-        add, calls = CoverageSums.add, []
+        add, calls = CoverageSums.add_sums, []
 
         def acting(self, sums):
             calls.append(self)
@@ -73,7 +73,7 @@ def send(number, times=1):
 def steps_of(out):
     """The steps of each rig, whether the run is complete, and how many maps there are."""
     summary = json.loads((out / "summary.json").read_text())
-    counts = [Coverage.load(out / "coverage" / f"{name}.npz").counts["frames"] for name in ("low", "both")]
+    counts = [Coverage.load(out / "coverage" / f"{name}.npz").counts["num_frames"] for name in ("low", "both")]
     assert counts == [of_rig["steps"] for of_rig in summary["counts"].values()]
     return counts, summary["complete"], sum(name.startswith("maps/") for name in summary["files"])
 

@@ -49,7 +49,7 @@ def test_a_target_beyond_the_steps_ends_the_run_as_ever_and_says_what_it_would_t
     target = json.loads((tmp_path / "out" / "summary.json").read_text())["target_error"]
     assert target["reached"] is False
     assert 1_000 < target["frames_needed"] < 1_000_000
-    assert Coverage.load(tmp_path / "out" / "coverage.npz").counts["frames"] == 40
+    assert Coverage.load(tmp_path / "out" / "coverage.npz").counts["num_frames"] == 40
 
 
 def test_compare_stops_when_rigs_and_differences_are_good_enough(torchcover, worlds):

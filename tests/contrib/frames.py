@@ -17,7 +17,7 @@ def frame_of(cloud, reference=(), boxes=(), categories=(), *, index=0, weights=N
         name=f"frame {index}",
         reference_weights=None if weights is None else torch.tensor(weights, dtype=torch.float32),
         boxes=Boxes.from_rows(rows, categories=tuple(categories) or ("",) * len(rows)),
-        sensor_points=None if sensors is None else {"rig": sensors},
+        sensor_point_counts=None if sensors is None else {"rig": sensors},
         block_index=block_index,
     )
 

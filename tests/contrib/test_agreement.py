@@ -5,53 +5,59 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from torchcover.contrib import Judged, Ranking, agreement_of, lead, read_results
-from torchcover.contrib.ranks import spearman
+from torchcover.contrib import PlacementRatings, Ranking, compare_correlations, correlate_rankings, read_results
+from torchcover.contrib.ranks import compute_spearman
 from torchcover.estimation import Quantity
 from torchcover.files import BadFileError
-from torchcover.simulation import Rig, builtin_folder
+from torchcover.simulation import Rig, get_builtin_folder
 
 HEADER = "placement,quantity,model,class,value\n"
-PLACE3D = read_results(builtin_folder("published") / "place3d_2024.csv")
+PLACE3D = read_results(get_builtin_folder("published") / "place3d_2024.csv")
 
 
 def judged_by(values):
     values = np.array(values, dtype=float)
     placements = tuple(f"placement {number}" for number in range(values.shape[1]))
-    return Judged("AP", placements, tuple(f"net {number}" for number in range(len(values))), values)
+    return PlacementRatings("AP", placements, tuple(f"net {number}" for number in range(len(values))), values)
 
 
 def metric(values, draws=None, name="metric"):
-    return Ranking.of_values(Quantity(name, name, "share", lower_is_better=False), values, "published", draws)
+    return Ranking.from_values(Quantity(name, name, "share", lower_is_better=False), values, "published", draws)
 
 
 def test_a_metric_that_is_the_truth_has_rank_1_and_one_that_is_its_negative_minus_1():
     truth = judged_by([[3.0, 1.0, 4.0, 1.5, 5.0], [3.5, 0.0, 4.5, 2.0, 6.0]])
-    found = agreement_of([metric(truth.mean, name="same"), metric(-truth.mean, name="opposite")], truth)
-    for row, value in zip(found.ranked, (1.0, -1.0), strict=True):
+    found = correlate_rankings([metric(truth.mean, name="same"), metric(-truth.mean, name="opposite")], truth)
+    for row, value in zip(found.correlations, (1.0, -1.0), strict=True):
         assert row.spearman == (pytest.approx(value),) * 3
         assert row.kendall == (pytest.approx(value),) * 3
-        assert row.p == pytest.approx(2 / 120)
-    assert found.best_p == pytest.approx(2 / 120)  # the same order, or the opposite one
+        assert row.p_value == pytest.approx(2 / 120)
+    assert found.best_p_value == pytest.approx(2 / 120)  # the same order, or the opposite one
 
 
 def test_what_does_not_vary_has_no_rank_and_is_not_counted_among_those_looked_at():
     truth = judged_by([[1.0, 2.0, 3.0, 4.0]])
-    found = agreement_of([metric([7.0] * 4, name="rays"), metric([1.0, 3.0, 2.0, 4.0], name="other")], truth)
-    assert np.isnan([*found.ranked[0].spearman, *found.ranked[0].kendall, found.ranked[0].p]).all()
-    assert (found.looked_at, found.best) == (1, "other")
-    nothing = agreement_of([metric([7.0] * 4)], truth)
-    assert (nothing.looked_at, nothing.best) == (0, None)
-    assert np.isnan([nothing.best_p, nothing.by_chance]).all()
+    found = correlate_rankings([metric([7.0] * 4, name="rays"), metric([1.0, 3.0, 2.0, 4.0], name="other")], truth)
+    assert np.isnan(
+        [*found.correlations[0].spearman, *found.correlations[0].kendall, found.correlations[0].p_value]
+    ).all()
+    assert (found.metric_count, found.best_metric) == (1, "other")
+    nothing = correlate_rankings([metric([7.0] * 4)], truth)
+    assert (nothing.metric_count, nothing.best_metric) == (0, None)
+    assert np.isnan([nothing.best_p_value, nothing.chance_threshold]).all()
 
 
 def test_the_p_of_the_best_of_many_is_uniform_where_nothing_is_there_to_be_found():
     generator = np.random.default_rng(0)
     many, values = [metric(generator.normal(size=4)) for _ in range(6)], generator.normal(size=4)
     # A truth that has nothing to do with the metrics is any of its orders, each as likely.
-    found = [agreement_of(many, judged_by([values[order]]), draws=1) for order in map(list, permutations(range(4)))]
+    found = [
+        correlate_rankings(many, judged_by([values[order]]), num_samples=1)
+        for order in map(list, permutations(range(4)))
+    ]
     best, alone = (
-        np.array(p) for p in zip(*((one.best_p, [row.p for row in one.ranked]) for one in found), strict=True)
+        np.array(p)
+        for p in zip(*((one.best_p_value, [row.p_value for row in one.correlations]) for one in found), strict=True)
     )
     for level in np.unique(best):
         assert (best <= level).mean() == pytest.approx(level)
@@ -67,7 +73,7 @@ def test_intervals_are_over_judges_over_worlds_and_over_placements_if_they_are_d
     alike, unlike = judged_by([values] * 4), judged_by(values + generator.normal(0, 2, (4, 6)))
 
     def width(candidate, judged, **how):
-        relation = agreement_of([candidate], judged, **how).ranked[0].spearman
+        relation = correlate_rankings([candidate], judged, **how).correlations[0].spearman
         return relation.high - relation.low
 
     sure = metric(values)
@@ -82,17 +88,17 @@ def test_the_lead_is_the_difference_and_what_is_shared_cancels_out():
     generator = np.random.default_rng(3)
     truth = judged_by(np.arange(6.0) + generator.normal(0, 2, (4, 6)))
     first, second = metric(np.arange(6.0)), metric(generator.permutation(6))
-    rho = [row.spearman.value for row in agreement_of([first, second], truth).ranked]
-    assert lead(first, second, truth).value == pytest.approx(rho[0] - rho[1])
-    assert lead(first, metric(first.gains**3), truth, placements=True) == (0.0, 0.0, 0.0)
+    rho = [row.spearman.value for row in correlate_rankings([first, second], truth).correlations]
+    assert compare_correlations(first, second, truth).value == pytest.approx(rho[0] - rho[1])
+    assert compare_correlations(first, metric(first.scores**3), truth, resample_placements=True) == (0.0, 0.0, 0.0)
 
 
 def test_another_number_of_placements_or_of_draws_is_refused():
     truth = judged_by([[1.0, 2.0, 3.0]])
     with pytest.raises(ValueError, match="a value of each of 3 placements"):
-        agreement_of([metric([1.0, 2.0])], truth)
+        correlate_rankings([metric([1.0, 2.0])], truth)
     with pytest.raises(ValueError, match="500 draws"):
-        agreement_of([metric([1.0, 2.0, 3.0], np.zeros((7, 3)))], truth)
+        correlate_rankings([metric([1.0, 2.0, 3.0], np.zeros((7, 3)))], truth)
 
 
 # Results of papers.
@@ -104,15 +110,19 @@ def test_the_tables_of_place3d_are_there_with_the_means_and_ceilings_that_follow
         "center": 52.525, "line": 49.65, "pyramid": 52.175, "square": 49.95, "trapezoid": 50.925,
         "line_roll": 51.025, "pyramid_roll": 52.125, "optimised_detection": 53.375,
     }  # fmt: skip
-    ceilings = {category: PLACE3D["map", category].ceiling for category in ("car", "bicycle", "pedestrian")}
+    ceilings = {
+        category: PLACE3D["map", category].inter_rater_correlation for category in ("car", "bicycle", "pedestrian")
+    }
     assert ceilings == {
         "car": pytest.approx(0.85, abs=0.01),
         "bicycle": pytest.approx(0.20, abs=0.01),
         "pedestrian": pytest.approx(-0.10, abs=0.01),
     }
-    assert PLACE3D["miou", ""].judges == ("MinkUNet", "PolarNet", "SPVCNN", "Cylinder3D")
+    assert PLACE3D["miou", ""].raters == ("MinkUNet", "PolarNet", "SPVCNN", "Cylinder3D")
     # The paper's own metric ranks cars as its detectors do.
-    assert spearman(PLACE3D["m_sog_1e-6", "detection"].of(cars.placements).mean, cars.mean) == pytest.approx(1.0)
+    assert compute_spearman(
+        PLACE3D["m_sog_1e-6", "detection"].select(cars.placements).mean, cars.mean
+    ) == pytest.approx(1.0)
 
 
 def test_every_placement_of_the_table_is_a_rig():
@@ -133,17 +143,17 @@ def test_every_placement_of_the_table_is_a_rig():
 )
 def test_the_ceiling_is_what_judges_agree_on(values, ceiling):
     judges = tuple(f"net {number}" for number in range(len(values)))
-    judged = Judged("AP", tuple("abcd"), judges, np.array(values, dtype=float))
-    assert judged.ceiling == pytest.approx(ceiling, nan_ok=True)
+    judged = PlacementRatings("AP", tuple("abcd"), judges, np.array(values, dtype=float))
+    assert judged.inter_rater_correlation == pytest.approx(ceiling, nan_ok=True)
 
 
 def test_placements_can_be_chosen_but_not_made_up():
-    judged = Judged("AP", tuple("abc"), ("net",), np.array([[1.0, 2.0, 3.0]]))
-    assert judged.of(["c", "a"]).values.tolist() == [[3.0, 1.0]]
+    judged = PlacementRatings("AP", tuple("abc"), ("net",), np.array([[1.0, 2.0, 3.0]]))
+    assert judged.select(["c", "a"]).values.tolist() == [[3.0, 1.0]]
     with pytest.raises(ValueError, match="nothing is known of d"):
-        judged.of(["a", "d"])
+        judged.select(["a", "d"])
     with pytest.raises(ValueError, match="a finite number"):
-        Judged("AP", tuple("abc"), ("net",), np.array([[1.0, np.nan, 3.0]]))
+        PlacementRatings("AP", tuple("abc"), ("net",), np.array([[1.0, np.nan, 3.0]]))
 
 
 @pytest.mark.parametrize(

@@ -13,16 +13,16 @@ from torchcover import BevGrid, Region
 from torchcover.contrib import (
     PUBLISHED,
     FalseVisible,
+    FrameQueryCache,
     KCover,
+    MetricSetup,
     ObjectCoverage,
     PerceptionEntropy,
     PointDensity,
-    Setup,
-    Sights,
-    field_of_view,
-    metric_names,
+    compute_field_of_view,
+    parse_metric_names,
 )
-from torchcover.contrib.ratio_metrics import entropy, late_fusion, standard_deviation
+from torchcover.contrib.ratio_metrics import compute_entropy_nats, compute_standard_deviation, fuse_standard_deviations
 from torchcover.simulation import CameraSensor, Lidar, Pose
 from torchcover.simulation.shapes import Box
 
@@ -30,7 +30,7 @@ from .frames import frame_of, values
 
 OF_FRAMES = ("object coverage", "perception entropy", "k-cover", "point density", "false visible")
 EVERY = pytest.mark.parametrize("case", [CASES[name] for name in OF_FRAMES], ids=OF_FRAMES)
-GRID = BevGrid(x=(0.0, 8.0), y=(0.0, 4.0), cell=1.0, heights={"low": (-0.5, 0.5), "high": (0.5, 2.0)})
+GRID = BevGrid(x_m=(0.0, 8.0), y_m=(0.0, 4.0), cell_m=1.0, heights={"low": (-0.5, 0.5), "high": (0.5, 2.0)})
 CAR = [10.0, 0.0, 1.0, 4.0, 2.0, 2.0, 0.0]
 
 
@@ -42,7 +42,9 @@ CAR = [10.0, 0.0, 1.0, 4.0, 2.0, 2.0, 0.0]
     [(0, 16.651387), (1, 1.520195), (5, -1.638678), (9, -7.065483), (10, -10.975632), (100, -10.975632)],
 )
 def test_the_entropy_of_points_of_a_lidar(points, nats):
-    assert float(entropy(standard_deviation(torch.tensor(points), "lidar"))) == pytest.approx(nats, abs=1e-6)
+    assert float(compute_entropy_nats(compute_standard_deviation(torch.tensor(points), "lidar"))) == pytest.approx(
+        nats, abs=1e-6
+    )
     box = replace(frame_of([], boxes=[CAR]).boxes, hits={"rig": torch.tensor([points])})
     metric = PerceptionEntropy()
     metric.update(replace(frame_of([]), boxes=box))
@@ -51,14 +53,19 @@ def test_the_entropy_of_points_of_a_lidar(points, nats):
 
 @pytest.mark.parametrize(("pixels", "nats"), [(1, 6.229700), (1000, 2.558009), (100_000, 0.209528)])
 def test_the_entropy_of_pixels_of_a_camera(pixels, nats):
-    assert float(entropy(standard_deviation(torch.tensor(pixels), "camera"))) == pytest.approx(nats, abs=1e-6)
+    assert float(compute_entropy_nats(compute_standard_deviation(torch.tensor(pixels), "camera"))) == pytest.approx(
+        nats, abs=1e-6
+    )
 
 
 def test_late_fusion_is_sharper_than_the_sharpest():
-    sigmas = standard_deviation(torch.tensor(5), "lidar"), standard_deviation(torch.tensor(1000), "camera")
-    assert float(late_fusion(sigmas)) == pytest.approx(0.105849, abs=1e-6)
-    assert float(entropy(late_fusion(sigmas))) == pytest.approx(-1.653611, abs=1e-6)
-    assert late_fusion(sigmas) < min(sigmas)
+    sigmas = (
+        compute_standard_deviation(torch.tensor(5), "lidar"),
+        compute_standard_deviation(torch.tensor(1000), "camera"),
+    )
+    assert float(fuse_standard_deviations(sigmas)) == pytest.approx(0.105849, abs=1e-6)
+    assert float(compute_entropy_nats(fuse_standard_deviations(sigmas))) == pytest.approx(-1.653611, abs=1e-6)
+    assert fuse_standard_deviations(sigmas) < min(sigmas)
 
 
 def test_points_of_cameras_and_of_lidars_of_a_rig_are_told_apart():
@@ -68,12 +75,14 @@ def test_points_of_cameras_and_of_lidars_of_a_rig_are_told_apart():
     frame = frame_of(inside, boxes=[CAR], sensors={"eye": 3, "roof": 5})
     metric = PerceptionEntropy((camera, lidar))
     metric.update(frame)
-    kinds = standard_deviation(torch.tensor(3), "camera"), standard_deviation(torch.tensor(5), "lidar")
-    assert values(metric)["perception_entropy"] == pytest.approx(float(entropy(late_fusion(kinds))), abs=1e-12)
+    kinds = compute_standard_deviation(torch.tensor(3), "camera"), compute_standard_deviation(torch.tensor(5), "lidar")
+    assert values(metric)["perception_entropy"] == pytest.approx(
+        float(compute_entropy_nats(fuse_standard_deviations(kinds))), abs=1e-12
+    )
     alone = PerceptionEntropy((camera,))
     alone.update(frame_of(inside, boxes=[CAR], sensors={"eye": 8}))
-    only = standard_deviation(torch.tensor(8), "camera")
-    assert values(alone)["perception_entropy"] == pytest.approx(float(entropy(only)), abs=1e-12)
+    only = compute_standard_deviation(torch.tensor(8), "camera")
+    assert values(alone)["perception_entropy"] == pytest.approx(float(compute_entropy_nats(only)), abs=1e-12)
 
 
 def test_the_share_of_an_object_weighs_square_metres():
@@ -88,7 +97,7 @@ def test_the_share_of_an_object_weighs_square_metres():
         == 0.25
     )
     assert math.isnan(found["object_coverage_0.4m:bus"])
-    assert {number.count for number in metric.compute() if not number.known} == {0}
+    assert {number.count for number in metric.compute() if not number.has_value} == {0}
 
 
 def test_an_object_that_nobody_can_see_counts_for_hits_only_and_a_far_one_for_nothing():
@@ -128,43 +137,43 @@ def lidar(**changes):
 
 
 def test_a_ray_crosses_the_cells_down_to_the_ground():
-    grid = BevGrid(x=(-1.0, 5.0), y=(-1.0, 1.0), cell=0.25, heights={"low": (-0.1, 0.5), "high": (0.5, 2.0)})
-    seen = field_of_view([lidar(mount=Pose(x_m=0.05, y_m=0.1, z_m=1.0))], grid)
-    low, high = (set((grid.x_centres_m[band.nonzero()[:, 1]]).tolist()) for band in seen)
+    grid = BevGrid(x_m=(-1.0, 5.0), y_m=(-1.0, 1.0), cell_m=0.25, heights={"low": (-0.1, 0.5), "high": (0.5, 2.0)})
+    seen = compute_field_of_view([lidar(mount=Pose(x_m=0.05, y_m=0.1, z_m=1.0))], grid)
+    low, high = (set((grid.x_centers_m[band.nonzero()[:, 1]]).tolist()) for band in seen)
     assert low == {0.625, 0.875, 1.125}  # below 0.5 m from x = 0.55 on, and on the ground at 1.05
     assert high == {0.125, 0.375, 0.625}
     assert {int(row) for row in seen.nonzero()[:, 1]} == {4}
 
 
 def test_no_cell_that_a_ray_crosses_is_missed():
-    grid = BevGrid(x=(-20.0, 20.0), y=(-20.0, 20.0), cell=1.0, heights={"low": (-0.5, 0.4), "high": (0.4, 2.0)})
+    grid = BevGrid(x_m=(-20.0, 20.0), y_m=(-20.0, 20.0), cell_m=1.0, heights={"low": (-0.5, 0.4), "high": (0.4, 2.0)})
     around = lidar(mount=Pose(x_m=0.3, y_m=-0.2, z_m=1.7, pitch_deg=2.0), columns=90, horizontal_fov_deg=360,
                    channels=4, vertical_fov_deg=(-12, 3))  # fmt: skip
-    seen = field_of_view([around], grid).numpy()
+    seen = compute_field_of_view([around], grid).numpy()
     origin_m, turn = around.mount.matrix()[:3, 3], around.mount.matrix()[:3, :3]
     directions = (turn @ around.directions().reshape(3, -1)).T
     ends_m = np.where(directions[:, 2] < 0, origin_m[2] / np.maximum(-directions[:, 2], 1e-9), 60.0).clip(max=50.0)
     along = np.linspace(0.0, 1.0, 4001)[1:-1]
     points = (origin_m + (directions * ends_m[:, None])[:, None] * along[None, :, None]).reshape(-1, 3)
     found = np.zeros_like(seen)
-    found.reshape(-1)[grid.bins(torch.from_numpy(points)).cell.numpy()] = True
+    found.reshape(-1)[grid.assign_cells(torch.from_numpy(points)).cell_indices.numpy()] = True
     assert (seen >= found).all()
     assert (seen & ~found).sum() < 0.01 * found.sum()  # of which a ray cuts off less than a centimetre
 
 
 def test_what_points_at_the_vehicle_sees_nothing_and_range_ends_a_ray():
-    grid = BevGrid(x=(0.0, 8.0), y=(-1.0, 1.0), cell=0.5)
+    grid = BevGrid(x_m=(0.0, 8.0), y_m=(-1.0, 1.0), cell_m=0.5)
     bonnet = Box(type="box", size_m=(1.0, 2.0, 0.8)).mesh()
-    assert not field_of_view([lidar(mount=Pose(x_m=0.0, z_m=1.0))], grid, bonnet).any()
+    assert not compute_field_of_view([lidar(mount=Pose(x_m=0.0, z_m=1.0))], grid, bonnet).any()
     flat = lidar(vertical_fov_deg=(0.0, 0.0), max_range_m=3.2)
-    assert field_of_view([flat], grid)[1].any(dim=0).nonzero().squeeze(1).tolist() == list(range(7))
+    assert compute_field_of_view([flat], grid)[1].any(dim=0).nonzero().squeeze(1).tolist() == list(range(7))
     blind = lidar(vertical_fov_deg=(0.0, 0.0), max_range_m=3.2, min_range_m=2.0)
-    assert field_of_view([blind], grid)[1].any(dim=0).nonzero().squeeze(1).tolist() == [4, 5, 6]
+    assert compute_field_of_view([blind], grid)[1].any(dim=0).nonzero().squeeze(1).tolist() == [4, 5, 6]
 
 
 def test_false_visible_is_a_share_of_what_is_not_seen():
     sensors = [lidar(vertical_fov_deg=(0.0, 0.0), mount=Pose(x_m=0.0, y_m=0.5, z_m=1.0), max_range_m=5.0)]
-    grid = BevGrid(x=(0.0, 8.0), y=(0.0, 1.0), cell=1.0, heights={"high": (0.5, 2.0)})
+    grid = BevGrid(x_m=(0.0, 8.0), y_m=(0.0, 1.0), cell_m=1.0, heights={"high": (0.5, 2.0)})
     metric = FalseVisible(sensors, None, grid)
     # Seen: 0. Not seen: 1 to 3 and 7, the first three of which the ray crosses. Nobody asked about the others.
     reference = [[x + 0.5, 0.5, 1.0] for x in (0, 1, 2, 3, 7)] + [[0.5, 0.9, 1.9]]
@@ -176,7 +185,7 @@ def test_false_visible_is_a_share_of_what_is_not_seen():
 def test_a_rig_that_sees_all_has_no_false_visible_number():
     metric = FalseVisible([lidar()], None, GRID)
     metric.update(frame_of([[0.5, 0.5, 0.0]], [[0.5, 0.5, 0.0]]))
-    assert [number.known for number in metric.compute()] == [False, False]
+    assert [number.has_value for number in metric.compute()] == [False, False]
 
 
 # Slow twins.
@@ -237,7 +246,7 @@ def test_a_number_that_few_worlds_know_has_no_error_and_none_to_race_with_unless
         there = index < with_objects
         metric.update(frame_of([[10.0, 0.0, 1.0]] * (index % 2), boxes=[CAR] if there else [], index=index))
     (at,) = (at for at, one in enumerate(metric.compute()) if one.quantity.key == "objects_hit_1")
-    assert math.isfinite(float(metric.estimate().errors(least=3)[at])) == known
+    assert math.isfinite(float(metric.estimate().compute_errors(min_blocks=3)[at])) == known
     assert math.isfinite(metric.compute()[at].error) == (known and worlds >= 8)
 
 
@@ -306,11 +315,11 @@ def test_the_order_of_points_boxes_and_frames_does_not_matter(case):
 
 @EVERY
 def test_metrics_that_share_a_search_find_what_each_finds_alone(case):
-    sights = Sights()
+    sights = FrameQueryCache()
     together = {name: CASES[name].make() for name in OF_FRAMES}
     for metric in together.values():
         metric.sights = sights
-    sights.by_sensor = True
+    sights.searches_by_sensor = True
     for step in case.steps:
         for metric in together.values():
             metric.update(**step)
@@ -364,10 +373,10 @@ def test_another_rig_is_refused():
     [
         lambda: ObjectCoverage(-1.0),
         lambda: ObjectCoverage(math.nan),
-        lambda: ObjectCoverage(hits=(0,)),
+        lambda: ObjectCoverage(min_point_counts=(0,)),
         lambda: ObjectCoverage(categories=("car", "car")),
         lambda: ObjectCoverage(range_borders_m=(20.0, 10.0)),
-        lambda: KCover(GRID, (), at_least=(0,)),
+        lambda: KCover(GRID, (), min_sensor_counts=(0,)),
         lambda: KCover(GRID, [Region("far", (0.0, 99.0), (0.0, 1.0))]),
         lambda: FalseVisible([lidar()], None, GRID, math.inf),
     ],
@@ -378,14 +387,14 @@ def test_parameters_that_make_no_sense_are_refused(make):
 
 
 def test_names_of_metrics():
-    assert metric_names("all") == tuple(PUBLISHED)
-    assert metric_names("k_cover, point_density,k_cover") == ("k_cover", "point_density")
+    assert parse_metric_names("all") == tuple(PUBLISHED)
+    assert parse_metric_names("k_cover, point_density,k_cover") == ("k_cover", "point_density")
     with pytest.raises(ValueError, match="got 'nosuch'"):
-        metric_names(["nosuch"])
+        parse_metric_names(["nosuch"])
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_every_metric_is_made_from_a_setup(name):
-    metric = PUBLISHED[name].make(Setup(rig="rig", sensors=(lidar(),), grid=GRID, regions=()))
-    assert metric.rig == "rig"
-    assert PUBLISHED[name].words
+    metric = PUBLISHED[name].build(MetricSetup(rig_name="rig", sensors=(lidar(),), grid=GRID, regions=()))
+    assert metric.rig_name == "rig"
+    assert PUBLISHED[name].description

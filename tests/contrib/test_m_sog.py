@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from torchcover.contrib import MSog
-from torchcover.contrib.voxels import VoxelGrid, crossed_voxels
-from torchcover.detection import points_in_boxes
+from torchcover.contrib.voxels import VoxelGrid, find_crossed_voxels
+from torchcover.detection import find_points_in_boxes
 from torchcover.geometry import BoundingBox
 
 from .voxel_frames import beam, boxes, frame
@@ -43,7 +43,7 @@ def test_three_labels_of_one_voxel_by_hand():
     ]
     number = m_sog([AHEAD], frames)
     assert number.value == pytest.approx(-1.039721 / 8, abs=1e-7)  # H(.5, .25, .25)
-    assert (number.quantity.key, number.count, number.count_of) == ("m_sog_car_0.5m", 8, "voxels")
+    assert (number.quantity.key, number.count, number.counted_items) == ("m_sog_car_0.5m", 8, "voxels")
     assert "only for ranks" in number.warning
     always = [frame(index, boxes(CAR), reference=seen(ON_CAR, ON_WALL)) for index in range(4)]
     assert m_sog([AHEAD], always).value == 0.0
@@ -56,7 +56,7 @@ def test_points_vote_and_a_draw_is_the_category():
     metric = MSog([AHEAD], voxel_m=0.5, region=REGION)
     for index, points in enumerate(([in_it, beside_it], [in_it, beside_it, beside_it], [beside_it])):
         metric.update(frame(index, short, reference=seen(*points)))
-    assert metric.labelled.sum(dim=(0, 2)).tolist() == [1, 2]
+    assert metric.label_counts.sum(dim=(0, 2)).tolist() == [1, 2]
 
 
 def test_it_is_that_of_a_slow_twin_and_its_error_the_jackknife_by_hand():
@@ -70,11 +70,11 @@ def test_it_is_that_of_a_slow_twin_and_its_error_the_jackknife_by_hand():
     crossed = np.zeros(grid.shape, dtype=bool)
     for sensor in sensors:
         origin = np.array([sensor.mount.x_m, 0.0, sensor.mount.z_m])
-        crossed_voxels(grid, origin, sensor.directions().reshape(3, -1).T, crossed=crossed)
+        find_crossed_voxels(grid, origin, sensor.directions().reshape(3, -1).T, output=crossed)
     labels = np.zeros((16, 3, *grid.shape))
     for index, one in enumerate(frames):
         votes = np.zeros((2, *grid.shape))
-        inside = set(points_in_boxes(one.reference, one.boxes).point.tolist())
+        inside = set(find_points_in_boxes(one.reference, one.boxes).point_indices.tolist())
         for number, point in enumerate(one.reference.double().numpy()):
             if (point >= REGION.lower_m).all() and (point < REGION.upper_m).all():
                 votes[(int(number not in inside), *((point - REGION.lower_m) // 0.5).astype(int))] += 1
@@ -96,7 +96,7 @@ def test_it_is_that_of_a_slow_twin_and_its_error_the_jackknife_by_hand():
     assert number.error == pytest.approx(expected)
     metric = MSog(sensors, voxel_m=0.5, region=REGION)
     metric.update(frames)
-    assert metric.estimate().resampled(1.0 - torch.eye(16))[:, 0].tolist() == pytest.approx(left_out)
+    assert metric.estimate().resample(1.0 - torch.eye(16))[:, 0].tolist() == pytest.approx(left_out)
     assert math.isnan(m_sog(sensors, frames[:7]).error)
 
 
@@ -128,4 +128,4 @@ def test_a_frame_without_boxes_is_refused_and_adds_nothing():
     metric = MSog([AHEAD], region=REGION)
     with pytest.raises(ValueError, match="has no boxes"):
         metric.update(frame(0, None, reference=seen(ON_CAR)))
-    assert (int(metric.steps), int(metric.block_steps.sum())) == (0, 0)
+    assert (int(metric.num_frames), int(metric.block_frame_counts.sum())) == (0, 0)

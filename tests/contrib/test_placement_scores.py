@@ -5,7 +5,7 @@ import pytest
 
 from torchcover import Region, evaluate
 from torchcover.contrib import score_placements
-from torchcover.contrib.placement_scores import circle
+from torchcover.contrib.placement_scores import build_circle_region
 from torchcover.data import RegionsOfInterest
 
 RIGS = {name: f"place3d2024_{name}" for name in ("center", "line", "pyramid")}
@@ -13,7 +13,7 @@ RIGS = {name: f"place3d2024_{name}" for name in ("center", "line", "pyramid")}
 
 def test_own_numbers_are_those_of_compare_over_both_measures():
     region = Region("front", (0.0, 20.0), (-10.0, 10.0))
-    scores = score_placements(RIGS, "courtyard", region=region, metrics=[], steps=8, seed=3)
+    scores = score_placements(RIGS, "courtyard", region=region, metrics=[], num_frames=8, seed=3)
     asked = {
         "regions": {"front": {"x_m": (0, 20), "y_m": (-10, 10)}},
         "grid": {"x_m": (0, 20), "y_m": (-10, 10), "cell_m": 1.0},
@@ -27,17 +27,21 @@ def test_own_numbers_are_those_of_compare_over_both_measures():
         ]
         for name, expected in zip(("ground", "obstacle", "both bands"), (*each, np.mean(each, axis=0)), strict=True):
             one = found[f"detection 0.4 m, {name}, front, {words}"]
-            np.testing.assert_array_equal(one.gains, expected)  # one number, not two of one name
+            np.testing.assert_array_equal(one.scores, expected)  # one number, not two of one name
             # Draws of worlds are around the number that all of them give.
-            assert one.draws.shape[1] == 3
-            np.testing.assert_allclose(one.draws.mean(axis=0), expected, atol=4 * one.draws.std(axis=0).max() + 1e-3)
+            assert one.samples.shape[1] == 3
+            np.testing.assert_allclose(
+                one.samples.mean(axis=0), expected, atol=4 * one.samples.std(axis=0).max() + 1e-3
+            )
 
 
 def test_the_region_is_a_circle():
     area_m2 = sum(
         x * next_y - y * next_x
         for (x, y), (next_x, next_y) in zip(
-            circle().corners_m, (*circle().corners_m[1:], circle().corners_m[0]), strict=True
+            build_circle_region().corners_m,
+            (*build_circle_region().corners_m[1:], build_circle_region().corners_m[0]),
+            strict=True,
         )
     )
     assert area_m2 / 2 == pytest.approx(np.pi * 50**2, rel=1e-3)

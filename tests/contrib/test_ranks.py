@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from torchcover.contrib.ranks import check_best_correlation, kendall_tau_b, rank_values, spearman
+from torchcover.contrib.ranks import check_best_correlation, compute_kendall_tau_b, compute_spearman, rank_values
 
 STATISTICS = pytest.mark.parametrize(
-    ("own", "of_scipy"), [(kendall_tau_b, stats.kendalltau), (spearman, stats.spearmanr)], ids=["tau", "spearman"]
+    ("own", "of_scipy"),
+    [(compute_kendall_tau_b, stats.kendalltau), (compute_spearman, stats.spearmanr)],
+    ids=["tau", "spearman"],
 )
 
 
@@ -45,7 +47,7 @@ def test_two_rigs_have_no_relation_and_equal_ones_have_none(own, of_scipy, serie
 
 
 def test_infinite_values_are_the_largest_not_unknown():
-    assert kendall_tau_b([1.0, 2.0, math.inf], [1.0, 2.0, 3.0]) == pytest.approx(1.0)
+    assert compute_kendall_tau_b([1.0, 2.0, math.inf], [1.0, 2.0, 3.0]) == pytest.approx(1.0)
     assert rank_values([math.inf, 1.0, math.inf]).tolist() == [2.5, 1.0, 2.5]
 
 
@@ -53,16 +55,16 @@ def test_the_p_of_one_series_is_that_of_all_permutations():
     one, other = [1, 2, 3, 4, 5], [2, 1, 4, 3, 5]
     found = abs(stats.spearmanr(one, other).statistic)
     expected = np.mean([abs(stats.spearmanr(one, order).statistic) >= found - 1e-9 for order in permutations(other)])
-    assert check_best_correlation(one, other).p == pytest.approx(expected, abs=1e-15)
+    assert check_best_correlation(one, other).p_value == pytest.approx(expected, abs=1e-15)
 
 
 def test_sampled_permutations_are_repeatable_and_p_is_never_0():
     same = np.arange(12.0)
     first, second = (check_best_correlation(same, same, seed=5) for _ in range(2))
-    assert first.p == pytest.approx(1 / 40321)
-    np.testing.assert_array_equal(first.by_chance, second.by_chance)
+    assert first.p_value == pytest.approx(1 / 40321)
+    np.testing.assert_array_equal(first.chance_correlations, second.chance_correlations)
 
 
 def test_unknown_series_have_no_p():
-    assert math.isnan(check_best_correlation([1, 1, 1], [1, 2, 3]).p)
-    assert math.isnan(check_best_correlation([1, math.nan, 2], [1, 2, 3]).p)
+    assert math.isnan(check_best_correlation([1, 1, 1], [1, 2, 3]).p_value)
+    assert math.isnan(check_best_correlation([1, math.nan, 2], [1, 2, 3]).p_value)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchcover.contrib import SMig
-from torchcover.contrib.s_mig import occupancy_of, occupancy_rows
+from torchcover.contrib.s_mig import build_occupancy, build_occupancy_rows
 from torchcover.contrib.voxels import VoxelGrid
 from torchcover.detection import Boxes
 from torchcover.geometry import BoundingBox
@@ -36,7 +36,7 @@ def test_what_is_always_there_says_nothing_and_half_of_the_time_a_bit_a_voxel():
     assert value(s_mig([ahead], always)).value == 0.0
     number = value(s_mig([ahead], half))
     assert number.value == pytest.approx(-8 * math.log(2), rel=1e-12)  # 4 m in voxels of 0.5 m
-    assert (number.count, number.count_of, number.quantity.unit, number.quantity.lower_is_better) == (
+    assert (number.count, number.counted_items, number.quantity.unit, number.quantity.lower_is_better) == (
         1,
         "boxes",
         "nats",
@@ -98,21 +98,21 @@ def test_occupancy_and_its_blocks_are_those_of_a_slow_twin():
     frames = [frame(index, random_boxes(generator, index % 6), place=index // 2) for index in range(40)]
     frames.append(frames[5])  # the same frame again
     metric = s_mig([beam()], frames)
-    found = occupancy_of(metric.boxes.numpy(), 0, grid, 16)
+    found = build_occupancy(metric.boxes.numpy(), 0, grid, 16)
     counts = np.zeros((16, *grid.shape), dtype=int)
     for one in frames:
         counts[one.block_index // 2] += slowly(one.boxes, grid)  # 20 places: two in a block
     assert np.array_equal(found.voxels, np.flatnonzero(counts.sum(axis=0)))
-    assert np.array_equal(found.counts[found.pattern].T, counts.reshape(16, -1)[:, found.voxels])
-    assert found.steps.tolist() == [4, 5, *[4] * 8, *[0] * 6]
+    assert np.array_equal(found.counts[found.pattern_indices].T, counts.reshape(16, -1)[:, found.voxels])
+    assert found.frame_counts.tolist() == [4, 5, *[4] * 8, *[0] * 6]
 
 
 def test_boxes_that_overlap_count_once_and_beside_each_other_share_no_voxel():
     grid = VoxelGrid(REGION, 0.5)
 
     def occupied(*rows):
-        table = occupancy_rows(boxes(*rows), 0, ("car",), REGION).numpy()
-        found = occupancy_of(table, 0, grid, 16)
+        table = build_occupancy_rows(boxes(*rows), 0, ("car",), REGION).numpy()
+        found = build_occupancy(table, 0, grid, 16)
         assert found.counts.max() == 1
         return len(found.voxels)
 
@@ -138,8 +138,8 @@ def test_errors_over_worlds_are_the_jackknife_by_hand_and_none_below_eight():
     expected = math.sqrt(15 / 16 * sum((one - np.mean(left_out)) ** 2 for one in left_out))
     assert value(whole).error == pytest.approx(expected, rel=1e-9)
     weights = 1.0 - torch.eye(16)
-    assert whole.estimate().resampled(weights)[:, 1].tolist() == pytest.approx(left_out)
-    assert whole.estimate().resampled(torch.zeros(1, 16)).isnan().all()
+    assert whole.estimate().resample(weights)[:, 1].tolist() == pytest.approx(left_out)
+    assert whole.estimate().resample(torch.zeros(1, 16)).isnan().all()
     assert math.isnan(value(s_mig(sensors, frames[:7])).error)
     hits = {"beam": torch.tensor([[9.0, 0.0, 1.0]])}
     occluded = s_mig(sensors, [frame(one.index, one.boxes, clouds=hits) for one in frames], occlusion=True)
@@ -156,7 +156,7 @@ def test_with_occlusion_rays_end_at_what_was_measured_and_without_points_nowhere
     assert number.quantity.key == "s_mig_occluded_0.5m:car"
     assert number.value == pytest.approx(-4 * math.log(2) / 2)
     assert math.isnan(number.error)
-    assert s_mig([beam(z_m=1.25)], frames, occlusion=True).estimate().resampled(torch.ones(1, 2)) is None
+    assert s_mig([beam(z_m=1.25)], frames, occlusion=True).estimate().resample(torch.ones(1, 2)) is None
 
 
 def test_with_occlusion_it_is_the_mean_over_frames_of_the_entropy_on_their_way():
@@ -214,4 +214,4 @@ def test_frames_that_cannot_say_it_are_refused_and_add_nothing():
     for given, message in ((without, "has no boxes"), (nobody, "it is unknown which points"), (other, "sensor 'rear'")):
         with pytest.raises(ValueError, match=message):
             metric.update(given)
-    assert (int(metric.steps), len(metric.boxes), int(metric.crossings.sum())) == (1, 1, 0)
+    assert (int(metric.num_frames), len(metric.boxes), int(metric.crossings.sum())) == (1, 1, 0)

@@ -6,7 +6,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from torchcover.contrib.voxels import VoxelGrid, crossed_voxels
+from torchcover.contrib.voxels import VoxelGrid, find_crossed_voxels
 from torchcover.geometry import BoundingBox
 
 # Sides that are exact in binary, and are not equal in number.
@@ -54,7 +54,7 @@ def test_nasty_rays_cross_what_the_twin_in_fractions_says():
         one = slice(ray, ray + 1)
         least, most = slowly(GRID, origins[one], directions[one], ends[one])
         assert (least == most).all()
-        assert np.array_equal(crossed_voxels(GRID, origins[one], directions[one], ends[one]), least), ray
+        assert np.array_equal(find_crossed_voxels(GRID, origins[one], directions[one], ends[one]), least), ray
 
 
 def test_any_rays_cross_what_the_twin_in_fractions_says():
@@ -65,7 +65,7 @@ def test_any_rays_cross_what_the_twin_in_fractions_says():
     for ray in range(200):
         one = slice(ray, ray + 1)
         least, most = slowly(GRID, origins[one], directions[one], ends[one])
-        found = crossed_voxels(GRID, origins[one], directions[one], ends[one])
+        found = find_crossed_voxels(GRID, origins[one], directions[one], ends[one])
         assert (least <= found).all(), ray
         assert (found <= most).all(), ray
 
@@ -75,16 +75,16 @@ MIDDLE = VoxelGrid(BoundingBox((-5.0, -5.0, -2.0), (5.0, 5.0, 2.0)), 0.5)
 
 def test_directions_that_are_all_but_parallel_run_in_the_upper_voxel_of_a_face():
     for tiny in (0.0, 1e-17, -1e-17, 1e-13, -1e-13):
-        found = np.argwhere(crossed_voxels(MIDDLE, [0.0, 0.0, 0.25], [[1.0, tiny, tiny]]))
+        found = np.argwhere(find_crossed_voxels(MIDDLE, [0.0, 0.0, 0.25], [[1.0, tiny, tiny]]))
         assert found[:, 1:].tolist() == [[10, 4]] * 10
     # From far away it would leave the region's side.
-    assert crossed_voxels(MIDDLE, [-1e6, 0.25, 0.25], [[1.0, 1e-5, 0.0]]).sum() == 0
+    assert find_crossed_voxels(MIDDLE, [-1e6, 0.25, 0.25], [[1.0, 1e-5, 0.0]]).sum() == 0
 
 
 def test_a_ray_that_grazes_the_upper_wall_stays_within_the_region():
     grid = VoxelGrid(BoundingBox((0.0, 0.0, 0.0), (4.0, 4.0, 1.0)), 1.0)
     # Within a billionth of the wall at the last plane, and beyond it only after that.
-    found = np.argwhere(crossed_voxels(grid, [0.0, 4.0 - 3.5e-9, 0.5], [[1.0, 1e-9, 0.0]]))
+    found = np.argwhere(find_crossed_voxels(grid, [0.0, 4.0 - 3.5e-9, 0.5], [[1.0, 1e-9, 0.0]]))
     assert found.tolist() == [[0, 3, 0], [1, 3, 0], [2, 3, 0], [3, 3, 0]]
 
 
@@ -95,21 +95,21 @@ def some_rays(count=300):
 
 def test_order_and_division_and_length_of_directions_do_not_matter(monkeypatch):
     origins, directions, ends = some_rays()
-    whole = crossed_voxels(MIDDLE, origins, directions, ends)
+    whole = find_crossed_voxels(MIDDLE, origins, directions, ends)
     order = np.random.default_rng(1).permutation(len(origins))
-    assert np.array_equal(whole, crossed_voxels(MIDDLE, origins[order], directions[order], ends[order]))
-    assert np.array_equal(whole, crossed_voxels(MIDDLE, origins, directions * 4, ends / 4))
-    parts = crossed_voxels(MIDDLE, origins[:100], directions[:100], ends[:100])
-    assert parts is crossed_voxels(MIDDLE, origins[100:], directions[100:], ends[100:], crossed=parts)
+    assert np.array_equal(whole, find_crossed_voxels(MIDDLE, origins[order], directions[order], ends[order]))
+    assert np.array_equal(whole, find_crossed_voxels(MIDDLE, origins, directions * 4, ends / 4))
+    parts = find_crossed_voxels(MIDDLE, origins[:100], directions[:100], ends[:100])
+    assert parts is find_crossed_voxels(MIDDLE, origins[100:], directions[100:], ends[100:], output=parts)
     assert np.array_equal(whole, parts)
     monkeypatch.setattr("torchcover.contrib.voxels.RAYS_AT_ONCE", 7)
-    assert np.array_equal(whole, crossed_voxels(MIDDLE, origins, directions, ends))
+    assert np.array_equal(whole, find_crossed_voxels(MIDDLE, origins, directions, ends))
 
 
 def test_directions_of_nan_are_no_rays():
     some = np.array([[1.0, 0.0, 0.0], [np.nan, np.nan, np.nan], [0.0, 1.0, 0.0]])
-    expected = crossed_voxels(MIDDLE, np.zeros(3), some[[0, 2]], [3.0, 2.0])
-    assert np.array_equal(crossed_voxels(MIDDLE, np.zeros(3), some, [3.0, 1.0, 2.0]), expected)
+    expected = find_crossed_voxels(MIDDLE, np.zeros(3), some[[0, 2]], [3.0, 2.0])
+    assert np.array_equal(find_crossed_voxels(MIDDLE, np.zeros(3), some, [3.0, 1.0, 2.0]), expected)
 
 
 @pytest.mark.parametrize(
@@ -127,12 +127,12 @@ def test_directions_of_nan_are_no_rays():
 )
 def test_rays_that_are_none_are_refused(given, message):
     with pytest.raises(ValueError, match=message):
-        crossed_voxels(MIDDLE, *given)
+        find_crossed_voxels(MIDDLE, *given)
 
 
 def test_an_array_of_another_grid_is_not_added_to():
     with pytest.raises(ValueError, match=r"crossed: a contiguous bool array of shape \(20, 20, 8\)"):
-        crossed_voxels(MIDDLE, [0, 0, 0], [[1, 0, 0]], crossed=np.zeros((20, 20, 9), dtype=bool))
+        find_crossed_voxels(MIDDLE, [0, 0, 0], [[1, 0, 0]], output=np.zeros((20, 20, 9), dtype=bool))
 
 
 @pytest.mark.parametrize(
@@ -150,8 +150,8 @@ def test_a_side_that_does_not_divide_the_region_is_refused_and_one_that_does_nam
 
 
 def test_every_centre_is_in_its_own_voxel_and_borders_are_half_open():
-    x, y, z = GRID.centres_m()
+    x, y, z = GRID.compute_centers_m()
     centres = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
-    assert GRID.number_of(centres).tolist() == list(range(GRID.voxels))
-    assert GRID.number_of([GRID.region.lower_m, GRID.region.upper_m]).tolist() == [0, -1]
-    assert GRID.number_of(np.full((1, 3), np.nan)).tolist() == [-1]
+    assert GRID.find_voxels(centres).tolist() == list(range(GRID.num_voxels))
+    assert GRID.find_voxels([GRID.region.lower_m, GRID.region.upper_m]).tolist() == [0, -1]
+    assert GRID.find_voxels(np.full((1, 3), np.nan)).tolist() == [-1]

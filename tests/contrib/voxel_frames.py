@@ -55,5 +55,5 @@ def frame(index, objects, *, reference=None, clouds=None, place=None):
         name=f"frame {index}",
         boxes=objects,
         block_index=place,
-        sensor_points={"rig": {name: len(cloud) for name, cloud in clouds.items()}},
+        sensor_point_counts={"rig": {name: len(cloud) for name, cloud in clouds.items()}},
     )

@@ -14,18 +14,18 @@ from torchcover import BevGrid, Coverage, CoverageMetric, Region
 from torchcover.coverage import (
     AGGREGATIONS,
     Aggregation,
+    FrameQuantiles,
     Layer,
     Maximum,
     PooledMean,
     Quantiles,
-    State,
-    StepQuantiles,
-    aggregation_named,
+    SumState,
+    parse_aggregation,
 )
 from torchcover.estimation import Estimate, Quantity
 from torchcover.report import RENDERERS, CoverageTable
 
-ONE_CELL = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)})
+ONE_CELL = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=1.0, heights={"all": (-1.0, 1.0)})
 NOTHING = torch.zeros(0, 3)
 ORIGIN = torch.zeros(1, 3)
 
@@ -53,7 +53,7 @@ def quantile(steps, level, grid=ONE_CELL, kind=Quantiles, **options):
 @pytest.mark.parametrize("level", [0.0, 0.1, 0.5, 0.9, 1.0])
 def test_quantiles_are_right_within_a_bin(level):
     """A bin is 12 % wide, or 1 cm."""
-    grid = BevGrid(x=(0.0, 64.0), y=(0.0, 64.0), cell=64.0, heights={"all": (-1.0, 1.0)})
+    grid = BevGrid(x_m=(0.0, 64.0), y_m=(0.0, 64.0), cell_m=64.0, heights={"all": (-1.0, 1.0)})
     random = np.random.default_rng(0)
     distances = np.concatenate([10 ** random.uniform(-4, 1.7, 801)])
     expected = np.quantile(distances, level, method="inverted_cdf")
@@ -66,7 +66,7 @@ def test_steps_weigh_the_same_in_a_quantile():
 
 
 def test_quantiles_beyond_the_histogram_are_max_radius():
-    grid = BevGrid(x=(0.0, 512.0), y=(0.0, 512.0), cell=512.0, heights={"all": (-1.0, 1.0)})
+    grid = BevGrid(x_m=(0.0, 512.0), y_m=(0.0, 512.0), cell_m=512.0, heights={"all": (-1.0, 1.0)})
     steps = [(ORIGIN, points_at(1.0, 200.0, 300.0))]
     assert quantile(steps, 0.9, grid, max_radius=250.0) == 250.0
     assert quantile(steps, 0.9, grid) == math.inf
@@ -87,7 +87,7 @@ def test_a_quantile_over_steps_is_that_of_the_means(level):
     random = np.random.default_rng(3)
     steps = [random.uniform(0.02, 0.9, random.integers(1, 9)) for _ in range(101)]
     means = [np.float32(step).astype(float).mean() for step in steps]
-    found = quantile([(ORIGIN, points_at(*step)) for step in steps], level, kind=StepQuantiles)
+    found = quantile([(ORIGIN, points_at(*step)) for step in steps], level, kind=FrameQuantiles)
     expected = np.quantile(means, level, method="inverted_cdf")
     assert abs(found - expected) <= max(0.123 * expected, 0.01)
 
@@ -95,16 +95,16 @@ def test_a_quantile_over_steps_is_that_of_the_means(level):
 def test_a_bad_moment_is_no_bad_point():
     """One point in a hundred is blind in every step: no step is bad. One step in ten is blind: it is."""
     spread = [(ORIGIN, points_at(*[0.02] * 99, 0.9))] * 10
-    assert quantile(spread, 0.95, kind=StepQuantiles) < 0.04
+    assert quantile(spread, 0.95, kind=FrameQuantiles) < 0.04
     moment = [(ORIGIN, points_at(*[0.02] * 10))] * 9 + [(ORIGIN, points_at(*[0.9] * 10))]
-    assert quantile(moment, 0.95, kind=StepQuantiles) == pytest.approx(0.9, rel=0.13)
+    assert quantile(moment, 0.95, kind=FrameQuantiles) == pytest.approx(0.9, rel=0.13)
 
 
 def test_blind_steps_saturate_and_unprobed_ones_do_not_count():
     steps = [(ORIGIN, points_at(0.1)), (ORIGIN, NOTHING), (NOTHING, points_at(0.1))]
-    assert quantile(steps, 1.0, kind=StepQuantiles) == math.inf
-    assert quantile(steps, 1.0, kind=StepQuantiles, max_radius=2.0) == 2.0
-    assert quantile(steps, 0.4, kind=StepQuantiles) == pytest.approx(0.1, rel=0.13)
+    assert quantile(steps, 1.0, kind=FrameQuantiles) == math.inf
+    assert quantile(steps, 1.0, kind=FrameQuantiles, max_radius=2.0) == 2.0
+    assert quantile(steps, 0.4, kind=FrameQuantiles) == pytest.approx(0.1, rel=0.13)
 
 
 # Regions
@@ -120,9 +120,9 @@ def random_steps(count, seed=0):
 
 NEAR, ALL = Region("near", (-1.0, 1.0), (-1.0, 1.0)), Region("all", (-2.0, 2.0), (-2.0, 2.0))
 BANDS = {"all": (-1.0, 1.0), "high": (0.1, 1.0)}
-FOUR = BevGrid(x=(-2.0, 2.0), y=(-2.0, 2.0), cell=1.0, heights=BANDS)
+FOUR = BevGrid(x_m=(-2.0, 2.0), y_m=(-2.0, 2.0), cell_m=1.0, heights=BANDS)
 MEANS = {"radius_m", "detection_0.4m"}
-EVERY = (Maximum(), PooledMean(), Quantiles((0.5, 0.9)), StepQuantiles((0.5,)))
+EVERY = (Maximum(), PooledMean(), Quantiles((0.5, 0.9)), FrameQuantiles((0.5,)))
 
 
 def in_regions(steps, first=0, **options):
@@ -197,7 +197,9 @@ def test_what_was_not_seen_or_not_asked_for_is_unknown():
     for coverage, region in ((empty, NEAR), (in_regions(random_steps(9)).compute(), other)):
         numbers = coverage.summary([region])[0].numbers
         assert numbers.keys() >= {"radius_maximum_m", "radius_pooled_m", "radius_q0.5_m", "radius_step_q0.5_m"}
-        assert all(not number.known and math.isnan(number.error) for key, number in numbers.items() if key not in MEANS)
+        assert all(
+            not number.has_value and math.isnan(number.error) for key, number in numbers.items() if key not in MEANS
+        )
 
 
 def test_any_number_of_a_result_has_an_estimate():
@@ -210,21 +212,25 @@ def test_any_number_of_a_result_has_an_estimate():
         return metric.compute()
 
     one, other = measured(0.0), measured(0.1)
-    keys = [quantity.key for quantity in one.every_quantity]
+    keys = [quantity.key for quantity in one.all_quantities]
     assert {"cells_radius_m", "radius_m_without_a", "radius_q0.9_m", "seen_by_two_0.4m"} < set(keys)
     row = one.summary()[0]
-    values = {**row.numbers, **{f"known_{key}": number for key, number in row.known.items()}, **row.redundancy.seen_by}
+    values = {
+        **row.numbers,
+        **{f"known_{key}": number for key, number in row.cell_averages.items()},
+        **row.redundancy.detecting_sensors,
+    }
     for key in keys:
-        found, compared = (each.estimate_of(key, NEAR, "all") for each in (one, other))
+        found, compared = (each.estimate_number(key, NEAR, "all") for each in (one, other))
         assert [quantity.key for quantity in found.quantities] == [key]
         if key in values:
             assert float(found.value) == values[key].value
         # Three worlds are too few to show an error, and enough to race with.
-        assert found.left_out.shape == (3, 1)
+        assert found.jackknife_values.shape == (3, 1)
         assert math.isnan(found.error)
-        assert compared.minus(found).errors(3).isnan().tolist() == [key == "radius_maximum_m"]
+        assert compared.subtract(found).compute_errors(3).isnan().tolist() == [key == "radius_maximum_m"]
     with pytest.raises(ValueError, match=r"radius_q0\.8_m: the result has no such number; it has radius_q0"):
-        one.estimate_of("radius_q0.8_m", NEAR, "all")
+        one.estimate_number("radius_q0.8_m", NEAR, "all")
 
 
 # Any other
@@ -235,16 +241,16 @@ class Blind(Aggregation):
     """The share of points that nothing is near: all that an aggregation of sums has to be."""
 
     name: ClassVar[str] = "blind"
-    words: ClassVar[str] = "blind shares"
+    description: ClassVar[str] = "blind shares"
 
-    def states(self, cells):
-        return {name: State(torch.zeros(cells, dtype=torch.float64)) for name in ("blind", "all")}
+    def create_states(self, num_cells):
+        return {name: SumState(torch.zeros(num_cells, dtype=torch.float64)) for name in ("blind", "all")}
 
-    def update(self, sums, step):
-        sums["blind"].index_add_(0, step.cell, (step.radius > 0.5).double())
-        sums["all"].index_add_(0, step.cell, torch.ones_like(step.radius))
+    def update(self, sums, frame):
+        sums["blind"].index_add_(0, frame.cell_indices, (frame.radius > 0.5).double())
+        sums["all"].index_add_(0, frame.cell_indices, torch.ones_like(frame.radius))
 
-    def layers(self, sums, probed_steps, max_radius):
+    def compute_layers(self, sums, observed_frames, max_radius_m):
         quantity = Quantity("blind_share", "share that nothing is near", "share", lower_is_better=True)
         return [Layer(quantity, sums["blind"] / sums["all"])]
 
@@ -259,7 +265,7 @@ def test_an_aggregation_of_ones_own_has_a_map_numbers_errors_and_a_place_in_ever
     base, sums = (
         torch.tensor(each, dtype=torch.float64) for each in ([len(b) for b in blind], [b.sum() for b in blind])
     )
-    expected = Estimate.of_ratios((), base, sums[:, None], torch.ones(16))
+    expected = Estimate.from_ratios((), base, sums[:, None], torch.ones(16))
     number = found.summary()[0].numbers["blind_share"]
     assert (number.value, number.error) == pytest.approx((float(expected.value), float(expected.error)), rel=1e-12)
     assert found.layers["blind_share"].values.shape == FOUR.shape
@@ -276,17 +282,17 @@ class Minimum(Aggregation):
     """The smallest radius: all that an aggregation has to be."""
 
     name: ClassVar[str] = "minimum"
-    words: ClassVar[str] = "minima"
+    description: ClassVar[str] = "minima"
 
-    def states(self, cells):
-        return {"negative": State(torch.full((cells,), -math.inf, dtype=torch.float64), reduction="max")}
+    def create_states(self, num_cells):
+        return {"negative": SumState(torch.full((num_cells,), -math.inf, dtype=torch.float64), reduction="max")}
 
-    def update(self, sums, step):
-        sums["negative"].scatter_reduce_(0, step.cell, -step.radius, "amax")
+    def update(self, sums, frame):
+        sums["negative"].scatter_reduce_(0, frame.cell_indices, -frame.radius, "amax")
 
-    def layers(self, sums, probed_steps, max_radius):
+    def compute_layers(self, sums, observed_frames, max_radius_m):
         quantity = Quantity("radius_minimum_m", "smallest blind spot radius", "m", lower_is_better=True)
-        return [Layer(quantity, (-sums["negative"]).where(probed_steps > 0, math.nan))]
+        return [Layer(quantity, (-sums["negative"]).where(observed_frames > 0, math.nan))]
 
 
 def test_what_is_known_of_means_only_is_told_of_means_only():
@@ -305,7 +311,7 @@ def test_what_is_known_of_means_only_is_told_of_means_only():
 
 
 def test_an_aggregation_of_ones_own_is_measured_merged_saved_and_loaded(tmp_path):
-    grid = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)})
+    grid = BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 1.0), cell_m=1.0, heights={"all": (-1.0, 1.0)})
     one, other = (CoverageMetric(grid, aggregations=[Minimum()], blocks=8) for _ in range(2))
     one.update(ORIGIN, points_at(0.5, 0.25))
     other.update(ORIGIN, points_at(0.75, 0.125), block_index=1)
@@ -319,26 +325,30 @@ def test_an_aggregation_of_ones_own_is_measured_merged_saved_and_loaded(tmp_path
 
 
 def test_aggregations_have_names_of_their_own():
-    assert len({kind.name for kind in AGGREGATIONS}) == len({kind.words for kind in AGGREGATIONS}) == len(AGGREGATIONS)
+    assert (
+        len({kind.name for kind in AGGREGATIONS})
+        == len({kind.description for kind in AGGREGATIONS})
+        == len(AGGREGATIONS)
+    )
 
 
 def test_each_of_the_package_has_a_name_that_makes_it():
     for kind in AGGREGATIONS:
-        made = aggregation_named(f"{kind.name}:{kind.example}")
+        made = parse_aggregation(f"{kind.name}:{kind.example}")
         assert type(made) is kind
         assert bool(fields(kind)) == bool(kind.example)
         with pytest.raises(ValueError, match=rf"^aggregation {kind.name}:\?: .*\S$"):
-            aggregation_named(f"{kind.name}:?")
+            parse_aggregation(f"{kind.name}:?")
         keys = [quantity.key for quantity in made.quantities]
-        assert kind.of_keys({*keys, "radius_m", "detection_0.4m"}) == made
-        assert kind.of_keys({"radius_m", "detection_0.4m"}) is None
-        assert not any(other.of_keys(set(keys)) for other in AGGREGATIONS if other is not kind)
+        assert kind.from_keys({*keys, "radius_m", "detection_0.4m"}) == made
+        assert kind.from_keys({"radius_m", "detection_0.4m"}) is None
+        assert not any(other.from_keys(set(keys)) for other in AGGREGATIONS if other is not kind)
 
 
 def test_the_numbers_of_a_search_make_its_aggregations():
-    assert Quantiles.of_keys({"radius_q0.9_m", "radius_q0_m", "radius_step_q0.5_m"}) == Quantiles((0.0, 0.9))
-    assert StepQuantiles.of_keys({"radius_q0.9_m", "radius_q2_m"}) is None
-    assert Quantiles.of_keys({"radius_q2_m", "radius_q1.5_m", "radius_q_m", "radius_q0.9_m_without_roof"}) is None
+    assert Quantiles.from_keys({"radius_q0.9_m", "radius_q0_m", "radius_step_q0.5_m"}) == Quantiles((0.0, 0.9))
+    assert FrameQuantiles.from_keys({"radius_q0.9_m", "radius_q2_m"}) is None
+    assert Quantiles.from_keys({"radius_q2_m", "radius_q1.5_m", "radius_q_m", "radius_q0.9_m_without_roof"}) is None
 
 
 @pytest.mark.parametrize(
@@ -351,11 +361,11 @@ def test_the_numbers_of_a_search_make_its_aggregations():
 )
 def test_what_makes_no_aggregation_is_refused(words, message):
     with pytest.raises(ValueError, match=re.escape(message)):
-        aggregation_named(words)
+        parse_aggregation(words)
 
 
 def test_an_unknown_name_lists_all():
     with pytest.raises(ValueError, match=r"^aggregation minimum: one of .* is needed$") as raised:
-        aggregation_named("minimum")
+        parse_aggregation("minimum")
     listed = str(raised.value).removeprefix("aggregation minimum: one of ").removesuffix(" is needed").split(" or ")
-    assert [type(aggregation_named(form)) for form in listed] == list(AGGREGATIONS)
+    assert [type(parse_aggregation(form)) for form in listed] == list(AGGREGATIONS)

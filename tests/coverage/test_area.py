@@ -10,12 +10,12 @@ from torchcover import BevGrid, Coverage, CoverageMetric, Region
 from torchcover.data import SimulatedFrames
 from torchcover.simulation import SurfaceReference
 
-REGION = Region("all", x=(0.0, 8.0), y=(0.0, 4.0))
+REGION = Region("all", x_m=(0.0, 8.0), y_m=(0.0, 4.0))
 HEIGHTS = {"low": (0.0, 1.0), "high": (1.0, 2.0)}
 
 
 def grid(cell=1.0):
-    return BevGrid(x=(0.0, 8.0), y=(0.0, 4.0), cell=cell, heights=HEIGHTS)
+    return BevGrid(x_m=(0.0, 8.0), y_m=(0.0, 4.0), cell_m=cell, heights=HEIGHTS)
 
 
 def steps_of(count, seed=0, points=40):
@@ -64,11 +64,11 @@ def test_what_is_left_out_is_what_a_run_without_the_block_gives():
     steps = steps_of(40)
     coverage = metric_over(steps, blocks=16).compute()
     estimate = coverage.estimate(REGION, "low", "area")
-    assert estimate.steps.tolist() == [4] * 10
+    assert estimate.frame_counts.tolist() == [4] * 10
     for block in range(10):
         kept = [number for number in range(40) if number // 4 != block]
         without = by_hand([steps[number] for number in kept], *HEIGHTS["low"])
-        torch.testing.assert_close(estimate.left_out[block], without, rtol=1e-6, atol=1e-9)
+        torch.testing.assert_close(estimate.jackknife_values[block], without, rtol=1e-6, atol=1e-9)
     assert (estimate.error > 0).all()
 
 
@@ -91,21 +91,21 @@ def test_two_halves_merge_to_the_whole_and_a_file_gives_back_what_was_saved(tmp_
     for other, exact in ((first.compute(), 1e-12), (loaded, 0.0)):
         one, two = (each.estimate(REGION, "high", "area") for each in (coverage, other))
         torch.testing.assert_close(one.value, two.value, rtol=exact, atol=0)
-        torch.testing.assert_close(one.left_out, two.left_out, rtol=exact, atol=0)
+        torch.testing.assert_close(one.jackknife_values, two.jackknife_values, rtol=exact, atol=0)
     assert torch.equal(loaded.layers["radius_area_m"].values, coverage.layers["radius_area_m"].values)
 
 
 # Regions that overlap, with edges that no cell of 0.32 m follows; the last is what is left of the first.
 ODD = (
-    Region("near", x=(0.4, 3.3), y=(0.5, 2.1)),
-    Region("far", x=(2.9, 7.77), y=(0.0, 4.0)),
-    Region.polygon("corner", [(0.5, 0.5), (6.0, 0.5), (0.5, 3.7)]),
-    Region.polygon("rest", [(6.0, 0.5), (7.0, 3.7), (0.5, 3.7)]),
+    Region("near", x_m=(0.4, 3.3), y_m=(0.5, 2.1)),
+    Region("far", x_m=(2.9, 7.77), y_m=(0.0, 4.0)),
+    Region.from_corners("corner", [(0.5, 0.5), (6.0, 0.5), (0.5, 3.7)]),
+    Region.from_corners("rest", [(6.0, 0.5), (7.0, 3.7), (0.5, 3.7)]),
 )
 
 
 def of_odd(steps, index=None, regions=ODD):
-    odd = BevGrid(x=(0.0, 8.0), y=(0.0, 6.4), cell=0.32, heights=HEIGHTS)
+    odd = BevGrid(x_m=(0.0, 8.0), y_m=(0.0, 6.4), cell_m=0.32, heights=HEIGHTS)
     metric = CoverageMetric(odd, (0.4, 0.8), square_metres=True, blocks=8, regions=regions)
     for number, (sensor, reference, m2) in zip(index or range(len(steps)), steps, strict=True):
         metric.update(sensor, reference, weights=m2, block_index=number)
@@ -136,11 +136,11 @@ def test_a_point_belongs_to_a_region_by_its_own_place_whatever_the_cells():
         for height, band in HEIGHTS.items():
             found = coverage.estimate(region, height)
             np.testing.assert_allclose(found.value, twin(steps, region, *band), rtol=1e-6)
-            np.testing.assert_allclose(found.left_out[0], twin(steps[1:], region, *band), rtol=1e-6)
-            (row,) = (row for row in coverage.summary([region]) if row.height == height)
+            np.testing.assert_allclose(found.jackknife_values[0], twin(steps[1:], region, *band), rtol=1e-6)
+            (row,) = (row for row in coverage.summary([region]) if row.band == height)
             assert row.visible_m2 > 0
     # By the centres of cells it is another number.
-    cells = coverage.area.over(ODD[0].mask(coverage.grid), 0).sum(dim=0)
+    cells = coverage.area_sums.sum_cells(ODD[0].mask_cells(coverage.grid), 0).sum(dim=0)
     assert abs(cells[1] / cells[0] / coverage.estimate(ODD[0], "low").value[0] - 1) > 1e-3
 
 
@@ -158,20 +158,23 @@ def test_neither_the_order_of_points_nor_of_steps_moves_it():
         for region in ODD:
             one, two = (each.estimate(region, "high") for each in (whole, coverage))
             torch.testing.assert_close(one.value, two.value, rtol=1e-12, atol=0)
-            torch.testing.assert_close(one.left_out, two.left_out, rtol=1e-12, atol=0)
+            torch.testing.assert_close(one.jackknife_values, two.jackknife_values, rtol=1e-12, atol=0)
     with pytest.raises(ValueError, match="cannot merge metrics with different regions"):
         parts.merge_state(of_odd(steps[:1], regions=ODD[:1]))
 
 
 def test_a_region_that_was_not_asked_for_is_made_from_whole_cells_or_refused(tmp_path):
     of_odd(steps_of(20)).compute().save(tmp_path / "coverage.npz")
-    loaded, asked = Coverage.load(tmp_path / "coverage.npz"), Region("later", x=(0.32, 3.2), y=(0.64, 1.6))
+    loaded, asked = Coverage.load(tmp_path / "coverage.npz"), Region("later", x_m=(0.32, 3.2), y_m=(0.64, 1.6))
     there = of_odd(steps_of(20), regions=[asked]).compute()
     one, two = (each.estimate(asked, "low") for each in (there, loaded))
     torch.testing.assert_close(one.value, two.value, rtol=1e-12, atol=0)
-    assert (len(one.steps), len(two.steps)) == (20, 5)  # sums over cells are in fewer blocks
+    assert (len(one.frame_counts), len(two.frame_counts)) == (20, 5)  # sums over cells are in fewer blocks
     assert str(loaded.summary(ODD)) == str(of_odd(steps_of(20)).compute().summary(ODD))
-    for other in (Region("later", x=(0.3, 3.2), y=(0.64, 1.6)), Region.polygon("later", [(0, 0), (3.2, 0), (0, 3.2)])):
+    for other in (
+        Region("later", x_m=(0.3, 3.2), y_m=(0.64, 1.6)),
+        Region.from_corners("later", [(0, 0), (3.2, 0), (0, 3.2)]),
+    ):
         with pytest.raises(ValueError, match=r"'later': no points were summed up over it, and cells of 0\.32 m"):
             loaded.estimate(other, "low")
         assert loaded.estimate(other, "low", "known").value.isfinite().all()
@@ -179,7 +182,7 @@ def test_a_region_that_was_not_asked_for_is_made_from_whole_cells_or_refused(tmp
 
 def test_a_cell_has_the_ratio_of_its_own_sums():
     coverage = metric_over(steps_of(30), cell=4.0).compute()
-    band = coverage.area.totals()[0, 0]
+    band = coverage.area_sums.sum_blocks()[0, 0]
     radius = coverage.layers["radius_area_m"].values[0]
     detection = coverage.layers["detection_area_0.8m"].values[0]
     value = coverage.estimate(REGION, "low", "area").value
@@ -208,9 +211,9 @@ def test_it_needs_square_metres():
 
 
 def test_the_ray_budget_does_not_move_it():
-    ahead = Region("ahead", x=(0.0, 40.0), y=(-10.0, 10.0))
+    ahead = Region("ahead", x_m=(0.0, 40.0), y_m=(-10.0, 10.0))
     few, many = (
-        simulated(ahead, SurfaceReference(((ahead.x, ahead.y),), rays), steps=steps)
+        simulated(ahead, SurfaceReference(((ahead.x_m, ahead.y_m),), rays), steps=steps)
         for rays, steps in ((512, 32), (4096, 32))
     )
     for height in ("ground", "obstacle"):
@@ -222,7 +225,9 @@ def test_the_ray_budget_does_not_move_it():
 
 def simulated(region, reference_sensor, steps):
     """Height -> (value, error) of the radius and of the detection."""
-    metric = CoverageMetric(BevGrid(x=region.x, y=region.y, cell=0.5), max_radius=50.0, blocks=16, square_metres=True)
+    metric = CoverageMetric(
+        BevGrid(x_m=region.x, y_m=region.y, cell_m=0.5), max_radius=50.0, blocks=16, square_metres=True
+    )
     for frame in SimulatedFrames("courtyard", "front_roof_32", steps=steps, reference_sensor=reference_sensor):
         metric.update(frame.sensor, frame.reference, weights=frame.reference_weights, block_index=frame.index)
     coverage = metric.compute()

@@ -25,16 +25,16 @@ HEIGHT = torch.cat([torch.zeros(40), torch.ones(40)])
 
 def measured(grid, height=None, **parameters):
     metric = CoverageMetric(grid, **parameters)
-    metric.update(ON_RAMP, REFERENCE, height=height)
+    metric.update(ON_RAMP, REFERENCE, heights_m=height)
     return metric.compute()
 
 
 def test_on_a_ramp_bands_follow_the_ground():
     """By height the ramp is ground and what stands on it obstacle; by z the road is an obstacle from 5 to 20 m."""
     by_ground, by_z = measured(GROUND, HEIGHT), measured(VEHICLE)
-    assert (by_ground.points == 1).all()
+    assert (by_ground.point_counts == 1).all()
     torch.testing.assert_close(by_ground.radius[:, 0].float(), torch.tensor([[0.0] * 40, [1.0] * 40]))
-    road = by_z.points[:, 0]
+    road = by_z.point_counts[:, 0]
     assert road[0].tolist() == [1] * 5 + [0] * 35
     assert road[1].tolist() == [1] * 5 + [2] * 5 + [1] * 10 + [0] * 20
     assert (by_ground.band_frame, by_z.band_frame) == ("ground", "vehicle")
@@ -45,7 +45,7 @@ def test_on_level_ground_both_are_the_same():
     both = []
     for grid, height in ((GROUND, HEIGHT), (VEHICLE, None)):
         metric = CoverageMetric(grid, aggregations=(Maximum(),), sensors=("low", "high"))
-        metric.update({"low": ON_RAMP, "high": ABOVE}, points, height=height)
+        metric.update({"low": ON_RAMP, "high": ABOVE}, points, heights_m=height)
         both.append(metric.compute())
     by_ground, by_z = both
     for key, layer in by_ground.layers.items():
@@ -58,11 +58,11 @@ def test_points_without_ground_are_in_no_band_and_counted():
     holes = HEIGHT.clone()
     holes[:10] = math.nan
     result = measured(GROUND, holes)
-    assert result.points[:, 0].sum(dim=1).tolist() == [30, 40]
+    assert result.point_counts[:, 0].sum(dim=1).tolist() == [30, 40]
     assert (result.counts["no_ground_points"], result.counts["outside_points"]) == (10, 10)
     many = BevGrid(**EXTENT, heights={f"b{k}": (float(k), k + 1.0) for k in range(40)}, band_frame="ground")
-    assert len(many.bins(REFERENCE, holes).inside) == 70
-    assert GROUND.points_by_column(REFERENCE, holes).sum() == 70
+    assert len(many.assign_cells(REFERENCE, holes).point_indices) == 70
+    assert GROUND.count_points_by_column(REFERENCE, holes).sum() == 70
 
 
 @pytest.mark.parametrize(
@@ -96,7 +96,7 @@ def test_a_step_without_points_needs_no_heights():
 
 def test_results_of_two_band_frames_are_neither_merged_nor_compared(tmp_path):
     ground, vehicle = CoverageMetric(GROUND), CoverageMetric(VEHICLE)
-    ground.update(ON_RAMP, REFERENCE, height=HEIGHT)
+    ground.update(ON_RAMP, REFERENCE, heights_m=HEIGHT)
     with pytest.raises(ValueError, match="cannot merge metrics with different grid"):
         vehicle.merge_state(ground)
     with pytest.raises(RuntimeError, match=r"made by another metric .* or with other grid"):
@@ -111,16 +111,16 @@ def test_results_of_two_band_frames_are_neither_merged_nor_compared(tmp_path):
 
 def test_what_looks_at_frames_takes_their_heights():
     frame = Frame(
-        {"rig": ON_RAMP}, REFERENCE, 0, "ramp", sensor_points={"rig": {"one": 40}}, reference_heights_m=HEIGHT
+        {"rig": ON_RAMP}, REFERENCE, 0, "ramp", sensor_point_counts={"rig": {"one": 40}}, reference_heights_m=HEIGHT
     )
-    observer, k_cover = CoverageObserver(CoverageMetric(GROUND)), KCover(GROUND, (), square_metres=False)
+    observer, k_cover = CoverageObserver(CoverageMetric(GROUND)), KCover(GROUND, (), has_area_weights=False)
     density = PointDensity(GROUND, ())
     level = {"channels": 1, "columns": 1, "horizontal_fov_deg": 1, "max_range_m": 60, "mount": {"z_m": 1.0}}
     rays = [Lidar(name="ray", vertical_fov_deg=(up, up), **level) for up in (60, 0)]
     predicted = [FalseVisible([ray], None, GROUND) for ray in rays]
     for one in (observer, k_cover, density, *predicted):
         one.update(frame)
-    assert torch.equal(observer.compute().points, measured(GROUND, HEIGHT).points)
+    assert torch.equal(observer.compute().point_counts, measured(GROUND, HEIGHT).point_counts)
     assert k_cover.compute()[0].value == 0.5
     # All points of the rig are on the ramp, one in each square metre; over z half of them lie above 2 m.
     assert [number.value for number in density.compute()[1:]] == [1.0, 1.0]

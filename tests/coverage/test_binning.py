@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchcover.coverage.binning import mean_per_cell
+from torchcover.coverage.binning import compute_cell_means
 
 
 @settings(max_examples=50, deadline=None)
@@ -15,34 +15,34 @@ def test_means_are_those_of_a_loop(seed, points, cells, rows):
     generator = torch.Generator().manual_seed(seed)
     cell = torch.randint(cells, (points,), generator=generator)
     values = torch.randn(rows, points, generator=generator)
-    found = mean_per_cell(cell, values)
-    assert found.cell.tolist() == sorted(set(cell.tolist()))
-    assert found.mean.shape == (rows, len(found.cell))
-    for at, number in enumerate(found.cell.tolist()):
+    found = compute_cell_means(cell, values)
+    assert found.cell_indices.tolist() == sorted(set(cell.tolist()))
+    assert found.means.shape == (rows, len(found.cell_indices))
+    for at, number in enumerate(found.cell_indices.tolist()):
         chosen = values.double().numpy()[:, cell.numpy() == number]
-        assert found.points[at] == chosen.shape[1]
-        np.testing.assert_allclose(found.mean[:, at].numpy(), chosen.mean(axis=1), rtol=1e-13, atol=1e-15)
+        assert found.point_counts[at] == chosen.shape[1]
+        np.testing.assert_allclose(found.means[:, at].numpy(), chosen.mean(axis=1), rtol=1e-13, atol=1e-15)
 
 
 def test_sums_are_taken_in_float64():
     """Trap 8: 2**24 + 1 is not a float32, and 0.1 added 300,000 times in float32 drifts by more than 1e-5."""
     count = 300_000
     values = torch.full((1, count), 0.1)
-    found = mean_per_cell(torch.zeros(count, dtype=torch.int64), values)
-    assert found.mean.dtype == found.weight.dtype == torch.float64
-    np.testing.assert_allclose(found.mean.item(), float(np.float32(0.1)), rtol=1e-12)
+    found = compute_cell_means(torch.zeros(count, dtype=torch.int64), values)
+    assert found.means.dtype == found.weight_sums.dtype == torch.float64
+    np.testing.assert_allclose(found.means.item(), float(np.float32(0.1)), rtol=1e-12)
     large = torch.tensor([[2.0**24, 1.0, 1.0, 1.0]])
-    assert mean_per_cell(torch.zeros(4, dtype=torch.int64), large).mean.item() == (2.0**24 + 3) / 4
+    assert compute_cell_means(torch.zeros(4, dtype=torch.int64), large).means.item() == (2.0**24 + 3) / 4
 
 
 def test_infinite_values_stay_in_their_cell():
-    found = mean_per_cell(torch.tensor([0, 0, 2]), torch.tensor([[1.0, torch.inf, 3.0]]))
-    assert found.mean.tolist() == [[torch.inf, 3.0]]
-    assert (found.cell.dtype, found.points.dtype) == (torch.int64, torch.int64)
+    found = compute_cell_means(torch.tensor([0, 0, 2]), torch.tensor([[1.0, torch.inf, 3.0]]))
+    assert found.means.tolist() == [[torch.inf, 3.0]]
+    assert (found.cell_indices.dtype, found.point_counts.dtype) == (torch.int64, torch.int64)
 
 
 @pytest.mark.parametrize("weights", [None, torch.zeros(0)])
 def test_no_points_touch_no_cell(weights):
-    found = mean_per_cell(torch.zeros(0, dtype=torch.int64), torch.zeros(2, 0), weights)
-    assert (found.cell.numel(), found.points.numel(), found.mean.shape) == (0, 0, (2, 0))
-    assert found.mean.dtype == found.weight.dtype == torch.float64
+    found = compute_cell_means(torch.zeros(0, dtype=torch.int64), torch.zeros(2, 0), weights)
+    assert (found.cell_indices.numel(), found.point_counts.numel(), found.means.shape) == (0, 0, (2, 0))
+    assert found.means.dtype == found.weight_sums.dtype == torch.float64

@@ -9,15 +9,15 @@ import torch
 
 from torchcover import BevGrid, CoverageMetric, Region
 from torchcover.coverage import Coverage, Layer, Maximum, MeanOfMeans, PooledMean, Quantiles
-from torchcover.coverage.blocks import BlockSums, KnownCells
-from torchcover.estimation import jackknife_error, ratio_errors
+from torchcover.coverage.blocks import BlockSums, ObservedCells
+from torchcover.estimation import compute_jackknife_error, estimate_ratio_errors
 
 # Cells so large that the sensor point below a reference point is always the nearest.
 SHAPE = {"x": (0.0, 400.0), "y": (0.0, 100.0), "cell": 100.0, "heights": {"all": (-1.0, 1.0)}}
 GRID = BevGrid(**SHAPE)
-CELLS = GRID.cells
+CELLS = GRID.num_cells
 THRESHOLD = 0.5
-EVERYWHERE = Region("everywhere", GRID.x, GRID.y)
+EVERYWHERE = Region("everywhere", GRID.x_m, GRID.y_m)
 
 
 def clouds_of(radii: dict[int, list[float]]) -> tuple[torch.Tensor, torch.Tensor]:
@@ -58,7 +58,7 @@ def slow_blocks(steps, blocks: int, *, weighted: bool = False) -> dict[str, np.n
     length = 1
     while last // length >= blocks:
         length *= 2
-    sums = {name: np.zeros((blocks, CELLS)) for name in ("probed_steps", "radius", "detection")}
+    sums = {name: np.zeros((blocks, CELLS)) for name in ("observed_frames", "radius", "detection")}
     sums["steps"] = np.zeros(blocks)
     for step in steps:
         block = step["more"]["block_index"] // length
@@ -66,7 +66,7 @@ def slow_blocks(steps, blocks: int, *, weighted: bool = False) -> dict[str, np.n
         for cell, own in step["radii"].items():
             weights = step["weights"][cell] if weighted else [1.0] * len(own)
             radii = np.float32(own).astype(float)
-            sums["probed_steps"][block, cell] += 1
+            sums["observed_frames"][block, cell] += 1
             sums["radius"][block, cell] += np.average(radii, weights=weights)
             sums["detection"][block, cell] += np.average(radii <= THRESHOLD, weights=weights)
     return sums
@@ -85,7 +85,7 @@ def slow_jackknife(left_out: list[float], whole: float, sizes: list[float]) -> f
 
 def slow_region_error(sums: dict[str, np.ndarray], name: str) -> float:
     def mean(kept) -> float:
-        frames, total = sums["probed_steps"][kept].sum(axis=0), sums[name][kept].sum(axis=0)
+        frames, total = sums["observed_frames"][kept].sum(axis=0), sums[name][kept].sum(axis=0)
         return float(np.mean([total[cell] / frames[cell] for cell in range(CELLS) if frames[cell]]))
 
     used = [block for block in range(len(sums["steps"])) if sums["steps"][block]]
@@ -106,7 +106,7 @@ def assert_same_state(one: CoverageMetric, other: CoverageMetric) -> None:
 def test_the_jackknife_of_a_mean_is_the_textbook_standard_error(count):
     values = torch.randn(count, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(count))
     left_out = (values.sum(dim=0) - values) / (count - 1)
-    error = jackknife_error(left_out, values.mean(dim=0), torch.ones(count))
+    error = compute_jackknife_error(left_out, values.mean(dim=0), torch.ones(count))
     torch.testing.assert_close(error, values.std(dim=0) / math.sqrt(count))
 
 
@@ -114,7 +114,7 @@ def test_the_jackknife_of_a_mean_is_the_textbook_standard_error(count):
 def test_unequal_blocks_are_weighed_as_in_plain_loops(seed):
     random = np.random.default_rng(seed)
     sizes, left_out, whole = random.integers(1, 9, 11), random.random(11), random.random()
-    error = jackknife_error(*map(torch.as_tensor, (left_out, np.array(whole), sizes)))
+    error = compute_jackknife_error(*map(torch.as_tensor, (left_out, np.array(whole), sizes)))
     assert float(error) == pytest.approx(slow_jackknife(left_out.tolist(), whole, sizes.tolist()), rel=1e-12)
 
 
@@ -154,10 +154,10 @@ def test_one_step_a_block_gives_the_textbook_error_in_a_region():
 def test_sums_and_errors_are_those_of_plain_loops(count):
     steps = random_steps(count, seed=count)
     coverage, sums = metric_over(steps).compute(), slow_blocks(steps, 16)
-    np.testing.assert_array_equal(coverage.blocks.steps, sums["steps"])
-    cells, probed_steps, listed = coverage.blocks.spread_where(1)
+    np.testing.assert_array_equal(coverage.block_sums.frame_counts, sums["steps"])
+    cells, probed_steps, listed = coverage.block_sums.extract_common_cells(1)
     assert cells.tolist() == list(range(CELLS))
-    np.testing.assert_array_equal(probed_steps, sums["probed_steps"])
+    np.testing.assert_array_equal(probed_steps, sums["observed_frames"])
     np.testing.assert_allclose(listed[0], sums["radius"], rtol=1e-12)
     np.testing.assert_allclose(listed[1], sums["detection"], rtol=1e-12)
     (row,) = coverage.summary([EVERYWHERE])
@@ -170,7 +170,7 @@ def test_the_error_in_a_cell_is_that_of_a_ratio_of_sums_with_two_more_blocks():
     coverage, sums = metric_over(steps).compute(), slow_blocks(steps, 16)
     for name, found in zip(("radius", "detection"), coverage.errors.values(), strict=True):
         for cell in range(CELLS):
-            n, s = sums["probed_steps"][:, cell], sums[name][:, cell]
+            n, s = sums["observed_frames"][:, cell], sums[name][:, cell]
             mean, usual = s.sum() / n.sum(), n.sum() / np.count_nonzero(n)
             imagined = [0.0, 5.0 * mean] if name == "radius" else [0.0, 1.0]
             residual = [s[j] - mean * n[j] for j in range(16) if n[j]] + [usual * (own - mean) for own in imagined]
@@ -193,7 +193,7 @@ def test_no_error_is_told_from_fewer_than_8_blocks_nor_in_a_cell_that_fewer_prob
 
 def test_without_blocks_there_are_no_errors():
     coverage = metric_over(random_steps(20), blocks=1).compute()
-    assert (coverage.blocks, len(coverage.errors)) == (None, 0)
+    assert (coverage.block_sums, len(coverage.errors)) == (None, 0)
     assert math.isnan(coverage.summary([EVERYWHERE])[0].numbers["radius_m"].error)
 
 
@@ -278,20 +278,20 @@ def test_steps_without_a_number_are_counted_on(forward):
 def test_doubling_the_blocks_keeps_every_sum(count):
     steps = random_steps(count, dyadic=True)
     blocked, plain = metric_over(steps), metric_over(steps, blocks=1)
-    sums = torch.zeros(CELLS, plain.cells.shape[1] - 1, dtype=torch.float64)
-    sums.index_add_(0, (blocked.cells[:, 0] % CELLS).long(), blocked.cells[:, 1:])
-    assert torch.equal(sums, plain.cells[:, 1:])
-    assert blocked.block_steps.sum() == plain.block_steps.sum() == count
-    assert int(blocked.block_length) == 2 ** math.ceil(math.log2(count / 16))
-    used = blocked.block_steps[blocked.block_steps > 0]
+    sums = torch.zeros(CELLS, plain.cell_sums.shape[1] - 1, dtype=torch.float64)
+    sums.index_add_(0, (blocked.cell_sums[:, 0] % CELLS).long(), blocked.cell_sums[:, 1:])
+    assert torch.equal(sums, plain.cell_sums[:, 1:])
+    assert blocked.block_frame_counts.sum() == plain.block_frame_counts.sum() == count
+    assert int(blocked.frames_per_block) == 2 ** math.ceil(math.log2(count / 16))
+    used = blocked.block_frame_counts[blocked.block_frame_counts > 0]
     assert 8 <= len(used) <= 16
-    assert (used[:-1] == blocked.block_length).all()
+    assert (used[:-1] == blocked.frames_per_block).all()
 
 
 @pytest.mark.parametrize("blocks", [8, 16])
 @pytest.mark.parametrize("last", [7, 127, 128, 255, 256, 511, 512, 5000])
 def test_fine_blocks_are_worlds_as_long_as_there_is_room_and_parts_merge_to_them(blocks, last):
-    grid = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)})
+    grid = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=1.0, heights={"all": (-1.0, 1.0)})
     places = sorted({0, 1, last // 3, last // 2, last})
 
     def over(some):
@@ -305,22 +305,22 @@ def test_fine_blocks_are_worlds_as_long_as_there_is_room_and_parts_merge_to_them
 
     whole, merged = over(places), over(places[3:])
     merged.merge_state(over(places[:3]))
-    length = max(1, int(whole.block_length) // 16)
+    length = max(1, int(whole.frames_per_block) // 16)
     assert length == (1 if last < 16 * blocks else 2 ** math.ceil(math.log2((last + 1) / (16 * blocks))))
     expected = torch.zeros(16 * blocks, dtype=torch.float64)
     for place in places:
         expected[place // length] += 1.0 + place
     for metric in (whole, merged):
-        assert torch.equal(metric.compute().places.m2[:, 0], expected)
-        assert metric.fine_steps.sum() == metric.block_steps.sum() == len(places)
+        assert torch.equal(metric.compute().region_sums.areas_m2[:, 0], expected)
+        assert metric.fine_block_frame_counts.sum() == metric.block_frame_counts.sum() == len(places)
 
 
 @pytest.mark.parametrize("aggregations", [(), (Maximum(), PooledMean(), Quantiles((0.5,)))])
 def test_blocks_change_no_number(aggregations):
     steps = random_steps(40, weighted=True)
     blocked, plain = (metric_over(steps, blocks=blocks, aggregations=aggregations).compute() for blocks in (16, 1))
-    assert torch.equal(blocked.probed_steps, plain.probed_steps)
-    assert torch.equal(blocked.points, plain.points)
+    assert torch.equal(blocked.observed_frames, plain.observed_frames)
+    assert torch.equal(blocked.point_counts, plain.point_counts)
     for key, layer in plain.layers.items():
         torch.testing.assert_close(blocked.layers[key].values, layer.values, rtol=1e-12, atol=0, equal_nan=True)
 
@@ -329,7 +329,7 @@ def test_a_step_far_ahead_makes_room_and_leaves_a_gap():
     steps = random_steps(3, dyadic=True)
     steps[2]["more"]["block_index"] = 1_000_000
     coverage = metric_over(steps).compute()
-    assert coverage.blocks.steps.tolist() == [2] + [0] * 14 + [1]
+    assert coverage.block_sums.frame_counts.tolist() == [2] + [0] * 14 + [1]
     assert math.isnan(coverage.summary([EVERYWHERE])[0].numbers["radius_m"].error)
 
 
@@ -348,7 +348,7 @@ def test_numbers_of_steps_that_make_no_sense_are_refused(index, message):
 def test_weighted_means_are_those_of_plain_loops():
     steps = random_steps(30, seed=5, weighted=True)
     coverage, sums = metric_over(steps, aggregations=[PooledMean()]).compute(), slow_blocks(steps, 16, weighted=True)
-    frames = sums["probed_steps"].sum(axis=0)
+    frames = sums["observed_frames"].sum(axis=0)
     np.testing.assert_allclose(coverage.radius.flatten(), sums["radius"].sum(axis=0) / frames, rtol=1e-12)
     np.testing.assert_allclose(coverage.detection.flatten(), sums["detection"].sum(axis=0) / frames, rtol=1e-12)
     for cell in range(CELLS):
@@ -416,13 +416,13 @@ def test_bad_weights_are_refused_and_nothing_is_counted(weights, message):
         metric.update(*clouds_of({0: [0.5, 0.5]}), weights=torch.tensor(weights))
     with pytest.raises(ValueError, match="2 weights, 1 heights, 1 places in time and 1 errors for 1 reference clouds"):
         metric.update(*clouds_of({0: [0.5]}), weights=[torch.ones(1), torch.ones(1)])
-    assert int(metric.steps) == 0
+    assert int(metric.num_frames) == 0
 
 
 def test_points_of_another_density_with_weights_ask_the_same_question():
     """r = x from a sensor point at x = 0: the mean over [0, 1) is 1/2, the share within 0.3 m is 0.3."""
     uniform = torch.rand(200_000, generator=torch.Generator().manual_seed(0))
-    line = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)})
+    line = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=1.0, heights={"all": (-1.0, 1.0)})
     # Density p(x) = 1/2 + x, by the inverse of its integral; the weights are 1 / p(x).
     denser = (torch.sqrt(1 + 8 * uniform) - 1) / 2
 
@@ -450,12 +450,12 @@ def coverage_of(radii: np.ndarray, probed: np.ndarray) -> Coverage:
     counts, listed = dict.fromkeys(Coverage.COUNTS, 0), frames.flatten().nonzero().squeeze(1)
     return Coverage(
         grid=GRID,
-        thresholds=(THRESHOLD,),
-        max_radius=math.inf,
-        known=KnownCells(GRID.shape, at, *[frames.sum(dim=0).flatten()[at]] * 2),
+        thresholds_m=(THRESHOLD,),
+        max_radius_m=math.inf,
+        observed_cells=ObservedCells(GRID.shape, at, *[frames.sum(dim=0).flatten()[at]] * 2),
         layers=map(Layer, MeanOfMeans((THRESHOLD,)).quantities, means.flatten(1)[:, at]),
         counts=counts,
-        blocks=BlockSums(steps, tuple(frames.shape), listed, frames.flatten()[listed], sums.flatten(1)[:, listed]),
+        block_sums=BlockSums(steps, tuple(frames.shape), listed, frames.flatten()[listed], sums.flatten(1)[:, listed]),
     )
 
 
@@ -485,5 +485,5 @@ def test_two_errors_cover_what_a_cell_with_a_rare_event_has():
     blind = torch.from_numpy(np.random.default_rng(1).random((500, 16, 1, 1, 1)) < 0.1)
     once = torch.ones((16, 1, 1, 1), dtype=torch.int64)
     for unit, seen, truth in (("share", (~blind).double(), 0.9), ("m", torch.where(blind, 1.0, 0.2).double(), 0.28)):
-        each = [(float(sums.mean()), float(ratio_errors(once, sums, unit))) for sums in seen]
+        each = [(float(sums.mean()), float(estimate_ratio_errors(once, sums, unit))) for sums in seen]
         assert np.mean([abs(mean - truth) <= 2 * error for mean, error in each]) >= 0.93

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from torchcover import BevGrid, CoverageMetric, Region
-from torchcover.coverage.measures import known_mean
+from torchcover.coverage.measures import compute_cell_average
 
-GRID = BevGrid(x=(0.0, 8.0), y=(0.0, 4.0), cell=1.0, heights={"low": (0.0, 1.0), "high": (1.0, 2.0)})
-PART = Region("part", x=(1.0, 7.0), y=(0.0, 3.0))
+GRID = BevGrid(x_m=(0.0, 8.0), y_m=(0.0, 4.0), cell_m=1.0, heights={"low": (0.0, 1.0), "high": (1.0, 2.0)})
+PART = Region("part", x_m=(1.0, 7.0), y_m=(0.0, 3.0))
 
 
 def steps_of(count, seed=0, points=12):
@@ -37,22 +37,22 @@ def test_what_is_left_out_is_what_a_run_without_the_block_gives():
     coverage = metric_over(steps, blocks=16).compute()
     for height in GRID.heights:
         estimate = coverage.estimate(PART, height)
-        assert estimate.steps.tolist() == [4] * 10
+        assert estimate.frame_counts.tolist() == [4] * 10
         for block in range(10):
             kept = [number for number in range(40) if number // 4 != block]
             without = metric_over([steps[number] for number in kept], kept).compute()
             expected = without.estimate(PART, height).value
-            torch.testing.assert_close(estimate.left_out[block], expected, rtol=1e-10, atol=1e-12)
+            torch.testing.assert_close(estimate.jackknife_values[block], expected, rtol=1e-10, atol=1e-12)
 
 
 def test_a_difference_is_that_of_its_parts_block_by_block():
     steps = steps_of(40)
     nearer = [(torch.cat([sensor, sensor + 0.2]), reference) for sensor, reference in steps]
     one, other = (metric_over(run, blocks=16).compute().estimate(PART, "low") for run in (steps, nearer))
-    difference = other.minus(one)
+    difference = other.subtract(one)
     torch.testing.assert_close(difference.value, other.value - one.value)
     assert (difference.error < one.error + other.error).all()
-    assert (one.minus(one).error == 0).all()
+    assert (one.subtract(one).error == 0).all()
 
 
 def test_without_blocks_there_is_a_value_but_no_error():
@@ -64,12 +64,12 @@ def test_without_blocks_there_is_a_value_but_no_error():
 def test_the_mean_over_known_cells_is_that_of_the_map():
     coverage = metric_over(steps_of(9)).compute()
     for band, height in enumerate(GRID.heights):
-        cells = coverage.radius[band][PART.mask(GRID)]
+        cells = coverage.radius[band][PART.mask_cells(GRID)]
         assert coverage.estimate(PART, height).value[0].item() == pytest.approx(cells.nanmean().item(), rel=1e-12)
 
 
 def test_nothing_known_is_unknown():
-    assert known_mean(torch.zeros(5, dtype=torch.int64), torch.zeros(2, 5, dtype=torch.float64)).isnan().all()
+    assert compute_cell_average(torch.zeros(5, dtype=torch.int64), torch.zeros(2, 5, dtype=torch.float64)).isnan().all()
 
 
 def test_the_summary_has_the_numbers_with_their_errors():
@@ -102,9 +102,9 @@ def test_numbers_of_worlds_that_are_drawn_again_are_those_of_a_run_over_them(mea
     weights = torch.tensor(np.bincount(drawn, minlength=10), dtype=torch.float64)
     whole = over(range(10))
     once = torch.ones_like(weights)
-    torch.testing.assert_close(whole.resampled(torch.stack([weights, once]))[0], over(drawn).value)
-    torch.testing.assert_close(whole.resampled(once[None])[0], whole.value)
-    torch.testing.assert_close(whole[1:].resampled(1 - torch.eye(10)), whole.left_out[:, 1:])
+    torch.testing.assert_close(whole.resample(torch.stack([weights, once]))[0], over(drawn).value)
+    torch.testing.assert_close(whole.resample(once[None])[0], whole.value)
+    torch.testing.assert_close(whole[1:].resample(1 - torch.eye(10)), whole.jackknife_values[:, 1:])
 
 
 @pytest.mark.parametrize("measure", ["area", "known"])
@@ -113,7 +113,7 @@ def test_numbers_without_maps_are_those_of_the_result_to_the_last_bit(measure):
     for number, (sensor, reference) in enumerate(steps_of(40)):
         metric.update(sensor, reference, weights=reference[:, 0] + 0.1, block_index=number)
     places = [(PART, height) for height in GRID.heights]
-    for place, found in zip(places, metric.estimates(places, measure), strict=True):
+    for place, found in zip(places, metric.estimate_regions(places, measure), strict=True):
         expected = metric.compute().estimate(*place, measure)
         assert found.quantities == expected.quantities
         for name in ("value", "left_out", "steps"):

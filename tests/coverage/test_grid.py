@@ -31,7 +31,7 @@ def index_of(grid, point):
 @pytest.mark.parametrize("axis", ["x", "y"])
 def test_cells_are_half_open_wherever_the_range_lies(bounds, axis):
     other = "y" if axis == "x" else "x"
-    grid = BevGrid(**{axis: bounds, other: (0.0, 1.0)}, cell=0.5, heights=ONE_BAND)
+    grid = BevGrid(**{axis: bounds, other: (0.0, 1.0)}, cell_m=0.5, heights=ONE_BAND)
     count = round((bounds[1] - bounds[0]) / 0.5)
     place = {"x": 2, "y": 1}[axis]
     for cell in range(count):
@@ -43,7 +43,7 @@ def test_cells_are_half_open_wherever_the_range_lies(bounds, axis):
 
 
 def test_bands_are_half_open_and_touch_without_a_gap():
-    grid = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0)
+    grid = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=1.0)
     for z, band in [(-0.5, 0), (0.0, 0), (0.4999, 0), (0.5, 1), (1.9999, 1), (2.0, None), (-0.5001, None)]:
         found = index_of(grid, at(z=z))
         assert (found and found[0]) == band if band is not None else found is None
@@ -52,7 +52,7 @@ def test_bands_are_half_open_and_touch_without_a_gap():
 @pytest.mark.parametrize("order", [("low", "middle", "high"), ("high", "low", "middle"), ("middle", "high", "low")])
 def test_bands_come_in_any_order_and_with_gaps(order):
     bounds = {"low": (-2.0, -1.0), "middle": (-1.0, 0.5), "high": (3.0, 4.0)}
-    grid = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0, heights={name: bounds[name] for name in order})
+    grid = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=1.0, heights={name: bounds[name] for name in order})
     expected = {-2.0: "low", -1.5: "low", -1.0: "middle", 0.0: "middle", 0.5: None, 2.0: None, 3.0: "high", 4.0: None}
     for z, name in {**expected, -2.5: None, 9.0: None}.items():
         found = index_of(grid, at(z=z))
@@ -63,23 +63,23 @@ def test_many_bands_are_those_that_few_would_be():
     heights = {
         f"{k}": (0.1 * k, 0.1 * (k + 1) if k % 3 else 0.1 * k + 0.05) for k in np.random.default_rng(0).permutation(50)
     }
-    grid = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0, heights=heights)
+    grid = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=1.0, heights=heights)
     for z in np.linspace(-0.1, 5.1, 300):
         expected = [band for band, (low, high) in enumerate(heights.values()) if low <= z < high]
-        assert grid.cell_of(at(z=z)).item() == (expected[0] if expected else -1)
+        assert grid.find_cells(at(z=z)).item() == (expected[0] if expected else -1)
 
 
 @pytest.mark.parametrize("shape", [(3,), (5, 2), (5, 4)])
 def test_points_of_another_shape_are_refused(shape):
     with pytest.raises(ValueError, match=r"shape \(N, 3\) is needed"):
-        BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0).cell_of(torch.zeros(shape))
+        BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=1.0).find_cells(torch.zeros(shape))
 
 
 def test_cells_are_numbered_band_by_band_then_row_by_row():
-    grid = BevGrid(x=(0.0, 4.0), y=(-1.0, 2.0), cell=1.0, heights={"a": (0.0, 1.0), "b": (1.0, 2.0)})
+    grid = BevGrid(x_m=(0.0, 4.0), y_m=(-1.0, 2.0), cell_m=1.0, heights={"a": (0.0, 1.0), "b": (1.0, 2.0)})
     assert grid.shape == (2, 3, 4)
-    assert grid.cells == 24
-    assert grid.cell_of(at(x=3.5, y=0.5, z=1.5)).item() == (1 * 3 + 1) * 4 + 3
+    assert grid.num_cells == 24
+    assert grid.find_cells(at(x=3.5, y=0.5, z=1.5)).item() == (1 * 3 + 1) * 4 + 3
 
 
 @pytest.mark.parametrize(
@@ -87,12 +87,12 @@ def test_cells_are_numbered_band_by_band_then_row_by_row():
 )
 def test_a_border_is_the_decimal_that_one_writes(cell, bounds):
     """Multiples of 0.1 are not representable: 3 * 0.1 > 0.3, and a point at x = 0.3 belongs to the cell from 0.3 on."""
-    grid = BevGrid(x=bounds, y=(0.0, cell), cell=cell, heights=ONE_BAND)
+    grid = BevGrid(x_m=bounds, y_m=(0.0, cell), cell_m=cell, heights=ONE_BAND)
     decimal = Fraction(str(cell))
     borders = [float(bounds[0] + decimal * k) for k in range(grid.shape[2] + 1)]
     assert grid.x_edges_m.tolist() == borders
     points = torch.tensor([[border, 0.0, 0.0] for border in borders], dtype=torch.float64)
-    assert grid.cell_of(points).tolist() == [*range(grid.shape[2]), -1]
+    assert grid.find_cells(points).tolist() == [*range(grid.shape[2]), -1]
 
 
 @settings(max_examples=100, deadline=None)
@@ -104,13 +104,13 @@ def test_a_border_is_the_decimal_that_one_writes(cell, bounds):
 )
 def test_a_point_lies_between_the_borders_of_its_cell(low, count, cell, share):
     bounds = (low * cell, (low + count) * cell)
-    grid = BevGrid(x=(0.0, cell), y=bounds, cell=cell, heights=ONE_BAND)
+    grid = BevGrid(x_m=(0.0, cell), y_m=bounds, cell_m=cell, heights=ONE_BAND)
     edges = grid.y_edges_m
     assert grid.shape == (1, count, 1)
     assert (edges[0], edges[-1]) == bounds
     assert (edges.diff() > 0).all()
     y = bounds[0] + share * (bounds[1] - bounds[0])
-    found = grid.cell_of(at(x=0.0, y=y)).item()
+    found = grid.find_cells(at(x=0.0, y=y)).item()
     if bounds[0] <= y < bounds[1]:
         assert edges[found] <= y < edges[found + 1]
     else:
@@ -119,13 +119,13 @@ def test_a_point_lies_between_the_borders_of_its_cell(low, count, cell, share):
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
 def test_points_of_any_type_are_compared_as_they_are(dtype):
-    grid = BevGrid(x=(0, 1), y=(0, 1), cell=0.1, heights=ONE_BAND)
+    grid = BevGrid(x_m=(0, 1), y_m=(0, 1), cell_m=0.1, heights=ONE_BAND)
     x = torch.arange(10).to(dtype) / 10
     points = torch.stack([x, torch.zeros_like(x), torch.zeros_like(x)], dim=1)
     # What 0.7 becomes in a short type lies on one side of 0.7.
     expected = [max(k for k in range(10) if value >= k / 10) for value in x.double().tolist()]
-    assert grid.cell_of(points).tolist() == expected
-    assert grid.cell_of(points.T.contiguous().T.requires_grad_()).tolist() == expected
+    assert grid.find_cells(points).tolist() == expected
+    assert grid.find_cells(points.T.contiguous().T.requires_grad_()).tolist() == expected
 
 
 @pytest.mark.parametrize(
@@ -143,7 +143,7 @@ def test_points_of_any_type_are_compared_as_they_are(dtype):
 )
 def test_cells_are_those_of_a_search_among_the_borders(x, cell, monkeypatch):
     """On every border, beside it, between, far out, and for what is no number; in one part and in several."""
-    grid = BevGrid(x=x, y=(0.0, cell), cell=cell, heights=ONE_BAND)
+    grid = BevGrid(x_m=x, y_m=(0.0, cell), cell_m=cell, heights=ONE_BAND)
     edges = grid.x_edges_m.numpy()
     between = np.random.default_rng(0).uniform(*x, 5000)
     far = [-np.inf, np.inf, np.nan, -1.7e308, 1.7e308, 0.0]
@@ -154,11 +154,11 @@ def test_cells_are_those_of_a_search_among_the_borders(x, cell, monkeypatch):
     points[:, 0] = torch.from_numpy(values)
     for part in (65_536, 1000):
         monkeypatch.setattr("torchcover.coverage.grid.PART", part)
-        np.testing.assert_array_equal(grid.cell_of(points), expected)
+        np.testing.assert_array_equal(grid.find_cells(points), expected)
 
 
 def test_no_points_have_no_cells():
-    cells = BevGrid(x=(0, 1), y=(0, 1), cell=0.1).cell_of(torch.zeros(0, 3))
+    cells = BevGrid(x_m=(0, 1), y_m=(0, 1), cell_m=0.1).find_cells(torch.zeros(0, 3))
     assert (cells.shape, cells.dtype) == ((0,), torch.int64)
 
 
@@ -166,38 +166,38 @@ def test_no_points_have_no_cells():
 
 
 def test_centres_lie_in_the_middle():
-    grid = BevGrid(x=(-1.0, 1.0), y=(2.0, 3.0), cell=0.5)
-    assert grid.x_centres_m.tolist() == [-0.75, -0.25, 0.25, 0.75]
-    assert grid.y_centres_m.tolist() == [2.25, 2.75]
+    grid = BevGrid(x_m=(-1.0, 1.0), y_m=(2.0, 3.0), cell_m=0.5)
+    assert grid.x_centers_m.tolist() == [-0.75, -0.25, 0.25, 0.75]
+    assert grid.y_centers_m.tolist() == [2.25, 2.75]
 
 
 def test_the_diagonal_spans_all_bands():
-    grid = BevGrid(x=(-1.0, 2.0), y=(0.0, 4.0), cell=0.5, heights={"b": (5.0, 12.0), "a": (0.0, 1.0)})
+    grid = BevGrid(x_m=(-1.0, 2.0), y_m=(0.0, 4.0), cell_m=0.5, heights={"b": (5.0, 12.0), "a": (0.0, 1.0)})
     assert grid.diagonal_m == 13.0
 
 
 def test_the_defaults_are_the_papers():
-    grid = BevGrid(x=(0, 20), y=(-5, 5))
-    assert grid.cell == 0.25
+    grid = BevGrid(x_m=(0, 20), y_m=(-5, 5))
+    assert grid.cell_m == 0.25
     assert grid.heights == {"ground": (-0.5, 0.5), "obstacle": (0.5, 2.0)}
     assert list(grid.heights) == ["ground", "obstacle"]
 
 
 def test_grids_are_equal_when_their_cells_mean_the_same():
     heights = {"a": (0.0, 1.0), "b": (1.0, 2.0)}
-    grid = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights=heights)
-    same = BevGrid(x=[0, 2], y=(0, 1), cell=1, heights={"a": [0, 1], "b": [1, 2]})
+    grid = BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 1.0), cell_m=1.0, heights=heights)
+    same = BevGrid(x_m=[0, 2], y_m=(0, 1), cell_m=1, heights={"a": [0, 1], "b": [1, 2]})
     assert grid == same
     assert hash(grid) == hash(same)
     assert repr(grid) == repr(same)
-    assert grid != BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights={"b": (1.0, 2.0), "a": (0.0, 1.0)})
-    assert grid != BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=0.5, heights=heights)
+    assert grid != BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 1.0), cell_m=1.0, heights={"b": (1.0, 2.0), "a": (0.0, 1.0)})
+    assert grid != BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 1.0), cell_m=0.5, heights=heights)
     assert grid != "a grid"
 
 
 def test_a_grid_does_not_change_with_its_arguments():
     heights = {"a": (0.0, 1.0)}
-    grid = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights=heights)
+    grid = BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 1.0), cell_m=1.0, heights=heights)
     heights["b"] = (1.0, 2.0)
     assert grid.shape == (1, 1, 2)
 
@@ -208,7 +208,7 @@ def test_a_grid_does_not_change_with_its_arguments():
 @pytest.mark.parametrize("cell", [0.0, -0.5, math.nan, math.inf])
 def test_a_cell_without_a_length_is_refused(cell):
     with pytest.raises(ValueError, match=f"cell: a positive length in metres is needed; got {cell}"):
-        BevGrid(x=(0, 1), y=(0, 1), cell=cell)
+        BevGrid(x_m=(0, 1), y_m=(0, 1), cell_m=cell)
 
 
 @pytest.mark.parametrize("axis", ["x", "y"])
@@ -230,7 +230,7 @@ def test_a_cell_without_a_length_is_refused(cell):
 def test_bounds_that_do_not_make_cells_are_refused(axis, bounds, message):
     other = "y" if axis == "x" else "x"
     with pytest.raises(ValueError, match=f"^{axis}: {message}"):
-        BevGrid(**{axis: bounds, other: (0.0, 1.0)}, cell=0.5)
+        BevGrid(**{axis: bounds, other: (0.0, 1.0)}, cell_m=0.5)
 
 
 @pytest.mark.parametrize(
@@ -244,11 +244,11 @@ def test_bounds_that_do_not_make_cells_are_refused(axis, bounds, message):
 )
 def test_bands_that_make_no_sense_are_refused(heights, message):
     with pytest.raises(ValueError, match=message):
-        BevGrid(x=(0, 1), y=(0, 1), cell=0.5, heights=heights)
+        BevGrid(x_m=(0, 1), y_m=(0, 1), cell_m=0.5, heights=heights)
 
 
 def test_a_grid_too_large_for_the_memory_is_refused_before_it_is_made():
     with pytest.raises(ValueError, match=r"x: inf cells of 1e-310 m, over 100,000,000: use larger cells"):
-        BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1e-310)
+        BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=1e-310)
     with pytest.raises(ValueError, match="the grid has 200,000,000 cells, over 100,000,000: use larger cells"):
-        BevGrid(x=(0, 10_000), y=(0, 10_000), cell=1.0)
+        BevGrid(x_m=(0, 10_000), y_m=(0, 10_000), cell_m=1.0)

@@ -8,13 +8,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchcover.coverage.aggregations.quantiles import bin_of, check_levels, histogram_quantiles
+from torchcover.coverage.aggregations.quantiles import check_levels, compute_histogram_quantiles, find_bins
 
 
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.integers(-5, 5), min_size=2, max_size=6).map(sorted), st.floats(-6, 6))
 def test_bin_of_is_the_definition(edges, value):
-    found = bin_of(torch.tensor([value], dtype=torch.float64), torch.tensor(edges, dtype=torch.float64)).item()
+    found = find_bins(torch.tensor([value], dtype=torch.float64), torch.tensor(edges, dtype=torch.float64)).item()
     bins = [i for i in range(len(edges) - 1) if edges[i] <= value < edges[i + 1]]
     assert found == (bins[0] if bins else -1)
 
@@ -29,7 +29,7 @@ def test_a_quantile_lies_in_the_bin_of_the_true_one(values, level):
     histogram = torch.zeros(10, 2, dtype=torch.float64)
     for value in values:
         histogram[int(value), 0] += 1.0
-    found = histogram_quantiles(histogram, edges, (level,))
+    found = compute_histogram_quantiles(histogram, edges, (level,))
     true = np.quantile(values, level, method="inverted_cdf")
     assert math.floor(true) <= found[0, 0].item() <= math.floor(true) + 1
     assert found[0, 1].isnan()
@@ -38,7 +38,7 @@ def test_a_quantile_lies_in_the_bin_of_the_true_one(values, level):
 def test_quantiles_are_linear_within_a_bin():
     edges = torch.tensor([0.0, 1.0, 3.0, math.inf], dtype=torch.float64)
     histogram = torch.tensor([[0.0], [4.0], [1.0]], dtype=torch.float64)
-    found = histogram_quantiles(histogram, edges, (0.0, 0.2, 0.4, 0.8, 0.9, 1.0))
+    found = compute_histogram_quantiles(histogram, edges, (0.0, 0.2, 0.4, 0.8, 0.9, 1.0))
     assert found.flatten().tolist() == [1.0, 1.5, 2.0, 3.0, math.inf, math.inf]
 
 
@@ -49,7 +49,7 @@ def test_a_tie_stays_where_it_is_however_the_weights_are_rounded(weights, scale)
     *below, above = weights
     edges = torch.tensor([*torch.linspace(0, 1, len(below) + 1), 10.0, 11.0], dtype=torch.float64)
     histogram = scale * torch.tensor([*below, 0.0, above], dtype=torch.float64)[:, None]
-    assert histogram_quantiles(histogram, edges, (0.5,)).item() == pytest.approx(1.0)
+    assert compute_histogram_quantiles(histogram, edges, (0.5,)).item() == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("levels", [(), (0.5, 1.1), (math.nan,), (-0.1,), (0.5, 0.5), (0.5, 0.5000001)])

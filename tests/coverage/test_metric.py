@@ -9,13 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchcover import BevGrid, CoverageMetric
-from torchcover.coverage import Maximum, MeanOfMeans, PooledMean, Quantiles, StepQuantiles
+from torchcover.coverage import FrameQuantiles, Maximum, MeanOfMeans, PooledMean, Quantiles
 
-GRID = BevGrid(x=(-2.0, 3.0), y=(-1.5, 1.0), cell=0.5, heights={"high": (1.0, 2.0), "low": (-1.0, 0.5)})
-ONE_CELL = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)})
+GRID = BevGrid(x_m=(-2.0, 3.0), y_m=(-1.5, 1.0), cell_m=0.5, heights={"high": (1.0, 2.0), "low": (-1.0, 0.5)})
+ONE_CELL = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=1.0, heights={"all": (-1.0, 1.0)})
 NOTHING = torch.zeros(0, 3)
 SETS_OF_THRESHOLDS = ((0.1,), (0.25,), (0.5,), (0.1, 0.25, 0.5), (0.25, 0.4, 3.0))
-EVERY_AGGREGATION = (Maximum(), PooledMean(), Quantiles((0.25, 0.9)), StepQuantiles((0.5,)))
+EVERY_AGGREGATION = (Maximum(), PooledMean(), Quantiles((0.25, 0.9)), FrameQuantiles((0.5,)))
 OPTIONS = {"aggregations": EVERY_AGGREGATION}
 
 
@@ -59,7 +59,7 @@ def random_steps(seed, steps=3, dyadic=True, empty=True):
 @pytest.mark.parametrize("backend", ["cdist", "kdtree"])
 def test_one_sensor_point_over_a_plane_of_reference_points(backend):
     """r is the distance to that point; a grid of four points a cell, two bands of which one is empty."""
-    grid = BevGrid(x=(-4.0, 4.0), y=(-2.0, 2.0), cell=1.0)
+    grid = BevGrid(x_m=(-4.0, 4.0), y_m=(-2.0, 2.0), cell_m=1.0)
     x, y = torch.meshgrid(torch.arange(-4, 4, 0.5) + 0.25, torch.arange(-2, 2, 0.5) + 0.25, indexing="ij")
     plane = torch.stack([x.flatten(), y.flatten(), torch.zeros(128)], dim=1)
     result = coverage([(cloud([1, 0, 1]), plane)], grid, (1.5, 3.0), backend=backend)
@@ -70,7 +70,7 @@ def test_one_sensor_point_over_a_plane_of_reference_points(backend):
             assert result.radius[0, row, column].item() == pytest.approx(sum(r) / 4, rel=1e-6)
             for at, threshold in enumerate((1.5, 3.0)):
                 assert result.detection[at, 0, row, column].item() == sum(d <= threshold for d in r) / 4
-    assert (result.points[0] == 4).all()
+    assert (result.point_counts[0] == 4).all()
     assert result.radius[1].isnan().all()
 
 
@@ -80,14 +80,14 @@ def test_a_mean_of_means_not_a_pooled_mean():
     assert result.radius.item() == 0.5
     assert result.detection.item() == 0.5
     assert map_of(result, "radius_pooled_m").item() == (1000 * 0.125 + 0.875) / 1001
-    assert (result.probed_steps.item(), result.points.item()) == (2, 1001)
+    assert (result.observed_frames.item(), result.point_counts.item()) == (2, 1001)
 
 
 def test_a_step_without_a_point_in_the_cell_does_not_count_there():
-    grid = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)})
+    grid = BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 1.0), cell_m=1.0, heights={"all": (-1.0, 1.0)})
     result = coverage([(ORIGIN, points_at(0.5)), (ORIGIN, cloud([1, 0, 0])), (ORIGIN, points_at(0.25))], grid)
     assert result.radius.flatten().tolist() == [0.375, 1.0]
-    assert result.probed_steps.flatten().tolist() == [2, 1]
+    assert result.observed_frames.flatten().tolist() == [2, 1]
 
 
 def test_the_nearest_sensor_point_may_lie_outside_the_grid():
@@ -101,17 +101,17 @@ def test_reference_points_outside_the_grid_change_nothing_but_their_count():
     outside = cloud([1, 0, 0], [-0.01, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, -1.01])
     alone, together = coverage([(ORIGIN, inside)]), coverage([(ORIGIN, torch.cat([outside, inside]))])
     assert torch.equal(alone.radius, together.radius)
-    assert together.points.item() == 2
+    assert together.point_counts.item() == 2
     assert (alone.counts["outside_points"], together.counts["outside_points"]) == (0, 5)
 
 
 def test_unknown_cells_are_nan_with_count_zero():
-    grid = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)})
+    grid = BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 1.0), cell_m=1.0, heights={"all": (-1.0, 1.0)})
     result = coverage([(ORIGIN, points_at(0.5))], grid, (0.4, 0.6), **OPTIONS)
     for values in (result.detection, *(layer.values for layer in result.layers.values())):
         assert values[..., 1].isnan().all()
         assert not values[..., 0].isnan().any()
-    assert (result.probed_steps[..., 1].item(), result.points[..., 1].item()) == (0, 0)
+    assert (result.observed_frames[..., 1].item(), result.point_counts[..., 1].item()) == (0, 0)
 
 
 # Thresholds
@@ -129,7 +129,7 @@ def test_a_point_at_exactly_the_threshold_is_detected(threshold, dtype):
 def test_several_thresholds_in_one_pass():
     result = coverage([(ORIGIN, points_at(0.0, 0.25, 0.5, 0.75))], ONE_CELL, (0.25, 0.0, 10.0, 0.5))
     assert result.detection.flatten().tolist() == [0.5, 0.25, 1.0, 0.75]
-    assert result.thresholds == (0.25, 0.0, 10.0, 0.5)
+    assert result.thresholds_m == (0.25, 0.0, 10.0, 0.5)
 
 
 def test_no_thresholds_give_no_detection():
@@ -146,14 +146,14 @@ def test_a_step_in_which_the_rig_saw_nothing_is_blind_not_missing():
         [(NOTHING, points_at(0.5)), (ORIGIN, points_at(0.5))], ONE_CELL, (0.75,), aggregations=[Maximum()]
     )
     assert (result.radius.item(), map_of(result, "radius_maximum_m").item()) == (math.inf, math.inf)
-    assert (result.detection.item(), result.probed_steps.item()) == (0.5, 2)
+    assert (result.detection.item(), result.observed_frames.item()) == (0.5, 2)
     assert result.counts["empty_sensor_frames"] == 1
 
 
 def test_an_empty_sensor_cloud_gives_max_radius():
     result = coverage([(NOTHING, points_at(0.5)), (ORIGIN, points_at(0.5))], max_radius=8.0)
     assert result.radius.item() == 4.25
-    assert result.max_radius == 8.0
+    assert result.max_radius_m == 8.0
 
 
 def test_a_blind_step_detects_nothing_even_at_a_threshold_of_max_radius():
@@ -164,8 +164,8 @@ def test_a_blind_step_detects_nothing_even_at_a_threshold_of_max_radius():
 
 def test_an_empty_reference_cloud_says_nothing():
     result = coverage([(ORIGIN, NOTHING), (ORIGIN, points_at(0.5)), (NOTHING, NOTHING)], **OPTIONS)
-    assert (result.radius.item(), result.probed_steps.item()) == (0.5, 1)
-    assert (result.counts["frames"], result.counts["empty_reference_frames"]) == (3, 2)
+    assert (result.radius.item(), result.observed_frames.item()) == (0.5, 1)
+    assert (result.counts["num_frames"], result.counts["empty_reference_frames"]) == (3, 2)
     assert result.counts["empty_sensor_frames"] == 1
 
 
@@ -201,7 +201,7 @@ def test_a_search_bounded_by_the_threshold_detects_the_same_to_the_last_bit():
     steps = random_steps(11, steps=6)
     whole, bounded = (coverage(steps, GRID, (0.25, 0.5), max_radius=limit) for limit in (math.inf, 0.5))
     assert torch.equal(whole.detection.nan_to_num(-1), bounded.detection.nan_to_num(-1))
-    assert (bounded.radius[bounded.probed_steps > 0] <= 0.5).all()
+    assert (bounded.radius[bounded.observed_frames > 0] <= 0.5).all()
 
 
 def test_without_radii_only_points_near_the_reference_matter_to_the_last_bit():
@@ -240,7 +240,7 @@ def test_shorter_types_give_what_their_rounded_coordinates_give(slow_coverage, d
     result = coverage(steps, GRID)
     assert result.radius.dtype == result.detection.dtype == torch.float64
     np.testing.assert_allclose(result.radius.numpy(), expected["radius"], rtol=1e-6)
-    np.testing.assert_array_equal(result.points.numpy(), expected["points"])
+    np.testing.assert_array_equal(result.point_counts.numpy(), expected["points"])
 
 
 @pytest.mark.parametrize(
@@ -248,18 +248,18 @@ def test_shorter_types_give_what_their_rounded_coordinates_give(slow_coverage, d
     [(torch.bfloat16, 0.5, 0.4), (torch.float16, 0.25, 0.4), (torch.float16, 1.0, 0.1), (torch.float32, 0.25, 1e-4)],
 )
 def test_types_that_are_too_coarse_for_cells_or_thresholds_are_refused(dtype, cell, threshold):
-    grid = BevGrid(x=(0.0, 80.0), y=(-20.0, 20.0), cell=cell)
+    grid = BevGrid(x_m=(0.0, 80.0), y_m=(-20.0, 20.0), cell_m=cell)
     metric, cloud = CoverageMetric(grid, (threshold,)), torch.zeros(3, 3)
     for clouds in ((cloud.to(dtype), cloud.double()), (cloud.double(), cloud.to(dtype))):
         with pytest.raises(ValueError, match=rf"{dtype}"[6:] + r" coordinates are .* apart at 80 m, .* wider type"):
             metric.update(*clouds)
-    assert metric.compute().counts["frames"] == 0
+    assert metric.compute().counts["num_frames"] == 0
     metric.update(cloud.double(), cloud.double())
 
 
 @pytest.mark.filterwarnings("error")
 def test_numbers_that_mean_something_else_than_they_seem_are_warned_of_once():
-    grid = BevGrid(x=(0.0, 10.0), y=(0.0, 10.0), cell=1.0)
+    grid = BevGrid(x_m=(0.0, 10.0), y_m=(0.0, 10.0), cell_m=1.0)
     ground = torch.rand(1200, 3) * torch.tensor([10.0, 10.0, 0.2])
     in_lidar_frame, over_cells, right = (CoverageMetric(grid, max_radius=9.0) for _ in range(3))
     in_lidar_frame.update(ground, ground - torch.tensor([0.0, 0.0, 1.8]))
@@ -280,7 +280,7 @@ def test_numbers_that_mean_something_else_than_they_seem_are_warned_of_once():
 def assert_same(one, other):
     assert one.counts == other.counts
     assert one.layers.keys() == other.layers.keys()
-    for name in ("probed_steps", "points", *one.layers):
+    for name in ("observed_frames", "points", *one.layers):
         torch.testing.assert_close(map_of(one, name), map_of(other, name), rtol=1e-12, atol=0, equal_nan=True)
 
 
@@ -309,7 +309,7 @@ def test_more_sensor_points_never_make_it_worse(seed):
     steps = random_steps(seed, empty=False)
     more = [(torch.cat([sensor, sensor + 0.5]), reference) for sensor, reference in steps]
     before, after = coverage(steps, GRID, **OPTIONS), coverage(more, GRID, **OPTIONS)
-    known = before.probed_steps > 0
+    known = before.observed_frames > 0
     assert (after.radius <= before.radius + 1e-12)[known].all()
     assert (after.detection >= before.detection - 1e-12)[:, known].all()
     assert (map_of(before, "radius_maximum_m") >= before.radius - 1e-12)[known].all()
@@ -320,7 +320,7 @@ def test_a_point_covers_from_a_threshold_as_large_as_its_error_on_whatever_else_
     error = torch.linspace(-0.6, 0.6, 40)[torch.randperm(40, generator=torch.Generator().manual_seed(3))]
     asked = {thresholds: CoverageMetric(ONE_CELL, thresholds, max_radius=9.0) for thresholds in SETS_OF_THRESHOLDS}
     for metric in asked.values():
-        metric.update([points], [reference], error=[error])
+        metric.update([points], [reference], errors_m=[error])
     found = {thresholds: metric.compute() for thresholds, metric in asked.items()}
     (radius,) = {float(one.radius) for one in found.values()}
     assert radius == float(coverage([(points[error.abs() <= 0.4], reference)], max_radius=9.0).radius)
@@ -335,14 +335,14 @@ def test_errors_are_those_of_all_sensors_one_after_the_other():
     points, reference = torch.rand(2, 40, 3, generator=torch.Generator().manual_seed(2)).unbind()
     error, far = torch.linspace(-0.6, 0.6, 40), torch.full((5,), math.inf)
     by_name, plain = (CoverageMetric(ONE_CELL, (0.3,), max_radius=9.0, sensors=("a", "b")) for _ in range(2))
-    by_name.update({"b": points[:5], "a": points}, reference, error=torch.cat([far, error]))
+    by_name.update({"b": points[:5], "a": points}, reference, errors_m=torch.cat([far, error]))
     plain.update({"a": points[error.abs() <= 0.3], "b": NOTHING}, reference)
     layers, expected = (metric.compute().redundancy.layers for metric in (by_name, plain))
     assert [key for key in layers if "radius" not in key and torch.equal(layers[key].values, expected[key].values)] == [
         key for key in layers if "radius" not in key
     ]
     blind = CoverageMetric(ONE_CELL, (3.0,), max_radius=9.0)
-    blind.update(points, reference, error=torch.full((40,), 0.5))
+    blind.update(points, reference, errors_m=torch.full((40,), 0.5))
     assert int(blind.empty_sensor_frames) == 1
     assert (float(blind.compute().radius), float(blind.compute().detection)) == (9.0, 1.0)
 
@@ -364,15 +364,15 @@ def test_errors_are_those_of_all_sensors_one_after_the_other():
 def test_errors_that_are_none_of_its_points_are_refused(given, error, message):
     metric = CoverageMetric(ONE_CELL)
     with pytest.raises(error, match=message):
-        metric.update(torch.zeros(2, 3), torch.zeros(2, 3), error=given)
-    assert int(metric.steps) == 0
+        metric.update(torch.zeros(2, 3), torch.zeros(2, 3), errors_m=given)
+    assert int(metric.num_frames) == 0
 
 
 def test_a_step_split_in_two_is_another_number():
     """The unit is the step: twice half of its points is not the step."""
     whole = coverage([(ORIGIN, points_at(0.125, 0.5, 0.875))])
     parts = coverage([(ORIGIN, points_at(0.125)), (ORIGIN, points_at(0.5, 0.875))])
-    assert whole.points.item() == parts.points.item()
+    assert whole.point_counts.item() == parts.point_counts.item()
     assert whole.radius.item() == 0.5
     assert parts.radius.item() == (0.125 + 0.6875) / 2
 
@@ -425,15 +425,15 @@ def test_a_number_of_a_step_that_is_none_is_refused(index, error, message):
     metric = CoverageMetric(ONE_CELL, blocks=8)
     with pytest.raises(error, match=message):
         metric.update(ORIGIN, ORIGIN, block_index=index)
-    assert int(metric.steps) == 0
+    assert int(metric.num_frames) == 0
 
 
 def test_the_largest_number_of_a_step_has_its_block():
     metric = CoverageMetric(ONE_CELL, blocks=8)
     metric.update(ORIGIN, ORIGIN, block_index=np.int64(3))
     metric.update(ORIGIN, ORIGIN, block_index=10**15)
-    assert metric.block_steps.sum() == 2
-    assert 8 * int(metric.block_length) > 10**15
+    assert metric.block_frame_counts.sum() == 2
+    assert 8 * int(metric.frames_per_block) > 10**15
 
 
 @pytest.mark.parametrize("aggregations", [Maximum(), (Quantiles,), ("maximum",)])
@@ -469,7 +469,7 @@ def test_bad_clouds_are_refused_before_anything_is_added(sensor, reference, erro
 def test_clouds_that_are_coarser_than_cells_are_refused():
     near = torch.rand(50, 3)
     for far, kind, refused in ((1e3, torch.float32, False), (1e6, torch.float32, True), (1e6, torch.float64, False)):
-        grid = BevGrid(x=(far - 5.0, far + 5.0), y=(-5.0, 5.0), cell=0.5, heights={"all": (-1.0, 2.0)})
+        grid = BevGrid(x_m=(far - 5.0, far + 5.0), y_m=(-5.0, 5.0), cell_m=0.5, heights={"all": (-1.0, 2.0)})
         cloud = (near.double() + torch.tensor([far, 0.0, 0.0])).to(kind)
         if not refused:
             assert CoverageMetric(grid).update(cloud, cloud) is None

@@ -10,9 +10,9 @@ from torchmetrics import MetricCollection
 from torchmetrics.wrappers import MetricTracker
 
 from torchcover import BevGrid, CoverageMetric, Region, nearest
-from torchcover.coverage import CoverageNumber, sums
+from torchcover.coverage import CoverageNumberMetric, sums
 
-GRID = BevGrid(x=(0.0, 8.0), y=(-2.0, 2.0), cell=1.0, heights={"low": (-1.0, 0.5), "high": (0.5, 2.0)})
+GRID = BevGrid(x_m=(0.0, 8.0), y_m=(-2.0, 2.0), cell_m=1.0, heights={"low": (-1.0, 0.5), "high": (0.5, 2.0)})
 NEAR, FAR = Region("near", (0.0, 4.0), (-2.0, 2.0)), Region("far", (4.0, 8.0), (-2.0, 2.0))
 OPTIONS = {"thresholds": (0.4, 1.0), "max_radius": 9.0}
 # Named so that neither the order of names nor that of making is that of the directions.
@@ -31,7 +31,7 @@ def step(seed, points=60):
 
 
 def numbers(**options):
-    return {name: CoverageNumber(*which, GRID, **OPTIONS, **options) for name, which in NUMBERS.items()}
+    return {name: CoverageNumberMetric(*which, GRID, **OPTIONS, **options) for name, which in NUMBERS.items()}
 
 
 def scalar(coverage, name):
@@ -85,7 +85,7 @@ def test_in_a_collection_every_number_has_its_direction_and_each_step_is_measure
 
 
 def test_a_number_that_is_unknown_is_nan_and_the_best_of_nothing():
-    tracker = MetricTracker(CoverageNumber("radius_m", NEAR, "low", GRID))
+    tracker = MetricTracker(CoverageNumberMetric("radius_m", NEAR, "low", GRID))
     for reference in (torch.empty(0, 3), torch.tensor([[1.0, 0.0, 0.0]])):
         tracker.increment()
         tracker.update(torch.zeros(1, 3), reference)
@@ -115,4 +115,4 @@ def test_a_plot_shows_the_values():
 )
 def test_what_there_is_not_is_refused_at_once(which, message):
     with pytest.raises(ValueError, match=message):
-        CoverageNumber(*which, GRID, **OPTIONS)
+        CoverageNumberMetric(*which, GRID, **OPTIONS)

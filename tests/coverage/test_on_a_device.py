@@ -7,8 +7,14 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_leaves, tree_map
 
 from torchcover import BevGrid, Camera, CoverageMetric, blind_spot_radius, nearest
-from torchcover.coverage import Maximum, PooledMean, Quantiles, Region, StepQuantiles
-from torchcover.detection import Boxes, RecallByVisibility, bev_iou, box_visibility, points_in_boxes
+from torchcover.coverage import FrameQuantiles, Maximum, PooledMean, Quantiles, Region
+from torchcover.detection import (
+    Boxes,
+    RecallByVisibility,
+    compute_bev_iou,
+    find_points_in_boxes,
+    measure_box_visibility,
+)
 from torchcover.frames import Frame, rotate
 from torchcover.neighbors import choice
 
@@ -87,8 +93,8 @@ def each_step():
 
 
 def test_the_sums_stay_on_the_device():
-    grid = BevGrid(x=(0.0, 20.0), y=(0.0, 20.0), cell=1.0, heights={"low": (0.0, 4.0), "high": (4.0, 20.0)})
-    every = (Maximum(), PooledMean(), Quantiles((0.5, 0.9)), StepQuantiles((0.9,)))
+    grid = BevGrid(x_m=(0.0, 20.0), y_m=(0.0, 20.0), cell_m=1.0, heights={"low": (0.0, 4.0), "high": (4.0, 20.0)})
+    every = (Maximum(), PooledMean(), Quantiles((0.5, 0.9)), FrameQuantiles((0.9,)))
     # 8 blocks for 10 steps, so that some are added up in pairs.
     options = {"max_radius": 30.0, "blocks": 8, "aggregations": every, "square_metres": True}
     here, there = (CoverageMetric(grid, (0.4, 1.0), backend="cdist", **options) for _ in range(2))
@@ -114,7 +120,7 @@ def test_the_sums_stay_on_the_device():
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_a_gpu_adds_up_what_the_cpu_does():
     """But for the order in which float64 is added up, and the last bit of a distance."""
-    grid = BevGrid(x=(0.0, 20.0), y=(0.0, 20.0), cell=1.0, heights={"low": (0.0, 4.0), "high": (4.0, 20.0)})
+    grid = BevGrid(x_m=(0.0, 20.0), y_m=(0.0, 20.0), cell_m=1.0, heights={"low": (0.0, 4.0), "high": (4.0, 20.0)})
     options = {"max_radius": 30.0, "blocks": 8, "aggregations": (Maximum(), PooledMean()), "square_metres": True}
     metrics = [CoverageMetric(grid, (0.4, 1.0), **options).to(device) for device in ("cpu", "cuda")]
     for metric in metrics:
@@ -132,10 +138,10 @@ def test_what_was_seen_of_boxes_stays_on_the_device(monkeypatch):
         torch.tensor([[5.0, 5, 5, 8, 8, 8, 0.3], [15.0, 15, 15, 8, 8, 8, 0], [99.0, 0, 0, 1, 1, 1, 0]])
     )
     sensor, reference, weights = next(each_step())
-    expected = box_visibility(sensor, reference, boxes, reference_weights=weights)
+    expected = measure_box_visibility(sensor, reference, boxes, reference_weights=weights)
     with PretendedGpu() as gpu:
         clouds = on_gpu(sensor, reference)
-        found = box_visibility(*clouds, boxes, reference_weights=weights.as_subclass(OnGpu))
+        found = measure_box_visibility(*clouds, boxes, reference_weights=weights.as_subclass(OnGpu))
     assert isinstance(found.share, OnGpu)
     np.testing.assert_array_equal(as_values(found.share), expected.share.numpy())
     assert all(count <= len(boxes) for _, count in gpu.to_host)
@@ -143,23 +149,23 @@ def test_what_was_seen_of_boxes_stays_on_the_device(monkeypatch):
 
 def test_devices_without_float64_get_what_the_cpu_computes():
     """Results return to the device of the caller, in float32 where they would be float64; sums stay on the CPU."""
-    grid = BevGrid(x=(0.0, 20.0), y=(0.0, 20.0), cell=1.0, heights={"low": (0.0, 4.0), "high": (4.0, 20.0)})
+    grid = BevGrid(x_m=(0.0, 20.0), y_m=(0.0, 20.0), cell_m=1.0, heights={"low": (0.0, 4.0), "high": (4.0, 20.0)})
     boxes = Boxes.from_rows(torch.tensor([[5.0, 5, 5, 8, 8, 8, 0.3], [15.0, 15, 15, 8, 8, 8, 0]]))
     camera = Camera.from_fov(4, 3, 90.0)
     sensor, reference, weights = next(each_step())
     depth = torch.rand(3, 4) + 1
 
     def compute_all(sensor, reference, weights, boxes, depth):
-        seen = box_visibility(sensor, reference, boxes, reference_weights=weights)
+        seen = measure_box_visibility(sensor, reference, boxes, reference_weights=weights)
         frame = Frame({"rig": sensor}, reference, index=0, name="a", boxes=boxes)
         turned = rotate(frame, 0.3)
-        region = Region.polygon("corner", [(0.0, 0.0), (20.0, 0.0), (20.0, 20.0)])
+        region = Region.from_corners("corner", [(0.0, 0.0), (20.0, 0.0), (20.0, 20.0)])
         return [
-            *nearest(reference, sensor), blind_spot_radius(reference, sensor, max_radius=2.0), grid.cell_of(reference),
-            *grid.bins(reference), grid.points_by_column(reference), region.contains(*reference[:, :2].T),
-            *points_in_boxes(reference, boxes), seen.share, seen.reference_points, bev_iou(boxes.rows, boxes.rows),
+            *nearest(reference, sensor), blind_spot_radius(reference, sensor, max_radius=2.0), grid.find_cells(reference),
+            *grid.assign_cells(reference), grid.count_points_by_column(reference), region.mask_points(*reference[:, :2].T),
+            *find_points_in_boxes(reference, boxes), seen.share, seen.reference_points, compute_bev_iou(boxes.rows, boxes.rows),
             turned.reference, turned.boxes.rows, *camera.project(reference), camera.unproject(depth),
-            *camera.compute_rays(reference[:, :2]), camera.convert_z_to_distance(depth), camera.to_vehicle(reference),
+            *camera.rays(reference[:, :2]), camera.convert_z_to_distance(depth), camera.to_vehicle(reference),
         ]  # fmt: skip
 
     def measure(sensor, reference, weights, boxes):
@@ -167,8 +173,8 @@ def test_devices_without_float64_get_what_the_cpu_computes():
         for each in (metric, recall):
             each.to(reference.device)
         metric.update(sensor, reference, weights=weights)
-        recall.update(boxes.rows, boxes, box_visibility(sensor, reference, boxes, reference_weights=weights))
-        return metric.compute().scalars([Region("front", (0.0, 20.0), (5.0, 15.0))]) | recall.compute().scalars()
+        recall.update(boxes.rows, boxes, measure_box_visibility(sensor, reference, boxes, reference_weights=weights))
+        return metric.compute().scalars([Region("front", (0.0, 20.0), (5.0, 15.0))]) | recall.compute().to_scalars()
 
     expected = compute_all(sensor, reference, weights, boxes, depth)
     numbers = measure(sensor, reference, weights, boxes)

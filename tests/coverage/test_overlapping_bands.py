@@ -10,7 +10,7 @@ BANDS = {"child": (0.1, 1.1), "dog": (0.05, 0.5), "all": (-1.0, 2.0), "above": (
 
 
 def grid_of(heights):
-    return BevGrid(x=(-2.0, 2.0), y=(-1.0, 1.0), cell=0.5, heights=heights)
+    return BevGrid(x_m=(-2.0, 2.0), y_m=(-1.0, 1.0), cell_m=0.5, heights=heights)
 
 
 def measured(heights, **options):
@@ -28,7 +28,7 @@ def test_each_of_several_overlapping_bands_is_what_it_is_alone(square_metres):
     together = measured(BANDS, square_metres=square_metres)
     for number, (name, band) in enumerate(BANDS.items()):
         alone = measured({name: band}, square_metres=square_metres)
-        assert torch.equal(together.points[number], alone.points[0])
+        assert torch.equal(together.point_counts[number], alone.point_counts[0])
         for key, layer in alone.layers.items():
             torch.testing.assert_close(
                 together.layers[key].values[number], layer.values[0], equal_nan=True, rtol=0, atol=0
@@ -40,20 +40,20 @@ def test_each_of_several_overlapping_bands_is_what_it_is_alone(square_metres):
 def test_a_point_in_several_bands_is_counted_once():
     together, widest = measured(BANDS), measured({"all": BANDS["all"]})
     assert together.counts == widest.counts
-    assert together.points.sum() > together.counts["inside_points"] == widest.points.sum()
+    assert together.point_counts.sum() > together.counts["inside_points"] == widest.point_counts.sum()
 
 
 def test_bins_are_the_cells_of_each_band():
     points = torch.randn(500, 3, generator=torch.Generator().manual_seed(1))
-    bins = grid_of(BANDS).bins(points)
-    found = set(zip(bins.inside[bins.of].tolist(), bins.cell.tolist(), strict=True))
+    bins = grid_of(BANDS).assign_cells(points)
+    found = set(zip(bins.point_indices[bins.point_positions].tolist(), bins.cell_indices.tolist(), strict=True))
     expected = set()
     for number, (name, band) in enumerate(BANDS.items()):
-        cells = grid_of({name: band}).cell_of(points)
+        cells = grid_of({name: band}).find_cells(points)
         expected |= {(at, cell + number * 32) for at, cell in enumerate(cells.tolist()) if cell >= 0}
     assert found == expected
-    assert len(bins.cell) == len(expected)
-    assert bins.inside.tolist() == sorted({at for at, _ in expected})
+    assert len(bins.cell_indices) == len(expected)
+    assert bins.point_indices.tolist() == sorted({at for at, _ in expected})
 
 
 @pytest.mark.parametrize("heights", [BANDS, {"ground": (-0.5, 0.5), "obstacle": (0.5, 2.0)}], ids=["over", "above"])
@@ -65,12 +65,12 @@ def test_points_by_column_are_those_of_the_bins(heights, dtype, monkeypatch):
     points[9:18, :2], points[9:18, 2] = 0.25, points[:9, 0]  # on the borders of the bands
     points[18:27, 0] = points[:9, 0]
     grid = grid_of(heights)
-    expected = torch.bincount(grid.bins(points).cell % 32, minlength=32).view(4, 8)
-    assert torch.equal(grid.points_by_column(points), expected.double())
+    expected = torch.bincount(grid.assign_cells(points).cell_indices % 32, minlength=32).view(4, 8)
+    assert torch.equal(grid.count_points_by_column(points), expected.double())
     assert expected.sum() > 300
-    assert torch.equal(grid.points_by_column(points[:0]), torch.zeros(4, 8, dtype=torch.float64))
+    assert torch.equal(grid.count_points_by_column(points[:0]), torch.zeros(4, 8, dtype=torch.float64))
 
 
 def test_where_bands_overlap_a_point_has_no_single_cell():
     with pytest.raises(ValueError, match="the height bands overlap, so that a point may be in several cells: use"):
-        grid_of(BANDS).cell_of(torch.zeros(1, 3))
+        grid_of(BANDS).find_cells(torch.zeros(1, 3))

@@ -5,9 +5,9 @@ import pytest
 import torch
 from scipy import stats
 
-from torchcover.coverage import BevGrid, CoverageMetric, Region, check_paired, differences
+from torchcover.coverage import BevGrid, CoverageMetric, Region, check_paired, compute_differences
 
-SQUARE = BevGrid(x=(0.0, 10.0), y=(-5.0, 5.0), cell=1.0)
+SQUARE = BevGrid(x_m=(0.0, 10.0), y_m=(-5.0, 5.0), cell_m=1.0)
 NEAR = Region("near", (0.0, 5.0), (-5.0, 5.0))
 
 
@@ -53,17 +53,17 @@ def test_significant_is_what_a_paired_t_test_calls_so(shift, seed):
         for at, radius in enumerate(own.tolist()):
             metric.update(torch.tensor([[0.5, 0.5, -radius]]), torch.tensor([[0.5, 0.5, 0.0]]), block_index=at)
         coverages[name] = metric.compute()
-    itself, other = differences(coverages, NEAR, "ground").values()
+    itself, other = compute_differences(coverages, NEAR, "ground").values()
     found = other["radius_m"]
     test = stats.ttest_rel(radii["b"], radii["a"])
     assert found.value == pytest.approx(radii["b"].mean() - radii["a"].mean(), abs=1e-6)
     assert abs(found.value) / found.error == pytest.approx(abs(test.statistic), rel=1e-4)
-    assert found.significant is bool(test.pvalue < 0.05)
-    assert found.p == pytest.approx(test.pvalue, rel=1e-3)
-    assert (found.blocks, found.better) == (16, (radii["b"] < radii["a"]).sum())
+    assert found.is_significant is bool(test.pvalue < 0.05)
+    assert found.p_value == pytest.approx(test.pvalue, rel=1e-3)
+    assert (found.block_count, found.better_count) == (16, (radii["b"] < radii["a"]).sum())
     # Of lengths the end that is farther from 0 is a quarter longer.
     low, high = (end - found.value for end in test.confidence_interval())
     reach = (low, 1.25 * high) if found.value > 0 else (1.25 * low, high)
     assert (found.low - found.value, found.high - found.value) == pytest.approx(reach, abs=1e-3)
     assert itself["radius_m"][1:3] == (0.0, 0.0)
-    assert itself["radius_m"].significant is False
+    assert itself["radius_m"].is_significant is False

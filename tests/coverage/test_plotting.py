@@ -10,7 +10,7 @@ from matplotlib import colormaps
 
 from torchcover import BevGrid, CoverageMetric
 
-GRID = BevGrid(x=(5.0, 8.0), y=(-1.0, 1.0), cell=1.0, heights={"low": (-1.0, 0.0), "high": (0.0, 1.0)})
+GRID = BevGrid(x_m=(5.0, 8.0), y_m=(-1.0, 1.0), cell_m=1.0, heights={"low": (-1.0, 0.0), "high": (0.0, 1.0)})
 AHEAD = torch.tensor([[5.5, -0.5, 0.5]])  # in the first cell of the band "high"
 
 
@@ -33,7 +33,7 @@ def drawn(axes):
 def test_the_map_holds_the_layer_in_its_place_and_the_vehicle_is_at_the_origin():
     sensor = torch.tensor([[5.5, -0.5, 0.5]])
     metric = metric_over(sensor, sensor + torch.tensor([[0.0, 0.0, 0.0], [2.0, 1.0, 0.0]]), max_radius=9.0)
-    _, axes = metric.plot(height="high", layer="radius_m")
+    _, axes = metric.plot(band="high", quantity_key="radius_m")
     corners = drawn(axes).get_coordinates()
     assert (corners[0, 0].tolist(), corners[-1, -1].tolist()) == ([5.0, -1.0], [8.0, 1.0])
     values = drawn(axes).get_array()
@@ -61,7 +61,7 @@ def test_dark_is_blind_even_where_the_radius_is_infinite_and_grey_is_unknown():
     metric = metric_over(torch.empty(0, 3), AHEAD)
     darkest = colormaps["viridis"](0.0)
     for layer in ("radius_m", "detection_0.4m"):
-        figure, axes = metric.plot(layer=layer, height="high")
+        figure, axes = metric.plot(quantity_key=layer, band="high")
         figure.canvas.draw()
         assert tuple(drawn(axes).get_facecolors()[0]) == pytest.approx(darkest)
         assert drawn(axes).get_facecolors()[1][3] == 0.0
@@ -70,6 +70,6 @@ def test_dark_is_blind_even_where_the_radius_is_infinite_and_grey_is_unknown():
 def test_layers_and_bands_that_there_are_not_are_refused():
     metric = metric_over(AHEAD, AHEAD)
     with pytest.raises(ValueError, match=r"layer: one of radius_m, detection_0.4m is needed; got 'detection'"):
-        metric.plot(layer="detection")
+        metric.plot(quantity_key="detection")
     with pytest.raises(ValueError, match=r"height: one of low, high is needed; got 'ground'"):
-        metric.plot(height="ground")
+        metric.plot(band="ground")

@@ -6,10 +6,13 @@ import pytest
 import torch
 
 from torchcover import BevGrid, Coverage, CoverageMetric, Region
-from torchcover.coverage import differences
+from torchcover.coverage import compute_differences
 
-GRID = BevGrid(x=(-2.0, 2.0), y=(-1.0, 1.0), cell=0.5, heights={"low": (-2.0, 0.3), "high": (0.0, 2.0)})
-REGIONS = [Region("left", (-2.0, 2.0), (0.0, 1.0)), Region.polygon("corner", [(-2.0, -1.0), (2.0, -1.0), (-2.0, 1.0)])]
+GRID = BevGrid(x_m=(-2.0, 2.0), y_m=(-1.0, 1.0), cell_m=0.5, heights={"low": (-2.0, 0.3), "high": (0.0, 2.0)})
+REGIONS = [
+    Region("left", (-2.0, 2.0), (0.0, 1.0)),
+    Region.from_corners("corner", [(-2.0, -1.0), (2.0, -1.0), (-2.0, 1.0)]),
+]
 SENSORS = ("roof", "left", "rear")
 OPTIONS = {"thresholds": (0.3, 0.8), "max_radius": 3.0, "blocks": 8, "regions": REGIONS}
 
@@ -54,16 +57,16 @@ def test_without_a_sensor_it_is_the_rig_of_the_others(square_metres, empty):
             torch.testing.assert_close(found, rest.layers[key].values, equal_nan=True, **exact)
         for found, expected, full in zip(whole.summary(), rest.summary(), alone.summary(), strict=True):
             region = next(region for region in REGIONS if region.name == found.region)
-            compared = differences({"all": alone, "rest": rest}, region, found.height)["rest"]
+            compared = compute_differences({"all": alone, "rest": rest}, region, found.band)["rest"]
             for key, number in expected.numbers.items():
-                own = found.redundancy.without[sensor][key]
+                own = found.redundancy.failure_numbers[sensor][key]
                 assert own.value == pytest.approx(number.value, rel=1e-13)
-                change = found.redundancy.change[sensor][key]
+                change = found.redundancy.failure_effects[sensor][key]
                 assert change.value == pytest.approx(number.value - full.numbers[key].value, rel=1e-9, abs=1e-13)
                 if square_metres:
                     assert own.error == pytest.approx(number.error, rel=1e-9)
                     assert change.error == pytest.approx(compared[key].error, rel=1e-6, abs=1e-12)
-                    assert change.significant == compared[key].significant
+                    assert change.is_significant == compared[key].is_significant
                 else:
                     assert math.isnan(own.error)
                     assert math.isnan(change.error)
@@ -82,7 +85,7 @@ def test_how_many_sensors_see_a_point_is_counted():
     )
     for at, row in enumerate(whole.summary()):
         expected = sum(each.summary()[at].numbers["detection_0.8m"].value for each in alone)
-        seen_by = row.redundancy.seen_by
+        seen_by = row.redundancy.detecting_sensors
         assert seen_by["sensors_0.8m"].value == pytest.approx(expected, rel=1e-13)
         assert 0 < seen_by["seen_by_two_0.8m"].value < row.numbers["detection_0.8m"].value
         assert seen_by["sensors_0.8m"].error > 0
@@ -94,13 +97,15 @@ def test_a_twin_makes_a_sensor_dispensable_and_the_only_one_is_indispensable():
             yield {"roof": clouds["roof"], "left": clouds["roof"], "rear": torch.empty(0, 3)}, reference, weights
 
     for row in measured(twins(), square_metres=True).summary():
-        assert row.redundancy.indispensable is None
-        assert {change.value for changes in row.redundancy.change.values() for change in changes.values()} == {0.0}
-        assert row.redundancy.seen_by["seen_by_two_0.3m"].value == row.numbers["detection_0.3m"].value
+        assert row.redundancy.most_critical_sensor is None
+        assert {change.value for changes in row.redundancy.failure_effects.values() for change in changes.values()} == {
+            0.0
+        }
+        assert row.redundancy.detecting_sensors["seen_by_two_0.3m"].value == row.numbers["detection_0.3m"].value
     for row in measured(steps(empty=("left", "rear")), square_metres=True).summary():
-        assert row.redundancy.indispensable == "roof"
-        assert row.redundancy.without["roof"]["radius_m"].value == 3.0
-        assert row.redundancy.without["roof"]["detection_0.8m"].value == 0.0
+        assert row.redundancy.most_critical_sensor == "roof"
+        assert row.redundancy.failure_numbers["roof"]["radius_m"].value == 3.0
+        assert row.redundancy.failure_numbers["roof"]["detection_0.8m"].value == 0.0
 
 
 @pytest.mark.parametrize("square_metres", [True, False])

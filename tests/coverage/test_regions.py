@@ -6,39 +6,39 @@ import torch
 from torchcover import BevGrid, Region, forward_regions
 from torchcover.coverage import check_regions
 
-GRID = BevGrid(x=(-4.0, 4.0), y=(-2.0, 2.0), cell=0.5)
+GRID = BevGrid(x_m=(-4.0, 4.0), y_m=(-2.0, 2.0), cell_m=0.5)
 
 
 def test_the_papers_regions():
-    assert [(r.name, r.x, r.y) for r in forward_regions()] == [
+    assert [(r.name, r.x_m, r.y_m) for r in forward_regions()] == [
         ("20m", (0, 20), (-5, 5)),
         ("80m", (0, 80), (-20, 20)),
         ("160m", (0, 160), (-40, 40)),
     ]
-    assert forward_regions((2.5,)) == (Region("2.5m", x=(0.0, 2.5), y=(-0.625, 0.625)),)
+    assert forward_regions((2.5,)) == (Region("2.5m", x_m=(0.0, 2.5), y_m=(-0.625, 0.625)),)
     assert forward_regions(()) == ()
 
 
 def test_a_cell_belongs_to_a_region_if_its_centre_does():
     # Centres along x: ..., 0.25, 0.75, 1.25, ...; along y: -1.75, ..., 1.75.
-    mask = Region("r", x=(0.25, 1.25), y=(-0.3, 0.25)).mask(GRID)
+    mask = Region("r", x_m=(0.25, 1.25), y_m=(-0.3, 0.25)).mask_cells(GRID)
     assert mask.shape == (8, 16)
     inside = [
-        (GRID.y_centres_m[row].item(), GRID.x_centres_m[column].item()) for row, column in mask.nonzero().tolist()
+        (GRID.y_centers_m[row].item(), GRID.x_centers_m[column].item()) for row, column in mask.nonzero().tolist()
     ]
     assert inside == [(-0.25, 0.25), (-0.25, 0.75)]  # half-open: 1.25 and y = 0.25 are out, 0.25 is in
 
 
 def test_a_region_as_large_as_the_grid_is_the_grid():
-    assert Region("all", x=GRID.x, y=GRID.y).mask(GRID).all()
+    assert Region("all", x_m=GRID.x_m, y_m=GRID.y_m).mask_cells(GRID).all()
 
 
 def test_a_region_smaller_than_a_cell_may_hold_no_centre():
-    assert not Region("gap", x=(0.3, 0.7), y=(0.0, 1.0)).mask(GRID).any()
+    assert not Region("gap", x_m=(0.3, 0.7), y_m=(0.0, 1.0)).mask_cells(GRID).any()
 
 
 def test_two_regions_side_by_side_share_no_cell():
-    masks = [Region("r", x=bounds, y=(-2.0, 2.0)).mask(GRID) for bounds in ((-4.0, 0.75), (0.75, 4.0))]
+    masks = [Region("r", x_m=bounds, y_m=(-2.0, 2.0)).mask_cells(GRID) for bounds in ((-4.0, 0.75), (0.75, 4.0))]
     assert torch.equal(masks[0], ~masks[1])
 
 
@@ -53,7 +53,7 @@ def test_two_regions_side_by_side_share_no_cell():
 )
 def test_a_region_beyond_the_grid_is_refused(bounds, message):
     with pytest.raises(ValueError, match=f"region 'far' {message}"):
-        Region("far", **bounds).mask(GRID)
+        Region("far", **bounds).mask_cells(GRID)
 
 
 @pytest.mark.parametrize("bounds", [(1.0, 1.0), (2.0, 1.0), (0.0, math.inf), (-math.inf, 0.0), (math.nan, 1.0)])
@@ -65,7 +65,7 @@ def test_bounds_without_inside_are_refused(axis, bounds):
 
 def test_a_region_needs_a_name():
     with pytest.raises(ValueError, match="a region needs a name"):
-        Region("", x=(0.0, 1.0), y=(0.0, 1.0))
+        Region("", x_m=(0.0, 1.0), y_m=(0.0, 1.0))
 
 
 def test_a_forward_region_of_no_range_is_refused():
@@ -74,9 +74,9 @@ def test_a_forward_region_of_no_range_is_refused():
 
 
 def test_regions_without_a_cell_are_found_before_a_run():
-    check_regions([Region("all", x=GRID.x, y=GRID.y)], GRID)
+    check_regions([Region("all", x_m=GRID.x_m, y_m=GRID.y_m)], GRID)
     with pytest.raises(ValueError, match="region 'gap' holds no cell centre; use smaller cells than"):
-        check_regions([Region("gap", x=(0.3, 0.7), y=(0.0, 1.0))], GRID)
+        check_regions([Region("gap", x_m=(0.3, 0.7), y_m=(0.0, 1.0))], GRID)
 
 
 @pytest.mark.parametrize(
@@ -86,17 +86,17 @@ def test_a_rectangle_given_by_its_corners_is_the_rectangle(x, y):
     # 0.25, -0.25 and so on are centres of cells: on an edge.
     corners = [(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])]
     for order in (corners, corners[::-1], [*corners, corners[0]]):
-        polygon = Region.polygon("r", order)
-        assert (polygon.x, polygon.y) == (x, y)
-        assert torch.equal(polygon.mask(GRID), Region("r", x, y).mask(GRID))
+        polygon = Region.from_corners("r", order)
+        assert (polygon.x_m, polygon.y_m) == (x, y)
+        assert torch.equal(polygon.mask_cells(GRID), Region("r", x, y).mask_cells(GRID))
 
 
 def test_polygons_that_share_an_edge_share_no_cell_and_leave_none_out():
     # The edge goes through centres.
-    left = Region.polygon("left", [(-4.0, -2.0), (0.25, -2.0), (2.25, 2.0), (-4.0, 2.0)])
-    right = Region.polygon("right", [(0.25, -2.0), (4.0, -2.0), (4.0, 2.0), (2.25, 2.0)])
-    assert torch.equal(left.mask(GRID), ~right.mask(GRID))
-    assert 0 < left.mask(GRID).sum() < 128
+    left = Region.from_corners("left", [(-4.0, -2.0), (0.25, -2.0), (2.25, 2.0), (-4.0, 2.0)])
+    right = Region.from_corners("right", [(0.25, -2.0), (4.0, -2.0), (4.0, 2.0), (2.25, 2.0)])
+    assert torch.equal(left.mask_cells(GRID), ~right.mask_cells(GRID))
+    assert 0 < left.mask_cells(GRID).sum() < 128
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_polygons_that_share_an_edge_share_no_cell_and_leave_none_out():
 )
 def test_corners_that_are_no_polygon_are_refused(corners, message):
     with pytest.raises(ValueError, match=f"region 'r': {message}"):
-        Region.polygon("r", corners)
+        Region.from_corners("r", corners)
 
 
 def test_a_polygon_has_the_bounds_of_its_corners():
@@ -124,11 +124,11 @@ def test_a_name_is_given_once():
 
 def test_points_belong_to_one_of_two_polygons_that_share_an_edge():
     # Corners, points of the edge to the last bit, and some around it.
-    left = Region.polygon("left", [(-4.0, -2.0), (0.3, -2.0), (2.1, 2.0), (-4.0, 2.0)])
-    right = Region.polygon("right", [(0.3, -2.0), (4.0, -2.0), (4.0, 2.0), (2.1, 2.0)])
+    left = Region.from_corners("left", [(-4.0, -2.0), (0.3, -2.0), (2.1, 2.0), (-4.0, 2.0)])
+    right = Region.from_corners("right", [(0.3, -2.0), (4.0, -2.0), (4.0, 2.0), (2.1, 2.0)])
     share = torch.linspace(0, 1, 1001, dtype=torch.float64)
     y = torch.cat([-2 + 4 * share, 4 * share - 2.5])
     x = torch.cat([0.3 + 1.8 * share, 8 * share.roll(500) - 4])
     inside = (x >= -4) & (x < 4) & (y >= -2) & (y < 2)
-    assert torch.equal(left.contains(x, y) ^ right.contains(x, y), inside)
-    assert not (left.contains(x, y) & right.contains(x, y)).any()
+    assert torch.equal(left.mask_points(x, y) ^ right.mask_points(x, y), inside)
+    assert not (left.mask_points(x, y) & right.mask_points(x, y)).any()

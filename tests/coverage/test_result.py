@@ -11,15 +11,15 @@ import pytest
 import torch
 
 from torchcover import BevGrid, Coverage, CoverageMetric, Region
-from torchcover.coverage import Layer, Maximum, MeanOfMeans, PooledMean, Quantiles, StepQuantiles, differences
-from torchcover.coverage.blocks import KnownCells
-from torchcover.detection import Boxes, box_visibility
+from torchcover.coverage import FrameQuantiles, Layer, Maximum, MeanOfMeans, PooledMean, Quantiles, compute_differences
+from torchcover.coverage.blocks import ObservedCells
+from torchcover.detection import Boxes, measure_box_visibility
 from torchcover.files import BadFileError
 from torchcover.frames import Frame, collate_frames
-from torchcover.frames.frame import Measured
+from torchcover.frames.frame import Measurement
 
-GRID = BevGrid(x=(-1.0, 20.0), y=(-5.0, 5.0), cell=0.5)
-EVERY_AGGREGATION = (Maximum(), PooledMean(), Quantiles((0.5, 0.9)), StepQuantiles((0.9,)))
+GRID = BevGrid(x_m=(-1.0, 20.0), y_m=(-5.0, 5.0), cell_m=0.5)
+EVERY_AGGREGATION = (Maximum(), PooledMean(), Quantiles((0.5, 0.9)), FrameQuantiles((0.9,)))
 COUNTS = dict.fromkeys(Coverage.COUNTS, 3)
 
 
@@ -28,16 +28,16 @@ def a_coverage(seed=0, thresholds=(0.4, 0.8), grid=GRID, frames=None):
     if frames is None:
         frames = torch.randint(0, 3, grid.shape, generator=random)
     at = frames.flatten().nonzero().squeeze(1)
-    known = KnownCells(grid.shape, at, frames.flatten()[at], 5 * frames.flatten()[at])
+    known = ObservedCells(grid.shape, at, frames.flatten()[at], 5 * frames.flatten()[at])
 
     def values():
         return torch.rand(grid.shape, generator=random, dtype=torch.float64).flatten()[at]
 
     return Coverage(
         grid=grid,
-        thresholds=thresholds,
-        max_radius=30.0,
-        known=known,
+        thresholds_m=thresholds,
+        max_radius_m=30.0,
+        observed_cells=known,
         layers=[Layer(quantity, values()) for quantity in MeanOfMeans(thresholds).quantities],
         counts=COUNTS,
     )
@@ -50,7 +50,7 @@ def a_coverage(seed=0, thresholds=(0.4, 0.8), grid=GRID, frames=None):
 def test_a_regions_number_is_the_unweighted_mean_over_its_known_cells(region):
     result = a_coverage()
     rows = result.summary([region])
-    assert [(row.region, row.height) for row in rows] == [(region.name, "ground"), (region.name, "obstacle")]
+    assert [(row.region, row.band) for row in rows] == [(region.name, "ground"), (region.name, "obstacle")]
     for band, row in enumerate(rows):
         inside = [
             (y, x)
@@ -58,9 +58,9 @@ def test_a_regions_number_is_the_unweighted_mean_over_its_known_cells(region):
             for x, centre_x in enumerate(np.arange(-0.75, 20, 0.5))
             if region.x[0] <= centre_x < region.x[1] and region.y[0] <= centre_y < region.y[1]
         ]
-        known = [cell for cell in inside if result.probed_steps[(band, *cell)] > 0]
+        known = [cell for cell in inside if result.observed_frames[(band, *cell)] > 0]
         assert 0 < len(known) < len(inside)
-        assert (row.cells, row.observed_cells) == (len(inside), len(known))
+        assert (row.num_cells, row.observed_cells) == (len(inside), len(known))
         assert row.observed_share == len(known) / len(inside)
         assert row.numbers["radius_m"].value == pytest.approx(np.mean([result.radius[(band, *cell)] for cell in known]))
         assert list(row.numbers) == ["radius_m", "detection_0.4m", "detection_0.8m"]
@@ -77,8 +77,8 @@ def test_a_region_of_which_nothing_is_known_is_unknown():
 
 def test_a_cell_that_is_blind_without_end_makes_its_region_so():
     result = a_coverage()
-    result.listed["radius_m"].values[0] = math.inf
-    assert result.summary([Region("all", GRID.x, GRID.y)])[0].numbers["radius_m"].value == math.inf
+    result.sparse_layers["radius_m"].values[0] = math.inf
+    assert result.summary([Region("all", GRID.x_m, GRID.y_m)])[0].numbers["radius_m"].value == math.inf
 
 
 @pytest.mark.parametrize(
@@ -93,8 +93,8 @@ def test_a_cell_that_is_blind_without_end_makes_its_region_so():
     ],
 )
 def test_the_regions_of_the_paper_are_given_where_the_grid_holds_them(x, y, names):
-    rows = a_coverage(grid=BevGrid(x=x, y=y, cell=1.0)).summary()
-    assert [row.region for row in rows if row.height == "ground"] == names
+    rows = a_coverage(grid=BevGrid(x_m=x, y_m=y, cell_m=1.0)).summary()
+    assert [row.region for row in rows if row.band == "ground"] == names
 
 
 def test_a_region_the_grid_cannot_speak_of_is_refused():
@@ -123,7 +123,9 @@ def test_scalars_are_the_summary_laid_flat():
 @pytest.mark.parametrize(("blocks", "errors"), [(1, []), (8, ["radius_m_error", "detection_0.4m_error"])])
 def test_a_table_has_the_scalars_and_errors_where_there_are_blocks(blocks, errors):
     random = torch.Generator().manual_seed(7)
-    metric = CoverageMetric(GRID, blocks=blocks, regions=[Region("a", GRID.x, GRID.y), Region("b", (0, 5), (-5, 5))])
+    metric = CoverageMetric(
+        GRID, blocks=blocks, regions=[Region("a", GRID.x_m, GRID.y_m), Region("b", (0, 5), (-5, 5))]
+    )
     for _ in range(8):
         metric.update(torch.rand(9, 3, generator=random), 10 * torch.rand(60, 3, generator=random))
     result = metric.compute()
@@ -137,26 +139,26 @@ def test_a_table_has_the_scalars_and_errors_where_there_are_blocks(blocks, error
 
 
 def test_without_a_block_of_one_step_a_pooled_mean_is_that_of_the_others():
-    grid = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)})
-    region, radii = Region("one", grid.x, grid.y), [3.0, 1.0, 4.0, 1.5, 9.0, 2.0, 6.0, 5.0]
+    grid = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=1.0, heights={"all": (-1.0, 1.0)})
+    region, radii = Region("one", grid.x_m, grid.y_m), [3.0, 1.0, 4.0, 1.5, 9.0, 2.0, 6.0, 5.0]
     metric = CoverageMetric(grid, aggregations=[PooledMean()], regions=[region], blocks=8)
     for at, radius in enumerate(radii):
         metric.update(torch.tensor([[0.5, 0.5, -radius]]), torch.tensor([[0.5, 0.5, 0.0]]), block_index=at)
     found = metric.compute().estimate_aggregated(region, "all")
     without = [(sum(radii) - radius) / 7 for radius in radii]
-    assert found.left_out[:, 0].tolist() == pytest.approx(without)
-    assert found.steps.tolist() == [1] * 8
+    assert found.jackknife_values[:, 0].tolist() == pytest.approx(without)
+    assert found.frame_counts.tolist() == [1] * 8
 
 
 def test_what_was_not_aggregated_has_no_numbers():
-    grid = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)})
+    grid = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=1.0, heights={"all": (-1.0, 1.0)})
     result = a_coverage(grid=grid, frames=torch.tensor([[[1]]]))
-    found = result.estimate_aggregated(Region("one", grid.x, grid.y), "all")
+    found = result.estimate_aggregated(Region("one", grid.x_m, grid.y_m), "all")
     assert (found.quantities, len(found.value)) == ((), 0)
 
 
 def test_the_share_of_known_cells_is_in_the_repr():
-    grid = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=0.5, heights={"all": (0.0, 1.0)})
+    grid = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=0.5, heights={"all": (0.0, 1.0)})
     result = a_coverage(grid=grid, frames=torch.tensor([[[1, 0], [0, 0]]]))
     assert repr(result) == "Coverage((1, 2, 2) cells, 3 steps, 25.0% of the cells known)"
 
@@ -169,7 +171,7 @@ def assert_same(one, other):
     assert list(one.grid.heights) == list(other.grid.heights)
     for name in ("thresholds", "max_radius", "quantities", "counts"):
         assert getattr(one, name) == getattr(other, name), name
-    pairs = [(getattr(one, name), getattr(other, name)) for name in ("probed_steps", "points")]
+    pairs = [(getattr(one, name), getattr(other, name)) for name in ("observed_frames", "points")]
     assert [layer.quantity for layer in one.layers.values()] == [layer.quantity for layer in other.layers.values()]
     pairs += [(layer.values, other.layers[key].values) for key, layer in one.layers.items()]
     assert (one.blocks is None) == (other.blocks is None)
@@ -188,7 +190,9 @@ def assert_same(one, other):
 @pytest.mark.parametrize("as_text", [False, True])
 def test_a_file_gives_back_what_was_saved(tmp_path, options, as_text):
     heights = {"high": (1.0, 2.0), "low": (-1.0, 0.1)}
-    metric = CoverageMetric(BevGrid(x=(-1, 1), y=(0, 0.3), cell=0.1, heights=heights), **{"max_radius": 2.5, **options})
+    metric = CoverageMetric(
+        BevGrid(x_m=(-1, 1), y_m=(0, 0.3), cell_m=0.1, heights=heights), **{"max_radius": 2.5, **options}
+    )
     metric.update(torch.zeros(1, 3), torch.rand(50, 3, generator=torch.Generator().manual_seed(0)))
     result = metric.compute()
     path = tmp_path / "coverage"  # no suffix: the name is left as it is
@@ -200,8 +204,8 @@ def test_a_file_gives_back_what_was_saved(tmp_path, options, as_text):
 def test_a_loaded_result_has_its_errors_and_can_be_compared(tmp_path):
     """To the last bit: what is written is the sums in blocks, not what was made of them."""
     random = torch.Generator().manual_seed(3)
-    grid = BevGrid(x=(0.0, 4.0), y=(-2.0, 2.0), cell=1.0, heights={"all": (-1.0, 1.0)})
-    region, found = Region("all", grid.x, grid.y), {}
+    grid = BevGrid(x_m=(0.0, 4.0), y_m=(-2.0, 2.0), cell_m=1.0, heights={"all": (-1.0, 1.0)})
+    region, found = Region("all", grid.x_m, grid.y_m), {}
     metrics = {name: CoverageMetric(grid, blocks=16) for name in ("a", "b")}
     for _ in range(20):
         reference = torch.rand(40, 3, generator=random) * 4 - torch.tensor([0.0, 2.0, 0.0])
@@ -213,7 +217,7 @@ def test_a_loaded_result_has_its_errors_and_can_be_compared(tmp_path):
     loaded = {name: Coverage.load(tmp_path / f"{name}.npz") for name in found}
     assert repr(loaded["b"].summary([region])) == repr(found["b"].summary([region]))  # NaN equals no NaN
     assert loaded["b"].summary([region])[0].numbers["radius_m"].error > 0
-    assert differences(loaded, region, "all") == differences(found, region, "all")
+    assert compute_differences(loaded, region, "all") == compute_differences(found, region, "all")
     for key, error in found["a"].errors.items():
         assert torch.equal(loaded["a"].errors[key].nan_to_num(), error.nan_to_num())
 
@@ -244,7 +248,7 @@ def test_a_file_that_is_not_there_is_said_to_be_missing(tmp_path):
 @pytest.fixture
 def saved(tmp_path):
     path = tmp_path / "coverage.npz"
-    a_coverage(grid=BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=0.5)).save(path)
+    a_coverage(grid=BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 1.0), cell_m=0.5)).save(path)
     return path
 
 
@@ -305,7 +309,7 @@ def test_a_file_with_wrong_parts_is_refused(saved, change):
 
 @pytest.fixture
 def saved_in_blocks(tmp_path):
-    grid = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=0.5)
+    grid = BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 1.0), cell_m=0.5)
     metric = CoverageMetric(grid, blocks=8, max_radius=9.0, square_metres=True)
     for _ in range(8):
         reference = torch.rand(20, 3)
@@ -319,7 +323,7 @@ def saved_in_blocks(tmp_path):
     [
         ({"header": lambda old: json.dumps({**old, "blocks": 10**9})}, "the steps of 1000000000 blocks have shape"),
         ({"header": lambda old: json.dumps({**old, "blocks": -8})}, "the steps of -8 blocks have shape"),
-        ({"cell": lambda old: old[1:]}, "probed_steps has shape"),
+        ({"cell": lambda old: old[1:]}, "observed_frames has shape"),
         ({"cell": lambda old: old[::-1]}, "cell: numbers of cells in ascending order, below 16, are needed"),
         ({"block_cell": lambda old: old.astype(np.int64) - 1000}, "block_cell: numbers of cells in ascending order"),
         ({"area_cell": lambda old: old + 8 * 16}, "area_cell: numbers of cells in ascending order, below 128"),
@@ -366,7 +370,7 @@ def test_another_format_is_refused_by_its_number(saved, number, then):
 
 def test_torch_loads_plain_objects_without_running_what_a_file_says():
     """As Lightning does with the hyperparameters of a checkpoint."""
-    grid, region = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0)), Region("a", x=(0.0, 1.0), y=(0.0, 1.0))
+    grid, region = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0)), Region("a", x_m=(0.0, 1.0), y_m=(0.0, 1.0))
     options = {"blocks": 8, "square_metres": True, "sensors": ("a",), "aggregations": (Maximum(), PooledMean())}
     metric = CoverageMetric(grid, max_radius=5.0, regions=[region], **options)
     clouds = torch.rand(5, 3)
@@ -374,9 +378,14 @@ def test_torch_loads_plain_objects_without_running_what_a_file_says():
         metric.update({"a": clouds}, clouds, weights=torch.ones(5))
     boxes = Boxes.from_rows(torch.tensor([[1.0, 0, 0, 4, 2, 2, 0]]))
     frame = Frame(
-        {"a": clouds}, clouds, index=np.int64(3), name="a", boxes=boxes, measured={"a": Measured(clouds, clouds[:, 0])}
+        {"a": clouds},
+        clouds,
+        index=np.int64(3),
+        name="a",
+        boxes=boxes,
+        measurements={"a": Measurement(clouds, clouds[:, 0])},
     )
-    seen = box_visibility(clouds, clouds, boxes, reference_weights=None)
+    seen = measure_box_visibility(clouds, clouds, boxes, reference_weights=None)
     stream = io.BytesIO()
     torch.save([grid, region, metric.compute(), frame, collate_frames([frame]), seen], stream)
     stream.seek(0)

@@ -7,10 +7,10 @@ import torch
 
 from torchcover import BevGrid, CoverageMetric
 from torchcover.coverage import Maximum, PooledMean
-from torchcover.metrics import added_up
-from torchcover.metrics.blocks import merged
+from torchcover.metrics import sum_rows
+from torchcover.metrics.blocks import merge_tables
 
-ONE_CELL = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)})
+ONE_CELL = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=1.0, heights={"all": (-1.0, 1.0)})
 STEP = (torch.tensor([[1.0, 0.0, 0.0]]), torch.zeros(1, 3))
 
 
@@ -22,7 +22,7 @@ def test_sums_over_very_many_steps_do_not_drift():
     many = {name: value if name == "fingerprint" else value * 2**25 for name, value in metric.state_dict().items()}
     metric.load_state_dict(many)
     metric.update([STEP[0]] * 3, [STEP[1]] * 3)
-    assert metric.cells.tolist() == [[0.0, 2**25 + 3, 2**25 + 3, 2**25 + 3, 2**25 + 3]]
+    assert metric.cell_sums.tolist() == [[0.0, 2**25 + 3, 2**25 + 3, 2**25 + 3, 2**25 + 3]]
 
 
 def clouds(seed: int, points: int = 300) -> tuple[torch.Tensor, torch.Tensor]:
@@ -32,23 +32,23 @@ def clouds(seed: int, points: int = 300) -> tuple[torch.Tensor, torch.Tensor]:
 
 @pytest.mark.parametrize("cell", [0.1, 0.001])
 def test_the_state_is_a_few_numbers_for_each_cell_that_a_step_has_touched(cell):
-    grid = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=cell, heights={"all": (-1.0, 1.0)})
+    grid = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=cell, heights={"all": (-1.0, 1.0)})
     metric = CoverageMetric(grid, blocks=8)
     for at in range(16):
         metric.update(*clouds(at), block_index=at)
-    assert len(metric.cells) <= min(8 * grid.cells, 16 * 300)
-    assert sum(value.numel() for value in metric.metric_state.values()) < 5 * len(metric.cells) + 250
+    assert len(metric.cell_sums) <= min(8 * grid.num_cells, 16 * 300)
+    assert sum(value.numel() for value in metric.metric_state.values()) < 5 * len(metric.cell_sums) + 250
 
 
 def test_when_rows_are_added_up_changes_no_bit_and_a_state_has_no_order():
     """Reading the state adds up what waits: after every step, or once."""
-    grid = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=0.1, heights={"all": (-1.0, 1.0)})
+    grid = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=0.1, heights={"all": (-1.0, 1.0)})
     every = [CoverageMetric(grid, blocks=8, aggregations=[Maximum(), PooledMean()]) for _ in range(3)]
     for at in range(40):
         for number, metric in enumerate(every):
             metric.update(*clouds(at, points=60), block_index=at)
             if number == 1 or (number == 2 and at % 7 == 0):
-                assert (metric.cells[:, 0].diff() > 0).all()
+                assert (metric.cell_sums[:, 0].diff() > 0).all()
     for metric in every[1:]:
         assert all(torch.equal(value, metric.metric_state[name]) for name, value in every[0].metric_state.items())
 
@@ -57,7 +57,7 @@ def test_when_rows_are_added_up_changes_no_bit_and_a_state_has_no_order():
     "spoil", [lambda key: key + 0.5, lambda key: key.flip(0), lambda key: key - 1.0, lambda key: key * 1e6]
 )
 def test_a_table_whose_keys_are_none_is_refused(spoil):
-    metric = CoverageMetric(BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=0.1, heights={"all": (-1.0, 1.0)}))
+    metric = CoverageMetric(BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=0.1, heights={"all": (-1.0, 1.0)}))
     metric.update(*clouds(0))
     metric.persistent(True)
     state = metric.state_dict()
@@ -73,7 +73,7 @@ def test_no_step_holds_on_to_its_graph():
     result = metric(sensor, reference)
     assert not any(value.requires_grad for value in metric.metric_state.values())
     assert not result.radius.requires_grad
-    assert copy.deepcopy(metric).compute().counts["frames"] == 2
+    assert copy.deepcopy(metric).compute().counts["num_frames"] == 2
 
 
 @pytest.mark.parametrize("maxima", [0, 2])
@@ -82,8 +82,8 @@ def test_tables_merge_into_what_their_rows_add_up_to(sizes, maxima):
     generator = torch.Generator().manual_seed(3)
     keys = [torch.randint(0, 90, (size, 1), generator=generator) for size in sizes]
     values = [torch.randn(size, 4, generator=generator) for size in sizes]
-    one, other = (added_up(torch.cat(each, dim=1).double(), maxima) for each in zip(keys, values, strict=True))
+    one, other = (sum_rows(torch.cat(each, dim=1).double(), maxima) for each in zip(keys, values, strict=True))
     given = one.clone(), other.clone()
-    assert torch.equal(merged(one, other, maxima), added_up(torch.cat([one, other]), maxima))
+    assert torch.equal(merge_tables(one, other, maxima), sum_rows(torch.cat([one, other]), maxima))
     assert torch.equal(one, given[0])
     assert torch.equal(other, given[1])

@@ -126,7 +126,7 @@ def exr(folder):
 
 def coverage(folder):
     """A saved result with blocks and sums over the surface."""
-    grid = BevGrid(x=(0.0, 4.0), y=(0.0, 2.0), cell=0.5)
+    grid = BevGrid(x_m=(0.0, 4.0), y_m=(0.0, 2.0), cell_m=0.5)
     metric = CoverageMetric(grid, blocks=8, max_radius=9.0, square_metres=True)
     random = torch.Generator().manual_seed(0)
     for _ in range(8):

@@ -9,13 +9,13 @@ import torch
 from scipy.spatial.distance import cdist
 
 from torchcover.data import SimulatedFrames
-from torchcover.detection import Boxes, box_visibility
+from torchcover.detection import Boxes, measure_box_visibility
 from torchcover.simulation import PaperReference
 
 TWO = Boxes.from_rows(torch.tensor([[10.0, 0.0, 1.0, 4.0, 2.0, 2.0, 0.0], [30.0, 0.0, 1.0, 4.0, 2.0, 2.0, 0.6]]))
 
 
-unweighted = partial(box_visibility, reference_weights=None)
+unweighted = partial(measure_box_visibility, reference_weights=None)
 
 
 def slow_visibility(sensor, reference, boxes, threshold, weights):
@@ -42,7 +42,9 @@ def test_against_a_slow_twin(weighted):
     boxes = Boxes.from_rows(rows)
     sensor, reference = (torch.rand(n, 3, generator=generator) * torch.tensor([20.0, 20, 3]) for n in (700, 1500))
     weights = torch.rand(1500, generator=generator).double() + 0.1 if weighted else torch.ones(1500).double()
-    found = box_visibility(sensor, reference, boxes, threshold=0.7, reference_weights=weights if weighted else None)
+    found = measure_box_visibility(
+        sensor, reference, boxes, threshold_m=0.7, reference_weights=weights if weighted else None
+    )
     share, mean, count = slow_visibility(sensor, reference, boxes, 0.7, weights.numpy())
     sampled = count > 0
     np.testing.assert_allclose(found.share.numpy()[sampled], share[sampled], atol=1e-12)
@@ -54,8 +56,8 @@ def test_against_a_slow_twin(weighted):
 
 def test_weights_that_are_all_equal_change_nothing():
     sensor, reference = torch.rand(50, 3) * 4, torch.rand(300, 3) * 4 + torch.tensor([8.0, -2.0, 0.0])
-    plain = box_visibility(sensor, reference, TWO, reference_weights=None)
-    weighted = box_visibility(sensor, reference, TWO, reference_weights=torch.full((300,), 7.0))
+    plain = measure_box_visibility(sensor, reference, TWO, reference_weights=None)
+    weighted = measure_box_visibility(sensor, reference, TWO, reference_weights=torch.full((300,), 7.0))
     torch.testing.assert_close(plain.mean_radius_m, weighted.mean_radius_m, equal_nan=True)
     torch.testing.assert_close(plain.share, weighted.share, equal_nan=True)
 
@@ -77,11 +79,11 @@ def test_a_box_that_only_the_rig_saw_is_known_by_the_sides_that_face_the_vehicle
     np.testing.assert_allclose(seen.share, expected, atol=0.03)
     # From the middle of a square of side 2, the mean distance is 0.7652 times half of it.
     assert seen.mean_radius_m[0] == pytest.approx(0.7652, rel=0.01)
-    assert seen.known.tolist() == [True, True, True, False]
+    assert seen.observed.tolist() == [True, True, True, False]
     assert (seen.reference_points.tolist(), seen.sensor_points.tolist()) == ([0] * 4, [1, 1, 1, 0])
     # Where the reference saw anything, that decides; and beside it nothing changes.
-    reference = torch.cat([boxes.centre_m[1:2], boxes.centre_m[1:2] + 0.1])
-    both = box_visibility(sensor, reference, boxes, 0.5, reference_weights=torch.ones(2))
+    reference = torch.cat([boxes.center_m[1:2], boxes.center_m[1:2] + 0.1])
+    both = measure_box_visibility(sensor, reference, boxes, 0.5, reference_weights=torch.ones(2))
     assert both.share[1] == 0.0
     torch.testing.assert_close(both.share[[0, 2]], seen.share[[0, 2]])
 
@@ -136,7 +138,7 @@ def test_no_boxes_give_an_empty_answer():
 def test_a_box_that_points_were_drawn_on_and_none_seen_is_hidden_and_one_without_is_not_sampled():
     boxes = Boxes.from_rows(TWO.rows.repeat(2, 1), drawn_points=torch.tensor([0, 7, 9, 0]))
     seen = unweighted(torch.rand(5, 3), torch.tensor([[10.0, 0.0, 1.0]]), boxes)
-    assert seen.known.tolist() == [True, False, True, False]
+    assert seen.observed.tolist() == [True, False, True, False]
     assert seen.hidden.tolist() == [False, True, False, False]
     assert seen.select(torch.tensor([3, 1])).hidden.tolist() == [False, True]
     # Where nobody says anything about drawing, as in a recording, nothing is known to be hidden.
@@ -145,12 +147,12 @@ def test_a_box_that_points_were_drawn_on_and_none_seen_is_hidden_and_one_without
 
 def test_weights_cannot_be_forgotten():
     with pytest.raises(TypeError, match="reference_weights"):
-        box_visibility(torch.rand(5, 3), torch.rand(5, 3), TWO)
+        measure_box_visibility(torch.rand(5, 3), torch.rand(5, 3), TWO)
 
 
 def test_selecting_keeps_the_columns_together():
     seen = unweighted(torch.rand(5, 3), torch.tensor([[10.0, 0.0, 1.0]]), TWO)
-    one = seen.select(seen.known)
+    one = seen.select(seen.observed)
     assert len(one) == 1
     assert one.reference_points.tolist() == [1]
 
@@ -188,7 +190,7 @@ def test_without_a_point_in_it_a_box_is_unknown_and_so_is_one_that_the_vehicle_s
 def test_bad_input_is_refused(changes, message):
     good = {"sensor": torch.rand(5, 3), "reference": torch.rand(5, 3), "boxes": TWO, "reference_weights": None}
     with pytest.raises(ValueError, match=message):
-        box_visibility(**{**good, **changes})
+        measure_box_visibility(**{**good, **changes})
 
 
 def test_in_a_simulated_frame_what_lies_behind_the_rig_is_blind_and_what_is_seen_holds_points():
@@ -196,11 +198,11 @@ def test_in_a_simulated_frame_what_lies_behind_the_rig_is_blind_and_what_is_seen
     reference = PaperReference(rows=512, columns=512, max_tilt_deg=0.0)
     frame = SimulatedFrames("highway", "front_roof_128", steps=1, seed=1, reference_sensor=reference, boxes=True)[0]
     seen = unweighted(frame.sensor, frame.reference, frame.boxes)
-    known = seen.known
+    known = seen.observed
     assert known.sum() >= 5
-    assert torch.equal(seen.sensor_points, frame.boxes.hits["front_roof_128"])
+    assert torch.equal(seen.sensor_points, frame.boxes.points_in_box["front_roof_128"])
     # The rig looks 120 degrees forward: what is behind is blind, and what it sees, it has points on.
-    behind = known & (frame.boxes.centre_m[:, 0] < -10.0)
+    behind = known & (frame.boxes.center_m[:, 0] < -10.0)
     assert (seen.share[behind] == 0).all()
     assert (seen.sensor_points[known & (seen.share > 0.5)] > 0).all()
     assert (seen.share[known] > 0.5).any()

@@ -12,7 +12,7 @@ from torch.utils.data import DataLoader
 
 from torchcover import Scenario
 from torchcover.data import Frame, SimulatedFrames, collate_frames
-from torchcover.detection import Boxes, BoxVisibility, box_visibility, match, points_in_boxes
+from torchcover.detection import Boxes, BoxVisibility, find_points_in_boxes, match_detections, measure_box_visibility
 from torchcover.detection.inside import SKIN_M
 from torchcover.simulation import PaperReference, Rig
 
@@ -43,10 +43,12 @@ def test_points_in_boxes_are_those_of_the_definition(seed):
     generator = torch.Generator().manual_seed(seed)
     boxes = random_boxes(12, generator, reach=6.0)
     points = torch.rand(800, 3, generator=generator) * torch.tensor([16.0, 16.0, 4.0]) - torch.tensor([8.0, 8.0, 0.5])
-    inside = points_in_boxes(points, boxes)
-    assert set(zip(inside.box.tolist(), inside.point.tolist(), strict=True)) == slow_inside(points, boxes)
-    assert (inside.box.diff() >= 0).all()
-    assert len(inside.box) > 20
+    inside = find_points_in_boxes(points, boxes)
+    assert set(zip(inside.box_indices.tolist(), inside.point_indices.tolist(), strict=True)) == slow_inside(
+        points, boxes
+    )
+    assert (inside.box_indices.diff() >= 0).all()
+    assert len(inside.box_indices) > 20
 
 
 @pytest.mark.parametrize("far_m", [30.0, 3e4, 1e30])
@@ -60,8 +62,10 @@ def test_boxes_may_be_far_apart_and_of_any_size(far_m):
     points[:4, 0] = torch.tensor([torch.inf, -torch.inf, torch.nan, far_m])
     points[4] = rows[3, :3]
     given = points.clone()
-    inside = points_in_boxes(points, boxes)
-    assert set(zip(inside.box.tolist(), inside.point.tolist(), strict=True)) == slow_inside(points, boxes)
+    inside = find_points_in_boxes(points, boxes)
+    assert set(zip(inside.box_indices.tolist(), inside.point_indices.tolist(), strict=True)) == slow_inside(
+        points, boxes
+    )
     assert torch.equal(points.nan_to_num(), given.nan_to_num())
 
 
@@ -76,8 +80,8 @@ def test_sides_and_top_are_closed_and_the_ground_below_is_outside():
         [12.0, -2.0, 2.0],
     ]
     out = [[10.0, -3.0, 0.0], [10.0, -3.0, 0.009], [12.02, -3.0, 1.0], [10.0, -3.0, 2.02], [10.0, -4.02, 1.0]]
-    inside = points_in_boxes(torch.tensor(in_it + out), box)
-    assert inside.point.sort().values.tolist() == list(range(len(in_it)))
+    inside = find_points_in_boxes(torch.tensor(in_it + out), box)
+    assert inside.point_indices.sort().values.tolist() == list(range(len(in_it)))
 
 
 def test_every_point_of_a_turned_box_s_surface_is_in_it_although_coordinates_are_rounded():
@@ -89,30 +93,30 @@ def test_every_point_of_a_turned_box_s_surface_is_in_it_although_coordinates_are
     local = on_face * rows[0, 3:6].double().numpy()
     c, s = math.cos(0.7), math.sin(0.7)
     points = local @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + rows[0, :3].double().numpy()
-    assert len(points_in_boxes(torch.from_numpy(points).float(), Boxes.from_rows(rows)).point) == 500
+    assert len(find_points_in_boxes(torch.from_numpy(points).float(), Boxes.from_rows(rows)).point_indices) == 500
 
 
 def test_a_point_may_lie_in_two_boxes_and_nothing_in_none():
     twice = Boxes.from_rows(torch.tensor([[0.0, 0, 1, 2, 2, 2, 0]] * 2))
-    assert points_in_boxes(torch.tensor([[0.0, 0.0, 1.0]]), twice).box.tolist() == [0, 1]
-    assert len(points_in_boxes(torch.rand(9, 3), NONE).box) == 0
-    assert len(points_in_boxes(torch.empty(0, 3), twice).box) == 0
+    assert find_points_in_boxes(torch.tensor([[0.0, 0.0, 1.0]]), twice).box_indices.tolist() == [0, 1]
+    assert len(find_points_in_boxes(torch.rand(9, 3), NONE).box_indices) == 0
+    assert len(find_points_in_boxes(torch.empty(0, 3), twice).box_indices) == 0
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
 def test_other_types_of_clouds_are_compared_exactly(dtype):
     points = (torch.rand(300, 3) * 100).to(dtype)
     boxes = Boxes.from_rows(torch.tensor([[50.0, 50, 50, 60, 30, 90, 0.4]]))
-    assert set(points_in_boxes(points, boxes).point.tolist()) == {p for _, p in slow_inside(points, boxes)}
+    assert set(find_points_in_boxes(points, boxes).point_indices.tolist()) == {p for _, p in slow_inside(points, boxes)}
 
 
 def test_membership_does_not_change_when_everything_is_moved_together():
     generator = torch.Generator().manual_seed(9)
     boxes, points = random_boxes(8, generator, 5.0), torch.rand(400, 3, generator=generator).double() * 12 - 6
     shift = torch.tensor([31.0, -17.0, 2.0], dtype=torch.float64)
-    moved = Boxes(boxes.centre_m.double() + shift, boxes.size_m.double(), boxes.yaw_rad.double())
-    before, after = points_in_boxes(points, boxes), points_in_boxes(points + shift, moved)
-    pairs = [set(zip(i.box.tolist(), i.point.tolist(), strict=True)) for i in (before, after)]
+    moved = Boxes(boxes.center_m.double() + shift, boxes.size_m.double(), boxes.yaw_rad.double())
+    before, after = find_points_in_boxes(points, boxes), find_points_in_boxes(points + shift, moved)
+    pairs = [set(zip(i.box_indices.tolist(), i.point_indices.tolist(), strict=True)) for i in (before, after)]
     assert pairs[0] == pairs[1]
 
 
@@ -165,7 +169,7 @@ def test_unknown_velocities_are_nan_unknown_names_empty_and_nothing_was_drawn():
     made = rows()
     assert made.velocity_mps.isnan().all()
     assert made.ids == made.categories == ("", "")
-    assert made.drawn_points.tolist() == [0, 0]
+    assert made.sampled_points.tolist() == [0, 0]
 
 
 def test_selecting_keeps_everything_together():
@@ -176,12 +180,16 @@ def test_selecting_keeps_everything_together():
         hits={"r": torch.tensor([3, 4])},
         drawn_points=torch.tensor([5, 6]),
     )
-    for chosen in (made.select(torch.tensor([False, True])), made.select(torch.tensor([1])), made.of_category("bus")):
-        assert (chosen.ids, chosen.categories, chosen.hits["r"].tolist()) == (("b",), ("bus",), [4])
-        assert chosen.centre_m.tolist() == [[3.0, 4.0, 5.0]]
-        assert chosen.drawn_points.tolist() == [6]
-    assert len(made.of_category("tram")) == 0
-    assert len(NONE.of_category("car")) == 0
+    for chosen in (
+        made.select(torch.tensor([False, True])),
+        made.select(torch.tensor([1])),
+        made.select_categories("bus"),
+    ):
+        assert (chosen.ids, chosen.categories, chosen.points_in_box["r"].tolist()) == (("b",), ("bus",), [4])
+        assert chosen.center_m.tolist() == [[3.0, 4.0, 5.0]]
+        assert chosen.sampled_points.tolist() == [6]
+    assert len(made.select_categories("tram")) == 0
+    assert len(NONE.select_categories("car")) == 0
 
 
 TRAFFIC = {"name": "t", "traffic": {"type": "parking", "duration_s": 2.0, "time_step_s": 0.5}}
@@ -239,37 +247,37 @@ def test_an_object_keeps_its_name_and_moves_as_its_velocity_says(frames):
 
 def test_hits_are_the_points_in_the_box_and_no_body_sticks_out_of_its_box(frames):
     frame = frames[1]
-    inside = points_in_boxes(frame.sensor, frame.boxes)
-    assert torch.equal(torch.bincount(inside.box, minlength=len(frame.boxes)), frame.boxes.hits["r"])
+    inside = find_points_in_boxes(frame.sensor, frame.boxes)
+    assert torch.equal(torch.bincount(inside.box_indices, minlength=len(frame.boxes)), frame.boxes.hits["r"])
     assert frame.boxes.hits["r"].sum() > 500
     grown = Boxes(frame.boxes.centre_m, frame.boxes.size_m + torch.tensor([0.3, 0.3, 0.0]), frame.boxes.yaw_rad)
-    around = points_in_boxes(frame.sensor, grown).point
-    just_outside = around[~torch.isin(around, inside.point)]
+    around = find_points_in_boxes(frame.sensor, grown).point_indices
+    just_outside = around[~torch.isin(around, inside.point_indices)]
     # Within 15 cm of a box but not in it: a few points of the ground, the ego is tilted, or of a wheel stop.
     assert (frame.sensor[just_outside, 2] < 0.3).all()
-    assert len(just_outside) < 0.02 * len(inside.point)
+    assert len(just_outside) < 0.02 * len(inside.point_indices)
 
 
 def test_a_batch_gives_boxes_in_a_list_padded_and_points_with_their_frame_s_number(frames):
     batch = collate_frames([frames[0], frames[5]])
     assert [len(boxes) for boxes in batch.boxes] == [len(frames[0].boxes), len(frames[5].boxes)]
-    padded = batch.padded_boxes(["pedestrian", "car"])
+    padded = batch.pad_boxes(["pedestrian", "car"])
     assert padded.shape[0] == 2
     assert padded.shape[2] == 8
     for row, boxes in zip(padded, batch.boxes, strict=True):
-        wanted = boxes.of_category("car", "pedestrian")
+        wanted = boxes.select_categories("car", "pedestrian")
         assert torch.equal(row[: len(wanted), :7], wanted.rows)
         assert [["pedestrian", "car"][int(number) - 1] for number in row[: len(wanted), 7]] == list(wanted.categories)
         assert not row[len(wanted) :].any()
-    stacked = batch.stacked_points()
+    stacked = batch.stack_points()
     for number, cloud in enumerate(batch.sensor):
         assert torch.equal(stacked[stacked[:, 0] == number, 1:], cloud)
-    assert torch.equal(stacked, batch.stacked_points("r"))
+    assert torch.equal(stacked, batch.stack_points("r"))
 
 
 def test_frames_without_objects_pad_to_nothing_and_frames_without_boxes_say_what_to_do():
     empty = Frame({"r": torch.zeros(2, 3)}, torch.zeros(2, 3), 0, "night 7", boxes=NONE)
-    assert collate_frames([empty, empty]).padded_boxes(["car"]).shape == (2, 0, 8)
+    assert collate_frames([empty, empty]).pad_boxes(["car"]).shape == (2, 0, 8)
     nobody_looked = Frame({"r": torch.zeros(2, 3)}, torch.zeros(2, 3), 0, "night 8")
     with pytest.raises(
         ValueError, match=r"1 of 2 frames have no boxes, such as 'night 8': SimulatedFrames\(.*boxes=True"
@@ -280,7 +288,7 @@ def test_frames_without_objects_pad_to_nothing_and_frames_without_boxes_say_what
 def test_a_world_without_objects_has_no_boxes_which_is_not_the_same_as_none():
     frame = SimulatedFrames("courtyard", "front_roof_32", steps=1, reference_sensor=SMALL, boxes=True)[0]
     assert len(frame.boxes) == 0
-    assert frame.boxes.hits["front_roof_32"].shape == (0,)
+    assert frame.boxes.points_in_box["front_roof_32"].shape == (0,)
 
 
 MOVING = rows(
@@ -299,12 +307,15 @@ def test_boxes_move_with_their_frame():
     ("call", "name"),
     [
         (lambda a, t, boxes: Boxes.from_rows(a), "rows"),
-        (lambda a, t, boxes: points_in_boxes(a, boxes), "points"),
-        (lambda a, t, boxes: match(a, t[:, 0], t, "distance", 2.0), "detections"),
-        (lambda a, t, boxes: match(t, a[:, 0], t, "distance", 2.0), "scores"),
-        (lambda a, t, boxes: match(t, t[:, 0], a, "distance", 2.0), "truth"),
-        (lambda a, t, boxes: box_visibility(a[:, :3], t[:, :3], boxes, reference_weights=None), "sensor"),
-        (lambda a, t, boxes: box_visibility(t[:, :3], t[:, :3], boxes, reference_weights=a[:, 0]), "reference_weights"),
+        (lambda a, t, boxes: find_points_in_boxes(a, boxes), "points"),
+        (lambda a, t, boxes: match_detections(a, t[:, 0], t, "distance", 2.0), "detections"),
+        (lambda a, t, boxes: match_detections(t, a[:, 0], t, "distance", 2.0), "scores"),
+        (lambda a, t, boxes: match_detections(t, t[:, 0], a, "distance", 2.0), "truth"),
+        (lambda a, t, boxes: measure_box_visibility(a[:, :3], t[:, :3], boxes, reference_weights=None), "sensor"),
+        (
+            lambda a, t, boxes: measure_box_visibility(t[:, :3], t[:, :3], boxes, reference_weights=a[:, 0]),
+            "reference_weights",
+        ),
     ],
 )
 def test_an_array_of_numpy_is_refused_by_its_name(call, name):
@@ -334,4 +345,4 @@ def test_the_skin_is_of_the_top_and_not_of_the_bottom():
     heights_m = [1.0 + SKIN_M, 1.0 + SKIN_M + 1e-9, SKIN_M - 1.0, SKIN_M - 1.0 + 1e-9]
     points = torch.tensor([[0.5, -0.5, height_m] for height_m in heights_m]).double()
     points[:, 2] = torch.tensor(heights_m, dtype=torch.float64)
-    assert points_in_boxes(points, boxes).point.tolist() == [0, 3]
+    assert find_points_in_boxes(points, boxes).point_indices.tolist() == [0, 3]

@@ -10,8 +10,8 @@ import pytest
 import torch
 from scipy.stats import binomtest
 
-from torchcover.detection import Boxes, BoxVisibility, RecallByVisibility, bev_iou, match, matching
-from torchcover.detection.recall_curve import Ratio
+from torchcover.detection import Boxes, BoxVisibility, RecallByVisibility, compute_bev_iou, match_detections, matching
+from torchcover.detection.recall_curve import RatioWithInterval
 
 VISIBILITY, DISTANCE = (0.2, 0.4, 0.6, 0.8), (20.0, 40.0, 60.0)
 
@@ -31,7 +31,7 @@ def test_overlap_of_boxes_along_the_axes_in_closed_form():
     upper = np.minimum(a[:, None, :2] + a[:, None, 2:] / 2, b[None, :, :2] + b[None, :, 2:] / 2)
     shared = np.clip(upper - lower, 0, None).prod(axis=2)
     expected = shared / (a[:, None, 2:].prod(axis=2) + b[None, :, 2:].prod(axis=2) - shared)
-    np.testing.assert_allclose(bev_iou(*rows).numpy(), expected, atol=1e-12)
+    np.testing.assert_allclose(compute_bev_iou(*rows).numpy(), expected, atol=1e-12)
     # Turned together by any angle, it is the same; by a quarter, length and width change places.
     for angle in (0.3, math.pi / 4, 2.0):
         c, s = math.cos(angle), math.sin(angle)
@@ -41,17 +41,17 @@ def test_overlap_of_boxes_along_the_axes_in_closed_form():
             boxes[:, :2] = boxes[:, :2] @ torch.tensor([[c, s], [-s, c]], dtype=torch.float64)
             boxes[:, 6] += angle
             turned.append(boxes)
-        np.testing.assert_allclose(bev_iou(*turned).numpy(), expected, atol=1e-12)
+        np.testing.assert_allclose(compute_bev_iou(*turned).numpy(), expected, atol=1e-12)
     quarter = rows[1][:, [0, 1, 2, 4, 3, 5, 6]].clone()
     quarter[:, 6] += math.pi / 2
-    np.testing.assert_allclose(bev_iou(rows[0], quarter).numpy(), expected, atol=1e-12)
+    np.testing.assert_allclose(compute_bev_iou(rows[0], quarter).numpy(), expected, atol=1e-12)
 
 
 def test_boxes_whose_circles_do_not_meet_are_not_compared_any_further(monkeypatch):
     asked = []
     monkeypatch.setattr(matching, "_intersection", lambda a, b: asked.append(len(a)) or torch.zeros(len(a)).double())
     diagonal = math.hypot(4.0, 2.0)
-    bev_iou(torch.tensor([row(0.0, 0.0)]), torch.tensor([row(1.01 * diagonal, 0.0), row(0.0, 0.99 * diagonal)]))
+    compute_bev_iou(torch.tensor([row(0.0, 0.0)]), torch.tensor([row(1.01 * diagonal, 0.0), row(0.0, 0.99 * diagonal)]))
     assert asked == [1]
 
 
@@ -69,7 +69,7 @@ def test_overlap_of_turned_boxes_against_a_fine_raster():
     stack = torch.stack(masks)
     both = stack @ stack.T
     expected = both / (stack.sum(dim=1)[:, None] + stack.sum(dim=1)[None] - both)
-    found = bev_iou(boxes, boxes)
+    found = compute_bev_iou(boxes, boxes)
     assert ((found > 0.05) & (found < 0.95)).sum() > 40
     torch.testing.assert_close(found, expected.double(), atol=0.02, rtol=0)
 
@@ -78,19 +78,19 @@ def test_a_square_and_itself_turned_by_45_degrees_share_an_octagon():
     square = torch.tensor([row(0, 0, 1, 1)])
     octagon = 2 * (math.sqrt(2) - 1)
     turned = torch.tensor([row(0, 0, 1, 1, math.pi / 4)], dtype=torch.float64)
-    assert bev_iou(square, turned).item() == pytest.approx(octagon / (2 - octagon), abs=1e-12)
+    assert compute_bev_iou(square, turned).item() == pytest.approx(octagon / (2 - octagon), abs=1e-12)
 
 
 def test_overlap_is_symmetric_one_with_itself_and_nothing_without_area():
     boxes = torch.rand(50, 7, dtype=torch.float64) * torch.tensor([5.0, 5, 1, 4, 3, 1, 7]) + 0.1
     boxes[:, 0] += 3e4  # far away, nothing is lost
-    found = bev_iou(boxes, boxes)
+    found = compute_bev_iou(boxes, boxes)
     torch.testing.assert_close(found, found.T, atol=1e-9, rtol=0)
     torch.testing.assert_close(found.diagonal(), torch.ones(50, dtype=torch.float64), atol=1e-9, rtol=0)
     flat = torch.tensor([row(0, 0, 0.0, 2.0), row(0, 0, 0.0, 0.0)])
-    assert not bev_iou(flat, flat).any()
-    assert not bev_iou(torch.tensor([row(0, 0)]), torch.tensor([row(4.0, 0), row(0, 2.0)])).any()  # they touch
-    assert bev_iou(torch.empty(0, 7), boxes).shape == (0, 50)
+    assert not compute_bev_iou(flat, flat).any()
+    assert not compute_bev_iou(torch.tensor([row(0, 0)]), torch.tensor([row(4.0, 0), row(0, 2.0)])).any()  # they touch
+    assert compute_bev_iou(torch.empty(0, 7), boxes).shape == (0, 50)
 
 
 # Matching.
@@ -106,7 +106,7 @@ def slow_match(detections, scores, truth, by, threshold):
                 cost = math.dist(detections[n][:2], truth[k][:2])
                 allowed = cost < threshold
             else:
-                cost = -bev_iou(torch.tensor([detections[n]]), torch.tensor([truth[k]])).item()
+                cost = -compute_bev_iou(torch.tensor([detections[n]]), torch.tensor([truth[k]])).item()
                 allowed = cost <= -threshold
             if k not in taken and allowed and cost < best_cost:
                 best, best_cost = k, cost
@@ -125,7 +125,7 @@ def test_matches_are_those_of_a_slow_twin(by, threshold, seed):
         [0.7, 0.7, 0, 0, 0, 0, 0.1]
     )
     scores = (torch.rand(24, generator=generator) * 6).round() / 6  # with ties
-    found = match(detections, scores, truth, by, threshold)
+    found = match_detections(detections, scores, truth, by, threshold)
     assert found.tolist() == slow_match(detections.tolist(), scores.tolist(), truth.tolist(), by, threshold)
     assert (found >= 0).sum() >= 6
 
@@ -134,38 +134,38 @@ def test_the_higher_score_chooses_first_even_if_the_other_is_nearer():
     truth = torch.tensor([row(0.0, 0.0), row(3.0, 0.0)])
     detections = torch.tensor([row(0.1, 0.0), row(1.0, 0.0)])
     # The second detection takes object 0; the first, nearer to it, is left with none within 2 m.
-    assert match(detections, torch.tensor([0.5, 0.9]), truth, "distance", 2.0).tolist() == [-1, 0]
-    assert match(detections, torch.tensor([0.9, 0.5]), truth, "distance", 2.01).tolist() == [0, 1]
+    assert match_detections(detections, torch.tensor([0.5, 0.9]), truth, "distance", 2.0).tolist() == [-1, 0]
+    assert match_detections(detections, torch.tensor([0.9, 0.5]), truth, "distance", 2.01).tolist() == [0, 1]
 
 
 def test_of_all_overlaps_only_that_of_the_box_itself_is_one():
     truth = torch.tensor([row(0.0, 0.0), row(20.0, 0.0)])
-    metric = RecallByVisibility(by="iou", threshold=1.0)
+    metric = RecallByVisibility(match_by="iou", threshold=1.0)
     moved = truth + torch.tensor([0, 0, 0, 0, 0, 0, 0.01]) * torch.tensor([[0.0], [1.0]])
     metric.update(moved, Boxes.from_rows(truth), torch.ones(2))
-    assert metric.compute().overall().recall.value.item() == 0.5
+    assert metric.compute().compute_overall().recall.value.item() == 0.5
 
 
 def test_a_distance_of_exactly_the_threshold_is_too_far_and_an_overlap_of_exactly_it_is_enough():
     truth = torch.tensor([row(0.0, 0.0)])
-    assert match(torch.tensor([row(2.0, 0.0)]), torch.ones(1), truth, "distance", 2.0).tolist() == [-1]
+    assert match_detections(torch.tensor([row(2.0, 0.0)]), torch.ones(1), truth, "distance", 2.0).tolist() == [-1]
     # 2 of 6 square metres, as exact in binary as 1/3 can be.
-    third = bev_iou(torch.tensor([row(2.0, 0.0)]), truth).item()
-    assert match(torch.tensor([row(2.0, 0.0)]), torch.ones(1), truth, "iou", third).tolist() == [0]
+    third = compute_bev_iou(torch.tensor([row(2.0, 0.0)]), truth).item()
+    assert match_detections(torch.tensor([row(2.0, 0.0)]), torch.ones(1), truth, "iou", third).tolist() == [0]
 
 
 def test_matching_by_something_else_or_without_a_score_for_each_is_refused():
     boxes = torch.tensor([row(0, 0), row(9, 0)])
     with pytest.raises(ValueError, match="by: 'distance' or 'iou' is needed; got 'centre'"):
-        match(boxes, torch.ones(2), boxes, "centre", 2.0)
+        match_detections(boxes, torch.ones(2), boxes, "centre", 2.0)
     with pytest.raises(ValueError, match=r"scores: one for each of 2 detections is needed; got \(1,\)"):
-        match(boxes, torch.ones(1), boxes, "distance", 2.0)
+        match_detections(boxes, torch.ones(1), boxes, "distance", 2.0)
 
 
 def test_nothing_matches_nothing():
     none = torch.empty(0, 7)
-    assert match(none, torch.empty(0), torch.tensor([row(0, 0)]), "iou", 0.5).tolist() == []
-    assert match(torch.tensor([row(0, 0)]), torch.ones(1), none, "distance", 2.0).tolist() == [-1]
+    assert match_detections(none, torch.empty(0), torch.tensor([row(0, 0)]), "iou", 0.5).tolist() == []
+    assert match_detections(torch.tensor([row(0, 0)]), torch.ones(1), none, "distance", 2.0).tolist() == [-1]
 
 
 # The metric.
@@ -254,7 +254,7 @@ def test_recall_and_precision_are_quotients_of_the_counts_with_nan_where_there_a
     objects, found, detected, true = slow_counts(FRAMES, (0.0, 0.5))
     result = filled(FRAMES).compute()
     for axis, summed in {"visibility": 2, "distance": 1}.items():
-        curve = result.over(axis)
+        curve = result.compute_curve(axis)
         with np.errstate(invalid="ignore"):
             np.testing.assert_allclose(
                 curve.recall.value.numpy(), found.sum(axis=summed) / objects.sum(axis=summed - 1), err_msg=axis
@@ -264,7 +264,7 @@ def test_recall_and_precision_are_quotients_of_the_counts_with_nan_where_there_a
             )
         assert len(curve.bins) == curve.recall.value.shape[1]
         assert (curve.recall.trials[0].numpy() == objects.sum(axis=summed - 1)).all()
-    assert result.overall().recall.value[0, 0] == found[0].sum() / objects.sum()
+    assert result.compute_overall().recall.value[0, 0] == found[0].sum() / objects.sum()
 
 
 def test_bins_are_half_open_and_the_last_ones_reach_to_one_and_to_infinity():
@@ -282,24 +282,24 @@ def test_without_visibility_of_detections_their_precision_is_known_over_distance
     detections, boxes, share, scores, _ = FRAMES[1]
     metric.update(detections, boxes, share, scores)
     result = metric.compute()
-    assert result.over("visibility").precision.trials[0].tolist() == [0] * 6 + [len(detections)]
-    assert result.over("visibility").precision.value[0, :-1].isnan().all()
-    assert result.over("distance").precision.trials.sum() == len(detections)
+    assert result.compute_curve("visibility").precision.trials[0].tolist() == [0] * 6 + [len(detections)]
+    assert result.compute_curve("visibility").precision.value[0, :-1].isnan().all()
+    assert result.compute_curve("distance").precision.trials.sum() == len(detections)
 
 
 def test_without_scores_all_detections_count_and_the_first_chooses_first():
     metric = RecallByVisibility(score_thresholds=(0.9,))
     truth = Boxes.from_rows(torch.tensor([row(5.0, 0.0)]))
     metric.update(torch.tensor([row(6.0, 0.0), row(5.0, 0.0)]), truth, torch.tensor([0.9]))
-    assert metric.compute().overall().recall.value.item() == 1.0
-    assert metric.compute().overall().precision.value.item() == 0.5
+    assert metric.compute().compute_overall().recall.value.item() == 1.0
+    assert metric.compute().compute_overall().precision.value.item() == 0.5
 
 
 def test_a_score_of_exactly_the_threshold_counts():
     metric = RecallByVisibility(score_thresholds=(0.5, 0.51))
     truth = Boxes.from_rows(torch.tensor([row(5.0, 0.0)]))
     metric.update(truth.rows, truth, torch.tensor([0.9]), torch.tensor([0.5]))
-    result = metric.compute().overall()
+    result = metric.compute().compute_overall()
     assert result.recall.value.flatten().tolist() == [1.0, 0.0]
     assert result.precision.trials.flatten().tolist() == [1, 0]
 
@@ -310,28 +310,28 @@ def test_frames_without_objects_or_detections_are_counted_and_break_nothing(coun
     none = Boxes.from_rows(torch.empty(0, 7))
     metric.update(torch.rand(count, 7), none, torch.empty(0), torch.rand(count))
     result = metric.compute()
-    assert result.steps == 1
-    assert result.overall().recall.value.isnan().all()
-    assert result.overall().precision.trials.item() == count
+    assert result.num_frames == 1
+    assert result.compute_overall().recall.value.isnan().all()
+    assert result.compute_overall().precision.trials.item() == count
 
 
 def test_scalars_are_flat_floats_that_say_how_much_they_rest_on():
     scalars = RecallByVisibility(visibility_borders=(0.5,), distance_borders=())
     scalars.update(torch.tensor([row(5.0, 0.0)]), Boxes.from_rows(torch.tensor([row(5.0, 0.0)])), torch.tensor([0.7]))
-    flat = scalars.compute().scalars()
+    flat = scalars.compute().to_scalars()
     assert flat["recall/all"] == 1.0
     assert flat["recall/visibility 0.5-1"] == 1.0
     assert math.isnan(flat["recall/visibility 0-0.5"])
     assert flat["objects/visibility 0-0.5"] == 0.0
     assert flat["precision/distance over 0 m"] == 1.0
     assert all(isinstance(value, float) for value in flat.values())
-    several = filled(FRAMES).compute().scalars()
+    several = filled(FRAMES).compute().to_scalars()
     assert several["recall_score_0.5/all"] <= several["recall_score_0/all"]
 
 
 def test_intervals_are_wilson_s_and_unknown_without_trials():
     successes, trials = torch.tensor([8, 0, 10, 1, 57, 0]), torch.tensor([10, 10, 10, 400, 60, 0])
-    ratio = Ratio.of(successes, trials)
+    ratio = RatioWithInterval.from_counts(successes, trials)
     for k in range(5):
         exact = binomtest(int(successes[k]), int(trials[k])).proportion_ci(0.95, method="wilson")
         assert ratio.low[k].item() == pytest.approx(exact.low, abs=1e-12)
@@ -397,7 +397,7 @@ def test_bad_frames_are_refused_and_leave_the_state_alone(changes, message):
     }
     with pytest.raises(ValueError, match=message):
         metric.update(**{**good, **changes})
-    assert int(metric.steps) == 0
+    assert int(metric.num_frames) == 0
 
 
 def test_a_frame_in_which_nobody_looked_for_objects_is_refused():
@@ -407,7 +407,7 @@ def test_a_frame_in_which_nobody_looked_for_objects_is_refused():
 
 def test_intervals_of_all_and_of_none_end_at_one_and_at_zero_however_they_are_rounded():
     trials = torch.arange(1, 20_000)
-    every, none = (Ratio.of(successes, trials) for successes in (trials, torch.zeros_like(trials)))
+    every, none = (RatioWithInterval.from_counts(successes, trials) for successes in (trials, torch.zeros_like(trials)))
     assert every.high.max() == 1.0
     assert none.low.min() == 0.0
 
@@ -416,7 +416,7 @@ def test_a_plot_of_recall_has_a_point_and_its_wilson_interval_for_every_bin_with
     metric = RecallByVisibility(visibility_borders=(0.5,), score_thresholds=(0.0, 0.5))
     rows = torch.tensor([row(10 * k, 0) for k in range(1, 4)])
     metric.update(rows[:2], Boxes.from_rows(rows), torch.tensor([0.9, 0.1, math.nan]), torch.tensor([0.9, 0.3]))
-    curve = metric.compute().over("visibility")
+    curve = metric.compute().compute_curve("visibility")
     for at, score in enumerate((None, 0.5)):
         figure, axes = metric.plot(score_threshold=score)
         points, (bars,) = axes.lines[0].get_xydata(), axes.collections
@@ -455,4 +455,4 @@ def test_keys_are_those_that_every_logger_takes():
     metric = RecallByVisibility(score_thresholds=(0.0, 0.5))
     metric.update([], [], [])
     legal = re.compile(r"[\w\-. /]+")  # of MLflow
-    assert all(legal.fullmatch(key) for key in metric.compute().scalars())
+    assert all(legal.fullmatch(key) for key in metric.compute().to_scalars())

@@ -13,7 +13,7 @@ from tests.targets.worlds import EGO, FLOOR, lidar, on_target
 from torchcover.encounters import Criterion, Encounter, EncounterSet, Staged, sight_encounter
 from torchcover.encounters.sighting import NEVER, Looks, MountedRig, channels, first_run, look_steps
 from torchcover.evaluation import build_flat_ground, evaluate_encounters, plot_encounter_animation
-from torchcover.geometry import euler_from_rotation, overlapping
+from torchcover.geometry import convert_rotation_to_euler, find_overlaps
 from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, with_ego
 from torchcover.simulation.bodies import called
 from torchcover.simulation.moving import Solid
@@ -111,10 +111,10 @@ def test_a_touch_of_less_than_a_millisecond_is_one():
     staged = Staged(grazing(0.004), SOLID)
     assert staged.contact_s == pytest.approx(1.5 - 0.05045, abs=1e-9)
     whole_s = np.arange(2000) / 1000
-    assert not overlapping(staged.other.box, staged.vehicle_T_other(whole_s), SOLID.box.corners_m).any()
+    assert not find_overlaps(staged.other.box, staged.vehicle_T_other(whole_s), SOLID.box.corners_m).any()
     bent = Staged(grazing(0.4, radius_m=8), SOLID)
     finely_s = np.linspace(bent.contact_s - 1e-3, bent.contact_s + 1e-3, 20_001)
-    touching = overlapping(bent.other.box, bent.vehicle_T_other(finely_s), SOLID.box.corners_m)
+    touching = find_overlaps(bent.other.box, bent.vehicle_T_other(finely_s), SOLID.box.corners_m)
     assert finely_s[touching.argmax()] == pytest.approx(bent.contact_s, abs=2e-7)
 
 
@@ -146,7 +146,7 @@ def test_a_bend_ends_at_the_meeting_and_is_as_long_as_its_angle():
     staged = Staged(turning, SOLID)
     bend_s = 8 * math.pi / 2 / 5
     poses = staged.world_T_ego(turning.before_s - np.array([0.0, bend_s, bend_s + 0.1]))
-    yaw_deg = [euler_from_rotation(pose[:3, :3])[0] for pose in poses]
+    yaw_deg = [convert_rotation_to_euler(pose[:3, :3])[0] for pose in poses]
     assert yaw_deg == pytest.approx([0.0, -90.0, -90.0], abs=1e-6)
     assert poses[:, :2, 3] == pytest.approx(np.array([[-2.0, 0.0], [-10.0, 8.0], [-10.0, 8.5]]))
 
@@ -204,7 +204,7 @@ def test_points_are_those_of_a_simulation_with_the_other_in_the_world():
             bodies.append({"name": one.side, "shape": poses[one.side], "poses": [{"x_m": x_m, "y_m": y_m}]})
         assert len(bodies) == 1 + len(shapes)
         x_m, y_m, _ = vehicle_T_other[:3, 3].tolist()
-        yaw_deg = float(euler_from_rotation(vehicle_T_other[:3, :3])[0])
+        yaw_deg = float(convert_rotation_to_euler(vehicle_T_other[:3, :3])[0])
         actor = {"name": "c", "category": "child", "shape": {"type": "vehicle", "vehicle": "child_120cm"},
                  "pose": {"x_m": x_m, "y_m": y_m, "yaw_deg": yaw_deg}}  # fmt: skip
         world = Scenario.model_validate({"name": "s", "ego": EGO, "bodies": bodies, "actors": [actor]})

@@ -16,7 +16,7 @@ from torchcover.encounters import Criterion, Sightings
 from torchcover.encounters.sighting import NEVER
 from torchcover.encounters.traffic import Approach, Drive, Eyes, Watch, approaches, sight_approach
 from torchcover.evaluation import evaluate_recorded_encounters, evaluate_traffic_encounters
-from torchcover.geometry import BoundingBox, rigid
+from torchcover.geometry import BoundingBox, build_transform
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings import open_recording
 from torchcover.recordings.objects import Track
@@ -91,7 +91,7 @@ def test_points_are_those_of_frames(scenario, driven):
         watch = Watch(there, track, eyes)
         for step in (0, 9, 21, 30):
             boxes = frames[step].boxes
-            expected = int(boxes.hits["small"][boxes.ids.index(track.name)])
+            expected = int(boxes.points_in_box["small"][boxes.ids.index(track.name)])
             assert watch.points(range(3), np.array([step])) == [expected]
             counted += expected
     assert counted > 1000
@@ -164,7 +164,7 @@ def test_who_is_in_time_is_open_where_braking_was_never_needed(driven):
 
 
 def test_who_looks_rarely_has_seen_him_before():
-    track = Track("t", "car", "passenger", (4.0, 2.0, 1.5), Trajectory.resting([10.0, 0.0, 0.0]))
+    track = Track("t", "car", "passenger", (4.0, 2.0, 1.5), Trajectory.create_static([10.0, 0.0, 0.0]))
     there = Drive("w", STEP_S * np.arange(70), np.tile(np.eye(4), (70, 1, 1)), None, [track])
     one = Approach(track, 45, np.array([2.0] * 20), np.array([0.5] * 20), "cars and vans", 0.0)
     for seen_from, ttc_s in ((0, 2.5), (20, 2.0), (40, 0.0)):
@@ -215,7 +215,7 @@ def test_braking_is_needed_where_it_helps(ego_mps, other_mps, from_m, needed_s):
     [(0, 4.0, 1), (6, 2.0, 1), (7, 1.0, 0), (8, 1.0, 0), (9, 0.0, 0)],
 )
 def test_the_nearest_time_until_detection_counts_though_it_grew_again(seen_from, ttc_s, in_time):
-    track = Track("t", "car", "passenger", (4.0, 2.0, 1.5), Trajectory.resting([10.0, 0.0, 0.0]))
+    track = Track("t", "car", "passenger", (4.0, 2.0, 1.5), Trajectory.create_static([10.0, 0.0, 0.0]))
     there = Drive("w", STEP_S * np.arange(9), np.tile(np.eye(4), (9, 1, 1)), None, [track])
     one = Approach(track, 5, np.array([3.0, 2.0, 1.0, 3.5]), np.array([0.5, 0.5, 1.1, 0.5]), "cars and vans", 0.0, 0.0)
     on_it, about_it = [[9.0, 0.0, 1.0]], [[9.0, 0.0, 1.52], [9.0, 0.0, 0.0], [12.02, 0.0, 1.0], [9.0, -1.02, 1.0]]
@@ -270,10 +270,10 @@ class Closing(SyntheticDrive):
     """At 15 m/s behind a car with 5 m/s, on which there are points from the ninth instant on."""
 
     def get_world_T_vehicle(self, index):
-        return rigid(np.eye(3), [1.5 * index, 0.0, 0.0])
+        return build_transform(np.eye(3), [1.5 * index, 0.0, 0.0])
 
     def world_T_car(self, index):
-        return rigid(np.eye(3), [50.0 + 0.5 * index, 0.0, 0.75])
+        return build_transform(np.eye(3), [50.0 + 0.5 * index, 0.0, 0.75])
 
     def read_scan(self, sensor, index):
         back_m, self.back_m = self.back_m, self.back_m[: None if index >= 8 else 0]
@@ -301,7 +301,7 @@ def test_real_road_users_are_first_hit_as_their_layout_says(layout, tmp_path):
 def test_parked_vehicles_are_not_met_and_people_who_stand_are(category, met):
     class Standing(Closing):
         def world_T_car(self, index):
-            return rigid(np.eye(3), [68.0 + 0.1 * (index % 2), 0.0, 0.75])
+            return build_transform(np.eye(3), [68.0 + 0.1 * (index % 2), 0.0, 0.75])
 
         def read_boxes(self, index):
             box = super().read_boxes(index)

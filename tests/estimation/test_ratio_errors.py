@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchcover.estimation import jackknife_error, ratio_errors
+from torchcover.estimation import compute_jackknife_error, estimate_ratio_errors
 
 
 def blocks_of(cells: int, blocks: int = 16, seed: int = 0):
@@ -24,21 +24,24 @@ def test_it_is_the_spread_of_the_residuals_with_two_blocks_more(unit, blind):
         base = np.append(m2[:, cell], [mean_m2, mean_m2])
         residual = np.append(sums[:, cell], [covered * mean_m2, blind(ratio) * mean_m2]) - ratio * base
         expected.append(np.sqrt((residual**2).sum() * 18 / 17) / base.sum())
-    found = ratio_errors(torch.from_numpy(m2), torch.from_numpy(sums), unit)
+    found = estimate_ratio_errors(torch.from_numpy(m2), torch.from_numpy(sums), unit)
     np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
 def test_with_many_blocks_it_is_the_jackknife_of_the_same_ratio():
     m2, sums = blocks_of(50, blocks=2000)
     left_out = (sums.sum(dim=0) - sums) / (m2.sum(dim=0) - m2)
-    jackknife = jackknife_error(left_out, sums.sum(dim=0) / m2.sum(dim=0), torch.ones(2000))
-    torch.testing.assert_close(ratio_errors(m2, sums, "share"), jackknife, rtol=0.02, atol=0)
+    jackknife = compute_jackknife_error(left_out, sums.sum(dim=0) / m2.sum(dim=0), torch.ones(2000))
+    torch.testing.assert_close(estimate_ratio_errors(m2, sums, "share"), jackknife, rtol=0.02, atol=0)
 
 
 def test_the_unit_of_the_square_metres_does_not_matter():
     m2, sums = blocks_of(9)
     torch.testing.assert_close(
-        ratio_errors(1e-6 * m2, 1e-6 * sums, "share"), ratio_errors(m2, sums, "share"), rtol=1e-9, atol=0
+        estimate_ratio_errors(1e-6 * m2, 1e-6 * sums, "share"),
+        estimate_ratio_errors(m2, sums, "share"),
+        rtol=1e-9,
+        atol=0,
     )
 
 
@@ -48,12 +51,12 @@ def test_two_errors_cover_a_share_near_one():
     for blocks in (11, 16):
         sums = torch.from_numpy(random.binomial(6, 0.95, (blocks, 4000)).astype(float))
         m2 = torch.full_like(sums, 6.0)
-        ratio, error = sums.sum(dim=0) / m2.sum(dim=0), ratio_errors(m2, sums, "share")
+        ratio, error = sums.sum(dim=0) / m2.sum(dim=0), estimate_ratio_errors(m2, sums, "share")
         assert float(((ratio - 0.95).abs() <= 2 * error).double().mean()) >= 0.93
 
 
 def test_what_few_blocks_know_is_unknown():
     m2 = torch.tensor([[1.0, 2.0, 0.0]] * 7 + [[0.0, 1.0, 0.0]] * 9, dtype=torch.float64)
-    assert ratio_errors(m2, 0.5 * m2, "share").isnan().tolist() == [True, False, True]
+    assert estimate_ratio_errors(m2, 0.5 * m2, "share").isnan().tolist() == [True, False, True]
     infinite = torch.where(m2 > 0, torch.inf, 0.0)
-    assert ratio_errors(m2, infinite, "m").isnan().all()
+    assert estimate_ratio_errors(m2, infinite, "m").isnan().all()

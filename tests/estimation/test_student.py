@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from torchcover.coverage.quantity import RADIUS, detection
-from torchcover.estimation import Quantity, interval95, student_p, student_t95
+from torchcover.coverage.quantity import RADIUS, make_detection_quantity
+from torchcover.estimation import Quantity, compute_interval95, compute_student_p, compute_student_t95
 from torchcover.estimation.errors import BLIND_SIDE, is_significant
 
-SHARE = detection(0.4)
+SHARE = make_detection_quantity(0.4)
 BLIND = Quantity("blind", "share that is not seen", "share", lower_is_better=True)
 FAR = Quantity("range_m", "how far it sees", "m", lower_is_better=False)
 NATS = Quantity("gain", "gain", "nats", lower_is_better=False)
@@ -19,7 +19,7 @@ NATS = Quantity("gain", "gain", "nats", lower_is_better=False)
 @pytest.mark.parametrize("freedom", [1, 2, 3, 6, 7, 8, 9, 11, 15, 31, 200, 10_000])
 def test_students_t_is_that_of_scipy_and_decides(freedom):
     limit = float(stats.t.ppf(0.975, freedom))
-    assert student_t95(freedom) == pytest.approx(limit, abs=1e-4)
+    assert compute_student_t95(freedom) == pytest.approx(limit, abs=1e-4)
     for sign in (-1, 1):
         assert is_significant(sign * 1.001 * limit * 0.2, 0.2, freedom) is True
         assert is_significant(sign * 0.999 * limit * 0.2, 0.2, freedom) is False
@@ -30,8 +30,8 @@ def test_students_t_is_that_of_scipy_and_decides(freedom):
 @pytest.mark.parametrize("freedom", [1, 2, 3, 6, 15, 40])
 def test_the_probability_of_t_is_students(freedom):
     for t in (0.0, 0.3, -2.0, 7.0):
-        assert student_p(t, freedom) == pytest.approx(2 * stats.t.sf(abs(t), freedom), abs=1e-12)
-    assert np.isnan(student_p(float("nan"), freedom))
+        assert compute_student_p(t, freedom) == pytest.approx(2 * stats.t.sf(abs(t), freedom), abs=1e-12)
+    assert np.isnan(compute_student_p(float("nan"), freedom))
 
 
 def twin(value, error, freedom, quantity, is_difference):
@@ -51,35 +51,35 @@ def twin(value, error, freedom, quantity, is_difference):
 @pytest.mark.parametrize("freedom", [7, 10, 42, 255])
 def test_ends_are_students_t_on_a_scale_without_bounds(quantity, is_difference, freedom):
     for value, error in ((0.3, 0.001), (0.3, 0.05), (0.02, 0.015), (0.98, 0.015)):
-        found = interval95(value, error, freedom, quantity, is_difference=is_difference)
+        found = compute_interval95(value, error, freedom, quantity, is_difference=is_difference)
         assert found == pytest.approx(twin(value, error, freedom, quantity, is_difference), rel=1e-4)
 
 
 def test_a_difference_is_significant_just_where_its_interval_does_not_hold_0():
     for quantity in (RADIUS, SHARE):
         for value in np.linspace(-0.3, 0.3, 61).tolist():
-            low, high = interval95(value, 0.05, 10, quantity, is_difference=True)
+            low, high = compute_interval95(value, 0.05, 10, quantity, is_difference=True)
             assert is_significant(value, 0.05, 10) is not (low <= 0.0 <= high)
 
 
 @pytest.mark.parametrize("quantity", [RADIUS, SHARE])
 def test_what_is_not_known_has_no_interval_and_neither_has_what_all_blocks_agree_on(quantity):
-    assert all(map(math.isnan, interval95(0.5, math.nan, 3, quantity)))
-    assert all(map(math.isnan, interval95(1.0, 0.0, 10, quantity)))
-    assert interval95(math.inf, math.nan, 10, quantity)[0] != math.inf
+    assert all(map(math.isnan, compute_interval95(0.5, math.nan, 3, quantity)))
+    assert all(map(math.isnan, compute_interval95(1.0, 0.0, 10, quantity)))
+    assert compute_interval95(math.inf, math.nan, 10, quantity)[0] != math.inf
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0, 1 + 2e-16, -1e-17])
 def test_a_share_at_the_rim_with_an_error_may_be_anything(value):
-    assert interval95(value, 1e-3, 10, SHARE) == (0.0, 1.0)
-    assert all(map(math.isnan, interval95(0.0, 1e-3, 10, RADIUS)))
+    assert compute_interval95(value, 1e-3, 10, SHARE) == (0.0, 1.0)
+    assert all(map(math.isnan, compute_interval95(0.0, 1e-3, 10, RADIUS)))
 
 
 @pytest.mark.parametrize(("value", "error"), [(1e-9, 1.0), (1 - 1e-12, 0.5), (0.5, 1e6)])
 def test_absurd_errors_leave_no_range(value, error):
-    low, high = interval95(value, error, 7, SHARE)
+    low, high = compute_interval95(value, error, 7, SHARE)
     assert 0.0 <= low <= value <= high <= 1.0
-    low, high = interval95(value, error, 7, RADIUS)
+    low, high = compute_interval95(value, error, 7, RADIUS)
     assert 0.0 <= low <= value < high < math.inf
 
 
@@ -90,7 +90,7 @@ def test_means_of_skewed_blocks_are_covered(quantity, sigma):
     each = radii if quantity is RADIUS else np.clip(2.0 - radii, 0.01, 0.99)
     truth, errors = each.mean(), each.std(axis=1, ddof=1) / math.sqrt(11)
     numbers = list(zip(each.mean(axis=1).tolist(), errors.tolist(), strict=True))
-    covered = [low <= truth <= high for low, high in (interval95(*number, 10, quantity) for number in numbers)]
+    covered = [low <= truth <= high for low, high in (compute_interval95(*number, 10, quantity) for number in numbers)]
     assert np.mean(covered) > 0.92
     plain = [abs(value - truth) <= 1.96 * error for value, error in numbers]
     assert np.mean(plain) < 0.91

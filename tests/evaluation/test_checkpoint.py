@@ -15,7 +15,7 @@ import pytest
 import torch
 
 import torchcover
-from torchcover.coverage import Maximum, StepQuantiles
+from torchcover.coverage import FrameQuantiles, Maximum
 from torchcover.data import BadFrameError, FrameDataset
 from torchcover.evaluation import Checkpoint, checkpoint
 from torchcover.evaluation.checkpoint import read_header, read_state, write_checkpoint
@@ -24,7 +24,7 @@ from torchcover.evaluation.task import TOLD_OTHERWISE
 from torchcover.files import BadFileError
 
 STEPS = 16
-SETTINGS = {"cell_m": 8.0, "aggregations": (Maximum(), StepQuantiles((0.5,)))}
+SETTINGS = {"cell_m": 8.0, "aggregations": (Maximum(), FrameQuantiles((0.5,)))}
 
 
 class Drive(FrameDataset):
@@ -34,9 +34,9 @@ class Drive(FrameDataset):
     sensors = {}  # noqa: RUF012
     ego_outline_m = None
     description = {"scenario": None, "frames": "drive", "seed": None}  # noqa: RUF012
-    square_metres = False
+    has_area_weights = False
     reference_record = None
-    world_of = staticmethod(int)
+    get_scene_id = staticmethod(int)
 
     def __init__(self, frame_of, bad=(), content="drive", delay_s=0.0):
         self.frame_of, self.bad, self.content, self.delay_s = frame_of, bad, {"frames": content}, delay_s

@@ -47,10 +47,10 @@ class Source(FrameDataset):
     sensors = {}  # noqa: RUF012
     ego_outline_m = None
     description = {"scenario": None, "frames": "made up", "seed": None}  # noqa: RUF012
-    square_metres = False
+    has_area_weights = False
     reference_record = None
     content = {"frames": "made up"}  # noqa: RUF012
-    world_of = staticmethod(int)
+    get_scene_id = staticmethod(int)
 
     def __len__(self):
         return 3
@@ -78,7 +78,7 @@ def test_one_rig(tmp_path):
     result = torchcover.evaluate("front_roof_32", observers={"points": PointCount()}, **SMALL)
     assert result.observer_results["points"] > 1000
     assert result.coverage is result.coverages["front_roof_32"]
-    assert result.coverage.counts["frames"] == result.run.num_frames == 2
+    assert result.coverage.counts["num_frames"] == result.run.num_frames == 2
     # Of the near field, two sides hold a centre of such large cells, and of that the ground is asked about.
     places = [(row["region"], row["height"]) for row in result.summary]
     assert places[:6:2] == [("20m", "ground"), ("80m", "ground"), ("160m", "ground")]
@@ -236,7 +236,7 @@ def test_a_rig_may_be_called_what_no_file_can_be(tmp_path):
     result.save(tmp_path)
     stems = [path.stem for path in sorted((tmp_path / "coverage").iterdir())]
     assert len(stems) == 2
-    assert Coverage.load(tmp_path / "coverage" / f"{stems[0]}.npz").counts["frames"] == 1
+    assert Coverage.load(tmp_path / "coverage" / f"{stems[0]}.npz").counts["num_frames"] == 1
 
 
 def test_settings_have_one_form_whatever_they_are_given_as():
@@ -325,7 +325,7 @@ def test_aggregations_are_measured_drawn_and_saved(tmp_path):
     assert f"{quantity.key}_ground" in {path.stem for path in files}
     assert quantity.key in Coverage.load(tmp_path / "coverage.npz").layers
     (kept_not,) = [omission.description for omission in result.omissions if "not kept" in omission.description]
-    assert Maximum.words not in kept_not
+    assert Maximum.description not in kept_not
 
 
 def test_of_detections_alone_the_same_is_known_and_of_radii_nothing():
@@ -336,8 +336,8 @@ def test_of_detections_alone_the_same_is_known_and_of_radii_nothing():
     every, some = (torchcover.evaluate(rigs, "parking", **given, only_detection=only) for only in (False, True))
     for name, coverage in every.coverages.items():
         other = some.coverages[name]
-        assert coverage.bodies
-        assert not other.bodies  # nobody has asked for them
+        assert coverage.target_sums
+        assert not other.target_sums  # nobody has asked for them
         np.testing.assert_array_equal(other.detection, coverage.detection)
         assert other.radius.isnan().all()
         for region, height in ((region, height) for region in every.regions for height in coverage.grid.heights):

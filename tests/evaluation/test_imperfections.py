@@ -7,7 +7,7 @@ import pytest
 
 from tests.simulation.small_worlds import FLOOR, box, scenario
 from torchcover import BevGrid, CoverageMetric, Region
-from torchcover.contrib import PUBLISHED, Setup, Sights, SMig
+from torchcover.contrib import PUBLISHED, FrameQueryCache, MetricSetup, SMig
 from torchcover.coverage import Maximum
 from torchcover.data import SimulatedFrames
 from torchcover.evaluation.observers import CoverageObserver
@@ -17,7 +17,7 @@ from torchcover.targets import Raster, Target, survey
 
 AREA = Region("20m", (2.0, 22.0), (-6.0, 6.0))
 GRID = BevGrid(
-    x=AREA.x, y=AREA.y, cell=0.5, heights={"ground": (-0.5, 0.2), "obstacle": (0.2, 2.0)}, band_frame="ground"
+    x_m=AREA.x_m, y_m=AREA.y_m, cell_m=0.5, heights={"ground": (-0.5, 0.2), "obstacle": (0.2, 2.0)}, band_frame="ground"
 )
 CAR = {"category": "car", "shape": {"type": "box", "size_m": [4, 1.8, 1.5]}}
 CARS = [{"name": f"car {x_m}", "pose": {"x_m": x_m, "y_m": y_m}, **CAR} for x_m, y_m in ((9, -3), (17, 2))]
@@ -57,7 +57,7 @@ def rig(kind, name, **changes):
 
 def numbers_of(rigs, steps=1, world=WORLD):
     """Name of each rig -> all its numbers."""
-    reference = SurfaceReference(((AREA.x, AREA.y),), rays=1000, bands_m=((-0.5, 2.0),), object_points=32)
+    reference = SurfaceReference(((AREA.x_m, AREA.y_m),), rays=1000, bands_m=((-0.5, 2.0),), object_points=32)
     frames = SimulatedFrames(world, rigs=rigs, steps=steps, reference_sensor=reference, boxes=True)
     observers = {}
     for name, one in rigs.items():
@@ -66,10 +66,10 @@ def numbers_of(rigs, steps=1, world=WORLD):
             GRID, (0.2, 0.4, 3.0), max_radius=30.0, aggregations=(Maximum(),), regions=(AREA,), sensors=sensors,
             square_metres=True,
         )  # fmt: skip
-        setup = Setup(name, one.sensors, None, GRID, (AREA,), threshold_m=0.4, sights=Sights())
+        setup = MetricSetup(name, one.sensors, None, GRID, (AREA,), threshold_m=0.4, query_cache=FrameQueryCache())
         observers[name] = [
             CoverageObserver(metric, name),
-            *(PUBLISHED[other].make(setup) for other in PUBLISHED_WITH_LAW),
+            *(PUBLISHED[other].build(setup) for other in PUBLISHED_WITH_LAW),
         ]
     for frame in frames:
         for one in (one for of_rig in observers.values() for one in of_rig):
@@ -116,8 +116,10 @@ def test_what_s_mig_captures_falls_with_what_returns():
     rigs = {str(at): rig("lidar", str(at), **keys) for at, keys in enumerate(CHAINS["missing returns"])}
     frame, captured = SimulatedFrames(WORLD, rigs=rigs, steps=1, boxes=True)[0], []
     for name, one in rigs.items():
-        metric = SMig(one.sensors, 1.0, categories=("car",), occlusion=True, rig=name)
-        metric.update([frame, replace(frame, boxes=frame.boxes.of_category())])  # the cars are there every other time
+        metric = SMig(one.sensors, 1.0, categories=("car",), ends_at_hits=True, rig=name)
+        metric.update(
+            [frame, replace(frame, boxes=frame.boxes.select_categories())]
+        )  # the cars are there every other time
         captured.append(metric.compute()[0].parameters["entropy_captured_nats"])
     assert captured == sorted(captured, reverse=True)
     assert captured[-1] < captured[0]

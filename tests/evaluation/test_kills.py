@@ -20,10 +20,10 @@ class Drive(FrameDataset):
     sensors = {}  # noqa: RUF012
     ego_outline_m = None
     description = {"scenario": None, "frames": "made up", "seed": None}  # noqa: RUF012
-    square_metres = False
+    has_area_weights = False
     reference_record = None
     content = {"frames": "made up"}  # noqa: RUF012
-    world_of = staticmethod(int)
+    get_scene_id = staticmethod(int)
 
     def __len__(self):
         return 3
@@ -47,7 +47,7 @@ def test_a_kill_at_any_file_operation_leaves_the_earlier_or_the_new_result(tmp_p
             with pytest.raises(BadFileError, match="an incomplete result"):
                 Coverage.load(out / "coverage.npz")
             continue
-        steps.append(Coverage.load(out / "coverage.npz").counts["frames"])
+        steps.append(Coverage.load(out / "coverage.npz").counts["num_frames"])
         assert summary["counts"]["steps"] == steps[-1]
         assert [name for name in summary["files"] if not os.path.isfile(out / name)] == []
     assert steps == sorted(steps)

@@ -10,7 +10,7 @@ import pytest
 
 import torchcover
 from torchcover.data import SimulatedFrames
-from torchcover.detection import box_visibility
+from torchcover.detection import measure_box_visibility
 from torchcover.encounters import EncounterSet
 from torchcover.simulation import Rig
 from torchcover.targets import STATES, Raster
@@ -106,7 +106,7 @@ def test_without_the_extra_it_is_told(results, monkeypatch):
 
 def test_what_holds_arrays_is_called_by_their_shapes(results):
     frame = SimulatedFrames("courtyard", "front_roof_32", steps=1, boxes=True)[0]
-    seen = box_visibility(frame.sensor, frame.reference, frame.boxes, reference_weights=frame.reference_weights)
+    seen = measure_box_visibility(frame.sensor, frame.reference, frame.boxes, reference_weights=frame.reference_weights)
     assert repr(frame).startswith(f"Frame(clouds={{'front_roof_32': ({len(frame.sensor)}, 3) float32}}, reference=(")
     for one in (frame, frame.boxes, seen, *results.values()):
         assert len(repr(one)) < MOST_CHARS, type(one)

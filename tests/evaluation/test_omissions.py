@@ -11,28 +11,28 @@ from torchcover.simulation import CameraSensor
 
 
 def test_points_outside_the_grid_are_counted_over_all_rigs():
-    grid = BevGrid(x=(0.0, 2.0), y=(0.0, 2.0), cell=1.0)
+    grid = BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 2.0), cell_m=1.0)
     metric = CoverageMetric(grid)
     metric.update(torch.zeros(1, 3), torch.tensor([[0.5, 0.5, 0.0], [9.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]))
     records = {row.description: row for row in list_omissions({}, [metric.compute()] * 2)}
     outside = records["reference points outside every cell: not searched for"]
     assert (outside.count, outside.total) == (4, 6)
-    others = ", ".join(aggregation.words for aggregation in AGGREGATIONS)
+    others = ", ".join(aggregation.description for aggregation in AGGREGATIONS)
     assert f"{others}: not asked for, not kept" in records
 
 
 def test_aggregations_that_were_asked_for_are_not_left_out():
-    metric = CoverageMetric(BevGrid(x=(0.0, 2.0), y=(0.0, 2.0), cell=1.0), aggregations=[Maximum()])
+    metric = CoverageMetric(BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 2.0), cell_m=1.0), aggregations=[Maximum()])
     metric.update(torch.zeros(1, 3), torch.tensor([[0.5, 0.5, 0.0]]))
     (listed,) = [
         row.description for row in list_omissions({}, [metric.compute()], [Maximum()]) if "not kept" in row.description
     ]
-    assert [kind.words in listed for kind in AGGREGATIONS] == [kind is not Maximum for kind in AGGREGATIONS]
+    assert [kind.description in listed for kind in AGGREGATIONS] == [kind is not Maximum for kind in AGGREGATIONS]
 
 
 @pytest.mark.parametrize("count", [0, 7])
 def test_what_was_not_left_out_is_not_listed(count):
-    metric = CoverageMetric(BevGrid(x=(0.0, 2.0), y=(0.0, 2.0), cell=1.0))
+    metric = CoverageMetric(BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 2.0), cell_m=1.0))
     metric.update(torch.zeros(1, 3), torch.tensor([[0.5, 0.5, 0.0]]))
     counts = {"moving_bodies_out_of_range": count, "moving_bodies": 9}
     listed = [row.count for row in list_omissions(counts, [metric.compute()]) if row.total == 9]

@@ -14,14 +14,14 @@ import torch
 from torch.utils.data import Subset
 
 from torchcover import BevGrid, CoverageMetric, Scenario, evaluate
-from torchcover.data import BadFrameError, ChosenRigs, SimulatedFrames
+from torchcover.data import BadFrameError, RigSubset, SimulatedFrames
 from torchcover.evaluation import CoverageObserver, observe, pipeline
 from torchcover.evaluation.pipeline import MOST_TOGETHER, MeasuredFrames, group_by_scene
 from torchcover.evaluation.progress import Progress, handle_termination, show_wait
-from torchcover.frames import worlds_of
+from torchcover.frames import build_scene_lookup
 from torchcover.simulation import PaperReference
 
-GRID = BevGrid(x=(0.0, 4.0), y=(0.0, 2.0), cell=1.0, heights={"all": (-1.0, 1.0)})
+GRID = BevGrid(x_m=(0.0, 4.0), y_m=(0.0, 2.0), cell_m=1.0, heights={"all": (-1.0, 1.0)})
 
 
 class Occupancy:
@@ -61,7 +61,7 @@ class Spoiled:
     def __len__(self):
         return len(self.frames)
 
-    def world_of(self, index):
+    def get_scene_id(self, index):
         return index
 
     def __getitem__(self, index):
@@ -105,7 +105,7 @@ def test_coverage_is_that_of_the_metric_with_weights_and_places_in_time(frames):
         for frame in frames:
             metric.update(frame.clouds[rig], frame.reference, weights=frame.reference_weights, block_index=frame.index)
         assert torch.equal(observer.compute().radius, metric.compute().radius)
-        assert torch.equal(observer.compute().blocks.listed, metric.compute().blocks.listed)
+        assert torch.equal(observer.compute().block_sums.sums, metric.compute().block_sums.sums)
     assert (run.num_frames, dict(run.counts), run.is_complete) == (6, {"seen": 15}, True)
 
 
@@ -125,7 +125,7 @@ def test_frames_are_measured_where_they_are_made_and_travel_only_if_somebody_els
     assert (seen.frame is None, seen.counts) == (not others, frames[2].counts)
     assert set(seen.sums) == {number for number, one in enumerate(apart) if isinstance(one, CoverageObserver)}
     assert MeasuredFrames(frames, apart, "cuda")[2].sums == {}
-    assert all(one.metric.steps == 0 for one in (apart[0], apart[-1])), "what is measured apart adds nothing"
+    assert all(one.metric.num_frames == 0 for one in (apart[0], apart[-1])), "what is measured apart adds nothing"
     alone = coverage("b")
     for frame in frames:
         alone.update(frame)
@@ -142,21 +142,21 @@ def test_what_cannot_be_measured_ends_the_run_with_what_was_seen_before(frames, 
     observer = CoverageObserver(CoverageMetric(GRID, square_metres=True), "a")
     frames[4] = replace(frames[4], reference_weights=None)
     run = observe(frames, [observer], num_workers=workers, keep_partial=True, skip_bad_frames=True)
-    assert (run.num_frames, run.skipped_frames, int(observer.metric.steps)) == (4, [], 4)
+    assert (run.num_frames, run.skipped_frames, int(observer.metric.num_frames)) == (4, [], 4)
     assert "weights: the square metres of each reference point are needed" in str(run.failure)
 
 
 def test_of_several_workers_one_makes_the_frames_of_a_world_and_all_come_in_order():
     spread = SimulatedFrames("urban", "front_roof_32", steps=15, frame_interval_s=10.0)
-    tasks = list(group_by_scene(range(15), spread.world_of))
+    tasks = list(group_by_scene(range(15), spread.get_scene_id))
     assert tasks == [[*range(7)], [*range(7, 13)], [13, 14]]
     assert [{spread.simulator.run_of(index) for index in task} for task in tasks] == [{0}, {1}, {2}]
-    dense = list(group_by_scene(range(700), SimulatedFrames("urban", "front_roof_32", steps=1000).world_of))
+    dense = list(group_by_scene(range(700), SimulatedFrames("urban", "front_roof_32", steps=1000).get_scene_id))
     assert [index for task in dense for index in task] == [*range(700)]
     assert max(map(len, dense)) == MOST_TOGETHER
     still = SimulatedFrames("courtyard", "front_roof_32", steps=3)  # of which every process has the whole
     for alone in (still, []):
-        assert list(group_by_scene(range(3), worlds_of(alone))) == [[0], [1], [2]]
+        assert list(group_by_scene(range(3), build_scene_lookup(alone))) == [[0], [1], [2]]
 
 
 class Wrapped:
@@ -181,12 +181,12 @@ class Told(Wrapped):
 
 def test_whoever_wraps_frames_keeps_their_worlds():
     frames = SimulatedFrames("urban", "front_roof_32", steps=15, frame_interval_s=10.0)
-    chosen, told = ChosenRigs(frames, {"mine": "front_roof_32"}), Told(frames)
+    chosen, told = RigSubset(frames, {"mine": "front_roof_32"}), Told(frames)
     part = Subset(Told(chosen), [14, 0, 6, 7])
-    worlds = [frames.world_of(index) for index in range(15)]
-    assert [worlds_of(chosen)(index) for index in range(15)] == worlds == [0] * 7 + [1] * 6 + [2] * 2
-    assert [worlds_of(told)(index) for index in range(15)] == worlds
-    assert [worlds_of(part)(index) for index in range(4)] == [2, 0, 0, 1]
+    worlds = [frames.get_scene_id(index) for index in range(15)]
+    assert [build_scene_lookup(chosen)(index) for index in range(15)] == worlds == [0] * 7 + [1] * 6 + [2] * 2
+    assert [build_scene_lookup(told)(index) for index in range(15)] == worlds
+    assert [build_scene_lookup(part)(index) for index in range(4)] == [2, 0, 0, 1]
 
 
 def test_each_world_is_built_by_one_worker_whoever_gives_the_frames(monkeypatch, tmp_path):
@@ -204,7 +204,7 @@ def test_each_world_is_built_by_one_worker_whoever_gives_the_frames(monkeypatch,
     assert sorted((tmp_path / "built").read_text().split()) == ["0", "1"]
 
 
-@pytest.mark.parametrize("frames_of", [Wrapped, lambda frames: Subset(Wrapped(frames), [0, 1])])
+@pytest.mark.parametrize("get_frames", [Wrapped, lambda frames: Subset(Wrapped(frames), [0, 1])])
 def test_a_source_that_does_not_know_its_worlds_is_refused_where_it_matters(frames, frames_of):
     source = frames_of(Told(frames))
     assert observe(source, [Names()], num_workers=1).num_frames == len(source)
@@ -216,7 +216,7 @@ def test_a_source_that_does_not_know_its_worlds_is_refused_where_it_matters(fram
 def test_no_list_is_made_of_all_the_steps_there_may_be(scenario):
     frames = SimulatedFrames(scenario, "front_roof_32", steps=20_000)
     tracemalloc.start()
-    tasks = group_by_scene(range(20_000), frames.world_of)
+    tasks = group_by_scene(range(20_000), frames.get_scene_id)
     assert sum(map(len, tasks)) == 20_000
     _, most_bytes = tracemalloc.get_traced_memory()
     tracemalloc.stop()
@@ -277,7 +277,7 @@ def test_square_metres_are_not_made_up(frames):
     with pytest.raises(ValueError, match="the square metres of each reference point are needed"):
         CoverageObserver(metric, "a").update(replace(frames[0], reference_weights=None))
     CoverageObserver(metric, "a").update(frames[0])
-    assert metric.compute().measure == "area"
+    assert metric.compute().average == "area"
 
 
 @pytest.mark.parametrize("workers", [0, 2])

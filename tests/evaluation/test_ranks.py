@@ -29,9 +29,9 @@ class Drive(FrameDataset):
     sensors = {}  # noqa: RUF012
     ego_outline_m = None
     description = {"scenario": None, "frames": "drive", "seed": None}  # noqa: RUF012
-    square_metres = False
+    has_area_weights = False
     reference_record = None
-    world_of = staticmethod(int)
+    get_scene_id = staticmethod(int)
 
     def __init__(self, frame_of, length=7, bad=(), content="drive", delay_s=0.0):
         self.frame_of, self.length, self.bad, self.content = frame_of, length, bad, {"frames": content}
@@ -97,8 +97,13 @@ def measured(source, ranks=None, **settings):
     )
     counts, sums = {}, {}
     for name, coverage in result.coverages.items():
-        counts[name] = (coverage.counts, coverage.points, coverage.probed_steps, coverage.blocks.steps)
-        sums[name] = (coverage.blocks.listed, coverage.radius)
+        counts[name] = (
+            coverage.counts,
+            coverage.point_counts,
+            coverage.observed_frames,
+            coverage.block_sums.frame_counts,
+        )
+        sums[name] = (coverage.block_sums.sums, coverage.radius)
     run = (result.run.num_frames, dict(result.run.counts), result.run.skipped_frames, str(result.run.failure))
     return {"counts": (counts, run, result.observer_results), "sums": sums}
 

@@ -113,7 +113,7 @@ def test_areas_of_the_plan_are_those_of_its_cells(found):
 
 def test_a_budget_ends_the_traffic_once_it_has_intervals():
     found = report(ONE, "courtyard", num_frames=64, budget_s=0.01, num_workers=0)
-    assert found.result.table.first_conditions.counts["frames"] == 8
+    assert found.result.table.first_conditions.counts["num_frames"] == 8
     assert found.verdict[-1] == "The budget was over after 8 of 64 steps of traffic."
     assert not found.record["complete"]
 

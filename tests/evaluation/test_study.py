@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import pytest
 
-from torchcover.coverage.quantity import detection
+from torchcover.coverage.quantity import make_detection_quantity
 from torchcover.estimation import ErrorModel
 from torchcover.evaluation import Settings, StudyPlan, Trial, evaluate, measure_error_against_time
 from torchcover.evaluation.study import StudiedNumber, Study
 from torchcover.simulation import Rig
 
-DETECTION = detection(0.4)
+DETECTION = make_detection_quantity(0.4)
 SMALL = Settings("front_roof_32", "courtyard", num_frames=8, cell_m=4.0, num_rays=256)
 
 
@@ -39,13 +39,13 @@ def trial(a, seconds=64.0, bias=0.0, options="", least=64):
 @pytest.mark.parametrize("a", [0.01, 0.36, 25.0])
 def test_the_model_falls_to_the_bias_and_says_which_steps_reach_an_error(a):
     model = ErrorModel(a, bias=0.003)
-    assert model.error_after(10**12) == pytest.approx(0.003, rel=1e-3)
-    assert ErrorModel(a).error_after(400) == pytest.approx(0.5 * ErrorModel(a).error_after(100), rel=1e-12)
-    steps = model.steps_for(0.01)
-    assert model.error_after(steps) <= 0.01 < model.error_after(steps - 1) or steps == 1
-    assert model.steps_for(0.003) is None
-    assert ErrorModel(math.nan).steps_for(0.01) is None
-    assert ErrorModel.of(ErrorModel(a).error_after(77), 77).a == pytest.approx(a, rel=1e-12)
+    assert model.estimate_error(10**12) == pytest.approx(0.003, rel=1e-3)
+    assert ErrorModel(a).estimate_error(400) == pytest.approx(0.5 * ErrorModel(a).estimate_error(100), rel=1e-12)
+    steps = model.estimate_num_frames(0.01)
+    assert model.estimate_error(steps) <= 0.01 < model.estimate_error(steps - 1) or steps == 1
+    assert model.estimate_num_frames(0.003) is None
+    assert ErrorModel(math.nan).estimate_num_frames(0.01) is None
+    assert ErrorModel.from_error(ErrorModel(a).estimate_error(77), 77).error_coefficient == pytest.approx(a, rel=1e-12)
 
 
 def test_a_study_says_of_the_same_steps_what_an_evaluation_says(study):
@@ -142,6 +142,6 @@ def test_a_run_that_was_cut_short_is_no_study(monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("torchcover.evaluation.observers.CoverageObserver.add", interrupted)
+    monkeypatch.setattr("torchcover.evaluation.observers.CoverageObserver.add_sums", interrupted)
     with pytest.raises(KeyboardInterrupt):
         measure_error_against_time(StudyPlan(SMALL))

@@ -19,7 +19,7 @@ from torchcover.evaluation import (
     summarize_target_error,
 )
 
-GRID = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-0.5, 0.5), "above": (0.5, 1.0)})
+GRID = BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 1.0), cell_m=1.0, heights={"all": (-0.5, 0.5), "above": (0.5, 1.0)})
 REGIONS = (Region("near", (0.0, 1.0), (0.0, 1.0)), Region("far", (1.0, 2.0), (0.0, 1.0)))
 
 
@@ -69,7 +69,7 @@ def test_every_known_number_of_every_rig_and_every_difference_counts():
     names = ["a", "b", "c", "b minus a", "c minus a"]
     quantities = ["radius_m", "detection_0.4m", "detection_0.8m"]
     # Nothing is known above: nothing waits for it.
-    assert [(one.region, one.height, one.rig, one.quantity) for one in found] == [
+    assert [(one.region, one.band, one.rig, one.quantity) for one in found] == [
         (region, "all", name, quantity) for region in ("near", "far") for name in names for quantity in quantities
     ]
     assert {one.target for one in found if one.quantity == "radius_m"} == {0.1}
@@ -78,7 +78,7 @@ def test_every_known_number_of_every_rig_and_every_difference_counts():
     (near, _, far, _) = coverages["b"].summary(REGIONS)
     assert by_name["b", "near", "radius_m"] == near.numbers["radius_m"].error
     assert by_name["b", "far", "detection_0.4m"] == far.numbers["detection_0.4m"].error
-    difference = coverages["b"].estimate(REGIONS[1], "all").minus(coverages["a"].estimate(REGIONS[1], "all"))
+    difference = coverages["b"].estimate(REGIONS[1], "all").subtract(coverages["a"].estimate(REGIONS[1], "all"))
     assert by_name["b minus a", "far", "radius_m"] == float(difference.error[0]) > 0
     assert by_name["c minus a", "far", "radius_m"] == 0.0
     only_radius = compute_convergence(TargetError(radius_m=0.1), coverages, REGIONS)

@@ -13,7 +13,7 @@ import sys
 import pytest
 
 from tests.killing import operations_of
-from torchcover.files import RECORDING, WRITING, AtomicOutput, BadFileError, lock_folder, reads, write_atomically
+from torchcover.files import RECORDING, WRITING, AtomicOutput, BadFileError, guard_reader, lock_folder, write_atomically
 from torchcover.files.atomic import MAX_MANIFEST_BYTES
 
 # Content of each file in two publications. `mine.txt` and `maps/mine.png` belong to the user.
@@ -41,7 +41,7 @@ def publish(folder, *contents):
     return files
 
 
-@reads("a text")
+@guard_reader("a text")
 def read(path):
     return path.read_text()
 

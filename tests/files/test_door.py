@@ -5,14 +5,14 @@ import re
 import numpy as np
 import pytest
 
-from torchcover.files import BadFileError, TooLargeError, check_memory, read_npz, read_short_text, reads
+from torchcover.files import BadFileError, TooLargeError, check_memory, guard_reader, read_npz, read_short_text
 from torchcover.files.bad_file import MAX_SHORT_BYTES
 
 
 def reading(tmp_path, error):
     """Read a file with a reader that raises."""
 
-    @reads("a thing")
+    @guard_reader("a thing")
     def read(path):
         raise error
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.files import apart_readers
-from torchcover.files import BadFileError, isolated, reads
+from torchcover.files import BadFileError, guard_reader, isolated
 from torchcover.simulation.mesh_files import mesh_arrays
 
 
@@ -46,7 +46,7 @@ def test_errors_are_raised_here(path, kind, error, words):
 
 
 def test_a_crash_is_a_bad_file_and_the_next_one_is_read(path):
-    door = reads("a thing")(apart_readers.crashing)
+    door = guard_reader("a thing")(apart_readers.crashing)
     for _ in range(2):
         with pytest.raises(BadFileError, match=r"file\.x: the library that reads it crashed; the file is damaged"):
             door(path)

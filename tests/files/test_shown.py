@@ -5,7 +5,7 @@ import io
 
 import pytest
 
-from torchcover.files import csv_text, read_csv, shown
+from torchcover.files import escape_control_chars, format_csv, read_csv
 from torchcover.report import Terminal
 
 NASTY = (
@@ -23,22 +23,22 @@ NASTY = (
 
 @pytest.mark.parametrize("name", NASTY)
 def test_names_are_no_formulas_and_no_control_codes(name):
-    ((cell,),) = csv.reader(io.StringIO(csv_text([[name]])))
+    ((cell,),) = csv.reader(io.StringIO(format_csv([[name]])))
     assert cell[0] not in "=+-@\t\r"
     assert all(letter.isprintable() or letter == "\t" for letter in cell)
 
 
 def test_numbers_stay_numbers():
     values = [-1.5, 3, "-0.25", "+1e-9", "-inf", None, float("nan"), "roof", "front left", "ü"]
-    ((*cells,),) = csv.reader(io.StringIO(csv_text([values])))
+    ((*cells,),) = csv.reader(io.StringIO(format_csv([values])))
     assert cells == ["-1.5", "3", "-0.25", "+1e-9", "-inf", "", "", "roof", "front left", "ü"]
 
 
 def test_a_name_that_begins_like_a_formula_comes_back(tmp_path):
     names = ["=1+1", "-x", "'plain'", "'=quoted", "car"]
     path = tmp_path / "names.csv"
-    path.write_text(csv_text([["name"], *([name] for name in names)]), encoding="utf-8")
-    assert read_csv(path, (), ["name"]).words["name"] == names
+    path.write_text(format_csv([["name"], *([name] for name in names)]), encoding="utf-8")
+    assert read_csv(path, (), ["name"]).texts["name"] == names
 
 
 def test_terminals_show_control_characters(capsys):
@@ -47,7 +47,7 @@ def test_terminals_show_control_characters(capsys):
     terminal.print("two\nlines\x9b", highlight=False)
     assert "\\x1b[2J\\x1b]0;mine" in (printed := capsys.readouterr().out)
     assert "two\nlines\\x9b" in printed
-    assert shown("two\nlines, ü, 車") == "two\nlines, ü, 車"
+    assert escape_control_chars("two\nlines, ü, 車") == "two\nlines, ü, 車"
     with terminal.status("opening"):  # whose own codes hide the cursor
         pass
     assert "\x1b[?25l" in capsys.readouterr().out

@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from torchcover.files import as_yaml, parse_yaml
+from torchcover.files import parse_yaml, to_yaml
 
 LAUGHS = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]\n" for k in range(1, 12)
@@ -69,4 +69,4 @@ def test_what_is_a_trap_is_refused_at_once_with_its_line(text, message):
 )
 def test_what_is_written_is_read_again_as_it_was(text):
     content = {"name": text, "values": [1, 1.0, 1e-7, 1e22, True, None], text or "empty": {"a": [text]}}
-    assert parse_yaml(as_yaml(content)) == content
+    assert parse_yaml(to_yaml(content)) == content

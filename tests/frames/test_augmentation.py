@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from torchcover import blind_spot_radius
-from torchcover.data import Augmentation, Frame, Measured, flip, rotate, scale
-from torchcover.detection import Boxes, points_in_boxes
+from torchcover.data import Augmentation, Frame, Measurement, flip, rotate, scale
+from torchcover.detection import Boxes, find_points_in_boxes
 
 
 def make_frame(seed=0, index=0):
@@ -44,7 +44,7 @@ def test_where_points_landed_moves_with_where_they_are(move, factor):
     frame = make_frame()
     error_m = torch.linspace(-1, 1, 500)
     off = torch.nn.functional.normalize(frame.clouds["b"]) * error_m[:, None]
-    frame = replace(frame, measured={"b": Measured(frame.clouds["b"] + off, error_m)})
+    frame = replace(frame, measured={"b": Measurement(frame.clouds["b"] + off, error_m)})
     moved = move(frame)
     torch.testing.assert_close(moved.measured["b"].error_m, factor * error_m)
     distance = torch.linalg.vector_norm(moved.landed("b") - moved.clouds["b"], dim=1)
@@ -62,11 +62,11 @@ def test_points_stay_in_their_boxes(move, factor):
     clear = torch.ones(900, dtype=torch.bool)
     for change in (-0.03, 0.03):
         grown = replace(frame.boxes, size_m=frame.boxes.size_m + change)
-        clear[points_in_boxes(frame.clouds["a"], grown).point] ^= True
+        clear[find_points_in_boxes(frame.clouds["a"], grown).point_indices] ^= True
     frame = replace(frame, clouds={"a": frame.clouds["a"][clear]})
     moved = move(frame)
-    before, after = (points_in_boxes(f.clouds["a"], f.boxes) for f in (frame, moved))
-    pairs = [sorted(zip(i.box.tolist(), i.point.tolist(), strict=True)) for i in (before, after)]
+    before, after = (find_points_in_boxes(f.clouds["a"], f.boxes) for f in (frame, moved))
+    pairs = [sorted(zip(i.box_indices.tolist(), i.point_indices.tolist(), strict=True)) for i in (before, after)]
     assert pairs[0] == pairs[1]
     assert len(pairs[0]) > 100
 
@@ -76,7 +76,7 @@ def test_velocity_points_where_the_box_goes(move, factor):
     """A frame a second later: the moved centre less the centre moved is the moved velocity."""
     frame = make_frame()
     later = torch.cat([frame.boxes.velocity_mps, torch.zeros(9, 1)], dim=1)
-    then = replace(frame, boxes=replace(frame.boxes, centre_m=frame.boxes.centre_m + later))
+    then = replace(frame, boxes=replace(frame.boxes, centre_m=frame.boxes.center_m + later))
     went = move(then).boxes.centre_m - move(frame).boxes.centre_m
     torch.testing.assert_close(went[:, :2], move(frame).boxes.velocity_mps, atol=1e-5, rtol=1e-5)
 
@@ -130,7 +130,7 @@ def test_an_augmentation_depends_on_seed_epoch_and_index_only():
 
 
 def test_draws_stay_within_their_bounds_and_reach_them():
-    augment = Augmentation(flip=0.25, max_yaw_rad=0.5, factors=(0.9, 1.2), seed=0)
+    augment = Augmentation(flip_probability=0.25, max_yaw_rad=0.5, scale_range=(0.9, 1.2), seed=0)
     arrow = Boxes.from_rows(torch.tensor([[1.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0]]))
     left = torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     flips, yaws, factors = [], [], []
@@ -153,9 +153,9 @@ def test_draws_stay_within_their_bounds_and_reach_them():
         (lambda: scale(make_frame(), 0.0), "factor: a finite number > 0 is needed; got 0"),
         (lambda: scale(make_frame(), math.nan), "factor: .* got nan"),
         (lambda: rotate(make_frame(), math.inf), "yaw_rad: a finite angle is needed; got inf"),
-        (lambda: Augmentation(flip=1.5), r"flip: a probability in \[0, 1\] is needed; got 1.5"),
+        (lambda: Augmentation(flip_probability=1.5), r"flip: a probability in \[0, 1\] is needed; got 1.5"),
         (lambda: Augmentation(max_yaw_rad=-1.0), "max_yaw_rad: an angle >= 0 is needed"),
-        (lambda: Augmentation(factors=(1.1, 0.9)), "factors: two numbers 0 < lowest <= highest"),
+        (lambda: Augmentation(scale_range=(1.1, 0.9)), "factors: two numbers 0 < lowest <= highest"),
         (lambda: Augmentation(seed=-1), "seed: a number >= 0"),
         (lambda: Augmentation()(make_frame(index=-1)), "frame 'f', index -1, epoch 0: numbers >= 0 are needed"),
     ],

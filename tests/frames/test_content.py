@@ -7,7 +7,7 @@ import shutil
 import numpy as np
 import pytest
 
-from torchcover.data import ChosenRigs, RecordedFrames, SimulatedFrames
+from torchcover.data import RecordedFrames, RigSubset, SimulatedFrames
 from torchcover.simulation.simulated_frames import reference_called
 
 RIG = (
@@ -79,13 +79,13 @@ def test_of_a_recording_it_is_names_sizes_times_and_poses(tmp_path, change):
     for place in ("rigs/a", "rigs/b", "reference"):
         (folder / place).mkdir(parents=True)
         np.save(folder / place / "f1.npy", np.zeros((4, 3), dtype=np.float32))
-    before = ChosenRigs(RecordedFrames(folder), {"A": "a"}).content
+    before = RigSubset(RecordedFrames(folder), {"A": "a"}).content
     shutil.move(folder, tmp_path / "elsewhere")
     folder = tmp_path / "elsewhere"
     (folder / "out").mkdir()
     (folder / "out" / "checkpoint.npz").touch()  # results are no part of it
-    assert ChosenRigs(RecordedFrames(folder), {"A": "a"}).content == before
-    assert ChosenRigs(RecordedFrames(folder), {"A": "b"}).content != before
+    assert RigSubset(RecordedFrames(folder), {"A": "a"}).content == before
+    assert RigSubset(RecordedFrames(folder), {"A": "b"}).content != before
     cloud = folder / "rigs" / "a" / "f1.npy"
     if change == "size":
         stamp = cloud.stat()
@@ -99,4 +99,4 @@ def test_of_a_recording_it_is_names_sizes_times_and_poses(tmp_path, change):
     else:
         rows = "[[1, 0, 0, 1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
         (folder / "frames.yaml").write_text(f"reference: {{vehicle_T_sensor: {rows}}}\n")
-    assert ChosenRigs(RecordedFrames(folder), {"A": "a"}).content != before
+    assert RigSubset(RecordedFrames(folder), {"A": "a"}).content != before

@@ -9,11 +9,11 @@ import torch
 from torchcover import Scenario
 from torchcover.data import (
     FORMATS,
-    ChosenRigs,
     Frame,
     FrameSource,
     RecordedFrames,
     RecordingSettings,
+    RigSubset,
     SimulatedFrames,
     collate_frames,
     open_recording,
@@ -45,7 +45,7 @@ def recorded_rigs(path):
 
 
 def chosen(path):
-    return ChosenRigs(recorded_rigs(path), {"first": "b"})
+    return RigSubset(recorded_rigs(path), {"first": "b"})
 
 
 def by_area(_):
@@ -60,9 +60,9 @@ def test_a_source_is_a_map_style_dataset_that_knows_whose_frames_they_are(tmp_pa
     assert len(source) == 2
     for index in range(2):
         frame = source[index]
-        assert (frame.index, frame.block_index) == (index, source.block_index(index))
+        assert (frame.index, frame.block_index) == (index, source.get_block_index(index))
         assert list(frame.clouds) == list(source.rigs)
-        assert (frame.reference_weights is not None) == source.square_metres
+        assert (frame.reference_weights is not None) == source.has_area_weights
         heights_m = frame.reference_heights_m
         assert (heights_m is not None and bool(heights_m.isfinite().any())) == source.has_heights()
         assert all(cloud.dtype == torch.float32 for cloud in (*frame.clouds.values(), frame.reference))
@@ -125,21 +125,21 @@ def test_rigs_are_chosen_in_any_order_under_any_name_with_what_belongs_to_them()
     rigs = {"a": "front_roof_32", "b": "front_grille_128"}
     reference_sensor = PaperReference(16, 16)
     both = SimulatedFrames("parking", rigs=rigs, steps=1, boxes=True, reference_sensor=reference_sensor)
-    turned = ChosenRigs(both, {"second": "b", "a": "a"})
+    turned = RigSubset(both, {"second": "b", "a": "a"})
     assert list(turned.rigs) == list(turned.sensors) == list(turned[0].clouds) == ["second", "a"]
     assert turned.sensors["second"] == both.sensors["b"]
-    assert torch.equal(turned[0].cloud_of("second"), both[0].cloud_of("b"))
+    assert torch.equal(turned[0].get_cloud("second"), both[0].get_cloud("b"))
     assert torch.equal(turned[0].reference, both[0].reference)
-    assert torch.equal(turned[0].boxes.hits["second"], both[0].boxes.hits["b"])
-    assert list(ChosenRigs(both, {"b": "b"})[0].boxes.hits) == ["b"]
+    assert torch.equal(turned[0].boxes.points_in_box["second"], both[0].boxes.points_in_box["b"])
+    assert list(RigSubset(both, {"b": "b"})[0].boxes.points_in_box) == ["b"]
     with pytest.raises(ValueError, match="no clouds of the rig c; the frames have a, b"):
-        ChosenRigs(both, {"b": "c"})
+        RigSubset(both, {"b": "c"})
 
 
 def test_a_batch_without_the_rig_that_is_asked_for_says_what_it_has(tmp_path):
     batch = collate_frames([recorded_rigs(tmp_path)[0]])
     with pytest.raises(ValueError, match="frame 'f0' has no rig 'c'; it has a, b"):
-        batch.clouds_of("c")
+        batch.get_clouds("c")
 
 
 def test_a_batch_has_weights_of_all_its_frames_or_of_none():
@@ -158,7 +158,7 @@ def test_blocks_of_a_source_end_where_its_frames_show_something_else(tmp_path):
         "urban", "front_roof_32", steps=3, frame_interval_s=10.0, reference_sensor=PaperReference(4, 4)
     )
     ends = find_block_ends(traffic, max_blocks=4)
-    places = [traffic.block_index(index) for index in range(ends[-1] + 1)]
+    places = [traffic.get_block_index(index) for index in range(ends[-1] + 1)]
     assert ends == [places.index(number) for number in range(1, 5)]
     assert find_block_ends(simulated(None), max_blocks=3) == [1, 2, 3]  # nothing moves: each frame has its reference
     assert find_block_ends(recorded(tmp_path)) == [1, 2]

@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from torchcover.data import Augmentation, Frame, SimulatedFrames, VisibleTargets, collate_frames
-from torchcover.detection import Boxes, BoxVisibility, box_visibility
+from torchcover.data import Augmentation, Frame, SimulatedFrames, VisibleBoxes, collate_frames
+from torchcover.detection import Boxes, BoxVisibility, measure_box_visibility
 
 PLACES_M = (10.0, 20.0, 30.0, 40.0)
 
@@ -31,24 +31,26 @@ def a_frame(**others):
     ("least", "kept"), [(0.0, PLACES_M[:2] + PLACES_M[3:]), (0.25, PLACES_M[:2]), (0.26, PLACES_M[:1]), (0.8, ())]
 )
 def test_what_is_less_visible_or_unknown_is_left_out_and_counted(least, kept):
-    (frame,) = VisibleTargets([a_frame()], least, threshold_m=0.1)
-    assert frame.boxes.centre_m[:, 0].tolist() == list(kept)
+    (frame,) = VisibleBoxes([a_frame()], least, threshold_m=0.1)
+    assert frame.boxes.center_m[:, 0].tolist() == list(kept)
     assert frame.boxes.visibility.tolist() == [{10.0: 0.75, 20.0: 0.25, 40.0: 0.0}[x] for x in kept]
     assert frame.counts == {"seen": 1, "targets_omitted": 4 - len(kept)}
-    assert len(frame.boxes.hits["rig"]) == len(frame.boxes.categories) == len(kept)
+    assert len(frame.boxes.points_in_box["rig"]) == len(frame.boxes.categories) == len(kept)
 
 
 def test_shares_go_with_their_boxes_through_loaders_and_augmentation():
-    loader = DataLoader(VisibleTargets([a_frame()] * 3, 0.2, threshold_m=0.1), batch_size=2, collate_fn=collate_frames)
+    loader = DataLoader(VisibleBoxes([a_frame()] * 3, 0.2, threshold_m=0.1), batch_size=2, collate_fn=collate_frames)
     frames = [Augmentation(max_yaw_rad=1.0)(frame, 0) for batch in loader for frame in batch.frames]
     assert [frame.boxes.visibility.tolist() for frame in frames] == [[0.75, 0.25]] * 3
-    assert frames[0].boxes.of_category("van").visibility.tolist() == [0.25]
+    assert frames[0].boxes.select_categories("van").visibility.tolist() == [0.25]
 
 
 def test_of_a_simulation_they_are_those_of_box_visibility():
     frames = SimulatedFrames("urban", "front_roof_32", steps=2, frame_interval_s=15.0, boxes=True)
-    for frame, kept in zip(frames, VisibleTargets(frames, 0.3), strict=True):
-        seen = box_visibility(frame.sensor, frame.reference, frame.boxes, reference_weights=frame.reference_weights)
+    for frame, kept in zip(frames, VisibleBoxes(frames, 0.3), strict=True):
+        seen = measure_box_visibility(
+            frame.sensor, frame.reference, frame.boxes, reference_weights=frame.reference_weights
+        )
         expected = [name for name, share in zip(frame.boxes.ids, seen.share.tolist(), strict=True) if share >= 0.3]
         assert list(kept.boxes.ids) == expected
         assert 0 < len(expected) < len(frame.boxes)
@@ -57,11 +59,11 @@ def test_of_a_simulation_they_are_those_of_box_visibility():
 def test_levels_are_those_of_nuscenes():
     shares = torch.tensor([math.nan, 0.0, 0.39, 0.4, 0.59, 0.6, 0.79, 0.8, 1.0], dtype=torch.float64)
     none = torch.zeros(len(shares), dtype=torch.int64)
-    assert BoxVisibility(shares, shares, none, none, none, 0.4).level.tolist() == [0, 1, 1, 2, 2, 3, 3, 4, 4]
+    assert BoxVisibility(shares, shares, none, none, none, 0.4).levels.tolist() == [0, 1, 1, 2, 2, 3, 3, 4, 4]
 
 
 def test_what_cannot_be_filtered_is_told():
     with pytest.raises(ValueError, match="least: a share from 0 to 1 is needed; got 20"):
-        VisibleTargets([a_frame()], 20)
+        VisibleBoxes([a_frame()], 20)
     with pytest.raises(ValueError, match="frame 'f' has no boxes: SimulatedFrames"):
-        VisibleTargets([Frame({"rig": torch.zeros(1, 3)}, torch.zeros(1, 3), 0, "f")])[0]
+        VisibleBoxes([Frame({"rig": torch.zeros(1, 3)}, torch.zeros(1, 3), 0, "f")])[0]

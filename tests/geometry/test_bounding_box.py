@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
 
-from torchcover.geometry import BoundingBox, overlapping
+from torchcover.geometry import BoundingBox, find_overlaps
 from torchcover.targets.placing import poses
 
 
 def test_a_box_around_points_touches_them():
-    box = BoundingBox.around(np.array([[1.0, -2.0, 0.5], [-1.0, 3.0, 0.0], [0.0, 0.0, 2.0]], dtype=np.float32))
+    box = BoundingBox.from_points(np.array([[1.0, -2.0, 0.5], [-1.0, 3.0, 0.0], [0.0, 0.0, 2.0]], dtype=np.float32))
     assert box == BoundingBox((-1.0, -2.0, 0.0), (1.0, 3.0, 2.0))
     assert box.size_m == (2.0, 5.0, 2.0)
     assert all(type(bound) is float for bound in (*box.lower_m, *box.upper_m))
@@ -38,9 +38,9 @@ def test_boxes_that_touch_share_no_space_and_those_that_are_turned_may():
     there = poses(
         np.array([[4.0, 0.0], [3.99, 0.0], [0.0, -2.0], [2.9, 1.9], [2.9, 1.9]]), np.deg2rad([0, 0, 0, 0, 45])
     )
-    assert overlapping(car, there, car.corners_m).tolist() == [False, True, False, True, True]
+    assert find_overlaps(car, there, car.corners_m).tolist() == [False, True, False, True, True]
     above = np.eye(4)[None].copy()
     above[:, 2, 3] = 1.5
-    assert not overlapping(car, above, car.corners_m).any()
+    assert not find_overlaps(car, above, car.corners_m).any()
     away = poses(np.array([[3.6, 2.4]]), np.deg2rad([135]))  # their shadows along x and y overlap
-    assert not overlapping(car, away, car.corners_m).any()
+    assert not find_overlaps(car, away, car.corners_m).any()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import shapely
 
-from torchcover.geometry import BoundingBox, contact_s, outlines_at
+from torchcover.geometry import BoundingBox, compute_contact_time_s, transform_outline
 from torchcover.targets.placing import poses
 
 
@@ -21,7 +21,7 @@ def pairs():
     generator = np.random.default_rng(3)
     count = 300
     a_m, b_m = (
-        outlines_at(BoundingBox((-length, -width, 0.0), (length, width, 1.0)).outline_m,
+        transform_outline(BoundingBox((-length, -width, 0.0), (length, width, 1.0)).outline_m,
                     poses(generator.uniform(-far_m, far_m, (count, 2)), generator.uniform(-4, 4, count)))
         for length, width, far_m in ((2.0, 1.0, 1.0), (0.4, 0.3, 20.0))
     )  # fmt: skip
@@ -31,18 +31,18 @@ def pairs():
 
 def test_contact_is_where_the_way_enters_the_hull_of_all_differences(pairs):
     expected_s = np.array([by_differences(*pair) for pair in zip(*pairs, strict=True)])
-    found_s = contact_s(*pairs)
+    found_s = compute_contact_time_s(*pairs)
     assert found_s == pytest.approx(expected_s, abs=1e-9)
     assert 0.2 < np.isfinite(found_s).mean() < 0.95
     a_m, b_m, velocity_mps = pairs
-    assert contact_s(b_m, a_m, -velocity_mps) == pytest.approx(found_s, abs=1e-9)
+    assert compute_contact_time_s(b_m, a_m, -velocity_mps) == pytest.approx(found_s, abs=1e-9)
     utm_m = np.array([5e5, 4e6])
-    assert contact_s(a_m + utm_m, b_m + utm_m, velocity_mps) == pytest.approx(found_s, abs=1e-7)
+    assert compute_contact_time_s(a_m + utm_m, b_m + utm_m, velocity_mps) == pytest.approx(found_s, abs=1e-7)
 
 
 def test_at_contact_they_are_as_near_as_rounding(pairs):
     a_m, b_m, velocity_mps = pairs
-    found_s = contact_s(a_m, b_m, velocity_mps)
+    found_s = compute_contact_time_s(a_m, b_m, velocity_mps)
     for k in np.flatnonzero(np.isfinite(found_s)).tolist():
         there = shapely.Polygon(b_m[k] + found_s[k] * velocity_mps[k])
         assert shapely.Polygon(a_m[k]).distance(there) < 1e-9
@@ -69,7 +69,7 @@ SQUARE_M = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     ],
 )  # fmt: skip
 def test_squares_that_touch_slide_or_hardly_move(offset_m, velocity_mps, expected_s):
-    found_s = contact_s(SQUARE_M, SQUARE_M + offset_m, np.array(velocity_mps, dtype=float))
+    found_s = compute_contact_time_s(SQUARE_M, SQUARE_M + offset_m, np.array(velocity_mps, dtype=float))
     assert found_s == pytest.approx(expected_s, rel=1e-6)
 
 
@@ -80,4 +80,6 @@ def test_contact_far_from_the_origin_is_the_same_to_the_last_bit():
         np.array([-1, -0.5]),
     )
     far_m = tilted_m + np.array([2.0**50, -(2.0**50)])  # where numbers are 0.25 m apart
-    assert contact_s(far_m, far_m + away_m, velocity_mps) == contact_s(tilted_m, tilted_m + away_m, velocity_mps)
+    assert compute_contact_time_s(far_m, far_m + away_m, velocity_mps) == compute_contact_time_s(
+        tilted_m, tilted_m + away_m, velocity_mps
+    )

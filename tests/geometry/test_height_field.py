@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from torchcover.geometry.height_field import VERGE_SHARE, HeightField, fitted, spread
+from torchcover.geometry.height_field import VERGE_SHARE, HeightField, accumulate_heights, fit_height_field
 
 RANDOM = np.random.default_rng(5)
 
@@ -23,15 +23,19 @@ def height_of(field, place_m):
 def test_heights_are_those_of_the_triangles_and_beyond_the_border_those_of_the_border():
     field = HeightField(np.array([-3.0, 7.0]), RANDOM.normal(size=(4, 6)), 0.5)
     places_m = RANDOM.uniform([-4.0, 6.0], [0.5, 9.5], (500, 2))
-    assert field.heights_m(places_m) == pytest.approx([height_of(field, place_m) for place_m in places_m], abs=1e-12)
-    assert field.heights_m(field.places_m) == pytest.approx(field.corners_m.ravel(), abs=1e-12)
+    assert field.compute_heights_m(places_m) == pytest.approx(
+        [height_of(field, place_m) for place_m in places_m], abs=1e-12
+    )
+    assert field.compute_heights_m(field.corner_positions_m) == pytest.approx(field.corner_heights_m.ravel(), abs=1e-12)
 
 
 def test_above_adds_what_lies_beneath():
     field = HeightField(np.array([1.0, 2.0]), RANDOM.normal(size=(3, 3)), 2.0)
     places_m = RANDOM.uniform([1.0, 2.0], [5.0, 6.0], (50, 2))
-    plane = field.above(lambda at_m: at_m @ [0.5, -0.25])
-    assert plane.heights_m(places_m) - field.heights_m(places_m) == pytest.approx(places_m @ [0.5, -0.25], abs=1e-12)
+    plane = field.add_base(lambda at_m: at_m @ [0.5, -0.25])
+    assert plane.compute_heights_m(places_m) - field.compute_heights_m(places_m) == pytest.approx(
+        places_m @ [0.5, -0.25], abs=1e-12
+    )
 
 
 def test_a_place_is_shared_by_the_corners_around_it():
@@ -48,7 +52,7 @@ def test_a_place_is_shared_by_the_corners_around_it():
                 apart = max(abs(at_row - row), abs(at_column - column))
                 part = share * ((apart == 0) + VERGE_SHARE * (apart <= 1))
                 expected[:, at_row, at_column] += part * height_m, part
-    assert np.array(spread(cells, heights_m, rows, columns, weights)) == pytest.approx(expected, abs=1e-12)
+    assert np.array(accumulate_heights(cells, heights_m, rows, columns, weights)) == pytest.approx(expected, abs=1e-12)
 
 
 def test_of_a_slope_with_things_on_it_the_slope_is_found():
@@ -56,11 +60,11 @@ def test_of_a_slope_with_things_on_it_the_slope_is_found():
     slope_m = 1.0 + places_m @ [0.03, -0.02]
     heights_m = slope_m + RANDOM.normal(0.0, 0.01, 4000)
     heights_m[::5] += 0.8  # of what stands there
-    field = fitted(places_m, heights_m, np.array([20.0, 20.0]), (4.0, 2.0), beneath=0.3)
+    field = fit_height_field(places_m, heights_m, np.array([20.0, 20.0]), (4.0, 2.0), above_weight=0.3)
     inner = (np.abs(places_m - 10.0) < 9.0).all(axis=1)
-    assert np.abs(field.heights_m(places_m[inner]) - slope_m[inner]).max() < 0.05
-    finer = fitted(places_m, heights_m, np.array([20.0, 20.0]), (1.0,), beneath=0.3, on=field)
-    assert np.abs(finer.heights_m(places_m[inner]) - slope_m[inner]).max() < 0.05
+    assert np.abs(field.compute_heights_m(places_m[inner]) - slope_m[inner]).max() < 0.05
+    finer = fit_height_field(places_m, heights_m, np.array([20.0, 20.0]), (1.0,), above_weight=0.3, base_field=field)
+    assert np.abs(finer.compute_heights_m(places_m[inner]) - slope_m[inner]).max() < 0.05
     assert finer.cell_m == 1.0
 
 
@@ -68,8 +72,8 @@ def test_who_is_trusted_counts_wherever_he_stands():
     places_m = np.stack(np.meshgrid(np.arange(12.0), np.arange(12.0)), axis=-1).reshape(-1, 2)
     bump_m = 0.9 * (np.abs(places_m - 5.5) < 1.0).all(axis=1)
     size_m = np.array([11.0, 11.0])
-    trusted = fitted(places_m, bump_m, size_m, (1.0,), trusted=np.ones(len(places_m), dtype=bool))
-    doubted = fitted(places_m, bump_m, size_m, (1.0,))
+    trusted = fit_height_field(places_m, bump_m, size_m, (1.0,), trusted_mask=np.ones(len(places_m), dtype=bool))
+    doubted = fit_height_field(places_m, bump_m, size_m, (1.0,))
     top = np.array([[5.5, 5.5]])
-    assert trusted.heights_m(top)[0] > 0.6
-    assert abs(doubted.heights_m(top)[0]) < 0.2
+    assert trusted.compute_heights_m(top)[0] > 0.6
+    assert abs(doubted.compute_heights_m(top)[0]) < 0.2

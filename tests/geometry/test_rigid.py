@@ -6,14 +6,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchcover.geometry import (
+    build_transform,
     check_rigid,
-    euler_from_rotation,
+    convert_euler_to_rotation,
+    convert_quaternion_to_rotation,
+    convert_rotation_to_euler,
+    interpolate_quaternions,
     invert,
-    rigid,
-    rotation_from_euler,
-    rotation_from_quaternion,
-    slerp,
-    transform,
+    transform_points,
 )
 
 angles = st.tuples(*[st.floats(-360, 360)] * 3)
@@ -21,7 +21,7 @@ positions = st.tuples(*[st.floats(-1e3, 1e3)] * 3)
 
 
 def a_transform():
-    return rigid(rotation_from_euler(30.0, -20.0, 10.0), [1.0, -2.0, 3.0])
+    return build_transform(convert_euler_to_rotation(30.0, -20.0, 10.0), [1.0, -2.0, 3.0])
 
 
 @pytest.mark.parametrize(
@@ -35,13 +35,13 @@ def a_transform():
     ],
 )
 def test_euler_angles_by_hand(angles_deg, point, expected):
-    np.testing.assert_allclose(rotation_from_euler(*angles_deg) @ point, expected, atol=1e-15)
+    np.testing.assert_allclose(convert_euler_to_rotation(*angles_deg) @ point, expected, atol=1e-15)
 
 
 @settings(max_examples=50, deadline=None)
 @given(angles)
 def test_a_rotation_is_orthonormal_and_right_handed(angles_deg):
-    rotation = rotation_from_euler(*angles_deg)
+    rotation = convert_euler_to_rotation(*angles_deg)
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-14)
     assert np.linalg.det(rotation) == pytest.approx(1.0)
 
@@ -49,26 +49,26 @@ def test_a_rotation_is_orthonormal_and_right_handed(angles_deg):
 @settings(max_examples=50, deadline=None)
 @given(angles, positions, positions)
 def test_the_inverse_brings_points_back(angles_deg, translation, point):
-    world_T_vehicle = rigid(rotation_from_euler(*angles_deg), translation)
-    there = transform(world_T_vehicle, np.array([point]))
-    np.testing.assert_allclose(transform(invert(world_T_vehicle), there)[0], point, atol=1e-10)
+    world_T_vehicle = build_transform(convert_euler_to_rotation(*angles_deg), translation)
+    there = transform_points(world_T_vehicle, np.array([point]))
+    np.testing.assert_allclose(transform_points(invert(world_T_vehicle), there)[0], point, atol=1e-10)
     np.testing.assert_allclose(invert(world_T_vehicle) @ world_T_vehicle, np.eye(4), atol=1e-10)
 
 
 @settings(max_examples=50, deadline=None)
 @given(angles, positions, positions)
 def test_transforms_act_on_column_vectors(angles_deg, translation, point):
-    matrix = rigid(rotation_from_euler(*angles_deg), translation)
-    np.testing.assert_allclose(transform(matrix, np.array([point]))[0], (matrix @ [*point, 1.0])[:3], atol=1e-9)
+    matrix = build_transform(convert_euler_to_rotation(*angles_deg), translation)
+    np.testing.assert_allclose(transform_points(matrix, np.array([point]))[0], (matrix @ [*point, 1.0])[:3], atol=1e-9)
 
 
 def test_transform_takes_any_type_and_leaves_its_input_alone():
     points = np.arange(6, dtype=np.float32).reshape(2, 3)
     before = points.copy()
-    moved = transform(a_transform(), points)
+    moved = transform_points(a_transform(), points)
     assert moved.dtype == np.float64
     np.testing.assert_array_equal(points, before)
-    assert transform(a_transform(), np.zeros((0, 3))).shape == (0, 3)
+    assert transform_points(a_transform(), np.zeros((0, 3))).shape == (0, 3)
 
 
 @settings(max_examples=50, deadline=None)
@@ -77,7 +77,7 @@ def test_a_quaternion_turns_about_its_axis(axis, norm, angle_deg):
     axis = np.array([0.0, 0.0, 20.0]) + axis
     axis /= np.linalg.norm(axis)
     half = np.deg2rad(angle_deg) / 2
-    rotation = rotation_from_quaternion(norm * np.array([np.cos(half), *(np.sin(half) * axis)]))
+    rotation = convert_quaternion_to_rotation(norm * np.array([np.cos(half), *(np.sin(half) * axis)]))
     np.testing.assert_allclose(rotation @ axis, axis, atol=1e-12)
     across = np.cross(axis, [1.0, 0.0, 0.0])
     across /= np.linalg.norm(across)
@@ -88,38 +88,44 @@ def test_a_quaternion_turns_about_its_axis(axis, norm, angle_deg):
 @pytest.mark.parametrize("bad", [[1.0, 0.0, 0.0], [1.0, 0.0, 0.0, np.nan], [[1.0, 0.0, 0.0]], np.inf])
 def test_a_quaternion_of_the_wrong_kind_is_refused(bad):
     with pytest.raises(ValueError, match="four finite numbers w, x, y, z"):
-        rotation_from_quaternion(bad)
+        convert_quaternion_to_rotation(bad)
 
 
 def test_many_quaternions_are_turned_at_once_as_each_alone():
     many = np.random.default_rng(0).normal(size=(2, 3, 4))
-    each = [[rotation_from_quaternion(one) for one in row] for row in many]
-    np.testing.assert_allclose(rotation_from_quaternion(many), each, rtol=0.0, atol=1e-15)
+    each = [[convert_quaternion_to_rotation(one) for one in row] for row in many]
+    np.testing.assert_allclose(convert_quaternion_to_rotation(many), each, rtol=0.0, atol=1e-15)
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.int8])
 def test_a_quaternion_of_fewer_digits_is_turned_with_all_of_a_double(dtype):
     few = np.array([[3, 1, -2, 5], [0, 1, 1, 1]], dtype=dtype)
-    np.testing.assert_array_equal(rotation_from_quaternion(few), rotation_from_quaternion(few.astype(np.float64)))
+    np.testing.assert_array_equal(
+        convert_quaternion_to_rotation(few), convert_quaternion_to_rotation(few.astype(np.float64))
+    )
 
 
 def test_between_two_rotations_the_way_is_the_shorter_one_whatever_the_signs_of_their_quaternions():
     random = np.random.default_rng(0)
     first, second = (of / np.linalg.norm(of, axis=1, keepdims=True) for of in random.normal(size=(2, 50, 4)))
     share = random.random((50, 1))
-    between = rotation_from_quaternion(slerp(first, second, share))
-    for other in (slerp(-first, second, share), slerp(first, -second, share), slerp(second, first, 1 - share)):
-        np.testing.assert_allclose(rotation_from_quaternion(other), between, rtol=0, atol=1e-12)
+    between = convert_quaternion_to_rotation(interpolate_quaternions(first, second, share))
+    for other in (
+        interpolate_quaternions(-first, second, share),
+        interpolate_quaternions(first, -second, share),
+        interpolate_quaternions(second, first, 1 - share),
+    ):
+        np.testing.assert_allclose(convert_quaternion_to_rotation(other), between, rtol=0, atol=1e-12)
     turned = [
-        np.linalg.norm(of - rotation_from_quaternion(first), axis=(1, 2))
-        for of in (between, rotation_from_quaternion(second))
+        np.linalg.norm(of - convert_quaternion_to_rotation(first), axis=(1, 2))
+        for of in (between, convert_quaternion_to_rotation(second))
     ]
     assert (turned[0] <= turned[1] + 1e-12).all()
 
 
 def test_a_quaternion_of_norm_zero_is_refused():
     with pytest.raises(ValueError, match="norm 0 is no rotation"):
-        rotation_from_quaternion([0.0, 0.0, 0.0, 0.0])
+        convert_quaternion_to_rotation([0.0, 0.0, 0.0, 0.0])
 
 
 def test_check_rigid_repairs_the_rounding_of_a_printed_matrix():
@@ -160,5 +166,5 @@ def test_check_rigid_says_what_is_wrong(bad, message):
 @pytest.mark.parametrize("pitch", [-90.0, -89.999, 0.0, 45.0, 90.0])
 def test_euler_angles_describe_the_rotation_they_came_from(pitch):
     for yaw, roll in ((0, 0), (30, 20), (-170, 100)):
-        rotation = rotation_from_euler(yaw, pitch, roll)
-        np.testing.assert_allclose(rotation_from_euler(*euler_from_rotation(rotation)), rotation, atol=1e-8)
+        rotation = convert_euler_to_rotation(yaw, pitch, roll)
+        np.testing.assert_allclose(convert_euler_to_rotation(*convert_rotation_to_euler(rotation)), rotation, atol=1e-8)

@@ -5,28 +5,28 @@ import re
 import numpy as np
 import pytest
 
-from torchcover.geometry import rigid, rotation_from_euler
-from torchcover.geometry.trajectory import Trajectory, poses_at
+from torchcover.geometry import build_transform, convert_euler_to_rotation
+from torchcover.geometry.trajectory import Trajectory, interpolate_poses
 
 
 def test_between_poses_a_body_moves_straight_and_turns_the_shorter_way():
     turn = Trajectory.from_arrays(
         [0.0, 2.0, 3.0], [[0, 0, 0], [4, 0, 0], [4, 2, 0]], [[170, 0, 0], [-170, 10, 0], [-170, 10, -6]]
     )
-    np.testing.assert_allclose(turn.at(1.0)[:3, 3], [2, 0, 0])
-    np.testing.assert_allclose(turn.at(1.0)[:3, :3], rotation_from_euler(180, 5, 0), atol=1e-12)
-    np.testing.assert_allclose(turn.at(2.5)[:3, :3], rotation_from_euler(-170, 10, -3), atol=1e-12)
-    np.testing.assert_allclose(turn.at(2.0)[:3, 3], [4, 0, 0])
+    np.testing.assert_allclose(turn.interpolate(1.0)[:3, 3], [2, 0, 0])
+    np.testing.assert_allclose(turn.interpolate(1.0)[:3, :3], convert_euler_to_rotation(180, 5, 0), atol=1e-12)
+    np.testing.assert_allclose(turn.interpolate(2.5)[:3, :3], convert_euler_to_rotation(-170, 10, -3), atol=1e-12)
+    np.testing.assert_allclose(turn.interpolate(2.0)[:3, 3], [4, 0, 0])
 
 
 def test_outside_its_times_a_body_rests_or_is_not_there():
     resting = Trajectory.from_arrays([1.0, 2.0], [[0, 0, 0], [1, 0, 0]], [[0, 0, 0]] * 2)
-    np.testing.assert_array_equal(resting.at(-5.0), resting.at(1.0))
-    np.testing.assert_array_equal(resting.at(9.0), resting.at(2.0))
-    transient = Trajectory(resting.times_s, resting.positions_m, resting.angles_deg, transient=True)
+    np.testing.assert_array_equal(resting.interpolate(-5.0), resting.interpolate(1.0))
+    np.testing.assert_array_equal(resting.interpolate(9.0), resting.interpolate(2.0))
+    transient = Trajectory(resting.times_s, resting.positions_m, resting.angles_deg, is_transient=True)
     times = np.array([0.9, 1.0, 1.5, 2.0, 2.1])
-    np.testing.assert_allclose(transient.positions_at(times)[:, 0], [np.nan, 0, 0.5, 1, np.nan])
-    np.testing.assert_allclose(resting.positions_at(times)[:, 0], [0, 0, 0.5, 1, 1])
+    np.testing.assert_allclose(transient.interpolate_positions_m(times)[:, 0], [np.nan, 0, 0.5, 1, np.nan])
+    np.testing.assert_allclose(resting.interpolate_positions_m(times)[:, 0], [0, 0, 0.5, 1, 1])
 
 
 def test_poses_at_many_times_are_those_at_each():
@@ -35,11 +35,13 @@ def test_poses_at_many_times_are_those_at_each():
         np.sort(generator.uniform(0, 9, 20)), generator.normal(size=(20, 3)), generator.uniform(-180, 180, (20, 3))
     )
     times = np.append(track.times_s, generator.uniform(-1, 10, 50))
-    poses = np.stack([track.at(time) for time in times])
-    np.testing.assert_allclose(track.positions_at(times), poses[:, :3, 3], atol=1e-12)
-    np.testing.assert_allclose(track.at_each(times), poses, atol=1e-12)
-    resting = Trajectory.resting((1, 2, 3), (4, 5, 6))
-    np.testing.assert_allclose(resting.at_each(times), np.stack([resting.at(0)] * len(times)), atol=1e-12)
+    poses = np.stack([track.interpolate(time) for time in times])
+    np.testing.assert_allclose(track.interpolate_positions_m(times), poses[:, :3, 3], atol=1e-12)
+    np.testing.assert_allclose(track.interpolate_many(times), poses, atol=1e-12)
+    resting = Trajectory.create_static((1, 2, 3), (4, 5, 6))
+    np.testing.assert_allclose(
+        resting.interpolate_many(times), np.stack([resting.interpolate(0)] * len(times)), atol=1e-12
+    )
 
 
 def test_poses_of_many_bodies_are_those_of_each():
@@ -50,21 +52,25 @@ def test_poses_of_many_bodies_are_those_of_each():
         for late in (0.0, 0.0, 0.7)
     ]
     for time_s in (-1.0, 0.0, 0.3, 1.0, 2.4, 9.0):
-        np.testing.assert_array_equal(poses_at(tracks, time_s), [track.at(time_s) for track in tracks])
-    assert poses_at([], 0.0).shape == (0, 4, 4)
+        np.testing.assert_array_equal(
+            interpolate_poses(tracks, time_s), [track.interpolate(time_s) for track in tracks]
+        )
+    assert interpolate_poses([], 0.0).shape == (0, 4, 4)
 
 
 @pytest.mark.parametrize("pitch_deg", [(85.0, 95.0), (60.5, 80.0), (-90.0, -70.0), (89.0, 90.0)])
 @pytest.mark.parametrize("others_deg", [(0.0, 0.0), (170.0, -30.0)])
 def test_between_steep_poses_a_body_turns_about_one_axis(pitch_deg, others_deg):
     yaw_deg, roll_deg = others_deg
-    ends = np.stack([rigid(rotation_from_euler(yaw_deg, pitch, roll_deg), np.zeros(3)) for pitch in pitch_deg])
+    ends = np.stack(
+        [build_transform(convert_euler_to_rotation(yaw_deg, pitch, roll_deg), np.zeros(3)) for pitch in pitch_deg]
+    )
     body = Trajectory.from_poses([0.0, 1.0], ends)
     for share in (0.0, 0.25, 0.5, 1.0):
-        between = rotation_from_euler(yaw_deg, pitch_deg[0] + share * (pitch_deg[1] - pitch_deg[0]), roll_deg)
-        assert body.at(share)[:3, :3] == pytest.approx(between, abs=1e-9)
-        assert poses_at([body, body], share)[1, :3, :3] == pytest.approx(between, abs=1e-9)
-        assert body.at_each(np.array([0.1, share]))[1, :3, :3] == pytest.approx(between, abs=1e-9)
+        between = convert_euler_to_rotation(yaw_deg, pitch_deg[0] + share * (pitch_deg[1] - pitch_deg[0]), roll_deg)
+        assert body.interpolate(share)[:3, :3] == pytest.approx(between, abs=1e-9)
+        assert interpolate_poses([body, body], share)[1, :3, :3] == pytest.approx(between, abs=1e-9)
+        assert body.interpolate_many(np.array([0.1, share]))[1, :3, :3] == pytest.approx(between, abs=1e-9)
 
 
 def test_the_first_pose_out_of_order_is_named_and_any_later_time_will_do():
@@ -91,19 +97,27 @@ def test_velocity_is_that_of_the_stretch_and_at_a_pose_the_mean_of_both():
     expected = {0.9: [0, 0, 0], 1.0: [2, 0, 0], 1.2: [2, 0, 0], 1.5: [1, 1.5, -0.5], 2.0: [0, 3, -1],
                 3.5: [0, 1.5, -0.5], 3.9: [0, 0, 0], 4.0: [0, 0, 0], 4.1: [0, 0, 0]}  # fmt: skip
     for time_s, velocity_mps in expected.items():
-        np.testing.assert_allclose(track.velocity_at(time_s), velocity_mps, atol=1e-12)
+        np.testing.assert_allclose(track.compute_velocity_mps(time_s), velocity_mps, atol=1e-12)
     for inner_s in (1.2, 2.0, 3.7):  # the difference of places, where nothing changes
-        near = track.positions_at(np.array([inner_s - 1e-6, inner_s + 1e-6]))
-        np.testing.assert_allclose(track.velocity_at(inner_s), (near[1] - near[0]) / 2e-6, atol=1e-6)
-    assert Trajectory.resting((1, 2, 3)).velocity_at(0.0).tolist() == [0, 0, 0]
+        near = track.interpolate_positions_m(np.array([inner_s - 1e-6, inner_s + 1e-6]))
+        np.testing.assert_allclose(track.compute_velocity_mps(inner_s), (near[1] - near[0]) / 2e-6, atol=1e-6)
+    assert Trajectory.create_static((1, 2, 3)).compute_velocity_mps(0.0).tolist() == [0, 0, 0]
     moving_last = Trajectory.from_arrays([0.0, 2.0], [[0, 0, 0], [0, -3, 0]], np.zeros((2, 3)))
-    assert [moving_last.velocity_at(time_s)[1] for time_s in (-0.1, 0.0, 1.0, 2.0, 2.1)] == [0, -1.5, -1.5, -1.5, 0]
+    assert [moving_last.compute_velocity_mps(time_s)[1] for time_s in (-0.1, 0.0, 1.0, 2.0, 2.1)] == [
+        0,
+        -1.5,
+        -1.5,
+        -1.5,
+        0,
+    ]
 
 
 def test_what_ever_changes_its_pose_moves():
     def moves(places, angles=None, **how):
         angles = np.zeros((len(places), 3)) if angles is None else angles
-        return Trajectory(np.arange(len(places)) * 1.0, np.array(places, float), np.array(angles, float), **how).moves
+        return Trajectory(
+            np.arange(len(places)) * 1.0, np.array(places, float), np.array(angles, float), **how
+        ).is_moving
 
     here, aside = [0, 0, 0], np.eye(3)
     rest = [moves([here]), moves([here] * 3), moves([[5, 6, 7]] * 2, [[1, 2, 3]] * 2)]
@@ -119,10 +133,10 @@ def test_places_at_its_own_times_are_its_places_and_elsewhere_between():
     times_s, places = np.array([0.0, 1.0, 3.0]), np.array([[0.0, 0, 0], [2, 0, 0], [2, 8, 0]])
     for transient in (False, True):
         track = Trajectory(times_s, places, np.zeros((3, 3)), transient)
-        assert track.bytes == 2 * 3 * 3 * 8
+        assert track.num_bytes == 2 * 3 * 3 * 8
         for asked in (times_s, times_s[:2], times_s[1:], np.array([0.0, 2.0]), np.empty(0)):
-            expected = [track.at(time_s)[:3, 3] for time_s in asked.tolist()]
-            np.testing.assert_allclose(track.positions_at(asked), np.reshape(expected, (-1, 3)), atol=1e-12)
+            expected = [track.interpolate(time_s)[:3, 3] for time_s in asked.tolist()]
+            np.testing.assert_allclose(track.interpolate_positions_m(asked), np.reshape(expected, (-1, 3)), atol=1e-12)
     for transient, before in ((False, [1, 2, 3]), (True, [np.nan] * 3)):
         alone = Trajectory(np.array([5.0]), np.array([[1.0, 2, 3]]), np.zeros((1, 3)), transient)
-        np.testing.assert_array_equal(alone.positions_at(np.array([4.0, 5.0])), [before, [1, 2, 3]])
+        np.testing.assert_array_equal(alone.interpolate_positions_m(np.array([4.0, 5.0])), [before, [1, 2, 3]])

@@ -20,7 +20,7 @@ from torchcover.contrib import (
     PointDensity,
     SMig,
 )
-from torchcover.coverage import AGGREGATIONS, StepQuantiles
+from torchcover.coverage import AGGREGATIONS, FrameQuantiles
 from torchcover.data import Frame
 from torchcover.detection import Boxes, RecallByVisibility
 from torchcover.geometry import BoundingBox
@@ -137,7 +137,7 @@ def by_sensor(steps: int) -> Case:
 
     regions = (
         Region("left", (-2.0, 2.0), (0.0, 1.0)),
-        Region.polygon("corner", [(-2.0, -1.0), (2.0, -1.0), (0.0, 1.0)]),
+        Region.from_corners("corner", [(-2.0, -1.0), (2.0, -1.0), (0.0, 1.0)]),
     )
     whole = coverage(
         steps,
@@ -195,13 +195,16 @@ def frame_step(index: int) -> Step:
         name=f"frame {index}",
         reference_weights=torch.rand(60 + 8 * count, generator=generator) + 0.1,
         boxes=Boxes.from_rows(rows, categories=categories),
-        sensor_points={"rig": {"front": 25, "rear": 35 + 4 * count}},
+        sensor_point_counts={"rig": {"front": 25, "rear": 35 + 4 * count}},
     )
     return {"frame": frame}
 
 
-PLACES = {"grid": BevGrid(x=(0.0, 8.0), y=(0.0, 4.0), cell=0.5), "regions": (Region("near", (0.0, 4.0), (0.0, 4.0)),)}
-OTHER_GRID = {"grid": BevGrid(x=(0.0, 10.0), y=(0.0, 4.0), cell=0.5)}
+PLACES = {
+    "grid": BevGrid(x_m=(0.0, 8.0), y_m=(0.0, 4.0), cell_m=0.5),
+    "regions": (Region("near", (0.0, 4.0), (0.0, 4.0)),),
+}
+OTHER_GRID = {"grid": BevGrid(x_m=(0.0, 10.0), y_m=(0.0, 4.0), cell_m=0.5)}
 SENSORS = (
     Lidar(
         name="front",
@@ -238,7 +241,7 @@ def of_frames(kind: type[FrameMetric], usual: Step, changes: Mapping[str, Step])
         "nothing",
         reference_weights=torch.zeros(0),
         boxes=Boxes.from_rows(torch.zeros(0, 7)),
-        sensor_points={"rig": {"front": 0, "rear": 0}},
+        sensor_point_counts={"rig": {"front": 0, "rear": 0}},
     )
     return Case(
         lambda **changed: as_metric(kind)(**{**usual, **changed}),
@@ -256,7 +259,7 @@ CASES = {
             "aggregations, one less": {"aggregations": ALL[1:]},
             "aggregations in another order": {"aggregations": ALL[::-1]},
             "aggregations, other levels": {
-                "aggregations": (*(one for one in ALL if not isinstance(one, StepQuantiles)), StepQuantiles((0.9,)))
+                "aggregations": (*(one for one in ALL if not isinstance(one, FrameQuantiles)), FrameQuantiles((0.9,)))
             },
         },
         blocks=8,

@@ -17,9 +17,9 @@ from torchmetrics.wrappers import BootStrapper, MinMaxMetric
 import torchcover.contrib
 import torchcover.coverage
 import torchcover.detection
-from torchcover.contrib import FrameMetric, WorldRatios
+from torchcover.contrib import FrameMetric, SceneRatios
 from torchcover.coverage import CoverageSums
-from torchcover.metrics import MergeableMetric, SumsInBlocks
+from torchcover.metrics import BlockedSums, MergeableMetric
 
 from .cases import CASES, flat, in_lists
 from .two_ranks import in_two_processes
@@ -71,7 +71,7 @@ def test_every_metric_of_the_package_is_asked():
     for room in (torchcover.coverage, torchcover.detection, torchcover.contrib):
         for module in pkgutil.iter_modules(room.__path__, f"{room.__name__}."):
             importlib.import_module(module.name)
-    bases = {MergeableMetric, SumsInBlocks, FrameMetric, WorldRatios, CoverageSums}
+    bases = {MergeableMetric, BlockedSums, FrameMetric, SceneRatios, CoverageSums}
     kinds = {kind for base in bases for kind in base.__subclasses__()} - bases
     # Who needs a world is asked in its own room.
     rooms = ("torchcover.coverage.", "torchcover.detection.", "torchcover.contrib.")

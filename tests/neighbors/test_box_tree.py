@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from torchcover.neighbors.box_tree import AXIS_CELLS, LEAF, NONE, SPREAD, along_the_curve, box_tree
+from torchcover.neighbors.box_tree import AXIS_CELLS, LEAF, NONE, SPREAD, build_box_tree, compute_morton_order
 
 
 def random_cloud(count, seed, dtype=torch.float32):
@@ -14,28 +14,28 @@ def random_cloud(count, seed, dtype=torch.float32):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_boxes_and_smallest_numbers_are_of_all_beneath(count, dtype):
     points = random_cloud(count, count, dtype)
-    tree = box_tree(points)
-    assert tree.numbers.unique().tolist() == list(range(count))
-    assert torch.equal(tree.points, points[tree.numbers])
+    tree = build_box_tree(points)
+    assert tree.point_indices.unique().tolist() == list(range(count))
+    assert torch.equal(tree.points, points[tree.point_indices])
     first = len(tree.boxes) // 2
     assert first.bit_count() == 1
-    leaves = list(zip(tree.points.split(LEAF), tree.numbers.split(LEAF), strict=True))
+    leaves = list(zip(tree.points.split(LEAF), tree.point_indices.split(LEAF), strict=True))
     assert len(leaves) == -(-count // LEAF) <= first
     for node in range(1, 2 * first):
         depth = first.bit_length() - node.bit_length()
         beneath = leaves[(node << depth) - first : ((node + 1) << depth) - first]
         if not beneath:
             assert tree.boxes[node].tolist() == [torch.inf] * 3 + [-torch.inf] * 3
-            assert tree.smallest[node] == NONE
+            assert tree.min_point_indices[node] == NONE
             continue
         cloud, numbers = (torch.cat(parts) for parts in zip(*beneath, strict=True))
         assert torch.equal(tree.boxes[node], torch.cat([cloud.amin(dim=0), cloud.amax(dim=0)]))
-        assert tree.smallest[node] == numbers.min()
+        assert tree.min_point_indices[node] == numbers.min()
 
 
 def leaf_sizes(cloud):
     """The diagonals of the boxes around every `LEAF` points in order."""
-    leaves = cloud[along_the_curve(cloud)][: len(cloud) // LEAF * LEAF].view(-1, LEAF, 3)
+    leaves = cloud[compute_morton_order(cloud)][: len(cloud) // LEAF * LEAF].view(-1, LEAF, 3)
     return (leaves.amax(dim=1) - leaves.amin(dim=1)).double().norm(dim=1)
 
 
@@ -66,15 +66,15 @@ def test_many_equal_points_do_not_coarsen_the_order_of_the_others(height_m):
 @pytest.mark.parametrize("extent", [0.0, 1e-45, 1e-38, 1e-3, 1e9])
 def test_the_order_is_a_permutation(count, extent):
     for cloud in (random_cloud(count, 4) * extent, torch.full((count, 3), extent)):
-        assert along_the_curve(cloud).sort().values.tolist() == list(range(count))
+        assert compute_morton_order(cloud).sort().values.tolist() == list(range(count))
 
 
 def test_equal_points_keep_their_order():
-    assert along_the_curve(torch.ones(5000, 3)).tolist() == list(range(5000))
+    assert compute_morton_order(torch.ones(5000, 3)).tolist() == list(range(5000))
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_what_lies_far_beyond_a_crowd_is_at_that_end_of_the_curve(sign):
     cloud = torch.cat([sign * torch.full((1, 3), 1e6), random_cloud(2000, 5)])
-    order = along_the_curve(cloud)
+    order = compute_morton_order(cloud)
     assert order[-1 if sign > 0 else 0] == 0

@@ -341,15 +341,15 @@ def test_packets_do_not_pay_around_points_on_a_line_or_in_a_plane(scale, chosen,
     """All of a packet's queries are compared with what is near any of them; flat boxes of the tree are soon passed."""
     monkeypatch.setattr(choice, "_works", lambda *_: True)
     query, points = random_cloud(100_000, 22), random_cloud(300_000, 23) * torch.tensor(scale, dtype=torch.float32)
-    assert (choice.backend_of_several(query, [points]) == "packets") is chosen
-    assert choice.backend_of_several(points, [points]) == "packets"  # queries among them are near few
+    assert (choice.choose_shared_backend(query, [points]) == "packets") is chosen
+    assert choice.choose_shared_backend(points, [points]) == "packets"  # queries among them are near few
 
 
 def test_packets_that_do_not_pay_in_one_cloud_do_in_many(monkeypatch):
     monkeypatch.setattr(choice, "_works", lambda *_: True)
     query, points = random_cloud(2_000, 24), random_cloud(100, 25)
-    assert choice.backend_of_several(query, [points]) != "packets"
-    assert choice.backend_of_several(query, [points] * 20) == "packets"
+    assert choice.choose_shared_backend(query, [points]) != "packets"
+    assert choice.choose_shared_backend(query, [points] * 20) == "packets"
 
 
 def test_packets_lose_nothing_to_the_tree_where_queries_and_points_are_in_one_plane():
@@ -369,7 +369,7 @@ def test_what_packets_lose_around_points_in_a_plane_does_not_hang_on_the_unit_of
 def test_without_a_query_or_a_point_nothing_is_lost_whatever_is_chosen(counts, monkeypatch):
     monkeypatch.setattr(choice, "_works", lambda *_: True)
     query, points = (torch.zeros(count, 3) for count in counts)
-    assert choice.backend_of_several(query, [points]) == "packets"
+    assert choice.choose_shared_backend(query, [points]) == "packets"
 
 
 def box_of(extent, count, low=(5.0, -20.0, 300.0)):
@@ -400,7 +400,7 @@ def test_what_packets_lose_around_points_in_a_plane_or_on_a_line_by_hand(asked, 
 def test_packets_are_taken_until_they_lose_more_than_they_gain(count, chosen, monkeypatch):
     monkeypatch.setattr(choice, "_works", lambda *_: True)
     query, points = box_of((160.0, 62.5, 100.0), 64_000), box_of((80.0, 160.0, 0.0), count, (5.0, -20.0, 310.0))
-    assert choice.backend_of_several(query, [points]) == chosen
+    assert choice.choose_shared_backend(query, [points]) == chosen
 
 
 @pytest.fixture

@@ -22,7 +22,7 @@ if find_spec("warp"):
     BACKENDS += ["warp", "warp on a GPU"] if torch.cuda.is_available() else ["warp"]
 if INSTALLED:
     from torchcover.neighbors import packets
-    from torchcover.neighbors.packets import along_the_curve
+    from torchcover.neighbors.packets import compute_morton_order
 
 
 def generator(seed):
@@ -274,7 +274,7 @@ def test_a_bound_only_leaves_out_what_is_beyond(name, backend, quantile):
 
 def leaf_sizes(cloud):
     """The diagonals of the boxes around every 16 points in order."""
-    leaves = cloud[along_the_curve(cloud)][: len(cloud) // 16 * 16].reshape(-1, 16, 3)
+    leaves = cloud[compute_morton_order(cloud)][: len(cloud) // 16 * 16].reshape(-1, 16, 3)
     return np.linalg.norm(np.ptp(leaves.astype(np.float64), axis=1), axis=1)
 
 
@@ -365,12 +365,12 @@ def test_the_order_is_as_fine_along_whichever_axis_a_cloud_is_long(installed, ax
 @pytest.mark.parametrize("extent", [0.0, 1e-45, 1e-38, 1e-3, 1e9])
 def test_the_order_is_a_permutation(installed, count, extent):
     for cloud in (uniform(count, 32, 0, 1) * np.float32(extent), np.full((count, 3), np.float32(extent))):
-        assert sorted(along_the_curve(cloud)) == list(range(count))
+        assert sorted(compute_morton_order(cloud)) == list(range(count))
 
 
 @if_installed
 def test_equal_points_keep_their_order(installed):
-    assert along_the_curve(np.ones((5000, 3), np.float32)).tolist() == list(range(5000))
+    assert compute_morton_order(np.ones((5000, 3), np.float32)).tolist() == list(range(5000))
 
 
 def test_without_its_library_a_backend_says_what_to_install(monkeypatch):

@@ -55,7 +55,7 @@ class Surface:
         share = share[:, np.arange(len(self.objectives)) % QUESTIONS]  # what nobody asked for is near or far, too
         found = estimate_of(share, self.scene_ids)
         named = [one._replace(key=name) for one, name in zip(found.quantities, self.objectives, strict=True)]
-        return type(found)(tuple(named), found.value, found.left_out, found.steps)
+        return type(found)(tuple(named), found.value, found.jackknife_values, found.frame_counts)
 
     def score(self, rig):
         self.scored.append(rig.name)

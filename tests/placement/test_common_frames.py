@@ -150,8 +150,8 @@ def test_what_some_worlds_do_not_show_is_about_the_others():
     found = held(scenarios, obstacles, worlds=1, per_world=1)
     assert [index.scene_id for index in found.indices] == [0, 1, 2]
     estimate = found.score(rig()).estimate
-    assert torch.isfinite(estimate.left_out).all()
-    assert estimate.left_out[1, 0] == estimate.value[0]  # the empty one has no obstacle
+    assert torch.isfinite(estimate.jackknife_values).all()
+    assert estimate.jackknife_values[1, 0] == estimate.value[0]  # the empty one has no obstacle
     nothing = held([yard()], obstacles).score(rig()).estimate.value
     assert torch.isnan(nothing).tolist() == [True, False]
 

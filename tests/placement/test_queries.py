@@ -26,7 +26,7 @@ def test_the_points_that_are_kept_are_those_in_the_regions_and_in_their_cells():
     assert asked.max_radius_m == 0.4
     # Cells of half a metre that the lane touches.
     assert asked.areas == (((0.0, 20.0), (-5.0, 5.0)), ((-7.5, -2.0), (-1.5, 2.0)))
-    assert (asked.grid.x, asked.grid.y) == ((-7.5, 20.0), (-5.0, 5.0))
+    assert (asked.grid.x_m, asked.grid.y_m) == ((-7.5, 20.0), (-5.0, 5.0))
     generator = np.random.default_rng(0)
     points = generator.uniform([-50, -45, -1], [30, 45, 3], (40_000, 3)).astype(np.float32)
     # Bands are over the ground, which is 5 m below the vehicle there.
@@ -77,16 +77,16 @@ def test_an_objective_is_any_number_of_a_result_and_knows_its_direction(several)
     observer = CoverageObserver(metric)
     for frame in several.frames(TWO):
         observer.update(frame)
-    (row,) = (row for row in observer.compute().summary() if row.height == "ground")
+    (row,) = (row for row in observer.compute().summary() if row.band == "ground")
     assert value["radius_m"] == row.numbers["radius_m"].value
     for key in ("radius_maximum_m", "radius_q0.5_m", "radius_q0.9_m"):
         assert value[key] == row.numbers[key].value
-    assert value["seen_by_two_0.4m"] == row.redundancy.seen_by["seen_by_two_0.4m"].value
-    without = {sensor: numbers["detection_0.4m"].value for sensor, numbers in row.redundancy.without.items()}
+    assert value["seen_by_two_0.4m"] == row.redundancy.detecting_sensors["seen_by_two_0.4m"].value
+    without = {sensor: numbers["detection_0.4m"].value for sensor, numbers in row.redundancy.failure_numbers.items()}
     assert value["detection_0.4m_without_top"] == without["top"]
     assert value["detection_0.4m_without_any"] == min(without.values()) < row.numbers["detection_0.4m"].value
     assert value["radius_m_without_any"] == max(
-        numbers["radius_m"].value for numbers in row.redundancy.without.values()
+        numbers["radius_m"].value for numbers in row.redundancy.failure_numbers.values()
     )
     # Of a rig that has no such sensor, none is lost; of one with a single sensor, all.
     assert dict(zip(NUMBERS, one.value.tolist(), strict=True))["detection_0.4m_without_any"] == 0
@@ -109,7 +109,7 @@ def test_what_a_failure_leaves_is_over_known_cells_where_evaluate_has_it_so(seve
     for frame in several.frames(TWO):
         observer.update(frame)
     for key in ("detection_0.4m", "radius_m", "seen_by_two_0.4m", "detection_0.4m_without_top"):
-        assert by_cells[key] == float(observer.compute().estimate_of(key, region, "ground").value)
+        assert by_cells[key] == float(observer.compute().estimate_number(key, region, "ground").value)
         assert by_cells[key] != by_area[key]
     # An aggregation is over all points of the region, whatever the means are over.
     assert by_cells["radius_q0.9_m"] == by_area["radius_q0.9_m"]
@@ -172,12 +172,12 @@ def test_an_objective_that_makes_no_sense_is_refused(given, message):
 
 
 def test_the_worst_sensor_is_the_worst_without_each_block_too():
-    from torchcover.coverage.quantity import RADIUS, detection
+    from torchcover.coverage.quantity import RADIUS, make_detection_quantity
     from torchcover.placement.queries import _worst
 
     value, left_out = torch.tensor([0.4]), torch.tensor([[0.3], [0.6]])
     other = torch.tensor([0.5]), torch.tensor([[0.5], [0.5]])
-    for quantity, expected in ((detection(0.4), [0.4, 0.3, 0.5]), (RADIUS, [0.5, 0.5, 0.6])):
+    for quantity, expected in ((make_detection_quantity(0.4), [0.4, 0.3, 0.5]), (RADIUS, [0.5, 0.5, 0.6])):
         each = [Estimate((quantity,), *one, torch.ones(2)) for one in ((value, left_out), other)]
         worst = _worst(each)
-        assert [*worst.value.tolist(), *worst.left_out[:, 0].tolist()] == pytest.approx(expected)
+        assert [*worst.value.tolist(), *worst.jackknife_values[:, 0].tolist()] == pytest.approx(expected)

@@ -60,7 +60,7 @@ def test_the_number_is_the_share_of_the_places_that_are_seen_well_enough_and_has
         points = survey_places(each, empty, Target.load("child"), np.array(PLACES)).least_points
         assert np.isnan(points[3])
         assert estimate.value[1] == np.mean(points >= 1)
-        assert (estimate.left_out[:, 1] == estimate.value[1]).all()
+        assert (estimate.jackknife_values[:, 1] == estimate.value[1]).all()
         assert estimate.quantities[1][0] == "child"
         assert estimate.quantities[1][2:] == ("share", False)
         # The others are what they are without it.
@@ -93,7 +93,7 @@ def test_a_search_finds_where_the_child_is_seen_and_resumed_it_finds_the_same(lo
     assert (start, best) == (0.0, 0.75)
     assert found.summary.startswith("child: gained +75.0 points in any world, optimism +0.00. ")
     (gain,) = found.best.improvements
-    assert (gain.average, gain.difference.p, gain.difference.error, gain.difference.significant) == (
+    assert (gain.average, gain.difference.p_value, gain.difference.error, gain.difference.is_significant) == (
         "-",
         0.0,
         0.0,

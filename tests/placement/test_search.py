@@ -68,8 +68,8 @@ def test_the_optimizer_is_better_than_random_candidates_and_so_it_is_on_held_out
     (gain,) = best.improvements
     assert gain.average == "area"
     assert gain.t_statistic > 4
-    assert gain.difference.blocks == 16
-    assert gain.optimism == gain.search_improvement - gain.difference.gain
+    assert gain.difference.block_count == 16
+    assert gain.optimism == gain.search_improvement - gain.difference.improvement
     assert gain.search_improvement >= max(
         control.improvements[0].search_improvement, np.nanmax(random.search.improvements)
     )
@@ -366,7 +366,7 @@ def test_an_objective_that_is_unknown_is_refused():
 def test_noise_alone_and_one_world_are_not_called_a_gain():
     result = searched(evaluations=12, worth=lambda rig: np.array([0.5, 0.5]), seed=4)
     assert "gained" not in result.summary
-    assert result.best.improvements[0].difference.significant is False
+    assert result.best.improvements[0].difference.is_significant is False
     assert result.best.improvements[0].optimism > 0
     assert "no gain is shown" in searched(evaluations=6, worlds=1, fresh_worlds=1).summary
 

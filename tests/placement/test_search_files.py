@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.placement.surfaces import plan, space
-from torchcover.coverage.quantity import RADIUS, detection
+from torchcover.coverage.quantity import RADIUS, make_detection_quantity
 from torchcover.estimation import Difference
 from torchcover.placement import PlacementSearch, run_search
 from torchcover.placement.running import JOURNAL
@@ -111,7 +111,7 @@ def test_where_nothing_can_be_there_are_files_all_the_same(tmp_path):
     assert json.loads((tmp_path / "search.json").read_text())["found"][0]["gains"] is None
 
 
-DETECTION = detection(0.4)
+DETECTION = make_detection_quantity(0.4)
 
 
 def gain(mean, error, significant, worlds=16, quantity=DETECTION):

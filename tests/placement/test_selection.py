@@ -100,7 +100,7 @@ def test_the_choice_is_the_rig_with_the_best_score_and_its_files_say_so(folder):
     assert f"{100 * found.numbers['around'].value:.2f} %" in found.summary
     assert found.best.is_proven
     assert list(found.excluded) == ["wide_inside"]
-    assert found.improvements[0].difference.blocks == 3
+    assert found.improvements[0].difference.block_count == 3
     assert found.improvements[0].search_improvement == pytest.approx(
         found.best.values[0] - found.coverage.compute_values(found.baseline)[0], rel=1e-6
     )

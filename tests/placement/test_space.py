@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from torchcover.files import BadFileError, as_yaml
+from torchcover.files import BadFileError, to_yaml
 from torchcover.placement import SearchSpace
 from torchcover.simulation import Lidar, Pose, Rig
 
@@ -272,7 +272,7 @@ def test_a_space_that_cannot_be_searched_is_refused_at_the_door(changed, message
     keys = {"name": "here", "start": "front_roof_32", "scenario": "courtyard", "objectives": NEAR}
     keys["free"] = {"roof": {"pitch_deg": [-5, 5]}}
     path = tmp_path / "space.yaml"
-    path.write_text(as_yaml(keys | changed), encoding="utf-8")
+    path.write_text(to_yaml(keys | changed), encoding="utf-8")
     with pytest.raises(BadFileError) as refused:
         SearchSpace.load(path)
     assert str(refused.value).startswith(f"{path}: ")

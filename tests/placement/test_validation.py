@@ -67,12 +67,12 @@ def test_the_fresh_test_is_about_other_worlds_and_says_what_was_optimism(frames)
     anew = held(seed=1, worlds=8, objectives={**frames.objectives, **others})
     assert [(gain.objective, gain.average) for gain in found] == [(name, "area") for name in ("near", "far", "bay")]
     by_test, by_search = ([of.score(one).estimate for one in (high, low)] for of in (anew, frames))
-    expected, in_search = by_test[0].differences(by_test[1]), by_search[0].minus(by_search[1])
+    expected, in_search = by_test[0].compute_differences(by_test[1]), by_search[0].subtract(by_search[1])
     for column, gain in enumerate(found):
         np.testing.assert_equal(gain.difference, expected[gain.objective])
         assert gain.search_improvement == float(in_search.value[column])
         np.testing.assert_equal(gain.optimism, gain.search_improvement - expected[gain.objective].value)
-    assert found[1].difference.p < 0.5
+    assert found[1].difference.p_value < 0.5
     assert {change.name for change in test.side_effects} == others.keys()
     # What a gain is made of sums up to it, whatever else the parts are; a loss has no share of a gain.
     for name in ("near", "far", "bay"):
@@ -92,9 +92,10 @@ def test_of_twenty_searches_that_change_nothing_at_most_one_says_that_something_
     for _ in range(200):
         shared = draws.normal(0.0, 1.0, (16, 4)) @ draws.normal(0.0, 1.0, (4, 33))  # regions overlap
         one, other = (estimate_of(shared + draws.normal(0.0, 0.5, (16, 33)), np.arange(16)) for _ in range(2))
-        tests = list(one.differences(other).values())
+        tests = list(one.compute_differences(other).values())
         changes = [
-            SideEffect("a", test, p, {}) for test, p in zip(tests, adjust_holm([test.p for test in tests]), strict=True)
+            SideEffect("a", test, p, {})
+            for test, p in zip(tests, adjust_holm([test.p_value for test in tests]), strict=True)
         ]
         alarms += any(change.is_worse for change in changes)
     assert alarms <= 10
@@ -104,6 +105,6 @@ def test_targets_are_counted_around_the_vehicle(frames, monkeypatch):
     monkeypatch.setattr(validation, "TARGETS", ("child",))
     low, high = rig(lidar(mount={"z_m": 1.6}), name="low"), rig(lidar(mount={"z_m": 2.4}), name="high")
     (change,) = validation._of_targets(high, low, frames).values()
-    assert change.gain > 0
-    assert change.p < 0.05
-    assert change.blocks == 16
+    assert change.improvement > 0
+    assert change.p_value < 0.05
+    assert change.block_count == 16

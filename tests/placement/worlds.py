@@ -54,4 +54,4 @@ def estimate_of(values, world, lower_is_better=()):
     steps = torch.bincount(world)
     names = [f"o{k}" for k in range(values.shape[1])]
     quantities = [Quantity(name, name, "share", name in lower_is_better) for name in names]
-    return Estimate.of_ratios(quantities, steps.double(), sums, steps)
+    return Estimate.from_ratios(quantities, steps.double(), sums, steps)

@@ -7,7 +7,7 @@ from rosbags import rosbag1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from torchcover.geometry import invert, quaternion_from_rotation, rigid, rotation_from_euler
+from torchcover.geometry import build_transform, convert_euler_to_rotation, convert_rotation_to_quaternion, invert
 
 TYPES, TYPES_OF_1 = get_typestore(Stores.ROS2_HUMBLE), get_typestore(Stores.ROS1_NOETIC)
 TYPES_OF_1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
@@ -56,7 +56,7 @@ def points(points_m, **others):
 
 def place(matrix, kind):
     """Position and orientation, as a `Transform` or a `Pose`."""
-    w, x, y, z = map(float, quaternion_from_rotation(matrix[:3, :3]))
+    w, x, y, z = map(float, convert_rotation_to_quaternion(matrix[:3, :3]))
     name = "Vector3" if kind == "Transform" else "Point"
     return made(
         f"geometry_msgs/msg/{kind}",
@@ -126,8 +126,8 @@ def as_ros1(message):
 
 
 # A sensor stands on a mast, which is turned, on the roof.
-roof_T_mast = rigid(rotation_from_euler(30.0, 0.0, 0.0), [0.1, 0.0, 0.4])
-vehicle_T_roof = rigid(np.eye(3), [0.0, 0.0, 1.4])
+roof_T_mast = build_transform(convert_euler_to_rotation(30.0, 0.0, 0.0), [0.1, 0.0, 0.4])
+vehicle_T_roof = build_transform(np.eye(3), [0.0, 0.0, 1.4])
 
 
 def mounts(drive):

@@ -8,7 +8,7 @@ import torch
 
 from torchcover.data import Scan
 from torchcover.detection import Boxes
-from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_euler, transform
+from torchcover.geometry import BoundingBox, build_transform, convert_euler_to_rotation, invert, transform_points
 
 CAR_SIZE_M = (4.0, 2.0, 1.5)
 
@@ -27,7 +27,7 @@ class Drive:
     ego_box: BoundingBox | None = None
     sensors = ("left", "right")
     reference_sensors = ()
-    square_metres = False
+    has_area_weights = False
     block_indices = None
     path = Path("drive")
 
@@ -42,23 +42,27 @@ class Drive:
         self.back_m = np.stack([np.full(y.size, -1.98), y.ravel(), z.ravel()], axis=1)  # in the frame of its box
 
     def get_world_T_vehicle(self, index):
-        return rigid(rotation_from_euler(10.0 * index, 0.0, 0.0), self.origin_m + np.array([1.5 * index, 0.0, 0.0]))
+        return build_transform(
+            convert_euler_to_rotation(10.0 * index, 0.0, 0.0), self.origin_m + np.array([1.5 * index, 0.0, 0.0])
+        )
 
     def world_T_car(self, index):
         place_m = self.origin_m + np.array([10.0 + 2.0 * index, 0.0, 0.75])
-        return rigid(rotation_from_euler(5.0 * index, 0.0, 0.0), place_m)
+        return build_transform(convert_euler_to_rotation(5.0 * index, 0.0, 0.0), place_m)
 
     def vehicle_T_sensor(self, sensor):
-        return rigid(rotation_from_euler(0.0, 3.0, 0.0), [0.5, 0.3 if sensor == "left" else -0.3, 1.7])
+        return build_transform(convert_euler_to_rotation(0.0, 3.0, 0.0), [0.5, 0.3 if sensor == "left" else -0.3, 1.7])
 
     def read_scan(self, sensor, index):
-        seen_m = transform(invert(self.get_world_T_vehicle(index)), self.wall_m)
+        seen_m = transform_points(invert(self.get_world_T_vehicle(index)), self.wall_m)
         if sensor == "left":
             seen_m = seen_m[seen_m[:, 0] < 0]
         else:
             vehicle_T_car = invert(self.get_world_T_vehicle(index)) @ self.world_T_car(index)
-            seen_m = np.concatenate([seen_m, transform(vehicle_T_car, self.back_m)])
-        return Scan(transform(invert(self.vehicle_T_sensor(sensor)), seen_m), self.vehicle_T_sensor(sensor), sensor)
+            seen_m = np.concatenate([seen_m, transform_points(vehicle_T_car, self.back_m)])
+        return Scan(
+            transform_points(invert(self.vehicle_T_sensor(sensor)), seen_m), self.vehicle_T_sensor(sensor), sensor
+        )
 
     def read_boxes(self, index):
         if not self.labelled:

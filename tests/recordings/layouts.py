@@ -7,18 +7,24 @@ import math
 import numpy as np
 
 from tests.recordings.bags import ros, ros1, ros_database
-from torchcover.geometry import euler_from_rotation, invert, rigid, rotation_from_euler, transform
+from torchcover.geometry import (
+    build_transform,
+    convert_euler_to_rotation,
+    convert_rotation_to_euler,
+    invert,
+    transform_points,
+)
 from torchcover.recordings.formats import argoverse2, kitti, nuscenes
 
 T0_NS = 1_532_402_927_600_000_000
 LATITUDE_DEG, LONGITUDE_DEG, ALTITUDE_M = 49.01, 8.43, 115.0
-velodyne_T_imu = rigid(rotation_from_euler(0.1, -0.2, 0.3), [-0.81, 0.32, -0.8])
+velodyne_T_imu = build_transform(convert_euler_to_rotation(0.1, -0.2, 0.3), [-0.81, 0.32, -0.8])
 
 
 def seen(drive, index):
     """All points of both sensors in the vehicle frame, those of `left` first."""
     scans = [drive.scan(sensor, index) for sensor in drive.sensors]
-    return [transform(scan.vehicle_T_sensor, scan.points_m) for scan in scans]
+    return [transform_points(scan.vehicle_T_sensor, scan.points_m) for scan in scans]
 
 
 def quaternion(matrix):
@@ -50,7 +56,7 @@ def kitti_raw(drive, root):
     radius_m = kitti.EARTH_RADIUS_M
     first_m = None
     for index, name in enumerate(f"{k:010d}" for k in range(drive.steps)):
-        points_m = transform(invert(vehicle_T_velodyne), np.concatenate(seen(drive, index)))
+        points_m = transform_points(invert(vehicle_T_velodyne), np.concatenate(seen(drive, index)))
         (path / "velodyne_points" / "data" / f"{name}.bin").write_bytes(records(points_m, 4))
         pose = drive.world_T_vehicle(index) @ vehicle_T_velodyne @ velodyne_T_imu
         first_m = pose[:3, 3] if first_m is None else first_m
@@ -60,7 +66,7 @@ def kitti_raw(drive, root):
         east_m, north_m, up_m = pose[:3, 3] - first_m
         latitude = 2 * math.degrees(math.atan(math.exp(north + north_m / (scale * radius_m)))) - 90
         longitude = LONGITUDE_DEG + math.degrees(east_m / (scale * radius_m))
-        yaw, pitch, roll = np.deg2rad(euler_from_rotation(pose[:3, :3]))
+        yaw, pitch, roll = np.deg2rad(convert_rotation_to_euler(pose[:3, :3]))
         row = [latitude, longitude, ALTITUDE_M + up_m, roll, pitch, yaw, *[0.0] * 24]
         (path / "oxts" / "data" / f"{name}.txt").write_text(" ".join(map(repr, map(float, row))))
     (path / "tracklet_labels.xml").write_text(tracklets(drive))
@@ -72,7 +78,7 @@ def tracklets(drive):
     poses = []
     for index in range(drive.steps):
         row = drive.boxes(index).rows[0].double().numpy()
-        x, y, z = transform(velodyne_T_vehicle, row[None, :3])[0] - [0.0, 0.0, row[5] / 2]
+        x, y, z = transform_points(velodyne_T_vehicle, row[None, :3])[0] - [0.0, 0.0, row[5] / 2]
         poses.append(f"<item><tx>{x}</tx><ty>{y}</ty><tz>{z}</tz><rx>0</rx><ry>0</ry><rz>{row[6]}</rz></item>")
     length, width, height = drive.boxes(0).size_m[0].tolist()
     return f"""<?xml version="1.0" encoding="UTF-8" standalone="yes" ?>
@@ -85,7 +91,7 @@ def tracklets(drive):
 
 def nuscenes_tables(drive, root):
     """Every second sweep is a key frame."""
-    mount = rigid(rotation_from_euler(-90.0, 0.0, 0.0), [0.94, 0.0, 1.84])
+    mount = build_transform(convert_euler_to_rotation(-90.0, 0.0, 0.0), [0.94, 0.0, 1.84])
     tables = {
         name: [] for name in ("scene", "sample", "sample_data", "ego_pose", "calibrated_sensor", "sample_annotation")
     }
@@ -99,7 +105,7 @@ def nuscenes_tables(drive, root):
         name = f"{'samples' if key else 'sweeps'}/LIDAR_TOP/n015__LIDAR_TOP__{time_us}.pcd.bin"
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         points_m = np.concatenate(seen(drive, index))
-        (root / name).write_bytes(records(transform(invert(nuscenes.vehicle_T_ego @ mount), points_m), 5))
+        (root / name).write_bytes(records(transform_points(invert(nuscenes.vehicle_T_ego @ mount), points_m), 5))
         tables["ego_pose"].append(
             {"token": f"p{index}", "rotation": quaternion(world_T_ego), "translation": world_T_ego[:3, 3].tolist()}
         )
@@ -135,7 +141,7 @@ def argoverse2_log(drive, root):
     poses, cuboids = [], []
     for index in range(drive.steps):
         time_ns = T0_NS + round(1e9 * drive.times_s[index])
-        clouds = [transform(invert(argoverse2.vehicle_T_ego), cloud) for cloud in seen(drive, index)]
+        clouds = [transform_points(invert(argoverse2.vehicle_T_ego), cloud) for cloud in seen(drive, index)]
         points_m, laser = np.concatenate(clouds), np.repeat([3, 40], [len(cloud) for cloud in clouds]).astype(np.uint8)
         columns = {axis: points_m[:, k].astype(np.float32) for k, axis in enumerate("xyz")}
         columns |= {"laser_number": laser, "offset_ns": np.zeros(len(laser), np.int32)}
@@ -157,7 +163,7 @@ def posed(matrix):
     return {**rotation, **dict(zip(("tx_m", "ty_m", "tz_m"), map(float, matrix[:3, 3]), strict=True))}
 
 
-HALF_TURN = rigid(rotation_from_euler(180.0, 0.0, 0.0), [0.0, 0.0, 2.0])
+HALF_TURN = build_transform(convert_euler_to_rotation(180.0, 0.0, 0.0), [0.0, 0.0, 2.0])
 POSE = ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 BOX = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "yaw_rad")
 
@@ -181,13 +187,17 @@ def plain_folder(drive, root):
         poses.append([name, drive.times_s[index], *pose_row(drive.world_T_vehicle(index))])
         for sensor in drive.sensors:
             scan = drive.scan(sensor, index)
-            turned = rigid(rotation_from_euler(40.0 * index, 0.0, 0.0), [index, 0.0, 1.0])
-            points_m = transform(scan.vehicle_T_sensor, scan.points_m)
+            turned = build_transform(convert_euler_to_rotation(40.0 * index, 0.0, 0.0), [index, 0.0, 1.0])
+            points_m = transform_points(scan.vehicle_T_sensor, scan.points_m)
             if sensor == "left":
                 mounts.append([name, *pose_row(turned)])
-                points_m = transform(invert(turned), points_m)
+                points_m = transform_points(invert(turned), points_m)
             else:
-                points_m = transform(HALF_TURN, points_m - [0.0, 0.0, 4.0]) * [1, -1, 1]  # its own inverse but for z
+                points_m = transform_points(HALF_TURN, points_m - [0.0, 0.0, 4.0]) * [
+                    1,
+                    -1,
+                    1,
+                ]  # its own inverse but for z
             np.save(root / "sensors" / sensor / f"{name}.npy", points_m)
         row = drive.boxes(index).rows[0].tolist()
         table(root / "boxes" / f"{name}.csv", (*BOX, "id", "category"), [[*row, "car", "car, red"]])
@@ -206,14 +216,14 @@ CARLA_BOX = ("id", "category", *CARLA_POSE, "extent_x", "extent_y", "extent_z")
 
 def carla_row(matrix):
     """x, y, z, roll, pitch, yaw of a right-handed pose in CARLA's axes."""
-    yaw, pitch, roll = euler_from_rotation(matrix[:3, :3])
+    yaw, pitch, roll = convert_rotation_to_euler(matrix[:3, :3])
     x, y, z = matrix[:3, 3]
     return [float(number) for number in (x, -y, z, roll, -pitch, -yaw)]
 
 
 def carla_folder(drive, root):
     """Two ticks an instant, `left` makes half a turn in each; the origin of the actor is not under its middle."""
-    vehicle_T_actor = rigid(np.eye(3), [-0.1, 0.2, 0.0])
+    vehicle_T_actor = build_transform(np.eye(3), [-0.1, 0.2, 0.0])
     box = {"location": {"x": 0.1, "y": 0.2, "z": 0.75}, "extent": {"x": 2.0, "y": 1.0, "z": 0.75}}
     (root / "vehicle.json").write_text(json.dumps(box))
     listed, poses = [], []

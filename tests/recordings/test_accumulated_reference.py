@@ -10,7 +10,7 @@ from tests.recordings.drives import Drive
 from torchcover.data import AccumulatedReference, BadFrameError, RecordedFrames
 from torchcover.detection import Boxes
 from torchcover.evaluation import evaluate
-from torchcover.geometry import BoundingBox, invert, rigid, transform
+from torchcover.geometry import BoundingBox, build_transform, invert, transform_points
 
 FAR_M = (513_248.0, 5_403_655.0, 260.0)
 
@@ -20,11 +20,11 @@ def distances_m(points_m, to_m):
 
 
 def standing(drive, index):
-    return transform(invert(drive.world_T_vehicle(index)), drive.wall_m)
+    return transform_points(invert(drive.world_T_vehicle(index)), drive.wall_m)
 
 
 def moving(drive, index):
-    return transform(invert(drive.world_T_vehicle(index)) @ drive.world_T_car(index), drive.back_m)
+    return transform_points(invert(drive.world_T_vehicle(index)) @ drive.world_T_car(index), drive.back_m)
 
 
 @pytest.mark.parametrize("origin_m", [(0.0, 0.0, 0.0), FAR_M])
@@ -59,7 +59,7 @@ class Parked(Drive):
 
     def read_boxes(self, index):
         moving, size_m = super().read_boxes(index), (6.0, 1.0, 3.2)
-        vehicle_T_parked = invert(self.get_world_T_vehicle(index)) @ rigid(np.eye(3), [10.0, 5.0, 1.5])
+        vehicle_T_parked = invert(self.get_world_T_vehicle(index)) @ build_transform(np.eye(3), [10.0, 5.0, 1.5])
         yaw = np.arctan2(vehicle_T_parked[1, 0], vehicle_T_parked[0, 0])
         row = torch.tensor([[*vehicle_T_parked[:3, 3], *size_m, yaw]], dtype=torch.float32)
         return Boxes.from_rows(torch.cat([moving.rows, row]), ids=("car", "parked"))
@@ -198,7 +198,7 @@ def test_what_is_left_out_is_counted_and_points_have_square_metres():
 def test_a_pose_that_jumps_ends_the_window():
     drive = Drive(steps=20)
     places = Drive(steps=20).get_world_T_vehicle
-    drive.get_world_T_vehicle = lambda index: rigid(np.eye(3), [5.0 * (index >= 8), 0.0, 0.0]) @ places(index)
+    drive.get_world_T_vehicle = lambda index: build_transform(np.eye(3), [5.0 * (index >= 8), 0.0, 0.0]) @ places(index)
     frames = RecordedFrames(drive, reference=AccumulatedReference(10.0))
     assert frames[9].counts["reference_sweeps"] == 2 * 11
     assert frames[9].counts["reference_sweeps_skipped"] == 2 * 8

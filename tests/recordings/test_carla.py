@@ -11,7 +11,7 @@ from tests.recordings.layouts import CARLA_BOX, table
 from tests.recordings.test_accumulated_reference import distances_m
 from torchcover.data import AccumulatedReference, BadFrameError, RecordedFrames, open_recording
 from torchcover.files import BadFileError
-from torchcover.geometry import transform
+from torchcover.geometry import transform_points
 from torchcover.recordings.formats.carla import Carla
 
 MOUNT = {"x": 0.7, "y": 0.4, "z": 1.6, "roll": 5.0, "pitch": 10.0, "yaw": 30.0}
@@ -43,7 +43,7 @@ def recorded(folder, *, reference=True, ids=("roof",)):
     sensors = [{"id": "front", "type": "sensor.camera.rgb"}]
     for name in ids:
         sensors.append({"id": name, "type": "sensor.lidar.ray_cast", **MOUNT, "range": "50", "channels": "64"})
-        cloud = transform(np.linalg.inv(carla_matrix(**MOUNT)), mirrored(WORLD))
+        cloud = transform_points(np.linalg.inv(carla_matrix(**MOUNT)), mirrored(WORLD))
         (folder / name).mkdir(parents=True)
         for frame in ("8", "10"):
             np.save(folder / name / f"{frame}.npy", np.c_[cloud, np.ones(50)].astype(np.float32))
@@ -52,7 +52,7 @@ def recorded(folder, *, reference=True, ids=("roof",)):
         (folder / "reference").mkdir()
         poses = {"8": (1.0, -0.5, 2.0, 45.0, -40.0, 170.0), "10": (0.0, 1.5, 1.0, -30.0, 20.0, -100.0)}
         for frame, pose in poses.items():
-            cloud = transform(np.linalg.inv(carla_matrix(*pose)), mirrored(WORLD))
+            cloud = transform_points(np.linalg.inv(carla_matrix(*pose)), mirrored(WORLD))
             np.save(folder / "reference" / f"{frame}.npy", cloud)
         table(folder / "reference" / "poses.csv", ("frame", *POSE), [[frame, *pose] for frame, pose in poses.items()])
     (folder / "sensors.json").write_text(json.dumps(sensors))
@@ -75,8 +75,8 @@ def test_poses_are_turned_as_the_clouds_are(tmp_path):
     recording = open_recording(tmp_path)
     assert recording.times_s.tolist() == [0.0, 0.5]
     for index, row in enumerate(rows[::-1]):
-        expected = mirrored(transform(carla_matrix(*row[2:]), mirrored(WORLD)))
-        np.testing.assert_allclose(transform(recording.get_world_T_vehicle(index), WORLD), expected, atol=1e-12)
+        expected = mirrored(transform_points(carla_matrix(*row[2:]), mirrored(WORLD)))
+        np.testing.assert_allclose(transform_points(recording.get_world_T_vehicle(index), WORLD), expected, atol=1e-12)
     assert len(RecordedFrames(recording)[0].reference) > 10  # of the other frame
 
 
@@ -151,7 +151,7 @@ def test_pixels_of_a_depth_camera_are_where_carla_has_them(tmp_path):
     codes = np.random.default_rng(1).integers(10_000, 2_000_000, (3, 4))
     codes[0, 1], codes[2, 2] = 2**24 - 1, 0  # sky, and nothing at all
     recording = open_recording(photographed(tmp_path, codes))
-    (seen,) = [transform(scan.vehicle_T_sensor, scan.points_m) for scan in [recording.read_scan("head", 0)]]
+    (seen,) = [transform_points(scan.vehicle_T_sensor, scan.points_m) for scan in [recording.read_scan("head", 0)]]
     focal = 4 / (2 * np.tan(np.deg2rad(80) / 2))
     expected = []
     for (row, column), code in np.ndenumerate(codes):
@@ -159,7 +159,7 @@ def test_pixels_of_a_depth_camera_are_where_carla_has_them(tmp_path):
             depth_m = 1000 * code / (2**24 - 1)
             right, down = (column + 0.5 - 2) / focal, (row + 0.5 - 1.5) / focal
             expected.append([depth_m, depth_m * right, -depth_m * down])
-    np.testing.assert_allclose(seen, mirrored(transform(carla_matrix(**MOUNT), np.array(expected))), atol=1e-4)
+    np.testing.assert_allclose(seen, mirrored(transform_points(carla_matrix(**MOUNT), np.array(expected))), atol=1e-4)
 
 
 def test_a_camera_that_does_not_fit_its_image_is_told(tmp_path):

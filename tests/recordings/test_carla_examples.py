@@ -14,7 +14,7 @@ from tests.recordings.test_carla import carla_matrix, mirrored
 from torchcover import Rig
 from torchcover.cameras import Camera
 from torchcover.data import RecordedFrames, SimulatedFrames, open_recording
-from torchcover.geometry import invert, transform
+from torchcover.geometry import invert, transform_points
 from torchcover.simulation import PaperReference
 
 FULL_CODE = 2**24 - 1
@@ -128,7 +128,7 @@ class Actor:
         place = np.array(self.parent.pose.get_matrix()) @ np.array(self.pose.get_matrix())
         if self.type_id == "sensor.lidar.ray_cast":
             assert float(self.attributes["rotation_frequency"]) == 20.0
-            seen = transform(invert(place), mirrored(WORLD))
+            seen = transform_points(invert(place), mirrored(WORLD))
             return SimpleNamespace(frame=tick, raw_data=np.c_[seen, np.ones(len(seen))].astype(np.float32).tobytes())
         width, height, fov = (int(float(self.attributes[name])) for name in ("image_size_x", "image_size_y", "fov"))
         focal = width / (2 * np.tan(np.deg2rad(fov) / 2))
@@ -249,7 +249,7 @@ def test_what_the_recorder_writes_is_read_with_the_numbers_of_the_world(recorder
     for index in range(3):
         ticks = 2 * index + 2
         world_T_actor = carla_matrix(1.0 + 0.5 * ticks, 2.0, 0.0, 0.0, 0.0, 10.0 + 4.0 * ticks)
-        seen = mirrored(transform(invert(world_T_actor), mirrored(WORLD))) + UNDER_THE_MIDDLE_M
+        seen = mirrored(transform_points(invert(world_T_actor), mirrored(WORLD))) + UNDER_THE_MIDDLE_M
         own = (np.abs(seen[:, :2]) < [2.3, 1.0]).all(axis=1) & (seen[:, 2] < 1.5)
         for cloud in (roof[index].sensor, roof[index].reference):
             np.testing.assert_allclose(cloud, seen[~own], atol=1e-4)
@@ -258,8 +258,8 @@ def test_what_the_recorder_writes_is_read_with_the_numbers_of_the_world(recorder
         assert heights.abs().max() < 0.01  # the ground, of pixels that look down by a degree and more
         (box,) = recording.read_boxes(index).rows
         assert recording.read_boxes(index).categories == ("vehicle.audi.tt",)
-        centre = transform(np.array(world.other.pose.get_matrix()), np.array([[0.1, 0.05, 0.75]]))
-        expected = mirrored(transform(invert(world_T_actor), centre)) + UNDER_THE_MIDDLE_M
+        centre = transform_points(np.array(world.other.pose.get_matrix()), np.array([[0.1, 0.05, 0.75]]))
+        expected = mirrored(transform_points(invert(world_T_actor), centre)) + UNDER_THE_MIDDLE_M
         np.testing.assert_allclose(box[:3], expected[0], atol=1e-5)
         np.testing.assert_allclose(box[3:], [4.6, 2.0, 1.5, np.deg2rad(-30 + 10 + 4.0 * ticks)], atol=1e-5)
         places_m.append(recording.read_scan("reference", index).vehicle_T_sensor[:3, 3])

@@ -13,10 +13,10 @@ import torchcover
 from tests.recordings.drives import Drive
 from torchcover.data import AccumulatedReference, RecordedFrames, Scan
 from torchcover.detection import Boxes
-from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_euler, transform
+from torchcover.geometry import BoundingBox, build_transform, convert_euler_to_rotation, invert, transform_points
 from torchcover.recordings.checks import estimate_ground_height
 
-MOUNT = rigid(rotation_from_euler(2.0, 1.0, -1.0), [0.5, 0.1, 1.73])
+MOUNT = build_transform(convert_euler_to_rotation(2.0, 1.0, -1.0), [0.5, 0.1, 1.73])
 SIZE_M = (4.0, 1.8, 1.5)
 
 
@@ -41,7 +41,7 @@ class Street:
     path = Path("street")
     sensors = ("lidar",)
     reference_sensors = ("reference",)
-    square_metres = False
+    has_area_weights = False
     block_indices = None
 
     def __post_init__(self):
@@ -67,10 +67,12 @@ class Street:
             points_m = points_m[::2]  # every second laser
         if self.flipped:
             points_m = points_m * [1.0, -1.0, 1.0]
-        return Scan(transform(invert(MOUNT), points_m), MOUNT if self.mount is None else self.mount, sensor)
+        return Scan(transform_points(invert(MOUNT), points_m), MOUNT if self.mount is None else self.mount, sensor)
 
     def get_world_T_vehicle(self, index):
-        return rigid(rotation_from_euler(30.0 + 4.0 * index + self.turned_deg, 0.0, 0.0), self._place_m(index))
+        return build_transform(
+            convert_euler_to_rotation(30.0 + 4.0 * index + self.turned_deg, 0.0, 0.0), self._place_m(index)
+        )
 
     def _place_m(self, index):
         yaw = np.deg2rad(30.0 + 4.0 * np.arange(index))
@@ -86,7 +88,7 @@ class Street:
 
 
 def doubts(street, **options):
-    return RecordedFrames(street, **options).doubts(None)
+    return RecordedFrames(street, **options).check(None)
 
 
 def test_nothing_is_wrong_with_what_is_right():
@@ -114,7 +116,10 @@ def test_nothing_is_wrong_with_what_is_right():
             {"mount": np.eye(4)},
             r"ground lies at z = -1.[78] m \(lidar\), -1.[78] m \(reference\), not near 0: .*vehicle_T",
         ),
-        ({"mount": rigid(np.eye(3), [0.0, 0.0, 3.4])}, r"ground lies at z = \+1.[67] m \(lidar\), \+1.[67] m \(ref"),
+        (
+            {"mount": build_transform(np.eye(3), [0.0, 0.0, 3.4])},
+            r"ground lies at z = \+1.[67] m \(lidar\), \+1.[67] m \(ref",
+        ),
         ({"flipped": True}, r"20 of 20 labeled boxes contain points of (lidar|reference) only if its left and right"),
         ({"same": True}, r"reference points are those of the rig one itself.*--reference accumulated"),
     ],
@@ -155,7 +160,9 @@ def test_ground_is_what_is_connected_below_the_vehicle():
     x, y = generator.uniform(-20, 20, (2, 5000))
     flat_m = np.stack([x, y, np.full(5000, -1.73)], axis=1)
     assert estimate_ground_height(flat_m) == pytest.approx(-1.73)
-    assert estimate_ground_height(transform(rigid(np.eye(3), [0.0, 0.0, 1.73]), flat_m)) == pytest.approx(0.0, abs=1e-9)
+    assert estimate_ground_height(
+        transform_points(build_transform(np.eye(3), [0.0, 0.0, 1.73]), flat_m)
+    ) == pytest.approx(0.0, abs=1e-9)
     assert estimate_ground_height(flat_m[:20]) is None  # too few
     assert estimate_ground_height(np.stack([x, y, generator.uniform(2, 12, 5000)], axis=1)) is None  # roofs and trees
     ahead_m = flat_m[(x > 5) & (np.abs(y) < 0.6 * x)]
@@ -190,19 +197,19 @@ class Striped(Drive):
         self.back_m, self.rigs, self.labelled = np.empty((0, 3)), {"one": ("right",)}, False
 
     def get_world_T_vehicle(self, index):
-        return rigid(np.eye(3), [0.5 * max(0, index - self.standing), 0.0, 0.0])
+        return build_transform(np.eye(3), [0.5 * max(0, index - self.standing), 0.0, 0.0])
 
     def read_scan(self, sensor, index):
         scan = super().read_scan(sensor, index)
-        points_m = transform(scan.vehicle_T_sensor, scan.points_m)
+        points_m = transform_points(scan.vehicle_T_sensor, scan.points_m)
         return replace(scan, points_m=scan.points_m[points_m[:, 0] % 6.0 < 3.0])
 
     def share_near_stripes(self, index):
         """The share of the wall 0 to 20 m ahead whose middle is within 0.4 m of a point of the scan."""
-        wall_m = transform(invert(self.get_world_T_vehicle(index)), self.wall_m)
+        wall_m = transform_points(invert(self.get_world_T_vehicle(index)), self.wall_m)
         wall_m = wall_m[(wall_m[:, 0] >= 0) & (wall_m[:, 0] < 20)]
         seen = self.read_scan("right", index)
-        apart_m = np.linalg.norm(wall_m[:, None] - transform(seen.vehicle_T_sensor, seen.points_m), axis=2)
+        apart_m = np.linalg.norm(wall_m[:, None] - transform_points(seen.vehicle_T_sensor, seen.points_m), axis=2)
         return (apart_m.min(axis=1) < 0.4).mean()
 
 

@@ -59,7 +59,7 @@ def test_points_of_the_reference_keep_their_weights_and_those_left_out_take_thei
         "{reference: {square_metres: true}, vehicle: {lower_m: [-1, -1, 0], upper_m: [1, 1, 1]}}"
     )
     frames = RecordedFrames(tmp_path)
-    assert frames.square_metres
+    assert frames.has_area_weights
     assert frames[1].reference[:, 0].tolist() == [9.0, 7.0]
     assert frames[1].reference_weights.tolist() == [2.0, 5.0]
     assert frames[1].reference_weights.dtype == torch.float32

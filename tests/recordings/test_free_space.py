@@ -3,10 +3,15 @@
 import numpy as np
 import pytest
 
-from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_euler
+from torchcover.geometry import BoundingBox, build_transform, convert_euler_to_rotation, invert
 from torchcover.recordings import free_space
 from torchcover.recordings import movers as moved
-from torchcover.recordings.free_space import FreeSpaceCounter, RangeImage, estimate_visible_share, square_metres
+from torchcover.recordings.free_space import (
+    FreeSpaceCounter,
+    RangeImage,
+    estimate_surface_areas_m2,
+    estimate_visible_share,
+)
 from torchcover.recordings.movers import find_moving_clusters
 
 CAR = BoundingBox((-2.4, -0.95, 0.0), (2.4, 0.95, 1.7))
@@ -84,7 +89,7 @@ def test_loops_do_what_arrays_do():
     generator = np.random.default_rng(0)
     points_m = generator.normal(0.0, 20.0, (5000, 3))
     points_m[:3] = [[0.0, 0.0, 0.0], [0.0, 0.0, 5.0], [-5.0, -0.0, 0.0]]
-    sensor_T_local = invert(rigid(rotation_from_euler(20.0, 3.0, -2.0), [1.0, 2.0, 0.5]))
+    sensor_T_local = invert(build_transform(convert_euler_to_rotation(20.0, 3.0, -2.0), [1.0, 2.0, 0.5]))
     image = RangeImage.from_points(generator.normal(0.0, 30.0, (40_000, 3)), sensor_T_local)
     one, other = np.zeros((2, 5000), np.int16)
     for kernel, votes in ((loops.count_votes_by_loop, one), (free_space.count_votes_by_arrays, other)):
@@ -134,10 +139,10 @@ def test_square_metres_add_up_to_the_surface():
     generator = np.random.default_rng(0)
     sparse_m = np.column_stack([generator.uniform(0.0, 40.0, (4000, 2)), np.zeros(4000)])
     dense_m = np.column_stack([generator.uniform(60.0, 70.0, (4000, 2)), np.zeros(4000)])
-    area_m2 = square_metres(np.concatenate([sparse_m, dense_m]))
+    area_m2 = estimate_surface_areas_m2(np.concatenate([sparse_m, dense_m]))
     assert abs(area_m2[:4000].sum() / 1600.0 - 1) < 0.2
     assert abs(area_m2[4000:].sum() / 100.0 - 1) < 0.2
-    assert square_metres(sparse_m[:3]).tolist() == [np.pi * 9.0 / 8] * 3
+    assert estimate_surface_areas_m2(sparse_m[:3]).tolist() == [np.pi * 9.0 / 8] * 3
 
 
 @pytest.mark.parametrize("velocity_mps", [(0.0, 0.0), (1.3, -0.8), (-28.0, 2.0)])

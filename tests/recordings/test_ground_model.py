@@ -8,7 +8,7 @@ import pytest
 import torchcover
 from tests.recordings.drives import CAR_SIZE_M, Drive
 from torchcover.data import AccumulatedReference, RecordedFrames
-from torchcover.geometry import invert, rigid, rotation_from_euler, transform
+from torchcover.geometry import build_transform, convert_euler_to_rotation, invert, transform_points
 from torchcover.recordings.ground_model import CELL_M, GroundModel, extract_low_surfaces
 
 NOISE_M = 0.03
@@ -171,12 +171,14 @@ class Road(Drive):
     tilt_deg = (0.0, 0.0)
 
     def get_world_T_vehicle(self, index):
-        return super().get_world_T_vehicle(index) @ rigid(rotation_from_euler(0.0, *self.tilt_deg), np.zeros(3))
+        return super().get_world_T_vehicle(index) @ build_transform(
+            convert_euler_to_rotation(0.0, *self.tilt_deg), np.zeros(3)
+        )
 
     def read_scan(self, sensor, index):
         scan = super().read_scan(sensor, index)
         road_m = seen(rises, 12_000, 30.0, seed=index) + self.origin_m
-        road_m = transform(invert(self.get_world_T_vehicle(index) @ scan.vehicle_T_sensor), road_m)
+        road_m = transform_points(invert(self.get_world_T_vehicle(index) @ scan.vehicle_T_sensor), road_m)
         return replace(scan, points_m=np.concatenate([scan.points_m, road_m]))
 
 
@@ -192,7 +194,7 @@ def test_heights_of_a_drive_are_those_of_its_world_however_the_vehicle_leans(til
     frames = RecordedFrames(road, reference=AccumulatedReference(10.0))
     assert frames.has_heights()
     frame = frames[1]
-    placed_m = transform(road.get_world_T_vehicle(1), frame.reference.numpy().astype(np.float64)) - origin_m
+    placed_m = transform_points(road.get_world_T_vehicle(1), frame.reference.numpy().astype(np.float64)) - origin_m
     expected_m = placed_m[:, 2] - rises(placed_m[:, 0], placed_m[:, 1])
     found_m = frame.reference_heights_m.numpy()
     assert found_m.dtype == np.float32
@@ -223,7 +225,7 @@ def test_without_times_the_ground_is_that_of_the_instant():
     road.times_s = None
     frames = RecordedFrames(road, rigs={"left": ("left",)}, reference=AccumulatedReference(0.0))
     frame = frames[1]
-    placed_m = transform(road.get_world_T_vehicle(1), frame.reference.numpy().astype(np.float64))
+    placed_m = transform_points(road.get_world_T_vehicle(1), frame.reference.numpy().astype(np.float64))
     off_m = frame.reference_heights_m.numpy() - (placed_m[:, 2] - rises(placed_m[:, 0], placed_m[:, 1]))
     assert np.sqrt(np.nanmean(off_m**2)) < 0.03
 

@@ -5,11 +5,11 @@ from scipy.spatial import cKDTree
 
 from torchcover import BevGrid, CoverageMetric
 from torchcover.data import RecordedFrames, Scan
-from torchcover.geometry import BoundingBox, rigid, rotation_from_euler
+from torchcover.geometry import BoundingBox, build_transform, convert_euler_to_rotation
 from torchcover.recordings.in_vehicle import transform_to_vehicle
 
-MOUNT = rigid(rotation_from_euler(1.0, -0.5, 0.2), [0.943, 0.02, 1.84])
-GRID = BevGrid(x=(-20.0, 20.0), y=(-15.0, 15.0), cell=0.5)
+MOUNT = build_transform(convert_euler_to_rotation(1.0, -0.5, 0.2), [0.943, 0.02, 1.84])
+GRID = BevGrid(x_m=(-20.0, 20.0), y_m=(-15.0, 15.0), cell_m=0.5)
 
 
 def turn(generator):
@@ -55,8 +55,8 @@ def test_numbers_are_those_of_an_independent_computation(tmp_path):
     for frame in RecordedFrames(tmp_path):
         metric.update(frame.sensor, frame.reference)
     coverage = metric.compute()
-    np.testing.assert_array_equal(coverage.points, counts)
-    np.testing.assert_array_equal(coverage.probed_steps, np.isfinite(means).sum(axis=0))
+    np.testing.assert_array_equal(coverage.point_counts, counts)
+    np.testing.assert_array_equal(coverage.observed_frames, np.isfinite(means).sum(axis=0))
     known = counts > 0
     assert known.sum() > 1000
     np.testing.assert_allclose(coverage.radius[known], np.nanmean(np.array(means)[:, known], axis=0), rtol=0, atol=1e-5)

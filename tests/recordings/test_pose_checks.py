@@ -13,13 +13,13 @@ import torch
 from torchcover.data import AccumulatedReference, RecordedFrames, RecordingSettings, Scan
 from torchcover.detection import Boxes
 from torchcover.geometry import (
-    euler_from_rotation,
+    build_transform,
+    convert_euler_to_rotation,
+    convert_quaternion_to_rotation,
+    convert_rotation_to_euler,
+    convert_rotation_to_quaternion,
     invert,
-    quaternion_from_rotation,
-    rigid,
-    rotation_from_euler,
-    rotation_from_quaternion,
-    transform,
+    transform_points,
 )
 from torchcover.recordings.corrected import correct_recording
 from torchcover.recordings.pose_checks import (
@@ -30,7 +30,7 @@ from torchcover.recordings.pose_checks import (
     read_pose_segments,
 )
 
-MOUNT = rigid(rotation_from_euler(2.0, 1.0, -1.0), [0.5, 0.1, 1.73])
+MOUNT = build_transform(convert_euler_to_rotation(2.0, 1.0, -1.0), [0.5, 0.1, 1.73])
 GROUND, SIDES = 3000, 6000
 AWAY_M = np.array([300.0, -40.0, 7.0])
 
@@ -47,7 +47,7 @@ class Yard:
     path = Path("yard")
     sensors = ("lidar",)
     reference_sensors = ()
-    square_metres = False
+    has_area_weights = False
     block_indices = None
     ego_box = None
 
@@ -65,7 +65,7 @@ class Yard:
         way_m = self.speed_mps * (time_s + 0.4 * time_s**2)
         turn_deg = 25.0 + 4.0 * np.sin(2.5 * time_s) * (self.speed_mps > 0)
         place_m = AWAY_M + np.array([0.9, 0.4, 0.02]) * way_m
-        return rigid(rotation_from_euler(turn_deg, 0.3 * way_m, 0.0), place_m)
+        return build_transform(convert_euler_to_rotation(turn_deg, 0.3 * way_m, 0.0), place_m)
 
     def read_scan(self, sensor, index):
         index = 0 if self.fault == "same" else index
@@ -77,7 +77,7 @@ class Yard:
         world_m = self.crates_m[crate] + (on_side + np.array([0, 0, 0.5])) * self.sizes_m[crate]
         ground_m = random.uniform([-40, -40, 0], [40, 40, 0.02], (GROUND, 3))
         world_m = AWAY_M + np.concatenate([world_m, ground_m])
-        seen_m = transform(invert(self.true(index) @ MOUNT), world_m)
+        seen_m = transform_points(invert(self.true(index) @ MOUNT), world_m)
         seen_m += random.normal(0, self.noise_m, seen_m.shape) if self.noise_m else 0.0
         if self.fault == "axes":
             seen_m = seen_m[:, [1, 0, 2]]
@@ -89,12 +89,12 @@ class Yard:
         if self.pose_noise:
             random = np.random.default_rng(index)
             angles_deg, place_m = random.normal(0, self.pose_noise * 2, 3), random.normal(0, self.pose_noise, 3)
-            pose = pose @ rigid(rotation_from_euler(*angles_deg), place_m)
+            pose = pose @ build_transform(convert_euler_to_rotation(*angles_deg), place_m)
         if self.fault == "xyzw":
-            wxyz = quaternion_from_rotation(pose[:3, :3])
-            return rigid(rotation_from_quaternion(np.roll(wxyz, -1)), pose[:3, 3])
+            wxyz = convert_rotation_to_quaternion(pose[:3, :3])
+            return build_transform(convert_quaternion_to_rotation(np.roll(wxyz, -1)), pose[:3, 3])
         if self.fault == "yx":
-            return rigid(pose[:3, :3], pose[[1, 0, 2], 3])
+            return build_transform(pose[:3, :3], pose[[1, 0, 2], 3])
         return invert(pose) if self.fault == "inverse" else pose
 
     def read_boxes(self, index):
@@ -148,9 +148,9 @@ def test_what_would_mend_a_fault_is_named_and_mends_it(fault):
     # The last poses, and those between two, are not there: where the vehicle went on evenly they would be right.
     exact = fault not in ("late", "held")
     assert max(np.linalg.norm(each[:3, 3]) for each in off) < (1e-9 if exact else 0.05)
-    assert max(np.abs(euler_from_rotation(each[:3, :3])).max() for each in off) < (1e-9 if exact else 0.5)
-    points_m = transform(MOUNT, mended.read_scan("lidar", 3).points_m)
-    assert np.abs(points_m - transform(MOUNT, Yard().read_scan("lidar", 3).points_m)).max() < 1e-9
+    assert max(np.abs(convert_rotation_to_euler(each[:3, :3])).max() for each in off) < (1e-9 if exact else 0.5)
+    points_m = transform_points(MOUNT, mended.read_scan("lidar", 3).points_m)
+    assert np.abs(points_m - transform_points(MOUNT, Yard().read_scan("lidar", 3).points_m)).max() < 1e-9
 
 
 @pytest.mark.parametrize(
@@ -165,10 +165,10 @@ def test_what_nothing_mends_is_said(fault, says):
 @pytest.mark.parametrize("unit", ["mm", "cm"])
 def test_units_of_clouds(unit):
     frames = RecordedFrames(Yard(unit), reference=AccumulatedReference(1.0))
-    (doubt,) = frames.doubts()
+    (doubt,) = frames.check()
     assert f"(--set recording.units={unit})" in doubt
     mended = RecordedFrames(correct_recording(frames.recording, RecordingSettings(units=unit)))
-    assert mended.doubts() == []
+    assert mended.check() == []
     assert f"Read as asked: --set recording.units={unit}." in mended.reference_record["notes"]
     assert mended.content != frames.content
 
@@ -183,7 +183,7 @@ def test_clouds_in_feet_are_read_as_asked():
 
 
 def test_labels_of_which_none_fits():
-    (doubt,) = RecordedFrames(Yard("unlabelled")).doubts()
+    (doubt,) = RecordedFrames(Yard("unlabelled")).check()
     assert "labels, and none in 12 frames" in doubt
 
 
@@ -194,7 +194,11 @@ def test_poses_that_jump_are_told_and_no_scans_are_compared_across(jump_m, turn_
             pose = super().get_world_T_vehicle(index)
             if index < 6:
                 return pose
-            return rigid(np.eye(3), jump_m) @ pose @ rigid(rotation_from_euler(turn_deg, 0.0, 0.0), np.zeros(3))
+            return (
+                build_transform(np.eye(3), jump_m)
+                @ pose
+                @ build_transform(convert_euler_to_rotation(turn_deg, 0.0, 0.0), np.zeros(3))
+            )
 
     assert "poses jump 1 times in 12 instants that were looked at, first at f6" in jumped(Jumping())
     assert not doubts(Jumping())

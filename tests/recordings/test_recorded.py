@@ -8,7 +8,7 @@ from torch.utils.data import DataLoader
 
 from tests.recordings.drives import Drive
 from torchcover.data import AccumulatedReference, BadFrameError, RecordedFrames, collate_frames
-from torchcover.geometry.rigid import rigid, rotation_from_euler, transform
+from torchcover.geometry.rigid import build_transform, convert_euler_to_rotation, transform_points
 
 WHY = ("nonfinite", "no_return", "own_vehicle")
 CLOUD = np.array([[1.0, 2.0, 3.0], [-4.0, 5.0, 0.5]], dtype=np.float32)
@@ -88,14 +88,14 @@ def test_an_empty_sensor_cloud_is_a_blind_step_and_an_empty_reference_an_error(t
 
 
 def test_utm_clouds_are_transformed_before_they_become_float32(tmp_path):
-    vehicle_T_world = rigid(rotation_from_euler(33.0, 0.0, 0.0), [0.0, 0.0, 0.0])
+    vehicle_T_world = build_transform(convert_euler_to_rotation(33.0, 0.0, 0.0), [0.0, 0.0, 0.0])
     ego_m = np.array([513248.123, 5403655.456, 260.389])
     vehicle_T_world[:3, 3] = -vehicle_T_world[:3, :3] @ ego_m
     near_m = np.array([[10.001, -3.002, 1.003], [0.5, 60.25, -1.5]])
     record(tmp_path, ["a"], sensor=near_m + ego_m, reference=near_m + ego_m)
     write_poses(tmp_path, sensor=vehicle_T_world, reference=vehicle_T_world)
     frame = RecordedFrames(tmp_path)[0]
-    expected = transform(rigid(vehicle_T_world[:3, :3], [0, 0, 0]), near_m)
+    expected = transform_points(build_transform(vehicle_T_world[:3, :3], [0, 0, 0]), near_m)
     np.testing.assert_allclose(frame.sensor, expected, atol=1e-5)
     np.testing.assert_allclose(frame.reference, expected, atol=1e-5)
 
@@ -249,7 +249,7 @@ def test_several_rigs_share_a_reference_and_have_a_pose_each(tmp_path):
     assert frames.frame_names == ("f2", "f10")
     assert frames[0].clouds["rig10"].tolist() == CLOUD.tolist()
     assert {name: count for name, count in frames[1].counts.items() if count} == {"sensor_nonfinite": 1}
-    turned = rigid(rotation_from_euler(90.0, 0.0, 0.0), [1.0, 0.0, 0.0])
+    turned = build_transform(convert_euler_to_rotation(90.0, 0.0, 0.0), [1.0, 0.0, 0.0])
     (tmp_path / "frames.yaml").write_text(f"rigs: {{rig2: {{vehicle_T_sensor: {turned.tolist()}}}}}")
     frame = RecordedFrames(tmp_path)[0]
     np.testing.assert_allclose(frame.clouds["rig2"], [[-1.0, 1.0, 3.0]], atol=1e-6)

@@ -10,10 +10,10 @@ import torch
 from tests.killing import operations_of
 from torchcover import Rig
 from torchcover.data import RecordedFrames, SimulatedFrames, open_recording, write_recording
-from torchcover.detection import box_visibility
+from torchcover.detection import measure_box_visibility
 from torchcover.files import RECORDING, WRITING, BadFileError, read_manifest
-from torchcover.geometry import rotation_from_euler, rotation_from_quaternion
-from torchcover.geometry.rigid import quaternion_from_rotation
+from torchcover.geometry import convert_euler_to_rotation, convert_quaternion_to_rotation
+from torchcover.geometry.rigid import convert_rotation_to_quaternion
 from torchcover.recordings.formats.kitti import BODY, read_calibration, read_labels
 from torchcover.recordings.recorders import NOTHING, KittiRecorder
 from torchcover.simulation import SurfaceReference, writing
@@ -49,7 +49,7 @@ def test_a_plain_folder_gives_the_frames_that_were_written(both, tmp_path):
     write_recording(both, tmp_path)
     again = RecordedFrames(tmp_path)
     assert again.recording.sensors == ("a rear", "z front")
-    assert again.square_metres
+    assert again.has_area_weights
     assert len(again) == 3
     for written, read in zip(both, again, strict=True):
         assert len(read.sensor) == len(written.sensor) > 100
@@ -59,10 +59,10 @@ def test_a_plain_folder_gives_the_frames_that_were_written(both, tmp_path):
         assert torch.equal(read.boxes.rows, written.boxes.rows)
         assert written.boxes.velocity_mps.isfinite().all()
         assert torch.equal(read.boxes.velocity_mps, written.boxes.velocity_mps)
-        assert torch.equal(read.boxes.drawn_points, written.boxes.drawn_points)
+        assert torch.equal(read.boxes.sampled_points, written.boxes.drawn_points)
         assert (read.boxes.ids, read.boxes.categories) == (written.boxes.ids, written.boxes.categories)
         # Of what was written it is unknown where it truly is: a point may leave a box that it was on.
-        hits = [next(iter(frame.boxes.hits.values())) for frame in (read, written)]
+        hits = [next(iter(frame.boxes.points_in_box.values())) for frame in (read, written)]
         assert (hits[0] - hits[1]).abs().max() <= 0.2 * max(hits[1].max(), 5)
         assert read.block_index == written.block_index
         assert sum(read.counts.values()) == 0  # nothing was lost on the way
@@ -70,7 +70,7 @@ def test_a_plain_folder_gives_the_frames_that_were_written(both, tmp_path):
 
 def test_clouds_are_in_the_frame_of_their_sensor(both, tmp_path):
     write_recording(both, tmp_path)
-    alone = simulated(FRONT, steps=3)[0].landed().numpy()
+    alone = simulated(FRONT, steps=3)[0].get_measured_points().numpy()
     points = np.load(tmp_path / "sensors" / "z front" / "000000.npy")
     assert len(points) == len(alone)
     range_m = np.linalg.norm(points, axis=1)
@@ -96,10 +96,10 @@ def test_poses_are_those_of_the_ego_and_cities_are_far_apart_in_time(both, tmp_p
 
 @pytest.mark.parametrize("angles", [(0, 0, 0), (180, 0, 0), (33, -20, 170), (0, 90, 0), (-90, 0, 180), (1e-5, 0, 0)])
 def test_a_quaternion_is_that_of_its_rotation(angles):
-    rotation = rotation_from_euler(*map(float, angles))
-    wxyz = quaternion_from_rotation(rotation)
+    rotation = convert_euler_to_rotation(*map(float, angles))
+    wxyz = convert_rotation_to_quaternion(rotation)
     assert wxyz[0] >= 0
-    np.testing.assert_allclose(rotation_from_quaternion(wxyz), rotation, atol=1e-14)
+    np.testing.assert_allclose(convert_quaternion_to_rotation(wxyz), rotation, atol=1e-14)
 
 
 def test_kittis_layout_is_read_as_kittis(tmp_path):
@@ -109,7 +109,7 @@ def test_kittis_layout_is_read_as_kittis(tmp_path):
     assert (again.rigs, again.frame_names) == (("kitti",), ("000000",))
     written, read = frames[0], again[0]
     # What is drawn in KITTI's own car the reader takes for that car.
-    points = written.landed().numpy().astype(np.float64)
+    points = written.get_measured_points().numpy().astype(np.float64)
     own = ((points > BODY.lower_m) & (points < BODY.upper_m)).all(axis=1)
     assert read.counts["sensor_own_vehicle"] == own.sum()
     np.testing.assert_allclose(read.sensor, points[~own], atol=1e-5)
@@ -119,7 +119,9 @@ def test_kittis_layout_is_read_as_kittis(tmp_path):
     assert torch.sin(turned / 2).abs().max() < 1e-5
     assert read.boxes.categories == written.boxes.categories
     weights = written.reference_weights
-    shares = box_visibility(written.sensor, written.reference, written.boxes, reference_weights=weights).share.numpy()
+    shares = measure_box_visibility(
+        written.sensor, written.reference, written.boxes, reference_weights=weights
+    ).share.numpy()
     said = read.boxes.visibility.numpy()
     assert (np.isnan(said) == np.isnan(shares)).all()
     known = np.flatnonzero(~np.isnan(shares))

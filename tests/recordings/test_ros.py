@@ -13,14 +13,14 @@ from tests.recordings.bags import T0_NS, bag, cloud, link, made, odometry, point
 from tests.recordings.drives import Drive
 from torchcover.data import RecordedFrames, open_recording
 from torchcover.files import BadFileError
-from torchcover.geometry import invert, rigid, rotation_from_euler, transform
+from torchcover.geometry import build_transform, convert_euler_to_rotation, invert, transform_points
 from torchcover.recordings.formats.bag import Bag
 from torchcover.recordings.formats.ros import RosBag
 from torchcover.recordings.in_vehicle import transform_to_vehicle
 
 CORNERS_M = np.array([[5.0, 1.0, 0.5], [8.0, -2.0, 0.25], [-4.0, 0.5, 1.0], [6.0, 6.0, 2.0]])
 FAR_CORNERS_M = CORNERS_M + np.array([1e5, -4e5, 0.0])
-mount = rigid(rotation_from_euler(25.0, 4.0, -3.0), [1.0, 0.2, 1.6])
+mount = build_transform(convert_euler_to_rotation(25.0, 4.0, -3.0), [1.0, 0.2, 1.6])
 
 
 def static(*links):
@@ -41,7 +41,9 @@ def pose_at(seconds):
     """Fast, and in a bend."""
     yaw_deg = 30.0 * np.asarray(seconds)
     flat = np.zeros_like(yaw_deg)
-    return rigid(rotation_from_euler(yaw_deg, flat, flat), np.stack([1e5 + 20.0 * seconds, flat - 4e5, flat], axis=-1))
+    return build_transform(
+        convert_euler_to_rotation(yaw_deg, flat, flat), np.stack([1e5 + 20.0 * seconds, flat - 4e5, flat], axis=-1)
+    )
 
 
 def driven(count=60, every_ns=10_000_000):
@@ -69,7 +71,7 @@ def test_a_cloud_may_have_gaps_rows_and_big_ends(tmp_path, kind, order):
     assert scan.points_m.dtype == np.dtype(kind)
     seen = transform_to_vehicle(scan)
     assert seen.excluded_counts == {"nonfinite": 1, "no_return": 1}
-    np.testing.assert_allclose(seen.points_m, transform(mount, stored_m[[0, 1, 2, 4]]), atol=1e-6)
+    np.testing.assert_allclose(seen.points_m, transform_points(mount, stored_m[[0, 1, 2, 4]]), atol=1e-6)
 
 
 @pytest.mark.parametrize(("height", "row_step"), [(1, 0), (1, 36), (1, 10**6), (2, 12)])
@@ -157,7 +159,7 @@ def test_times_of_points_over_a_part_of_a_turn_are_said(tmp_path):
 
 
 def check_points_are_moved(tmp_path, field, stored):
-    world_m = transform(pose_at(0.15), np.repeat(CORNERS_M, 50, axis=0) * np.linspace(0.5, 3.0, 200)[:, None])
+    world_m = transform_points(pose_at(0.15), np.repeat(CORNERS_M, 50, axis=0) * np.linspace(0.5, 3.0, 200)[:, None])
     offset_ns = np.linspace(-20_000_000, 90_000_000, 200).round().astype(np.int64)
     if field == "t":
         offset_ns += 20_000_000
@@ -172,20 +174,20 @@ def check_points_are_moved(tmp_path, field, stored):
     for index in range(3):
         scan = recording.read_scan("lidar", index)
         assert (scan.points_m[7] == 0).all()  # what never came back is still at the sensor
-        there_m = transform(recording.get_world_T_vehicle(index) @ scan.vehicle_T_sensor, scan.points_m)
+        there_m = transform_points(recording.get_world_T_vehicle(index) @ scan.vehicle_T_sensor, scan.points_m)
         np.testing.assert_allclose(np.delete(there_m, 7, axis=0), np.delete(world_m, 7, axis=0), atol=1e-3)
 
 
 def test_clouds_of_other_times_are_moved_to_the_instant(tmp_path):
     def late(time_ns):
         world_T_sensor = pose_at((time_ns - T0_NS) * 1e-9 + 0.04) @ mount
-        return cloud(points(transform(invert(world_T_sensor), FAR_CORNERS_M)), time_ns + 40_000_000, "lidar")
+        return cloud(points(transform_points(invert(world_T_sensor), FAR_CORNERS_M)), time_ns + 40_000_000, "lidar")
 
     second = [("/b", time_ns + 40_000_000, message) for _, time_ns, message in clouds(late, 4)]
     recording = RosBag(bag(tmp_path / "a", MOUNTED + driven() + clouds(count=3) + second))
     assert recording.sensors == ("lidar", "b")
     frame = RecordedFrames(recording)[2]
-    others_m = transform(invert(recording.get_world_T_vehicle(2)), FAR_CORNERS_M)
+    others_m = transform_points(invert(recording.get_world_T_vehicle(2)), FAR_CORNERS_M)
     np.testing.assert_allclose(frame.sensor.numpy()[4:], others_m, atol=1e-3)
     np.testing.assert_allclose(recording.get_world_T_vehicle(2), pose_at(0.2), atol=1e-9)
     chosen = RecordedFrames(recording, rigs={"b": ("b",)})[2]
@@ -193,7 +195,7 @@ def test_clouds_of_other_times_are_moved_to_the_instant(tmp_path):
 
 
 def test_odometry_may_be_that_of_another_frame(tmp_path):
-    vehicle_T_imu = rigid(rotation_from_euler(90.0, 0.0, 0.0), [-1.0, 0.5, 0.3])
+    vehicle_T_imu = build_transform(convert_euler_to_rotation(90.0, 0.0, 0.0), [-1.0, 0.5, 0.3])
     mounted = [static(link("base_link", "/lidar", mount), link("base_link", "imu", vehicle_T_imu))]
     measured = [
         ("/odom", T0_NS + k * STEP_NS, odometry(pose_at(0.1 * k) @ vehicle_T_imu, T0_NS + k * STEP_NS, "imu"))
@@ -206,7 +208,7 @@ def test_odometry_may_be_that_of_another_frame(tmp_path):
 def test_a_tree_leads_to_the_frame_that_never_jumps(tmp_path):
     jump = [link("map", "odom", pose_at(7.0), T0_NS + k * STEP_NS) for k in range(2)]
     here = [link("odom", "footprint", pose_at(0.1 * k), T0_NS + k * STEP_NS) for k in range(2)]
-    raised = rigid(np.eye(3), [0.0, 0.0, 0.3])
+    raised = build_transform(np.eye(3), [0.0, 0.0, 0.3])
     mounted = [static(link("base_link", "lidar", mount), link("footprint", "base_link", raised))]
     moved = [("/tf", T0_NS + k * STEP_NS, tree(jump[k], here[k])) for k in range(2)]
     recording = RosBag(bag(tmp_path / "a", mounted + moved + clouds()))
@@ -239,7 +241,7 @@ def test_what_was_chosen_is_said(tmp_path):
     np.testing.assert_allclose(recording.read_scan("lidar", 0).vehicle_T_sensor, np.eye(4), atol=1e-12)
 
 
-raised = rigid(np.eye(3), [0.0, 0.0, 0.2])
+raised = build_transform(np.eye(3), [0.0, 0.0, 0.2])
 
 
 def test_the_frame_on_the_ground_is_the_vehicles(tmp_path):
@@ -265,7 +267,7 @@ def moved_tree(k, *links):
 @pytest.mark.parametrize("write", [bag, lambda path, messages: bags.bag1(path.with_suffix(".bag"), messages)])
 def test_mounts_may_come_with_what_moves(tmp_path, write):
     # The head turns, and its camera with it.
-    turned = [rigid(rotation_from_euler(float(k), 0.0, 0.0), [0.0, 0.0, 1.0]) for k in range(8)]
+    turned = [build_transform(convert_euler_to_rotation(float(k), 0.0, 0.0), [0.0, 0.0, 1.0]) for k in range(8)]
     moved = [
         moved_tree(
             k, link("base_link", "mast", raised), link("mast", "lidar", mount), link("base_link", "head", turned[k])
@@ -286,7 +288,7 @@ def test_mounts_may_be_told(tmp_path):
         ("/odom", time_ns, odometry(pose_at((time_ns - T0_NS) * 1e-9) @ mount, time_ns, "lidar"))
         for _, time_ns, _ in driven()
     ]
-    beside = rigid(np.eye(3), [0.0, 1.0, 0.0])
+    beside = build_transform(np.eye(3), [0.0, 1.0, 0.0])
     second = [("/b", time_ns, cloud(points(CORNERS_M), time_ns, "second")) for _, time_ns, _ in clouds(count=3)]
     path = bag(
         tmp_path / "a",
@@ -389,7 +391,7 @@ LOOP = link("a", "lidar", mount), link("b", "a", mount), link("a", "b", mount)
 RING = link("b", "base_link", mount), link("base_link", "b", mount)
 OTHER = link("base_link", "other", mount)
 OTHER_CLOCK = [("/odom", T0_NS + k, odometry(mount, 5 * 10**9 + k)) for k in range(3)]
-NOT_FINITE = rigid(np.eye(3), [0.0, np.nan, 0.0])
+NOT_FINITE = build_transform(np.eye(3), [0.0, np.nan, 0.0])
 
 
 @pytest.mark.parametrize(
@@ -423,7 +425,7 @@ def test_bags_that_do_not_hold_together(tmp_path, messages, told):
 
 def two_parents(odom_every, map_every):
     """`odom -> base_link`, and `map -> base_link`, which is elsewhere, each at 20 Hz or more rarely."""
-    elsewhere = rigid(np.eye(3), [0.3, 0.25, 0.0])
+    elsewhere = build_transform(np.eye(3), [0.3, 0.25, 0.0])
     messages = []
     for k in range(12):
         time_ns = T0_NS + k * STEP_NS // 2
@@ -451,7 +453,7 @@ def test_a_second_way_to_the_same_frame_is_told(tmp_path):
     for k in range(12):
         time_ns = T0_NS + k * STEP_NS // 2
         first = link("map", "odometry", pose_at(0.05 * k), time_ns), link("odometry", "base_link", np.eye(4), time_ns)
-        other = rigid(np.eye(3), [0.3, 0.0, 0.0]) @ pose_at(0.05 * k)
+        other = build_transform(np.eye(3), [0.3, 0.0, 0.0]) @ pose_at(0.05 * k)
         second = link("map", "matcher", other, time_ns), link("matcher", "base_link", np.eye(4), time_ns)
         messages.append(("/tf", time_ns, tree(*first, *second)))
     with pytest.warns(UserWarning, match="map -> (odometry|matcher): not used, since poses are taken on another way"):
@@ -464,7 +466,11 @@ def test_a_second_way_to_the_same_frame_is_told(tmp_path):
 
 def test_two_senders_of_one_pose_are_told(tmp_path):
     messages = [
-        ("/tf", time_ns, tree(link("odom", "base_link", rigid(np.eye(3), [0.0, 0.3 * (k % 2), 0.0]) @ pose, time_ns)))
+        (
+            "/tf",
+            time_ns,
+            tree(link("odom", "base_link", build_transform(np.eye(3), [0.0, 0.3 * (k % 2), 0.0]) @ pose, time_ns)),
+        )
         for k, (time_ns, pose) in enumerate((T0_NS + k * 20_000_000, pose_at(0.02 * k)) for k in range(20))
     ]
     with pytest.warns(UserWarning, match=r"\(base_link in odom\) jump to and fro by 0.3 m: do two nodes send them"):
@@ -472,7 +478,7 @@ def test_two_senders_of_one_pose_are_told(tmp_path):
 
 
 def test_a_frame_that_is_mounted_twice_is_told(tmp_path):
-    other_mount = rigid(np.eye(3), [1.0, 0.2, 2.1])
+    other_mount = build_transform(np.eye(3), [1.0, 0.2, 2.1])
     rack = [static(link("base_link", "rack", raised)), static(link("rack", "lidar", other_mount))]
     driver = [static(link("sensor", "lidar", other_mount))]
     for name, more, told in (

@@ -5,7 +5,7 @@ import torch
 
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric, Region
 
-GRID = BevGrid(x=(-8.0, 12.0), y=(-5.0, 5.0), cell=1.0)
+GRID = BevGrid(x_m=(-8.0, 12.0), y_m=(-5.0, 5.0), cell_m=1.0)
 # Nothing was ever probed behind x = -5 m.
 REGIONS = (Region("near", (0.0, 5.0), (-5.0, 5.0)), Region("behind", (-8.0, -6.0), (-5.0, 5.0)))
 

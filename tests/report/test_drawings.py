@@ -9,7 +9,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
-from torchcover.geometry import rigid, rotation_from_euler
+from torchcover.geometry import build_transform, convert_euler_to_rotation
 from torchcover.report import ActorMark, SensorView, StaticFaces, plot_depth_images, plot_rig, plot_scene
 from torchcover.report.page.drawings import build_sensor_table, render_rig
 from torchcover.report.scene import PATH, REFERENCE, SENSOR, SKY
@@ -19,7 +19,7 @@ FACES = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [1, 5, 7], [1, 7, 
 
 
 def view(yaw=0.0, pitch=0.0, *, at=(2.0, 0.0, 1.0), wide=90.0, high=(-30.0, 10.0), name="lidar", range_m=99.0):
-    pose = rigid(rotation_from_euler(yaw, pitch, 0.0), at)
+    pose = build_transform(convert_euler_to_rotation(yaw, pitch, 0.0), at)
     return SensorView(name, pose, wide, high, range_m)
 
 
@@ -283,7 +283,7 @@ def test_a_field_of_view_from_above_ends_on_the_ground(pitch, high, height_m, re
 @pytest.mark.parametrize(("pitch_deg", "roll_deg"), [(90.0, 0.0), (0.0, 90.0)])
 def test_a_tilted_lidar_is_drawn_with_its_true_field_of_view(pitch_deg, roll_deg):
     """On its side, it sees as far as its range along its plane, and across it no farther than its elevations allow."""
-    pose = rigid(rotation_from_euler(0.0, pitch_deg, roll_deg), (1.0, 2.0, 1.5))
+    pose = build_transform(convert_euler_to_rotation(0.0, pitch_deg, roll_deg), (1.0, 2.0, 1.5))
     view = SensorView("tilted", pose, 360.0, (-15.0, 15.0), 50.0)
     extent_m = np.abs(view.compute_outline_m(10.0) - (1.0, 2.0)).max(axis=0)
     along, across = (1, 0) if pitch_deg else (0, 1)

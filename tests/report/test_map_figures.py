@@ -12,13 +12,13 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from torchcover.coverage import AGGREGATIONS, Aggregation, BevGrid, Coverage, CoverageMetric, Layer, Region
-from torchcover.coverage.aggregations import State
-from torchcover.coverage.quantity import RADIUS, detection
+from torchcover.coverage.aggregations import SumState
+from torchcover.coverage.quantity import RADIUS, make_detection_quantity
 from torchcover.estimation import Quantity
 from torchcover.report import SensorView, build_difference_scale, plot_band_maps, plot_maps, write_figures
 
-SQUARE = BevGrid(x=(-20.0, 20.0), y=(-10.0, 10.0), cell=1.0)
-SMALL = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)})
+SQUARE = BevGrid(x_m=(-20.0, 20.0), y_m=(-10.0, 10.0), cell_m=1.0)
+SMALL = BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 1.0), cell_m=1.0, heights={"all": (-1.0, 1.0)})
 BANDS = ("ground", "obstacle")
 EGO = np.array([[2.0, 1.0], [-2.0, 1.0], [-2.0, -1.0], [2.0, -1.0]])
 
@@ -121,15 +121,15 @@ class Emptiness(Aggregation):
     """Nothing that the package knows of."""
 
     name: ClassVar[str] = "emptiness"
-    words: ClassVar[str] = "emptinesses"
+    description: ClassVar[str] = "emptinesses"
 
-    def states(self, cells):
-        return {"sum": State(torch.zeros(cells, dtype=torch.float64))}
+    def create_states(self, num_cells):
+        return {"sum": SumState(torch.zeros(num_cells, dtype=torch.float64))}
 
-    def update(self, sums, step):
+    def update(self, sums, frame):
         pass
 
-    def layers(self, sums, probed_steps, max_radius):
+    def compute_layers(self, sums, observed_frames, max_radius_m):
         return [Layer(Quantity("emptiness", "share of emptiness", "share", lower_is_better=True), sums["sum"] + 0.5)]
 
 
@@ -142,7 +142,7 @@ def test_a_quantity_of_ones_own_is_drawn_without_being_known():
 
 
 def test_the_bands_of_a_quantity_share_their_colours():
-    grid = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0, heights={"low": (0.0, 1.0), "high": (9.0, 11.0)})
+    grid = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=1.0, heights={"low": (0.0, 1.0), "high": (9.0, 11.0)})
     metric = CoverageMetric(grid, thresholds=())
     metric.update(torch.zeros(1, 3), torch.tensor([[0.5, 0.5, 0.5], [0.5, 0.5, 10.0]]))
     low, high = (colours(figure)[400, 400] for _, figure in plot_maps({"a": metric.compute()}))
@@ -153,7 +153,7 @@ def test_the_bands_of_a_quantity_share_their_colours():
 def test_any_band_name_becomes_a_file_in_the_folder_and_no_two_share_one(tmp_path):
     bands = ["../up", "a/b", "a\\b", "A b", "a_b_3", "$x$", "long" * 99, "Höhe", "\n"]
     heights = {name: (float(at), at + 1.0) for at, name in enumerate(bands)}
-    grid = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights=heights)
+    grid = BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 1.0), cell_m=1.0, heights=heights)
     paths = write_figures(plot_maps({"a": coverage_of(grid, thresholds=())}), tmp_path / "maps")
     assert len({path.name.lower() for path in paths}) == len(bands)
     assert sorted(tmp_path.rglob("*.png")) == sorted(paths)
@@ -224,7 +224,7 @@ def test_the_difference_scale_is_symmetric_and_robust_and_turns_with_what_is_bet
     assert scale.low == -scale.high
     assert 0.9 <= scale.high <= 1.0
     assert (scale.colormap, scale.unit) == ("RdBu_r", "m")
-    within = build_difference_scale(detection(0.4), differences)
+    within = build_difference_scale(make_detection_quantity(0.4), differences)
     assert (within.colormap, within.unit) == ("RdBu", "percentage points")
     assert build_difference_scale(RADIUS, torch.zeros(9)).high > 0
 

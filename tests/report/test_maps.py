@@ -12,13 +12,13 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from torchcover.coverage import BevGrid
-from torchcover.coverage.quantity import RADIUS, detection
-from torchcover.geometry import rigid, rotation_from_euler
+from torchcover.coverage.quantity import RADIUS, make_detection_quantity
+from torchcover.geometry import build_transform, convert_euler_to_rotation
 from torchcover.report import ColorScale, SensorView, build_color_scale, plot_side_by_side
 from torchcover.report.colours import INFINITE, UNKNOWN
 
 SCALE = ColorScale("blind spot radius", "m", "viridis_r", 0.0, 1.0)
-SQUARE = BevGrid(x=(-20.0, 20.0), y=(-10.0, 10.0), cell=1.0)
+SQUARE = BevGrid(x_m=(-20.0, 20.0), y_m=(-10.0, 10.0), cell_m=1.0)
 EGO = np.array([[2.0, 1.0], [-2.0, 1.0], [-2.0, -1.0], [2.0, -1.0]])
 
 
@@ -49,7 +49,11 @@ def flat(value: float = 0.0, grid: BevGrid = SQUARE) -> torch.Tensor:
 
 def marked(name: str, x_m: float, y_m: float, yaw_deg: float, wide_deg: float, range_m: float) -> SensorView:
     return SensorView(
-        name, rigid(rotation_from_euler(yaw_deg, 0.0, 0.0), (x_m, y_m, 1.5)), wide_deg, (-9.0, 9.0), range_m
+        name,
+        build_transform(convert_euler_to_rotation(yaw_deg, 0.0, 0.0), (x_m, y_m, 1.5)),
+        wide_deg,
+        (-9.0, 9.0),
+        range_m,
     )
 
 
@@ -73,7 +77,7 @@ def test_a_blind_spot_at_the_front_left_is_dark_at_the_upper_right():
 @pytest.mark.parametrize("extent", [(40, 40), (1000, 400), (160, 9), (3, 50)])
 def test_every_cell_is_drawn_as_a_whole_number_of_equal_pixels(extent):
     columns, rows = extent
-    grid = BevGrid(x=(0.0, columns / 4), y=(0.0, rows / 4), cell=0.25)
+    grid = BevGrid(x_m=(0.0, columns / 4), y_m=(0.0, rows / 4), cell_m=0.25)
     values = torch.rand(rows, columns, generator=torch.Generator().manual_seed(0))
     pixels = draw(values, grid).map[::-1]
     across, up = pixels.shape[1] // columns, len(pixels) // rows
@@ -90,7 +94,7 @@ def test_every_cell_is_drawn_as_a_whole_number_of_equal_pixels(extent):
 
 
 def test_cells_smaller_than_a_pixel_are_averaged_not_dropped():
-    grid = BevGrid(x=(0.0, 600.0), y=(0.0, 6.0), cell=0.1)
+    grid = BevGrid(x_m=(0.0, 600.0), y_m=(0.0, 6.0), cell_m=0.1)
     stripes = flat(0.0, grid)
     stripes[:, ::2] = 1.0
     inside = draw(stripes, grid).map[8:-8, 20:-20]
@@ -191,8 +195,8 @@ def test_the_ego_is_filled_and_named():
 def test_nothing_is_clipped_and_the_legend_hides_no_data():
     sensors = [marked(f"a sensor with a long name, number {n}", 0.0, 0.0, 45.0 * n, 90.0, 10.0) for n in range(8)]
     title = "A title that is much longer than this narrow map is wide, and that nobody would ever write"
-    narrow = BevGrid(x=(-1.0, 1.0), y=(-20.0, 20.0), cell=1.0)
-    for grid in (narrow, SQUARE, BevGrid(x=(-40.0, 40.0), y=(-1.0, 1.0), cell=1.0)):
+    narrow = BevGrid(x_m=(-1.0, 1.0), y_m=(-20.0, 20.0), cell_m=1.0)
+    for grid in (narrow, SQUARE, BevGrid(x_m=(-40.0, 40.0), y_m=(-1.0, 1.0), cell_m=1.0)):
         picture = draw(flat(2.0, grid), grid, title=title, subtitle=title, sensors=sensors, ego_outline_m=EGO)
         pixels = picture.pixels
         for border in (pixels[:5], pixels[-5:], pixels[:, :5], pixels[:, -5:]):
@@ -210,7 +214,7 @@ def test_dollars_are_no_formula():
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, 0.0, 1e-9, 1e9])
 def test_a_map_of_one_cell_or_one_value_can_be_drawn(value):
-    grid = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0)
+    grid = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=1.0)
     values = flat(value, grid)
     picture = draw(values, grid, scale=build_color_scale(RADIUS, values))
     unknown = picture.axes.get_legend().get_texts()[0].get_text()
@@ -225,7 +229,10 @@ def test_the_radius_scale_ends_at_the_98th_percentile_of_the_known_cells():
 def test_dark_means_blind_in_every_scale():
     halves = flat(0.0)
     halves[:, 20:] = 100.0
-    for scale, blind in ((build_color_scale(RADIUS, halves), 10.0), (build_color_scale(detection(0.4), halves), -10.0)):
+    for scale, blind in (
+        (build_color_scale(RADIUS, halves), 10.0),
+        (build_color_scale(make_detection_quantity(0.4), halves), -10.0),
+    ):
         picture = draw(halves, scale=scale)
         assert picture.at(blind, 5.0).sum() < 1.0 < picture.at(-blind, 5.0).sum()
 

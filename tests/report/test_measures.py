@@ -33,7 +33,7 @@ def table(surface_pair, regions):
 
 def two_cells() -> Coverage:
     """3 m2 at a radius of 0 and 1 m2 at one of 1 m, in cells of their own; then a step of nothing."""
-    grid = BevGrid(x=(0.0, 3.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)})
+    grid = BevGrid(x_m=(0.0, 3.0), y_m=(0.0, 1.0), cell_m=1.0, heights={"all": (-1.0, 1.0)})
     metric = CoverageMetric(grid, square_metres=True)
     reference = torch.tensor([[0.5, 0.5, 0.0], [1.5, 0.5, 0.0]])
     metric.update(reference[:1], reference, weights=torch.tensor([3.0, 1.0]))
@@ -81,10 +81,10 @@ def test_files_have_both_measures_each_under_its_name():
 
 @pytest.mark.parametrize("band_frame", ["ground", "vehicle"])
 def test_every_row_of_a_file_names_what_its_band_is_over(band_frame):
-    grid = BevGrid(x=(0.0, 4.0), y=(0.0, 2.0), cell=1.0, band_frame=band_frame)
+    grid = BevGrid(x_m=(0.0, 4.0), y_m=(0.0, 2.0), cell_m=1.0, band_frame=band_frame)
     metric, point = CoverageMetric(grid), torch.tensor([[0.5, 0.5, 0.0]])
-    metric.update(point, point, height=torch.zeros(1) if band_frame == "ground" else None)
-    table = CoverageTable.from_coverages({"rig": metric.compute()}, [Region("all", grid.x, grid.y)])
+    metric.update(point, point, heights_m=torch.zeros(1) if band_frame == "ground" else None)
+    table = CoverageTable.from_coverages({"rig": metric.compute()}, [Region("all", grid.x_m, grid.y_m)])
     assert {row["band_frame"] for row in csv.DictReader(io.StringIO(RENDERERS["csv"](table)))} == {band_frame}
 
 

@@ -17,8 +17,8 @@ from matplotlib.figure import Figure
 
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric
 from torchcover.coverage.quantity import RADIUS
-from torchcover.geometry import rigid, rotation_from_euler
-from torchcover.notebooks import small_html
+from torchcover.geometry import build_transform, convert_euler_to_rotation
+from torchcover.notebooks import build_result_html
 from torchcover.report import (
     MapLine,
     Page,
@@ -38,7 +38,7 @@ from torchcover.report.page.writing import fit_maps
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 NASTY = "</script><script>document.title='broken'</script>"
-GRID = BevGrid(x=(-8.0, 12.0), y=(-5.0, 5.0), cell=1.0)
+GRID = BevGrid(x_m=(-8.0, 12.0), y_m=(-5.0, 5.0), cell_m=1.0)
 EGO = np.array([[2.0, 1.0], [-2.0, 1.0], [-2.0, -1.0], [2.0, -1.0]])
 SENSOR = SensorView("<b>front</b>", np.eye(4), 90.0, (-10.0, 10.0), 8.0)
 SCALE = build_color_scale(RADIUS, torch.tensor([4.0]))
@@ -302,7 +302,9 @@ def test_the_map_draws_the_true_field_of_view_of_a_tilted_sensor(named, tmp_path
         document.body.append(pre);
       });
     """
-    poses = [rigid(rotation_from_euler(0.0, pitch, 0.0), (1.0, -1.0, 2.0)) for pitch in (90.0, 90.0, 0.0)]
+    poses = [
+        build_transform(convert_euler_to_rotation(0.0, pitch, 0.0), (1.0, -1.0, 2.0)) for pitch in (90.0, 90.0, 0.0)
+    ]
     fields = (360.0, (-15.0, 15.0), 50.0), (60.0, (-20.0, 20.0), 50.0), (360.0, (-15.0, 15.0), 50.0)
     sensors = [SensorView("tilted", pose, *field) for pose, field in zip(poses, fields, strict=True)]
     page = page_of({"rig": named["many"]}, rigs=[PageRig("rig", sensors)])
@@ -472,7 +474,7 @@ def test_backticks_do_not_break_escaping(words):
         table = PageTable(words, (words,), [[TextCell(words, words)]], notes=[words])
         parts = {"tables": [table], "pictures": [PagePicture(words, b"")], "facts": {words: {words: words}}}
         page = Page(words, words, findings=[words, words], **parts)
-        return ElementNames(render_page(page) + small_html([words, words], Figure(figsize=(1, 1))))
+        return ElementNames(render_page(page) + build_result_html([words, words], Figure(figsize=(1, 1))))
 
     hostile, harmless = names(words), names("a `b` c")
     assert hostile.elements <= harmless.elements

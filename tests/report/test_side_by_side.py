@@ -12,9 +12,9 @@ from torchcover.coverage import BevGrid
 from torchcover.coverage.quantity import RADIUS
 from torchcover.report import SensorView, build_color_scale, plot_side_by_side
 
-GRID = BevGrid(x=(-8.0, 12.0), y=(-5.0, 5.0), cell=1.0)
-AROUND = BevGrid(x=(-10.0, 10.0), y=(-10.0, 10.0), cell=0.25)
-SQUARE = BevGrid(x=(0.0, 10.0), y=(-5.0, 5.0), cell=1.0)
+GRID = BevGrid(x_m=(-8.0, 12.0), y_m=(-5.0, 5.0), cell_m=1.0)
+AROUND = BevGrid(x_m=(-10.0, 10.0), y_m=(-10.0, 10.0), cell_m=0.25)
+SQUARE = BevGrid(x_m=(0.0, 10.0), y_m=(-5.0, 5.0), cell_m=1.0)
 EGO = np.array([[1.0, 0.5], [-1.0, 0.5], [-1.0, -0.5], [1.0, -0.5]])
 
 
@@ -49,7 +49,7 @@ def test_the_same_value_has_the_same_colour_in_every_panel():
 
 
 def test_long_maps_lie_below_each_other_and_square_ones_beside_each_other():
-    long = BevGrid(x=(0.0, 50.0), y=(-10.0, 10.0), cell=1.0)
+    long = BevGrid(x_m=(0.0, 50.0), y_m=(-10.0, 10.0), cell_m=1.0)
     for grid, stacked in ((long, True), (SQUARE, False)):
         for names in ("ab", "abc"):
             figure = side_by_side(grid, {name: torch.zeros(grid.shape[1:]) for name in names})
@@ -61,7 +61,7 @@ def test_long_maps_lie_below_each_other_and_square_ones_beside_each_other():
 
 
 @pytest.mark.parametrize("count", [2, 3, 5])
-@pytest.mark.parametrize("grid", [GRID, AROUND, BevGrid(x=(0.0, 200.0), y=(-40.0, 40.0), cell=0.5)])
+@pytest.mark.parametrize("grid", [GRID, AROUND, BevGrid(x_m=(0.0, 200.0), y_m=(-40.0, 40.0), cell_m=0.5)])
 def test_every_panel_has_whole_pixels_for_each_cell_and_overlaps_no_other(count, grid):
     generator = torch.Generator().manual_seed(0)
     values = torch.rand(grid.shape[1:], generator=generator)

@@ -20,8 +20,8 @@ from torchcover.report.map_subjects import (
 
 CELL_M = 0.25
 # Neither a whole number of squares wide nor high.
-GRID = BevGrid(x=(0.0, 5.75), y=(0.0, 3.25), cell=CELL_M, heights={"low": (0.0, 1.0), "high": (1.0, 2.0)})
-ALL = Region("all", GRID.x, GRID.y)
+GRID = BevGrid(x_m=(0.0, 5.75), y_m=(0.0, 3.25), cell_m=CELL_M, heights={"low": (0.0, 1.0), "high": (1.0, 2.0)})
+ALL = Region("all", GRID.x_m, GRID.y_m)
 
 
 def measured(steps: int = 16, points: int = 400):
@@ -152,7 +152,9 @@ def test_infinity_stays_in_its_square():
 @pytest.mark.parametrize(("cell", "drawn_m"), [(0.25, 0.25), (0.15, 0.15), (0.125, 0.25), (0.05, 0.2)])
 def test_small_cells_are_drawn_in_squares_with_the_same_numbers(cell, drawn_m):
     """Neither side of the grid is a whole number of squares; a region's ratio is that of its squares."""
-    grid = BevGrid(x=(0.0, 46 * cell), y=(0.0, 25 * cell), cell=cell, heights={"low": (0.0, 1.0), "high": (1.0, 2.0)})
+    grid = BevGrid(
+        x_m=(0.0, 46 * cell), y_m=(0.0, 25 * cell), cell_m=cell, heights={"low": (0.0, 1.0), "high": (1.0, 2.0)}
+    )
     metric = CoverageMetric(grid, (0.1,), blocks=8, square_metres=True, regions=[])
     for seed in range(16):
         random = torch.Generator().manual_seed(seed)
@@ -160,14 +162,16 @@ def test_small_cells_are_drawn_in_squares_with_the_same_numbers(cell, drawn_m):
         metric.update(rig, reference, weights=torch.rand(99, generator=random) + 0.1, block_index=seed)
     whole = metric.compute()
     drawn = downsample_coverage(whole)
-    assert (drawn.grid.cell, drawn is whole) == (pytest.approx(drawn_m), drawn_m == cell)
-    assert drawn.points.sum() == whole.points.sum()
+    assert (drawn.grid.cell_m, drawn is whole) == (pytest.approx(drawn_m), drawn_m == cell)
+    assert drawn.point_counts.sum() == whole.point_counts.sum()
     assert drawn.layers.keys() == whole.layers.keys()
     assert drawn.errors.keys() == whole.errors.keys()
     side = round(drawn_m / cell)
     near = Region("near", (0.0, 4 * side * cell), (0.0, 2 * side * cell))
-    for one, other in zip(*(each.estimate(near, "low").left_out for each in (drawn, whole)), strict=True):
+    for one, other in zip(*(each.estimate(near, "low").jackknife_values for each in (drawn, whole)), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12)
-    m2, sums, *_ = whole.area.totals()[:, 1, : 2 * side, : 4 * side].reshape(-1, 2, side, 4, side).sum(dim=(2, 4))
+    m2, sums, *_ = (
+        whole.area_sums.sum_blocks()[:, 1, : 2 * side, : 4 * side].reshape(-1, 2, side, 4, side).sum(dim=(2, 4))
+    )
     found = drawn.layers["radius_area_m"].values[1, :2, :4]
     torch.testing.assert_close(found, sums / m2, rtol=1e-12, atol=0, equal_nan=True)

@@ -6,7 +6,7 @@ from itertools import permutations
 import pytest
 import torch
 
-from torchcover.coverage import BevGrid, CoverageMetric, Region, differences
+from torchcover.coverage import BevGrid, CoverageMetric, Region, compute_differences
 from torchcover.report import CoverageTable, collect_table_notes
 
 
@@ -28,7 +28,7 @@ def test_a_table_has_the_summaries_of_its_coverages(trio, regions):
 def test_differences_are_the_paired_ones_of_the_coverage(trio, regions):
     table = CoverageTable.from_coverages(trio, regions)
     for rows in table.rows_by_region:
-        expected = differences(trio, rows[0].region, rows[0].summary.height)
+        expected = compute_differences(trio, rows[0].region, rows[0].summary.band)
         assert str({row.rig: row.differences for row in rows}) == str(expected)
 
 
@@ -79,7 +79,7 @@ def test_the_best_is_marked_where_its_lead_over_the_next_is_more_than_chance(tri
     table = CoverageTable.from_coverages(trio, regions)
     for rows in table.rows_by_region[:2]:
         for key in ("radius_m", "detection_0.4m"):
-            each = {row.rig: trio[row.rig].estimate(row.region, row.summary.height) for row in rows}
+            each = {row.rig: trio[row.rig].estimate(row.region, row.summary.band) for row in rows}
             ahead = [each["many"].differences(each[other])[key].significant for other in ("few", "other")]
             assert [key in row.leading_keys for row in rows] == [False, False, all(ahead)]
             assert all(ahead)
@@ -98,10 +98,10 @@ def test_remarks_are_made_of_what_did_happen_only(blind, trios, regions):
 
 
 def test_there_is_nothing_to_remark_where_every_cell_is_known():
-    grid = BevGrid(x=(0.0, 4.0), y=(0.0, 2.0), cell=1.0, heights={"ground": (-0.5, 0.5)})
+    grid = BevGrid(x_m=(0.0, 4.0), y_m=(0.0, 2.0), cell_m=1.0, heights={"ground": (-0.5, 0.5)})
     metric = CoverageMetric(grid)
     metric.update(torch.zeros(1, 3), torch.cartesian_prod(torch.arange(4) + 0.5, torch.arange(2) + 0.5, torch.zeros(1)))
-    table = CoverageTable.from_coverages({"full": metric.compute()}, [Region("all", grid.x, grid.y)])
+    table = CoverageTable.from_coverages({"full": metric.compute()}, [Region("all", grid.x_m, grid.y_m)])
     assert not collect_table_notes(table, "full")
 
 
@@ -111,7 +111,7 @@ def test_there_is_nothing_to_remark_where_every_cell_is_known():
         ({"seed": 7}, "different reference points"),
         ({"thresholds": (0.5,)}, "differ in their thresholds"),
         ({"max_radius": 9.0}, "differ in their max_radius"),
-        ({"grid": BevGrid(x=(0.0, 10.0), y=(-5.0, 5.0), cell=1.0)}, "differ in their grid"),
+        ({"grid": BevGrid(x_m=(0.0, 10.0), y_m=(-5.0, 5.0), cell_m=1.0)}, "differ in their grid"),
     ],
 )
 def test_coverages_that_are_not_paired_are_refused(measure, points, regions, other, message):
@@ -124,4 +124,4 @@ def test_what_makes_no_table_is_refused(pair):
     with pytest.raises(ValueError, match="at least one rig"):
         CoverageTable.from_coverages({}, ())
     with pytest.raises(ValueError, match="beyond the grid's"):
-        CoverageTable.from_coverages(pair, [Region("wide", x=(0.0, 99.0), y=(0.0, 2.0))])
+        CoverageTable.from_coverages(pair, [Region("wide", x_m=(0.0, 99.0), y_m=(0.0, 2.0))])

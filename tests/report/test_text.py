@@ -12,8 +12,8 @@ from torchcover.report import CoverageTable, PageTable, TextCell, print_page_tab
 from torchcover.report.records import COLUMNS
 from torchcover.report.renderers import build_rich_tables, compute_min_width
 
-NEAR = Region("near", x=(0.0, 2.0), y=(0.0, 2.0))
-FAR = Region("far", x=(2.0, 4.0), y=(0.0, 2.0))
+NEAR = Region("near", x_m=(0.0, 2.0), y_m=(0.0, 2.0))
+FAR = Region("far", x_m=(2.0, 4.0), y_m=(0.0, 2.0))
 ORIGIN = torch.zeros(1, 3)
 
 
@@ -25,7 +25,7 @@ def no_other_columns(monkeypatch):
 
 
 def metric(thresholds=(0.4, 1.0), **options) -> CoverageMetric:
-    grid = BevGrid(x=(0.0, 4.0), y=(0.0, 2.0), cell=1.0, heights={"ground": (-0.5, 0.5)})
+    grid = BevGrid(x_m=(0.0, 4.0), y_m=(0.0, 2.0), cell_m=1.0, heights={"ground": (-0.5, 0.5)})
     return CoverageMetric(grid, thresholds=thresholds, **options)
 
 
@@ -248,7 +248,9 @@ def test_with_many_sensors_each_has_a_row_and_eighty_columns_are_enough():
     assert max(map(len, wide.splitlines())) > 160
     table = CoverageTable.from_coverages(computed, (NEAR, FAR))
     for row in table.rows["rig"]:
-        changes = {name: change["detection_0.4m"].value for name, change in row.summary.redundancy.change.items()}
+        changes = {
+            name: change["detection_0.4m"].value for name, change in row.summary.redundancy.failure_effects.items()
+        }
         rows = re.findall(rf"│ {row.summary.region} .*(sensor_number_\d) │ *(?:! )?([+-][\d.]+)", narrow)
         assert {name for name, _ in rows} == {name for name, change in changes.items() if change}
         assert [name for name, _ in rows] == sorted((name for name, _ in rows), key=lambda name: changes[name])

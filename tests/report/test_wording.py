@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchcover.coverage.quantity import RADIUS, detection
+from torchcover.coverage.quantity import RADIUS, make_detection_quantity
 from torchcover.estimation import Difference, Number
 from torchcover.report.wording import (
     format_difference,
@@ -18,7 +18,7 @@ from torchcover.report.wording import (
     round_number,
 )
 
-SHARE = detection(0.4)
+SHARE = make_detection_quantity(0.4)
 NUMBERS = st.tuples(
     st.floats(0.0, 1.0) | st.sampled_from([0.0, 1.0, 0.9996, 0.0004, 0.5]),
     st.floats(0.0, 0.1) | st.sampled_from([0.0, math.nan, 1e-13, 1e-9]),

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from torchcover import Rig
-from torchcover.geometry import transform
+from torchcover.geometry import transform_points
 from torchcover.simulation import builtin_names
 from torchcover.simulation.bodies import Vehicle
 
@@ -270,7 +270,7 @@ def test_rays_reach_the_ground_in_front(rig):
     reached = 0
     for sensor in Rig.load(rig).sensors:
         matrix, directions = sensor.mount.matrix(), sensor.directions().reshape(3, -1)
-        ends = transform(matrix, directions.T)
+        ends = transform_points(matrix, directions.T)
         origin = matrix[:3, 3]
         fall = origin[2] - ends[:, 2]
         distance = np.divide(origin[2], fall, out=np.full_like(fall, np.inf), where=fall > 1e-3)

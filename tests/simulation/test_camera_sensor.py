@@ -127,6 +127,6 @@ def test_points_on_an_object_are_counted_as_pixels_of_the_full_image():
     }
     few = SurfaceReference((AHEAD,), rays=50)
     (frame,) = SimulatedFrames(made, rigs=rigs, steps=1, reference_sensor=few, boxes=True)
-    full, *strided = (int(hits) for hits in frame.boxes.hits.values())
+    full, *strided = (int(hits) for hits in frame.boxes.points_in_box.values())
     assert full > 5000
     assert strided == pytest.approx([full, full], rel=0.05)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from torchcover.geometry import BoundingBox, rigid, rotation_from_euler
+from torchcover.geometry import BoundingBox, build_transform, convert_euler_to_rotation
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation import PaperReference, Pose, Scenario
 from torchcover.simulation.raycaster import cast_from
@@ -79,16 +79,18 @@ def test_bodies_of_one_kind_are_cast_at_together_from_a_place_on_one_of_them_too
     ]
     ways[2] = ways[1]
     actors = [Actor(f"car {k}", "car", car, way) for k, way in enumerate(ways)]
-    ground = Plane(type="plane", size_m=(60, 60)).mesh().moved(rigid(np.eye(3), [0, 0, -2]))
+    ground = Plane(type="plane", size_m=(60, 60)).mesh().moved(build_transform(np.eye(3), [0, 0, -2]))
     instant = Scene(World((ground,), actors[0], tuple(actors[1:]), duration_s=3.0)).at(0)
     roof_m = np.array([9.0, -4.0, car.vertices_m[:, 2].max()])
     touched = instant.moving.touched_by(roof_m, instant.moving.from_there_m(roof_m))
     assert touched.tolist() == [False, False, False, True, False]
     for place_m in (roof_m, np.array([4.0, 0.0, 1.0])):
-        pose = rigid(np.eye(3), place_m)
+        pose = build_transform(np.eye(3), place_m)
         assert_same_bits(instant.scan(pose, SPHERE, max_range_m=90.0), at_every_body(instant, pose, SPHERE, 90.0))
     (tile,) = into_tiles(unit_directions(np.zeros((1, 1)), np.array([[14.0]])))
-    _, hits, _ = instant.cast(rigid(np.eye(3), place_m), tile, np.full(1, 90, np.float32), instant.outlines(place_m))
+    _, hits, _ = instant.cast(
+        build_transform(np.eye(3), place_m), tile, np.full(1, 90, np.float32), instant.outlines(place_m)
+    )
     assert hits.body == instant.moving.body[2]
 
 
@@ -97,7 +99,7 @@ def boxes_around(generator, count):
     corners = BoundingBox((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)).corners_m
     sizes = generator.uniform(0.05, 1.0, size=(count, 3)) * 10 ** generator.uniform(-1, 1.3, size=(count, 1))
     places = generator.normal(size=(count, 3)) * 10 ** generator.uniform(-1, 1.5, size=(count, 1))
-    poses = [rigid(rotation_from_euler(*generator.uniform(-180, 180, 3)), place) for place in places]
+    poses = [build_transform(convert_euler_to_rotation(*generator.uniform(-180, 180, 3)), place) for place in places]
     return np.array([(corners * s) @ p[:3, :3].T + p[:3, 3] for s, p in zip(sizes, poses, strict=True)]), sizes, poses
 
 
@@ -114,7 +116,7 @@ def test_no_ray_that_meets_a_box_is_left_out():
     corners_m, sizes, poses = boxes_around(generator, 300)
     origin_m = np.array([0.3, -0.2, 0.1])
     seen = outlines(corners_m, origin_m)
-    turned = rotation_from_euler(30, 20, 10)
+    turned = convert_euler_to_rotation(30, 20, 10)
     close = 0
     for k, (size, pose) in enumerate(zip(sizes, poses, strict=True)):
         inside = (
@@ -139,12 +141,14 @@ def test_no_ray_that_meets_a_box_is_left_out():
 
 
 def test_a_ray_does_not_depend_on_its_company():
-    turn, rays = rotation_from_euler(31, 7, 3), np.concatenate([tile.directions for tile in SPHERE], axis=1)
+    turn, rays = convert_euler_to_rotation(31, 7, 3), np.concatenate([tile.directions for tile in SPHERE], axis=1)
     together = rotate(turn, rays)
     for first in range(0, 2000, 40):
         for count in (1, 2, 3, 5, 8):
             some = slice(first, first + count)
             np.testing.assert_array_equal(rotate(turn, rays[:, some]), together[:, some])
-    turns = np.array([rotation_from_euler(*angles) for angles in np.random.default_rng(1).uniform(-90, 90, (50, 3))])
+    turns = np.array(
+        [convert_euler_to_rotation(*angles) for angles in np.random.default_rng(1).uniform(-90, 90, (50, 3))]
+    )
     alone = [rotate(turn, ray[:, None])[:, 0] for turn, ray in zip(turns, rays.T[:50], strict=True)]
     np.testing.assert_array_equal(rotate_each(turns.astype(np.float32), rays[:, :50]).T, alone)

@@ -34,18 +34,18 @@ def test_a_label_is_where_the_body_is_in_the_frame_of_the_ego():
 
 
 def test_the_range_is_measured_over_ground_and_who_is_not_there_has_no_label():
-    ego = Trajectory.resting([0.0, 0.0, 0.0])
-    near = Actor("near", "car", CAR, Trajectory.resting([30.0, 40.0, 9.0]))
-    far = Actor("far", "car", CAR, Trajectory.resting([30.0, 40.1, 0.0]))
-    brief = Trajectory(np.array([0.0, 1.0]), np.array([[9.0, 0, 0], [9.0, 1, 0]]), np.zeros((2, 3)), transient=True)
+    ego = Trajectory.create_static([0.0, 0.0, 0.0])
+    near = Actor("near", "car", CAR, Trajectory.create_static([30.0, 40.0, 9.0]))
+    far = Actor("far", "car", CAR, Trajectory.create_static([30.0, 40.1, 0.0]))
+    brief = Trajectory(np.array([0.0, 1.0]), np.array([[9.0, 0, 0], [9.0, 1, 0]]), np.zeros((2, 3)), is_transient=True)
     made = world(ego, [near, far, Actor("brief", "car", CAR, brief)])
     assert [label.name for label in labels(made, 0, 50.0)] == ["near", "brief"]
     assert [label.name for label in labels(made, 4, 50.0)] == ["near"]
 
 
 def test_parked_objects_have_labels_too():
-    parked = Actor("parked van 0", "car", CAR, Trajectory.resting([7.0, 3.0, 0.0], [180.0, 0.0, 0.0]))
-    (label,) = labels(world(Trajectory.resting([0, 0, 0]), [], [parked]), 3, 50.0)
+    parked = Actor("parked van 0", "car", CAR, Trajectory.create_static([7.0, 3.0, 0.0], [180.0, 0.0, 0.0]))
+    (label,) = labels(world(Trajectory.create_static([0, 0, 0]), [], [parked]), 3, 50.0)
     assert label.name == "parked van 0"
     np.testing.assert_array_equal(label.velocity_mps, 0.0)
 
@@ -55,8 +55,8 @@ def test_velocity_is_that_of_the_segment_their_mean_at_a_corner_and_zero_at_rest
     for time_s, expected in {
         0.5: [0, 0, 0], 1.0: [10, 0, 0], 1.5: [10, 0, 0], 2.0: [5, 2, 0], 3.0: [0, 4, 0], 4.0: [0, 4, 0], 4.5: [0, 0, 0]
     }.items():  # fmt: skip
-        np.testing.assert_allclose(track.velocity_at(time_s), expected, err_msg=f"at {time_s} s")
-    np.testing.assert_array_equal(Trajectory.resting([1, 2, 3]).velocity_at(0.0), 0.0)
+        np.testing.assert_allclose(track.compute_velocity_mps(time_s), expected, err_msg=f"at {time_s} s")
+    np.testing.assert_array_equal(Trajectory.create_static([1, 2, 3]).compute_velocity_mps(0.0), 0.0)
 
 
 def test_velocity_is_the_slope_of_the_positions():
@@ -65,5 +65,5 @@ def test_velocity_is_the_slope_of_the_positions():
     track = Trajectory.from_arrays(times_s, generator.normal(size=(20, 3)), np.zeros((20, 3)))
     for time_s in generator.uniform(times_s[0] + 0.01, times_s[-1] - 0.01, 30):
         if np.abs(times_s - time_s).min() > 1e-4:
-            slope = (track.at(time_s + 1e-5)[:3, 3] - track.at(time_s - 1e-5)[:3, 3]) / 2e-5
-            np.testing.assert_allclose(track.velocity_at(time_s), slope, atol=1e-6)
+            slope = (track.interpolate(time_s + 1e-5)[:3, 3] - track.interpolate(time_s - 1e-5)[:3, 3]) / 2e-5
+            np.testing.assert_allclose(track.compute_velocity_mps(time_s), slope, atol=1e-6)

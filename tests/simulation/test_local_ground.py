@@ -10,7 +10,7 @@ import torch
 
 from torchcover.data import RecordedFrames, SimulatedFrames, collate_frames
 from torchcover.frames.transforms import scale
-from torchcover.geometry import rigid, rotation_from_euler
+from torchcover.geometry import build_transform, convert_euler_to_rotation
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation import Scenario, Simulator, SurfaceReference
 from torchcover.simulation.bodies import Vehicle
@@ -38,7 +38,7 @@ def sheet(heights, half=60.0, every=5.0, down=False):
 
 
 def solid(size, x=0.0, y=0.0, z=0.0, yaw=0.0):
-    return Box(type="box", size_m=size).mesh().moved(rigid(rotation_from_euler(yaw, 0, 0), [x, y, z]))
+    return Box(type="box", size_m=size).mesh().moved(build_transform(convert_euler_to_rotation(yaw, 0, 0), [x, y, z]))
 
 
 def wedge(x, y, z):
@@ -73,7 +73,7 @@ def test_roofs_are_no_ground_and_pavements_are():
 def test_a_ramp_a_bridge_and_the_road_below_it():
     up = wedge((10, 30), (-3, 3), (0, 5))
     deck = solid((20, 6, 0.8), 40, 0, 4.2)
-    down = wedge((10, 30), (-3, 3), (0, 5)).moved(rigid(rotation_from_euler(180, 0, 0), [80, 0, 0]))
+    down = wedge((10, 30), (-3, 3), (0, 5)).moved(build_transform(convert_euler_to_rotation(180, 0, 0), [80, 0, 0]))
     ground = ground_of([PLANE, up, deck, down])
     found = heights(ground, [20, 0, 2.5], [20, 0, 3.5], [40, 0, 6], [40, 0, 2], [40, 0, 4.6], [40, 10, 6], [55, 0, 6])
     # On the ramp, above it, above the deck, below it, in it (where the road is the ground), beside, on the way down.
@@ -85,7 +85,9 @@ def test_a_ramp_a_bridge_and_the_road_below_it():
 def test_the_decks_of_a_car_park_and_the_stairs_between_them():
     stairs = [solid((0.3, 2, 0.18 * (k + 1)), 5 + 0.3 * k, 12) for k in range(16)]
     deck = solid((30, 20, 0.3), 24.65, 12, 0.18 * 17 - 0.3)
-    pillar = Cylinder(type="cylinder", radius_m=0.3, height_m=2.76).mesh().moved(rigid(np.eye(3), [24, 14, 0]))
+    pillar = (
+        Cylinder(type="cylinder", radius_m=0.3, height_m=2.76).mesh().moved(build_transform(np.eye(3), [24, 14, 0]))
+    )
     ground = ground_of([PLANE, *stairs, deck, pillar])
     top = 0.18 * 17
     found = heights(ground, [24, 12, 1.5], [24, 12, top + 1.5], [6.5, 12, 2.0], [8, 0, 1.0])
@@ -109,7 +111,7 @@ def test_heights_are_those_along_the_vertical_of_the_world_in_any_frame():
     ground = ground_of([PLANE, solid((9, 3, 0.15), -20)])
     rng = np.random.default_rng(2)
     world = np.column_stack([rng.uniform(-50, 50, (200, 2)), rng.uniform(-0.03, 9, 200)])
-    pose = rigid(rotation_from_euler(70, 3, -2), [4, -7, 1.0])
+    pose = build_transform(convert_euler_to_rotation(70, 3, -2), [4, -7, 1.0])
     inside = (world - pose[:3, 3]) @ pose[:3, :3]
     np.testing.assert_allclose(ground.heights_m(inside, pose), ground.heights_m(world), atol=1e-4)
 
@@ -118,7 +120,7 @@ def test_steep_faces_and_what_is_far_above_are_nobodys_ground():
     assert level_faces(wedge((0, 1), (0, 1), (0, 0.9))).sum() == 2
     assert level_faces(wedge((0, 1), (0, 1), (0, 1.1))).sum() == 0
     for seed in range(50):  # 45 degrees, whatever rounding makes of that
-        turn, side = rigid(rotation_from_euler(seed, 0, 0), [seed, 7.3, -0.1]), 1 / (1 + seed)
+        turn, side = build_transform(convert_euler_to_rotation(seed, 0, 0), [seed, 7.3, -0.1]), 1 / (1 + seed)
         assert level_faces(wedge((0, side), (0, 1), (0, side)).moved(turn)).sum() == 2
     walls = [solid((0.2, 40, 5), 5), solid((0.2, 40, 5), -5)]
     assert np.isnan(heights(ground_of(walls), [0, 0, 1])).all()
@@ -158,7 +160,9 @@ def scan(world, sensor, seed, step=0):
 
 def resting(static, **pose):
     place = [pose.pop(key, 0.0) for key in ("x", "y", "z")]
-    matrix = rigid(rotation_from_euler(*(pose.get(key, 0.0) for key in ("yaw", "pitch", "roll"))), place)
+    matrix = build_transform(
+        convert_euler_to_rotation(*(pose.get(key, 0.0) for key in ("yaw", "pitch", "roll"))), place
+    )
     return World(tuple(static), Actor("ego", "ego", EGO_MESH, Trajectory.from_poses([0.0], matrix[None])))
 
 
@@ -279,13 +283,13 @@ def test_frames_carry_heights_everywhere_they_go(tmp_path):
     assert torch.equal(pickle.loads(pickle.dumps(frame)).reference_heights_m, frame.reference_heights_m)
     assert torch.equal(frame.to("cpu").reference_heights_m, frame.reference_heights_m)
     batch = collate_frames([frame, frames[1]])
-    assert [len(h) for h in batch.heights_in("ground")] == [len(points) for points in batch.reference]
+    assert [len(h) for h in batch.get_heights_m("ground")] == [len(points) for points in batch.reference]
     with pytest.raises(ValueError, match=r"drawn for bands over the ground; use the band frame ground$"):
-        batch.heights_in("vehicle")
+        batch.get_heights_m("vehicle")
     unknown = dataclasses.replace(frame, reference_heights_m=None)
     with pytest.raises(ValueError, match=r"courtyard step 0.* are unknown; use the band frame vehicle$"):
-        collate_frames([frame, unknown]).heights_in("ground")
-    assert collate_frames([unknown]).heights_in("vehicle") is None
+        collate_frames([frame, unknown]).get_heights_m("ground")
+    assert collate_frames([unknown]).get_heights_m("vehicle") is None
     torch.testing.assert_close(scale(frame, 2.0).reference_heights_m, 2 * frame.reference_heights_m)
     write_recording(frames, tmp_path / "there")
     again = RecordedFrames(tmp_path / "there")[0]
@@ -298,7 +302,7 @@ def test_boxes_know_how_high_their_bottoms_are():
     boxes = frames[0].boxes
     assert len(boxes) > 20
     assert boxes.bottom_heights_m.abs().max() < 0.3
-    assert (boxes.centre_m[:, 2] - boxes.size_m[:, 2] / 2).abs().max() > 1.0
+    assert (boxes.center_m[:, 2] - boxes.size_m[:, 2] / 2).abs().max() > 1.0
 
 
 def test_a_scenario_says_its_ground_or_is_told_what_was_taken():

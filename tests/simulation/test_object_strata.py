@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from torchcover.data import SimulatedFrames
-from torchcover.detection import box_visibility
+from torchcover.detection import measure_box_visibility
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation import Rig, SurfaceReference
 from torchcover.simulation.patches import Bounds, Patches
@@ -20,7 +20,7 @@ from .small_worlds import AHEAD, FLOOR, agrees, box, scenario
 
 BEHIND = (((-20.0, -10.0), (-5.0, 5.0)),)
 GROUND = Plane(type="plane", size_m=(400.0, 400.0)).mesh()
-EGO = Actor("ego", "ego", Box(type="box", size_m=(4.0, 2.0, 1.5)).mesh(), Trajectory.resting([0.0, 0.0, 0.0]))
+EGO = Actor("ego", "ego", Box(type="box", size_m=(4.0, 2.0, 1.5)).mesh(), Trajectory.create_static([0.0, 0.0, 0.0]))
 
 
 def there(x_m, y_m=0.0, z_m=0.0, *, size_m=(2.0, 2.0, 1.5), moves=False, until_s=None):
@@ -28,8 +28,10 @@ def there(x_m, y_m=0.0, z_m=0.0, *, size_m=(2.0, 2.0, 1.5), moves=False, until_s
     place = [x_m, y_m, z_m]
     track = Trajectory.from_arrays([0.0, 1.0], [[x_m + 5.0, y_m, z_m], place], np.zeros((2, 3)))
     if until_s is not None:
-        track = Trajectory(np.array([0.0, until_s]), np.array([place, place]), np.zeros((2, 3)), transient=True)
-    return Actor("box", "car", Box(type="box", size_m=size_m).mesh(), track if moves else Trajectory.resting(place))
+        track = Trajectory(np.array([0.0, until_s]), np.array([place, place]), np.zeros((2, 3)), is_transient=True)
+    return Actor(
+        "box", "car", Box(type="box", size_m=size_m).mesh(), track if moves else Trajectory.create_static(place)
+    )
 
 
 def world(actors=(), parked=(), static=()):
@@ -186,15 +188,15 @@ def test_a_frame_tells_what_is_hidden_from_the_places_too_from_what_nobody_asked
     rig = Rig.model_validate({"name": "r", "sensors": [LIDAR]})
     sensor = SurfaceReference((AHEAD,), rays=100, object_points=64, max_range_m=60.0)
     (frame,) = SimulatedFrames(made, rig, steps=1, reference_sensor=sensor, boxes=True)
-    seen = box_visibility(frame.sensor, frame.reference, frame.boxes, reference_weights=frame.reference_weights)
+    seen = measure_box_visibility(frame.sensor, frame.reference, frame.boxes, reference_weights=frame.reference_weights)
     assert frame.boxes.ids == ("ahead", "behind a wall", "at the edge", "behind")
-    assert seen.known.tolist() == [True, False, False, True]
+    assert seen.observed.tolist() == [True, False, False, True]
     assert seen.hidden.tolist() == [False, True, False, False]
-    assert seen.drawn_points.tolist()[1:] == [64, 0, 64]
+    assert seen.sampled_points.tolist()[1:] == [64, 0, 64]
     # Its front: the roof is too flat for the rig to hit it at all.
     assert abs(float(seen.share[0]) - 3 / 11) < 0.05
     assert seen.share[3] == 0.0
-    assert torch.equal(frame.boxes.select(seen.hidden).drawn_points, torch.tensor([64]))
+    assert torch.equal(frame.boxes.select(seen.hidden).sampled_points, torch.tensor([64]))
 
 
 def test_frames_with_boxes_ask_about_every_object_unless_they_are_given_a_reference():

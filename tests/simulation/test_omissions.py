@@ -69,8 +69,10 @@ def test_bodies_out_of_range_change_nothing(monkeypatch):
     unlimited = everywhere.step(7)
     scene, step = everywhere.scene_of(7)
     time_s = np.array([step * scene.world.time_step_s])
-    moves = [actor.trajectory for actor in scene.world.actors if actor.trajectory.moves or actor.trajectory.transient]
-    absent = sum(not np.isfinite(one.positions_at(time_s)).all() for one in moves)
+    moves = [
+        actor.trajectory for actor in scene.world.actors if actor.trajectory.is_moving or actor.trajectory.is_transient
+    ]
+    absent = sum(not np.isfinite(one.interpolate_positions_m(time_s)).all() for one in moves)
     assert unlimited.counts["moving_bodies_out_of_range"] == absent < limited.counts["moving_bodies_out_of_range"]
     assert same_points(limited, unlimited)
 

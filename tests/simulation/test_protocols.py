@@ -10,7 +10,7 @@ import torch
 
 from torchcover import Rig
 from torchcover.data import SimulatedFrames
-from torchcover.geometry import BoundingBox, rigid
+from torchcover.geometry import BoundingBox, build_transform
 from torchcover.simulation import (
     REFERENCE_SENSORS,
     SENSORS,
@@ -55,7 +55,7 @@ class DownReference:
     """Looks straight down from its place: the smallest reference sensor there is."""
 
     name: ClassVar[str] = "down"
-    square_metres: ClassVar[bool] = True
+    has_area_weights: ClassVar[bool] = True
     band_frame: ClassVar[str] = "vehicle"
 
     rays: int
@@ -77,7 +77,7 @@ class DownReference:
         return ReferenceScan(seen.points, weights, seen.rays, seen.self_hits, seen.body_casts, redrawn)
 
     def vehicle_T_reference(self, ego, generator):
-        return rigid(np.eye(3), position_in_shell(ego, self.shell_m, generator))
+        return build_transform(np.eye(3), position_in_shell(ego, self.shell_m, generator))
 
 
 # Keys of one sensor of each kind, beside name, type, mount and ranges.

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchcover.geometry import rigid, rotation_from_euler
+from torchcover.geometry import build_transform, convert_euler_to_rotation
 from torchcover.simulation import raycaster
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.shapes import Box, Ellipsoid, Frustum, Mesh, Plane
@@ -48,7 +48,7 @@ def random_mesh(faces, seed=0):
 
 
 def box_at(x, y=0.0, size=1.0):
-    return Box(type="box", size_m=(size, size, size)).mesh().moved(rigid(np.eye(3), [x, y, -size / 2]))
+    return Box(type="box", size_m=(size, size, size)).mesh().moved(build_transform(np.eye(3), [x, y, -size / 2]))
 
 
 def slow_hits(mesh, origin, directions):
@@ -146,7 +146,10 @@ def planes_of(mesh):
 )
 def test_rays_leave_all_faces_that_meet_where_they_start(shape):
     """From places on edges and in corners: outwards to the walls of a room, inwards to the other side of the body."""
-    mesh, generator = shape.mesh().moved(rigid(rotation_from_euler(10.0, 20.0, 30.0), [1.0, 2.0, 3.0])), NUMBERS(5)
+    mesh, generator = (
+        shape.mesh().moved(build_transform(convert_euler_to_rotation(10.0, 20.0, 30.0), [1.0, 2.0, 3.0])),
+        NUMBERS(5),
+    )
     room = box_at(0.0, size=40.0)
     caster = RayCaster([room, mesh])
     (normals, away), (walls, walls_away) = planes_of(mesh), planes_of(room)
@@ -169,7 +172,7 @@ def test_rays_leave_all_faces_that_meet_where_they_start(shape):
 
 @pytest.mark.parametrize("limit_m", [1e-6, 0.3, 1.0, 7.0, np.inf])
 def test_a_ray_that_leaves_a_face_ends_at_its_limit(limit_m):
-    turned = rigid(rotation_from_euler(37.0, 21.0, -13.0), [1.0, 2.0, 3.0])
+    turned = build_transform(convert_euler_to_rotation(37.0, 21.0, -13.0), [1.0, 2.0, 3.0])
     floor, place = Plane(type="plane", size_m=(200, 200)).mesh().moved(turned), (turned @ [5.1, 7.2, 0.0, 1.0])[:3]
     away = turned[:3, 2]
     wall = Mesh(place + 5.0 * away + floor.vertices_m - turned[:3, 3], floor.faces)
@@ -267,7 +270,9 @@ def stacked(sizes):
 def test_a_place_between_bodies_that_touch_is_inside_one_however_they_are_turned(seed):
     """The faces in which they touch are there twice: which of the two a ray met would be up to rounding."""
     numbers = NUMBERS(seed)
-    turn = rigid(rotation_from_euler(*numbers.uniform(-np.pi, np.pi, 3) * (seed % 3 > 0)), numbers.uniform(-50, 50, 3))
+    turn = build_transform(
+        convert_euler_to_rotation(*numbers.uniform(-np.pi, np.pi, 3) * (seed % 3 > 0)), numbers.uniform(-50, 50, 3)
+    )
     slabs = stacked([(20, 20, 1), (20, 20, 2), (24, 16, 1)])
     order = numbers.permutation(3)
     caster = RayCaster([slabs[k].moved(turn) for k in order])
@@ -286,7 +291,7 @@ def test_a_place_is_inside_of_what_encloses_it_and_of_no_sheet():
     for place in places:
         within = [number for number, body in ((0, ball), (2, cube)) if behind_all(body, place)]
         assert caster.inside(place).tolist() == within
-    ahead = cube.moved(rigid(np.eye(3), [2, 0, 0]))
+    ahead = cube.moved(build_transform(np.eye(3), [2, 0, 0]))
     vertices_m, faces = (
         np.concatenate([cube.vertices_m, ahead.vertices_m]),
         np.concatenate([cube.faces, cube.faces + 8]),

@@ -11,7 +11,7 @@ from tests.recordings import bags, layouts
 from tests.recordings.drives import Drive
 from torchcover.data import RecordingSettings, Scan, open_recording, rig_document
 from torchcover.files import BadFileError
-from torchcover.geometry import invert, rigid, rotation_from_euler, transform
+from torchcover.geometry import build_transform, convert_euler_to_rotation, invert, transform_points
 from torchcover.recordings.formats import argoverse2, kitti, nuscenes
 from torchcover.simulation import Lidar, Rig, builtin_names
 from torchcover.simulation.camera_sensor import MOUNT_T_CAMERA
@@ -63,7 +63,7 @@ class Turning(Drive):
 
     lidar = Lidar.model_validate({"name": "a", "model": "velodyne_vlp16", "columns": 300})
     sensors, rigs = ("roof",), {"one": ("roof",)}
-    mount = rigid(rotation_from_euler(0.0, 2.0, 0.0), [0.5, 0.0, 1.7])
+    mount = build_transform(convert_euler_to_rotation(0.0, 2.0, 0.0), [0.5, 0.0, 1.7])
 
     def __init__(self, sense=-1, begin_deg=120.0, before=0.3, *, told=(), moved=True):
         super().__init__(steps=3)
@@ -71,7 +71,7 @@ class Turning(Drive):
 
     def pose(self, time_s):
         place_m = np.stack([20.0 * time_s, 1.75 * time_s**2, 0.0 * time_s], axis=-1)
-        return rigid(rotation_from_euler(10.0 * time_s, 0.0 * time_s, 0.0 * time_s), place_m)
+        return build_transform(convert_euler_to_rotation(10.0 * time_s, 0.0 * time_s, 0.0 * time_s), place_m)
 
     def get_world_T_vehicle(self, index):
         return self.pose(np.array([0.1 * index]))[0]
@@ -146,8 +146,8 @@ def test_clouds_stored_laser_by_laser_need_no_rows_that_can_be_told_apart():
 
 def test_a_field_of_view_has_its_middle_and_ranges():
     lidar = Lidar(name="a", channels=4, vertical_fov_deg=(-9, 0), columns=40, horizontal_fov_deg=80, max_range_m=99)
-    turned = rigid(rotation_from_euler(170.0, 0.0, 0.0), np.zeros(3))
-    points_m = transform(turned, in_a_room(lidar, 0, 0.0))
+    turned = build_transform(convert_euler_to_rotation(170.0, 0.0, 0.0), np.zeros(3))
+    points_m = transform_points(turned, in_a_room(lidar, 0, 0.0))
     found = estimate_scan([points_m])
     assert (found.columns, found.horizontal_fov_deg) == (40, pytest.approx(80.0))
     assert found.centre_deg == pytest.approx(170.0)
@@ -175,7 +175,7 @@ def nuscenes_with_camera(drive, root):
 
     def pixels(points_m):
         # In the ego's frame; the camera looks along it.
-        x, y, z = (transform(invert(nuscenes.vehicle_T_ego), points_m) - [1.7, 0.1, 1.5]).T
+        x, y, z = (transform_points(invert(nuscenes.vehicle_T_ego), points_m) - [1.7, 0.1, 1.5]).T
         return np.stack([816.0 - 1266.0 * y / x, 491.0 - 1250.0 * z / x], axis=1)
 
     return path, "CAM_FRONT", (1600, 900), pixels
@@ -187,12 +187,12 @@ def argoverse2_with_camera(drive, root):
 
     path = layouts.argoverse2_log(drive, root)
     (path / "calibration").mkdir()
-    ego_T_camera = rigid(rotation_from_euler(40.0, 3.0, 2.0), [1.5, 0.2, 1.4]) @ MOUNT_T_CAMERA
-    wxyz = bags.quaternion_from_rotation(ego_T_camera[:3, :3])
+    ego_T_camera = build_transform(convert_euler_to_rotation(40.0, 3.0, 2.0), [1.5, 0.2, 1.4]) @ MOUNT_T_CAMERA
+    wxyz = bags.convert_rotation_to_quaternion(ego_T_camera[:3, :3])
     turned = dict(zip(("qw", "qx", "qy", "qz"), map(float, wxyz), strict=True))
     places = dict(zip(("tx_m", "ty_m", "tz_m"), map(float, ego_T_camera[:3, 3]), strict=True))
     lidars = [
-        {"sensor_name": f"{one}_lidar", **layouts.posed(rigid(np.eye(3), [1.35, 0.0, z]))}
+        {"sensor_name": f"{one}_lidar", **layouts.posed(build_transform(np.eye(3), [1.35, 0.0, z]))}
         for one, z in (("up", 1.64), ("down", 1.53))
     ]
     rows = [{"sensor_name": "ring_front_left", **turned, **places}, *lidars]
@@ -205,7 +205,7 @@ def argoverse2_with_camera(drive, root):
     )
 
     def pixels(points_m, raw=False):
-        x, y, z = transform(invert(argoverse2.vehicle_T_ego @ ego_T_camera), points_m).T
+        x, y, z = transform_points(invert(argoverse2.vehicle_T_ego @ ego_T_camera), points_m).T
         x, y = x / z, y / z
         r2 = raw * (x * x + y * y)
         radial = 1 + r2 * (lens["k1"] + r2 * (lens["k2"] + r2 * lens["k3"]))
@@ -216,21 +216,24 @@ def argoverse2_with_camera(drive, root):
 
 P2 = np.array([[721.5, 0.0, 609.5, 44.8], [0.0, 721.5, 172.8, 0.2], [0.0, 0.0, 1.0, 0.003]])
 camera0_T_velodyne = np.vstack(
-    [np.c_[rotation_from_euler(0.2, -0.5, 0.4) @ MOUNT_T_CAMERA[:3, :3].T, [-0.01, -0.07, -0.29]], [0.0, 0.0, 0.0, 1.0]]
+    [
+        np.c_[convert_euler_to_rotation(0.2, -0.5, 0.4) @ MOUNT_T_CAMERA[:3, :3].T, [-0.01, -0.07, -0.29]],
+        [0.0, 0.0, 0.0, 1.0],
+    ]
 )
-R0 = rotation_from_euler(0.3, 0.4, -0.5)
+R0 = convert_euler_to_rotation(0.3, 0.4, -0.5)
 
 
 K2 = np.array([[959.7, 0.0, 696.0], [0.0, 956.9, 224.2], [0.0, 0.0, 1.0]])
 D2 = [-0.37, 0.19, 1.1e-3, 1.8e-3, -0.06]
-camera2_T_camera0 = rigid(rotation_from_euler(0.3, 0.2, -0.4), [0.06, 0.0, 0.004])
+camera2_T_camera0 = build_transform(convert_euler_to_rotation(0.3, 0.2, -0.4), [0.06, 0.0, 0.004])
 
 
 def by_kitti(points_m, raw=False):
     """Pixels of the left color camera, by the formula of the development kit, or by OpenCV's of the raw image."""
-    velodyne_m = transform(invert(kitti.vehicle_T_velodyne), points_m)
+    velodyne_m = transform_points(invert(kitti.vehicle_T_velodyne), points_m)
     if raw:
-        x, y, z = transform(camera2_T_camera0 @ camera0_T_velodyne, velodyne_m).T
+        x, y, z = transform_points(camera2_T_camera0 @ camera0_T_velodyne, velodyne_m).T
         x, y = x / z, y / z
         k1, k2, p1, p2, k3 = D2
         r2 = x * x + y * y
@@ -238,7 +241,7 @@ def by_kitti(points_m, raw=False):
         bent_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
         bent_y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
         return np.stack([696.0 + 959.7 * bent_x, 224.2 + 956.9 * bent_y], axis=1)
-    rectified = np.c_[transform(camera0_T_velodyne, velodyne_m) @ R0.T, np.ones(len(points_m))]
+    rectified = np.c_[transform_points(camera0_T_velodyne, velodyne_m) @ R0.T, np.ones(len(points_m))]
     seen = rectified @ P2.T
     return seen[:, :2] / seen[:, 2:]
 
@@ -304,7 +307,7 @@ def test_cameras_show_points_where_their_data_set_says(layout, raw, tmp_path):
         sensor.mount.matrix() @ np.c_[np.random.default_rng(0).uniform([5, -2, -1], [30, 2, 1], (50, 3)), np.ones(50)].T
     )
     vehicle_m = ahead_m[:3].T
-    in_camera_m = transform(invert(sensor.mount.matrix() @ MOUNT_T_CAMERA), vehicle_m)
+    in_camera_m = transform_points(invert(sensor.mount.matrix() @ MOUNT_T_CAMERA), vehicle_m)
     found, shown = sensor.camera().project(torch.from_numpy(in_camera_m))
     assert shown.sum() > 30
     np.testing.assert_allclose(

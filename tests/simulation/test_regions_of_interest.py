@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchcover import Region, RegionsOfInterest, Rig, Scenario, evaluate
-from torchcover.coverage import near_field_regions
+from torchcover.coverage import build_near_field_regions
 
 ROBOT_M = np.array([[0.5, 0.4], [-0.5, 0.4], [-0.5, -0.4], [0.5, -0.4]])
 SIDES = ["front_3m", "rear_3m", "left_3m", "right_3m"]
@@ -20,22 +20,22 @@ def rectangle(x, y):
 def test_the_usual_table_has_the_papers_regions_and_the_near_field_of_the_vehicle():
     asked = RegionsOfInterest().around(ROBOT_M)
     assert [region.name for region in asked.regions] == ["20m", "80m", "160m", *SIDES]
-    assert (asked.grid.x, asked.grid.y, asked.grid.cell, asked.bands_m) == (
+    assert (asked.grid.x_m, asked.grid.y_m, asked.grid.cell_m, asked.bands_m) == (
         (-40.0, 160.0),
         (-40.0, 40.0),
         0.25,
         ((-0.5, 0.5), (0.5, 2.0)),
     )
     # One area for all of the near field, and the grid last.
-    assert asked.areas[3:] == (((-3.5, 3.5), (-3.4, 3.4)), (asked.grid.x, asked.grid.y))
+    assert asked.areas[3:] == (((-3.5, 3.5), (-3.4, 3.4)), (asked.grid.x_m, asked.grid.y_m))
     assert [region.name for region in RegionsOfInterest().around().regions] == ["20m", "80m", "160m"]
 
 
 @pytest.mark.parametrize("cell", [0.1, 0.25, 0.5])
 def test_the_near_field_is_all_that_is_within_its_reach_of_the_vehicle_and_nothing_twice(cell):
     asked = RegionsOfInterest().around(ROBOT_M, cell)
-    covered = sum(region.mask(asked.grid).long() for region in asked.regions if region.name in SIDES)
-    x, y = asked.grid.x_centres_m, asked.grid.y_centres_m[:, None]
+    covered = sum(region.mask_cells(asked.grid).long() for region in asked.regions if region.name in SIDES)
+    x, y = asked.grid.x_centers_m, asked.grid.y_centers_m[:, None]
     around = (x >= -3.5) & (x < 3.5) & (y >= -3.4) & (y < 3.4)
     vehicle = (x >= -0.5) & (x < 0.5) & (y >= -0.4) & (y < 0.4)
     assert torch.equal(covered, (around & ~vehicle).long())
@@ -52,8 +52,8 @@ def test_what_the_grid_does_not_hold_is_not_in_the_usual_table():
 
 def test_a_region_beyond_the_usual_grid_makes_it_larger_by_whole_cells():
     asked = RegionsOfInterest(regions={"side": rectangle((-41.1, 0.0), (30.0, 55.0))}).around(ROBOT_M)
-    assert (asked.grid.x, asked.grid.y) == ((-41.25, 160.0), (-40.0, 55.0))
-    assert asked.areas == (((-41.1, 0.0), (30.0, 55.0)), (asked.grid.x, asked.grid.y))
+    assert (asked.grid.x_m, asked.grid.y_m) == ((-41.25, 160.0), (-40.0, 55.0))
+    assert asked.areas == (((-41.1, 0.0), (30.0, 55.0)), (asked.grid.x_m, asked.grid.y_m))
 
 
 def test_a_region_beyond_a_grid_that_was_given_is_refused():
@@ -125,9 +125,9 @@ def test_more_cells_than_there_is_memory_for_are_refused_in_one_line():
 
 
 def test_the_sides_are_named_by_their_reach():
-    names = [region.name for region in near_field_regions((-1.0, 1.0), (-1.0, 1.0), reach_m=1.5)]
+    names = [region.name for region in build_near_field_regions((-1.0, 1.0), (-1.0, 1.0), distance_m=1.5)]
     assert names == ["front_1.5m", "rear_1.5m", "left_1.5m", "right_1.5m"]
-    assert math.prod(near_field_regions((-1.0, 1.0), (-1.0, 1.0))[2].x) == -1.0
+    assert math.prod(build_near_field_regions((-1.0, 1.0), (-1.0, 1.0))[2].x_m) == -1.0
 
 
 # Rooms.

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from torchcover.geometry import rigid, rotation_from_euler
+from torchcover.geometry import build_transform, convert_euler_to_rotation
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation import Pose
 from torchcover.simulation.bodies import in_vehicle_frame
@@ -23,7 +23,7 @@ def box(*size_m):
 
 def world(origin_m=(0, 0, 0), yaw_deg=0.0, moving=True, ego_moves=False):
     """A wall 10 m ahead of the start, a car 6 m to the left that drives at 2 m/s, an ego that may drive at 1 m/s."""
-    place = rigid(rotation_from_euler(yaw_deg, 0, 0), origin_m)
+    place = build_transform(convert_euler_to_rotation(yaw_deg, 0, 0), origin_m)
 
     def along(start, way):
         ends = np.array([start, np.add(start, way)], dtype=float)

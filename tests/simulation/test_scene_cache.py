@@ -76,7 +76,7 @@ def test_a_world_from_disk_is_the_one_that_was_built_and_shares_its_bodies(disk,
 
 
 def test_actors_that_share_a_mesh_share_it_again(tmp_path):
-    mesh, way = Box(type="box", size_m=(4, 2, 1.5)).mesh(), Trajectory.resting([9.0, 0.0, 0.0])
+    mesh, way = Box(type="box", size_m=(4, 2, 1.5)).mesh(), Trajectory.create_static([9.0, 0.0, 0.0])
     ego, *actors = (Actor(name, "car", mesh, way) for name in ("ego", "a", "b"))
     world = World((), ego, tuple(actors))
     np.savez(tmp_path / "a.npz", **encode_scene("a", world, {}))

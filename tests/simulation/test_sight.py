@@ -116,9 +116,9 @@ def test_a_hit_lies_on_the_face_that_it_says_at_the_angle_that_it_says(ego_moves
     scene, time_s = Scene(replace(made, static=(bar, ground), actors=(car,), ego=ego)), 3.0
     scan = afresh(scene.at(3))
     struck, origin = scan.struck(), LIDAR.mount.matrix()[:3, 3]
-    vehicle_T_world = invert(ego.trajectory.at(time_s))
+    vehicle_T_world = invert(ego.trajectory.interpolate(time_s))
     there = {0: bar.moved(vehicle_T_world), 1: ground.moved(vehicle_T_world)}
-    there[2] = car.mesh.moved(vehicle_T_world @ car.trajectory.at(time_s))
+    there[2] = car.mesh.moved(vehicle_T_world @ car.trajectory.interpolate(time_s))
     # Resting bodies before what never was one, which is before those that move.
     of_body = {(False, False): [-1, 2, 0, 1], (False, True): [-1, 0, 1, 2], (True, True): [0, 1, -1, 2]}
     number = np.array(of_body[ego_moves, actor_moves])[struck.body]

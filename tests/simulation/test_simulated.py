@@ -120,12 +120,12 @@ def test_range_noise_is_along_the_ray_and_has_its_standard_deviation():
     exact = SimulatedFrames(scenario(), lidar(), steps=1, reference_sensor=SMALL)[0].sensor
     frame = SimulatedFrames(scenario(), lidar(range_noise_m=0.05), steps=1, reference_sensor=SMALL)[0]
     assert torch.equal(frame.sensor, exact)
-    exact, noisy = exact.double(), frame.landed().double()
+    exact, noisy = exact.double(), frame.get_measured_points().double()
     origin = torch.tensor([0.0, 0.0, 1.8]).double()
     ray = (exact - origin) / (exact - origin).norm(dim=1, keepdim=True)
     along = ((noisy - exact) * ray).sum(dim=1)
     assert ((noisy - exact) - along[:, None] * ray).abs().max() < 1e-5
-    torch.testing.assert_close(frame.measured["r"].error_m.double(), along, rtol=0, atol=1e-5)
+    torch.testing.assert_close(frame.measurements["r"].error_m.double(), along, rtol=0, atol=1e-5)
     assert along.std() == pytest.approx(0.05, rel=0.06)
     assert abs(along.mean()) < 4 * 0.05 / len(along) ** 0.5
 

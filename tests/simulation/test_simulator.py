@@ -97,4 +97,4 @@ def test_the_egos_box_is_that_of_a_world_of_the_scenario(name):
         scenario = scenario.model_copy(update={"traffic": scenario.traffic.model_copy(update={"duration_s": 1.0})})
     ego = scenario.world(seed=3, episode=1).ego.mesh
     np.testing.assert_array_equal(scenario.ego_mesh().vertices_m, ego.vertices_m)
-    assert scenario.ego_box() == BoundingBox.around(ego.vertices_m)
+    assert scenario.ego_box() == BoundingBox.from_points(ego.vertices_m)

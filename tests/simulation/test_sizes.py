@@ -85,8 +85,8 @@ def test_more_rays_than_there_is_memory_for_are_refused_before_they_are_made(sma
 
 def test_more_steps_and_bodies_than_there_is_memory_for_are_refused(small):
     mesh = Box(type="box", size_m=(4, 2, 1)).mesh()
-    ego = Actor("ego", "ego", mesh, Trajectory.resting((0, 0, 0)))
-    cars = tuple(Actor(f"car {k}", "car", mesh, Trajectory.resting((9.0 * k, 9, 0))) for k in range(3))
+    ego = Actor("ego", "ego", mesh, Trajectory.create_static((0, 0, 0)))
+    cars = tuple(Actor(f"car {k}", "car", mesh, Trajectory.create_static((9.0 * k, 9, 0))) for k in range(3))
     with pytest.raises(ValueError, match=r"500,001 time steps of 4 bodies: 0.192 GB of memory are needed"):
         Scene(World((), ego, cars, time_step_s=0.1, duration_s=50_000.0))
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from torchcover.geometry import rigid
+from torchcover.geometry import build_transform
 from torchcover.simulation import SurfaceReference, shapes
 from torchcover.simulation.local_ground import GroundSquares, level_faces
 from torchcover.simulation.patches import Bounds, Patches, outward_faces
@@ -64,8 +64,8 @@ def test_what_is_wrong_is_said_with_the_name_and_the_share():
 
 def test_faces_coincide_with_what_looks_the_same_way():
     plane, cube = Plane(type="plane", size_m=(30, 30)).mesh(), CUBE
-    decal = Plane(type="plane", size_m=(0.5, 0.5)).mesh().moved(rigid(np.eye(3), [9, 9, 5e-4]))
-    far = decal.moved(rigid(np.eye(3), [0, 0, 2e-3]))
+    decal = Plane(type="plane", size_m=(0.5, 0.5)).mesh().moved(build_transform(np.eye(3), [9, 9, 5e-4]))
+    far = decal.moved(build_transform(np.eye(3), [0, 0, 2e-3]))
 
     def counts(*meshes):
         return [int(mask.sum()) for mask in coincident_faces(meshes, [False] * len(meshes))]

@@ -62,11 +62,11 @@ def test_surface_without_ground_below_it_is_counted_and_changes_no_number(at, tm
     pairs = list(zip(seen, in_no_band, strict=True))
     agrees(np.array([step.reference_weights[mask].astype(np.float64).sum() for step, mask in pairs]), m2, within=0.05)
     metric = CoverageMetric(
-        BevGrid(x=AHEAD[0], y=AHEAD[1], cell=1.0, heights={"all": (-3.0, 3.0)}, band_frame="ground")
+        BevGrid(x_m=AHEAD[0], y_m=AHEAD[1], cell_m=1.0, heights={"all": (-3.0, 3.0)}, band_frame="ground")
     )
     for step in seen:
         clouds = torch.zeros(1, 3), torch.from_numpy(step.reference)
-        metric.update(*clouds, height=torch.from_numpy(step.reference_heights_m))
+        metric.update(*clouds, heights_m=torch.from_numpy(step.reference_heights_m))
     assert metric.compute().counts["no_ground_points"] == sum(map(int, map(np.sum, in_no_band))) > 0
     without = Simulator(scenario(floor), {}, sensor)
     if m2 == 4.0 and pit[0][0][2] < 0:  # nothing of the floor is hidden, and no number of the floor is drawn otherwise
@@ -210,7 +210,7 @@ def test_threads_workers_and_pickling_change_nothing():
             assert torch.equal(frame.sensor, other.sensor)
             assert torch.equal(frame.reference, other.reference)
             assert torch.equal(frame.reference_weights, other.reference_weights)
-            assert torch.equal(frame.boxes.drawn_points, other.boxes.drawn_points)
+            assert torch.equal(frame.boxes.sampled_points, other.boxes.drawn_points)
             assert frame.counts == other.counts
 
 

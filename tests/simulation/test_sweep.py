@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from torchcover.geometry import invert, transform
+from torchcover.geometry import invert, transform_points
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation import CameraSensor, Draws, Lidar, Pose
 from torchcover.simulation.bodies import in_vehicle_frame
@@ -62,7 +62,7 @@ def test_each_column_is_that_of_a_scan_at_its_own_time(ego_mps, cars_mps, turn_d
     np.testing.assert_array_equal(raw.points, seen.points)
     fine = Scene(world(ego_mps, cars_mps, turn_deg, step_s=STEP_S))
     now, at_once = round(0.5 / STEP_S), LIDAR.model_copy(update={"scan": None})
-    world_T_now = made.ego.trajectory.at(0.5)
+    world_T_now = made.ego.trajectory.interpolate(0.5)
     compared = moved = 0
     for column in range(COLUMNS):
         step = now - 2 * (COLUMNS - column) + 1
@@ -73,14 +73,16 @@ def test_each_column_is_that_of_a_scan_at_its_own_time(ego_mps, cars_mps, turn_d
         np.testing.assert_allclose(seen.range_m[mine], there.range_m[own], rtol=1e-4, atol=2e-3)
         np.testing.assert_allclose(raw.landed[mine], there.points[own], atol=5e-3)
         struck = then.scan(at_once.mount.matrix(), mounted.tiles, max_range_m=60).struck()
-        now_T_then = invert(world_T_now) @ made.ego.trajectory.at(time_s)
-        true = transform(now_T_then, there.points[own])
+        now_T_then = invert(world_T_now) @ made.ego.trajectory.interpolate(time_s)
+        true = transform_points(now_T_then, there.points[own])
         np.testing.assert_allclose((seen.points if seen.landed is None else seen.landed)[mine], true, atol=5e-3)
-        others = [actor for actor in made.actors if actor.trajectory.moves]
+        others = [actor for actor in made.actors if actor.trajectory.is_moving]
         for actor, number in zip(others, [body for body in then.moving.body if body != then.ego], strict=True):
             on_body, trajectory = struck.body[own] == number, actor.trajectory
-            travelled = invert(world_T_now) @ trajectory.at(0.5) @ invert(trajectory.at(time_s)) @ world_T_now
-            true[on_body] = transform(travelled, true[on_body])
+            travelled = (
+                invert(world_T_now) @ trajectory.interpolate(0.5) @ invert(trajectory.interpolate(time_s)) @ world_T_now
+            )
+            true[on_body] = transform_points(travelled, true[on_body])
             moved += int(on_body.sum())
         np.testing.assert_allclose(seen.points[mine], true, atol=5e-3)
         compared += len(true)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from torchcover import Scenario
-from torchcover.geometry import rotation_from_euler
+from torchcover.geometry import convert_euler_to_rotation
 from torchcover.recordings.formats.tracks import read_trajectory
 from torchcover.simulation import Pose
 from torchcover.simulation.rays import into_tiles, unit_directions
@@ -26,9 +26,9 @@ def write(folder, content, name="track.csv"):
 
 def test_a_csv_is_read_in_any_order_of_columns_whatever_else_is_in_it(tmp_path):
     path = write(tmp_path, "yaw, t, x, note, y, z, roll, pitch\n90, 0, 1, a, 2, 3, 10, 20\n90, 1, 1,, 2, 3, 10, 20\n")
-    pose = read_trajectory(path).at(0.5)
+    pose = read_trajectory(path).interpolate(0.5)
     np.testing.assert_allclose(pose[:3, 3], [1, 2, 3])
-    np.testing.assert_allclose(pose[:3, :3], rotation_from_euler(90, 20, 10), atol=1e-12)
+    np.testing.assert_allclose(pose[:3, :3], convert_euler_to_rotation(90, 20, 10), atol=1e-12)
 
 
 @pytest.mark.parametrize("unit", ["rad", "deg"])
@@ -62,7 +62,7 @@ def test_poses_are_read(tmp_path):
     np.savez(tmp_path / "p.npz", times_s=np.arange(4.0), world_T_body=poses)
     track = read_trajectory(tmp_path / "p.npz")
     for k in range(4):
-        np.testing.assert_allclose(track.at(k), poses[k], atol=1e-12)
+        np.testing.assert_allclose(track.interpolate(k), poses[k], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -108,7 +108,10 @@ def scenario_at(folder, ego_s, actor_s, boxes_s):
 @pytest.mark.parametrize("start_s", [0, UNIX_S, 1e5])
 def test_trajectories_of_another_clock_move_alike(tmp_path, start_s):
     world = scenario_at(tmp_path, start_s, start_s + 1, start_s).world()
-    places_m = [actor.trajectory.positions_at(np.array([0.0, 1.5, 3.0]))[:, 0] for actor in (world.ego, *world.actors)]
+    places_m = [
+        actor.trajectory.interpolate_positions_m(np.array([0.0, 1.5, 3.0]))[:, 0]
+        for actor in (world.ego, *world.actors)
+    ]
     np.testing.assert_allclose(places_m, [[0, 3, 6], [0, 1.5, 6], [0, 6, 12]], atol=1e-5)
 
 
@@ -161,8 +164,8 @@ def test_recorded_boxes_become_actors_that_come_and_go(tmp_path):
     a, b = read_boxes(write(tmp_path, BOXES + "\n".join(rows)))
     assert (a.name, a.category, b.name, b.category) == ("a", "car", "b", "truck")
     np.testing.assert_allclose(np.ptp(a.mesh.vertices_m, axis=0), [4, 2, 1.5])
-    np.testing.assert_allclose(a.trajectory.at(1.5)[:3, 3], [6.5, 0, 0])
-    np.testing.assert_allclose(b.trajectory.at(1.0)[:3, 0], [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(a.trajectory.interpolate(1.5)[:3, 3], [6.5, 0, 0])
+    np.testing.assert_allclose(b.trajectory.interpolate(1.0)[:3, 0], [0, 1, 0], atol=1e-12)
 
 
 @pytest.mark.parametrize(

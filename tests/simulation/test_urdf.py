@@ -129,7 +129,9 @@ def test_meshes_of_a_package_are_found_around_the_file_or_where_it_is_told(tmp_p
         (root / "urdf").mkdir()
         trimesh.creation.box((1, 2, 3)).export(root / "meshes" / "m.stl")
         (root / file).write_text(urdf)
-        assert BoundingBox.around(read_robot(root / file, packages).body.vertices_m).size_m == pytest.approx((1, 2, 3))
+        assert BoundingBox.from_points(read_robot(root / file, packages).body.vertices_m).size_m == pytest.approx(
+            (1, 2, 3)
+        )
 
 
 def test_what_a_sensor_is_built_into_is_left_out_and_the_largest_body_stays(robot_of):

@@ -55,16 +55,16 @@ def raster():
 
 def between_corners(dtype=None):
     field, places_m = raster()
-    cells = (places_m.astype(np.longdouble) - field.lower_m) / field.cell_m
+    cells = (places_m.astype(np.longdouble) - field.origin_m) / field.cell_m
     (column, row), (x, y) = np.floor(cells).astype(int).T, (cells % 1).T
-    first, right, above, across = (field.corners_m[row + j, column + i].astype(np.longdouble)
+    first, right, above, across = (field.corner_heights_m[row + j, column + i].astype(np.longdouble)
                                    for i, j in ((0, 0), (1, 0), (0, 1), (1, 1)))  # fmt: skip
     low, high = first + x * (right - first) + y * (across - right), first + y * (above - first) + x * (across - above)
     if dtype is None:
-        found_m = field.heights_m(places_m)
+        found_m = field.compute_heights_m(places_m)
     else:
-        narrow = HeightField(field.lower_m.astype(dtype), field.corners_m.astype(dtype), field.cell_m)
-        found_m = narrow.heights_m(places_m.astype(dtype))
+        narrow = HeightField(field.origin_m.astype(dtype), field.corner_heights_m.astype(dtype), field.cell_m)
+        found_m = narrow.compute_heights_m(places_m.astype(dtype))
     return most(found_m - np.where(x >= y, low, high))
 
 

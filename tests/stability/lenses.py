@@ -48,7 +48,7 @@ def image_error_px(model, pixels, rays):
 
 
 def our_rays(model, pixels):
-    return folding(model).compute_rays(pixels)[0]
+    return folding(model).rays(pixels)[0]
 
 
 def inside_fold(model, inverse):
@@ -99,7 +99,7 @@ def sideways():
 
 def fisheye_angles():
     pixels, off_axis = sideways()
-    rays = WIDE.compute_rays(pixels)[0].numpy()
+    rays = WIDE.rays(pixels)[0].numpy()
     return most(np.arctan2(rays[:, 0], rays[:, 2]) - off_axis)
 
 

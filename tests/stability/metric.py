@@ -22,7 +22,7 @@ LAST_EDGE_M = CELLS / 10
 
 
 def row_of_cells(count, cell=1.0, x=0.0):
-    return BevGrid(x=(x, x + count * cell), y=(0.0, cell), cell=cell, heights=ANY_HEIGHT)
+    return BevGrid(x_m=(x, x + count * cell), y_m=(0.0, cell), cell_m=cell, heights=ANY_HEIGHT)
 
 
 def merged(metric, times):
@@ -160,7 +160,7 @@ def heights_at_borders():
 
 def bands(search):
     z, expected = heights_at_borders()
-    metric = search.metric(BevGrid(x=(0.0, 10.0), y=(0.0, 1.0), cell=1.0, heights=HEIGHTS))
+    metric = search.metric(BevGrid(x_m=(0.0, 10.0), y_m=(0.0, 1.0), cell_m=1.0, heights=HEIGHTS))
     reference = np.stack([np.arange(10) + 0.5, np.full(10, 0.5), z], axis=1)
     metric.update(search.cloud([0.0, 0.0, 0.0]), search.cloud(reference, torch.float64))
     points = metric.compute().points[:, 0].T.tolist()
@@ -183,7 +183,7 @@ def region_cells(search):
     found = metric.compute()
     for first in range(CELLS - 2):
         low, high = (2 * first + 1) / 20, (2 * first + 5) / 20
-        rows = found.summary([Region("part", x=(low, high), y=(0.0, 0.1))])
+        rows = found.summary([Region("part", x_m=(low, high), y_m=(0.0, 0.1))])
         wrong_cells += abs(rows[0].cells - 2)
     return wrong_cells
 
@@ -236,7 +236,7 @@ def at_thresholds():
 
 def detections(search):
     reference, sensor = at_thresholds()
-    grid = BevGrid(x=(0.0, 16.0 * CELLS), y=(0.0, 16.0), cell=16.0, heights={"all": (-1.0, 9.0)})
+    grid = BevGrid(x_m=(0.0, 16.0 * CELLS), y_m=(0.0, 16.0), cell_m=16.0, heights={"all": (-1.0, 9.0)})
     metric = search.metric(grid, thresholds=THRESHOLDS_M)
     metric.update(search.cloud(sensor), search.cloud(reference))
     found = metric.compute().detection[:, 0, 0].diagonal()
@@ -272,8 +272,8 @@ def without_the_largest():
 
 def left_out(_):
     m2, sums = map(torch.from_numpy, lopsided_blocks())
-    estimate = Estimate.of_ratios((RADIUS,), m2, sums[:, None], torch.ones(256, dtype=torch.int64))
-    return relative(estimate.left_out[100].item(), without_the_largest())
+    estimate = Estimate.from_ratios((RADIUS,), m2, sums[:, None], torch.ones(256, dtype=torch.int64))
+    return relative(estimate.jackknife_values[100].item(), without_the_largest())
 
 
 def left_out_by_differences():

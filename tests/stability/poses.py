@@ -8,12 +8,12 @@ import torch
 
 from torchcover.cameras import Camera
 from torchcover.geometry import (
-    euler_from_rotation,
+    build_transform,
+    convert_euler_to_rotation,
+    convert_quaternion_to_rotation,
+    convert_rotation_to_euler,
     invert,
-    rigid,
-    rotation_from_euler,
-    rotation_from_quaternion,
-    transform,
+    transform_points,
 )
 from torchcover.geometry.trajectory import Trajectory
 
@@ -32,17 +32,17 @@ STEEP = (90.0, -90.0, 90.0 - 3e-8, 90.0 - 1e-7, 1e-7 - 90.0, 90.0 - 1e-5)
 def steep_rotations():
     """Rotations pitched by +-90 degrees and nearly so, as products of others: with the rounding of real ones."""
     generator = np.random.default_rng(0)
-    turns = [rotation_from_euler(*generator.uniform(-180, 180, 3)) for _ in range(200)]
+    turns = [convert_euler_to_rotation(*generator.uniform(-180, 180, 3)) for _ in range(200)]
     yaw_roll = generator.uniform(-180, 180, size=(200, 2))
     return [
-        turn @ (turn.T @ rotation_from_euler(yaw, pitch, roll))
+        turn @ (turn.T @ convert_euler_to_rotation(yaw, pitch, roll))
         for turn, (yaw, roll) in zip(turns, yaw_roll, strict=True)
         for pitch in STEEP
     ]
 
 
 def steep(euler):
-    return max(as_angle(rotation_from_euler(*euler(rotation)), rotation) for rotation in steep_rotations())
+    return max(as_angle(convert_euler_to_rotation(*euler(rotation)), rotation) for rotation in steep_rotations())
 
 
 def euler_by_the_book(r):
@@ -58,20 +58,22 @@ def between_steep(between):
     """A body that pitches through the vertical, on the way from one pose to another."""
     worst = 0.0
     for (first, last), (yaw, roll) in product(PITCHES, ((0.0, 0.0), (170.0, -30.0), (-90.0, 179.0))):
-        ends = [rotation_from_euler(yaw, pitch, roll) for pitch in (first, last)]
+        ends = [convert_euler_to_rotation(yaw, pitch, roll) for pitch in (first, last)]
         for share in (0.0, 0.1, 0.5, 0.9):
-            expected = rotation_from_euler(yaw, first + share * (last - first), roll)
+            expected = convert_euler_to_rotation(yaw, first + share * (last - first), roll)
             worst = max(worst, as_angle(between(ends, share), expected))
     return worst
 
 
 def on_a_trajectory(ends, share):
-    return Trajectory.from_poses([0.0, 1.0], np.stack([rigid(end, np.zeros(3)) for end in ends])).at(share)[:3, :3]
+    return Trajectory.from_poses([0.0, 1.0], np.stack([build_transform(end, np.zeros(3)) for end in ends])).interpolate(
+        share
+    )[:3, :3]
 
 
 def angle_by_angle(ends, share):
-    first, last = (euler_from_rotation(end) for end in ends)
-    return rotation_from_euler(*(first + share * ((last - first + 180.0) % 360.0 - 180.0)))
+    first, last = (convert_rotation_to_euler(end) for end in ends)
+    return convert_euler_to_rotation(*(first + share * ((last - first + 180.0) % 360.0 - 180.0)))
 
 
 def quaternions(of):
@@ -91,12 +93,12 @@ def quaternion_by_norm(wxyz):
 @lru_cache
 def far_pose(offset_m):
     points = np.random.default_rng(1).uniform(-80, 80, size=(500, 3))
-    return rigid(rotation_from_euler(37.0, 2.0, -1.0), [offset_m, -offset_m, 300.0]), points
+    return build_transform(convert_euler_to_rotation(37.0, 2.0, -1.0), [offset_m, -offset_m, 300.0]), points
 
 
 def there_and_back(offset_m):
     world_T_vehicle, points = far_pose(offset_m)
-    return most(transform(invert(world_T_vehicle), transform(world_T_vehicle, points)) - points)
+    return most(transform_points(invert(world_T_vehicle), transform_points(world_T_vehicle, points)) - points)
 
 
 def there_and_back_in_float32(offset_m):
@@ -109,9 +111,11 @@ def there_and_back_in_float32(offset_m):
 @lru_cache
 def camera_cloud():
     """A camera on a vehicle, points within 100 m of it, float32, and where they are in the vehicle frame."""
-    camera = Camera.from_fov(10, 10, 90.0, vehicle_T_camera=rigid(rotation_from_euler(30.0, 20.0, 10.0), [1, 2, 3]))
+    camera = Camera.from_fov(
+        10, 10, 90.0, vehicle_T_camera=build_transform(convert_euler_to_rotation(30.0, 20.0, 10.0), [1, 2, 3])
+    )
     points = torch.from_numpy(np.random.default_rng(2).uniform(-100, 100, size=(1000, 3))).float()
-    return camera, points, transform(camera.vehicle_T_camera, points.double().numpy())
+    return camera, points, transform_points(camera.vehicle_T_camera, points.double().numpy())
 
 
 def moved_under_autocast(move):
@@ -127,11 +131,11 @@ def moved_by_product(camera, points):
 
 CASES = [
     Case("pitch of +-90 degrees and 3e-8 beside, to angles and back", "the same rotation", "rad", 2e-9,
-         partial(steep, euler_from_rotation), "each angle on its own", partial(steep, euler_by_the_book)),
+         partial(steep, convert_rotation_to_euler), "each angle on its own", partial(steep, euler_by_the_book)),
     Case("between poses pitched by 60 to 120 degrees", "closed form", "rad", 1e-9,
          partial(between_steep, on_a_trajectory), "each angle on its own", partial(between_steep, angle_by_angle)),
     Case("quaternions of length 1e-300 to 1e300", "the same rotation", "rad", 1e-15,
-         partial(quaternions, rotation_from_quaternion), "divided by its norm",
+         partial(quaternions, convert_quaternion_to_rotation), "divided by its norm",
          partial(quaternions, quaternion_by_norm)),
     Case("there and back, 1e7 m from the origin", "the same points", "m", 1e-8, partial(there_and_back, 1e7),
          "float32", partial(there_and_back_in_float32, 1e7)),

@@ -8,7 +8,7 @@ import torch
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from torchcover.geometry import rigid, rotation_from_euler, transform
+from torchcover.geometry import build_transform, convert_euler_to_rotation, transform_points
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.rays import Balls, into_tiles, unit_directions
@@ -31,7 +31,7 @@ def plane(*size_m):
 
 
 def at(*position_m):
-    return rigid(np.eye(3), position_m)
+    return build_transform(np.eye(3), position_m)
 
 
 @lru_cache
@@ -88,7 +88,7 @@ def missed(range_m):
 def far_room(offset_m):
     """Walls at UTM-like coordinates, and a vehicle among them."""
     here = np.array([offset_m, -offset_m, 0.0])
-    ego = Actor("ego", "car", box(0.1, 0.1, 0.1), Trajectory.resting(here))
+    ego = Actor("ego", "car", box(0.1, 0.1, 0.1), Trajectory.create_static(here))
     return World(static=(box(*ROOM_M).moved(at(*here)),), ego=ego)
 
 
@@ -136,8 +136,8 @@ def grazing(caster):
 @lru_cache
 def tilted_floor_and_ceiling():
     """Two planes 3 m apart in general position, places on the lower one, directions away from it, and the ranges."""
-    rotation = rotation_from_euler(37.0, 21.0, -13.0)
-    floor_T = rigid(rotation, [1.0, 2.0, 3.0])
+    rotation = convert_euler_to_rotation(37.0, 21.0, -13.0)
+    floor_T = build_transform(rotation, [1.0, 2.0, 3.0])
     floor = plane(200.0, 200.0).moved(floor_T)
     ceiling = plane(4000.0, 4000.0).moved(floor_T @ at(0.0, 0.0, 3.0))
     generator = np.random.default_rng(3)
@@ -145,7 +145,7 @@ def tilted_floor_and_ceiling():
     towards = directions(500).astype(np.float64)
     towards[2] = np.abs(towards[2]) + 0.01
     towards = (rotation @ (towards / np.linalg.norm(towards, axis=0))).astype(np.float32)
-    return (floor, ceiling), transform(floor_T, places), towards, 3.0 / (rotation[:, 2] @ towards)
+    return (floor, ceiling), transform_points(floor_T, places), towards, 3.0 / (rotation[:, 2] @ towards)
 
 
 def from_a_surface(caster):
@@ -159,8 +159,10 @@ def along_a_surface(caster):
     """Rays that leave a plane in general position at slopes of 0.1 to 1e-5, and hit it."""
     generator, found = np.random.default_rng(5), 0
     for _ in range(100):
-        floor_T = rigid(rotation_from_euler(*generator.uniform(-60, 60, 3)), generator.uniform(-50, 50, 3))
-        place = transform(floor_T, np.append(generator.uniform(-90, 90, 2), 0.0)[None])[0]
+        floor_T = build_transform(
+            convert_euler_to_rotation(*generator.uniform(-60, 60, 3)), generator.uniform(-50, 50, 3)
+        )
+        place = transform_points(floor_T, np.append(generator.uniform(-90, 90, 2), 0.0)[None])[0]
         slope, azimuth = np.geomspace(0.1, 1e-5, 100), generator.uniform(0, 2 * np.pi, 100)
         flat = np.sqrt(1 - slope**2)
         towards = floor_T[:3, :3] @ np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), slope])
@@ -183,10 +185,12 @@ def between_slabs(held):
     generator, lost = np.random.default_rng(6), 0
     slabs = box(20.0, 20.0, 1.0), box(20.0, 20.0, 2.0).moved(at(0, 0, 1.0)), box(24.0, 16.0, 1.0).moved(at(0, 0, 3.0))
     for scale_m in np.repeat([1e-6, 1.0, 1e6], 200):
-        turn = rigid(rotation_from_euler(*generator.uniform(-180, 180, 3)), generator.uniform(-50, 50, 3))
+        turn = build_transform(
+            convert_euler_to_rotation(*generator.uniform(-180, 180, 3)), generator.uniform(-50, 50, 3)
+        )
         moved = [mesh.moved(turn) for mesh in slabs]
         caster = RayCaster([Mesh(mesh.vertices_m * scale_m, mesh.faces) for mesh in moved])
-        place_m = transform(turn, np.append(generator.uniform(-6, 6, 2), generator.uniform(1.1, 2.9))[None])[0]
+        place_m = transform_points(turn, np.append(generator.uniform(-6, 6, 2), generator.uniform(1.1, 2.9))[None])[0]
         lost += not held(caster, place_m * scale_m)
     return lost
 
@@ -209,7 +213,9 @@ def around_and_ahead():
     """A turn of 40 rows, and a narrow field of view, as tiles; and where they are mounted."""
     turn = unit_directions(np.linspace(-60.0, 60.0, 40)[:, None], np.linspace(-180.0, 180.0, 180)[None])
     ahead = unit_directions(np.linspace(-0.01, 0.01, 16)[:, None], np.linspace(-0.01, 0.01, 16)[None])
-    return (*into_tiles(turn), *into_tiles(ahead)), rigid(rotation_from_euler(37.0, 11.0, -8.0), [1.7, -0.4, 1.9])
+    return (*into_tiles(turn), *into_tiles(ahead)), build_transform(
+        convert_euler_to_rotation(37.0, 11.0, -8.0), [1.7, -0.4, 1.9]
+    )
 
 
 def spared(met_by):
@@ -223,7 +229,7 @@ def spared(met_by):
             for radius_m in (1e-9, 0.2, 2.0, 0.999 * distance_m):
                 # Ahead, behind, and beside the sensor.
                 for towards in (rays[0], -rays[0], np.roll(rays[0], 1)):
-                    centre_m = transform(vehicle_T_sensor, (towards * distance_m).astype(np.float64)[None])
+                    centre_m = transform_points(vehicle_T_sensor, (towards * distance_m).astype(np.float64)[None])
                     way_m = (centre_m[0] - vehicle_T_sensor[:3, 3]).astype(np.longdouble) @ vehicle_T_sensor[:3, :3]
                     along_m = np.maximum(rays @ way_m, 0.0)
                     through = np.sqrt(((along_m[:, None] * rays - way_m) ** 2).sum(axis=1)) <= radius_m
@@ -243,14 +249,14 @@ def met_by_cosine(balls, tile, vehicle_T_sensor):
 def slope_from(offset_m):
     """A slope of 400 m in general position at UTM-like coordinates, under an ego."""
     here = np.array([offset_m, -offset_m, 0.0])
-    slope = plane(400.0, 400.0).moved(rigid(rotation_from_euler(37.0, 11.0, -8.0), [*here[:2], -3.0]))
-    return World(static=(slope,), ego=Actor("ego", "car", box(0.1, 0.1, 0.1), Trajectory.resting(here)))
+    slope = plane(400.0, 400.0).moved(build_transform(convert_euler_to_rotation(37.0, 11.0, -8.0), [*here[:2], -3.0]))
+    return World(static=(slope,), ego=Actor("ego", "car", box(0.1, 0.1, 0.1), Trajectory.create_static(here)))
 
 
 def incidence(cosine):
     """Off the cosine of the incidence of rays that meet the slope."""
     downwards = directions(5000) * -np.sign(directions(5000)[2])
-    normal = rotation_from_euler(37.0, 11.0, -8.0)[:, 2]
+    normal = convert_euler_to_rotation(37.0, 11.0, -8.0)[:, 2]
     expected = np.abs(normal @ downwards.astype(np.float64))
     return most((cosine(downwards) - expected)[expected > 0.02])
 
@@ -260,7 +266,7 @@ def incidence_ours(towards):
     scan = Scene(slope_from(1e6 + 0.3)).at(0).scan(at(0.0, 0.0, 2.0), [tile])
     cosine = np.full(towards.shape[1], np.nan)
     cosine[scan.ray] = scan.struck().cos_incidence
-    return np.where(np.isnan(cosine), np.abs(rotation_from_euler(37.0, 11.0, -8.0)[:, 2] @ towards), cosine)
+    return np.where(np.isnan(cosine), np.abs(convert_euler_to_rotation(37.0, 11.0, -8.0)[:, 2] @ towards), cosine)
 
 
 def incidence_in_float32(towards):
@@ -275,14 +281,16 @@ def turning(samples):
     turn = Trajectory.from_arrays([0.0, 1.0], [[0.0, 0.0, 0.0], [20.0, 0.0, 0.0]], [[0.0] * 3, [90.0, 0.0, 0.0]])
     times_s = np.linspace(0.2, 0.3, 101)
     samples_s = np.linspace(0.2, 0.3, samples)
-    poses = np.stack([turn.at(each) for each in samples_s])
+    poses = np.stack([turn.interpolate(each) for each in samples_s])
     if samples == 3:
         found = np.tensordot(parabola_weights(samples_s, times_s), poses, 1)
     else:
         share = ((times_s - 0.2) / 0.1)[:, None, None]
         found = (1 - share) * poses[0] + share * poses[1]
     corner = np.array([100.0, 0.0, 0.0, 1.0])
-    return most(np.linalg.norm(np.stack([turn.at(each) for each in times_s]) @ corner - found @ corner, axis=1))
+    return most(
+        np.linalg.norm(np.stack([turn.interpolate(each) for each in times_s]) @ corner - found @ corner, axis=1)
+    )
 
 
 def ours(bodies, origin_m, towards, device=None):

@@ -7,8 +7,8 @@ import numpy as np
 import torch
 
 from torchcover.estimation import Estimate, Quantity
-from torchcover.estimation.errors import jackknife_error
-from torchcover.metrics.blocks import added_up
+from torchcover.estimation.errors import compute_jackknife_error
+from torchcover.metrics.blocks import sum_rows
 
 from .case import Case, most, relative
 
@@ -30,7 +30,7 @@ def of_one_cell():
 
 def one_cell():
     rows = torch.from_numpy(np.stack([np.full(ROWS, LARGEST_KEY - 1.0), of_one_cell()], axis=1))
-    ((key, total),) = added_up(rows).tolist()
+    ((key, total),) = sum_rows(rows).tolist()
     return relative(total, fsum(of_one_cell().tolist())) if key == LARGEST_KEY - 1 else np.inf
 
 
@@ -63,7 +63,7 @@ def unlike_dense(found):
 
 def keys_in_float32():
     rows = torch.from_numpy(extreme_rows())
-    return added_up(torch.cat([rows[:, :1].float().double(), rows[:, 1:]], dim=1), 1)
+    return sum_rows(torch.cat([rows[:, :1].float().double(), rows[:, 1:]], dim=1), 1)
 
 
 # Mixtures
@@ -79,10 +79,10 @@ def strata(scales):
 def mixture(weights, scales):
     ones = torch.ones(16, dtype=torch.float64)
     each = [
-        Estimate.of_ratios((RADIUS,), ones, torch.from_numpy(worlds)[:, None], ones.long())
+        Estimate.from_ratios((RADIUS,), ones, torch.from_numpy(worlds)[:, None], ones.long())
         for worlds in strata(tuple(scales))
     ]
-    return Estimate.mixed(list(zip(weights, each, strict=True)))
+    return Estimate.from_strata(list(zip(weights, each, strict=True)))
 
 
 def longdouble_error(weights, scales):
@@ -108,7 +108,7 @@ def error_without_squares(case):
 
 def freedom(case):
     """As whole numbers, which a rounding just below must not make one less."""
-    return abs(mixture(*case).freedom[0] - int(longdouble_error(*case)[1] + 1e-9))
+    return abs(mixture(*case).degrees_of_freedom[0] - int(longdouble_error(*case)[1] + 1e-9))
 
 
 def freedom_of_all_worlds(case):
@@ -141,16 +141,16 @@ def jackknife(error_of):
 
 
 def jackknife_in_float32(left_out, whole, steps):
-    return jackknife_error(left_out.float(), whole.float(), steps.float())
+    return compute_jackknife_error(left_out.float(), whole.float(), steps.float())
 
 
 CASES = [
     Case("1,000,000 rows of one cell, of 1e-8 to 1e8", "math.fsum", "relative", 1e-11, one_cell,
          "float32 running sum", one_cell_in_float32),
     Case("sums and maxima of cells with keys up to 2^53", "a dense float64 array", "of 800 wrong", 0,
-         lambda: unlike_dense(added_up(torch.from_numpy(extreme_rows()), 1)),
+         lambda: unlike_dense(sum_rows(torch.from_numpy(extreme_rows()), 1)),
          "float32 keys", lambda: unlike_dense(keys_in_float32())),
-    Case("error of 512 blocks that differ by 1e-6", "longdouble", "relative", 1e-7, partial(jackknife, jackknife_error),
+    Case("error of 512 blocks that differ by 1e-6", "longdouble", "relative", 1e-7, partial(jackknife, compute_jackknife_error),
          "float32", partial(jackknife, jackknife_in_float32)),
     Case("error of a mixture with weights of 1e-12 and 1", "longdouble", "relative", 1e-12,
          partial(error_of_a_mixture, TINY), "weights not squared", partial(error_without_squares, TINY)),

@@ -9,7 +9,7 @@ import torch
 from torchcover.coverage import BevGrid
 from torchcover.coverage.bodies import TRIED
 from torchcover.data import SimulatedFrames
-from torchcover.geometry import rigid
+from torchcover.geometry import build_transform
 from torchcover.simulation import PaperReference
 from torchcover.simulation.regions_of_interest import near_field
 from torchcover.targets import Probes, Raster, Target, counting, probing, survey
@@ -44,12 +44,12 @@ def numbers(probes, region, rig="small"):
 def test_the_numbers_are_those_of_targets_over_the_same_cells(name, bodies, monkeypatch):
     scenario, target = world(*bodies), Target.load(name)
     for module in (counting, probing):  # its surface is looked at from random places
-        monkeypatch.setattr(module, "pose_in_shell", lambda *_: rigid(np.eye(3), np.array([0.3, 0.2, 1.3])))
+        monkeypatch.setattr(module, "pose_in_shell", lambda *_: build_transform(np.eye(3), np.array([0.3, 0.2, 1.3])))
     found = survey(TOP, scenario, target, Raster.around(scenario.ego_box(), 3.0))
     probes = probed(simulated(scenario, steps=1), body=name, places=ALL)
     x, y = (torch.from_numpy(each) for each in found.raster.positions_m.T)
     for number, region in enumerate(probes.regions):
-        cells = region.contains(x, y).numpy().reshape(found.raster.shape)
+        cells = region.mask_points(x, y).numpy().reshape(found.raster.shape)
         free = cells & found.free
         visible_m2 = found.visible_m2[free]
         expected = [cells.sum(), free.sum(), found.seen[free].sum(), visible_m2.sum()]
@@ -98,7 +98,7 @@ def test_parts_and_other_processes_add_up_to_the_whole(tmp_path):
     first = pickle.loads(pickle.dumps(parts[0]))  # as ranks send them
     first.merge_state(pickle.loads(pickle.dumps(parts[1])))
     assert all(torch.equal(one, first.metric_state[name]) for name, one in whole.metric_state.items())
-    assert (int(whole.steps), int(whole.compute()[..., TRIED].sum())) == (5, 5 * 4 * 2)
+    assert (int(whole.num_frames), int(whole.compute()[..., TRIED].sum())) == (5, 5 * 4 * 2)
     again = Probes(frames.simulator, [Target.load("pole")], blocks=8)
     again.load_state_dict(whole.state_dict())
     assert torch.equal(again.compute(), whole.compute())
@@ -109,8 +109,8 @@ def test_parts_and_other_processes_add_up_to_the_whole(tmp_path):
 
 def test_where_nothing_is_free_the_number_is_unknown_with_a_count():
     probes = probed(simulated(world(BLOCK), steps=8), body="child", places=3)
-    left, right = probes.seen_by("small").summary()[LEFT:]
-    assert (left.cells, left.observed_cells, left.visible_m2) == (24, 0, pytest.approx(np.nan, nan_ok=True))
+    left, right = probes.seen_by("small").summarize()[LEFT:]
+    assert (left.num_cells, left.observed_cells, left.visible_m2) == (24, 0, pytest.approx(np.nan, nan_ok=True))
     assert all(np.isnan([one.value, one.error]).all() and one.count == 0 for one in left.numbers.values())
     assert 0 < right.observed_cells == next(iter(right.numbers.values())).count
 
@@ -121,7 +121,7 @@ def test_rays_that_were_cast_for_the_clouds_end_where_they_are_cast_again(tmp_pa
     frames = simulated(world(WALL, ego=ego), rigs=rig(lidar(mount={"z_m": 1.1})))
     frame = frames[3]
     probes = Probes(frames.simulator, [Target.load("pole")], every=1)
-    kept = probes.sums_of(frame)
+    kept = probes.compute_sums(frame)
     stage, instant = frames.simulator.placed(3)
     (mounted,) = stage.mounted["small"]
     known = mounted.ends(instant)
@@ -130,4 +130,4 @@ def test_rays_that_were_cast_for_the_clouds_end_where_they_are_cast_again(tmp_pa
     assert np.array_equal(known.range_m, anew.range_m)
     assert np.array_equal(known.is_hit, anew.is_hit)
     assert 0 < known.is_hit.sum() < len(known.is_hit)
-    assert all(map(torch.equal, kept[1:], probes.sums_of(frame)[1:]))
+    assert all(map(torch.equal, kept[1:], probes.compute_sums(frame)[1:]))

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from torchcover.evaluation.target_survey import summarize_target_maps
-from torchcover.geometry import BoundingBox, rigid
+from torchcover.geometry import BoundingBox, build_transform
 from torchcover.simulation import PaperReference, Scenario, Simulator
 from torchcover.simulation.bodies import merge
 from torchcover.simulation.shapes import Box
@@ -218,7 +218,9 @@ def test_the_surface_is_spread_by_area_and_leaves_out_what_is_inside():
 
 def test_a_target_hides_its_own_rear():
     """Two plates of a square metre, one behind the other."""
-    front, rear = (Box(type="box", size_m=(0.02, 1, 1)).mesh().moved(rigid(np.eye(3), [x, 0, 0])) for x in (0.1, -0.1))
+    front, rear = (
+        Box(type="box", size_m=(0.02, 1, 1)).mesh().moved(build_transform(np.eye(3), [x, 0, 0])) for x in (0.1, -0.1)
+    )
     raster = Raster((11.0, 13.0), (-1.0, 1.0), 2.0)
     seen = survey(rig(), world(), Target("plates", merge([front, rear])), raster, heading="wide")
     assert seen.visible_m2[0, 0] == pytest.approx(1.0, abs=0.35)

@@ -14,7 +14,7 @@ from mmengine.structures import BaseDataElement
 
 from torchcover import BevGrid, CoverageMetric, Region
 from torchcover.data import Frame
-from torchcover.training import CountOnce, MMEngineCoverage, frames_of_batch_dict, frames_of_data_batch
+from torchcover.training import FrameDeduplicator, MMEngineCoverage, convert_batch_dict, convert_data_batch
 from torchcover.training import mmengine as adapter
 
 GRID = {"x": (0.0, 8.0), "y": (-2.0, 2.0), "cell": 1.0}
@@ -61,7 +61,7 @@ def test_a_batch_dict_of_openpcdet(convert):
         "frame_id": np.array(["000134", "000007", "a1"]),
         "batch_size": 3,
     }
-    batch = frames_of_batch_dict(batch_dict)
+    batch = convert_batch_dict(batch_dict)
     assert [(frame.name, frame.index) for frame in batch.frames] == [("000134", 134), ("000007", 7), ("a1", -1)]
     for frame, sensor, reference in zip(batch.frames, sensors, references, strict=True):
         assert frame.sensor.dtype == torch.float32
@@ -74,7 +74,7 @@ def test_a_batch_dict_of_openpcdet(convert):
 
 def test_points_of_a_lidar_are_moved_into_the_vehicle_frame():
     points = in_one_array([torch.tensor([[3.0, 1.0, -1.7, 0.5]])])
-    batch = frames_of_batch_dict(
+    batch = convert_batch_dict(
         {"points": points, "reference_points": points, "batch_size": 1}, vehicle_T_lidar=VEHICLE_T_LIDAR
     )
     torch.testing.assert_close(batch.sensor[0], torch.tensor([[-0.5, 3.0, 0.0]]))
@@ -94,7 +94,7 @@ def test_wrong_batch_dicts_are_refused(change, complaint):
     points = in_one_array([cloud(3, 0), cloud(4, 1)])
     batch_dict = {"points": points, "reference_points": points, "batch_size": 2, **change}
     with pytest.raises(ValueError, match=complaint):
-        frames_of_batch_dict({key: value for key, value in batch_dict.items() if value is not None})
+        convert_batch_dict({key: value for key, value in batch_dict.items() if value is not None})
 
 
 def data_batch(numbers):
@@ -108,15 +108,15 @@ def pairs(numbers):
 
 
 def test_a_data_batch_of_mmdetection3d():
-    batch = frames_of_data_batch(*data_batch([3, 1]))
+    batch = convert_data_batch(*data_batch([3, 1]))
     assert [(frame.name, frame.index, len(frame.sensor)) for frame in batch.frames] == [("3", 3, 23), ("1", 1, 21)]
     inputs, samples = data_batch([0, 1])
     with pytest.raises(ValueError, match=r"a cloud for each of the 1 samples is needed; got 2"):
-        frames_of_data_batch(inputs, samples[:1])
+        convert_data_batch(inputs, samples[:1])
     with pytest.raises(ValueError, match="sample 1 has no 'reference_points'; add it"):
-        frames_of_data_batch(inputs, [samples[0], {"sample_idx": 1}])
+        convert_data_batch(inputs, [samples[0], {"sample_idx": 1}])
     with pytest.raises(ValueError, match=r"vehicle_T_lidar: shape \(4, 4\)"):
-        frames_of_data_batch(inputs, samples, vehicle_T_lidar=torch.eye(3))
+        convert_data_batch(inputs, samples, vehicle_T_lidar=torch.eye(3))
 
 
 @TRANSFORMS.register_module()
@@ -142,7 +142,7 @@ def test_packed_with_the_reference_a_sample_keeps_the_default_meta_keys(augmente
     packed = packed[0] if augmented else packed
     sample = packed["data_samples"].to_dict() | dict(packed["data_samples"].metainfo_items())
     assert (sample["box_type_3d"], sample["sample_idx"]) == ("lidar", 0)
-    batch = frames_of_data_batch({"inputs": {"points": [packed["inputs"]["points"]]}}, [sample])
+    batch = convert_data_batch({"inputs": {"points": [packed["inputs"]["points"]]}}, [sample])
     torch.testing.assert_close(batch.frames[0].reference, cloud(40, 100)[:, :3])
     with pytest.raises(ValueError, match="the results have no 'reference_points'"):
         pack({"points": cloud(20, 0)})
@@ -151,20 +151,20 @@ def test_packed_with_the_reference_a_sample_keeps_the_default_meta_keys(augmente
 def test_by_area_too_a_process_that_was_dealt_nothing_evaluates():
     metric = MMEngineCoverage({"grid": GRID, "square_metres": True})
     assert all(math.isnan(value) for name, value in metric.evaluate(0).items() if "radius_m" in name)
-    assert metric.coverage.measure == "area"
+    assert metric.coverage.average == "area"
 
 
 def test_mmengine_needs_the_square_metres_that_the_metric_wants():
     frame = Frame({"rig": cloud(9, 0, 3)}, cloud(9, 1, 3), 0, "0")
     without, metric = (
-        MMEngineCoverage({"grid": GRID, "square_metres": True}, frames_of=lambda batch, _: batch) for _ in range(2)
+        MMEngineCoverage({"grid": GRID, "square_metres": True}, get_frames=lambda batch, _: batch) for _ in range(2)
     )
     without.process([frame], [{}])
     with pytest.raises(ValueError, match="the square metres of each reference point are needed"):
         without.evaluate(1)
     metric.process([replace(frame, reference_weights=torch.ones(9))], [{}])
     metric.evaluate(1)
-    assert metric.coverage.counts["frames"] == 1
+    assert metric.coverage.counts["num_frames"] == 1
 
 
 def test_mmengine_evaluates_it_as_any_of_its_metrics():
@@ -205,10 +205,10 @@ def test_mmengine_padding_is_left_out_by_the_size_of_the_dataset(monkeypatch, sa
         scalars = metric.evaluate(samples)
         assert all(name.startswith("rig/") for name in scalars)
         own = [k for position, k in enumerate(dealt) if position % processes == rank and position < samples]
-        assert metric.coverage.counts["frames"] == len(own)
+        assert metric.coverage.counts["num_frames"] == len(own)
         for sensor, reference in pairs(own):
             total.update(sensor[:, :3], reference[:, :3])
-    assert total.steps == samples
+    assert total.num_frames == samples
 
 
 def test_mmengine_adds_up_where_its_processes_exchange_tensors(monkeypatch):
@@ -235,7 +235,7 @@ def test_other_batches_of_mmengine():
     metric = MMEngineCoverage(
         make_metric(),
         regions=[Region(**REGION)],
-        frames_of=lambda batch, samples: frames_of_batch_dict({**batch, "batch_size": len(samples)}),
+        get_frames=lambda batch, samples: convert_batch_dict({**batch, "batch_size": len(samples)}),
     )
     points = in_one_array([cloud(30, 0)])
     metric.process({"points": points, "reference_points": points}, [{}])
@@ -272,7 +272,7 @@ def test_without_a_framework_only_its_own_class_is_missing():
 
 
 def test_a_frame_counts_once_whatever_kind_of_number_its_index_is():
-    once = CountOnce()
+    once = FrameDeduplicator()
     frames = [Frame({"rig": torch.zeros(5, 3)}, torch.zeros(9, 3), index=index, name="a") for index in KINDS_OF_THREE]
-    assert len(once.new(frames)) == 1
+    assert len(once.select_new(frames)) == 1
     assert {type(frame.index) for frame in frames} == {type(frame.block_index) for frame in frames} == {int}

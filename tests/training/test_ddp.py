@@ -13,11 +13,11 @@ from torch.utils.data import BatchSampler, DataLoader, DistributedSampler
 
 from torchcover import BevGrid, Coverage, CoverageMetric, Region
 from torchcover.data import Frame, collate_frames
-from torchcover.training import CountOnce, frames_of_batch_dict, shard_of
+from torchcover.training import FrameDeduplicator, convert_batch_dict, find_shard
 from torchcover.training.counting import Shard
 
 GRID = {"x": (0.0, 8.0), "y": (-2.0, 2.0), "cell": 1.0}
-REGION = Region("all", x=GRID["x"], y=GRID["y"])
+REGION = Region("all", x_m=GRID["x"], y_m=GRID["y"])
 
 
 def clouds(seed):
@@ -56,7 +56,7 @@ def test_two_processes_give_the_numbers_of_one(tmp_path):
             job = torch.load(tmp_path / f"{name}_{rank}.pt", weights_only=False)
             for stage in ("train", "val"):
                 assert_same(Coverage.load(tmp_path / f"{name}_{stage}_{rank}.npz"), truth)
-                np.testing.assert_allclose(job["blocks"][stage], truth.blocks.listed, rtol=1e-12)
+                np.testing.assert_allclose(job["blocks"][stage], truth.block_sums.sums, rtol=1e-12)
                 assert job["logged"][f"coverage/{stage}/steps"] == 7
                 for tag, value in truth.scalars([REGION]).items():
                     assert job["logged"][f"coverage/{stage}/{tag}"] == pytest.approx(value, rel=1e-6, nan_ok=True)
@@ -64,7 +64,7 @@ def test_two_processes_give_the_numbers_of_one(tmp_path):
 
 
 def assert_same(coverage, other):
-    for name in ("probed_steps", "points", "radius", "detection"):
+    for name in ("observed_frames", "points", "radius", "detection"):
         np.testing.assert_allclose(getattr(coverage, name), getattr(other, name), rtol=1e-12, err_msg=name)
     assert coverage.counts == other.counts
 
@@ -90,10 +90,10 @@ def test_every_frame_is_counted_by_one_process(samples, processes, shuffle, drop
     for rank in range(processes):
         sampler = DistributedSampler(dataset, processes, rank, shuffle=shuffle, drop_last=drop_last)
         loader = DataLoader(dataset, batch_size=2, sampler=sampler, collate_fn=collate_frames)
-        once = CountOnce()
+        once = FrameDeduplicator()
         for batch in loader:
             dealt += [frame.index for frame in batch.frames]
-            counted += [frame.index for frame in once.new(batch.frames, shard_of(loader))]
+            counted += [frame.index for frame in once.select_new(batch.frames, find_shard(loader))]
     assert sorted(counted) == sorted(set(dealt))
 
 
@@ -105,28 +105,28 @@ def test_a_number_of_samples_that_is_told_at_the_end_gives_the_same(samples, pro
         loader = DataLoader(
             dataset, batch_size, sampler=DistributedSampler(dataset, processes, rank), collate_fn=collate_frames
         )
-        known, told_late = CountOnce(), CountOnce()
-        expected = [frame for batch in loader for frame in known.new(batch.frames, shard_of(loader))]
+        known, told_late = FrameDeduplicator(), FrameDeduplicator()
+        expected = [frame for batch in loader for frame in known.select_new(batch.frames, find_shard(loader))]
         unknown = Shard(rank, processes, None)
-        counted = [frame for batch in loader for frame in told_late.new(batch.frames, unknown)]
-        counted += told_late.new([], shard_of(loader))
+        counted = [frame for batch in loader for frame in told_late.select_new(batch.frames, unknown)]
+        counted += told_late.select_new([], find_shard(loader))
         assert [frame.index for frame in counted] == [frame.index for frame in expected]
 
 
 def test_frames_that_have_neither_index_nor_name_are_all_new():
     """Batches of OpenPCDet without `frame_id`, of clouds that were sampled to one number of points."""
     points = torch.zeros(64, 5)
-    batch = frames_of_batch_dict({"points": points, "reference_points": points, "batch_size": 1})
-    once = CountOnce()
-    assert [len(once.new(batch.frames)) for _ in range(3)] == [1, 1, 1]
+    batch = convert_batch_dict({"points": points, "reference_points": points, "batch_size": 1})
+    once = FrameDeduplicator()
+    assert [len(once.select_new(batch.frames)) for _ in range(3)] == [1, 1, 1]
 
 
 def test_a_batch_sampler_is_looked_through():
     sampler = DistributedSampler(range(5), num_replicas=2, rank=1)
     loader = DataLoader(range(5), batch_sampler=BatchSampler(sampler, 2, drop_last=False))
-    assert shard_of(loader) == (1, 2, 5)
-    assert shard_of(DataLoader(range(5))) is None
-    assert shard_of([1, 2, 3]) is None
+    assert find_shard(loader) == (1, 2, 5)
+    assert find_shard(DataLoader(range(5))) is None
+    assert find_shard([1, 2, 3]) is None
 
 
 def test_frames_of_two_datasets_with_the_same_index_are_different_ones():
@@ -138,19 +138,19 @@ def test_frames_of_two_datasets_with_the_same_index_are_different_ones():
         Frame({"rig": torch.zeros(5, 3)}, torch.zeros(8, 3), index=0, name="a"),
     ]
     flipped = Frame({"rig": -torch.ones(5, 3)}, torch.ones(9, 3), index=0, name="a")
-    once = CountOnce()
-    assert once.new([first, *others]) == [first, *others]
-    assert once.new([flipped]) == []
-    assert once.new([first], loader=1) == [first]
+    once = FrameDeduplicator()
+    assert once.select_new([first, *others]) == [first, *others]
+    assert once.select_new([flipped]) == []
+    assert once.select_new([first], loader_index=1) == [first]
     once.start_epoch()
-    assert once.new([first]) == [first]
+    assert once.select_new([first]) == [first]
 
 
 def test_the_state_goes_on_within_an_epoch():
     frames = [Clouds(6)[k] for k in range(6)]
-    once, resumed = CountOnce(), CountOnce()
-    once.new(frames[:3], shard_of(DataLoader(frames, sampler=DistributedSampler(frames, 2, 1))))
+    once, resumed = FrameDeduplicator(), FrameDeduplicator()
+    once.select_new(frames[:3], find_shard(DataLoader(frames, sampler=DistributedSampler(frames, 2, 1))))
     resumed.load_state_dict(once.state_dict())
-    shard = shard_of(DataLoader(frames[:5], sampler=DistributedSampler(frames[:5], 2, 1)))
+    shard = find_shard(DataLoader(frames[:5], sampler=DistributedSampler(frames[:5], 2, 1)))
     # The positions of this process are 1, 3, 5 of five samples: the last is padding.
-    assert resumed.new(frames[2:4], shard) == once.new(frames[2:4], shard) == []
+    assert resumed.select_new(frames[2:4], shard) == once.select_new(frames[2:4], shard) == []

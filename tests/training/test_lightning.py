@@ -21,7 +21,7 @@ from torchcover.data import Frame, collate_frames
 from torchcover.training import CoverageCallback
 
 GRID = {"x": (0.0, 8.0), "y": (-2.0, 2.0), "cell": 1.0}
-REGIONS = [Region("near", x=(0.0, 4.0), y=(-2.0, 2.0)), Region("all", x=(0.0, 8.0), y=(-2.0, 2.0))]
+REGIONS = [Region("near", x_m=(0.0, 4.0), y_m=(-2.0, 2.0)), Region("all", x_m=(0.0, 8.0), y_m=(-2.0, 2.0))]
 SIZE = torch.tensor([8.0, 4.0, 2.0])
 CORNER = torch.tensor([0.0, -2.0, -0.2])
 
@@ -90,7 +90,7 @@ def expected(frames):
 
 
 def assert_same(coverage, other):
-    for name in ("probed_steps", "points", "radius", "detection"):
+    for name in ("observed_frames", "points", "radius", "detection"):
         np.testing.assert_allclose(getattr(coverage, name), getattr(other, name), rtol=1e-12, err_msg=name)
     assert coverage.counts == other.counts
 
@@ -165,7 +165,7 @@ def measured_frames(trainer, metric):
 
 
 def test_fixed_frames_are_measured_once_and_logged_at_every_epoch(tmp_path, blank_maps):
-    callback = CoverageCallback(make_metric(), regions=REGIONS, fixed_frames=True)
+    callback = CoverageCallback(make_metric(), regions=REGIONS, has_fixed_frames=True)
     logger = TensorBoardLogger(tmp_path, name="", version="run")
     trainer = make_trainer(tmp_path, callback, logger=logger, max_epochs=3)
     seen = measured_frames(trainer, callback.metric)
@@ -193,7 +193,7 @@ def test_frames_that_were_said_to_be_fixed_and_are_not_are_added(tmp_path, blank
         def val_dataloader(self):
             return loader([RandomFrames(5)[2 * min(self.current_epoch, 1) + k] for k in range(3)])
 
-    callback = CoverageCallback(make_metric(), fixed_frames=True)
+    callback = CoverageCallback(make_metric(), has_fixed_frames=True)
     logger = TensorBoardLogger(tmp_path, name="", version="run")
     trainer = make_trainer(tmp_path, callback, logger=logger, max_epochs=3, reload_dataloaders_every_n_epochs=1)
     seen = measured_frames(trainer, callback.metric)
@@ -233,7 +233,7 @@ def test_no_frame_of_training_loaders_side_by_side_is_taken_for_padding(tmp_path
         for side in ("left", "right")
     }
     callback = CoverageCallback(
-        make_metric(), stage="train", frames_of=lambda batch: [f for side in batch.values() for f in side.frames]
+        make_metric(), stage="train", get_frames=lambda batch: [f for side in batch.values() for f in side.frames]
     )
     trainer = make_trainer(tmp_path, callback, use_distributed_sampler=False)
     seen = measured_frames(trainer, callback.metric)
@@ -255,7 +255,7 @@ def test_the_sums_are_where_the_model_is_even_if_no_frame_is_new(tmp_path):
         make_trainer(tmp_path, callback, use_distributed_sampler=False).fit(
             Validated(), loader(2), loader(1, sampler=padding)
         )
-    assert callback.coverage.counts["frames"] == 0
+    assert callback.coverage.counts["num_frames"] == 0
     assert set(callback.metric.devices) == {"cpu"}
 
 
@@ -300,8 +300,8 @@ def test_another_rig_other_batches_and_frames(tmp_path):
         return {"frames": frames, "target": torch.zeros(len(frames))}
 
     batches = DataLoader(RandomFrames(3), batch_size=2, collate_fn=collate)
-    callback = CoverageCallback(make_metric(), rig="b", frames_of=frames_of)
-    trainer = make_trainer(tmp_path, callback, CoverageCallback(make_metric(), rig="a", frames_of=frames_of))
+    callback = CoverageCallback(make_metric(), rig_name="b", get_frames=frames_of)
+    trainer = make_trainer(tmp_path, callback, CoverageCallback(make_metric(), rig_name="a", get_frames=frames_of))
     trainer.fit(Validated(), loader(2), batches)
     truth = expected([Frame({"b": f.sensor[:5]}, f.reference, f.index, f.name) for f in RandomFrames(3)])
     assert_same(callback.coverage, truth)
@@ -412,7 +412,7 @@ def test_a_logger_that_takes_no_figures_gets_numbers_and_one_warning(tmp_path):
 
 def test_without_maps_nothing_is_drawn(tmp_path):
     logger = TakesImages()
-    make_trainer(tmp_path, CoverageCallback(make_metric(), maps=False), logger=logger).fit(
+    make_trainer(tmp_path, CoverageCallback(make_metric(), should_log_maps=False), logger=logger).fit(
         Validated(), loader(2), loader(3)
     )
     assert logger.images == []
@@ -561,10 +561,10 @@ def test_wrong_arguments_are_refused(options, complaint):
 
 def test_batches_without_frames_and_unknown_rigs_are_refused(tmp_path):
     plain = DataLoader(RandomFrames(2), batch_size=2, collate_fn=lambda frames: {"points": [f.sensor for f in frames]})
-    with pytest.raises(TypeError, match=r"got dict; say how.*frames_of"):
+    with pytest.raises(TypeError, match=r"got dict; say how.*get_frames"):
         make_trainer(tmp_path, CoverageCallback(make_metric())).fit(Validated(), loader(2), plain)
     with pytest.raises(ValueError, match="has no rig 'roof'; it has rig"):
-        make_trainer(tmp_path, CoverageCallback(make_metric(), rig="roof")).fit(Validated(), loader(2), loader(2))
+        make_trainer(tmp_path, CoverageCallback(make_metric(), rig_name="roof")).fit(Validated(), loader(2), loader(2))
 
 
 # What Lightning sees of a batch
@@ -583,7 +583,7 @@ def test_a_batch_is_left_as_it_is_in_any_precision(tmp_path, precision):
     wanted = CoverageMetric(BevGrid(**GRID), max_radius=9.0)
     for frame in RandomFrames(5):
         wanted.update(frame.sensor, frame.reference)
-    callback = CoverageCallback(CoverageMetric(BevGrid(**GRID), max_radius=9.0), regions=REGIONS, maps=False)
+    callback = CoverageCallback(CoverageMetric(BevGrid(**GRID), max_radius=9.0), regions=REGIONS, should_log_maps=False)
     trainer = make_trainer(tmp_path, callback, precision=precision)
     trainer.fit(LogsOwn(), loader(3), loader(5))
     assert callback.coverage.scalars(REGIONS) == wanted.compute().scalars(REGIONS)
@@ -607,7 +607,7 @@ def test_a_test_is_measured_under_a_name_of_its_own(tmp_path):
     wanted = CoverageMetric(BevGrid(**GRID), max_radius=9.0)
     for frame in RandomFrames(5):
         wanted.update(frame.sensor, frame.reference)
-    callback = CoverageCallback(CoverageMetric(BevGrid(**GRID), max_radius=9.0), regions=REGIONS, maps=False)
+    callback = CoverageCallback(CoverageMetric(BevGrid(**GRID), max_radius=9.0), regions=REGIONS, should_log_maps=False)
     trainer = make_trainer(tmp_path, callback)
     trainer.test(Tested(), loader(5), verbose=False)
     logged = {name: float(value) for name, value in trainer.callback_metrics.items()}

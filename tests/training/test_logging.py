@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch.utils.tensorboard import SummaryWriter
 
-from torchcover.notebooks import data_frame
+from torchcover.notebooks import build_dataframe
 from torchcover.training import log_result
 
 
@@ -18,7 +18,7 @@ class Result:
     """Two rows, one with a name that is markup, and a picture."""
 
     def to_dataframe(self):
-        return data_frame([{"rig": "<b>|", "radius_m": 0.123456}, {"rig": "b", "radius_m": float("nan")}])
+        return build_dataframe([{"rig": "<b>|", "radius_m": 0.123456}, {"rig": "b", "radius_m": float("nan")}])
 
     def plot(self):
         return Figure(figsize=(1.0, 0.5))

@@ -13,7 +13,7 @@ from scipy.stats import spearmanr
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from torchcover.data import Frame
-from torchcover.detection import Boxes, RecallByVisibility, points_in_boxes
+from torchcover.detection import Boxes, RecallByVisibility, find_points_in_boxes
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "train_detector.py"
 
@@ -113,7 +113,7 @@ def test_average_precision_of_a_bin_is_over_the_recall_of_its_objects(example):
     found = there[:2]
     metric.update(found, Boxes.from_rows(there), torch.tensor([0.9, 0.8, 0.1]), torch.tensor([0.9, 0.8]))
     counts = metric.compute()
-    assert counts.over("visibility").bins[:2] == ("0-0.5", "0.5-1")
+    assert counts.compute_curve("visibility").bins[:2] == ("0-0.5", "0.5-1")
     assert (example.average_precision(counts, 1), example.average_precision(counts, 0)) == (1.0, pytest.approx(1 / 101))
     assert math.isnan(example.average_precision(counts, 2))
     assert example.average_precision(counts) == pytest.approx(67 / 101)
@@ -183,7 +183,9 @@ def random_frames(steps, seed, reference, name, keep_clouds):
         points = (torch.rand(8, 60, 3, generator=generator) - 0.5) * rows[:, None, 3:6] + rows[:, None, :3]
         sensors = {"front_roof_128": points[:, :40].reshape(-1, 3), "front_roof_32": points[:4, :20].reshape(-1, 3)}
         boxes = Boxes.from_rows(rows, categories=("car",) * 8)
-        hits = {rig: points_in_boxes(cloud, boxes).box.bincount(minlength=8) for rig, cloud in sensors.items()}
+        hits = {
+            rig: find_points_in_boxes(cloud, boxes).box_indices.bincount(minlength=8) for rig, cloud in sensors.items()
+        }
         boxes = Boxes.from_rows(rows, categories=("car",) * 8, hits=hits)
         clouds = {**sensors, **{f"network {rig}": cloud for rig, cloud in sensors.items()}}
         weights = torch.rand(160, generator=generator) + 0.1

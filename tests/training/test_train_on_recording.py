@@ -12,7 +12,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tests.recordings.drives import Drive
 from tests.recordings.layouts import kitti_raw
 from torchcover.data import AccumulatedReference, RecordedFrames
-from torchcover.geometry import rigid
+from torchcover.geometry import build_transform
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -21,10 +21,10 @@ class Straight(Drive):
     """Along the wall, with a car ahead that keeps its distance and of which one row of points is seen at a time."""
 
     def get_world_T_vehicle(self, index):
-        return rigid(torch.eye(3).numpy(), [1.5 * index, 0.0, 0.0])
+        return build_transform(torch.eye(3).numpy(), [1.5 * index, 0.0, 0.0])
 
     def world_T_car(self, index):
-        return rigid(torch.eye(3).numpy(), [12.0 + 1.5 * index, 0.0, 0.75])
+        return build_transform(torch.eye(3).numpy(), [12.0 + 1.5 * index, 0.0, 0.75])
 
     def read_scan(self, sensor, index):
         whole, row = self.back_m, index % 7

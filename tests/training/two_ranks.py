@@ -74,8 +74,8 @@ def fit(name, *callbacks, ckpt_path=None):
         return CoverageMetric(BevGrid(**job["grid"]), max_radius=9.0, blocks=8)
 
     regions = [Region("all", **{axis: job["grid"][axis] for axis in "xy"})]
-    train = CoverageCallback(metric(), regions=regions, stage="train", maps=False)
-    validation = CoverageCallback(metric(), regions=regions, fixed_frames=True)
+    train = CoverageCallback(metric(), regions=regions, stage="train", should_log_maps=False)
+    validation = CoverageCallback(metric(), regions=regions, has_fixed_frames=True)
     logger = TakesImages(folder, name="", version=name)
     trainer = pl.Trainer(
         accelerator="cpu",
@@ -98,7 +98,7 @@ def fit(name, *callbacks, ckpt_path=None):
     blocks = {}
     for stage, callback in (("train", train), ("val", validation)):
         callback.coverage.save(folder / f"{name}_{stage}_{trainer.global_rank}.npz")
-        blocks[stage] = callback.coverage.blocks.listed
+        blocks[stage] = callback.coverage.block_sums.sums
     logged = {tag: float(value) for tag, value in trainer.callback_metrics.items()}
     result = {"logged": logged, "images": logger.images, "blocks": blocks}
     torch.save(result, folder / f"{name}_{trainer.global_rank}.pt")

@@ -7,13 +7,13 @@ from torchmetrics import MetricCollection
 from torchmetrics.wrappers import MetricTracker
 
 from torchcover import BevGrid, Coverage, CoverageMetric, Region, compare, evaluate
-from torchcover.coverage import CoverageNumber
-from torchcover.data import ChosenRigs, Frame, RecordedFrames, SimulatedFrames
+from torchcover.coverage import CoverageNumberMetric
+from torchcover.data import Frame, RecordedFrames, RigSubset, SimulatedFrames
 
 
-def measured(frames: SimulatedFrames | RecordedFrames | ChosenRigs) -> Coverage:
+def measured(frames: SimulatedFrames | RecordedFrames | RigSubset) -> Coverage:
     """A loop over any source of frames."""
-    metric = CoverageMetric(BevGrid(x=(0.0, 20.0), y=(-5.0, 5.0)), max_radius=25.0)
+    metric = CoverageMetric(BevGrid(x_m=(0.0, 20.0), y_m=(-5.0, 5.0)), max_radius=25.0)
     for frame in frames:
         metric.update(frame.sensor, frame.reference, weights=frame.reference_weights, block_index=frame.block_index)
     return metric.compute()
@@ -36,11 +36,11 @@ def names(frames: RecordedFrames) -> list[str]:
 
 def best(frames: RecordedFrames) -> object:
     """The best of several runs by torchmetrics' tracker, and a picture of what was measured."""
-    grid, near = BevGrid(x=(0.0, 20.0), y=(-5.0, 5.0)), Region("near", x=(0.0, 20.0), y=(-5.0, 5.0))
-    tracker = MetricTracker(MetricCollection({"near": CoverageNumber("detection_0.4m", near, "ground", grid)}))
+    grid, near = BevGrid(x_m=(0.0, 20.0), y_m=(-5.0, 5.0)), Region("near", x_m=(0.0, 20.0), y_m=(-5.0, 5.0))
+    tracker = MetricTracker(MetricCollection({"near": CoverageNumberMetric("detection_0.4m", near, "ground", grid)}))
     tracker.increment()
     for frame in frames:
         tracker.update(frame.sensor, frame.reference, weights=frame.reference_weights)
-    figure, axes = CoverageMetric(grid).plot(height="ground")
+    figure, axes = CoverageMetric(grid).plot(band="ground")
     figure.suptitle(axes.get_title())
     return tracker.best_metric()

@@ -10,8 +10,21 @@ from numpy.typing import ArrayLike
 
 from torchcover.cameras.lens import to_vector
 from torchcover.cameras.models import check_image, check_model
-from torchcover.files import naming, parse_yaml, parse_yaml_stream, read_json_table, read_short_text, reads
-from torchcover.geometry import check_rigid, invert, rigid, rotation_from_euler, rotation_from_quaternion
+from torchcover.files import (
+    guard_reader,
+    parse_yaml,
+    parse_yaml_stream,
+    read_json_table,
+    read_short_text,
+    report_bad_file,
+)
+from torchcover.geometry import (
+    build_transform,
+    check_rigid,
+    convert_euler_to_rotation,
+    convert_quaternion_to_rotation,
+    invert,
+)
 from torchcover.geometry.rigid import Matrix
 
 # Beyond, squares of float64 overflow.
@@ -19,7 +32,7 @@ MAX_NUMBER = 1e150
 # A side of an image is shorter.
 MAX_PIXELS = 1_000_000
 # Camera axes (x right, y down, z forward) of a camera that looks along the vehicle's x (forward; y left, z up).
-LOOKING_FORWARD = rigid([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], [0.0, 0.0, 0.0])
+LOOKING_FORWARD = build_transform([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], [0.0, 0.0, 0.0])
 
 # ROS and OpenCV names of the models.
 _MODEL_NAMES = {
@@ -128,7 +141,7 @@ def split_projection(numbers: Matrix, name: str) -> tuple[tuple[float, float, fl
     intrinsics = split_matrix(P[:, :3], name)
     if 0.0 in intrinsics[:2]:
         raise ValueError(f"{name} has no focal length; got {P.tolist()}")
-    return intrinsics, rigid(np.eye(3), np.linalg.solve(P[:, :3], P[:, 3]))
+    return intrinsics, build_transform(np.eye(3), np.linalg.solve(P[:, :3], P[:, 3]))
 
 
 def convert_carla_pose(
@@ -153,10 +166,10 @@ def convert_carla_pose(
         array([ 0. , -1. ,  2.8])
     """
     x, y, z = location_m
-    return rigid(rotation_from_euler(-yaw_deg, -pitch_deg, roll_deg), [x, -y, z]) @ LOOKING_FORWARD
+    return build_transform(convert_euler_to_rotation(-yaw_deg, -pitch_deg, roll_deg), [x, -y, z]) @ LOOKING_FORWARD
 
 
-@reads("a camera_info file")
+@guard_reader("a camera_info file")
 def read_ros(path: Path) -> Calibration:
     """Read a ROS `camera_info` file, as camera_calibration writes it or as `topic echo` prints the message.
 
@@ -190,7 +203,7 @@ def read_ros(path: Path) -> Calibration:
     return _distorted(name, size, K, _MODEL_NAMES[model], distortion.ravel())
 
 
-@reads("an OpenCV calibration")
+@guard_reader("an OpenCV calibration")
 def read_opencv(
     path: Path,
     *,
@@ -225,7 +238,7 @@ def read_opencv(
     return _distorted(path.stem, size, matrix, model, distortion.ravel())
 
 
-@reads("a KITTI calibration")
+@guard_reader("a KITTI calibration")
 def read_kitti(
     path: Path, camera: int, *, width: int, height: int, vehicle_T_lidar: ArrayLike | None = None
 ) -> Calibration:
@@ -249,7 +262,7 @@ def read_kitti(
     rotation = get_numbers(table, "R0_rect", 9).reshape(3, 3) if "R0_rect" in table else np.eye(3)
     lidar = get_numbers(table, "Tr_velo_to_cam" if "Tr_velo_to_cam" in table else "Tr", 12)
     reference_T_lidar = np.vstack([lidar.reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
-    camera_T_lidar = camera_T_rectified @ rigid(rotation, np.zeros(3)) @ reference_T_lidar
+    camera_T_lidar = camera_T_rectified @ build_transform(rotation, np.zeros(3)) @ reference_T_lidar
     vehicle_T_lidar = check_rigid(np.eye(4) if vehicle_T_lidar is None else vehicle_T_lidar, "vehicle_T_lidar")
     pose = vehicle_T_lidar @ invert(check_rigid(camera_T_lidar, f"P{camera} from the lidar"))
     return _checked(Calibration(width, height, *intrinsics, vehicle_T_camera=pose, name=f"P{camera}"))
@@ -276,7 +289,7 @@ def read_nuscenes(
     """
     folder = Path(folder)
     table, sensors = (read_json_table(folder / f"{name}.json").rows for name in ("calibrated_sensor", "sensor"))
-    with naming(folder, "nuScenes' tables"):
+    with report_bad_file(folder, "nuScenes' tables"):
         channels = {row["token"]: row["channel"] for row in sensors}
         rows = [row for row in table if channels.get(row["sensor_token"]) == channel and token in (None, row["token"])]
         if not rows or not rows[0].get("camera_intrinsic"):
@@ -295,7 +308,7 @@ def read_nuscenes(
                 f"{channel!r} needs a rotation of four numbers and a translation of three; "
                 f"got {describe_value(rotation)}, {describe_value(translation)}"
             )
-        pose = check_rigid(rigid(rotation_from_quaternion(rotation), translation), f"{channel!r}")
+        pose = check_rigid(build_transform(convert_quaternion_to_rotation(rotation), translation), f"{channel!r}")
         intrinsics = split_matrix(matrix, channel)
         return _checked(Calibration(width, height, *intrinsics, vehicle_T_camera=pose, name=channel))
 

@@ -24,8 +24,8 @@ from torchcover.cameras.inverse import ANSWERED
 from torchcover.cameras.lens import Scalar, to_vector
 from torchcover.cameras.models import check_image, check_model
 from torchcover.cameras.optics import Optics, RayTable
-from torchcover.devices import through_cpu
-from torchcover.geometry import check_rigid, invert, transform_tensor
+from torchcover.devices import run_with_float64
+from torchcover.geometry import check_rigid, invert, transform_points_tensor
 from torchcover.geometry.rigid import Matrix
 
 
@@ -156,7 +156,7 @@ class Camera:
         size = f"{self.width}x{self.height}"
         return f"Camera({self.name!r}, {size}, {self.model}, fx={fx:g}, fy={fy:g}, cx={cx:g}, cy={cy:g})"
 
-    def compute_rays(
+    def rays(
         self, pixels: Tensor | None = None, *, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32
     ) -> tuple[Tensor, Tensor]:
         """Directions in which pixels look.
@@ -176,7 +176,7 @@ class Camera:
             raise ValueError(f"{self.name}: pixels are floats (..., 2); got {pixels.dtype} {tuple(pixels.shape)}")
         return self._rays_of(pixels)
 
-    @through_cpu
+    @run_with_float64
     def _rays_of(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         directions, status = self._optics.unproject(pixels.reshape(-1, 2).double())
         shape = pixels.shape[:-1]
@@ -191,7 +191,7 @@ class Camera:
         """
         return self._table.count_pixels()
 
-    @through_cpu
+    @run_with_float64
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels at which points are seen.
 
@@ -278,14 +278,14 @@ class Camera:
         rays, has_ray = self._table.get_points(str(depth.device), depth.dtype, kind)
         return select_pixels(rays, has_ray, depth, stride, valid)
 
-    @through_cpu
+    @run_with_float64
     def convert_z_to_distance(self, depth: Tensor) -> Tensor:
         """Distance along the ray for depth along the axis: (H, W) or (B, H, W), NaN where a pixel has no z-depth."""
         depth = check_depth(depth, "z", 1, None, (self.height, self.width), self.name)
         forward = self._forward(depth.device)
         return (depth.double() / torch.where(forward > 0, forward, torch.nan)).to(depth.dtype)
 
-    @through_cpu
+    @run_with_float64
     def convert_distance_to_z(self, depth: Tensor) -> Tensor:
         """Depth along the axis for distance along the ray: (H, W) or (B, H, W), NaN where a pixel has no ray.
 
@@ -304,8 +304,8 @@ class Camera:
 
     def to_vehicle(self, points: Tensor) -> Tensor:
         """Points (N, 3) of the camera frame in the vehicle frame."""
-        return transform_tensor(self.vehicle_T_camera, points)
+        return transform_points_tensor(self.vehicle_T_camera, points)
 
     def to_camera(self, points: Tensor) -> Tensor:
         """Points (N, 3) of the vehicle frame in the camera frame."""
-        return transform_tensor(invert(self.vehicle_T_camera), points)
+        return transform_points_tensor(invert(self.vehicle_T_camera), points)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.cameras.isolated_images import read_exr_image, read_png_image
-from torchcover.files import DEFLATE_MAX_RATIO, NpyHeader, check_memory, read_npy, reads
+from torchcover.files import DEFLATE_MAX_RATIO, NpyHeader, check_memory, guard_reader, read_npy
 
 CARLA_FAR_M = 1000.0
 _CARLA_FULL_CODE = 2**24 - 1
@@ -58,7 +58,7 @@ def decode_carla(image: NDArray[np.uint8], channel_order: str) -> Tensor:
     return torch.from_numpy(metres.astype(np.float32))
 
 
-@reads("a depth image")
+@guard_reader("a depth image")
 def read_depth(path: Path, *, meters_per_unit: float | None = None) -> Tensor:
     """Read a depth image.
 

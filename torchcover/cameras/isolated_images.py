@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.files import apart, check_memory
+from torchcover.files import check_memory, run_isolated
 
 
-@apart
+@run_isolated
 def read_exr_image(path: Path, bytes_per_pixel: int) -> dict[str, NDArray[Any]]:
     """(H, W) `pixels` of an EXR image with one channel, each of which may take so much memory."""
     try:
@@ -33,7 +33,7 @@ def read_exr_image(path: Path, bytes_per_pixel: int) -> dict[str, NDArray[Any]]:
     return {"pixels": values[0]}
 
 
-@apart
+@run_isolated
 def read_png_image(path: Path) -> dict[str, NDArray[Any]]:
     """Read the `pixels` of a PNG image, whose header was checked before."""
     from PIL import Image

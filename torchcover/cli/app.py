@@ -225,6 +225,6 @@ def print_error(message: str) -> None:
 
 
 def _one_line(words: str) -> str:
-    from torchcover.files import shown  # with NumPy, which nobody needs who asks for help
+    from torchcover.files import escape_control_chars  # with NumPy, which nobody needs who asks for help
 
-    return shown(" ".join(words.split()))
+    return escape_control_chars(" ".join(words.split()))

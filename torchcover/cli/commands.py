@@ -113,14 +113,14 @@ def rig(
     ] = False,
 ) -> None:
     """Print the sensors of a recording as a rig: mounts, LiDARs and cameras for `show` and `evaluate`."""
-    from torchcover.files import as_yaml
+    from torchcover.files import to_yaml
     from torchcover.simulation import rig_document
 
     models = dict(_pair(text, "--lidar", "LIDAR_TOP=velodyne_hdl32e") for text in lidar or ())
     names = [name for of in sensors or () for name in of.split(",")]
     recording = options.open_recording(frames, options.load_recording_settings(assignments))
     document = rig_document(recording, sensors=names or None, models=models, raw_images=raw_images)
-    typer.echo(as_yaml(document), nl=False)
+    typer.echo(to_yaml(document), nl=False)
 
 
 def world(

@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from torchcover.contrib.ranks import LEAST, Ranking, interval95, kendall_tau_b
-from torchcover.contrib.s_mig import unequal_rays
+from torchcover.contrib.ranks import LEAST, Ranking, compute_bootstrap_interval95, compute_kendall_tau_b
+from torchcover.contrib.s_mig import describe_unequal_rays
 from torchcover.estimation import Number
-from torchcover.files import csv_text
+from torchcover.files import format_csv
 from torchcover.report import PageTable, TextCell, format_number, get_display_unit, to_json_record
 
 TITLE, TAU_TITLE = "Metrics of others", "Kendall's tau-b with torchcover's numbers, 95 % over worlds"
@@ -20,11 +20,11 @@ TITLE, TAU_TITLE = "Metrics of others", "Kendall's tau-b with torchcover's numbe
 NOT_VALIDATED = "None of these metrics is validated; docs/metrics.md says what each is blind to."
 TOO_FEW = "Kendall's tau needs three rigs or more: two are in one order or in the other by chance; there are {}"
 # Of a table with a row for each rig and number.
-COLUMNS = ("rig", "metric", "name", "value", "error", "low", "high", "unit", "lower_is_better", "count", "count_of",
+COLUMNS = ("rig", "metric", "name", "value", "error", "low", "high", "unit", "lower_is_better", "count", "counted_items",
            "parameters", "warning", "rank")  # fmt: skip
 
 
-class Tau(NamedTuple):
+class KendallTau(NamedTuple):
     """How alike two numbers order the rigs: tau-b of what each holds for better, and its 95 % interval over worlds.
 
     The interval is NaN where one of the two does not say what it would be over other worlds.
@@ -35,35 +35,38 @@ class Tau(NamedTuple):
     tau: float
     low: float
     high: float
-    rigs: int
+    rig_count: int
 
 
 @dataclass(frozen=True, eq=False)
 class MetricComparison:
     """What metrics of others say of the rigs of a run, compared with torchcover's own numbers of regions.
 
-    `left_out` says of a metric that could not be made why.
+    `omissions` says of a metric that could not be made why.
     """
 
     rigs: tuple[str, ...]
     rankings: Sequence[Ranking]
-    own: Sequence[Ranking] = ()
-    left_out: Mapping[str, str] | None = None
+    coverage_rankings: Sequence[Ranking] = ()
+    omissions: Mapping[str, str] | None = None
 
     @property
-    def main(self) -> list[Ranking]:
+    def main_rankings(self) -> list[Ranking]:
         """The numbers that are about everything, and not about a category or a region only."""
         return [one for one in self.rankings if not one.is_part]
 
-    def taus(self) -> list[Tau]:
+    def compute_taus(self) -> list[KendallTau]:
         """Of all pairs of the main numbers and torchcover's own; none for fewer than three rigs."""
         if len(self.rigs) < LEAST:
             return []
-        return [tau_of(first, second) for first, second in combinations([*self.main, *self.own], 2)]
+        return [
+            compute_tau(first, second)
+            for first, second in combinations([*self.main_rankings, *self.coverage_rankings], 2)
+        ]
 
-    def rows(self) -> Iterator[dict[str, Any]]:
+    def iterate_rows(self) -> Iterator[dict[str, Any]]:
         """A row of `COLUMNS` for each rig and number, those of parts too; NaN where unknown."""
-        for one in (*self.rankings, *self.own):
+        for one in (*self.rankings, *self.coverage_rankings):
             for rig, number, rank in zip(self.rigs, one.numbers, one.ranks.tolist(), strict=True):
                 given = {**number.quantity._asdict(), **number._asdict(), "rig": rig, "rank": rank}
                 row = {**given, "metric": one.metric, "name": one.name}
@@ -79,9 +82,13 @@ class MetricComparison:
                 if number.warning:
                     warned.setdefault(number.warning, {})[one.metric] = None
         warnings = [f"{', '.join(metrics)}: {warning}" for warning, metrics in warned.items()]
-        along_rays = [one for one in self.main if one.metric.startswith("s_mig")]
-        rays = [note for one in along_rays if (note := unequal_rays(dict(zip(self.rigs, one.numbers, strict=True))))]
-        missing = [f"Without {name}: {why}" for name, why in (self.left_out or {}).items()]
+        along_rays = [one for one in self.main_rankings if one.metric.startswith("s_mig")]
+        rays = [
+            note
+            for one in along_rays
+            if (note := describe_unequal_rays(dict(zip(self.rigs, one.numbers, strict=True))))
+        ]
+        missing = [f"Without {name}: {why}" for name, why in (self.omissions or {}).items()]
         return [NOT_VALIDATED, *few, *warnings, *rays, *missing]
 
     def build_page_tables(self, *, include_parts: bool = True) -> list[PageTable]:
@@ -92,7 +99,7 @@ class MetricComparison:
         """
         rows = [
             [TextCell(cell) for cell in _format_row(ranking)]
-            for ranking in (self.rankings if include_parts else self.main)
+            for ranking in (self.rankings if include_parts else self.main_rankings)
         ]
         headings = ["metric", "unit", "better", *self.rigs]
         title = f"{TITLE} (rank)" if len(self.rigs) > 1 else TITLE
@@ -111,23 +118,28 @@ class MetricComparison:
             record["parameters"] = json.dumps(record["parameters"], sort_keys=True)
             lines.append([record[name] for name in COLUMNS])
         taus = [record.values() for record in self._tau_records()]
-        return {"metrics.csv": csv_text(lines), "metrics_rank_correlation.csv": csv_text([Tau._fields, *taus])}
+        return {
+            "metrics.csv": format_csv(lines),
+            "metrics_rank_correlation.csv": format_csv([KendallTau._fields, *taus]),
+        }
 
     def _number_records(self) -> list[dict[str, Any]]:
-        return [{**to_json_record(row), "parameters": to_json_record(row["parameters"])} for row in self.rows()]
+        return [{**to_json_record(row), "parameters": to_json_record(row["parameters"])} for row in self.iterate_rows()]
 
     def _tau_records(self) -> list[dict[str, Any]]:
-        return [to_json_record(tau._asdict()) for tau in self.taus()]
+        return [to_json_record(tau._asdict()) for tau in self.compute_taus()]
 
 
-def tau_of(first: Ranking, second: Ranking) -> Tau:
+def compute_tau(first: Ranking, second: Ranking) -> KendallTau:
     """Kendall's tau-b of two numbers, each turned so that more is better, and its interval over drawn worlds."""
-    value = float(kendall_tau_b(first.gains, second.gains))
-    known = int((~np.isnan(first.gains + second.gains)).sum())
+    value = float(compute_kendall_tau_b(first.scores, second.scores))
+    known = int((~np.isnan(first.scores + second.scores)).sum())
     low = high = math.nan
-    if first.drawn_gains is not None and second.drawn_gains is not None:
-        low, high = interval95(value, kendall_tau_b(first.drawn_gains, second.drawn_gains))
-    return Tau(first.name, second.name, value, low, high, known)
+    if first.sampled_scores is not None and second.sampled_scores is not None:
+        low, high = compute_bootstrap_interval95(
+            value, compute_kendall_tau_b(first.sampled_scores, second.sampled_scores)
+        )
+    return KendallTau(first.name, second.name, value, low, high, known)
 
 
 def _format_row(one: Ranking) -> list[str]:
@@ -137,22 +149,22 @@ def _format_row(one: Ranking) -> list[str]:
 
 
 def _words(number: Number, rank: float) -> str:
-    if not number.known:
+    if not number.has_value:
         return "–"
     return format_number(number) if math.isnan(rank) else f"{format_number(number)} ({rank:g})"
 
 
 def _tau_tables(comparison: MetricComparison) -> list[PageTable]:
     """A row for each main number; no table if there are no taus."""
-    found = {(tau.first, tau.second): tau for tau in comparison.taus()}
+    found = {(tau.first, tau.second): tau for tau in comparison.compute_taus()}
     # Numbers of torchcover that the table has room for: the detections.
-    shown = [own.name for own in comparison.own if not own.quantity.lower_is_better]
-    mains = [one.name for one in comparison.main if found]
+    shown = [own.name for own in comparison.coverage_rankings if not own.quantity.lower_is_better]
+    mains = [one.name for one in comparison.main_rankings if found]
     rows = [[TextCell(name), *(TextCell(_tau_words(found[name, own])) for own in shown)] for name in mains]
     return [PageTable(TAU_TITLE, ["metric", *shown], rows)] if rows else []
 
 
-def _tau_words(tau: Tau) -> str:
+def _tau_words(tau: KendallTau) -> str:
     if math.isnan(tau.tau):
         return "–"
     interval = "" if math.isnan(tau.low) else f" [{tau.low:+.2f}, {tau.high:+.2f}]"

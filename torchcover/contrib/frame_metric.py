@@ -10,16 +10,16 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage import BevGrid
-from torchcover.coverage.grid import Bins
+from torchcover.coverage.grid import CellAssignment
 from torchcover.coverage.quantity import MEASURED_WITHIN_M
-from torchcover.detection import Boxes, points_in_boxes
-from torchcover.detection.inside import Inside
+from torchcover.detection import Boxes, find_points_in_boxes
+from torchcover.detection.inside import BoxPointPairs
 from torchcover.devices import has_float64
 from torchcover.estimation import MIN_BLOCKS, Estimate, Number, Quantity
 from torchcover.frames import Frame
-from torchcover.metrics import MergeableSums, SumsInBlocks, figure_of
+from torchcover.metrics import BlockedSums, MergeableSums, get_figure
 from torchcover.neighbors import check_cloud, check_tensor, nearest
-from torchcover.neighbors.choice import backend_of_several
+from torchcover.neighbors.choice import choose_shared_backend
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -51,22 +51,22 @@ class ObjectStrata:
             raise ValueError(f"range_borders_m: ascending numbers > 0 are needed; got {self.range_borders_m}")
 
     @property
-    def meaning(self) -> dict[str, object]:
+    def definition(self) -> dict[str, object]:
         """What sums over them depend on."""
         return {"categories": self.categories, "range_borders_m": self.range_borders_m}
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def name_suffixes(self) -> tuple[str, ...]:
         """What is appended to the name of a number; nothing for all objects."""
         bins = [f":{low:g}-{high:g}m" for low, high in pairwise((0.0, *self.range_borders_m))]
         return ("", *(f":{category}" for category in self.categories), *bins)
 
-    def members(self, boxes: Boxes) -> Tensor:
+    def compute_membership(self, boxes: Boxes) -> Tensor:
         """(strata, K) float64: 1 where an object is one of them."""
         device = boxes.yaw_rad.device
         of_category = [[category == name for category in boxes.categories] for name in self.categories]
         category = torch.tensor(of_category, dtype=torch.float64, device=device).view(len(self.categories), len(boxes))
-        range_m = torch.linalg.vector_norm(boxes.centre_m[:, :2].double(), dim=1)
+        range_m = torch.linalg.vector_norm(boxes.center_m[:, :2].double(), dim=1)
         borders = torch.tensor(self.range_borders_m, dtype=torch.float64, device=device)
         bins = torch.nn.functional.one_hot(torch.bucketize(range_m, borders, right=True), len(borders) + 1).T.double()
         near = 1.0 - bins[-1]
@@ -81,7 +81,7 @@ NO_BOXES = (
 )
 
 
-class Sights:
+class FrameQueryCache:
     """Remembers what was found in the last frame. Metrics of a run, of all its rigs, share one; a copy starts anew.
 
     Example:
@@ -95,23 +95,25 @@ class Sights:
         self._found: dict[tuple[Any, ...], Any] = {}
         self._of_all: tuple[tuple[Any, ...], Any] | None = None
         # Whether a metric asks for single sensors: then the rig as a whole takes no search of its own.
-        self.by_sensor = False
+        self.searches_by_sensor = False
 
-    def __reduce__(self) -> tuple[type["Sights"], tuple[()], dict[str, bool]]:
-        return Sights, (), {"by_sensor": self.by_sensor}
+    def __reduce__(self) -> tuple[type["FrameQueryCache"], tuple[()], dict[str, bool]]:
+        return FrameQueryCache, (), {"searches_by_sensor": self.searches_by_sensor}
 
-    def distance(self, frame: Frame, rig: str, within_m: float) -> Tensor:
+    def find_distances_m(self, frame: Frame, rig_name: str, max_distance_m: float) -> Tensor:
         """(M,) metres from each reference point to the nearest point of the rig; infinite where none is within reach.
 
         Points that were measured farther off than that are none.
         """
-        if self.by_sensor:
-            return self.of_sensors(frame, rig, within_m).amin(dim=0)
-        return self.once(
-            frame, ("rig", rig, within_m), lambda: _search(frame, frame.cloud_of(rig, within_m=within_m), within_m)
+        if self.searches_by_sensor:
+            return self.find_sensor_distances_m(frame, rig_name, max_distance_m).amin(dim=0)
+        return self.get_or_compute(
+            frame,
+            ("rig", rig_name, max_distance_m),
+            lambda: _search(frame, frame.get_cloud(rig_name, max_error_m=max_distance_m), max_distance_m),
         )
 
-    def of_sensors(self, frame: Frame, rig: str, within_m: float) -> Tensor:
+    def find_sensor_distances_m(self, frame: Frame, rig_name: str, max_distance_m: float) -> Tensor:
         """(S, M) the same for each sensor of the rig.
 
         Raises:
@@ -119,13 +121,13 @@ class Sights:
         """
 
         def search() -> Tensor:
-            clouds = list(frame.clouds_by_sensor(rig, within_m=within_m).values())
-            backend = backend_of_several(frame.reference, clouds)
-            return torch.stack([_search(frame, cloud, within_m, backend) for cloud in clouds])
+            clouds = list(frame.get_clouds_by_sensor(rig_name, max_error_m=max_distance_m).values())
+            backend = choose_shared_backend(frame.reference, clouds)
+            return torch.stack([_search(frame, cloud, max_distance_m, backend) for cloud in clouds])
 
-        return self.once(frame, ("sensors", rig, within_m), search)
+        return self.get_or_compute(frame, ("sensors", rig_name, max_distance_m), search)
 
-    def boxes(self, frame: Frame) -> Boxes:
+    def get_boxes(self, frame: Frame) -> Boxes:
         """The objects of the frame.
 
         Raises:
@@ -135,53 +137,57 @@ class Sights:
             raise ValueError(NO_BOXES.format(f"frame {frame.name!r}"))
         return frame.boxes
 
-    def reference_in_boxes(self, frame: Frame) -> Inside:
+    def find_reference_in_boxes(self, frame: Frame) -> BoxPointPairs:
         """Which reference points lie in which objects."""
-        return self.once(frame, ("boxes",), lambda: points_in_boxes(frame.reference, self.boxes(frame)))
+        return self.get_or_compute(
+            frame, ("boxes",), lambda: find_points_in_boxes(frame.reference, self.get_boxes(frame))
+        )
 
-    def members(self, frame: Frame, strata: ObjectStrata) -> Tensor:
+    def compute_membership(self, frame: Frame, strata: ObjectStrata) -> Tensor:
         """(strata, K) float64: 1 where an object is one of them."""
-        what = ("strata", *strata.meaning.values())
-        return self.once(frame, what, lambda: strata.members(self.boxes(frame)))
+        what = ("strata", *strata.definition.values())
+        return self.get_or_compute(frame, what, lambda: strata.compute_membership(self.get_boxes(frame)))
 
-    def hits(self, frame: Frame, rig: str) -> Tensor:
+    def count_points_in_boxes(self, frame: Frame, rig_name: str) -> Tensor:
         """(K,) int64 how many points of the rig lie in each object."""
-        boxes = self.boxes(frame)
-        if rig in boxes.hits:
-            return boxes.hits[rig]
-        points = frame.cloud_of(rig, within_m=MEASURED_WITHIN_M)
-        return self.once(frame, ("hits", rig), lambda: count_in_boxes(points, boxes))
+        boxes = self.get_boxes(frame)
+        if rig_name in boxes.points_in_box:
+            return boxes.points_in_box[rig_name]
+        points = frame.get_cloud(rig_name, max_error_m=MEASURED_WITHIN_M)
+        return self.get_or_compute(frame, ("hits", rig_name), lambda: count_points_in_boxes(points, boxes))
 
-    def bins(self, frame: Frame, grid: BevGrid) -> Bins:
+    def assign_cells(self, frame: Frame, grid: BevGrid) -> CellAssignment:
         """In which cells of a grid the reference points are."""
-        return self.once(frame, ("bins", grid), lambda: grid.bins(frame.reference, frame.heights_in(grid.band_frame)))
+        return self.get_or_compute(
+            frame, ("bins", grid), lambda: grid.assign_cells(frame.reference, frame.get_heights_m(grid.band_frame))
+        )
 
-    def once(self, frame: Frame, what: tuple[Any, ...], find: Callable[[], Found]) -> Found:
+    def get_or_compute(self, frame: Frame, key: tuple[Any, ...], compute: Callable[[], Found]) -> Found:
         """Whatever is to be found in a frame; looked for when it is first asked for."""
         if frame is not self._frame:
             self._frame, self._found = frame, {}
-        if what not in self._found:
-            self._found[what] = find()
-        found: Found = self._found[what]
+        if key not in self._found:
+            self._found[key] = compute()
+        found: Found = self._found[key]
         return found
 
-    def after_all(self, what: tuple[Any, ...], find: Callable[[], Found]) -> Found:
+    def get_or_compute_total(self, key: tuple[Any, ...], compute: Callable[[], Found]) -> Found:
         """Whatever is to be found from what all frames left; remembered until something else is asked for."""
-        if self._of_all is None or self._of_all[0] != what:
-            self._of_all = what, find()
+        if self._of_all is None or self._of_all[0] != key:
+            self._of_all = key, compute()
         found: Found = self._of_all[1]
         return found
 
 
-def rig_of(frame: Frame, rig: str | None) -> str:
+def get_rig_name(frame: Frame, rig_name: str | None) -> str:
     """The name of the rig; of the only one if none is given. ValueError: there is no such rig, or there are several."""
-    frame.cloud_of(rig)
-    return next(iter(frame.clouds)) if rig is None else rig
+    frame.get_cloud(rig_name)
+    return next(iter(frame.clouds)) if rig_name is None else rig_name
 
 
-def count_in_boxes(cloud: Tensor, boxes: Boxes) -> Tensor:
+def count_points_in_boxes(cloud: Tensor, boxes: Boxes) -> Tensor:
     """(K,) int64 how many points lie in each of K boxes."""
-    return torch.bincount(points_in_boxes(cloud, boxes).box, minlength=len(boxes))
+    return torch.bincount(find_points_in_boxes(cloud, boxes).box_indices, minlength=len(boxes))
 
 
 def _search(frame: Frame, cloud: Tensor, within_m: float, backend: str = "auto") -> Tensor:
@@ -201,22 +207,22 @@ class FrameMetric(MergeableSums):
 
     Args:
         meaning: What the sums depend on, as in `MergeableSums`.
-        rig: Whose clouds; those of the only rig if not given.
-        sights: What metrics of a run share; its own if not given.
+        rig_name: Whose clouds; those of the only rig if not given.
+        query_cache: What metrics of a run share; its own if not given.
         kwargs: For the next base.
     """
 
     def __init__(
         self,
-        meaning: Mapping[str, object],
+        definition: Mapping[str, object],
         *,
-        rig: str | None = None,
-        sights: Sights | None = None,
+        rig_name: str | None = None,
+        query_cache: FrameQueryCache | None = None,
         **kwargs: Any,  # noqa: ANN401  (of `FrameMetric`)
     ) -> None:
-        super().__init__({**meaning, "rig": rig}, **kwargs)
-        self.rig = rig
-        self.sights = Sights() if sights is None else sights
+        super().__init__({**definition, "rig": rig_name}, **kwargs)
+        self.rig_name = rig_name
+        self.query_cache = FrameQueryCache() if query_cache is None else query_cache
 
     @torch.no_grad()
     def update(self, frame: Frame | Sequence[Frame]) -> None:
@@ -231,10 +237,10 @@ class FrameMetric(MergeableSums):
             raise TypeError(f"frame: a Frame, or a list of them, is needed; got {type(frame).__name__}")
         for each in frames:
             for name, cloud in {"reference": each.reference, **each.clouds}.items():
-                check_tensor(cloud, name, floating=True)
+                check_tensor(cloud, name, is_floating=True)
         for each in frames:
             self._add_frame(each if has_float64(each.reference.device) else each.to("cpu"))
-            self.steps += 1
+            self.num_frames += 1
 
     def _add_frame(self, frame: Frame) -> None:
         raise NotImplementedError
@@ -251,7 +257,7 @@ class FrameMetric(MergeableSums):
         """What the frames so far say."""
         estimate, about = self._found()
         # How often an interval around such a number holds the truth has not been measured.
-        numbers = estimate.numbers().values()
+        numbers = estimate.to_numbers().values()
         return tuple(
             one._replace(value=number.value, error=number.error, low=number.low, high=number.high)
             for one, number in zip(about, numbers, strict=True)
@@ -270,7 +276,7 @@ class FrameMetric(MergeableSums):
         numbers = self.compute() if val is None else val
         if not all(isinstance(number, Number) for number in numbers):
             raise TypeError(f"val: the numbers of compute() are needed; got {numbers!r}")
-        fig, ax = figure_of(ax)
+        fig, ax = get_figure(ax)
         places = range(len(numbers))
         ax.errorbar([one.value for one in numbers], places, xerr=[one.error for one in numbers], fmt="o")
         ax.set_yticks(places, [f"{one.quantity.key} ({one.quantity.unit})" for one in numbers])
@@ -278,13 +284,15 @@ class FrameMetric(MergeableSums):
         return fig, ax
 
 
-def said(key: str, unit: str, count_of: str, *, lower_is_better: bool = False, **parameters: Any) -> Number:  # noqa: ANN401
+def describe_number(
+    key: str, unit: str, counted_items: str, *, lower_is_better: bool = False, **parameters: Any
+) -> Number:  # noqa: ANN401
     """What a number of a metric is, before it has a value.
 
     Args:
         key: With all that decides it: "object_coverage_0.4m"; of a part of it ":car" is appended.
         unit: "share", "nats", "points", ...
-        count_of: What it is over: "objects", "voxels", ...
+        counted_items: What it is over: "objects", "voxels", ...
         lower_is_better: As its authors say it.
         parameters: What it is computed with.
 
@@ -293,10 +301,10 @@ def said(key: str, unit: str, count_of: str, *, lower_is_better: bool = False, *
         {'k': 2}
     """
     quantity = Quantity(key, key, unit, lower_is_better)
-    return Number(quantity, math.nan, count_of=count_of, parameters=parameters)
+    return Number(quantity, math.nan, counted_items=counted_items, parameters=parameters)
 
 
-class WorldRatios(SumsInBlocks, FrameMetric):
+class SceneRatios(BlockedSums, FrameMetric):
     """Ratios S / A of sums over frames, kept in 16 blocks of contiguous worlds (`Frame.block_index`).
 
     A metric gives its `ratios`, and in `_of_frame` what a frame adds to each: a_j, s_j, and how many these are. Errors
@@ -309,16 +317,16 @@ class WorldRatios(SumsInBlocks, FrameMetric):
         kwargs: `rig` and `sights` of `FrameMetric`.
     """
 
-    base: Tensor
-    sums: Tensor
+    denominators: Tensor
+    numerators: Tensor
     counts: Tensor
 
-    def __init__(self, ratios: Sequence[Number], meaning: Mapping[str, object], **kwargs: Any) -> None:  # noqa: ANN401
-        super().__init__(BLOCKS, meaning, **kwargs)
+    def __init__(self, ratios: Sequence[Number], definition: Mapping[str, object], **kwargs: Any) -> None:  # noqa: ANN401
+        super().__init__(BLOCKS, definition, **kwargs)
         self.ratios = tuple(ratios)
-        self.add_block_sum("base", (len(self.ratios),))
-        self.add_block_sum("sums", (len(self.ratios),))
-        self.add_sum("counts", (len(self.ratios),), torch.int64)
+        self.define_block_sum("denominators", (len(self.ratios),))
+        self.define_block_sum("numerators", (len(self.ratios),))
+        self.define_sum("counts", (len(self.ratios),), torch.int64)
 
     def _of_frame(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
         """(V,) what a frame adds to what is divided by, to the sums, and to the int64 counts of each ratio."""
@@ -327,12 +335,14 @@ class WorldRatios(SumsInBlocks, FrameMetric):
     def _add_frame(self, frame: Frame) -> None:
         base, sums, counts = self._of_frame(frame)  # before anything is added
         block = self._block_of(frame.block_index)
-        self.base[block] += base.to(self.base)
-        self.sums[block] += sums.to(self.sums)
+        self.denominators[block] += base.to(self.denominators)
+        self.numerators[block] += sums.to(self.numerators)
         self.counts += counts.to(self.counts)
 
     def _found(self) -> tuple[Estimate, Sequence[Number]]:
         about = [one._replace(count=count) for one, count in zip(self.ratios, self.counts.tolist(), strict=True)]
-        estimate = Estimate.of_ratios([one.quantity for one in about], self.base, self.sums, self.block_steps)
-        enough = (self.base > 0).sum(dim=0) >= min(MIN_BLOCKS, len(estimate.steps))
-        return replace(estimate, left_out=estimate.left_out.where(enough, math.nan)), about
+        estimate = Estimate.from_ratios(
+            [one.quantity for one in about], self.denominators, self.numerators, self.block_frame_counts
+        )
+        enough = (self.denominators > 0).sum(dim=0) >= min(MIN_BLOCKS, len(estimate.frame_counts))
+        return replace(estimate, jackknife_values=estimate.jackknife_values.where(enough, math.nan)), about

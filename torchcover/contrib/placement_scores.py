@@ -9,10 +9,10 @@ from typing import Any, Literal
 import numpy as np
 
 from torchcover.contrib.comparison import MetricComparison
-from torchcover.contrib.ranks import BASELINE, LEAST, OWN, Ranking, rankings
+from torchcover.contrib.ranks import BASELINE, LEAST, OWN, Ranking, build_rankings
 from torchcover.contrib.registry import PUBLISHED
 from torchcover.coverage import Coverage, Region
-from torchcover.coverage.measures import Measure
+from torchcover.coverage.measures import Average
 from torchcover.estimation import Quantity
 from torchcover.evaluation.evaluating import evaluate
 from torchcover.evaluation.task import AnyRig, load_rig
@@ -21,18 +21,18 @@ from torchcover.simulation import RegionsOfInterest, Scenario
 THRESHOLD_M = 0.4
 CELL_M = 1.0
 RADIUS_M = 50.0
-MEASURES: Mapping[Measure, str] = {"area": "visible surface", "cells": "observed cells"}
+MEASURES: Mapping[Average, str] = {"area": "visible surface", "cells": "observed cells"}
 # Counts what any metric has to beat: how many points there are.
 COUNTS_POINTS, POINTS = "point_density", "points"
 # Of the parts of a number, those about what detectors are judged on.
 CATEGORIES = ("car", "pedestrian", "cyclist")
 
 
-def circle(radius_m: float = RADIUS_M) -> Region:
+def build_circle_region(radius_m: float = RADIUS_M) -> Region:
     """The region around the vehicle, as a polygon with a corner for each degree."""
     angles = map(math.radians, range(360))
     corners_m = [(radius_m * math.cos(angle), radius_m * math.sin(angle)) for angle in angles]
-    return Region.polygon(f"{radius_m:g}m_around", corners_m)
+    return Region.from_corners(f"{radius_m:g}m_around", corners_m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,19 +42,19 @@ class PlacementScores:
     Args:
         rigs: Names of the placements.
         rankings: A row for each metric, with numbers in the order of `rigs`.
-        steps: Steps that they were measured in.
+        num_frames: Steps that they were measured in.
         sensor_models: Name of each placement -> what its sensors made of their hits, `ideal` or `real`.
     """
 
     rigs: tuple[str, ...]
     rankings: tuple[Ranking, ...]
-    steps: int
+    num_frames: int
     sensor_models: Mapping[str, str]
 
-    def of(self, rigs: Sequence[str]) -> tuple[Ranking, ...]:
+    def select(self, rigs: Sequence[str]) -> tuple[Ranking, ...]:
         """The rows of some of the placements, in another order."""
         places = [self.rigs.index(rig) for rig in rigs]
-        return tuple(one.of(places) for one in self.rankings)
+        return tuple(one.select(places) for one in self.rankings)
 
 
 def score_placements(
@@ -63,7 +63,7 @@ def score_placements(
     *,
     region: Region | None = None,
     metrics: Sequence[str] | None = None,
-    steps: int = 64,
+    num_frames: int = 64,
     seed: int = 0,
     sensor_model: Literal["ideal", "real"] | None = None,
     **settings: Any,  # noqa: ANN401  (those of `evaluate`)
@@ -79,7 +79,7 @@ def score_placements(
         region: Where; a circle of 50 m around the vehicle if not given.
         metrics: Those of others, of `torchcover.contrib.PUBLISHED`; all if not given. The number of points is always
             there.
-        steps: Steps.
+        num_frames: Steps.
         seed: Seed of the traffic.
         sensor_model: What sensors make of their hits; as for `evaluate`.
         settings: Others of `evaluate`: `frame_interval_s`, `workers`, `progress`.
@@ -99,14 +99,14 @@ def score_placements(
     carried = {
         name: load_rig(rig).sensing(sensor_model).model_copy(update={"name": name}) for name, rig in rigs.items()
     }
-    region = circle() if region is None else region
+    region = build_circle_region() if region is None else region
     result = evaluate(
         list(carried.values()),
         scenario,
         regions=_around(region),
         thresholds_m=THRESHOLD_M,
         metrics=tuple(dict.fromkeys([*(PUBLISHED if metrics is None else metrics), COUNTS_POINTS])),
-        num_frames=steps,
+        num_frames=num_frames,
         seed=seed,
         **settings,
     )
@@ -122,15 +122,15 @@ def score_placements(
             _of_rigs("mean mounting height", "m", [round(height_m, 6) for height_m in heights_m]),
             _of_rigs("rays", "rays", [float(sum(sensor.rays for sensor in rig.sensors)) for rig in carried.values()]),
         ),
-        steps=steps,
+        num_frames=num_frames,
         sensor_models={name: rig.sensor_model for name, rig in carried.items()},
     )
 
 
 def _around(region: Region) -> RegionsOfInterest:
     """What is asked about: one region, and a grid that just holds it."""
-    x, y = ((math.floor(low), math.ceil(high)) for low, high in (region.x, region.y))
-    where = {"polygon_m": region.corners_m} if region.corners_m else {"x_m": region.x, "y_m": region.y}
+    x, y = ((math.floor(low), math.ceil(high)) for low, high in (region.x_m, region.y_m))
+    where = {"polygon_m": region.corners_m} if region.corners_m else {"x_m": region.x_m, "y_m": region.y_m}
     grid = {"x_m": x, "y_m": y, "cell_m": CELL_M}
     return RegionsOfInterest.model_validate({"regions": {region.name: where}, "grid": grid})
 
@@ -141,14 +141,14 @@ def _own(coverages: Sequence[Coverage], region: Region, seed: int) -> Iterator[R
         name, bands = f"detection {THRESHOLD_M:g} m, {{}}, {region.name}, {words}", []
         for band in coverages[0].grid.heights:
             estimates = [coverage.estimate(region, band, measure)[1:] for coverage in coverages]
-            numbers = [list(estimate.numbers().values()) for estimate in estimates]
-            (one,) = rankings(OWN, numbers, estimates, seed)
+            numbers = [list(estimate.to_numbers().values()) for estimate in estimates]
+            (one,) = build_rankings(OWN, numbers, estimates, seed)
             bands.append(one._replace(name=name.format(band)))
         yield from bands
-        both = np.mean([one.gains for one in bands], axis=0)
-        draws = [one.draws for one in bands if one.draws is not None]
+        both = np.mean([one.scores for one in bands], axis=0)
+        draws = [one.samples for one in bands if one.samples is not None]
         again = np.asarray(np.mean(draws, axis=0)) if len(draws) == len(bands) else None
-        yield Ranking.of_values(bands[0].quantity, both, OWN, again)._replace(name=name.format("both bands"))
+        yield Ranking.from_values(bands[0].quantity, both, OWN, again)._replace(name=name.format("both bands"))
 
 
 def _of_others(published: Sequence[Ranking]) -> Iterator[Ranking]:
@@ -160,4 +160,4 @@ def _of_others(published: Sequence[Ranking]) -> Iterator[Ranking]:
 
 
 def _of_rigs(words: str, unit: str, values: Iterable[float]) -> Ranking:
-    return Ranking.of_values(Quantity(words, words, unit, lower_is_better=False), list(values))
+    return Ranking.from_values(Quantity(words, words, unit, lower_is_better=False), list(values))

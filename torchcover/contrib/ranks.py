@@ -29,7 +29,7 @@ class Ranking(NamedTuple):
         name: Of the number, with all that decides it.
         metric: The published metric that it is of, `OWN` or `BASELINE`.
         numbers: One for each rig.
-        draws: (R, rigs) what they were in worlds that are drawn again; None if that is unknown.
+        samples: (R, rigs) what they were in worlds that are drawn again; None if that is unknown.
 
     Example:
         >>> height = Quantity("height", "mean mounting height", "m", lower_is_better=False)
@@ -40,14 +40,18 @@ class Ranking(NamedTuple):
     name: str
     metric: str
     numbers: tuple[Number, ...]
-    draws: Float64 | None = None
+    samples: Float64 | None = None
 
     @classmethod
-    def of_values(
-        cls, quantity: Quantity, values: Sequence[float] | Float64, metric: str = BASELINE, draws: Float64 | None = None
+    def from_values(
+        cls,
+        quantity: Quantity,
+        values: Sequence[float] | Float64,
+        metric: str = BASELINE,
+        samples: Float64 | None = None,
     ) -> "Ranking":
         """Of values (rigs,) without errors."""
-        return cls(quantity.key, metric, tuple(Number(quantity, float(value)) for value in values), draws)
+        return cls(quantity.key, metric, tuple(Number(quantity, float(value)) for value in values), samples)
 
     @property
     def quantity(self) -> Quantity:
@@ -60,34 +64,36 @@ class Ranking(NamedTuple):
         return ":" in self.name
 
     @property
-    def gains(self) -> Float64:
+    def scores(self) -> Float64:
         """(rigs,) the values, with the sign turned so that more is better; NaN where unknown."""
-        return np.array([number.quantity.gain(number.value) for number in self.numbers])
+        return np.array([number.quantity.compute_improvement(number.value) for number in self.numbers])
 
     @property
-    def drawn_gains(self) -> Float64 | None:
+    def sampled_scores(self) -> Float64 | None:
         """(R, rigs) likewise those of the draws."""
-        return None if self.draws is None else self.quantity.gain(1.0) * self.draws
+        return None if self.samples is None else self.quantity.compute_improvement(1.0) * self.samples
 
     @property
     def ranks(self) -> Float64:
         """(rigs,) 1 for the best; equal ones share the mean of theirs, NaN where unknown."""
-        return rank_values(-self.gains)
+        return rank_values(-self.scores)
 
-    def of(self, rigs: Sequence[int]) -> "Ranking":
+    def select(self, rig_indices: Sequence[int]) -> "Ranking":
         """Of some of the rigs, by their places, in another order."""
-        numbers = tuple(self.numbers[rig] for rig in rigs)
-        return self._replace(numbers=numbers, draws=None if self.draws is None else self.draws[:, list(rigs)])
+        numbers = tuple(self.numbers[rig] for rig in rig_indices)
+        return self._replace(
+            numbers=numbers, samples=None if self.samples is None else self.samples[:, list(rig_indices)]
+        )
 
 
-def rankings(
+def build_rankings(
     metric: str, numbers: Sequence[Sequence[Number]], estimates: Sequence[Estimate], seed: int
 ) -> list[Ranking]:
     """A ranking by each number of a metric, the same of each rig, with draws of worlds from what they come from.
 
     The seed is the same for all metrics of a run.
     """
-    draws = [drawn_again(estimate, seed) for estimate in estimates]
+    draws = [resample_estimate(estimate, seed) for estimate in estimates]
     known = [each for each in draws if each is not None]
     stacked = np.stack(known, axis=2) if len(known) == len(draws) else None
     return [
@@ -96,19 +102,19 @@ def rankings(
     ]
 
 
-def drawn_again(estimate: Estimate, seed: int) -> Float64 | None:
+def resample_estimate(estimate: Estimate, seed: int) -> Float64 | None:
     """(R, Q) numbers over worlds that are drawn with replacement; None if too few, or what that gives, are known."""
-    worlds = len(estimate.steps)
+    worlds = len(estimate.frame_counts)
     if worlds < MIN_BLOCKS:
         return None
     drawn = np.random.default_rng([seed, worlds]).multinomial(worlds, np.full(worlds, 1 / worlds), size=DRAWS)
-    again = estimate.resampled(torch.from_numpy(drawn))
+    again = estimate.resample(torch.from_numpy(drawn))
     return None if again is None else again.cpu().numpy()
 
 
-def interval95(value: float, drawn: Float64) -> tuple[float, float]:
+def compute_bootstrap_interval95(value: float, sampled_values: Float64) -> tuple[float, float]:
     """Ends of the 95 % interval of a number by what it is in draws; NaN where it, or all of them, are unknown."""
-    known = drawn[~np.isnan(drawn)]
+    known = sampled_values[~np.isnan(sampled_values)]
     if math.isnan(value) or not known.size:
         return math.nan, math.nan
     low, high = np.quantile(known, (0.025, 0.975)).tolist()
@@ -125,7 +131,7 @@ def rank_values(values: ArrayLike) -> Float64:
     return ranks
 
 
-def kendall_tau_b(first: ArrayLike, second: ArrayLike) -> Float64:
+def compute_kendall_tau_b(first: ArrayLike, second: ArrayLike) -> Float64:
     """Compute Kendall's tau-b: 1 for the same order, -1 for the opposite one; ties count for neither.
 
         tau_b = (C - D) / sqrt((P - T_1) (P - T_2))
@@ -150,8 +156,8 @@ def kendall_tau_b(first: ArrayLike, second: ArrayLike) -> Float64:
     return _divide(agreement, np.sqrt(untied[0] * untied[1]), one)
 
 
-def spearman(first: ArrayLike, second: ArrayLike) -> Float64:
-    """Compute Spearman's rank correlation: Pearson's of the ranks, so that ties are right; else as `kendall_tau_b`."""
+def compute_spearman(first: ArrayLike, second: ArrayLike) -> Float64:
+    """Compute Spearman's rank correlation: Pearson's of the ranks, so that ties are right; else as `compute_kendall_tau_b`."""
     masked = _mask_unknown(first, second)
     centered = []
     for values in masked:
@@ -168,13 +174,13 @@ class BestCorrelation(NamedTuple):
 
     Args:
         strongest: Absolute rank correlation of the best series; NaN if none is known.
-        p: Two-sided probability that the best series is as strong by chance.
-        by_chance: (P,) strongest correlation for each permutation of the target.
+        p_value: Two-sided probability that the best series is as strong by chance.
+        chance_correlations: (P,) strongest correlation for each permutation of the target.
     """
 
     strongest: float
-    p: float
-    by_chance: Float64
+    p_value: float
+    chance_correlations: Float64
 
 
 def check_best_correlation(first: ArrayLike, second: ArrayLike, seed: int = 0) -> BestCorrelation:
@@ -191,11 +197,11 @@ def check_best_correlation(first: ArrayLike, second: ArrayLike, seed: int = 0) -
 
     def find_strongest(permuted: Float64, axis: int = -1) -> Float64:
         aligned = np.moveaxis(permuted, axis, -1)
-        correlations = np.abs([spearman(values, aligned) for values in series])
+        correlations = np.abs([compute_spearman(values, aligned) for values in series])
         strongest: Float64 = np.nan_to_num(correlations).max(axis=0)
         return strongest
 
-    observed = np.abs([spearman(values, target) for values in series])
+    observed = np.abs([compute_spearman(values, target) for values in series])
     if np.isnan(observed).all():
         return BestCorrelation(math.nan, math.nan, np.empty(0))
     test = permutation_test(

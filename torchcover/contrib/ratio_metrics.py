@@ -13,15 +13,15 @@ from torchcover.contrib.frame_metric import (
     CATEGORIES,
     RANGE_BORDERS_M,
     ObjectStrata,
-    WorldRatios,
-    count_in_boxes,
-    rig_of,
-    said,
+    SceneRatios,
+    count_points_in_boxes,
+    describe_number,
+    get_rig_name,
 )
 from torchcover.coverage import BevGrid, Region, check_regions
 from torchcover.coverage.quantity import MEASURED_WITHIN_M
-from torchcover.coverage.regions import Places
-from torchcover.detection.visibility import mean_by_box
+from torchcover.coverage.regions import RegionBands
+from torchcover.detection.visibility import compute_box_means
 from torchcover.frames import Frame
 from torchcover.neighbors import check_cloud, nearest
 from torchcover.simulation import CameraSensor, Sensor
@@ -29,16 +29,16 @@ from torchcover.simulation import CameraSensor, Sensor
 HITS = (1, 5, 10)
 
 
-class ObjectCoverage(WorldRatios):
+class ObjectCoverage(SceneRatios):
     """Mean over objects of the share that the rig sees, and share of objects with n points of the rig or more.
 
-    The share of one object is that of `torchcover.detection.box_visibility`: of what the reference's places see of it,
+    The share of one object is that of `torchcover.detection.measure_box_visibility`: of what the reference's places see of it,
     in square metres where the weights are; an object of which they see nothing is unknown and not in the mean. Hits are
     counted over all objects, those that are hidden from everywhere among them.
 
     Args:
         threshold_m: Distance within which a point counts as seen.
-        hits: Numbers of points, n.
+        min_point_counts: Numbers of points, n.
         categories: Those that have numbers of their own.
         range_borders_m: Borders between bins of range; farther objects do not count.
         kwargs: `rig` and `sights` of `FrameMetric`.
@@ -60,41 +60,47 @@ class ObjectCoverage(WorldRatios):
     def __init__(
         self,
         threshold_m: float = 0.4,
-        hits: Sequence[int] = HITS,
+        min_point_counts: Sequence[int] = HITS,
         categories: Sequence[str] = CATEGORIES,
         range_borders_m: Sequence[float] = RANGE_BORDERS_M,
         **kwargs: Any,  # noqa: ANN401  (of `FrameMetric`)
     ) -> None:
         if not 0 <= threshold_m < float("inf"):
             raise ValueError(f"threshold_m: a finite distance >= 0 in metres is needed; got {threshold_m}")
-        if not hits or any(least < 1 for least in hits) or len(set(hits)) < len(hits):
-            raise ValueError(f"hits: different numbers of points from 1 on are needed; got {tuple(hits)}")
+        if (
+            not min_point_counts
+            or any(least < 1 for least in min_point_counts)
+            or len(set(min_point_counts)) < len(min_point_counts)
+        ):
+            raise ValueError(f"hits: different numbers of points from 1 on are needed; got {tuple(min_point_counts)}")
         strata = ObjectStrata(categories, range_borders_m)
-        names = [f"object_coverage_{threshold_m:g}m", *(f"objects_hit_{least}" for least in hits)]
-        given: list[dict[str, Any]] = [{"threshold_m": threshold_m}, *({"hits": least} for least in hits)]
+        names = [f"object_coverage_{threshold_m:g}m", *(f"objects_hit_{least}" for least in min_point_counts)]
+        given: list[dict[str, Any]] = [{"threshold_m": threshold_m}, *({"hits": least} for least in min_point_counts)]
         within: dict[str, Any] = {"range_m": strata.range_borders_m[-1]}
         ratios = [
-            said(name + stratum, "share", "objects", **parameters, **within)
+            describe_number(name + stratum, "share", "objects", **parameters, **within)
             for name, parameters in zip(names, given, strict=True)
-            for stratum in strata.names
+            for stratum in strata.name_suffixes
         ]
-        super().__init__(ratios, {"threshold_m": float(threshold_m), "hits": tuple(hits), **strata.meaning}, **kwargs)
+        super().__init__(
+            ratios, {"threshold_m": float(threshold_m), "hits": tuple(min_point_counts), **strata.definition}, **kwargs
+        )
         self.strata = strata
         self.threshold_m = float(threshold_m)
-        self.hits = tuple(hits)
+        self.min_point_counts = tuple(min_point_counts)
 
     def _of_frame(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
-        rig, boxes = rig_of(frame, self.rig), self.sights.boxes(frame)
-        seen = self.sights.distance(frame, rig, self.threshold_m) <= self.threshold_m
-        box, point = self.sights.reference_in_boxes(frame)
+        rig, boxes = get_rig_name(frame, self.rig_name), self.query_cache.get_boxes(frame)
+        seen = self.query_cache.find_distances_m(frame, rig, self.threshold_m) <= self.threshold_m
+        box, point = self.query_cache.find_reference_in_boxes(frame)
         weights = None if frame.reference_weights is None else frame.reference_weights[point]
-        share = mean_by_box(seen[point].double(), box, len(boxes), weights)
+        share = compute_box_means(seen[point].double(), box, len(boxes), weights)
         known = ~share.isnan()
-        hits = self.sights.hits(frame, rig).to(share.device)
+        hits = self.query_cache.count_points_in_boxes(frame, rig).to(share.device)
         # (1 + hits, K) of each object, whether it counts, and with what.
-        counts = torch.stack([known.double(), *[torch.ones_like(share)] * len(self.hits)])
-        values = torch.stack([share.where(known, 0.0), *((hits >= least).double() for least in self.hits)])
-        members = self.sights.members(frame, self.strata).to(share.device)
+        counts = torch.stack([known.double(), *[torch.ones_like(share)] * len(self.min_point_counts)])
+        values = torch.stack([share.where(known, 0.0), *((hits >= least).double() for least in self.min_point_counts)])
+        members = self.query_cache.compute_membership(frame, self.strata).to(share.device)
         base = (counts @ members.T).flatten()
         return base, (values @ members.T).flatten(), base.long()
 
@@ -104,30 +110,30 @@ CONSTANTS: Mapping[str, tuple[float, float]] = MappingProxyType({"lidar": (0.152
 PRECISIONS = (0.001, 0.999)
 
 
-def standard_deviation(measurements: Tensor, kind: str) -> Tensor:
+def compute_standard_deviation(measurements: Tensor, sensor_kind: str) -> Tensor:
     """The sigma of objects with (K,) measurements of one kind of sensor: 1 / AP - 1, AP = a ln m + b.
 
     AP is kept within [0.001, 0.999], as GO4ROBO does; with the constants of LiDARs it is 0.999 from 10 points on. No
     measurement is as bad as can be.
     """
-    a, b = CONSTANTS[kind]
+    a, b = CONSTANTS[sensor_kind]
     precision = (a * measurements.double().log() + b).clamp(*PRECISIONS)
     return 1 / precision - 1
 
 
-def late_fusion(sigmas: Sequence[Tensor]) -> Tensor:
+def fuse_standard_deviations(sigmas: Sequence[Tensor]) -> Tensor:
     """The sigma of several kinds of sensors together: (sum of sigma_i^-2)^-1/2."""
     return torch.stack(list(sigmas)).pow(-2).sum(dim=0).pow(-0.5)
 
 
-def entropy(sigma: Tensor, *, bounded: bool = False) -> Tensor:
+def compute_entropy_nats(sigma: Tensor, *, is_bounded: bool = False) -> Tensor:
     """Nats of a Gaussian in the plane: 2 ln sigma + 1 + ln 2 pi; bounded: 2 ln(sigma + 1) + ln 2 pi."""
-    if bounded:
+    if is_bounded:
         return 2 * (sigma + 1).log() + math.log(2 * math.pi)
     return 2 * sigma.log() + 1 + math.log(2 * math.pi)
 
 
-class PerceptionEntropy(WorldRatios):
+class PerceptionEntropy(SceneRatios):
     """Mean over objects of their perception entropy (Ma et al. 2021, as GO4ROBO has it); lower is better.
 
     Points of LiDARs on an object are added up, those of cameras too, and the two kinds are fused late. The plain form
@@ -164,36 +170,38 @@ class PerceptionEntropy(WorldRatios):
         strata = ObjectStrata(categories, range_borders_m)
         given = {"range_m": strata.range_borders_m[-1], "constants": dict(CONSTANTS), "cameras": sorted(cameras)}
         ratios = [
-            said(form + name, "nats", "objects", lower_is_better=True, **given)
+            describe_number(form + name, "nats", "objects", lower_is_better=True, **given)
             for form in ("perception_entropy", "perception_entropy_bounded")
-            for name in strata.names
+            for name in strata.name_suffixes
         ]
-        super().__init__(ratios, {**strata.meaning, "cameras": tuple(sorted(cameras.items()))}, **kwargs)
+        super().__init__(ratios, {**strata.definition, "cameras": tuple(sorted(cameras.items()))}, **kwargs)
         self.strata = strata
-        self.cameras = cameras
+        self.pixels_per_sample = cameras
 
     def _of_frame(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
-        sigma = self._sigma(frame, rig_of(frame, self.rig))
-        members = self.sights.members(frame, self.strata).to(sigma.device)
-        values = torch.stack([entropy(sigma), entropy(sigma, bounded=True)])
+        sigma = self._sigma(frame, get_rig_name(frame, self.rig_name))
+        members = self.query_cache.compute_membership(frame, self.strata).to(sigma.device)
+        values = torch.stack([compute_entropy_nats(sigma), compute_entropy_nats(sigma, is_bounded=True)])
         count = members.sum(dim=1).repeat(2)
         return count, (values @ members.T).flatten(), count.long()
 
     def _sigma(self, frame: Frame, rig: str) -> Tensor:
-        if not self.cameras:
-            return standard_deviation(self.sights.hits(frame, rig), "lidar")
-        boxes, measurements = self.sights.boxes(frame), dict[str, Tensor]()
-        for name, cloud in frame.clouds_by_sensor(rig, within_m=MEASURED_WITHIN_M).items():
-            kind = "camera" if name in self.cameras else "lidar"
-            of_sensor = self.cameras.get(name, 1) * count_in_boxes(cloud, boxes)
+        if not self.pixels_per_sample:
+            return compute_standard_deviation(self.query_cache.count_points_in_boxes(frame, rig), "lidar")
+        boxes, measurements = self.query_cache.get_boxes(frame), dict[str, Tensor]()
+        for name, cloud in frame.get_clouds_by_sensor(rig, max_error_m=MEASURED_WITHIN_M).items():
+            kind = "camera" if name in self.pixels_per_sample else "lidar"
+            of_sensor = self.pixels_per_sample.get(name, 1) * count_points_in_boxes(cloud, boxes)
             measurements[kind] = measurements.get(kind, torch.zeros_like(of_sensor)) + of_sensor
-        return late_fusion([standard_deviation(count, kind) for kind, count in measurements.items()])
+        return fuse_standard_deviations(
+            [compute_standard_deviation(count, kind) for kind, count in measurements.items()]
+        )
 
 
 AT_LEAST = (1, 2, 3)
 
 
-class KCover(WorldRatios):
+class KCover(SceneRatios):
     """Share of the visible square metres within the threshold of k sensors of the rig or more.
 
     The binary cover with redundancy of the art gallery line (Vijay et al. 2021): of surface that the random reference
@@ -203,8 +211,8 @@ class KCover(WorldRatios):
         grid: Cells and height bands.
         regions: Those that have numbers of their own.
         threshold_m: Distance within which a point counts as seen.
-        at_least: Numbers of sensors, k; more than the rig has are covered nowhere.
-        square_metres: Whether the share is one of square metres, which frames are then to have; else one of points.
+        min_sensor_counts: Numbers of sensors, k; more than the rig has are covered nowhere.
+        has_area_weights: Whether the share is one of square metres, which frames are then to have; else one of points.
         kwargs: `rig` and `sights` of `FrameMetric`.
 
     Raises:
@@ -226,60 +234,71 @@ class KCover(WorldRatios):
         grid: BevGrid,
         regions: Sequence[Region],
         threshold_m: float = 0.4,
-        at_least: Sequence[int] = AT_LEAST,
+        min_sensor_counts: Sequence[int] = AT_LEAST,
         *,
-        square_metres: bool = True,
+        has_area_weights: bool = True,
         **kwargs: Any,  # noqa: ANN401  (of `FrameMetric`)
     ) -> None:
         if not 0 <= threshold_m < float("inf"):
             raise ValueError(f"threshold_m: a finite distance >= 0 in metres is needed; got {threshold_m}")
-        if not at_least or any(least < 1 for least in at_least) or len(set(at_least)) < len(at_least):
-            raise ValueError(f"at_least: different numbers of sensors from 1 on are needed; got {tuple(at_least)}")
+        if (
+            not min_sensor_counts
+            or any(least < 1 for least in min_sensor_counts)
+            or len(set(min_sensor_counts)) < len(min_sensor_counts)
+        ):
+            raise ValueError(
+                f"at_least: different numbers of sensors from 1 on are needed; got {tuple(min_sensor_counts)}"
+            )
         check_regions(regions, grid)
-        places = Places(regions, grid)
+        places = RegionBands(regions, grid)
         names = ["", *(f":{region.name}_{band}" for region in places.regions for band in grid.heights)]
-        counted = "reference points, by square metres" if square_metres else "reference points"
+        counted = "reference points, by square metres" if has_area_weights else "reference points"
         ratios = [
-            said(f"k_cover_{k}_{threshold_m:g}m{name}", "share", counted, k=k, threshold_m=threshold_m)
-            for k in at_least
+            describe_number(f"k_cover_{k}_{threshold_m:g}m{name}", "share", counted, k=k, threshold_m=threshold_m)
+            for k in min_sensor_counts
             for name in names
         ]
         meaning = {
             "threshold_m": float(threshold_m),
-            "at_least": tuple(at_least),
-            "square_metres": square_metres,
+            "at_least": tuple(min_sensor_counts),
+            "square_metres": has_area_weights,
             "grid": grid,
             "regions": places.regions,
         }
         super().__init__(ratios, meaning, **kwargs)
-        self.places = places
+        self.region_bands = places
         self.threshold_m = float(threshold_m)
-        self.at_least = tuple(at_least)
-        self.square_metres = square_metres
-        self.sights.by_sensor = True
+        self.min_sensor_counts = tuple(min_sensor_counts)
+        self.has_area_weights = has_area_weights
+        self.query_cache.searches_by_sensor = True
 
     def _of_frame(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
-        weights = frame.reference_weights if self.square_metres else frame.reference.new_ones(len(frame.reference))
+        weights = frame.reference_weights if self.has_area_weights else frame.reference.new_ones(len(frame.reference))
         if weights is None:
             raise ValueError(
                 f"frame {frame.name!r}: the square metres of its reference points (reference_weights) are needed; got "
                 "none; for a share of the points use square_metres=False"
             )
-        within = self.sights.of_sensors(frame, rig_of(frame, self.rig), self.threshold_m) <= self.threshold_m
-        inside, of, cell = self.sights.bins(frame, self.places.grid)
+        within = (
+            self.query_cache.find_sensor_distances_m(frame, get_rig_name(frame, self.rig_name), self.threshold_m)
+            <= self.threshold_m
+        )
+        inside, of, cell = self.query_cache.assign_cells(frame, self.region_bands.grid)
         point = inside[of]
         sensors = within.sum(dim=0)[point]
         weight = weights.to(point.device)[point].double()
-        seen = [weight * (sensors >= k) for k in self.at_least]
+        seen = [weight * (sensors >= k) for k in self.min_sensor_counts]
         values = torch.stack([torch.ones_like(weight), weight, *seen])
-        place, of_place = self.places.of_points(frame.reference.to(point.device)[point], cell)
-        in_places = values.new_zeros(len(values), self.places.count).index_add_(1, place, values[:, of_place])
+        place, of_place = self.region_bands.assign_points(frame.reference.to(point.device)[point], cell)
+        in_places = values.new_zeros(len(values), self.region_bands.num_region_bands).index_add_(
+            1, place, values[:, of_place]
+        )
         sums = torch.cat([values.sum(dim=1, keepdim=True), in_places], dim=1)
         count, base = (row.repeat(len(seen)) for row in sums[:2])
         return base, sums[2:].flatten(), count.long()
 
 
-class PointDensity(WorldRatios):
+class PointDensity(SceneRatios):
     """Points of the rig in a frame; over the grid and in regions those for each square metre, and their uniformity.
 
     The density is over the ground as drawn, be it visible or not. The uniformity is (sum n)^2 / (C sum n^2) over the
@@ -313,33 +332,33 @@ class PointDensity(WorldRatios):
         check_regions(regions, grid)
         names = ["", *(f":{region.name}" for region in regions)]
         ratios = [
-            said("points", "points", "frames"),
-            *(said(f"point_density{name}", "points/m2", "frames") for name in names),
-            *(said(f"point_uniformity_{grid.cell:g}m{name}", "share", "frames") for name in names),
+            describe_number("points", "points", "frames"),
+            *(describe_number(f"point_density{name}", "points/m2", "frames") for name in names),
+            *(describe_number(f"point_uniformity_{grid.cell_m:g}m{name}", "share", "frames") for name in names),
         ]
         super().__init__(ratios, {"grid": grid, "regions": tuple(regions)}, **kwargs)
         self.grid = grid
         everywhere = torch.ones(grid.shape[1:], dtype=torch.bool, device="cpu")
-        self._members = torch.stack([everywhere, *(region.mask(grid) for region in regions)]).flatten(1).double()
+        self._members = torch.stack([everywhere, *(region.mask_cells(grid) for region in regions)]).flatten(1).double()
 
     def _of_frame(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
-        cloud = frame.cloud_of(rig_of(frame, self.rig))
+        cloud = frame.get_cloud(get_rig_name(frame, self.rig_name))
         check_cloud(cloud, "sensor")
         height = None if self.grid.band_frame == "vehicle" else _heights_m(cloud, frame)
-        each = self.grid.points_by_column(cloud, height).flatten().cpu()
+        each = self.grid.count_points_by_column(cloud, height).flatten().cpu()
         cells = self._members.sum(dim=1)
         points, squares = (self._members @ torch.stack([each, each.square()], dim=1)).T
         somewhere = (points > 0).double()
         uniformity = points.square() / (cells * squares).where(points > 0, 1.0)
         one, all_points = cells.new_ones(1), cells.new_tensor([len(cloud)])
-        base = torch.cat([one, cells * self.grid.cell**2, somewhere])
+        base = torch.cat([one, cells * self.grid.cell_m**2, somewhere])
         counts = torch.cat([one, torch.ones_like(cells), somewhere]).long()
         return base, torch.cat([all_points, points, uniformity]), counts
 
 
 def _heights_m(cloud: Tensor, frame: Frame) -> Tensor:
     """(N,) how high points lie above the ground, NaN where it is unknown everywhere."""
-    heights_m = frame.heights_in("ground")
+    heights_m = frame.get_heights_m("ground")
     assert heights_m is not None  # those over z alone are
     known = heights_m.isfinite()
     ground_m = torch.cat([(frame.reference[:, 2] - heights_m)[known], heights_m.new_tensor([math.nan])])

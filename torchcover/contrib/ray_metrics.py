@@ -10,22 +10,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchcover.contrib.frame_metric import BLOCKS, FrameMetric, WorldRatios, rig_of, said
+from torchcover.contrib.frame_metric import BLOCKS, FrameMetric, SceneRatios, describe_number, get_rig_name
 from torchcover.contrib.voxels import (
     REGION,
     VoxelGrid,
     check_sensors,
-    checked_grid,
-    crossed_by,
-    crossed_voxels,
-    ray_count,
+    count_rays,
+    create_voxel_grid,
+    find_crossed_voxels,
+    mark_crossed_by_rays,
 )
 from torchcover.coverage import BevGrid
 from torchcover.estimation import Estimate, Number
 from torchcover.frames import Frame
 from torchcover.geometry import BoundingBox
 from torchcover.geometry.arrays import Float64
-from torchcover.metrics import SumsInBlocks
+from torchcover.metrics import BlockedSums
 from torchcover.neighbors import check_cloud
 from torchcover.simulation import Sensor
 from torchcover.simulation.raycaster import RayCaster
@@ -41,7 +41,7 @@ RANKS_ONLY = (
 )
 
 
-class MSog(SumsInBlocks, FrameMetric):
+class MSog(BlockedSums, FrameMetric):
     """Mean entropy in nats of what the voxels on the way of a rig's rays hold, as a loss: M-SOG (Place3D, 2024).
 
         H(v)  = - sum over c of p_c(v) ln p_c(v)         c: the category, anything else, empty
@@ -49,7 +49,7 @@ class MSog(SumsInBlocks, FrameMetric):
 
     where p_c is the share of frames in which the voxel has the label c. Higher is better. This is the paper's variant
     for detection. A frame's label of a voxel comes from the reference points in it: the category if at least half of
-    them are in its boxes (`points_in_boxes`), else anything else; empty if there is none, whether the reference saw
+    them are in its boxes (`find_points_in_boxes`), else anything else; empty if there is none, whether the reference saw
     that it is empty or did not see it.
 
     Nothing hides anything from the rays, which go to the wall of the region or the end of the sensor's range; and a
@@ -80,7 +80,7 @@ class MSog(SumsInBlocks, FrameMetric):
         ('m_sog_car_0.5m', -1.0)
     """
 
-    labelled: Tensor
+    label_counts: Tensor
 
     def __init__(
         self,
@@ -91,50 +91,52 @@ class MSog(SumsInBlocks, FrameMetric):
         **kwargs: Any,  # noqa: ANN401  (of `FrameMetric`)
     ) -> None:
         check_sensors(sensors)
-        grid = checked_grid(region, voxel_m, BLOCKS * LABELS * 8)
+        grid = create_voxel_grid(region, voxel_m, BLOCKS * LABELS * 8)
         meaning = {"sensors": tuple(sensors), "voxel_m": float(voxel_m), "region": region, "category": category}
         super().__init__(BLOCKS, meaning, **kwargs)
         self.sensors = tuple(sensors)
         self.grid = grid
         self.category = category
-        self.add_block_sum("labelled", (LABELS, grid.voxels), torch.int64)
+        self.define_block_sum("label_counts", (LABELS, grid.num_voxels), torch.int64)
 
     def _add_frame(self, frame: Frame) -> None:
         check_cloud(frame.reference, "reference")
-        labels = self.sights.once(frame, ("labels", self.category, self.grid), lambda: self._labels(frame))
+        labels = self.query_cache.get_or_compute(
+            frame, ("labels", self.category, self.grid), lambda: self._labels(frame)
+        )
         block = self._block_of(frame.block_index)
         for label, voxels in enumerate(labels):
-            self.labelled[block, label, voxels.to(self.labelled.device)] += 1
+            self.label_counts[block, label, voxels.to(self.label_counts.device)] += 1
 
     def _labels(self, frame: Frame) -> tuple[Tensor, Tensor]:
         """The voxels that have the label of the category in a frame, and those that hold anything else."""
-        boxes = self.sights.boxes(frame)
+        boxes = self.query_cache.get_boxes(frame)
         of_category = torch.tensor([each == self.category for each in boxes.categories], dtype=torch.bool, device="cpu")
-        inside = self.sights.reference_in_boxes(frame)
+        inside = self.query_cache.find_reference_in_boxes(frame)
         votes = np.zeros(len(frame.reference), dtype=bool)
-        votes[inside.point.cpu()[of_category[inside.box.cpu()]].numpy()] = True
-        voxel = self.grid.number_of(frame.reference.cpu().numpy())
+        votes[inside.point_indices.cpu()[of_category[inside.box_indices.cpu()]].numpy()] = True
+        voxel = self.grid.find_voxels(frame.reference.cpu().numpy())
         occupied, which, points = np.unique(voxel[voxel >= 0], return_inverse=True, return_counts=True)
         chosen = 2 * np.bincount(which, weights=votes[voxel >= 0], minlength=len(occupied)) >= points
         return torch.from_numpy(occupied[chosen]), torch.from_numpy(occupied[~chosen])
 
     def _found(self) -> tuple[Estimate, Sequence[Number]]:
-        crossed = torch.from_numpy(crossed_by(self.sensors, self.grid).reshape(-1).nonzero()[0])
-        about = said(
+        crossed = torch.from_numpy(mark_crossed_by_rays(self.sensors, self.grid).reshape(-1).nonzero()[0])
+        about = describe_number(
             f"m_sog_{self.category}_{self.grid.voxel_m:g}m",
             "nats",
             "voxels",
             voxel_m=self.grid.voxel_m,
             region_m=(self.grid.region.lower_m, self.grid.region.upper_m),
             category=self.category,
-            rays=ray_count(self.sensors),
-            crossed_share=len(crossed) / self.grid.voxels,
+            rays=count_rays(self.sensors),
+            crossed_share=len(crossed) / self.grid.num_voxels,
         )
-        used = self.block_steps.cpu() > 0
+        used = self.block_frame_counts.cpu() > 0
         # Unknown if the category was never seen.
-        on_the_way = crossed.to(self.labelled.device) if self.labelled[:, 0].any() else crossed[:0]
-        labelled, steps = self.labelled[:, :, on_the_way].cpu()[used], self.block_steps.cpu()[used]
-        estimate = Estimate.of_blocks([about.quantity], partial(_again, labelled, steps), steps)
+        on_the_way = crossed.to(self.label_counts.device) if self.label_counts[:, 0].any() else crossed[:0]
+        labelled, steps = self.label_counts[:, :, on_the_way].cpu()[used], self.block_frame_counts.cpu()[used]
+        estimate = Estimate.from_blocks([about.quantity], partial(_again, labelled, steps), steps)
         return estimate, [about._replace(count=0 if estimate.value[0].isnan() else len(crossed), warning=RANKS_ONLY)]
 
 
@@ -155,10 +157,10 @@ def _again(labelled: Tensor, steps: Tensor, weights: Tensor) -> Tensor:
 FARTHEST_M = 1000.0
 
 
-class FalseVisible(WorldRatios):
+class FalseVisible(SceneRatios):
     """Of the cells that the rig does not see, the share that its field of view says it does: FVR = FV / (FV + TI).
 
-    A cell is predicted visible if a ray crosses it in an empty world; see `field_of_view`. In a frame it is truly
+    A cell is predicted visible if a ray crosses it in an empty world; see `compute_field_of_view`. In a frame it is truly
     visible if the rig has a point within the threshold of a reference point there (detection > 0), and invisible if
     of none; a cell without reference points is unknown and does not count. FV is predicted visible and invisible, TI
     invisible either way predicted and found (after Börger et al. 2022).
@@ -186,7 +188,7 @@ class FalseVisible(WorldRatios):
     def __init__(
         self,
         sensors: Sequence[Sensor],
-        ego: Mesh | None,
+        ego_mesh: Mesh | None,
         grid: BevGrid,
         threshold_m: float = 0.4,
         cell_m: float = 1.0,
@@ -199,11 +201,11 @@ class FalseVisible(WorldRatios):
             )
         if not 0 <= threshold_m < float("inf"):
             raise ValueError(f"threshold_m: a finite distance >= 0 in metres is needed; got {threshold_m}")
-        coarse = coarse_grid(grid, cell_m)
-        predicted = field_of_view(sensors, coarse, ego)
+        coarse = build_coarse_grid(grid, cell_m)
+        predicted = compute_field_of_view(sensors, coarse, ego_mesh)
         given = {"threshold_m": float(threshold_m), "cell_m": float(cell_m)}
         ratios = [
-            said(
+            describe_number(
                 f"false_visible_{band}_{threshold_m:g}m_{cell_m:g}m",
                 "share",
                 "invisible cells",
@@ -215,42 +217,47 @@ class FalseVisible(WorldRatios):
         fingerprint = hashlib.sha256(predicted.numpy().tobytes()).hexdigest()
         super().__init__(ratios, {**given, "grid": coarse, "predicted": fingerprint}, **kwargs)
         self.grid = coarse
-        self.predicted = predicted.flatten()
+        self.predicted_mask = predicted.flatten()
         self.threshold_m = float(threshold_m)
 
     def _of_frame(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
-        seen = self.sights.distance(frame, rig_of(frame, self.rig), self.threshold_m) <= self.threshold_m
-        inside, of, cell = self.sights.bins(frame, self.grid)
-        known = torch.zeros(self.grid.cells, dtype=torch.bool, device=cell.device)
+        seen = (
+            self.query_cache.find_distances_m(frame, get_rig_name(frame, self.rig_name), self.threshold_m)
+            <= self.threshold_m
+        )
+        inside, of, cell = self.query_cache.assign_cells(frame, self.grid)
+        known = torch.zeros(self.grid.num_cells, dtype=torch.bool, device=cell.device)
         visible = known.clone()
         known[cell] = True
         visible[cell[seen[inside[of]]]] = True
         invisible = (known & ~visible).view(len(self.ratios), -1)
-        false_visible = invisible & self.predicted.to(cell.device).view(invisible.shape)
+        false_visible = invisible & self.predicted_mask.to(cell.device).view(invisible.shape)
         base = invisible.sum(dim=1)
         return base.double(), false_visible.sum(dim=1).double(), base
 
 
-def coarse_grid(grid: BevGrid, cell_m: float) -> BevGrid:
+def build_coarse_grid(grid: BevGrid, cell_m: float) -> BevGrid:
     """A grid of other cells, as large as the given one, or by a part of a cell larger.
 
     Example:
-        >>> coarse_grid(BevGrid(x=(-0.5, 2.0), y=(0.0, 1.0), cell=0.25), 1.0).x
+        >>> build_coarse_grid(BevGrid(x=(-0.5, 2.0), y=(0.0, 1.0), cell=0.25), 1.0).x
         (-1.0, 2.0)
     """
-    x, y = ((math.floor(low / cell_m) * cell_m, math.ceil(high / cell_m) * cell_m) for low, high in (grid.x, grid.y))
+    x, y = (
+        (math.floor(low / cell_m) * cell_m, math.ceil(high / cell_m) * cell_m) for low, high in (grid.x_m, grid.y_m)
+    )
     return BevGrid(x, y, cell_m, grid.heights, grid.band_frame)
 
 
-def field_of_view(sensors: Sequence[Sensor], grid: BevGrid, ego: Mesh | None = None) -> Tensor:
+def compute_field_of_view(sensors: Sequence[Sensor], grid: BevGrid, ego_mesh: Mesh | None = None) -> Tensor:
     """Which cells the rays of a rig cross, down to the plane z = 0, up to their range or the vehicle's own body.
 
-    Exactly: a cell is crossed in a height band if a piece of a ray lies in both; see `crossed_voxels`.
+    Exactly: a cell is crossed in a height band if a piece of a ray lies in both; see `find_crossed_voxels`.
 
     Args:
         sensors: With mounts, rays and ranges.
         grid: Cells and height bands.
-        ego: The vehicle's body in the vehicle frame; None if it hides nothing.
+        ego_mesh: The vehicle's body in the vehicle frame; None if it hides nothing.
 
     Returns:
         (H, Y, X) bool.
@@ -258,14 +265,14 @@ def field_of_view(sensors: Sequence[Sensor], grid: BevGrid, ego: Mesh | None = N
     Example:
         >>> from torchcover.simulation import Rig
         >>> grid = BevGrid(x=(-5.0, 40.0), y=(-5.0, 5.0), cell=1.0)
-        >>> seen = field_of_view(Rig.load("front_roof_32").sensors, grid)
+        >>> seen = compute_field_of_view(Rig.load("front_roof_32").sensors, grid)
         >>> [bool(seen[0, 5, x]) for x in (0, 6, 30)]           # behind it, too close, and ahead
         [False, False, True]
     """
     # Each band is one layer of cubes: rays are cut off at its ends and seen from above. Level ground is at z = 0.
-    flat = VoxelGrid(BoundingBox((grid.x[0], grid.y[0], 0.0), (grid.x[1], grid.y[1], grid.cell)), grid.cell)
+    flat = VoxelGrid(BoundingBox((grid.x_m[0], grid.y_m[0], 0.0), (grid.x_m[1], grid.y_m[1], grid.cell_m)), grid.cell_m)
     seen = np.zeros((len(grid.heights), *flat.shape), dtype=bool)
-    caster = None if ego is None else RayCaster([ego])
+    caster = None if ego_mesh is None else RayCaster([ego_mesh])
     for sensor in sensors:
         vehicle_T_sensor = sensor.mount.matrix()
         directions = sensor.directions().reshape(3, -1)
@@ -276,8 +283,8 @@ def field_of_view(sensors: Sequence[Sensor], grid: BevGrid, ego: Mesh | None = N
             begin_m, end_m = _within(band, origin_m[2], directions[2], sensor.min_range_m, ends_m)
             there = (begin_m < end_m) & directions[:2].any(axis=0)
             level = directions[:, there].T * [1.0, 1.0, 0.0]
-            starts_m = origin_m * [1.0, 1.0, 0.0] + level * begin_m[there, None] + [0.0, 0.0, grid.cell / 2]
-            crossed_voxels(flat, starts_m, level, (end_m - begin_m)[there], crossed=crossed)
+            starts_m = origin_m * [1.0, 1.0, 0.0] + level * begin_m[there, None] + [0.0, 0.0, grid.cell_m / 2]
+            find_crossed_voxels(flat, starts_m, level, (end_m - begin_m)[there], output=crossed)
     return torch.from_numpy(np.ascontiguousarray(seen[..., 0].transpose(0, 2, 1)))
 
 

@@ -16,22 +16,22 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchcover.contrib.frame_metric import BLOCKS, FrameMetric, said
+from torchcover.contrib.frame_metric import BLOCKS, FrameMetric, describe_number
 from torchcover.contrib.voxels import (
     REGION,
     VoxelGrid,
     check_sensors,
-    checked_grid,
-    crossed_by,
-    crossed_on_the_way,
-    ray_count,
+    count_rays,
+    create_voxel_grid,
+    mark_crossed_before_hits,
+    mark_crossed_by_rays,
 )
 from torchcover.detection import Boxes
 from torchcover.estimation import Estimate, Number
 from torchcover.frames import Frame
 from torchcover.geometry import BoundingBox
 from torchcover.geometry.arrays import Bools, Float64, Int32, Int64
-from torchcover.metrics import with_rows
+from torchcover.metrics import insert_rows
 from torchcover.neighbors import check_cloud
 from torchcover.simulation import Sensor
 
@@ -44,9 +44,9 @@ FRAME = -1.0
 ROUNDING_M = 1e-5
 
 
-def occupancy_rows(boxes: Boxes, block_index: int, categories: Sequence[str], region: BoundingBox) -> Tensor:
+def build_occupancy_rows(boxes: Boxes, block_index: int, categories: Sequence[str], region: BoundingBox) -> Tensor:
     """(1 + K, 10) rows of a table for a frame: its own, and those of its boxes near the region."""
-    boxes = boxes.of_category(*categories)
+    boxes = boxes.select_categories(*categories)
     rows = boxes.rows.double().cpu()
     half = rows[:, 3:6] / 2
     half[:, :2] = torch.linalg.vector_norm(half[:, :2], dim=1, keepdim=True)
@@ -68,56 +68,60 @@ def occupancy_rows(boxes: Boxes, block_index: int, categories: Sequence[str], re
 class Occupancy:
     """In how many frames each voxel was inside a box of one category, in blocks of contiguous worlds.
 
-    `voxels` (K,) are those that were in any, ascending; `pattern` (K,) is which row of `counts` (P, B), frames of each
-    block, is theirs: many have the same. `steps` (B,) are all frames, `boxes` how many held the centre of a voxel.
+    `voxels` (K,) are those that were in any, ascending; `pattern_indices` (K,) is which row of `counts` (P, B), frames of each
+    block, is theirs: many have the same. `frame_counts` (B,) are all frames, `box_count` how many held the centre of a voxel.
     """
 
     voxels: Int64
-    pattern: Int64
+    pattern_indices: Int64
     counts: Int64
-    steps: Int64
-    boxes: int
+    frame_counts: Int64
+    box_count: int
 
-    def entropy_nats(self, times: NDArray[np.float64 | np.bool_], weights: Float64) -> Float64:
+    def compute_entropy_nats(
+        self, voxel_multiplicities: NDArray[np.float64 | np.bool_], block_weights: Float64
+    ) -> Float64:
         """(R,) sum over the voxels of Hb(p) = -p ln p - (1 - p) ln(1 - p); NaN where no frame counts.
 
-        `times` (voxels of the grid,) is how often each voxel counts, `weights` (R, B) how often each block of worlds
+        `voxel_multiplicities` (voxels of the grid,) is how often each voxel counts, `block_weights` (R, B) how often each block of worlds
         does.
         """
-        of_pattern = np.bincount(self.pattern, weights=times[self.voxels], minlength=len(self.counts))
-        steps = weights @ self.steps
+        of_pattern = np.bincount(
+            self.pattern_indices, weights=voxel_multiplicities[self.voxels], minlength=len(self.counts)
+        )
+        steps = block_weights @ self.frame_counts
         with np.errstate(invalid="ignore", divide="ignore"):
             total = [
-                binary_entropy(self.counts @ one / all_steps) @ of_pattern
-                for one, all_steps in zip(weights, steps, strict=True)
+                compute_binary_entropy_nats(self.counts @ one / all_steps) @ of_pattern
+                for one, all_steps in zip(block_weights, steps, strict=True)
             ]
         return np.where(steps > 0, total, np.nan)
 
 
-def binary_entropy(p: Float64) -> Float64:
+def compute_binary_entropy_nats(probability: Float64) -> Float64:
     """-p ln p - (1 - p) ln(1 - p) in nats; 0 at 0 and 1."""
-    inside = (p > 0) & (p < 1)
-    p = np.where(inside, p, 0.5)
-    return np.where(inside, -p * np.log(p) - (1 - p) * np.log1p(-p), 0.0)
+    inside = (probability > 0) & (probability < 1)
+    probability = np.where(inside, probability, 0.5)
+    return np.where(inside, -probability * np.log(probability) - (1 - probability) * np.log1p(-probability), 0.0)
 
 
-def occupancy_of(table: Float64, category: int, grid: VoxelGrid, blocks: int) -> Occupancy:
-    """The occupancy by the boxes of one category, from (N, 10) rows of `occupancy_rows` in ascending order.
+def build_occupancy(table: Float64, category_index: int, grid: VoxelGrid, num_blocks: int) -> Occupancy:
+    """The occupancy by the boxes of one category, from (N, 10) rows of `build_occupancy_rows` in ascending order.
 
     A voxel is inside a box if its centre is; of a box that leaves the region, the voxels in the region count. Boxes of
     one frame that overlap count once. The number of blocks is even.
     """
-    own, centres_m = table[:, CATEGORY] == FRAME, grid.centres_m()
-    block_of = (table[:, PLACE] // block_length(table[own, PLACE], blocks)).astype(np.int64)
-    in_frame, counted = np.zeros(grid.voxels, dtype=bool), np.zeros(grid.voxels, dtype=np.int32)
+    own, centres_m = table[:, CATEGORY] == FRAME, grid.compute_centers_m()
+    block_of = (table[:, PLACE] // compute_frames_per_block(table[own, PLACE], num_blocks)).astype(np.int64)
+    in_frame, counted = np.zeros(grid.num_voxels, dtype=bool), np.zeros(grid.num_voxels, dtype=np.int32)
     found: list[tuple[Int64, Int32]] = []
     boxes = 0
-    for block in range(blocks):
+    for block in range(num_blocks):
         touched = [np.empty(0, dtype=np.int64)]
         for frame in _frames(table[block_of == block]):
             seen_again = int((frame[:, CATEGORY] == FRAME).sum())
-            rows = frame[frame[:, CATEGORY] == category, BOX:]
-            inside = [voxels_in_box(centres_m, box) for box in rows[::seen_again]]
+            rows = frame[frame[:, CATEGORY] == category_index, BOX:]
+            inside = [find_voxels_in_box(centres_m, box) for box in rows[::seen_again]]
             boxes += seen_again * sum(len(voxels) > 0 for voxels in inside)
             for voxels in inside:
                 first = voxels[~in_frame[voxels]]
@@ -134,7 +138,7 @@ def occupancy_of(table: Float64, category: int, grid: VoxelGrid, blocks: int) ->
     every = np.flatnonzero(in_frame)
     in_frame[every] = False
     pattern, counts = _patterns(every, found, in_frame)
-    return Occupancy(every, pattern, counts, np.bincount(block_of[own], minlength=blocks), boxes)
+    return Occupancy(every, pattern, counts, np.bincount(block_of[own], minlength=num_blocks), boxes)
 
 
 def _patterns(
@@ -159,32 +163,32 @@ def _patterns(
     return pattern, counts
 
 
-def block_length(places: Float64, blocks: int) -> int:
+def compute_frames_per_block(block_indices: Float64, num_blocks: int) -> int:
     """How many places in time are in a block, as `CoverageMetric` doubles it."""
     length = 1
-    while len(places) and places.max() >= blocks * length:
+    while len(block_indices) and block_indices.max() >= num_blocks * length:
         length *= 2
     return length
 
 
-def voxels_in_box(centres_m: Sequence[Float64], box: Float64) -> Int64:
+def find_voxels_in_box(centers_m: Sequence[Float64], box_row: Float64) -> Int64:
     """Numbers of the voxels whose centre, as of `VoxelGrid.centres_m`, is in a box, a row of `Boxes.rows`.
 
     Half-open: boxes side by side share none.
 
     Example:
         >>> grid = VoxelGrid(BoundingBox((0.0, 0.0, 0.0), (4.0, 4.0, 1.0)), 1.0)
-        >>> voxels_in_box(grid.centres_m(), np.array([2.0, 0.5, 0.5, 2.0, 0.2, 1.0, 0.0]))
+        >>> find_voxels_in_box(grid.centres_m(), np.array([2.0, 0.5, 0.5, 2.0, 0.2, 1.0, 0.0]))
         array([4, 8])
     """
-    (x_m, y_m, z_m), reach_m = centres_m, math.hypot(box[3], box[4]) / 2 + ROUNDING_M
-    x0, x1 = np.searchsorted(x_m, (box[0] - reach_m, box[0] + reach_m))
-    y0, y1 = np.searchsorted(y_m, (box[1] - reach_m, box[1] + reach_m))
-    off_x, off_y = x_m[x0:x1, None] - box[0], y_m[y0:y1] - box[1]
-    cosine, sine = math.cos(box[6]), math.sin(box[6])
+    (x_m, y_m, z_m), reach_m = centers_m, math.hypot(box_row[3], box_row[4]) / 2 + ROUNDING_M
+    x0, x1 = np.searchsorted(x_m, (box_row[0] - reach_m, box_row[0] + reach_m))
+    y0, y1 = np.searchsorted(y_m, (box_row[1] - reach_m, box_row[1] + reach_m))
+    off_x, off_y = x_m[x0:x1, None] - box_row[0], y_m[y0:y1] - box_row[1]
+    cosine, sine = math.cos(box_row[6]), math.sin(box_row[6])
     ahead, left = off_x * cosine + off_y * sine, off_y * cosine - off_x * sine
-    x, y = (_within(ahead, box[3]) & _within(left, box[4])).nonzero()
-    z = np.flatnonzero(_within(z_m - box[2], box[5]))
+    x, y = (_within(ahead, box_row[3]) & _within(left, box_row[4])).nonzero()
+    z = np.flatnonzero(_within(z_m - box_row[2], box_row[5]))
     column = (x + x0) * len(y_m) + y + y0
     return np.asarray((column[:, None] * len(z_m) + z).reshape(-1))
 
@@ -215,10 +219,10 @@ class SMig(FrameMetric):
     with independent voxels. Higher is better, say its authors; yet it falls as more voxels are crossed, and a rig
     without rays has the highest value, 0. Its negative, which is in its `parameters["entropy_captured_nats"]`, is
     what roadside placement maximises (EGVS, Jiang 2025, as far as its text could be read). Compare rigs of the same
-    number of rays (`unequal_rays`).
+    number of rays (`describe_unequal_rays`).
 
     A voxel is in a box if its centre is; of a box that leaves the region, the part within counts. Rays go through
-    everything, to the wall of the region or the end of the sensor's range. With `occlusion` they end at the points that
+    everything, to the wall of the region or the end of the sensor's range. With `ends_at_hits` they end at the points that
     the rig measured, and the number is the mean over frames of the entropy on their way; rays that gave no point are
     left out, for a frame does not know them. So it rises by its sign with what a rig misses: from -28,544 to -19,985
     for `kitti` in `urban` when fog of 100 m comes; `entropy_captured_nats` falls.
@@ -231,7 +235,7 @@ class SMig(FrameMetric):
         voxel_m: Side of a voxel; the published one is 0.05.
         region: What the voxels fill, the published 60 x 40 x 4 m if not given.
         categories: Each has its own occupancy and number. The number of all is their sum.
-        occlusion: Whether rays end at what they hit.
+        ends_at_hits: Whether rays end at what they hit.
         kwargs: `rig` and `sights` of `FrameMetric`.
 
     Raises:
@@ -260,47 +264,47 @@ class SMig(FrameMetric):
         region: BoundingBox = REGION,
         categories: Sequence[str] = CATEGORIES,
         *,
-        occlusion: bool = False,
+        ends_at_hits: bool = False,
         **kwargs: Any,  # noqa: ANN401  (of `FrameMetric`)
     ) -> None:
         check_sensors(sensors)
         if not categories or len(set(categories)) < len(categories):
             raise ValueError(f"categories: one or more different ones are needed; got {tuple(categories)}")
-        grid = checked_grid(region, voxel_m, BYTES_A_VOXEL_OCCLUDED if occlusion else BYTES_A_VOXEL)
+        grid = create_voxel_grid(region, voxel_m, BYTES_A_VOXEL_OCCLUDED if ends_at_hits else BYTES_A_VOXEL)
         meaning = {
             "sensors": tuple(sensors),
             "voxel_m": float(voxel_m),
             "region": region,
             "categories": tuple(categories),
-            "occlusion": occlusion,
+            "occlusion": ends_at_hits,
         }
         super().__init__(meaning, **kwargs)
         self.sensors = tuple(sensors)
         self.grid = grid
         self.categories = tuple(categories)
-        self.occlusion = occlusion
-        self.add_table("boxes", COLUMNS)
-        if occlusion:
-            self.add_sum("crossings", (grid.voxels,), torch.int64)
+        self.ends_at_hits = ends_at_hits
+        self.define_table("boxes", COLUMNS)
+        if ends_at_hits:
+            self.define_sum("crossings", (grid.num_voxels,), torch.int64)
 
     def _add_frame(self, frame: Frame) -> None:
         check_cloud(frame.reference, "reference")
-        boxes = self.sights.boxes(frame)
-        rows = self.sights.once(
+        boxes = self.query_cache.get_boxes(frame)
+        rows = self.query_cache.get_or_compute(
             frame,
             ("occupancy", self.categories, self.grid.region),
-            lambda: occupancy_rows(boxes, frame.block_index, self.categories, self.grid.region),
+            lambda: build_occupancy_rows(boxes, frame.block_index, self.categories, self.grid.region),
         )
-        if self.occlusion:
-            crossed = crossed_on_the_way(self.sensors, frame, self.rig, self.grid)
+        if self.ends_at_hits:
+            crossed = mark_crossed_before_hits(self.sensors, frame, self.rig_name, self.grid)
             self.crossings += torch.from_numpy(crossed.reshape(-1)).to(self.crossings)
-        self.boxes = with_rows(self.boxes, rows)
+        self.boxes = insert_rows(self.boxes, rows)
 
     def _found(self) -> tuple[Estimate, Sequence[Number]]:
-        of_each, times, rays = self._occupancies(), self._crossings(), ray_count(self.sensors)
+        of_each, times, rays = self._occupancies(), self._crossings(), count_rays(self.sensors)
         about = [
-            said(
-                f"s_mig{'_occluded' if self.occlusion else ''}_{self.grid.voxel_m:g}m{name}",
+            describe_number(
+                f"s_mig{'_occluded' if self.ends_at_hits else ''}_{self.grid.voxel_m:g}m{name}",
                 "nats",
                 "boxes",
                 voxel_m=self.grid.voxel_m,
@@ -310,11 +314,11 @@ class SMig(FrameMetric):
             )
             for name in ("", *(f":{category}" for category in self.categories))
         ]
-        quantities, steps = [one.quantity for one in about], torch.from_numpy(of_each[0].steps)
-        estimate = Estimate.of_blocks(quantities, partial(_again, of_each, times), steps[steps > 0])
-        if self.occlusion:  # what was crossed in each block is unknown
-            estimate = Estimate.of(quantities, estimate.value)
-        boxes = [one.boxes for one in of_each]
+        quantities, steps = [one.quantity for one in about], torch.from_numpy(of_each[0].frame_counts)
+        estimate = Estimate.from_blocks(quantities, partial(_again, of_each, times), steps[steps > 0])
+        if self.ends_at_hits:  # what was crossed in each block is unknown
+            estimate = Estimate.from_values(quantities, estimate.value)
+        boxes = [one.box_count for one in of_each]
         return estimate, [
             one._replace(count=count, parameters={**one.parameters, "entropy_captured_nats": -value}, warning=FALLS)
             for one, count, value in zip(about, [sum(boxes), *boxes], estimate.value.tolist(), strict=True)
@@ -322,34 +326,34 @@ class SMig(FrameMetric):
 
     def _crossings(self) -> NDArray[np.float64 | np.bool_]:
         """(voxels,) how often each voxel is crossed in a frame, on average."""
-        if self.occlusion:
-            return self.crossings.cpu().numpy() / max(int(self.steps), 1)
-        return crossed_by(self.sensors, self.grid).reshape(-1)
+        if self.ends_at_hits:
+            return self.crossings.cpu().numpy() / max(int(self.num_frames), 1)
+        return mark_crossed_by_rays(self.sensors, self.grid).reshape(-1)
 
     def _occupancies(self) -> list[Occupancy]:
         """That of each category; rigs that saw the same frames share them."""
         table = self.boxes.cpu().numpy()
         what = ("occupancy", hashlib.sha256(table.tobytes()).digest(), self.grid, self.categories)
-        return self.sights.after_all(
-            what, lambda: [occupancy_of(table, number, self.grid, BLOCKS) for number in range(len(self.categories))]
+        return self.query_cache.get_or_compute_total(
+            what, lambda: [build_occupancy(table, number, self.grid, BLOCKS) for number in range(len(self.categories))]
         )
 
 
 def _again(of_each: Sequence[Occupancy], times: NDArray[np.float64 | np.bool_], weights: Tensor) -> Tensor:
     """(R, 1 + C) the sum over the categories, and each; NaN where there was no box."""
     of_blocks = np.zeros((len(weights), BLOCKS))
-    of_blocks[:, of_each[0].steps > 0] = weights.cpu().numpy()
+    of_blocks[:, of_each[0].frame_counts > 0] = weights.cpu().numpy()
     values = np.full((len(weights), 1 + len(of_each)), np.nan)
     for column, one in enumerate(of_each, 1):
-        if one.boxes:
-            values[:, column] = -one.entropy_nats(times, of_blocks)
-    known = [column for column, one in enumerate(of_each, 1) if one.boxes]
+        if one.box_count:
+            values[:, column] = -one.compute_entropy_nats(times, of_blocks)
+    known = [column for column, one in enumerate(of_each, 1) if one.box_count]
     if known:
         values[:, 0] = values[:, known].sum(axis=1)
     return torch.from_numpy(values)
 
 
-def unequal_rays(numbers: Mapping[str, Number]) -> str | None:
+def describe_unequal_rays(numbers: Mapping[str, Number]) -> str | None:
     """What is to be said of the numbers of several rigs: that one has more rays than another; None if none has.
 
     Args:
@@ -357,9 +361,9 @@ def unequal_rays(numbers: Mapping[str, Number]) -> str | None:
 
     Example:
         >>> one, two = (said("s_mig_0.2m", "nats", "boxes", rays=rays) for rays in (4000, 90))
-        >>> unequal_rays({"one": one, "two": two})
+        >>> describe_unequal_rays({"one": one, "two": two})
         's_mig_0.2m: the rigs have different numbers of rays (one 4,000, two 90), and fewer rays score higher'
-        >>> unequal_rays({"one": one, "same": one})
+        >>> describe_unequal_rays({"one": one, "same": one})
     """
     rays = {rig: number.parameters["rays"] for rig, number in numbers.items()}
     if len(set(rays.values())) < 2:

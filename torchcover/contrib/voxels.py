@@ -69,21 +69,21 @@ class VoxelGrid:
         return x, y, z
 
     @property
-    def voxels(self) -> int:
+    def num_voxels(self) -> int:
         """How many there are in all."""
         return math.prod(self.shape)
 
-    def centres_m(self) -> tuple[Float64, Float64, Float64]:
+    def compute_centers_m(self) -> tuple[Float64, Float64, Float64]:
         """(X,), (Y,) and (Z,) coordinates of the voxels' centres."""
         bounds = zip(self.region.lower_m, self.region.upper_m, self.shape, strict=True)
         x, y, z = (_centres(low, high, count) for low, high, count in bounds)
         return x, y, z
 
-    def in_voxels(self, points_m: ArrayLike) -> Float64:
+    def to_voxel_units(self, points_m: ArrayLike) -> Float64:
         """Points (..., 3) in voxels from the lower corner of the region."""
         return (np.asarray(points_m, dtype=np.float64) - self.region.lower_m) * self._voxels_per_m
 
-    def number_of(self, points_m: ArrayLike) -> Int64:
+    def find_voxels(self, points_m: ArrayLike) -> Int64:
         """(N,) number of the voxel that each of (N, 3) points is in; -1 if it is in none.
 
         Example:
@@ -91,7 +91,7 @@ class VoxelGrid:
             >>> grid.number_of([[0.5, 0.5, 0.5], [1.0, 1.0, 0.0], [2.0, 0.0, 0.0]])
             array([ 0,  3, -1])
         """
-        at = np.floor(self.in_voxels(points_m))
+        at = np.floor(self.to_voxel_units(points_m))
         inside = np.asarray(((at >= 0) & (at < self.shape)).all(axis=1))
         number = np.where(inside[:, None], at, 0).astype(np.int64) @ self._strides.astype(np.int64)
         return np.where(inside, number, -1)
@@ -105,13 +105,13 @@ class VoxelGrid:
         return np.array([self.shape[1] * self.shape[2], self.shape[2], 1.0])
 
 
-def crossed_voxels(
+def find_crossed_voxels(
     grid: VoxelGrid,
     origins_m: ArrayLike,
     directions: ArrayLike,
-    ends: ArrayLike = math.inf,
+    ray_ends: ArrayLike = math.inf,
     *,
-    crossed: Bools | None = None,
+    output: Bools | None = None,
 ) -> Bools:
     """Which voxels are crossed by any of a bundle of rays.
 
@@ -123,9 +123,9 @@ def crossed_voxels(
         grid: The voxels.
         origins_m: (3,) where all rays start, or (N, 3) where each does; inside the grid's region or outside.
         directions: (N, 3) where they go, of any length; NaN where there is no ray.
-        ends: Where each ray ends, in lengths of its direction (metres, if those are unit vectors); (N,), or one number
+        ray_ends: Where each ray ends, in lengths of its direction (metres, if those are unit vectors); (N,), or one number
             for all. Infinite, as if not given: at the wall of the region.
-        crossed: Array to add to, as another call gave it; it is changed.
+        output: Array to add to, as another call gave it; it is changed.
 
     Returns:
         (X, Y, Z) bool, a byte for each voxel; beside it some megabytes, whatever the number of rays.
@@ -136,29 +136,29 @@ def crossed_voxels(
 
     Example:
         >>> grid = VoxelGrid(BoundingBox((0.0, 0.0, 0.0), (4.0, 4.0, 1.0)), 1.0)
-        >>> crossed_voxels(grid, [0.5, 0.5, 0.5], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], [3.0, 1.0])[:, :, 0].astype(int)
+        >>> find_crossed_voxels(grid, [0.5, 0.5, 0.5], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], [3.0, 1.0])[:, :, 0].astype(int)
         array([[1, 1, 0, 0],
                [1, 0, 0, 0],
                [1, 0, 0, 0],
                [1, 0, 0, 0]])
     """
     way = np.asarray(directions, dtype=np.float64)
-    start, end = np.asarray(origins_m, dtype=np.float64), np.asarray(ends, dtype=np.float64)
+    start, end = np.asarray(origins_m, dtype=np.float64), np.asarray(ray_ends, dtype=np.float64)
     _check(start, way, end)
     is_ray = ~np.isnan(way).any(axis=1)
     start, end = np.broadcast_to(start, way.shape)[is_ray], np.broadcast_to(end, len(way))[is_ray]
     way = way[is_ray]
-    if crossed is None:
-        crossed = np.zeros(grid.shape, dtype=bool)
-    elif crossed.shape != grid.shape or crossed.dtype != bool or not crossed.flags.c_contiguous:
-        raise ValueError(f"crossed: a contiguous bool array of shape {grid.shape} is needed; got {crossed.shape}")
+    if output is None:
+        output = np.zeros(grid.shape, dtype=bool)
+    elif output.shape != grid.shape or output.dtype != bool or not output.flags.c_contiguous:
+        raise ValueError(f"crossed: a contiguous bool array of shape {grid.shape} is needed; got {output.shape}")
     for first in range(0, len(way), RAYS_AT_ONCE):
         some = slice(first, first + RAYS_AT_ONCE)
         rays = _upwards(grid, start[some], way[some], end[some])
-        crossed.reshape(-1)[rays.numbers(rays.first)] = True
+        output.reshape(-1)[rays.numbers(rays.first)] = True
         for axis in range(3):
-            _cross_planes(rays, axis, crossed.reshape(-1))
-    return crossed
+            _cross_planes(rays, axis, output.reshape(-1))
+    return output
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +185,7 @@ class _Upwards:
 def _upwards(grid: VoxelGrid, start_m: Float64, way: Float64, end: Float64) -> _Upwards:
     """The rays that have a piece in the region."""
     shape, strides = np.array(grid.shape, dtype=np.float64)[:, None], grid._strides[:, None]
-    place, way = grid.in_voxels(start_m).T, (way * grid._voxels_per_m).T
+    place, way = grid.to_voxel_units(start_m).T, (way * grid._voxels_per_m).T
     # On an axis along which it moves less than a touch on its way through the region, a ray does not move.
     reach = np.maximum(np.abs(place), np.abs(shape - place)).max(axis=0)
     still = np.abs(way) * reach <= TOUCH * np.abs(way).max(axis=0)
@@ -264,14 +264,14 @@ def _check(origins_m: Float64, directions: Float64, ends: Float64) -> None:
 REGION: BoundingBox = BoundingBox((-30.0, -20.0, -0.5), (30.0, 20.0, 3.5))
 
 
-def checked_grid(region: BoundingBox, voxel_m: float, bytes_a_voxel: int) -> VoxelGrid:
+def create_voxel_grid(region: BoundingBox, voxel_m: float, bytes_per_voxel: int) -> VoxelGrid:
     """The voxels of a region, if this machine has the memory for what is kept of each.
 
     ValueError: it has not; or as `VoxelGrid`.
     """
     grid = VoxelGrid(region, float(voxel_m))
-    what = f"{grid.voxels:,} voxels of {voxel_m:g} m in {' x '.join(f'{size:g}' for size in region.size_m)} m"
-    check_fits(what, bytes_a_voxel * grid.voxels, "take larger voxels, or a smaller region")
+    what = f"{grid.num_voxels:,} voxels of {voxel_m:g} m in {' x '.join(f'{size:g}' for size in region.size_m)} m"
+    check_fits(what, bytes_per_voxel * grid.num_voxels, "take larger voxels, or a smaller region")
     return grid
 
 
@@ -284,12 +284,12 @@ def check_sensors(sensors: Sequence[Sensor]) -> None:
         raise ValueError("sensors: the sensors of the rig, with their mounts and rays, are needed; got none")
 
 
-def ray_count(sensors: Sequence[Sensor]) -> int:
+def count_rays(sensors: Sequence[Sensor]) -> int:
     """How many rays they have, without the pixels that have none."""
     return sum(int((~np.isnan(sensor.directions()[0])).sum()) for sensor in sensors)
 
 
-def crossed_by(sensors: Sequence[Sensor], grid: VoxelGrid) -> Bools:
+def mark_crossed_by_rays(sensors: Sequence[Sensor], grid: VoxelGrid) -> Bools:
     """(X, Y, Z) whether any of their rays crosses a voxel, up to the wall of the region or the end of its range.
 
     Nothing hides anything.
@@ -298,11 +298,11 @@ def crossed_by(sensors: Sequence[Sensor], grid: VoxelGrid) -> Bools:
     for sensor in sensors:
         vehicle_T_sensor = sensor.mount.matrix()
         directions = sensor.directions().reshape(3, -1).T @ vehicle_T_sensor[:3, :3].T
-        crossed_voxels(grid, vehicle_T_sensor[:3, 3], directions, sensor.max_range_m, crossed=crossed)
+        find_crossed_voxels(grid, vehicle_T_sensor[:3, 3], directions, sensor.max_range_m, output=crossed)
     return crossed
 
 
-def crossed_on_the_way(sensors: Sequence[Sensor], frame: Frame, rig: str | None, grid: VoxelGrid) -> Bools:
+def mark_crossed_before_hits(sensors: Sequence[Sensor], frame: Frame, rig_name: str | None, grid: VoxelGrid) -> Bools:
     """(X, Y, Z) whether a voxel is crossed on the way from a sensor to a point that it measured.
 
     A ray that gave no point is not known to a frame, and crosses nothing: what it passed through the open sky, or with
@@ -312,12 +312,12 @@ def crossed_on_the_way(sensors: Sequence[Sensor], frame: Frame, rig: str | None,
     """
     mounts = {sensor.name: sensor.mount.matrix()[:3, 3] for sensor in sensors}
     crossed = np.zeros(grid.shape, dtype=bool)
-    for name, points in frame.clouds_by_sensor(rig).items():
+    for name, points in frame.get_clouds_by_sensor(rig_name).items():
         if name not in mounts:
             raise ValueError(
                 f"frame {frame.name!r} has points of a sensor {name!r}; the rig has {', '.join(mounts)}: give the "
                 "sensors that made the frame"
             )
         ways = points.cpu().numpy().astype(np.float64) - mounts[name]
-        crossed_voxels(grid, mounts[name], ways[ways.any(axis=1)], 1.0, crossed=crossed)
+        find_crossed_voxels(grid, mounts[name], ways[ways.any(axis=1)], 1.0, output=crossed)
     return crossed

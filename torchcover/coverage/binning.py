@@ -16,20 +16,20 @@ MAX_BORDERS_COMPARED = 32
 class CellMeans(NamedTuple):
     """Means over the points of one step in those K cells that have points, ascending.
 
-    `of_point` (N,) is which of these each point lies in, `weight` (K,) the sum of their weights, or their number where
-    there are none, `mean` (V, K) that of each of the V values.
+    `point_cells` (N,) is which of these each point lies in, `weight_sums` (K,) the sum of their weights, or their number where
+    there are none, `means` (V, K) that of each of the V values.
     """
 
-    cell: Tensor
-    of_point: Tensor
-    points: Tensor
-    weight: Tensor
-    mean: Tensor
+    cell_indices: Tensor
+    point_cells: Tensor
+    point_counts: Tensor
+    weight_sums: Tensor
+    means: Tensor
 
 
-def mean_per_cell(cell: Tensor, values: Tensor, weights: Tensor | None = None) -> CellMeans:
+def compute_cell_means(cell_indices: Tensor, values: Tensor, weights: Tensor | None = None) -> CellMeans:
     """Mean of each of (V, N) values over the points of each cell, summed in float64; all weigh alike if not told."""
-    touched, of_point, points = torch.unique(cell, return_inverse=True, return_counts=True)
+    touched, of_point, points = torch.unique(cell_indices, return_inverse=True, return_counts=True)
     if weights is None:
         weight, weighted = points.double(), values.double()
     else:
@@ -45,7 +45,7 @@ def _sum_per_cell(cell: Tensor, values: Tensor, cells: int) -> Tensor:
     return torch.bincount(cell, weights=values, minlength=cells).double()
 
 
-def edges_below(values: Tensor, bounds: Tensor, low: float, high: float) -> Tensor:
+def count_edges_below(values: Tensor, bounds: Tensor, low: float, high: float) -> Tensor:
     """How many edges at equal distances are not above each value: what `torch.bucketize` gives, sooner.
 
     Divided by their distance first, then compared with, so that no rounding moves a point over a border. `bounds` are
@@ -61,14 +61,14 @@ def edges_below(values: Tensor, bounds: Tensor, low: float, high: float) -> Tens
     return below.add_(too_few).sub_(too_many.int())
 
 
-def borders_below(values: Tensor, borders: Sequence[float]) -> Tensor:
+def count_borders_below(values: Tensor, borders: Sequence[float]) -> Tensor:
     """The same for borders at any distances; a few are sooner compared with than searched."""
     if len(borders) > MAX_BORDERS_COMPARED:
         return torch.bucketize(values.contiguous(), values.new_tensor(borders), right=True)
     return torch.stack([values >= border for border in borders]).sum(dim=0)
 
 
-def with_ends(values: Tensor, end: float) -> Tensor:
+def pad_ends(values: Tensor, end_value: float) -> Tensor:
     """The values between two ends."""
-    ends = values.new_tensor([end])
+    ends = values.new_tensor([end_value])
     return torch.cat([ends, values, ends])

@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.coverage.aggregations import Layer
-from torchcover.coverage.blocks import BlockSums, KnownCells
-from torchcover.coverage.bodies import COLUMNS, BodySums
+from torchcover.coverage.blocks import BlockSums, ObservedCells
+from torchcover.coverage.bodies import COLUMNS, TargetSums
 from torchcover.coverage.grid import BevGrid
-from torchcover.coverage.redundancy import Redundancy, redundancy_quantities
-from torchcover.coverage.region_sums import PlaceNumbers, PlaceSums
+from torchcover.coverage.redundancy import Redundancy, list_redundancy_quantities
+from torchcover.coverage.region_sums import AggregatedNumbers, RegionSums
 from torchcover.coverage.regions import Region
 from torchcover.estimation import Quantity
-from torchcover.files import TooLargeError, check_kind, check_memory, read_npz, reads, write_npz
+from torchcover.files import TooLargeError, check_dtype_kind, check_memory, guard_reader, read_npz, write_npz
 from torchcover.metrics.blocks import FINER
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 FORMAT_VERSION = 10
 Arrays = dict[str, NDArray[Any]]
 # Steps, cells, what is divided by, sums.
-IN_BLOCKS = ("block_steps", "block_cell", "block_probed_steps", "block_sums")
+IN_BLOCKS = ("block_frame_counts", "block_cell", "block_probed_steps", "block_sums")
 OVER_AREA = ("area_steps", "area_cell", "area_m2", "area_sums")
 OVER_PLACES = ("place_steps", "place_m2", "place_sums")
 # Numbers of regions, and what they are without each block.
@@ -44,49 +44,51 @@ AGGREGATED = ("region_numbers", "region_numbers_left_out")
 
 def write_coverage(coverage: "Coverage", path: Path) -> None:
     """Write a coverage to one compressed file, with standard errors by key, for NumPy users."""
-    grid, known, blocks, area = coverage.grid, coverage.known, coverage.blocks, coverage.area
-    places, aggregated = coverage.places, coverage.aggregated
-    redundancy, bodies, layers = coverage.redundancy, coverage.bodies, coverage.listed.values()
+    grid, known, blocks, area = coverage.grid, coverage.observed_cells, coverage.block_sums, coverage.area_sums
+    places, aggregated = coverage.region_sums, coverage.aggregated_numbers
+    redundancy, bodies, layers = coverage.redundancy, coverage.target_sums, coverage.sparse_layers.values()
     header = {
         "format": FORMAT_VERSION,
         "grid": asdict(grid),
         "shape": grid.shape,
-        "thresholds": coverage.thresholds,
-        "max_radius": coverage.max_radius,
+        "thresholds": coverage.thresholds_m,
+        "max_radius": coverage.max_radius_m,
         "layers": [layer.quantity._asdict() for layer in layers],
         "counts": coverage.counts,
-        "blocks": 1 if blocks is None else len(blocks.steps),
+        "blocks": 1 if blocks is None else len(blocks.frame_counts),
         "square_metres": area is not None,
         "regions": [asdict(region) for region in coverage.regions],
         "by_area": places is not None,
         "aggregated": [] if aggregated is None else [quantity._asdict() for quantity in aggregated.quantities],
-        "sensors": None if redundancy is None else redundancy.sensors,
-        "bodies": None if bodies is None else bodies.stored(),
-        "redundancy": [] if redundancy is None else [layer.quantity._asdict() for layer in redundancy.listed.values()],
+        "sensors": None if redundancy is None else redundancy.sensor_names,
+        "bodies": None if bodies is None else bodies.to_record(),
+        "redundancy": []
+        if redundancy is None
+        else [layer.quantity._asdict() for layer in redundancy.sparse_layers.values()],
     }
-    tensors = {"cell": known.at, "probed_steps": known.probed_steps, "points": known.points}
+    tensors = {"cell": known.cell_indices, "observed_frames": known.observed_frames, "points": known.point_counts}
     tensors |= {layer.quantity.key: layer.values for layer in layers}
-    tensors |= {f"{key}_error": error for key, error in coverage.listed_errors.items()}
+    tensors |= {f"{key}_error": error for key, error in coverage.sparse_errors.items()}
     if aggregated is not None:
         tensors |= dict(zip(AGGREGATED, aggregated[1:], strict=True))
     if redundancy is not None:
-        tensors |= {key: layer.values for key, layer in redundancy.listed.items()}
+        tensors |= {key: layer.values for key, layer in redundancy.sparse_layers.items()}
     if places is not None:
         tensors |= dict(zip(OVER_PLACES, places, strict=True))
     if bodies is not None:
-        tensors |= dict(zip(BODIES, (bodies.steps, bodies.sums, bodies.cells), strict=True))
+        tensors |= dict(zip(BODIES, (bodies.frame_counts, bodies.sums, bodies.position_counts), strict=True))
     arrays: dict[str, Any] = {name: tensor.cpu().numpy() for name, tensor in tensors.items()}
-    arrays["cell"] = _short(arrays["cell"], grid.cells)
+    arrays["cell"] = _short(arrays["cell"], grid.num_cells)
     arrays |= {} if blocks is None else _listed(blocks, IN_BLOCKS)
     arrays |= {} if area is None else _listed(area, OVER_AREA)
     write_npz(path, {"header": np.array(json.dumps(header)), **arrays})
 
 
-@reads("a saved coverage")
+@guard_reader("a saved coverage")
 def read_coverage(path: Path) -> dict[str, Any]:
     """Read what `write_coverage` wrote: the arguments of `Coverage`."""
     try:
-        arrays = read_npz(path, partial(check_kind, "fiuU"))  # numbers, and one text: the header
+        arrays = read_npz(path, partial(check_dtype_kind, "fiuU"))  # numbers, and one text: the header
         header: dict[str, Any] = json.loads(str(arrays.pop("header")))
         version = header.pop("format")
         parts = _parts(header, arrays) if version == FORMAT_VERSION else None
@@ -108,7 +110,9 @@ def _parts(header: dict[str, Any], arrays: Arrays) -> dict[str, Any]:
     layers = _layers(header["layers"], arrays)
     blocks = max((len(arrays[names[0]]) for names in (IN_BLOCKS, OVER_AREA) if names[0] in arrays), default=0)
     # Of all cells maps are made one at a time, and of the known ones in all blocks errors.
-    check_memory(8 * (grid.cells + 3 * blocks * len(known.at)) + sum(array.nbytes for array in arrays.values()))
+    check_memory(
+        8 * (grid.num_cells + 3 * blocks * len(known.cell_indices)) + sum(array.nbytes for array in arrays.values())
+    )
     return {
         "grid": grid,
         "thresholds": tuple(header["thresholds"]),
@@ -126,17 +130,19 @@ def _parts(header: dict[str, Any], arrays: Arrays) -> dict[str, Any]:
     }
 
 
-def _bodies(stored: dict[str, Any], arrays: Arrays) -> BodySums:
+def _bodies(stored: dict[str, Any], arrays: Arrays) -> TargetSums:
     grid = BevGrid(**stored.pop("grid"))
     bodies, regions = tuple(stored.pop("bodies")), tuple(map(_region, stored.pop("regions")))
     steps, sums, cells = (torch.from_numpy(arrays[name]) for name in BODIES)
     shapes = (len(steps), len(bodies), len(regions), len(COLUMNS)), (len(bodies), *grid.shape[1:], 2)
     if (tuple(sums.shape), tuple(cells.shape)) != shapes:
         raise ValueError(f"sums of {len(bodies)} bodies of shape {tuple(sums.shape)} and {tuple(cells.shape)}")
-    return BodySums(bodies=bodies, regions=regions, grid=grid, steps=steps, sums=sums, cells=cells, **stored)
+    return TargetSums(
+        target_names=bodies, regions=regions, grid=grid, frame_counts=steps, sums=sums, position_counts=cells, **stored
+    )
 
 
-def _aggregated(header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> PlaceNumbers:
+def _aggregated(header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> AggregatedNumbers:
     quantities = tuple(Quantity(**quantity) for quantity in header["aggregated"])
     value, left_out = (torch.from_numpy(arrays[name]) for name in AGGREGATED)
     places = len(header["regions"]) * len(grid.heights)
@@ -144,19 +150,19 @@ def _aggregated(header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> PlaceN
     shape = (places, len(quantities))
     if (tuple(value.shape), tuple(left_out.shape)) != (shape, (blocks, *shape)):
         raise ValueError(f"{AGGREGATED[0]} of shape {tuple(value.shape)} in {blocks} blocks; needed is {shape}")
-    return PlaceNumbers(quantities, value, left_out)
+    return AggregatedNumbers(quantities, value, left_out)
 
 
-def _redundancy(header: dict[str, Any], known: KnownCells, arrays: Arrays) -> Redundancy:
+def _redundancy(header: dict[str, Any], known: ObservedCells, arrays: Arrays) -> Redundancy:
     layers = _layers(header["redundancy"], arrays)
     sensors = tuple(header["sensors"])
-    if [layer.quantity for layer in layers] != list(redundancy_quantities(sensors, header["thresholds"])):
+    if [layer.quantity for layer in layers] != list(list_redundancy_quantities(sensors, header["thresholds"])):
         raise ValueError(f"other layers of redundancy than those of the sensors {', '.join(sensors)}")
     return Redundancy(sensors, known, {layer.quantity.key: layer for layer in layers})
 
 
-def _places(header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> PlaceSums:
-    places = PlaceSums(*(torch.from_numpy(arrays[name]) for name in OVER_PLACES))
+def _places(header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> RegionSums:
+    places = RegionSums(*(torch.from_numpy(arrays[name]) for name in OVER_PLACES))
     blocks, count = header["blocks"], len(header["regions"]) * len(grid.heights)
     blocks *= FINER if blocks > 1 else 1
     values = 1 + len(header["thresholds"]) + len(header["redundancy"])
@@ -165,9 +171,9 @@ def _places(header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> PlaceSums:
     return places
 
 
-def _known(grid: BevGrid, arrays: Arrays) -> KnownCells:
-    at = _ascending("cell", arrays, grid.cells)
-    return KnownCells(grid.shape, at, *(_of_cells(name, arrays) for name in ("probed_steps", "points")))
+def _known(grid: BevGrid, arrays: Arrays) -> ObservedCells:
+    at = _ascending("cell", arrays, grid.num_cells)
+    return ObservedCells(grid.shape, at, *(_of_cells(name, arrays) for name in ("observed_frames", "points")))
 
 
 def _layers(stored: Sequence[dict[str, Any]], arrays: Arrays) -> list[Layer]:
@@ -198,7 +204,9 @@ def _region(stored: Mapping[str, Any]) -> Region:
 
 
 def _listed(blocks: BlockSums, names: Sequence[str]) -> Arrays:
-    arrays = [each.cpu().numpy() for each in (blocks.steps, blocks.at, blocks.base, blocks.listed)]
+    arrays = [
+        each.cpu().numpy() for each in (blocks.frame_counts, blocks.cell_indices, blocks.denominators, blocks.sums)
+    ]
     arrays[1] = _short(arrays[1], math.prod(blocks.shape))
     return dict(zip(names, arrays, strict=True))
 
@@ -209,6 +217,6 @@ def _read_listed(names: Sequence[str], header: dict[str, Any], grid: BevGrid, ar
         raise ValueError(f"the steps of {header['blocks']} blocks have shape {steps.shape}")
     shape = (len(steps), *grid.shape)
     at = _ascending(names[1], arrays, math.prod(shape))
-    if not (base.shape == at.shape == sums.shape[1:] and np.isin(at % grid.cells, arrays["cell"]).all()):
+    if not (base.shape == at.shape == sums.shape[1:] and np.isin(at % grid.num_cells, arrays["cell"]).all()):
         raise ValueError(f"sums of shape {sums.shape} at {tuple(at.shape)} cells do not fit into {shape}")
     return BlockSums(torch.from_numpy(steps), shape, at, *map(torch.from_numpy, (base, sums)))

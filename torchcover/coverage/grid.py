@@ -9,8 +9,8 @@ from typing import Literal, NamedTuple, get_args
 import torch
 from torch import Tensor
 
-from torchcover.coverage.binning import borders_below, edges_below, with_ends
-from torchcover.devices import through_cpu
+from torchcover.coverage.binning import count_borders_below, count_edges_below, pad_ends
+from torchcover.devices import run_with_float64
 
 # What heights are measured from: the local ground, or z = 0 of the vehicle frame, which pitches and rolls.
 BandFrame = Literal["ground", "vehicle"]
@@ -30,16 +30,16 @@ PART = 32_768
 OUTSIDE = -(2**40)
 
 
-class Bins(NamedTuple):
+class CellAssignment(NamedTuple):
     """Where points are in a grid.
 
-    `inside` (M,) int64 numbers of the points that are in any cell, ascending. For each of K pairs of a point and a cell
-    that it is in: `of` (K,) which of these points, `cell` (K,) int64 the number of the cell.
+    `point_indices` (M,) int64 numbers of the points that are in any cell, ascending. For each of K pairs of a point and a cell
+    that it is in: `point_positions` (K,) which of these points, `cell_indices` (K,) int64 the number of the cell.
     """
 
-    inside: Tensor
-    of: Tensor
-    cell: Tensor
+    point_indices: Tensor
+    point_positions: Tensor
+    cell_indices: Tensor
 
 
 @dataclass(frozen=True)
@@ -49,9 +49,9 @@ class BevGrid:
     A cell's number is `(h * Y + y) * X + x`; arrays over the grid have the shape (H, Y, X).
 
     Args:
-        x: Lower and upper bound forward, in metres.
-        y: Lower and upper bound to the left, in metres.
-        cell: Side of a cell in metres. The extents must be multiples of it.
+        x_m: Lower and upper bound forward, in metres.
+        y_m: Lower and upper bound to the left, in metres.
+        cell_m: Side of a cell in metres. The extents must be multiples of it.
         heights: Name of each height band -> lower and upper bound in metres. Bands may overlap, and leave gaps. The
             default is the paper's: ground [-0.5, 0.5) and obstacle [0.5, 2.0).
         band_frame: What these are bounds of: "vehicle", z of the vehicle frame, or "ground", the height above the local
@@ -59,7 +59,7 @@ class BevGrid:
 
     Raises:
         ValueError: Inverted or infinite bounds, a cell that is not positive, an extent that is not a multiple of the
-            cell, no band, another band frame, or more than 1e8 cells.
+            cell_m, no band, another band frame, or more than 1e8 cells.
 
     Example:
         >>> grid = BevGrid(x=(0.0, 20.0), y=(-5.0, 5.0), cell=0.5)
@@ -69,18 +69,18 @@ class BevGrid:
         tensor([  0, 800,  -1])
     """
 
-    x: tuple[float, float]
-    y: tuple[float, float]
-    cell: float = 0.25
+    x_m: tuple[float, float]
+    y_m: tuple[float, float]
+    cell_m: float = 0.25
     heights: Mapping[str, tuple[float, float]] = field(default_factory=lambda: dict(PAPER_HEIGHTS))
     band_frame: BandFrame = "vehicle"
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.cell) and self.cell > 0):
-            raise ValueError(f"cell: a positive length in metres is needed; got {self.cell}")
-        for axis, bounds in (("x", self.x), ("y", self.y)):
+        if not (math.isfinite(self.cell_m) and self.cell_m > 0):
+            raise ValueError(f"cell: a positive length in metres is needed; got {self.cell_m}")
+        for axis, bounds in (("x", self.x_m), ("y", self.y_m)):
             _check_bounds(axis, bounds)
-            _check_multiple(axis, bounds, self.cell)
+            _check_multiple(axis, bounds, self.cell_m)
         if not self.heights:
             raise ValueError("heights: at least one height band is needed, for example {'ground': (-0.5, 0.5)}")
         for name, band in self.heights.items():
@@ -91,7 +91,7 @@ class BevGrid:
             raise ValueError(f"the grid has {math.prod(self.shape):,} cells, over {MAX_CELLS:,}: use larger cells")
         # Plain floats in copies: lists, whole numbers and a dict that its owner changes later make no difference.
         heights = {name: (float(low), float(high)) for name, (low, high) in self.heights.items()}
-        own = {"x": tuple(map(float, self.x)), "y": tuple(map(float, self.y)), "cell": float(self.cell)}
+        own = {"x": tuple(map(float, self.x_m)), "y": tuple(map(float, self.y_m)), "cell": float(self.cell_m)}
         for name, value in {**own, "heights": heights}.items():
             object.__setattr__(self, name, value)
 
@@ -104,15 +104,15 @@ class BevGrid:
 
     @property
     def _key(self) -> tuple[object, ...]:
-        return self.x, self.y, self.cell, tuple(self.heights.items()), self.band_frame
+        return self.x_m, self.y_m, self.cell_m, tuple(self.heights.items()), self.band_frame
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """Number of bands, cells along y, cells along x: (H, Y, X)."""
-        return len(self.heights), _count(self.y, self.cell), _count(self.x, self.cell)
+        return len(self.heights), _count(self.y_m, self.cell_m), _count(self.x_m, self.cell_m)
 
     @property
-    def cells(self) -> int:
+    def num_cells(self) -> int:
         """Number of cells in all bands."""
         return math.prod(self.shape)
 
@@ -121,34 +121,34 @@ class BevGrid:
         """Longest distance between two points of the grid, heights included, in metres."""
         lowest = min(low for low, _ in self.heights.values())
         highest = max(high for _, high in self.heights.values())
-        return math.hypot(self.x[1] - self.x[0], self.y[1] - self.y[0], highest - lowest)
+        return math.hypot(self.x_m[1] - self.x_m[0], self.y_m[1] - self.y_m[0], highest - lowest)
 
     @property
     def x_edges_m(self) -> Tensor:
         """(X + 1,) float64 cell borders along x."""
-        return _edges(self.x, self.cell)
+        return _edges(self.x_m, self.cell_m)
 
     @property
     def y_edges_m(self) -> Tensor:
         """(Y + 1,) float64 cell borders along y."""
-        return _edges(self.y, self.cell)
+        return _edges(self.y_m, self.cell_m)
 
     @property
-    def x_centres_m(self) -> Tensor:
+    def x_centers_m(self) -> Tensor:
         """(X,) float64 cell centres along x."""
-        return _centres(self.x, self.cell)
+        return _centres(self.x_m, self.cell_m)
 
     @property
-    def y_centres_m(self) -> Tensor:
+    def y_centers_m(self) -> Tensor:
         """(Y,) float64 cell centres along y."""
-        return _centres(self.y, self.cell)
+        return _centres(self.y_m, self.cell_m)
 
-    def cell_of(self, points: Tensor, height: Tensor | None = None) -> Tensor:
+    def find_cells(self, points: Tensor, heights_m: Tensor | None = None) -> Tensor:
         """Number of the cell of each point, in a grid whose bands do not overlap.
 
         Args:
             points: (N, 3) coordinates in metres, any floating-point type.
-            height: (N,) metres above the local ground, of a grid whose band frame it is, and of no other; NaN, where
+            heights_m: (N,) metres above the local ground, of a grid whose band frame it is, and of no other; NaN, where
                 there is no ground at or below a point, is in no band.
 
         Returns:
@@ -160,10 +160,10 @@ class BevGrid:
         """
         if len(self._tiers) > 1:
             raise ValueError("the height bands overlap, so that a point may be in several cells: use `bins`")
-        return self._cells_of(points, height)[0]
+        return self._cells_of(points, heights_m)[0]
 
-    def bins(self, points: Tensor, height: Tensor | None = None) -> Bins:
-        """The cells that points are in, several where bands overlap; it takes what `cell_of` takes.
+    def assign_cells(self, points: Tensor, heights_m: Tensor | None = None) -> CellAssignment:
+        """The cells that points are in, several where bands overlap; it takes what `find_cells` takes.
 
         Raises:
             ValueError: Another shape, heights that are missing or of no use.
@@ -174,16 +174,16 @@ class BevGrid:
             >>> grid.bins(torch.tensor([[0.5, 0.5, 0.0], [0.5, 0.5, 0.3], [1.5, 0.5, 0.9]]))
             Bins(inside=tensor([1, 2]), of=tensor([0, 0, 1]), cell=tensor([0, 2, 3]))
         """
-        cells = self._cells_of(points, height)
+        cells = self._cells_of(points, heights_m)
         within = cells >= 0
         inside = within.any(dim=0).nonzero().squeeze(1)
         if len(cells) == 1:
-            return Bins(inside, torch.arange(len(inside), device=inside.device), cells[0, inside])
+            return CellAssignment(inside, torch.arange(len(inside), device=inside.device), cells[0, inside])
         tier, of = within[:, inside].nonzero(as_tuple=True)
-        return Bins(inside, of, cells[tier, inside[of]])
+        return CellAssignment(inside, of, cells[tier, inside[of]])
 
-    @through_cpu
-    def points_by_column(self, points: Tensor, height: Tensor | None = None) -> Tensor:
+    @run_with_float64
+    def count_points_by_column(self, points: Tensor, heights_m: Tensor | None = None) -> Tensor:
         """(Y, X) float64: how many points lie above each square of ground in each band, as by counting `bins`, sooner.
 
         Raises:
@@ -194,12 +194,14 @@ class BevGrid:
             >>> grid.points_by_column(torch.tensor([[0.5, 0.5, 0.0], [0.5, 0.5, 0.9], [1.5, 0.5, 9.0]]))
             tensor([[2., 0.]], dtype=torch.float64)
         """
-        parts = self._parts_of(points, height)
+        parts = self._parts_of(points, heights_m)
         _, rows, columns = (count + 2 for count in self.shape)  # with a border for what is beyond
         x_bounds, y_bounds = self._bounds_on(points.device)
         count = torch.zeros(rows * columns, dtype=torch.float64, device=points.device)
         for x, y, z in parts:
-            place = edges_below(y, y_bounds, *self.y).mul_(columns).add_(edges_below(x, x_bounds, *self.x))
+            place = (
+                count_edges_below(y, y_bounds, *self.y_m).mul_(columns).add_(count_edges_below(x, x_bounds, *self.x_m))
+            )
             bands = torch.zeros_like(z)
             for low, high in self.heights.values():
                 bands += (z >= low) & (z < high)
@@ -218,14 +220,14 @@ class BevGrid:
                 tiers.append([band])
         return tiers
 
-    @through_cpu
+    @run_with_float64
     def _cells_of(self, points: Tensor, height: Tensor | None) -> Tensor:
         """(tiers, N) int64 cell numbers, -1 for none."""
         parts = self._parts_of(points, height)
         _, rows, columns = self.shape
         x_bounds, y_bounds = self._bounds_on(points.device)
         steps = torch.arange(columns, device="cpu"), torch.arange(rows, device="cpu") * columns
-        x_terms, y_terms = (with_ends(terms, OUTSIDE).to(points.device) for terms in steps)
+        x_terms, y_terms = (pad_ends(terms, OUTSIDE).to(points.device) for terms in steps)
         # Between the borders of the bands of a tier lie, in turn, a band and a gap (which may be empty).
         bounds, tiers = list(self.heights.values()), []
         for bands in self._tiers:
@@ -233,50 +235,50 @@ class BevGrid:
                 [term for band in bands for term in (band * rows * columns, OUTSIDE)][:-1], device="cpu"
             )
             borders = [border for band in bands for border in bounds[band]]
-            tiers.append((borders, with_ends(terms, OUTSIDE).to(points.device)))
+            tiers.append((borders, pad_ends(terms, OUTSIDE).to(points.device)))
 
         def cells_of(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
-            place = x_terms.index_select(0, edges_below(x, x_bounds, *self.x))
-            place += y_terms.index_select(0, edges_below(y, y_bounds, *self.y))
-            in_tiers = [place + z_terms.index_select(0, borders_below(z, borders)) for borders, z_terms in tiers]
+            place = x_terms.index_select(0, count_edges_below(x, x_bounds, *self.x_m))
+            place += y_terms.index_select(0, count_edges_below(y, y_bounds, *self.y_m))
+            in_tiers = [place + z_terms.index_select(0, count_borders_below(z, borders)) for borders, z_terms in tiers]
             return torch.stack(in_tiers).clamp_(min=-1)
 
         return torch.cat([cells_of(*part) for part in parts], dim=1)
 
     def _bounds_on(self, device: torch.device) -> tuple[Tensor, Tensor]:
-        """The borders along x and along y as `edges_below` takes them."""
-        x, y = (with_ends(edges, math.nan).to(device) for edges in (self.x_edges_m, self.y_edges_m))
+        """The borders along x and along y as `count_edges_below` takes them."""
+        x, y = (pad_ends(edges, math.nan).to(device) for edges in (self.x_edges_m, self.y_edges_m))
         return x, y
 
     def _parts_of(self, points: Tensor, height: Tensor | None) -> Iterator[tuple[Tensor, ...]]:
         """Float64 x, y and what bands are of, in parts that stay in the processor's cache; a GPU takes all at once."""
         if points.ndim != 2 or points.shape[1] != 3:
             raise ValueError(f"points: shape (N, 3) is needed; got {tuple(points.shape)}")
-        self.check_height(points, height)
+        self.check_heights(points, height)
         each = (points[:, 0], points[:, 1], points[:, 2] if height is None else height.to(points.device))
         size = PART if points.device.type == "cpu" else max(len(points), 1)
         parts = zip(*(torch.split(values.detach(), size) for values in each), strict=True)
         return (tuple(values.double() for values in part) for part in parts)
 
-    def check_height(self, points: Tensor, height: Tensor | None, name: str = "height") -> None:
+    def check_heights(self, points: Tensor, heights_m: Tensor | None, name: str = "height") -> None:
         """Refuse heights that do not go with the bands.
 
         Args:
             points: (N, 3) points.
-            height: Their heights above the local ground, if there are any.
+            heights_m: Their heights above the local ground, if there are any.
             name: What messages call them.
 
         Raises:
             ValueError: None where bands are over the ground, any where they are over z; other than one for each point.
         """
-        if height is None:
+        if heights_m is None:
             if self.band_frame == "ground" and len(points):
                 raise ValueError(f"{name}: bands over the ground need the heights of points above it; got none")
         elif self.band_frame == "vehicle":
             raise ValueError(f"{name}: of no use for bands over z of the vehicle; use BevGrid(band_frame='ground')")
-        elif height.shape != points.shape[:1]:
+        elif heights_m.shape != points.shape[:1]:
             needed = f"({len(points)},), one for each point,"
-            raise ValueError(f"{name}: shape {needed} is needed; got {tuple(height.shape)}")
+            raise ValueError(f"{name}: shape {needed} is needed; got {tuple(heights_m.shape)}")
 
 
 def _check_bounds(name: str, bounds: tuple[float, float]) -> None:

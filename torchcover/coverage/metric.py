@@ -4,11 +4,11 @@ import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from torchcover.coverage.plotting import draw_coverage
+from torchcover.coverage.plotting import plot_coverage
 from torchcover.coverage.result import Coverage
-from torchcover.coverage.steps import Clouds, SensorClouds, as_list
+from torchcover.coverage.steps import Clouds, SensorClouds, to_list
 from torchcover.coverage.sums import CoverageSums
-from torchcover.metrics import MergeableMetric, figure_of
+from torchcover.metrics import MergeableMetric, get_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -44,31 +44,31 @@ class CoverageMetric(MergeableMetric, CoverageSums):
         reference: Clouds,
         *,
         weights: Clouds | None = None,
-        height: Clouds | None = None,
+        heights_m: Clouds | None = None,
         block_index: int | Sequence[int] | None = None,
-        error: Clouds | None = None,
+        errors_m: Clouds | None = None,
     ) -> None:
         """Add steps as `CoverageSums.update` does, which says what it takes and refuses.
 
         Warns:
             UserWarning: Once, of square metres that the metric does not average over.
         """
-        given = {"weights": weights, "height": height, "block_index": block_index, "error": error}
+        given = {"weights": weights, "height": heights_m, "block_index": block_index, "error": errors_m}
         CoverageSums.update(self, sensor, reference, **given)  # type: ignore[arg-type]  # each of its own type
         self._is_updated = True
-        if weights is not None and len(weights) and not self.square_metres:
+        if weights is not None and len(weights) and not self.has_area_weights:
             self._warn_once(
                 "weights",
                 "square metres were given, but this metric averages over cells; square_metres=True makes it average "
                 "over area, too",
             )
 
-    def forward(self, sensor: SensorClouds, reference: Clouds, **given: Any) -> Coverage:  # noqa: ANN401
+    def forward(self, sensor: SensorClouds, reference: Clouds, **options: Any) -> Coverage:  # noqa: ANN401
         """Add steps as `update` does, which takes the same, and return the coverage of these steps alone."""
-        if given.get("block_index") is None:  # torchmetrics adds steps to an empty state: counting would start at 0
-            steps = range(len(as_list(reference, "reference")))
-            given["block_index"] = [int(self.steps) + step for step in steps]
-        return super().forward(sensor, reference, **given)  # type: ignore[no-any-return]
+        if options.get("block_index") is None:  # torchmetrics adds steps to an empty state: counting would start at 0
+            steps = range(len(to_list(reference, "reference")))
+            options["block_index"] = [int(self.num_frames) + step for step in steps]
+        return super().forward(sensor, reference, **options)  # type: ignore[no-any-return]
 
     def compute(self) -> Coverage:
         """The coverage so far. Cells that no reference point ever probed are NaN with count 0.
@@ -95,17 +95,17 @@ class CoverageMetric(MergeableMetric, CoverageSums):
         val: Coverage | None = None,
         ax: "Axes | None" = None,
         *,
-        layer: str | None = None,
-        height: str | None = None,
+        quantity_key: str | None = None,
+        band: str | None = None,
     ) -> "tuple[Figure, Axes]":
-        """Draw one layer in one height band, seen from above, as `torchcover.coverage.plotting.draw_coverage` does.
+        """Draw one layer in one height band, seen from above, as `torchcover.coverage.plotting.plot_coverage` does.
 
         Args:
             val: What `compute` or `forward` returned; the coverage so far if not given.
             ax: Where to; a new figure of pyplot's if not given.
-            layer: A key of `Coverage.layers`; the detection at the first threshold if not given.
-            height: Name of the band; the first if not given.
+            quantity_key: A key of `Coverage.layers`; the detection at the first threshold if not given.
+            band: Name of the band; the first if not given.
         """
-        fig, ax = figure_of(ax)
-        draw_coverage(self.compute() if val is None else val, ax, layer, height)
+        fig, ax = get_figure(ax)
+        plot_coverage(self.compute() if val is None else val, ax, quantity_key, band)
         return fig, ax

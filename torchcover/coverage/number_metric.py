@@ -9,23 +9,23 @@ from torchcover.coverage.aggregations import MeanOfMeans
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.metric import CoverageMetric
 from torchcover.coverage.regions import Region, check_regions
-from torchcover.metrics import figure_of
+from torchcover.metrics import get_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
-class CoverageNumber(CoverageMetric):
+class CoverageNumberMetric(CoverageMetric):
     """One number of `Coverage.summary`, for torchmetrics' `MetricTracker`, which wants one and its better direction.
 
     Of detection more is better, of the radius less. In a `MetricCollection`, numbers with the same `grid` and options
     share their sums: each step is measured once.
 
     Args:
-        quantity: "radius_m", or "detection_0.4m" with one of the thresholds.
+        quantity_key: "radius_m", or "detection_0.4m" with one of the thresholds.
         region: Where.
-        height: Name of the band.
+        band: Name of the band.
         grid: As in `CoverageMetric`, and so are the others.
         thresholds: Detection thresholds in metres.
         options: `max_radius`, `square_metres`, ...
@@ -37,7 +37,7 @@ class CoverageNumber(CoverageMetric):
         >>> import torch
         >>> from torchmetrics.wrappers import MetricTracker
         >>> near = Region("near", x=(0.0, 2.0), y=(0.0, 1.0))
-        >>> tracker = MetricTracker(CoverageNumber("radius_m", near, "ground", BevGrid(x=(0.0, 2.0), y=(0.0, 1.0))))
+        >>> tracker = MetricTracker(CoverageNumberMetric("radius_m", near, "ground", BevGrid(x=(0.0, 2.0), y=(0.0, 1.0))))
         >>> for x_m in (1.0, 0.5, 1.5):
         ...     tracker.increment()
         ...     tracker.update(torch.zeros(1, 3), torch.tensor([[x_m, 0.0, 0.0]]))
@@ -47,33 +47,33 @@ class CoverageNumber(CoverageMetric):
 
     def __init__(
         self,
-        quantity: str,
+        quantity_key: str,
         region: Region,
-        height: str,
+        band: str,
         grid: BevGrid,
-        thresholds: Sequence[float] = (0.4,),
+        thresholds_m: Sequence[float] = (0.4,),
         **options: Any,  # noqa: ANN401  (whatever CoverageMetric takes)
     ) -> None:
-        super().__init__(grid, thresholds, **options)
+        super().__init__(grid, thresholds_m, **options)
         check_regions([region], grid)
-        quantities = MeanOfMeans(self.thresholds).quantities
+        quantities = MeanOfMeans(self.thresholds_m).quantities
         keys = [known.key for known in quantities]
-        for name, given, there in (("quantity", quantity, keys), ("height", height, list(grid.heights))):
+        for name, given, there in (("quantity", quantity_key, keys), ("height", band, list(grid.heights))):
             if given not in there:
                 raise ValueError(f"{name}: one of {', '.join(there)} is needed; got {given!r}")
-        self.quantity = quantities[keys.index(quantity)]
+        self.quantity_key = quantities[keys.index(quantity_key)]
         self.region = region
-        self.height = height
+        self.band = band
 
     @property
     def higher_is_better(self) -> bool:  # type: ignore[override]  # a constant of the class, in torchmetrics
         """Whether more of it is better."""
-        return not self.quantity.lower_is_better
+        return not self.quantity_key.lower_is_better
 
     def compute(self) -> Tensor:  # type: ignore[override]  # the sums are those of its parent, what comes out is not
         """() float64 the number so far, in metres or as a share; NaN where it is unknown."""
         coverage = super().compute()
-        return coverage.estimate(self.region, self.height).value[coverage.quantities.index(self.quantity)]
+        return coverage.estimate(self.region, self.band).value[coverage.quantities.index(self.quantity_key)]
 
     def plot(  # type: ignore[override]
         self, val: Tensor | Sequence[Tensor] | None = None, ax: "Axes | None" = None
@@ -84,6 +84,6 @@ class CoverageNumber(CoverageMetric):
             val: What `compute` or `forward` returned, once or several times; the number so far if not given.
             ax: Where to; a new figure of pyplot's if not given.
         """
-        fig, ax = figure_of(ax)
+        fig, ax = get_figure(ax)
         self._plot(val, ax)
         return fig, ax

@@ -7,12 +7,12 @@ from typing import TypeAlias
 
 import torch
 
-from torchcover.coverage.mixture import Mixture
+from torchcover.coverage.mixture import CoverageMixture
 from torchcover.coverage.regions import Region
 from torchcover.coverage.result import Coverage
 from torchcover.estimation import Difference, Estimate
 
-Parts: TypeAlias = tuple[Callable[[Coverage | Mixture], Callable[[Region, str], Estimate]], ...]
+EstimatorGetters: TypeAlias = tuple[Callable[[Coverage | CoverageMixture], Callable[[Region, str], Estimate]], ...]
 
 # What there is an estimate of, in each region and band, and in each region of each body.
 PARTS = attrgetter("estimate"), attrgetter("estimate_aggregated")
@@ -33,9 +33,11 @@ def check_paired(coverages: Mapping[str, Coverage]) -> None:
         for what in ("band_frame", "grid", "thresholds", "max_radius"):
             if getattr(coverage, what) != getattr(expected, what):
                 raise ValueError(f"{first!r} and {name!r} cannot be compared: they differ in their {what}")
-        if (coverage.bodies and coverage.bodies.places) != (expected.bodies and expected.bodies.places):
+        if (coverage.target_sums and coverage.target_sums.region_targets) != (
+            expected.target_sums and expected.target_sums.region_targets
+        ):
             raise ValueError(f"{first!r} and {name!r} cannot be compared: other bodies were put beside them")
-        if coverage.measure != expected.measure or coverage.layers.keys() != expected.layers.keys():
+        if coverage.average != expected.average or coverage.layers.keys() != expected.layers.keys():
             raise ValueError(f"{first!r} and {name!r} cannot be compared: they have different layers")
         if not _same_steps(coverage, expected):
             raise ValueError(
@@ -45,48 +47,56 @@ def check_paired(coverages: Mapping[str, Coverage]) -> None:
 
 
 def _same_steps(a: Coverage, b: Coverage) -> bool:
-    same = torch.equal(a.known.at, b.known.at) and torch.equal(a.known.points, b.known.points)
-    same = same and a.counts["frames"] == b.counts["frames"]
-    if a.blocks is None or b.blocks is None:
-        return same and a.blocks is b.blocks
-    return same and torch.equal(a.blocks.steps, b.blocks.steps)
+    same = torch.equal(a.observed_cells.cell_indices, b.observed_cells.cell_indices) and torch.equal(
+        a.observed_cells.point_counts, b.observed_cells.point_counts
+    )
+    same = same and a.counts["num_frames"] == b.counts["num_frames"]
+    if a.block_sums is None or b.block_sums is None:
+        return same and a.block_sums is b.block_sums
+    return same and torch.equal(a.block_sums.frame_counts, b.block_sums.frame_counts)
 
 
-def differences(
-    coverages: Mapping[str, Coverage | Mixture], region: Region, height: str, parts: Parts = PARTS
+def compute_differences(
+    coverages: Mapping[str, Coverage | CoverageMixture],
+    region: Region,
+    band: str,
+    estimator_getters: EstimatorGetters = PARTS,
 ) -> dict[str, dict[str, Difference]]:
     """The differences of every rig, the first one too, to the first.
 
     Args:
         coverages: By the name of the rig, from the same frames.
         region: A region within the grid.
-        height: Name of the band, or of a body.
-        parts: What there is an estimate of there.
+        band: Name of the band, or of a body.
+        estimator_getters: What there is an estimate of there.
 
     Returns:
         Name of the rig -> key of the quantity -> difference.
     """
     first = next(iter(coverages.values()))
     found: dict[str, dict[str, Difference]] = {name: {} for name in coverages}
-    for part in parts:
-        expected = part(first)(region, height)
+    for part in estimator_getters:
+        expected = part(first)(region, band)
         for name, coverage in coverages.items():
-            found[name] |= part(coverage)(region, height).differences(expected)
+            found[name] |= part(coverage)(region, band).compute_differences(expected)
     return found
 
 
-def leaders(
-    coverages: Mapping[str, Coverage | Mixture], region: Region, height: str, parts: Parts = PARTS
+def find_leaders(
+    coverages: Mapping[str, Coverage | CoverageMixture],
+    region: Region,
+    band: str,
+    estimator_getters: EstimatorGetters = PARTS,
 ) -> dict[str, str]:
     """Key of a quantity -> the rig that is best in it, where its lead over the next is more than chance."""
     found = {}
-    for part in parts:
-        each = {rig: part(coverage)(region, height) for rig, coverage in coverages.items()}
+    for part in estimator_getters:
+        each = {rig: part(coverage)(region, band) for rig, coverage in coverages.items()}
         for at, quantity in enumerate(next(iter(each.values())).quantities):
-            gains = {rig: quantity.gain(float(estimate.value[at])) for rig, estimate in each.items()}
+            gains = {rig: quantity.compute_improvement(float(estimate.value[at])) for rig, estimate in each.items()}
             ranked = sorted((rig for rig in gains if not math.isnan(gains[rig])), key=gains.__getitem__)
             if len(ranked) > 1:
                 best, following = (each[rig][at : at + 1] for rig in (ranked[-1], ranked[-2]))
-                if best.differences(following)[quantity.key].significant:
+                if best.compute_differences(following)[quantity.key].is_significant:
                     found[quantity.key] = ranked[-1]
     return found

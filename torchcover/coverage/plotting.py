@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from torchcover.coverage.quantity import by_area
+from torchcover.coverage.quantity import make_area_quantity
 from torchcover.coverage.result import Coverage
 
 if TYPE_CHECKING:
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 ROBUST_PERCENTILE = 98
 
 
-def draw_coverage(coverage: object, ax: "Axes", layer: str | None, height: str | None) -> None:
+def plot_coverage(coverage: object, ax: "Axes", quantity_key: str | None, band: str | None) -> None:
     """Draw one layer in one height band, seen from above: x forward to the right, y left upwards, the vehicle at 0, 0.
 
     Dark is blind, grey is unknown; what is beyond the colours, such as an infinite radius, has the last one. If not
@@ -24,18 +24,18 @@ def draw_coverage(coverage: object, ax: "Axes", layer: str | None, height: str |
     if not isinstance(coverage, Coverage):
         raise TypeError(f"val: one Coverage, as compute() returns it, is needed; got {type(coverage).__name__}")
     bands = list(coverage.grid.heights)
-    first = coverage.quantities[min(1, len(coverage.thresholds))]
-    first = first if coverage.measure == "cells" else by_area(first)
-    key = first.key if layer is None else layer
-    band = bands[0] if height is None else height
-    for name, given, there in (("layer", key, list(coverage.layers)), ("height", band, bands)):
+    first = coverage.quantities[min(1, len(coverage.thresholds_m))]
+    first = first if coverage.average == "cells" else make_area_quantity(first)
+    key = first.key if quantity_key is None else quantity_key
+    band_name = bands[0] if band is None else band
+    for name, given, there in (("layer", key, list(coverage.layers)), ("height", band_name, bands)):
         if given not in there:
             raise ValueError(f"{name}: one of {', '.join(there)} is needed; got {given!r}")
-    quantity, values = coverage.layers[key].quantity, coverage.layers[key].values[bands.index(band)].cpu().numpy()
+    quantity, values = coverage.layers[key].quantity, coverage.layers[key].values[bands.index(band_name)].cpu().numpy()
     finite = values[np.isfinite(values)]
     highest = (float(np.percentile(finite, ROBUST_PERCENTILE)) if quantity.unit == "m" and len(finite) else 0.0) or 1.0
     values = np.where(np.isinf(values), 2 * highest, values)  # what is infinite matplotlib would leave out, as unknown
-    (x_low, x_high), (y_low, y_high) = coverage.grid.x, coverage.grid.y
+    (x_low, x_high), (y_low, y_high) = coverage.grid.x_m, coverage.grid.y_m
     _, rows, columns = coverage.grid.shape
     mesh = ax.pcolormesh(
         np.linspace(x_low, x_high, columns + 1),
@@ -54,7 +54,7 @@ def draw_coverage(coverage: object, ax: "Axes", layer: str | None, height: str |
         aspect="equal",
         xlabel="x forward (m)",
         ylabel="y left (m)",
-        title=f"{quantity.title}, {band}, {coverage.counts['frames']} steps (grey: unknown)",
+        title=f"{quantity.title}, {band_name}, {coverage.counts['num_frames']} steps (grey: unknown)",
     )
     label = f"{quantity.title} (m)" if quantity.unit == "m" else quantity.title
     ax.figure.colorbar(mesh, ax=ax, label=label, shrink=0.7, extend="max" if (values > highest).any() else "neither")

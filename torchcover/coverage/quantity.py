@@ -6,47 +6,49 @@ from torchcover.estimation import Quantity
 MEASURED_WITHIN_M = 0.4
 
 
-def radius(which: str = "", title: str = "mean") -> Quantity:
+def make_radius_quantity(statistic: str = "", title: str = "mean") -> Quantity:
     """A blind spot radius in metres: which one, as a part of its key, and in words.
 
     Example:
         >>> radius("maximum", "largest")
         Quantity(key='radius_maximum_m', title='largest blind spot radius', unit='m', lower_is_better=True)
     """
-    key = f"radius_{which}_m" if which else "radius_m"
+    key = f"radius_{statistic}_m" if statistic else "radius_m"
     return Quantity(key, f"{title} blind spot radius", "m", lower_is_better=True)
 
 
-def detection(threshold_m: float) -> Quantity:
+def make_detection_quantity(threshold_m: float) -> Quantity:
     """The share of reference points, or steps, whose radius is at most a threshold in metres."""
     return Quantity(
         f"detection_{threshold_m:g}m", f"detection within {threshold_m:g} m", "share", lower_is_better=False
     )
 
 
-def sensors_seeing(threshold_m: float) -> Quantity:
+def make_sensor_count_quantity(threshold_m: float) -> Quantity:
     """The number of sensors of a rig whose radius is at most a threshold in metres."""
     title = f"sensors that see within {threshold_m:g} m"
     return Quantity(f"sensors_{threshold_m:g}m", title, "sensors", lower_is_better=False)
 
 
-def seen_by_two(threshold_m: float) -> Quantity:
+def make_redundancy_quantity(threshold_m: float) -> Quantity:
     """The share of reference points that two sensors or more see within a threshold in metres."""
     title = f"seen by two sensors or more within {threshold_m:g} m"
     return Quantity(f"seen_by_two_{threshold_m:g}m", title, "share", lower_is_better=False)
 
 
-def without(sensor: str, quantity: Quantity) -> Quantity:
+def make_failure_quantity(sensor_name: str, quantity: Quantity) -> Quantity:
     """A number of the rig without one of its sensors.
 
     Example:
         >>> without("roof", detection(0.4)).key
         'detection_0.4m_without_roof'
     """
-    return quantity._replace(key=f"{quantity.key}_without_{sensor}", title=f"{quantity.title}, without {sensor}")
+    return quantity._replace(
+        key=f"{quantity.key}_without_{sensor_name}", title=f"{quantity.title}, without {sensor_name}"
+    )
 
 
-def by_area(quantity: Quantity) -> Quantity:
+def make_area_quantity(quantity: Quantity) -> Quantity:
     """The same over the surface that the reference sees, where every square metre weighs the same.
 
     Example:
@@ -57,14 +59,14 @@ def by_area(quantity: Quantity) -> Quantity:
     return quantity._replace(key=f"{kind}_area_{unit}", title=f"{quantity.title}, by area")
 
 
-def over_known(quantity: Quantity) -> Quantity:
+def make_cells_quantity(quantity: Quantity) -> Quantity:
     """The same over the known cells of a region, every cell weighing the same, where the number itself is by area.
 
     Example:
-        >>> over_known(RADIUS).key
+        >>> make_cells_quantity(RADIUS).key
         'cells_radius_m'
     """
     return quantity._replace(key=f"cells_{quantity.key}", title=f"{quantity.title}, over known cells")
 
 
-RADIUS = radius()
+RADIUS = make_radius_quantity()

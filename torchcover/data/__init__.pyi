@@ -1,12 +1,12 @@
 from torchcover.frames import Augmentation as Augmentation
 from torchcover.frames import BadFrameError as BadFrameError
-from torchcover.frames import ChosenRigs as ChosenRigs
 from torchcover.frames import Frame as Frame
 from torchcover.frames import FrameBatch as FrameBatch
 from torchcover.frames import FrameDataset as FrameDataset
 from torchcover.frames import FrameSource as FrameSource
-from torchcover.frames import Measured as Measured
-from torchcover.frames import VisibleTargets as VisibleTargets
+from torchcover.frames import Measurement as Measurement
+from torchcover.frames import RigSubset as RigSubset
+from torchcover.frames import VisibleBoxes as VisibleBoxes
 from torchcover.frames import collate_frames as collate_frames
 from torchcover.frames import flip as flip
 from torchcover.frames import rotate as rotate

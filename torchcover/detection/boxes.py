@@ -11,11 +11,11 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from torchcover.devices import move
+from torchcover.devices import move_tensor
 from torchcover.geometry.arrays import Float64
-from torchcover.geometry.rigid import Matrix, transform
+from torchcover.geometry.rigid import Matrix, transform_points
 from torchcover.neighbors import check_tensor
-from torchcover.notebooks import brief
+from torchcover.notebooks import format_short_repr
 
 # The middles of what labels of KITTI call fully visible, partly and largely occluded, which has no numbers for them: by
 # the borders of nuScenes, whose second and third level are one here.
@@ -27,19 +27,19 @@ class Boxes:
     """Boxes that stand upright in the vehicle frame (x forward, y left, z up), around the objects of one frame.
 
     Args:
-        centre_m: (K, 3) centres, half-way up.
+        center_m: (K, 3) centres, half-way up.
         size_m: (K, 3) length along the heading, width, height.
         yaw_rad: (K,) heading: 0 along x, positive to the left.
         velocity_mps: (K, 2) velocity over ground along the vehicle's x and y: that of the object itself, not its motion
             relative to the ego (as in nuScenes). NaN where unknown.
         ids: K names, the same for an object in all frames of a run; empty strings where unknown.
         categories: K categories ("car", "pedestrian", ...); empty strings where unknown.
-        hits: Name of a rig -> (K,) int64 how many of its points lie in each box.
-        drawn_points: (K,) int64 how many points the reference drew on each object, to ask whether they are seen; zeros
+        points_in_box: Name of a rig -> (K,) int64 how many of its points lie in each box.
+        sampled_points: (K,) int64 how many points the reference drew on each object, to ask whether they are seen; zeros
             where none were, as in recordings.
         bottom_heights_m: (K,) height of the bottom of each box above the local ground, that is the highest ground below
             its centre; NaN where unknown.
-        visibility: (K,) share of what can be seen of it that a rig shows, as `box_visibility` measures it, or the
+        visibility: (K,) share of what can be seen of it that a rig shows, as `measure_box_visibility` measures it, or the
             middle of the level that a label says (`visibility_token`, `occluded`); NaN where unknown.
 
     Raises:
@@ -55,34 +55,34 @@ class Boxes:
         (1, torch.Size([1, 7]))
     """
 
-    centre_m: Tensor
+    center_m: Tensor
     size_m: Tensor
     yaw_rad: Tensor
     velocity_mps: Tensor = None  # type: ignore[assignment]  # never stays None, see __post_init__
     ids: tuple[str, ...] = ()
     categories: tuple[str, ...] = ()
-    hits: Mapping[str, Tensor] = field(default_factory=dict)
-    drawn_points: Tensor = None  # type: ignore[assignment]  # nor this
+    points_in_box: Mapping[str, Tensor] = field(default_factory=dict)
+    sampled_points: Tensor = None  # type: ignore[assignment]  # nor this
     bottom_heights_m: Tensor = None  # type: ignore[assignment]  # nor this
     visibility: Tensor = None  # type: ignore[assignment]  # nor this
 
-    __repr__ = brief
+    __repr__ = format_short_repr
 
     def __post_init__(self) -> None:
         for name in ("centre_m", "size_m", "yaw_rad"):
             tensor = getattr(self, name)
-            check_tensor(tensor, name, floating=True)
+            check_tensor(tensor, name, is_floating=True)
             if not tensor.isfinite().all():
                 bad = int((~tensor.reshape(len(tensor), -1).isfinite()).any(dim=1).sum())
                 raise ValueError(f"{name}: {bad} of {len(tensor)} boxes have NaN or infinite numbers; leave them out")
         count = len(self.yaw_rad)
         fill = {
-            "velocity_mps": self.centre_m.new_full((count, 2), math.nan),
+            "velocity_mps": self.center_m.new_full((count, 2), math.nan),
             "ids": ("",) * count,
             "categories": ("",) * count,
             "drawn_points": torch.zeros(count, dtype=torch.int64, device=self.yaw_rad.device),
-            "bottom_heights_m": self.centre_m.new_full((count,), math.nan),
-            "visibility": self.centre_m.new_full((count,), math.nan),
+            "bottom_heights_m": self.center_m.new_full((count,), math.nan),
+            "visibility": self.center_m.new_full((count,), math.nan),
         }
         for name, unknown in fill.items():
             given = getattr(self, name)
@@ -112,19 +112,19 @@ class Boxes:
         lengths = {
             "ids": self.ids,
             "categories": self.categories,
-            **{f"hits[{rig!r}]": n for rig, n in self.hits.items()},
+            **{f"hits[{rig!r}]": n for rig, n in self.points_in_box.items()},
         }
         for name, entries in lengths.items():
             if len(entries) != count:
                 raise ValueError(f"{name}: one entry for each of {count} boxes is needed; got {len(entries)}")
 
     @classmethod
-    def from_rows(cls, rows: Tensor, **others: object) -> "Boxes":
+    def from_rows(cls, rows: Tensor, **other_fields: object) -> "Boxes":
         """From (K, 7) rows x, y, z of the centre, length, width, height, yaw: the layout of OpenPCDet.
 
         Args:
             rows: Metres and radians; further columns are not allowed.
-            others: `velocity_mps`, `ids`, `categories`, `hits`, `drawn_points`, `bottom_heights_m`, `visibility`.
+            other_fields: `velocity_mps`, `ids`, `categories`, `hits`, `drawn_points`, `bottom_heights_m`, `visibility`.
 
         Raises:
             ValueError: Another shape, or as the constructor.
@@ -132,23 +132,25 @@ class Boxes:
         check_tensor(rows, "rows")
         if rows.ndim != 2 or rows.shape[1] != 7:
             raise ValueError(f"rows: shape (K, 7) is needed, x y z length width height yaw; got {tuple(rows.shape)}")
-        return cls(rows[:, :3], rows[:, 3:6], rows[:, 6], **others)  # type: ignore[arg-type]
+        return cls(rows[:, :3], rows[:, 3:6], rows[:, 6], **other_fields)  # type: ignore[arg-type]
 
     @classmethod
-    def from_kitti_label(cls, numbers: ArrayLike, vehicle_T_camera: Float64 | None = None, **others: object) -> "Boxes":
+    def from_kitti_label(
+        cls, label_values: ArrayLike, vehicle_T_camera: Float64 | None = None, **other_fields: object
+    ) -> "Boxes":
         """From the numbers of KITTI's `label_2`: places in the rectified camera frame, at the bottom of the box.
 
         Args:
-            numbers: (K, 14) what follows the type: truncated, occluded, alpha, four of the image, height, width,
+            label_values: (K, 14) what follows the type: truncated, occluded, alpha, four of the image, height, width,
                 length, x, y, z, rotation about the camera's y.
             vehicle_T_camera: (4, 4) where the rectified camera is: of the LiDAR frame it is
                 inv(R0_rect Tr_velo_to_cam).
-            others: As `from_rows`.
+            other_fields: As `from_rows`.
 
         Raises:
             ValueError: Another shape, or as the constructor.
         """
-        given = np.asarray(numbers, dtype=np.float64)
+        given = np.asarray(label_values, dtype=np.float64)
         given = given.reshape(0, 14) if given.size == 0 else given
         if given.ndim != 2 or given.shape[1] != 14:
             raise ValueError(
@@ -157,33 +159,33 @@ class Boxes:
         height, width, length, x, y, z, turn = given[:, 7:].T
         centre = np.column_stack([x, y - height / 2, z])  # the camera's y points down
         ahead = np.column_stack([np.cos(turn), np.zeros_like(turn), -np.sin(turn)])
-        rows = upright_rows(centre, np.column_stack([length, width, height]), ahead, vehicle_T_camera)
+        rows = build_upright_rows(centre, np.column_stack([length, width, height]), ahead, vehicle_T_camera)
         shares = [SHARE_OCCLUDED.get(occluded, math.nan) for occluded in given[:, 1].tolist()]
-        return cls.from_rows(rows, visibility=rows.new_tensor(shares), **others)
+        return cls.from_rows(rows, visibility=rows.new_tensor(shares), **other_fields)
 
     @property
     def rows(self) -> Tensor:
         """(K, 7) x, y, z of the centre, length, width, height, yaw: the layout of OpenPCDet."""
-        return torch.cat([self.centre_m, self.size_m, self.yaw_rad[:, None]], dim=1)
+        return torch.cat([self.center_m, self.size_m, self.yaw_rad[:, None]], dim=1)
 
     def __len__(self) -> int:
         return len(self.yaw_rad)
 
-    def select(self, which: Tensor) -> "Boxes":
+    def select(self, selection: Tensor) -> "Boxes":
         """Some of them.
 
         Args:
-            which: (K,) bool mask, or int64 numbers of boxes.
+            selection: (K,) bool mask, or int64 numbers of boxes.
         """
-        which = which.to(self.yaw_rad.device)
-        numbers = (which.nonzero().squeeze(1) if which.dtype == torch.bool else which).tolist()
+        selection = selection.to(self.yaw_rad.device)
+        numbers = (selection.nonzero().squeeze(1) if selection.dtype == torch.bool else selection).tolist()
         return self._each(
-            lambda tensor: tensor[which],
+            lambda tensor: tensor[selection],
             ids=tuple(self.ids[number] for number in numbers),
             categories=tuple(self.categories[number] for number in numbers),
         )
 
-    def of_category(self, *categories: str) -> "Boxes":
+    def select_categories(self, *categories: str) -> "Boxes":
         """Those of the given categories."""
         return self.select(
             torch.tensor([category in categories for category in self.categories], dtype=torch.bool, device="cpu")
@@ -195,13 +197,13 @@ class Boxes:
 
     def to(self, device: torch.device | str) -> "Boxes":
         """A copy on another device, in float32 where that has no float64."""
-        return self._each(lambda tensor: move(tensor, device))
+        return self._each(lambda tensor: move_tensor(tensor, device))
 
     def _each(self, change: Callable[[Tensor], Tensor], **names: tuple[str, ...]) -> "Boxes":
         """With all tensors changed, and other names where their number changes."""
         tensors = ("centre_m", "size_m", "yaw_rad", "velocity_mps", "drawn_points", "bottom_heights_m", "visibility")
         changed: dict[str, Any] = {name: change(getattr(self, name)) for name in tensors} | names
-        return replace(self, **changed, hits={rig: change(count) for rig, count in self.hits.items()})
+        return replace(self, **changed, points_in_box={rig: change(count) for rig, count in self.points_in_box.items()})
 
 
 def check_boxes(boxes: object) -> None:
@@ -213,19 +215,21 @@ def check_boxes(boxes: object) -> None:
         )
 
 
-def upright_rows(centre_m: ArrayLike, size_m: ArrayLike, heading: ArrayLike, vehicle_T_source: Matrix | None) -> Tensor:
+def build_upright_rows(
+    center_m: ArrayLike, size_m: ArrayLike, heading_vectors: ArrayLike, vehicle_T_source: Matrix | None
+) -> Tensor:
     """(K, 7) rows of boxes in the vehicle frame; what leans is put upright, its heading, (K, 3) vectors, kept.
 
     `vehicle_T_source` is where the frame of the centres and headings is; None: it is the vehicle frame.
 
     ValueError: numbers that are not finite, or shapes that do not fit.
     """
-    centre, size, ahead = _rows("centres", centre_m), _rows("sizes", size_m), _rows("headings", heading)
+    centre, size, ahead = _rows("centres", center_m), _rows("sizes", size_m), _rows("headings", heading_vectors)
     if not len(centre) == len(size) == len(ahead):
         counts = f"{len(centre)}, {len(size)} and {len(ahead)}"
         raise ValueError(f"boxes: as many centres, sizes and headings are needed; got {counts}")
     if vehicle_T_source is not None:
-        centre, ahead = transform(vehicle_T_source, centre), ahead @ vehicle_T_source[:3, :3].T
+        centre, ahead = transform_points(vehicle_T_source, centre), ahead @ vehicle_T_source[:3, :3].T
     yaw = np.arctan2(ahead[:, 1], ahead[:, 0])
     return torch.from_numpy(np.column_stack([centre, size, yaw])).float()
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchcover.detection.boxes import Boxes
-from torchcover.devices import move, with_float64
+from torchcover.devices import ensure_float64, move_tensor
 from torchcover.neighbors import check_tensor
 
 # A body's points lie on its box as often as in it; rounding of coordinates may put them on either side.
@@ -19,14 +19,14 @@ CELL_M = 2.0
 MAX_CELLS = 1_000_000
 
 
-class Inside(NamedTuple):
-    """Pairs of a box and a point in it: `box` (P,) and `point` (P,) int64, by ascending box."""
+class BoxPointPairs(NamedTuple):
+    """Pairs of a box and a point in it: `box_indices` (P,) and `point_indices` (P,) int64, by ascending box."""
 
-    box: Tensor
-    point: Tensor
+    box_indices: Tensor
+    point_indices: Tensor
 
 
-def points_in_boxes(points: Tensor, boxes: Boxes, *, skin_m: float = SKIN_M) -> Inside:
+def find_points_in_boxes(points: Tensor, boxes: Boxes, *, margin_m: float = SKIN_M) -> BoxPointPairs:
     """Which points lie in which boxes; a point may lie in several.
 
     A body touches its box: the wall of a box-shaped truck lies on the box's side. Sides and top are therefore closed,
@@ -36,7 +36,7 @@ def points_in_boxes(points: Tensor, boxes: Boxes, *, skin_m: float = SKIN_M) -> 
     Args:
         points: (N, 3) points in the vehicle frame in metres.
         boxes: K boxes in the same frame, on the same device.
-        skin_m: How much thicker.
+        margin_m: How much thicker.
 
     Returns:
         `Inside(box, point)`: (P,) int64 each, one entry for each pair.
@@ -46,12 +46,12 @@ def points_in_boxes(points: Tensor, boxes: Boxes, *, skin_m: float = SKIN_M) -> 
 
     Example:
         >>> boxes = Boxes.from_rows(torch.tensor([[10.0, 0.0, 1.0, 4.0, 2.0, 2.0, 0.0]]))
-        >>> points_in_boxes(torch.tensor([[11.9, 0.9, 1.9], [12.1, 0.0, 1.0], [10.0, 0.0, 0.0]]), boxes)
+        >>> find_points_in_boxes(torch.tensor([[11.9, 0.9, 1.9], [12.1, 0.0, 1.0], [10.0, 0.0, 0.0]]), boxes)
         Inside(box=tensor([0]), point=tensor([0]))
     """
     check_tensor(points, "points")
-    inside = _BoxMap(boxes, skin_m).holding(with_float64(points))
-    return Inside(*(move(numbers, points.device) for numbers in inside))
+    inside = _BoxMap(boxes, margin_m).holding(ensure_float64(points))
+    return BoxPointPairs(*(move_tensor(numbers, points.device) for numbers in inside))
 
 
 class _BoxMap:
@@ -59,8 +59,8 @@ class _BoxMap:
 
     def __init__(self, boxes: Boxes, skin_m: float = SKIN_M) -> None:
         self._skin_m = skin_m
-        boxes_m = (boxes.centre_m, boxes.size_m, boxes.yaw_rad)
-        centre_m, size_m, yaw_rad = (with_float64(tensor).double() for tensor in boxes_m)
+        boxes_m = (boxes.center_m, boxes.size_m, boxes.yaw_rad)
+        centre_m, size_m, yaw_rad = (ensure_float64(tensor).double() for tensor in boxes_m)
         self._boxes = torch.cat([centre_m, size_m / 2, yaw_rad.cos()[:, None], yaw_rad.sin()[:, None]], dim=1)
         if not len(boxes):
             return
@@ -82,18 +82,18 @@ class _BoxMap:
         self._count = torch.bincount(cell, minlength=rows * columns)
         self._start = self._count.cumsum(0) - self._count
 
-    def holding(self, points: Tensor) -> Inside:
+    def holding(self, points: Tensor) -> BoxPointPairs:
         """Which of the points lie in which boxes."""
         if len(self._boxes) == 0 or len(points) == 0:
             none = torch.empty(0, dtype=torch.int64, device=points.device)
-            return Inside(none, none)
+            return BoxPointPairs(none, none)
         points = points.detach().to(torch.promote_types(points.dtype, torch.float32))
         box, point = self._near(points)
         inside = self._is_inside(points.index_select(0, point), box)
         box, order = box[inside].sort(stable=True)
-        return Inside(box, point[inside][order])
+        return BoxPointPairs(box, point[inside][order])
 
-    def _near(self, points: Tensor) -> Inside:
+    def _near(self, points: Tensor) -> BoxPointPairs:
         """Pairs of a box and a point in a cell that it reaches into, by ascending point."""
         x, y = (
             points[:, axis].double().sub(self._corner_m[axis]).div_(self._cell_m).add_(1.0).clamp_(0, cells - 1)
@@ -104,7 +104,7 @@ class _BoxMap:
         point = count.nonzero().squeeze(1)
         count, start = count.index_select(0, point), self._start.index_select(0, cell.index_select(0, point))
         listed = start.repeat_interleave(count) + _numbered(count)
-        return Inside(self._listed.index_select(0, listed), point.repeat_interleave(count))
+        return BoxPointPairs(self._listed.index_select(0, listed), point.repeat_interleave(count))
 
     def _is_inside(self, points: Tensor, box: Tensor) -> Tensor:
         """(N,) whether each of (N, 3) points lies in its own of the boxes."""
@@ -125,14 +125,20 @@ def _numbered(counts: Tensor) -> Tensor:
     return every - (total - counts).repeat_interleave(counts)
 
 
-def with_hits(boxes: Boxes, clouds: Mapping[str, Tensor], counts_as: Mapping[str, Tensor] | None = None) -> Boxes:
+def add_point_counts(
+    boxes: Boxes, clouds: Mapping[str, Tensor], point_multiplicities: Mapping[str, Tensor] | None = None
+) -> Boxes:
     """The same boxes with `hits`: how many points of each rig, (N, 3) in the vehicle frame, lie in each.
 
-    `counts_as` says how many points each point of a rig, (N,), is counted as; one if not given.
+    `point_multiplicities` says how many points each point of a rig, (N,), is counted as; one if not given.
     """
     of_all, hits = _BoxMap(boxes), dict[str, Tensor]()
     for rig, cloud in clouds.items():
-        inside = of_all.holding(with_float64(cloud))
-        weights = with_float64(counts_as[rig])[inside.point] if counts_as and rig in counts_as else None
-        hits[rig] = move(torch.bincount(inside.box, weights, minlength=len(boxes)).long(), cloud.device)
-    return replace(boxes, hits=hits)
+        inside = of_all.holding(ensure_float64(cloud))
+        weights = (
+            ensure_float64(point_multiplicities[rig])[inside.point_indices]
+            if point_multiplicities and rig in point_multiplicities
+            else None
+        )
+        hits[rig] = move_tensor(torch.bincount(inside.box_indices, weights, minlength=len(boxes)).long(), cloud.device)
+    return replace(boxes, points_in_box=hits)

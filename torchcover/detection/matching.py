@@ -6,19 +6,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchcover.devices import through_cpu
+from torchcover.devices import run_with_float64
 from torchcover.neighbors import check_tensor
 
 MatchBy = Literal["distance", "iou"]
 
 
-@through_cpu
-def bev_iou(a: Tensor, b: Tensor) -> Tensor:
+@run_with_float64
+def compute_bev_iou(first_rows: Tensor, second_rows: Tensor) -> Tensor:
     """Intersection over union of boxes seen from above, exact for any yaw.
 
     Args:
-        a: (N, 7) x, y, z of the centre, length, width, height, yaw.
-        b: (M, 7) likewise.
+        first_rows: (N, 7) x, y, z of the centre, length, width, height, yaw.
+        second_rows: (M, 7) likewise.
 
     Returns:
         (N, M) float64; 0 where neither box has an area.
@@ -26,21 +26,26 @@ def bev_iou(a: Tensor, b: Tensor) -> Tensor:
     Example:
         >>> a = torch.tensor([[0.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0]])
         >>> b = torch.tensor([[1.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0]])
-        >>> bev_iou(a, b)
+        >>> compute_bev_iou(a, b)
         tensor([[0.6000]], dtype=torch.float64)
     """
-    a, b = a.double(), b.double()
-    overlap = a.new_zeros(len(a), len(b))
-    radius = [torch.linalg.vector_norm(boxes[:, 3:5], dim=1) / 2 for boxes in (a, b)]
-    near = torch.linalg.vector_norm(a[:, None, :2] - b[None, :, :2], dim=2) < radius[0][:, None] + radius[1]
+    first_rows, second_rows = first_rows.double(), second_rows.double()
+    overlap = first_rows.new_zeros(len(first_rows), len(second_rows))
+    radius = [torch.linalg.vector_norm(boxes[:, 3:5], dim=1) / 2 for boxes in (first_rows, second_rows)]
+    near = (
+        torch.linalg.vector_norm(first_rows[:, None, :2] - second_rows[None, :, :2], dim=2)
+        < radius[0][:, None] + radius[1]
+    )
     i, j = near.nonzero(as_tuple=True)
-    overlap[i, j] = _intersection(a[i], b[j])
-    union = (a[:, 3] * a[:, 4])[:, None] + (b[:, 3] * b[:, 4])[None] - overlap
+    overlap[i, j] = _intersection(first_rows[i], second_rows[j])
+    union = (first_rows[:, 3] * first_rows[:, 4])[:, None] + (second_rows[:, 3] * second_rows[:, 4])[None] - overlap
     return torch.where(union > 0, overlap / union.where(union > 0, 1.0), 0.0)
 
 
-@through_cpu
-def match(detections: Tensor, scores: Tensor, truth: Tensor, by: MatchBy, threshold: float) -> Tensor:
+@run_with_float64
+def match_detections(
+    detections: Tensor, scores: Tensor, ground_truth: Tensor, match_by: MatchBy, threshold: float
+) -> Tensor:
     """Give each detection at most one object, greedily: the higher score chooses first.
 
     As in nuScenes (Caesar et al. 2020): in the order of descending score, each detection takes the object that is
@@ -51,15 +56,15 @@ def match(detections: Tensor, scores: Tensor, truth: Tensor, by: MatchBy, thresh
     Args:
         detections: (N, 7) x, y, z of the centre, length, width, height, yaw.
         scores: (N,) scores.
-        truth: (K, 7) objects.
-        by: "distance" or "iou".
+        ground_truth: (K, 7) objects.
+        match_by: "distance" or "iou".
         threshold: Metres, or a share.
 
     Returns:
         (N,) int64 number of the object of each detection, -1 if none; on the CPU.
 
     Raises:
-        ValueError: Another `by`, or not one score for each detection.
+        ValueError: Another `match_by`, or not one score for each detection.
         TypeError: What is no tensor.
 
     Example:
@@ -67,19 +72,19 @@ def match(detections: Tensor, scores: Tensor, truth: Tensor, by: MatchBy, thresh
         >>> match(truth.repeat(2, 1), torch.tensor([0.2, 0.9]), truth, by="distance", threshold=2.0)
         tensor([-1,  0])
     """
-    if by not in ("distance", "iou"):
-        raise ValueError(f"by: 'distance' or 'iou' is needed; got {by!r}")
-    for name, given in (("detections", detections), ("scores", scores), ("truth", truth)):
+    if match_by not in ("distance", "iou"):
+        raise ValueError(f"by: 'distance' or 'iou' is needed; got {match_by!r}")
+    for name, given in (("detections", detections), ("scores", scores), ("truth", ground_truth)):
         check_tensor(given, name)
     if scores.shape != (len(detections),):
         raise ValueError(f"scores: one for each of {len(detections)} detections is needed; got {tuple(scores.shape)}")
-    if by == "distance":
+    if match_by == "distance":
         # From differences: the matrix product of cdist would lose centimetres at 100 m.
-        offset = detections[:, None, :2].double() - truth[None, :, :2].double()
+        offset = detections[:, None, :2].double() - ground_truth[None, :, :2].double()
         cost = torch.linalg.vector_norm(offset, dim=2)
         allowed = cost < threshold
     else:
-        cost = -bev_iou(detections, truth)
+        cost = -compute_bev_iou(detections, ground_truth)
         allowed = cost <= -threshold
     # A choice depends on those before it, so this is a loop; only detections near an object take part.
     costs = cost.where(allowed, torch.inf).cpu().numpy()

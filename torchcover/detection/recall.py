@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from torchcover.detection.boxes import Boxes, check_boxes
-from torchcover.detection.matching import MatchBy, match
-from torchcover.detection.recall_curve import DetectionCounts, draw_recall
+from torchcover.detection.matching import MatchBy, match_detections
+from torchcover.detection.recall_curve import DetectionCounts, plot_recall
 from torchcover.detection.visibility import BoxVisibility
-from torchcover.metrics import MergeableMetric, figure_of
+from torchcover.metrics import MergeableMetric, get_figure
 from torchcover.neighbors import check_tensor
 
 if TYPE_CHECKING:
@@ -55,9 +55,9 @@ class DetectedFrame:
                 f"detections: {int(bad.sum())} of {len(bad)} have NaN or infinite numbers or a negative size, "
                 f"the first is {int(bad.nonzero()[0])}; drop them"
             )
-        self.truth = boxes.rows.detach().cpu().double()
-        self.share = _shares(visibility, len(boxes), "visibility")
-        self.hidden = _hidden(visibility, len(boxes))
+        self.ground_truth = boxes.rows.detach().cpu().double()
+        self.visibility_share = _shares(visibility, len(boxes), "visibility")
+        self.is_hidden = _hidden(visibility, len(boxes))
         given = torch.zeros(len(bad), device="cpu") if scores is None else scores.detach().cpu()
         if given.shape != (len(bad),) or given.isnan().any():
             raise ValueError(
@@ -68,8 +68,8 @@ class DetectedFrame:
         self.scores = given.double() if scores is not None else given.double() + math.inf
         unknown = torch.full((len(bad),), math.nan, device="cpu")
         own = unknown if detection_visibility is None else detection_visibility
-        self.detection_share = _shares(own, len(bad), "detection_visibility")
-        self.detection_hidden = _hidden(own, len(bad))
+        self.detection_visibility_share = _shares(own, len(bad), "detection_visibility")
+        self.is_detection_hidden = _hidden(own, len(bad))
 
 
 def _shares(visibility: BoxVisibility | Tensor, count: int, name: str) -> Tensor:
@@ -96,8 +96,8 @@ def _hidden(visibility: BoxVisibility | Tensor, count: int) -> Tensor:
 class RecallByVisibility(MergeableMetric):
     """Recall and precision in bins of visibility and of distance, so that a miss and a blind spot can be told apart.
 
-    Detections are matched to objects by `torchcover.detection.match`. An object's visibility is its share from
-    `box_visibility`, and its distance that of its centre from the vehicle's origin, over ground. Bins are half-open
+    Detections are matched to objects by `torchcover.detection.match_detections`. An object's visibility is its share from
+    `measure_box_visibility`, and its distance that of its centre from the vehicle's origin, over ground. Bins are half-open
     [lo, hi), the last ones closed by 1 and open to infinity. Objects of unknown visibility have two bins of their own:
     those "hidden" from the reference's places too, and those "not sampled"; see `BoxVisibility.hidden`.
 
@@ -109,7 +109,7 @@ class RecallByVisibility(MergeableMetric):
     the same parameters merge, and ranks are added up when `compute` is called.
 
     Args:
-        by: "distance" of the centres over ground, or "iou", the overlap seen from above.
+        match_by: "distance" of the centres over ground, or "iou", the overlap seen from above.
         threshold: Of the match, in metres or as a share; 2 m, the third of nuScenes' four thresholds, or 0.5 if None.
         visibility_borders: Borders between bins of visibility, ascending, within (0, 1).
         distance_borders: Borders between bins of distance in metres, ascending, positive.
@@ -131,38 +131,38 @@ class RecallByVisibility(MergeableMetric):
     """
 
     objects: Tensor
-    found: Tensor
+    detected_objects: Tensor
     detections: Tensor
     true_detections: Tensor
 
     def __init__(
         self,
         *,
-        by: MatchBy = "distance",
+        match_by: MatchBy = "distance",
         threshold: float | None = None,
         visibility_borders: Sequence[float] = (0.2, 0.4, 0.6, 0.8),
         distance_borders: Sequence[float] = (20.0, 40.0, 60.0),
         score_thresholds: Sequence[float] = (-math.inf,),
         **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
     ) -> None:
-        threshold = float({"distance": 2.0, "iou": 0.5}.get(by, 0.0) if threshold is None else threshold)
+        threshold = float({"distance": 2.0, "iou": 0.5}.get(match_by, 0.0) if threshold is None else threshold)
         borders = {
             "visibility_borders": tuple(float(border) for border in visibility_borders),
             "distance_borders": tuple(float(border) for border in distance_borders),
         }
         scores = tuple(float(score) for score in score_thresholds)
-        _check_parameters(by, threshold, borders, scores)
-        super().__init__({"by": by, "threshold": threshold, **borders, "score_thresholds": scores}, **kwargs)
+        _check_parameters(match_by, threshold, borders, scores)
+        super().__init__({"by": match_by, "threshold": threshold, **borders, "score_thresholds": scores}, **kwargs)
         self._box_counts: tuple[int, int] | None = (0, 0)  # low and all; None once it has been warned of
-        self.by = by
+        self.match_by = match_by
         self.threshold = threshold
         self.visibility_borders = borders["visibility_borders"]
         self.distance_borders = borders["distance_borders"]
         self.score_thresholds = scores
         bins = (len(self.visibility_borders) + 3, len(self.distance_borders) + 1)
-        self.add_sum("objects", bins, torch.int64)
-        for name in ("found", "detections", "true_detections"):
-            self.add_sum(name, (len(self.score_thresholds), *bins), torch.int64)
+        self.define_sum("objects", bins, torch.int64)
+        for name in ("detected_objects", "detections", "true_detections"):
+            self.define_sum(name, (len(self.score_thresholds), *bins), torch.int64)
 
     def update(
         self,
@@ -177,9 +177,9 @@ class RecallByVisibility(MergeableMetric):
         Args:
             detections: (N, 7) x, y, z of the centre, length, width, height, yaw; further columns are ignored.
             boxes: The K objects.
-            visibility: What `box_visibility` said of them, or (K,) shares, NaN where they were not sampled.
+            visibility: What `measure_box_visibility` said of them, or (K,) shares, NaN where they were not sampled.
             scores: (N,) scores; without them, detections choose their objects in the order given and all count.
-            detection_visibility: What `box_visibility` says of the detections' boxes, or (N,) shares. Without it,
+            detection_visibility: What `measure_box_visibility` says of the detections' boxes, or (N,) shares. Without it,
                 precision is known over distance only: detections are in the bin of what was not sampled.
 
         Raises:
@@ -199,7 +199,7 @@ class RecallByVisibility(MergeableMetric):
         checked = [DetectedFrame(*frame) for frame in zip(*frames, strict=True)]
         for frame in checked:
             self._add_frame(frame)
-        self._warn_of_low_boxes(torch.cat([frame.truth for frame in checked]) if checked else None)
+        self._warn_of_low_boxes(torch.cat([frame.ground_truth for frame in checked]) if checked else None)
 
     def _warn_of_low_boxes(self, truth: Tensor | None) -> None:
         """Warn once if the centers of most objects so far are on the ground, as if z were that of the bottom."""
@@ -217,19 +217,19 @@ class RecallByVisibility(MergeableMetric):
 
     @torch.no_grad()
     def _add_frame(self, frame: DetectedFrame) -> None:
-        chosen = match(frame.detections, frame.scores, frame.truth, self.by, self.threshold)
+        chosen = match_detections(frame.detections, frame.scores, frame.ground_truth, self.match_by, self.threshold)
         hit = chosen >= 0
         # The score at which an object is found; NaN, at no threshold, if it is not.
-        found_at = torch.full((len(frame.truth),), math.nan, dtype=torch.float64, device="cpu")
+        found_at = torch.full((len(frame.ground_truth),), math.nan, dtype=torch.float64, device="cpu")
         found_at[chosen[hit]] = frame.scores[hit]
-        object_bin = self._bin(frame.truth, frame.share, frame.hidden)
-        detection_bin = self._bin(frame.detections, frame.detection_share, frame.detection_hidden)
+        object_bin = self._bin(frame.ground_truth, frame.visibility_share, frame.is_hidden)
+        detection_bin = self._bin(frame.detections, frame.detection_visibility_share, frame.is_detection_hidden)
         counts = [frame.scores >= score for score in self.score_thresholds]
         self.objects += self._counted([object_bin])[0]
-        self.found += self._counted([object_bin[found_at >= score] for score in self.score_thresholds])
+        self.detected_objects += self._counted([object_bin[found_at >= score] for score in self.score_thresholds])
         self.detections += self._counted([detection_bin[some] for some in counts])
         self.true_detections += self._counted([detection_bin[some & hit] for some in counts])
-        self.steps += 1
+        self.num_frames += 1
 
     def _bin(self, rows: Tensor, share: Tensor, hidden: Tensor) -> Tensor:
         distance = torch.linalg.vector_norm(rows[:, :2].double(), dim=1)
@@ -253,7 +253,7 @@ class RecallByVisibility(MergeableMetric):
         visibility, distance = (0.0, *self.visibility_borders, 1.0), (0.0, *self.distance_borders)
         return DetectionCounts(
             objects=self.objects.clone(),
-            found=self.found.clone(),
+            detected_objects=self.detected_objects.clone(),
             detections=self.detections.clone(),
             true_detections=self.true_detections.clone(),
             visibility_bins=(*(f"{a:g}-{b:g}" for a, b in pairwise(visibility)), "hidden", "not sampled"),
@@ -262,7 +262,7 @@ class RecallByVisibility(MergeableMetric):
                 f"over {distance[-1]:g} m",
             ),
             score_thresholds=self.score_thresholds,
-            steps=int(self.steps),
+            num_frames=int(self.num_frames),
         )
 
     def plot(
@@ -270,7 +270,7 @@ class RecallByVisibility(MergeableMetric):
         val: DetectionCounts | None = None,
         ax: "Axes | None" = None,
         *,
-        over: Literal["visibility", "distance"] = "visibility",
+        axis: Literal["visibility", "distance"] = "visibility",
         score_threshold: float | None = None,
     ) -> "tuple[Figure, Axes]":
         """Draw recall over visibility or distance, with its 95 % Wilson intervals and the number of objects.
@@ -278,7 +278,7 @@ class RecallByVisibility(MergeableMetric):
         Args:
             val: What `compute` or `forward` returned; the counts so far if not given.
             ax: Where to; a new figure of pyplot's if not given.
-            over: What the bins are of.
+            axis: What the bins are of.
             score_threshold: One of `score_thresholds`; the first if not given.
 
         Raises:
@@ -291,9 +291,9 @@ class RecallByVisibility(MergeableMetric):
         score = counts.score_thresholds[0] if score_threshold is None else score_threshold
         if score not in counts.score_thresholds:
             raise ValueError(f"score_threshold: one of {counts.score_thresholds} is needed; got {score}")
-        fig, ax = figure_of(ax)
-        draw_recall(counts.over(over), counts.score_thresholds.index(score), ax)
-        ax.set_xlabel(f"{over} of the object; below, objects")
+        fig, ax = get_figure(ax)
+        plot_recall(counts.compute_curve(axis), counts.score_thresholds.index(score), ax)
+        ax.set_xlabel(f"{axis} of the object; below, objects")
         return fig, ax
 
 

@@ -15,7 +15,7 @@ NORMAL_QUANTILE = 1.959963984540054
 
 
 @dataclass(frozen=True, eq=False)
-class Ratio:
+class RatioWithInterval:
     """A share of successes for each entry, in float64; NaN where nothing was counted.
 
     `low` and `high` are the ends of the 95 % Wilson interval (Wilson 1927), `trials` int64.
@@ -27,7 +27,7 @@ class Ratio:
     trials: Tensor
 
     @classmethod
-    def of(cls, successes: Tensor, trials: Tensor) -> "Ratio":
+    def from_counts(cls, successes: Tensor, trials: Tensor) -> "RatioWithInterval":
         """From counts. The interval takes trials as independent; the same object in frames 0.1 s apart is not."""
         trials = trials.expand_as(successes)
         n = trials.double().where(trials > 0, math.nan)
@@ -39,7 +39,7 @@ class Ratio:
 
 
 @dataclass(frozen=True, eq=False)
-class Curve:
+class RecallCurve:
     """Recall and precision over bins, (S, B) for S score thresholds and B bins.
 
     `bins`: what each bin holds, in words: "0.2-0.4", "hidden", "not sampled"; `recall`: objects found, of the objects
@@ -47,8 +47,8 @@ class Curve:
     """
 
     bins: tuple[str, ...]
-    recall: Ratio
-    precision: Ratio
+    recall: RatioWithInterval
+    precision: RatioWithInterval
 
 
 class DetectionCounts:
@@ -56,13 +56,13 @@ class DetectionCounts:
 
     Args:
         objects: (V, D) int64 objects.
-        found: (S, V, D) those that a detection of at least the score threshold found.
+        detected_objects: (S, V, D) those that a detection of at least the score threshold found.
         detections: (S, V, D) detections of at least the score threshold, by the visibility of their own boxes.
         true_detections: (S, V, D) those of them that found an object.
         visibility_bins: Names of the V bins.
         distance_bins: Names of the D bins.
         score_thresholds: The S score thresholds.
-        steps: Number of frames that were counted.
+        num_frames: Number of frames that were counted.
     """
 
     # No dataclass: torchmetrics would take it apart and squeeze its tensors.
@@ -70,37 +70,45 @@ class DetectionCounts:
         self,
         *,
         objects: Tensor,
-        found: Tensor,
+        detected_objects: Tensor,
         detections: Tensor,
         true_detections: Tensor,
         visibility_bins: tuple[str, ...],
         distance_bins: tuple[str, ...],
         score_thresholds: tuple[float, ...],
-        steps: int,
+        num_frames: int,
     ) -> None:
         self.objects = objects
-        self.found = found
+        self.detected_objects = detected_objects
         self.detections = detections
         self.true_detections = true_detections
         self.visibility_bins = visibility_bins
         self.distance_bins = distance_bins
         self.score_thresholds = score_thresholds
-        self.steps = steps
+        self.num_frames = num_frames
 
-    def over(self, axis: Literal["visibility", "distance"]) -> Curve:
+    def compute_curve(self, axis: Literal["visibility", "distance"]) -> RecallCurve:
         """Recall and precision over bins of visibility or of distance."""
         bins, other = {"visibility": (self.visibility_bins, -1), "distance": (self.distance_bins, -2)}[axis]
-        counts = (self.found, self.objects, self.true_detections, self.detections)
+        counts = (self.detected_objects, self.objects, self.true_detections, self.detections)
         found, objects, true_detections, detections = (count.sum(dim=other) for count in counts)
-        return Curve(bins, Ratio.of(found, objects), Ratio.of(true_detections, detections))
+        return RecallCurve(
+            bins,
+            RatioWithInterval.from_counts(found, objects),
+            RatioWithInterval.from_counts(true_detections, detections),
+        )
 
-    def overall(self) -> Curve:
+    def compute_overall(self) -> RecallCurve:
         """(S, 1) recall and precision of everything."""
-        counts = (self.found, self.objects, self.true_detections, self.detections)
+        counts = (self.detected_objects, self.objects, self.true_detections, self.detections)
         found, objects, true_detections, detections = (count.sum(dim=(-2, -1))[..., None] for count in counts)
-        return Curve(("all",), Ratio.of(found, objects), Ratio.of(true_detections, detections))
+        return RecallCurve(
+            ("all",),
+            RatioWithInterval.from_counts(found, objects),
+            RatioWithInterval.from_counts(true_detections, detections),
+        )
 
-    def scalars(self) -> dict[str, float]:
+    def to_scalars(self) -> dict[str, float]:
         """A flat dict for a logger.
 
         Returns:
@@ -109,7 +117,11 @@ class DetectionCounts:
             `"recall_score_0.5/all"`.
         """
         flat = {}
-        curves = {"": self.overall(), "visibility ": self.over("visibility"), "distance ": self.over("distance")}
+        curves = {
+            "": self.compute_overall(),
+            "visibility ": self.compute_curve("visibility"),
+            "distance ": self.compute_curve("distance"),
+        }
         for row, score in enumerate(self.score_thresholds):
             at = f"_score_{score:g}" if len(self.score_thresholds) > 1 else ""
             for axis, curve in curves.items():
@@ -121,12 +133,17 @@ class DetectionCounts:
         return flat
 
 
-def draw_recall(curve: Curve, row: int, ax: "Axes") -> None:
+def plot_recall(curve: RecallCurve, threshold_index: int, ax: "Axes") -> None:
     """Draw recall at one score threshold: a point and its interval for each bin that has objects."""
-    value, low, high = (t[row].cpu().numpy() for t in (curve.recall.value, curve.recall.low, curve.recall.high))
-    there = np.flatnonzero(curve.recall.trials[row].cpu().numpy())
+    value, low, high = (
+        t[threshold_index].cpu().numpy() for t in (curve.recall.value, curve.recall.low, curve.recall.high)
+    )
+    there = np.flatnonzero(curve.recall.trials[threshold_index].cpu().numpy())
     interval = np.stack([value - low, high - value])[:, there].clip(min=0.0)  # of rounding
     ax.errorbar(there, value[there], interval, fmt="o", capsize=3)
-    labels = [f"{name}\n{objects}" for name, objects in zip(curve.bins, curve.recall.trials[row].tolist(), strict=True)]
+    labels = [
+        f"{name}\n{objects}"
+        for name, objects in zip(curve.bins, curve.recall.trials[threshold_index].tolist(), strict=True)
+    ]
     ax.set_xticks(range(len(labels)), labels)
     ax.set(xlim=(-0.5, len(labels) - 0.5), ylim=(0.0, 1.03), ylabel="recall")

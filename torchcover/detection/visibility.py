@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from torchcover.detection.boxes import Boxes, check_boxes
-from torchcover.detection.inside import points_in_boxes
-from torchcover.devices import has_float64, move
+from torchcover.detection.inside import find_points_in_boxes
+from torchcover.devices import has_float64, move_tensor
 from torchcover.neighbors import blind_spot_radius, check_cloud, check_weights
-from torchcover.notebooks import brief
+from torchcover.notebooks import format_short_repr
 
 # The sides of a box that face this height above the vehicle's origin can be seen; so many points across each.
 SEEN_FROM_M, SIDE_POINTS = 1.7, 12
@@ -26,7 +26,7 @@ class BoxVisibility:
             sides that face the vehicle where it saw nothing and the rig did.
         mean_radius_m: (K,) mean blind spot radius of the same.
         reference_points: (K,) int64 reference points in the box.
-        drawn_points: (K,) int64 points that the reference drew on the object, from `Boxes`.
+        sampled_points: (K,) int64 points that the reference drew on the object, from `Boxes`.
         sensor_points: (K,) int64 points of the rig in the box.
         threshold_m: The threshold.
     """
@@ -34,14 +34,14 @@ class BoxVisibility:
     share: Tensor
     mean_radius_m: Tensor
     reference_points: Tensor
-    drawn_points: Tensor
+    sampled_points: Tensor
     sensor_points: Tensor
     threshold_m: float
 
-    __repr__ = brief
+    __repr__ = format_short_repr
 
     @property
-    def known(self) -> Tensor:
+    def observed(self) -> Tensor:
         """(K,) bool whether any point of the reference or of the rig fell into the box."""
         return ~self.share.isnan()
 
@@ -51,27 +51,27 @@ class BoxVisibility:
 
         What is neither known nor hidden was not sampled: nobody asked whether it can be seen.
         """
-        return ~self.known & (self.drawn_points > 0)
+        return ~self.observed & (self.sampled_points > 0)
 
     @property
-    def level(self) -> Tensor:
+    def levels(self) -> Tensor:
         """(K,) int64 levels of visibility as nuScenes names them: 1 to 40 %, 2 to 60 %, 3 to 80 %, 4; 0 if unknown.
 
         There it is the share of an object's pixels in all cameras, here that of its surface with this rig.
         """
         borders = self.share.new_tensor([0.4, 0.6, 0.8])
-        return (torch.bucketize(self.share, borders, right=True) + 1).where(self.known, 0)
+        return (torch.bucketize(self.share, borders, right=True) + 1).where(self.observed, 0)
 
     def __len__(self) -> int:
         return len(self.share)
 
-    def select(self, which: Tensor) -> "BoxVisibility":
+    def select(self, selection: Tensor) -> "BoxVisibility":
         """Some of them, as `Boxes.select` does."""
-        return self._each(lambda tensor: tensor[which.to(tensor.device)])
+        return self._each(lambda tensor: tensor[selection.to(tensor.device)])
 
     def to(self, device: torch.device | str) -> "BoxVisibility":
         """A copy on another device, in float32 where that has no float64."""
-        return self._each(lambda tensor: move(tensor, device))
+        return self._each(lambda tensor: move_tensor(tensor, device))
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> "BoxVisibility":
         names = ("share", "mean_radius_m", "reference_points", "drawn_points", "sensor_points")
@@ -80,11 +80,11 @@ class BoxVisibility:
 
 
 @torch.no_grad()
-def box_visibility(
+def measure_box_visibility(
     sensor: Tensor,
     reference: Tensor,
     boxes: Boxes,
-    threshold: float = 0.4,
+    threshold_m: float = 0.4,
     *,
     reference_weights: Tensor | None,
 ) -> BoxVisibility:
@@ -96,7 +96,7 @@ def box_visibility(
     with r(q) from `torchcover.blind_spot_radius`. With weights in square metres it is the share of the surface that the
     rig covers, of that which the reference's places see. The nearest sensor point may lie outside the box: an object
     right beside a wall that is seen counts as seen as far as the threshold reaches. `sensor_points` are those in the
-    box itself; see `points_in_boxes`.
+    box itself; see `find_points_in_boxes`.
 
     A rig may hit what the reference has no point of. What can be seen of such a box is at most its sides that face the
     vehicle (from 1.7 m above its origin), with their square metres: the share of these is a lower bound.
@@ -110,7 +110,7 @@ def box_visibility(
             radius is infinite and the share 0.
         reference: (M, 3) points of the reference sensor in the same frame. M = 0: every box is unknown.
         boxes: K objects of the same instant; K = 0 gives an empty result.
-        threshold: Radius in metres up to which a point counts as seen.
+        threshold_m: Radius in metres up to which a point counts as seen.
         reference_weights: (M,) weight of each reference point, positive: `frame.reference_weights`. None if they weigh
             the same, as those of a frame that has none do.
 
@@ -125,21 +125,23 @@ def box_visibility(
         >>> boxes = Boxes.from_rows(torch.tensor([[10.0, 0, 1, 4, 2, 2, 0], [30.0, 0, 1, 4, 2, 2, 0]]))
         >>> reference = torch.tensor([[8.0, 0.0, 0.5], [8.0, 0.0, 1.5]])
         >>> sensor = torch.tensor([[8.0, 0.0, 0.6]])
-        >>> seen = box_visibility(sensor, reference, boxes, reference_weights=torch.tensor([1.0, 3.0]))
+        >>> seen = measure_box_visibility(sensor, reference, boxes, reference_weights=torch.tensor([1.0, 3.0]))
         >>> seen.share, seen.reference_points
         (tensor([0.2500,    nan], dtype=torch.float64), tensor([2, 0]))
     """
     check_boxes(boxes)
-    _check(sensor, reference, threshold, reference_weights)
+    _check(sensor, reference, threshold_m, reference_weights)
     if not has_float64(reference.device):
         weights = None if reference_weights is None else reference_weights.cpu()
-        there = box_visibility(sensor.cpu(), reference.cpu(), boxes.to("cpu"), threshold, reference_weights=weights)
+        there = measure_box_visibility(
+            sensor.cpu(), reference.cpu(), boxes.to("cpu"), threshold_m, reference_weights=weights
+        )
         return there.to(reference.device)
     sensor, boxes = sensor.to(reference.device), boxes.to(reference.device)
-    box, point = points_in_boxes(reference, boxes)
+    box, point = find_points_in_boxes(reference, boxes)
     asked, weights = reference[point], None if reference_weights is None else reference_weights[point]
     reference_points = torch.bincount(box, minlength=len(boxes))
-    sensor_points = torch.bincount(points_in_boxes(sensor, boxes).box, minlength=len(boxes))
+    sensor_points = torch.bincount(find_points_in_boxes(sensor, boxes).box_indices, minlength=len(boxes))
     if only := ((reference_points == 0) & (sensor_points > 0)).nonzero().squeeze(1).tolist():
         sides, side_of, square_metres = _facing_sides(boxes, only)
         weights = asked.new_ones(len(asked)) if weights is None else weights
@@ -149,19 +151,19 @@ def box_visibility(
     radius = blind_spot_radius(asked, sensor).double()
     return BoxVisibility(
         # A GPU adds weights up in any order, so that even all of them may come to a trifle over the total.
-        share=mean_by_box((radius <= threshold).double(), box, len(boxes), weights).clamp(max=1.0),
-        mean_radius_m=mean_by_box(radius, box, len(boxes), weights),
+        share=compute_box_means((radius <= threshold_m).double(), box, len(boxes), weights).clamp(max=1.0),
+        mean_radius_m=compute_box_means(radius, box, len(boxes), weights),
         reference_points=reference_points,
-        drawn_points=boxes.drawn_points,
+        sampled_points=boxes.sampled_points,
         sensor_points=sensor_points,
-        threshold_m=float(threshold),
+        threshold_m=float(threshold_m),
     )
 
 
 def _facing_sides(boxes: Boxes, which: list[int]) -> tuple[Tensor, Tensor, Tensor]:
     """Points on the sides of some boxes that face the vehicle, the number of the box of each, and its square metres."""
     number = torch.tensor(which, device=boxes.yaw_rad.device)
-    centre_m, half_m, yaw_rad = (of.double()[number] for of in (boxes.centre_m, boxes.size_m / 2, boxes.yaw_rad))
+    centre_m, half_m, yaw_rad = (of.double()[number] for of in (boxes.center_m, boxes.size_m / 2, boxes.yaw_rad))
     turn = torch.stack([yaw_rad.cos(), yaw_rad.sin()], dim=1)
     along, across = turn, torch.stack([-turn[:, 1], turn[:, 0]], dim=1)
     from_m = centre_m.new_tensor([0.0, 0.0, SEEN_FROM_M]) - centre_m
@@ -184,17 +186,17 @@ def _facing_sides(boxes: Boxes, which: list[int]) -> tuple[Tensor, Tensor, Tenso
     return torch.cat(points), torch.cat(owners), torch.cat(areas)
 
 
-def mean_by_box(values: Tensor, box: Tensor, boxes: int, weights: Tensor | None) -> Tensor:
+def compute_box_means(values: Tensor, box_indices: Tensor, num_boxes: int, weights: Tensor | None) -> Tensor:
     """(K,) weighted mean over the points in each of K boxes, all alike without weights; NaN for a box without any.
 
     Example:
-        >>> mean_by_box(torch.tensor([1.0, 0.0]).double(), torch.tensor([1, 1]), 2, torch.tensor([1.0, 3.0]))
+        >>> compute_box_means(torch.tensor([1.0, 0.0]).double(), torch.tensor([1, 1]), 2, torch.tensor([1.0, 3.0]))
         tensor([   nan, 0.2500], dtype=torch.float64)
     """
     weight = torch.ones_like(values) if weights is None else weights.to(values)
-    total, whole = values.new_zeros(2, boxes).unbind()
-    total.index_add_(0, box, values * weight)
-    return total / whole.index_add_(0, box, weight)  # 0 / 0 is NaN
+    total, whole = values.new_zeros(2, num_boxes).unbind()
+    total.index_add_(0, box_indices, values * weight)
+    return total / whole.index_add_(0, box_indices, weight)  # 0 / 0 is NaN
 
 
 def _check(sensor: Tensor, reference: Tensor, threshold: float, weights: Tensor | None) -> None:

@@ -15,8 +15,8 @@ from torchcover.encounters.criterion import Criterion
 from torchcover.encounters.sighting import Sighting
 from torchcover.encounters.traffic import WHO, Approach
 from torchcover.estimation import Estimate, Number, Quantity
-from torchcover.files import csv_text
-from torchcover.notebooks import data_frame, small_html
+from torchcover.files import format_csv
+from torchcover.notebooks import build_dataframe, build_result_html
 from torchcover.report import PageTable, TextCell, format_percent, plot_encounters, to_json_record
 
 if TYPE_CHECKING:
@@ -150,9 +150,9 @@ class Sightings:
             sums[blocks[one.world if self.hours else str(k)]] += torch.tensor(of_one, dtype=torch.float64, device="cpu")
         base = sums[:, [2, 2, 2]]
         base[:, 2] = torch.tensor(list(self.hours.values()) or [math.nan] * len(blocks), device="cpu")
-        return Estimate.of_ratios(
+        return Estimate.from_ratios(
             NUMBERS, base, sums, torch.ones(len(blocks), dtype=torch.int64, device="cpu")
-        ).numbers()
+        ).to_numbers()
 
     def up_to_kmh(self) -> dict[tuple[str, str], float]:
         """Encounter and rig -> the speed up to which it is in time in every phase and draw, where speeds were swept.
@@ -237,7 +237,7 @@ class Sightings:
         of_rows = {(row.encounter, row.rig): f"{format_percent(row.in_time)} %" for row in self.rows}
         up_to = {key: "at no speed" if kmh != kmh else f"up to {kmh:g} km/h" for key, kmh in self.up_to_kmh().items()}
         told = (f"{rig} in time, {name}: {words}." for (name, rig), words in (of_rows | up_to).items())
-        return small_html([repr(self), *told], None if self.hours else self.plot())
+        return build_result_html([repr(self), *told], None if self.hours else self.plot())
 
     def plot(self) -> Figure:
         """Time to collision at detection against the speed, a band for each rig, and what is needed.
@@ -258,11 +258,11 @@ class Sightings:
         Raises:
             ModuleNotFoundError: pandas is not there.
         """
-        return data_frame(self.rows)
+        return build_dataframe(self.rows)
 
     def write_csv(self, path: Path) -> None:
         """Rows as of `rows`; empty where nothing is known."""
-        path.write_text(csv_text([EncounterRow._fields, *map(_cells, self.rows)]), encoding="utf-8")
+        path.write_text(format_csv([EncounterRow._fields, *map(_cells, self.rows)]), encoding="utf-8")
 
     def bands(self) -> Iterator[tuple[str, dict[str, list[tuple[float, float, float]]], list[tuple[float, float]]]]:
         """For the picture: each encounter; of each rig speed (km/h), least and most time to collision; the needed."""

@@ -7,7 +7,7 @@ from itertools import combinations, groupby
 import numpy as np
 
 from torchcover.encounters.encounter import Encounter, Obstacle, Way
-from torchcover.geometry import BoundingBox, contact_s, invert, outlines_at, overlapping
+from torchcover.geometry import BoundingBox, compute_contact_time_s, find_overlaps, invert, transform_outline
 from torchcover.geometry.arrays import Bools, Float64
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.bodies import Shape, called, mover_mesh
@@ -78,7 +78,7 @@ class Staged:
         times_s = np.linspace(0.0, steps * STEP_S, 1 + math.ceil(steps * STEP_S / BEND_S))
         along = Trajectory.from_poses(times_s, self.world_T_ego(times_s))
         # Transient: even an ego at rest is no part of what never moves, as it is in all other encounters.
-        drive = Trajectory(along.times_s, along.positions_m, along.angles_deg, transient=True)
+        drive = Trajectory(along.times_s, along.positions_m, along.angles_deg, is_transient=True)
         ground = Plane(type="plane", size_m=(GROUND_M, GROUND_M)).mesh().made_of("road")
         static = (ground, *(solid_of(one.body).mesh.moved(pose) for one, pose in self.obstacles))
         ego = Actor("ego", "ego", self.ego.mesh, drive)
@@ -135,7 +135,9 @@ class Staged:
         """(T - 1,) how long after each time they would touch, if they went on as until the next one."""
         there = self.vehicle_T_other(times_s)
         velocity_mps = np.diff(there[:, :2, 3], axis=0) / np.diff(times_s)[:, None]
-        return contact_s(self.ego.box.outline_m, outlines_at(self.other.box.outline_m, there[:-1]), velocity_mps)
+        return compute_contact_time_s(
+            self.ego.box.outline_m, transform_outline(self.other.box.outline_m, there[:-1]), velocity_mps
+        )
 
     def _check_ways(self) -> None:
         """Until they touch, nobody drives or walks through an obstacle, and none is inside another."""
@@ -163,7 +165,7 @@ class Staged:
 def _inside(solid: Solid, there: Float64, other: Solid) -> Bools:
     """(P,) whether the box of a body at (P, 4, 4) poses is inside that of another, by more than a touch."""
     corners_m = other.box.corners_m
-    return overlapping(solid.box, there, corners_m - TOUCH_M * np.sign(corners_m - corners_m.mean(axis=0)))
+    return find_overlaps(solid.box, there, corners_m - TOUCH_M * np.sign(corners_m - corners_m.mean(axis=0)))
 
 
 def _along(way: Way, before_s: Float64, at_m: tuple[float, float], heading: float) -> Float64:

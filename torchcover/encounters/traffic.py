@@ -11,7 +11,7 @@ from torchcover.coverage.quantity import MEASURED_WITHIN_M
 from torchcover.detection.inside import SKIN_M
 from torchcover.encounters.criterion import Criterion
 from torchcover.encounters.sighting import NEVER, IsEnough, Sighting, detections, enough_of, first_run
-from torchcover.geometry import BoundingBox, contact_s, invert, outlines_at
+from torchcover.geometry import BoundingBox, compute_contact_time_s, invert, transform_outline
 from torchcover.geometry.arrays import Float64, Int64
 from torchcover.recordings.in_vehicle import transform_to_vehicle
 from torchcover.recordings.objects import Track, extract_objects, find_vehicle_class
@@ -64,12 +64,12 @@ class Drive(NamedTuple):
         times_s = world.time_step_s * np.arange(world.steps, dtype=np.float64)
         tracks = []
         for actor in world.actors:
-            size_m = BoundingBox.around(actor.mesh.vertices_m).size_m
+            size_m = BoundingBox.from_points(actor.mesh.vertices_m).size_m
             tracks.append(
                 Track(actor.name, actor.category, find_vehicle_class(actor.category), size_m, actor.trajectory)
             )
-        ego = BoundingBox.around(world.ego.mesh.vertices_m)
-        return cls(name, times_s, world.ego.trajectory.at_each(times_s), ego, tracks)
+        ego = BoundingBox.from_points(world.ego.mesh.vertices_m)
+        return cls(name, times_s, world.ego.trajectory.interpolate_many(times_s), ego, tracks)
 
     @classmethod
     def of_recording(cls, recording: Recording) -> Self:
@@ -122,18 +122,18 @@ def approaches(drive: Drive, criterion: Criterion) -> list[Approach]:
     speed_mps = np.linalg.norm(ego_mps, axis=1)
     ahead = ego_mps / np.where(speed_mps > 0, speed_mps, 1.0)[:, None]
     for track in drive.tracks:
-        places_m = track.trajectory.positions_at(drive.times_s)
+        places_m = track.trajectory.interpolate_positions_m(drive.times_s)
         own_mps = _velocities_mps(drive.times_s, places_m[:, :2])
         closing_mps = own_mps - ego_mps
         reach_m = np.linalg.norm(drive.ego.outline_m, axis=1).max() + np.linalg.norm(track.size_m[:2]) / 2
         away_m = np.linalg.norm(places_m[:, :2] - drive.world_T_ego[:, :2, 3], axis=1) - reach_m
         near = np.flatnonzero(away_m <= criterion.within_s * np.linalg.norm(closing_mps, axis=1))
         world_T_ego = drive.world_T_ego[near]
-        there = invert(world_T_ego) @ track.trajectory.at_each(drive.times_s[near])
+        there = invert(world_T_ego) @ track.trajectory.interpolate_many(drive.times_s[near])
         outline_m = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * track.size_m[:2] / 2
         in_ego_mps = np.einsum("tji,tj->ti", world_T_ego[:, :2, :2], closing_mps[near])
         ttc_s = np.full(len(drive.times_s), np.inf)
-        ttc_s[near] = contact_s(drive.ego.outline_m, outlines_at(outline_m, there), in_ego_mps)
+        ttc_s[near] = compute_contact_time_s(drive.ego.outline_m, transform_outline(outline_m, there), in_ego_mps)
         met = np.flatnonzero(ttc_s <= criterion.within_s)
         if len(met) and met[0] >= criterion.looks - 1:
             some, first = slice(met[0], met[-1] + 1), int(met[0])
@@ -216,11 +216,11 @@ class Watch:
         return np.array([self._known[step][list(sensors)].sum() for step in steps.tolist()])
 
     def _look(self, step: int) -> Int64:
-        """(S,) the points in his box, which stands as he does; sides and top as `points_in_boxes` has them."""
+        """(S,) the points in his box, which stands as he does; sides and top as `find_points_in_boxes` has them."""
         time_s, way, size_m = self._drive.times_s[step], self._track.trajectory, np.array(self._track.size_m)
-        if np.isnan(way.positions_at(np.array([time_s]))).any():
+        if np.isnan(way.interpolate_positions_m(np.array([time_s]))).any():
             return np.zeros(len(self._eyes.periods), dtype=np.int64)
-        pose = invert(self._drive.world_T_ego[step]) @ way.at(time_s)
+        pose = invert(self._drive.world_T_ego[step]) @ way.interpolate(time_s)
         middle_m = pose[:3, 3] + size_m[2] / 2 * pose[:3, 2]
         clouds = self._eyes.clouds(step, Balls(middle_m[None], float(np.linalg.norm(size_m / 2 + SKIN_M))))
         counts = []

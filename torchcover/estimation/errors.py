@@ -31,7 +31,7 @@ class Quantity(NamedTuple):
     unit: Unit
     lower_is_better: bool
 
-    def gain(self, difference: float) -> float:
+    def compute_improvement(self, difference: float) -> float:
         """A difference of two of them with the sign turned so that more is better."""
         return -difference if self.lower_is_better else difference
 
@@ -46,24 +46,28 @@ MIN_BLOCKS_OF_A_CELL = 8
 IMAGINED_RADIUS = 5.0
 
 
-def blocks_needed(blocks: int, effective: float, *, assumed: float = 1.25, margin: float = 1.1) -> int:
+def estimate_blocks_needed(
+    num_blocks: int, effective_blocks: float, *, min_effective_ratio: float = 1.25, margin: float = 1.1
+) -> int:
     """How many blocks give intervals, which need 8 effective ones, if further blocks are as unequal as those of a run.
 
     Args:
-        blocks: Blocks of the run.
-        effective: How many blocks of equal weight would say as much; see `Estimate.effective`.
-        assumed: Least ratio of the two where fewer than 4 blocks show it; that of a city's streets.
+        num_blocks: Blocks of the run.
+        effective_blocks: How many blocks of equal weight would say as much; see `Estimate.effective`.
+        min_effective_ratio: Least ratio of the two where fewer than 4 blocks show it; that of a city's streets.
         margin: Factor by which the advice exceeds the expected number: it has to hold for other blocks, too.
 
     Example:
-        >>> blocks_needed(4, 4.0), blocks_needed(4, 3.5), blocks_needed(1, 1.0)
+        >>> estimate_blocks_needed(4, 4.0), estimate_blocks_needed(4, 3.5), estimate_blocks_needed(1, 1.0)
         (9, 11, 11)
     """
-    ratio = blocks / effective if effective > 0 else 1.0
-    return math.ceil(margin * MIN_BLOCKS * (max(ratio, assumed) if blocks < 4 else ratio))
+    ratio = num_blocks / effective_blocks if effective_blocks > 0 else 1.0
+    return math.ceil(margin * MIN_BLOCKS * (max(ratio, min_effective_ratio) if num_blocks < 4 else ratio))
 
 
-def jackknife_error(left_out: Tensor, whole: Tensor, steps: Tensor, least: int = MIN_BLOCKS) -> Tensor:
+def compute_jackknife_error(
+    jackknife_values: Tensor, full_value: Tensor, frame_counts: Tensor, min_blocks: int = MIN_BLOCKS
+) -> Tensor:
     """Standard error of an estimate from what it becomes as one block after the other is left out.
 
     The delete-m_j jackknife for blocks of unequal size (Busing, Meijer & van der Leeden 1999, Statistics and Computing
@@ -72,10 +76,10 @@ def jackknife_error(left_out: Tensor, whole: Tensor, steps: Tensor, least: int =
         error^2 = 1/g sum_j (p_j - mean of the estimates)^2 / (h_j - 1).
 
     Args:
-        left_out: (g, ...) estimates without block j.
-        whole: (...) estimate from all blocks.
-        steps: (g,) steps m_j of each block, all above 0.
-        least: Fewer blocks than these give no error; 2 at least.
+        jackknife_values: (g, ...) estimates without block j.
+        full_value: (...) estimate from all blocks.
+        frame_counts: (g,) steps m_j of each block, all above 0.
+        min_blocks: Fewer blocks than these give no error; 2 at least.
 
     Returns:
         (...) standard errors; NaN for too few blocks, and where an estimate is not finite.
@@ -83,27 +87,27 @@ def jackknife_error(left_out: Tensor, whole: Tensor, steps: Tensor, least: int =
     Example:
         >>> values = torch.arange(10.0, dtype=torch.float64)           # one step a block: the error of a mean
         >>> left_out = (values.sum() - values) / 9
-        >>> error = jackknife_error(left_out, values.mean(), torch.ones(10))
+        >>> error = compute_jackknife_error(left_out, values.mean(), torch.ones(10))
         >>> torch.isclose(error, values.std() / 10**0.5)
         tensor(True)
     """
-    blocks = len(steps)
-    if blocks < least:
-        return torch.full_like(whole, math.nan)
-    ratio = (steps.sum() / steps.double()).view(-1, *[1] * whole.dim())
-    pseudo = pseudo_values(left_out, whole, steps)
-    centre = blocks * whole - ((1 - 1 / ratio) * left_out).sum(dim=0)
+    blocks = len(frame_counts)
+    if blocks < min_blocks:
+        return torch.full_like(full_value, math.nan)
+    ratio = (frame_counts.sum() / frame_counts.double()).view(-1, *[1] * full_value.dim())
+    pseudo = compute_pseudo_values(jackknife_values, full_value, frame_counts)
+    centre = blocks * full_value - ((1 - 1 / ratio) * jackknife_values).sum(dim=0)
     error = (((pseudo - centre) ** 2 / (ratio - 1)).mean(dim=0)).sqrt()
-    return error.where(whole.isfinite(), math.nan)
+    return error.where(full_value.isfinite(), math.nan)
 
 
-def pseudo_values(left_out: Tensor, whole: Tensor, steps: Tensor) -> Tensor:
-    """(g, ...) the p_j of `jackknife_error`: what each block says by itself, had it been as long as all of them."""
-    ratio = (steps.sum() / steps.double()).view(-1, *[1] * whole.dim())
-    return ratio * whole - (ratio - 1) * left_out
+def compute_pseudo_values(jackknife_values: Tensor, full_value: Tensor, frame_counts: Tensor) -> Tensor:
+    """(g, ...) the p_j of `compute_jackknife_error`: what each block says by itself, had it been as long as all of them."""
+    ratio = (frame_counts.sum() / frame_counts.double()).view(-1, *[1] * full_value.dim())
+    return ratio * full_value - (ratio - 1) * jackknife_values
 
 
-def ratio_errors(base: Tensor, sums: Tensor, unit: Unit) -> Tensor:
+def estimate_ratio_errors(denominators: Tensor, numerators: Tensor, unit: Unit) -> Tensor:
     """Standard error of a ratio of sums in each cell: of a mean over steps, or over square metres.
 
     For R = S / A, sums over blocks of s_j and of a_j, the variance is to first order that of the sum of s_j - R a_j,
@@ -114,8 +118,8 @@ def ratio_errors(base: Tensor, sums: Tensor, unit: Unit) -> Tensor:
     as Agresti & Coull (1998, The American Statistician 52, 119-126) add successes and failures. No error is 0.
 
     Args:
-        base: (B, ...) the a_j: steps that probed the cell in each block, or square metres that were seen in it.
-        sums: (B, ...) the s_j.
+        denominators: (B, ...) the a_j: steps that probed the cell in each block, or square metres that were seen in it.
+        numerators: (B, ...) the s_j.
         unit: "share", so that the imagined ratios are 1 and 0; or "m": 0 and five times R.
 
     Returns:
@@ -125,16 +129,16 @@ def ratio_errors(base: Tensor, sums: Tensor, unit: Unit) -> Tensor:
     Example:
         >>> m2 = torch.full((16,), 2.0, dtype=torch.float64)
         >>> half = torch.tensor([2.0, 0.0] * 8, dtype=torch.float64)
-        >>> [round(float(ratio_errors(m2, sums, "share")), 3) for sums in (half, m2)]
+        >>> [round(float(estimate_ratio_errors(m2, sums, "share")), 3) for sums in (half, m2)]
         [0.121, 0.057]
     """
-    base = base.double()
-    known = (base > 0).sum(dim=0)
-    whole = base.sum(dim=0).where(known > 0, 1.0)
-    ratio = sums.sum(dim=0) / whole
+    denominators = denominators.double()
+    known = (denominators > 0).sum(dim=0)
+    whole = denominators.sum(dim=0).where(known > 0, 1.0)
+    ratio = numerators.sum(dim=0) / whole
     imagined = whole / known.clamp(min=1)
     seen_or_not = ratio**2 + (1 - ratio) ** 2 if unit == "share" else ratio**2 + (IMAGINED_RADIUS * ratio - ratio) ** 2
-    squares = (sums - ratio * base).square().sum(dim=0) + imagined**2 * seen_or_not
+    squares = (numerators - ratio * denominators).square().sum(dim=0) + imagined**2 * seen_or_not
     variance = squares * (known + 2) / (known + 1) / (whole + 2 * imagined) ** 2
     return variance.sqrt().where((known >= MIN_BLOCKS_OF_A_CELL) & (variance > 0) & variance.isfinite(), math.nan)
 
@@ -143,7 +147,7 @@ class ErrorModel(NamedTuple):
     """The error of a number after some steps: error^2 = bias^2 + a / steps.
 
     Args:
-        a: Variance of the number times the steps that it comes from, as worlds differ within and among each other.
+        error_coefficient: Variance of the number times the steps that it comes from, as worlds differ within and among each other.
         bias: What is left after any number of steps: by how much the setting is off, such as fewer rays.
 
     Example:
@@ -154,24 +158,24 @@ class ErrorModel(NamedTuple):
         True
     """
 
-    a: float
+    error_coefficient: float
     bias: float = 0.0
 
     @classmethod
-    def of(cls, error: float, steps: int, bias: float = 0.0) -> "ErrorModel":
+    def from_error(cls, error: float, num_frames: int, bias: float = 0.0) -> "ErrorModel":
         """From the standard error of a run; of an unknown error nothing is known."""
-        return cls(error**2 * steps, bias)
+        return cls(error**2 * num_frames, bias)
 
-    def error_after(self, steps: int) -> float:
+    def estimate_error(self, num_frames: int) -> float:
         """The error after so many steps."""
-        return math.sqrt(self.bias**2 + self.a / steps)
+        return math.sqrt(self.bias**2 + self.error_coefficient / num_frames)
 
-    def steps_for(self, error: float) -> int | None:
+    def estimate_num_frames(self, target_error: float) -> int | None:
         """The fewest steps after which it is at most this; None if there are none, or that is unknown."""
-        room = error**2 - self.bias**2
-        if math.isnan(self.a) or not room > 0:
+        room = target_error**2 - self.bias**2
+        if math.isnan(self.error_coefficient) or not room > 0:
             return None
-        return max(1, math.ceil(self.a / room * (1 - 1e-12)))  # which rounding would make one more
+        return max(1, math.ceil(self.error_coefficient / room * (1 - 1e-12)))  # which rounding would make one more
 
 
 # Scenes in which a rig is all but blind are rare and missing from most short runs, so that the true mean of a length
@@ -181,7 +185,7 @@ BLIND_SIDE = 1.25
 MOST = 700.0
 
 
-def interval95(
+def compute_interval95(
     value: float, error: float, degrees_of_freedom: int, quantity: Quantity, *, is_difference: bool = False
 ) -> tuple[float, float]:
     """The 95 % interval around a number, or around a difference of two.
@@ -210,7 +214,7 @@ def interval95(
         >>> [round(end, 3) for end in interval95(-0.3, 0.1, 10, radius, is_difference=True)]
         [-0.579, -0.077]
     """
-    t, unit = student_t95(degrees_of_freedom), quantity.unit
+    t, unit = compute_student_t95(degrees_of_freedom), quantity.unit
     if math.isnan(error) or error <= ROUND_OFF or (unit == "m" and not is_difference and value <= 0):
         return math.nan, math.nan
     below = above = t * error
@@ -227,14 +231,14 @@ def interval95(
     return 1 / (1 + against * math.exp(min(below / slope, MOST))), 1 / (1 + against * math.exp(-above / slope))
 
 
-def student_t95(degrees_of_freedom: int) -> float:
+def compute_student_t95(degrees_of_freedom: int) -> float:
     """Return the t that Student's distribution exceeds to either side with 5 %.
 
     Args:
         degrees_of_freedom: 1 or more; NaN for fewer.
 
     Example:
-        >>> round(student_t95(2), 3), round(student_t95(7), 3), round(student_t95(15), 3), round(student_t95(1000), 3)
+        >>> round(compute_student_t95(2), 3), round(compute_student_t95(7), 3), round(compute_student_t95(15), 3), round(compute_student_t95(1000), 3)
         (4.303, 2.365, 2.131, 1.962)
     """
     from scipy.special import stdtrit  # 0.15 s, which only results with errors need
@@ -242,24 +246,24 @@ def student_t95(degrees_of_freedom: int) -> float:
     return float(stdtrit(degrees_of_freedom, 0.975)) if degrees_of_freedom >= 1 else math.nan
 
 
-def student_p(t: float, degrees_of_freedom: int) -> float:
+def compute_student_p(t_statistic: float, degrees_of_freedom: int) -> float:
     """Return the probability that Student's t lies farther from 0 than some value, to either side.
 
     Args:
-        t: The value; NaN gives NaN.
+        t_statistic: The value; NaN gives NaN.
         degrees_of_freedom: 1 or more.
 
     Example:
-        >>> round(student_p(2.131, 15), 3), round(student_p(1.0, 1), 3)
+        >>> round(compute_student_p(2.131, 15), 3), round(compute_student_p(1.0, 1), 3)
         (0.05, 0.5)
     """
     from scipy.special import stdtr
 
-    return float(2 * stdtr(degrees_of_freedom, -abs(t)))
+    return float(2 * stdtr(degrees_of_freedom, -abs(t_statistic)))
 
 
 def is_significant(difference: float, error: float, degrees_of_freedom: int) -> bool | None:
     """Whether a difference is more than chance, by Student's t at 95 %; None if its standard error is NaN."""
     if math.isnan(error):
         return None
-    return abs(difference) > max(student_t95(degrees_of_freedom) * error, ROUND_OFF)
+    return abs(difference) > max(compute_student_t95(degrees_of_freedom) * error, ROUND_OFF)

@@ -14,11 +14,11 @@ from torchcover.estimation.errors import (
     MIN_BLOCKS,
     ROUND_OFF,
     Quantity,
-    interval95,
+    compute_interval95,
+    compute_jackknife_error,
+    compute_pseudo_values,
+    compute_student_p,
     is_significant,
-    jackknife_error,
-    pseudo_values,
-    student_p,
 )
 
 
@@ -32,7 +32,7 @@ class Number(NamedTuple):
         low: Lower end of its 95 % interval, as from `torchcover.estimation.interval95`.
         high: Upper end.
         count: How many it is over.
-        count_of: What these are: "known cells", "objects", "voxels", ...
+        counted_items: What these are: "known cells", "objects", "voxels", ...
         parameters: What else it was computed with.
         warning: What makes it unfit for a comparison, in words.
 
@@ -48,12 +48,12 @@ class Number(NamedTuple):
     low: float = math.nan
     high: float = math.nan
     count: int = 0  # type: ignore[assignment]  # hides tuple.count
-    count_of: str = ""
+    counted_items: str = ""
     parameters: Mapping[str, Any] = {}
     warning: str | None = None
 
     @property
-    def known(self) -> bool:
+    def has_value(self) -> bool:
         """Whether it has a value."""
         return not math.isnan(self.value)
 
@@ -68,10 +68,10 @@ class Difference(NamedTuple):
             hard for both rigs cancels out. NaN if there are not enough blocks.
         low: Lower end of its 95 % interval, as from `torchcover.estimation.interval95`.
         high: Upper end.
-        significant: Whether the difference is more than chance, by Student's t at 95 %; None if that is unknown.
-        p: Probability of a t at least as large to either side if there were no difference.
-        blocks: Blocks of contiguous steps, or worlds, that it comes from.
-        better: In how many of them the rig is better than the other.
+        is_significant: Whether the difference is more than chance, by Student's t at 95 %; None if that is unknown.
+        p_value: Probability of a t at least as large to either side if there were no difference.
+        block_count: Blocks of contiguous steps, or worlds, that it comes from.
+        better_count: In how many of them the rig is better than the other.
     """
 
     quantity: Quantity
@@ -79,15 +79,15 @@ class Difference(NamedTuple):
     error: float = math.nan
     low: float = math.nan
     high: float = math.nan
-    significant: bool | None = None
-    p: float = math.nan
-    blocks: int = 0
-    better: int = 0
+    is_significant: bool | None = None
+    p_value: float = math.nan
+    block_count: int = 0
+    better_count: int = 0
 
     @property
-    def gain(self) -> float:
+    def improvement(self) -> float:
         """The difference with the sign turned so that more is better."""
-        return self.quantity.gain(self.value)
+        return self.quantity.compute_improvement(self.value)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,10 +97,10 @@ class Estimate:
     Args:
         quantities: What the Q numbers are.
         value: (Q,) float64 from all steps; NaN where unknown.
-        left_out: (g, Q) without each block.
-        steps: (g,) int64 steps in these blocks, each above 0.
-        again: From (R, g) how often each block comes to (R, Q) what the numbers were then; None if that is unknown.
-        effective: (Q,) how many blocks of equal weight would say as much: Kish's (sum of w)^2 / sum of w^2 over what is
+        jackknife_values: (g, Q) without each block.
+        frame_counts: (g,) int64 steps in these blocks, each above 0.
+        recompute: From (R, g) how often each block comes to (R, Q) what the numbers were then; None if that is unknown.
+        effective_blocks: (Q,) how many blocks of equal weight would say as much: Kish's (sum of w)^2 / sum of w^2 over what is
             divided by in each. With fewer than 8 there is no interval. The number of blocks if not given.
         strata: Of a mixture, the weights, which sum to 1, and what is mixed; empty of all else.
 
@@ -122,53 +122,67 @@ class Estimate:
 
     quantities: tuple[Quantity, ...]
     value: Tensor
-    left_out: Tensor
-    steps: Tensor
-    again: Callable[[Tensor], Tensor] | None = None
-    effective: Tensor = None  # type: ignore[assignment]  # until the next line
+    jackknife_values: Tensor
+    frame_counts: Tensor
+    recompute: Callable[[Tensor], Tensor] | None = None
+    effective_blocks: Tensor = None  # type: ignore[assignment]  # until the next line
     strata: tuple[tuple[float, "Estimate"], ...] = ()
 
     def __post_init__(self) -> None:
-        if self.effective is None:
-            object.__setattr__(self, "effective", torch.full_like(self.value, len(self.steps)))
+        if self.effective_blocks is None:
+            object.__setattr__(self, "effective", torch.full_like(self.value, len(self.frame_counts)))
 
     @classmethod
-    def of(cls, quantities: Sequence[Quantity], value: Tensor) -> "Estimate":
+    def from_values(cls, quantities: Sequence[Quantity], value: Tensor) -> "Estimate":
         """Of numbers (Q,) that no block is known of, and so no error."""
         return cls(tuple(quantities), value, value.new_empty((0, len(value))), value.new_empty(0, dtype=torch.int64))
 
     @classmethod
-    def of_ratios(cls, quantities: Sequence[Quantity], base: Tensor, sums: Tensor, steps: Tensor) -> "Estimate":
+    def from_ratios(
+        cls, quantities: Sequence[Quantity], denominators: Tensor, numerators: Tensor, frame_counts: Tensor
+    ) -> "Estimate":
         """Ratios of sums in blocks, and what they become without each block.
 
         Args:
             quantities: What they are.
-            base: (B,) what is divided by; or (B, Q), of each.
-            sums: (B, Q) sums.
-            steps: (B,) steps in each block; 0 in blocks that are not in use.
+            denominators: (B,) what is divided by; or (B, Q), of each.
+            numerators: (B, Q) sums.
+            frame_counts: (B,) steps in each block; 0 in blocks that are not in use.
         """
-        whole = sums.sum(dim=0) / base.sum(dim=0)
-        used = steps.nonzero().flatten() if len(steps) > 1 else steps[:0]
-        base, sums = (base if base.dim() == 2 else base[:, None])[used], sums[used]
-        without = _without_each(sums) / _without_each(base)
-        effective = (base.sum(dim=0) ** 2 / base.square().sum(dim=0)).expand(len(whole))
-        return cls(tuple(quantities), whole, without, steps[used], partial(_ratios_again, base, sums), effective)
+        whole = numerators.sum(dim=0) / denominators.sum(dim=0)
+        used = frame_counts.nonzero().flatten() if len(frame_counts) > 1 else frame_counts[:0]
+        denominators, numerators = (
+            (denominators if denominators.dim() == 2 else denominators[:, None])[used],
+            numerators[used],
+        )
+        without = _without_each(numerators) / _without_each(denominators)
+        effective = (denominators.sum(dim=0) ** 2 / denominators.square().sum(dim=0)).expand(len(whole))
+        return cls(
+            tuple(quantities),
+            whole,
+            without,
+            frame_counts[used],
+            partial(_ratios_again, denominators, numerators),
+            effective,
+        )
 
     @classmethod
-    def of_blocks(cls, quantities: Sequence[Quantity], again: Callable[[Tensor], Tensor], steps: Tensor) -> "Estimate":
+    def from_blocks(
+        cls, quantities: Sequence[Quantity], recompute: Callable[[Tensor], Tensor], frame_counts: Tensor
+    ) -> "Estimate":
         """Of numbers that say for themselves what they become if blocks come more or less often.
 
         Args:
             quantities: What they are.
-            again: As in `Estimate`; float64.
-            steps: (g,) steps in each block, all above 0.
+            recompute: As in `Estimate`; float64.
+            frame_counts: (g,) steps in each block, all above 0.
         """
-        once = torch.ones(1, len(steps), dtype=torch.float64, device=steps.device)
-        values = again(torch.cat([once, 1.0 - torch.diag(once[0])]))
-        return cls(tuple(quantities), values[0], values[1:], steps, again)
+        once = torch.ones(1, len(frame_counts), dtype=torch.float64, device=frame_counts.device)
+        values = recompute(torch.cat([once, 1.0 - torch.diag(once[0])]))
+        return cls(tuple(quantities), values[0], values[1:], frame_counts, recompute)
 
     @classmethod
-    def mixed(cls, strata: Sequence[tuple[float, "Estimate"]]) -> "Estimate":
+    def from_strata(cls, strata: Sequence[tuple[float, "Estimate"]]) -> "Estimate":
         """The weighted mean of the same numbers of several strata, which are given and not drawn.
 
         Its variance is the sum of theirs, times the squares of the weights; that has as many degrees of freedom as
@@ -187,59 +201,74 @@ class Estimate:
         """
         each = [one for _, one in strata]
         value = torch.stack([weight * one.value for weight, one in strata]).sum(dim=0)
-        effective = torch.stack([one.effective for one in each]).amin(dim=0)
-        steps, left_out = torch.cat([one.steps for one in each]), torch.cat([one.left_out for one in each])
+        effective = torch.stack([one.effective_blocks for one in each]).amin(dim=0)
+        steps, left_out = (
+            torch.cat([one.frame_counts for one in each]),
+            torch.cat([one.jackknife_values for one in each]),
+        )
         return cls(each[0].quantities, value, left_out, steps, None, effective, tuple(strata))
 
     def __getitem__(self, which: slice) -> "Estimate":
         """Some of the numbers."""
         if self.strata:
-            return Estimate.mixed([(weight, one[which]) for weight, one in self.strata])
-        again = None if self.again is None else partial(_some_again, self.again, which)
-        some = self.value[which], self.left_out[:, which], self.steps, again, self.effective[which]
+            return Estimate.from_strata([(weight, one[which]) for weight, one in self.strata])
+        again = None if self.recompute is None else partial(_some_again, self.recompute, which)
+        some = (
+            self.value[which],
+            self.jackknife_values[:, which],
+            self.frame_counts,
+            again,
+            self.effective_blocks[which],
+        )
         return Estimate(self.quantities[which], *some)
 
-    def after(self, blocks: int) -> "Estimate":
+    def truncate_blocks(self, num_blocks: int) -> "Estimate":
         """What it was after the first blocks alone."""
-        again = self.again
+        again = self.recompute
         assert again is not None  # known of all that is a ratio of sums
-        rest = len(self.steps) - blocks
-        return Estimate.of_blocks(self.quantities, lambda some: again(pad(some, (0, rest))), self.steps[:blocks])
+        rest = len(self.frame_counts) - num_blocks
+        return Estimate.from_blocks(
+            self.quantities, lambda some: again(pad(some, (0, rest))), self.frame_counts[:num_blocks]
+        )
 
-    def resampled(self, weights: Tensor) -> Tensor | None:
+    def resample(self, block_weights: Tensor) -> Tensor | None:
         """What the numbers were if other worlds had come, for intervals of what is made from numbers of several rigs.
 
         Args:
-            weights: (R, g) how often each block comes, in each of R draws.
+            block_weights: (R, g) how often each block comes, in each of R draws.
 
         Returns:
             (R, Q) float64; None if it is unknown.
         """
-        return None if self.again is None else self.again(weights.to(self.value))
+        return None if self.recompute is None else self.recompute(block_weights.to(self.value))
 
     @property
     def error(self) -> Tensor:
         """(Q,) standard errors; NaN if there are fewer than 8 blocks."""
-        return self.errors()
+        return self.compute_errors()
 
-    def errors(self, least: int = MIN_BLOCKS) -> Tensor:
+    def compute_errors(self, min_blocks: int = MIN_BLOCKS) -> Tensor:
         """(Q,) standard errors by the block jackknife.
 
         Args:
-            least: Fewer blocks than these give none. Errors that are shown need 8; who only races rigs against each
+            min_blocks: Fewer blocks than these give none. Errors that are shown need 8; who only races rigs against each
                 other is content with 3 worlds.
         """
         if self.strata:
-            return torch.stack([(weight * one.errors(least)) ** 2 for weight, one in self.strata]).sum(dim=0).sqrt()
-        return jackknife_error(self.left_out, self.value, self.steps, least)
+            return (
+                torch.stack([(weight * one.compute_errors(min_blocks)) ** 2 for weight, one in self.strata])
+                .sum(dim=0)
+                .sqrt()
+            )
+        return compute_jackknife_error(self.jackknife_values, self.value, self.frame_counts, min_blocks)
 
     @property
-    def freedom(self) -> list[int]:
+    def degrees_of_freedom(self) -> list[int]:
         """(Q,) degrees of freedom of the errors: the blocks less one, or in a mixture what they come to."""
         if not self.strata:
-            return [len(self.steps) - 1] * len(self.value)
+            return [len(self.frame_counts) - 1] * len(self.value)
         variances = torch.stack([(weight * one.error) ** 2 for weight, one in self.strata])
-        most = torch.tensor([one.freedom for _, one in self.strata], device="cpu").to(variances)
+        most = torch.tensor([one.degrees_of_freedom for _, one in self.strata], device="cpu").to(variances)
         # As shares, as fourth powers of errors may vanish.
         found = 1 / ((variances / variances.sum(dim=0)) ** 2 / most).sum(dim=0)
         return [int(each + 1e-9) for each in found.where(found.isfinite(), most.amin(dim=0)).tolist()]
@@ -247,59 +276,59 @@ class Estimate:
     @property
     def has_intervals(self) -> list[bool]:
         """Whether 8 blocks or more are in effect, of each number."""
-        enough: list[bool] = (self.effective > MIN_BLOCKS - ROUND_OFF).tolist()
+        enough: list[bool] = (self.effective_blocks > MIN_BLOCKS - ROUND_OFF).tolist()
         return enough
 
-    def numbers(self, *, count: int = 0, count_of: str = "") -> dict[str, Number]:
+    def to_numbers(self, *, count: int = 0, counted_items: str = "") -> dict[str, Number]:
         """The numbers by the keys of their quantities; of fewer than 8 blocks in effect without intervals.
 
         Args:
             count: How many they are over.
-            count_of: What these are.
+            counted_items: What these are.
         """
         # Blocks, in a mixture those of each stratum, that all say the same prove nothing.
         each = [one.error > ROUND_OFF for _, one in self.strata] or [self.error > ROUND_OFF]
         found, varies = {}, torch.stack(each).all(dim=0).tolist()
         errors = [error if known else math.nan for error, known in zip(self.error.tolist(), varies, strict=True)]
-        numbers = self.quantities, self.value.tolist(), errors, self.has_intervals, self.freedom
+        numbers = self.quantities, self.value.tolist(), errors, self.has_intervals, self.degrees_of_freedom
         for quantity, value, error, has_interval, freedom in zip(*numbers, strict=True):
-            ends = interval95(value, error if has_interval else math.nan, freedom, quantity)
-            found[quantity.key] = Number(quantity, value, error, *ends, count, count_of)
+            ends = compute_interval95(value, error if has_interval else math.nan, freedom, quantity)
+            found[quantity.key] = Number(quantity, value, error, *ends, count, counted_items)
         return found
 
-    def minus(self, other: "Estimate") -> "Estimate":
+    def subtract(self, baseline: "Estimate") -> "Estimate":
         """The difference to another rig over the same steps: what both share cancels out, block by block."""
         if self.strata:
-            pairs = zip(self.strata, other.strata, strict=True)
-            return Estimate.mixed([(weight, one.minus(against)) for (weight, one), (_, against) in pairs])
-        both = self.value - other.value, self.left_out - other.left_out, self.steps, None
-        return Estimate(self.quantities, *both, torch.minimum(self.effective, other.effective))
+            pairs = zip(self.strata, baseline.strata, strict=True)
+            return Estimate.from_strata([(weight, one.subtract(against)) for (weight, one), (_, against) in pairs])
+        both = self.value - baseline.value, self.jackknife_values - baseline.jackknife_values, self.frame_counts, None
+        return Estimate(self.quantities, *both, torch.minimum(self.effective_blocks, baseline.effective_blocks))
 
-    def differences(self, other: "Estimate") -> dict[str, Difference]:
+    def compute_differences(self, baseline: "Estimate") -> dict[str, Difference]:
         """The differences to the same numbers of another rig over the same steps, by the keys of the quantities.
 
         What is from fewer than 8 blocks in effect has no interval, and is neither significant nor chance.
         """
         # Two infinite numbers are equal; their difference would be NaN, which means unknown.
-        values = (self.value - other.value).where(self.value != other.value, 0.0)
-        between, blocks = self.minus(other), len(self.steps)
+        values = (self.value - baseline.value).where(self.value != baseline.value, 0.0)
+        between, blocks = self.subtract(baseline), len(self.frame_counts)
         parts = [one for _, one in between.strata] or [between]
-        each = torch.cat([pseudo_values(one.left_out, one.value, one.steps) for one in parts])
+        each = torch.cat([compute_pseudo_values(one.jackknife_values, one.value, one.frame_counts) for one in parts])
         found = {}
-        numbers = self.quantities, values.tolist(), between.error.tolist(), between.freedom
+        numbers = self.quantities, values.tolist(), between.error.tolist(), between.degrees_of_freedom
         for at, (quantity, value, error, freedom) in enumerate(zip(*numbers, strict=True)):
             judged = error if between.has_intervals[at] else math.nan
-            low, high = interval95(value, judged, freedom, quantity, is_difference=True)
+            low, high = compute_interval95(value, judged, freedom, quantity, is_difference=True)
             found[quantity.key] = Difference(
                 quantity=quantity,
                 value=value,
                 error=error,
                 low=low,
                 high=high,
-                significant=is_significant(value, judged, freedom),
-                p=student_p(value / judged, freedom) if judged > ROUND_OFF else math.nan,
-                blocks=blocks,
-                better=int((-each[:, at] if quantity.lower_is_better else each[:, at]).gt(ROUND_OFF).sum()),
+                is_significant=is_significant(value, judged, freedom),
+                p_value=compute_student_p(value / judged, freedom) if judged > ROUND_OFF else math.nan,
+                block_count=blocks,
+                better_count=int((-each[:, at] if quantity.lower_is_better else each[:, at]).gt(ROUND_OFF).sum()),
             )
         return found
 

@@ -223,7 +223,7 @@ def _coverage(asked: Requirements, rig: Rig, scenario: AnyScenario | None, **mor
         return None
     keys = {one.number for one in of_regions}
     thresholds_m = sorted({one.threshold_m for one in of_regions if one.threshold_m})
-    aggregations = [one for kind in AGGREGATIONS if (one := kind.of_keys(keys))]
+    aggregations = [one for kind in AGGREGATIONS if (one := kind.from_keys(keys))]
     redundancy = any(one.failing_sensors or one.number.startswith(("sensors", "seen")) for one in of_regions)
     settings = Settings(
         [rig], scenario, regions=asked, thresholds_m=thresholds_m or THRESHOLD_M, aggregations=aggregations,
@@ -242,11 +242,11 @@ def _of_region(one: RegionRequirement, coverage: Coverage, rig: Rig) -> Readings
         "",
         *(f"_without_{name}" for name in one.find_failing_sensors([sensor.name for sensor in rig.sensors])),
     ):
-        estimate = coverage.estimate_of(one.number + words, region, one.height)
-        (number,) = estimate.numbers().values()
+        estimate = coverage.estimate_number(one.number + words, region, one.band)
+        (number,) = estimate.to_numbers().values()
         agreed = np.isnan(number.error) and estimate.has_intervals[0]  # all blocks say the same
         ends.append((number.value,) * 3 if agreed else (number.value, number.low, number.high))
-        where.append(f"{one.region} {one.height}{words.replace('_', ' ')}")
+        where.append(f"{one.region} {one.band}{words.replace('_', ' ')}")
     value, low, high = np.array(ends).T
     return Readings(value, low, high, where)
 

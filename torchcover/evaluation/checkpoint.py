@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.evaluation.observers import CoverageObserver, Stateful
-from torchcover.files import check_kind, check_memory, read_npz, reads, write_atomically
+from torchcover.files import check_dtype_kind, check_memory, guard_reader, read_npz, write_atomically
 
 EVERY_S = 60.0
 # Writing takes at most this share of the time, though it may take seconds.
@@ -171,7 +171,7 @@ def write_checkpoint(path: Path, header: Mapping[str, Any], states: Mapping[str,
     write_atomically(path, partial(write_states, header=header, states=states))
 
 
-@reads("a checkpoint")
+@guard_reader("a checkpoint")
 def read_header(path: Path) -> dict[str, Any]:
     """The header.
 
@@ -190,7 +190,7 @@ def read_header(path: Path) -> dict[str, Any]:
     return header
 
 
-@reads("a checkpoint")
+@guard_reader("a checkpoint")
 def read_state(path: Path, header: Mapping[str, Any], name: str) -> dict[str, Any]:
     """One of the states, bit for bit.
 
@@ -269,4 +269,4 @@ def _array(content: Mapping[str, Any], path: Path) -> Array:
 
 
 def _read(path: Path, name: str) -> Array:
-    return read_npz(path, partial(check_kind, "uU"), lambda _: [name])[name]  # bytes, and one text: the header
+    return read_npz(path, partial(check_dtype_kind, "uU"), lambda _: [name])[name]  # bytes, and one text: the header

@@ -169,9 +169,9 @@ def load_config(
         BadFileError: Not YAML, an unknown or doubled key, a value of a wrong type or unit.
         ValueError: An assignment that is no setting.
     """
-    from torchcover.files import reads  # loads NumPy, whose threads have to be set before
+    from torchcover.files import guard_reader  # loads NumPy, whose threads have to be set before
 
-    content = {} if path is None else reads("settings of a run")(_read_config)(path)
+    content = {} if path is None else guard_reader("settings of a run")(_read_config)(path)
     merged: dict[str, Any] = {**content, "recording": dict(content.get("recording") or {})}
     for text in assignments:
         _assign(merged, text)

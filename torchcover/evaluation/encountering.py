@@ -21,7 +21,7 @@ from torchcover.evaluation.settings import FILES, parse_file_kinds
 from torchcover.evaluation.target_survey import build_flat_ground
 from torchcover.evaluation.task import AnyRig, load_named_rig
 from torchcover.files import AtomicOutput
-from torchcover.geometry import invert, outlines_at
+from torchcover.geometry import invert, transform_outline
 from torchcover.recordings import Recording, open_recording
 from torchcover.report import ActorMark, Page, PagePicture, StaticFaces, plot_scene, render_page
 from torchcover.simulation import Draws, PaperReference, Rig, Scenario, Simulator, with_ego
@@ -199,7 +199,7 @@ def plot_encounter_animation(
     vehicle_T_world = invert(staged.world_T_ego(times_s))
     bodies = [(one.body, vehicle_T_world @ pose) for one, pose in staged.obstacles]
     bodies.append((case.other.body, staged.vehicle_T_other(times_s)))
-    outlines_m = np.stack([outlines_at(solid_of(body).box.outline_m, there) for body, there in bodies], axis=1)
+    outlines_m = np.stack([transform_outline(solid_of(body).box.outline_m, there) for body, there in bodies], axis=1)
     ego_m = mounted.ego.box.outline_m
     all_m = np.concatenate([outlines_m.reshape(-1, 2), ego_m])
     low_m, high_m = all_m.min(axis=0) - FILM_AROUND_M, all_m.max(axis=0) + FILM_AROUND_M

@@ -35,7 +35,7 @@ def evaluate(settings: Settings) -> Result:
 
     Example:
         >>> result = evaluate("front_roof_32", steps=2, cell_m=1.0, rays=1024)
-        >>> result.coverage.counts["frames"], sorted({row["region"] for row in result.summary})
+        >>> result.coverage.counts["num_frames"], sorted({row["region"] for row in result.summary})
         (2, ['160m', '20m', '80m', 'front_3m', 'left_3m', 'rear_3m', 'right_3m'])
     """
     if settings.mixture is not None:

@@ -51,7 +51,7 @@ def measure_coverage(task: Task[FrameSource], settings: Settings, stopping_rule:
     if isinstance(probes := seen.get(BODIES), Probes):
         for name, one in coverages.items():
             one.bodies = probes.seen_by(name)
-    if len({coverage.counts["frames"] for coverage in coverages.values()}) > 1:
+    if len({coverage.counts["num_frames"] for coverage in coverages.values()}) > 1:
         run.raise_failure()  # within a step: the rigs have not seen the same
     report = None
     if metrics is not None:
@@ -100,7 +100,7 @@ def find_block_ends(frames: FrameSource, max_blocks: int = 80, max_frames: int =
     places, ends, index = set[int](), list[int](), 0
     with suppress(IndexError):
         while index < max_frames and len(ends) < max_blocks:
-            place = frames.block_index(index)
+            place = frames.get_block_index(index)
             if place not in places and places:
                 ends.append(index)
             places.add(place)
@@ -117,7 +117,7 @@ def _workers(task: Task[FrameSource], settings: Settings) -> int:
         return 0
     most = min(len(frames), task.num_frames or len(frames), ENOUGH_FRAMES)
     whole = bool(settings.observers or settings.metrics) or not settings.device.startswith("cpu")
-    return compute_num_workers(most, len({frames.world_of(index) for index in range(most)}), sends_frames=whole)
+    return compute_num_workers(most, len({frames.get_scene_id(index) for index in range(most)}), sends_frames=whole)
 
 
 def _probes(task: Task[FrameSource], settings: Settings) -> dict[str, Probes]:
@@ -139,7 +139,7 @@ def _observed(
     if ranks:
         settings = replace(settings, device=ranks.get_device(settings.device))
     sensors = task.get_sensor_names() if settings.redundancy else {}
-    has_areas = task.frames.square_metres
+    has_areas = task.frames.has_area_weights
     coverage = {
         name: CoverageObserver(
             build_metric(settings, task.query_plan, sensors.get(name, ()), has_area_weights=has_areas), name
@@ -235,13 +235,15 @@ def build_metric(
     metric = CoverageSums(
         grid,
         settings.thresholds_m,
-        max_radius=grid.diagonal_m,
-        blocks=num_blocks,
+        max_radius_m=grid.diagonal_m,
+        num_blocks=num_blocks,
         aggregations=settings.aggregations,
         regions=query_plan.regions,
-        sensors=sensors,
-        radii=not settings.only_detection,
-        square_metres=has_area_weights and settings.average != "cells",
+        sensor_names=sensors,
+        needs_radii=not settings.only_detection,
+        has_area_weights=has_area_weights and settings.average != "cells",
     )
-    check_fits(f"maps of {grid.cells:,} cells", BYTES_A_CELL * grid.cells, "use larger cells, or a smaller grid")
+    check_fits(
+        f"maps of {grid.num_cells:,} cells", BYTES_A_CELL * grid.num_cells, "use larger cells, or a smaller grid"
+    )
     return metric.to(device)

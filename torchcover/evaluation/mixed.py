@@ -10,7 +10,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from torchcover.coverage import Coverage, Mixture
+from torchcover.coverage import Coverage, CoverageMixture
 from torchcover.evaluation.checkpoint import Checkpoint
 from torchcover.evaluation.measuring import measure_coverage
 from torchcover.evaluation.progress import defer_signals
@@ -18,7 +18,7 @@ from torchcover.evaluation.result import Result
 from torchcover.evaluation.result_page import build_result_tables
 from torchcover.evaluation.settings import FILES, Settings, parse_file_kinds
 from torchcover.evaluation.task import build_task
-from torchcover.files import SUMMARY, AtomicOutput, csv_text
+from torchcover.files import SUMMARY, AtomicOutput, format_csv
 from torchcover.report import RENDERERS, CoverageTable, PageTable, build_file_stems, merge_notes, render_page
 from torchcover.report.records import build_records
 
@@ -77,11 +77,13 @@ class MixedResult(Result):
         raise ValueError(f"a mixture has no maps: use worlds[name].coverage, of {', '.join(self.scenario_results)}")
 
     @cached_property
-    def mixtures(self) -> Mapping[str, Mixture]:
+    def mixtures(self) -> Mapping[str, CoverageMixture]:
         """Name of each rig -> its numbers, for any region, with what they become without one block after the other."""
         counted = [(name, weight, self.scenario_results[name]) for name, weight in self.weights.items() if weight > 0.0]
         rigs = counted[0][2].coverages
-        return {rig: Mixture({name: (weight, of.coverages[rig]) for name, weight, of in counted}) for rig in rigs}
+        return {
+            rig: CoverageMixture({name: (weight, of.coverages[rig]) for name, weight, of in counted}) for rig in rigs
+        }
 
     @cached_property
     def table(self) -> CoverageTable:
@@ -150,7 +152,7 @@ class MixedResult(Result):
         tables = {**{name: world.table for name, world in self.scenario_results.items()}, MIXTURE: self.table}
         rows = [{"world": name, **row} for name, table in tables.items() for row in build_records(table)]
         columns = list(dict.fromkeys(chain.from_iterable(rows)))
-        return csv_text([columns, *([row.get(column, "") for column in columns] for row in rows)])
+        return format_csv([columns, *([row.get(column, "") for column in columns] for row in rows)])
 
     @property
     def _about(self) -> str:

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, Self, TypeVar, runtime_checkable
 
 from torchcover.coverage import Coverage, CoverageSums
-from torchcover.coverage.steps import StepSums
+from torchcover.coverage.steps import FrameSums
 from torchcover.frames import Frame
 
 ResultT = TypeVar("ResultT", covariant=True)
@@ -76,9 +76,9 @@ class CoverageObserver:
 
     def update(self, frame: Frame) -> None:
         """Add a frame: what is made of it by `sums_of`."""
-        self.add(self.sums_of(frame))
+        self.add_sums(self.compute_sums(frame))
 
-    def sums_of(self, frame: Frame) -> list[StepSums]:
+    def compute_sums(self, frame: Frame) -> list[FrameSums]:
         """What a frame is to `add`, with the weights and the heights of its reference points and its place in time.
 
         It is small, and the same in every process, so that frames are measured where they are made.
@@ -88,20 +88,20 @@ class CoverageObserver:
                 square metres or the heights that the metric wants, or it is unknown which points are of which sensor
                 and it wants that.
         """
-        clouds = frame.clouds_by_sensor if self.metric.sensors else frame.cloud_of
-        return self.metric.sums_of(
+        clouds = frame.get_clouds_by_sensor if self.metric.sensor_names else frame.get_cloud
+        return self.metric.compute_sums(
             clouds(self.rig),
             frame.reference,
-            error=frame.error_of(self.rig),
+            error=frame.get_errors_m(self.rig),
             weights=frame.reference_weights,
-            height=frame.heights_in(self.metric.grid.band_frame),
+            height=frame.get_heights_m(self.metric.grid.band_frame),
             block_index=frame.block_index,
         )
 
-    def add(self, sums: Sequence[StepSums]) -> None:
+    def add_sums(self, sums: Sequence[FrameSums]) -> None:
         """Add a frame that `sums_of` an observer of the same rig and parameters has measured."""
         for one in sums:
-            self.metric.add(one)
+            self.metric.add_sums(one)
 
     def compute(self) -> Coverage:
         """The coverage so far."""

@@ -20,8 +20,8 @@ from torchcover.evaluation.cores import count_cores, get_start_method, warn_abou
 from torchcover.evaluation.observers import AnyObserver, CoverageObserver
 from torchcover.evaluation.progress import ENDS, Progress, defer_signals
 from torchcover.evaluation.ranks import Ranks
-from torchcover.files import end_with_parent, is_stopped, reporting_stopped
-from torchcover.frames import BadFrameError, Frame, FrameSource, worlds_of
+from torchcover.files import end_with_parent, is_stopped, report_stopped_processes
+from torchcover.frames import BadFrameError, Frame, FrameSource, build_scene_lookup
 
 Frames = FrameSource | Dataset[Frame] | Sequence[Frame]
 
@@ -87,7 +87,7 @@ class MeasuredFrames:
         self._observers: dict[int, Any] = {
             number: one
             for number, one in enumerate(observers)
-            if hasattr(one, "sums_of") and (on_the_cpu or not isinstance(one, CoverageObserver))
+            if hasattr(one, "compute_sums") and (on_the_cpu or not isinstance(one, CoverageObserver))
         }
         self._needs_frame = len(self._observers) < len(observers)
 
@@ -149,7 +149,7 @@ def observe(
     Raises:
         BadFrameError: The frame that ended it.
         ValueError: Not a single frame could be used.
-        TypeError: Several processes make the frames, which do not say of which worlds they are; see `worlds_of`.
+        TypeError: Several processes make the frames, which do not say of which worlds they are; see `build_scene_lookup`.
         ChildProcessError: A worker was killed.
         KeyboardInterrupt: Ctrl-C.
 
@@ -172,7 +172,7 @@ def observe(
     most = len(frames) if num_frames is None else min(num_frames, len(frames))  # type: ignore[arg-type]  # map-style: has one
     if journal:
         journal.restore(run)
-    world_of = int if num_workers < 2 and ranks is None else worlds_of(frames)
+    world_of = int if num_workers < 2 and ranks is None else build_scene_lookup(frames)
     todo = iter(range(most)) if ranks is None else ranks.iterate_share(range(most), world_of)
     todo = _left(todo, run, skip_bad_frames=skip_bad_frames)
     start = time.perf_counter() - run.duration_s
@@ -338,7 +338,7 @@ def iterate_batches(loader: DataLoader[Any]) -> Iterator[Any]:
     workers = [worker.pid or 0 for worker in active_children()] if loader.num_workers else []
     try:
         while True:
-            with reporting_stopped(workers, "a worker"):
+            with report_stopped_processes(workers, "a worker"):
                 batch = next(batches, None)
             if batch is None:
                 return

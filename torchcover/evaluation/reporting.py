@@ -27,7 +27,7 @@ from torchcover.evaluation.target_survey import (
 )
 from torchcover.evaluation.task import AnyRig, AnyScenario, build_simulation_task, load_rig, make_rig_names
 from torchcover.files import AtomicOutput
-from torchcover.notebooks import small_html
+from torchcover.notebooks import build_result_html
 from torchcover.report import (
     Page,
     build_detection_shares,
@@ -75,7 +75,7 @@ class Report:
     @property
     def cut_short(self) -> str:
         """That fewer steps were measured than asked for; no words where all were."""
-        done = self.result.table.first_conditions.counts["frames"]
+        done = self.result.table.first_conditions.counts["num_frames"]
         over = f"The budget was over after {done:,} of {self.num_frames:,} steps of traffic." * (done < self.num_frames)
         return self.result.cut_short or over
 
@@ -87,7 +87,7 @@ class Report:
     def page(self) -> Page:
         """The answer and what shows it; below it the tables and maps that it comes from."""
         target, *_ = self.targets.values()
-        steps = f"{self.result.table.first_conditions.counts['frames']:,} steps of {self.result.source['scenario']}"
+        steps = f"{self.result.table.first_conditions.counts['num_frames']:,} steps of {self.result.source['scenario']}"
         lead = f"{target.target}, {target.hits} points or more, on flat ground with nothing else; {steps}."
         of_targets = [build_target_page(one) for one in self.targets.values()]
         sides = [
@@ -111,7 +111,7 @@ class Report:
         )
 
     def _repr_html_(self) -> str:
-        return small_html(self.verdict)
+        return build_result_html(self.verdict)
 
     @property
     def markdown(self) -> str:

@@ -23,7 +23,13 @@ from pydantic import (
 )
 
 from torchcover.coverage import AGGREGATIONS
-from torchcover.coverage.quantity import RADIUS, detection, over_known, seen_by_two, sensors_seeing
+from torchcover.coverage.quantity import (
+    RADIUS,
+    make_cells_quantity,
+    make_detection_quantity,
+    make_redundancy_quantity,
+    make_sensor_count_quantity,
+)
 from torchcover.encounters import Criterion, EncounterSet
 from torchcover.encounters.criterion import MOST_LATENCY_S
 from torchcover.geometry import BoundingBox
@@ -324,14 +330,14 @@ class RegionRequirement(_Requirement):
 
     Args:
         region: As the file's `regions` call it; without these, as the usual table: "20m", "front_3m", ...
-        height: Of the height band.
+        band: Of the height band.
         number: By the name of its column in `summary.csv`: "detection_0.4m", "radius_m", "seen_by_two_0.4m", ...
         min_value: What it must not be below, if more of it is better.
         max_value: What it must not be above, if less of it is.
     """
 
     region: str
-    height: str
+    band: str
     number: str
     min_value: float | None = None
     max_value: float | None = None
@@ -351,9 +357,16 @@ class RegionRequirement(_Requirement):
     @model_validator(mode="after")
     def _check(self) -> Self:
         threshold_m = self.threshold_m or THRESHOLD_M
-        both = RADIUS, detection(threshold_m)
-        known = [*both, *map(over_known, both), sensors_seeing(threshold_m), seen_by_two(threshold_m)]
-        known += [one for of in AGGREGATIONS for one in (of.of_keys({self.number}) or of.parse(of.example)).quantities]
+        both = RADIUS, make_detection_quantity(threshold_m)
+        known = [
+            *both,
+            *map(make_cells_quantity, both),
+            make_sensor_count_quantity(threshold_m),
+            make_redundancy_quantity(threshold_m),
+        ]
+        known += [
+            one for of in AGGREGATIONS for one in (of.from_keys({self.number}) or of.parse(of.example)).quantities
+        ]
         _check_called("number of a region", [self.number], [one.key for one in known])
         quantity = next(one for one in known if one.key == self.number)
         better, right, wrong = ("less", "most", "least") if quantity.lower_is_better else ("more", "least", "most")
@@ -369,7 +382,7 @@ class RegionRequirement(_Requirement):
     @property
     def text(self) -> str:
         """Where."""
-        return self.format_text(f"{self.region} {self.height}")
+        return self.format_text(f"{self.region} {self.band}")
 
 
 class BrakingModel(Document):
@@ -467,7 +480,7 @@ class Requirements(BuiltIn, RegionsOfInterest):
                 _check_called("place", [one.positions], self.position_sets)
             if isinstance(one, RegionRequirement):
                 _check_called("region", [one.region], [region.name for region in asked.regions])
-                _check_called("height band", [one.height], asked.grid.heights)
+                _check_called("height band", [one.band], asked.grid.heights)
         told = Counter(f"{one.text}: {bound.text}" for one in self.requirements for bound in one.bounds)
         if (twice := told.most_common(1)[0])[1] > 1:
             raise ValueError(f"several requirements read {twice[0]!r}; give each a name, or leave all but one out")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.coverage import BevGrid
-from torchcover.coverage.quantity import RADIUS, by_area
+from torchcover.coverage.quantity import RADIUS, make_area_quantity
 from torchcover.detection import Boxes
 from torchcover.files import write_atomically
 from torchcover.frames import Frame
@@ -55,7 +55,7 @@ class RerunLog:
 
         self._stream.set_time("step", sequence=frame.index)
         for rig, cloud in frame.clouds.items():
-            self._stream.log([rig, "points"], rr.Points3D(_few(frame.landed(rig)), colors=[70, 120, 190]))
+            self._stream.log([rig, "points"], rr.Points3D(_few(frame.get_measured_points(rig)), colors=[70, 120, 190]))
             radius = blind_spot_radius(frame.reference, cloud, max_radius=FAR_M)
             colours = apply_colormap(_few(radius), ColorScale("radius", "m", "viridis_r", 0.0, FAR_M))
             self._stream.log([rig, "reference by radius"], rr.Points3D(_few(frame.reference), colors=colours))
@@ -89,7 +89,7 @@ class RerunLog:
             for view in build_sensor_views(sensors):
                 self._stream.log([rig, "sensors", view.name], rr.LineStrips3D(compute_frustum_lines(view)), static=True)
         coverages = result.coverages
-        key = (by_area(RADIUS) if result.table.average == "area" else RADIUS).key
+        key = (make_area_quantity(RADIUS) if result.table.average == "area" else RADIUS).key
         for rig, coverage in coverages.items():
             layer, grid = coverage.layers[key], coverage.grid
             scale = build_color_scale(layer.quantity, layer.values)
@@ -123,9 +123,9 @@ def _cells(values: NDArray[Any], grid: BevGrid, scale: ColorScale) -> Any:  # no
     import rerun as rr
 
     row, column = np.nonzero(~np.isnan(values))
-    low = np.array([grid.x[0], grid.y[0]]) + grid.cell * np.stack([column, row], axis=1)
+    low = np.array([grid.x_m[0], grid.y_m[0]]) + grid.cell_m * np.stack([column, row], axis=1)
     around = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
-    corners = (low[:, None] + grid.cell * around).reshape(-1, 2)
+    corners = (low[:, None] + grid.cell_m * around).reshape(-1, 2)
     two_triangles = np.array([[0, 1, 2], [0, 2, 3]])
     faces = (4 * np.arange(len(row))[:, None, None] + two_triangles).reshape(-1, 3)
     colours = apply_colormap(values[row, column], scale).repeat(4, axis=0)
@@ -144,7 +144,7 @@ def _boxes(boxes: Boxes) -> Any:  # noqa: ANN401
     half = boxes.yaw_rad.cpu().numpy() / 2
     xyzw = np.stack([0 * half, 0 * half, np.sin(half), np.cos(half)], axis=1)
     return rr.Boxes3D(
-        centers=boxes.centre_m.cpu().numpy(),
+        centers=boxes.center_m.cpu().numpy(),
         half_sizes=boxes.size_m.cpu().numpy() / 2,
         quaternions=xyzw,
         labels=boxes.categories,

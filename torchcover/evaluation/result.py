@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from torchcover import __version__
 from torchcover.coverage import Coverage, Region
-from torchcover.coverage.quantity import by_area
+from torchcover.coverage.quantity import make_area_quantity
 from torchcover.estimation import MIN_BLOCKS
 from torchcover.evaluation.pipeline import Run
 from torchcover.evaluation.progress import defer_signals
@@ -30,7 +30,7 @@ from torchcover.evaluation.result_page import (
 from torchcover.evaluation.settings import FILES, parse_file_kinds
 from torchcover.evaluation.target_error import TargetError, summarize_target_error
 from torchcover.files import AtomicOutput
-from torchcover.notebooks import data_frame, small_html
+from torchcover.notebooks import build_dataframe, build_result_html
 from torchcover.report import (
     RENDERERS,
     CoverageTable,
@@ -223,12 +223,12 @@ class Result:
             rigs=[PageRig(name, build_sensor_views(of), format_rig_yaml(name, of)) for name, of in rigs.items()],
             ego_outline_m=self.ego_outline_m,
             outlines=[build_region_outline(region) for region in self.regions],
-            facts=collect_facts(self.record, self.rigs, self.table.first_conditions.counts["frames"]),
+            facts=collect_facts(self.record, self.rigs, self.table.first_conditions.counts["num_frames"]),
             more_tables=[build_omissions_table(self.omissions)] if self.omissions else [],
         )
 
     def _repr_html_(self) -> str:
-        return small_html([self._about, *self.verdict], self.plot() if self.coverages else None)
+        return build_result_html([self._about, *self.verdict], self.plot() if self.coverages else None)
 
     def plot(self, layer: str | None = None) -> Figure:
         """Draw one map, several rigs side by side, in the first height band.
@@ -244,7 +244,7 @@ class Result:
             ValueError: No map shows that.
         """
         first = get_main_quantity(self.table)
-        key = layer or (by_area(first) if self.table.average == "area" else first).key
+        key = layer or (make_area_quantity(first) if self.table.average == "area" else first).key
         for _, figure in self.plot_maps(key):
             return figure
         raise ValueError(f"layer: no map shows {key!r}")
@@ -255,7 +255,7 @@ class Result:
         Raises:
             ModuleNotFoundError: pandas is not there.
         """
-        return data_frame(build_records(self.table))
+        return build_dataframe(build_records(self.table))
 
     def plot_maps(self, layer: str | None = None) -> Iterator[tuple[str, Figure]]:
         """Draw the maps, one by one; several rigs side by side, and their differences to the first.
@@ -305,7 +305,7 @@ class Result:
     ) -> tuple[float, float]:
         """Estimate the memory in bytes and the time in seconds that the page and the maps take, if they are wanted."""
         first, rigs = self._first, len(self.coverages)
-        quantities, cells = len(list_map_quantities(first)), first.grid.cells
+        quantities, cells = len(list_map_quantities(first)), first.grid.num_cells
         needed_bytes = float(rigs * cells * (costs.bytes_per_cell + costs.bytes_per_value * quantities))
         seconds = 3 * costs.seconds_per_panel * rigs * quantities * len(first.grid.heights) * ("maps" in file_kinds)
         return needed_bytes * ("maps" in file_kinds or "page" in file_kinds), seconds
@@ -393,9 +393,9 @@ class Result:
     @property
     def _on_bodies(self) -> list[str]:
         """Where bodies were put, or that a recording has none."""
-        bodies = self._first.bodies
+        bodies = self._first.target_sums
         if bodies is not None:
-            put = f"at {int(bodies.steps.sum()):,} steps, in random places whose middle is in the region"
+            put = f"at {int(bodies.frame_counts.sum()):,} steps, in random places whose middle is in the region"
             return [f"Bodies: {put}, one at a time and seen by nothing else."]
         near = any(region.bands for region in self.regions) and self.source.get("frames")
         return ["Bodies beside the vehicle: not for recordings, which have no scene to put them into."] if near else []
@@ -418,7 +418,7 @@ class Result:
         failure = None if self.run is None else self.run.failure
         if failure is None:
             return ""
-        steps = self._first.counts["frames"]
+        steps = self._first.counts["num_frames"]
         after = f"The run was cut short after {steps:,} step{'s' * (steps != 1)}"
         if isinstance(failure, KeyboardInterrupt):
             return f"{after}: interrupted."
@@ -439,13 +439,13 @@ class Result:
 
     @property
     def _has_errors(self) -> bool:
-        blocks = self._first.blocks
-        return blocks is not None and int((blocks.steps > 0).sum()) >= MIN_BLOCKS
+        blocks = self._first.block_sums
+        return blocks is not None and int((blocks.frame_counts > 0).sum()) >= MIN_BLOCKS
 
     @property
     def _about(self) -> str:
         cut_short = ", cut short" if self.run is not None and not self.run.is_complete else ""
-        return f"Result of {', '.join(self.coverages)}: {self._first.counts['frames']} steps{cut_short}"
+        return f"Result of {', '.join(self.coverages)}: {self._first.counts['num_frames']} steps{cut_short}"
 
     def __repr__(self) -> str:
         return "\n".join([self._about, *self.verdict])

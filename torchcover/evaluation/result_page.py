@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from torchcover.coverage import AGGREGATIONS, Aggregation, Coverage, Region
-from torchcover.files import as_yaml
+from torchcover.files import to_yaml
 from torchcover.report import BOLD_MARKS, MapLine, PageTable, SensorView, TextCell, build_page_tables
 from torchcover.report.remarks import explain_marks, list_notes
 from torchcover.report.table import CoverageTable
@@ -69,7 +69,7 @@ def list_omissions(
         num_workers: Processes that made the frames of each rank. What they have imported is unknown.
         num_ranks: Ranks that shared the run.
     """
-    steps = max((coverage.counts["frames"] for coverage in coverages), default=0)
+    steps = max((coverage.counts["num_frames"] for coverage in coverages), default=0)
     is_static = 0 < frame_counts.get("sensor_rays", 0) == frame_counts.get("sensor_rays_reused", 0)
     # Where nothing moves, each process casts the rays of its first step.
     first_steps = min(steps, num_ranks * max(num_workers, 1)) if is_static else 0
@@ -85,7 +85,7 @@ def list_omissions(
     if outside:
         found.append(Omission("reference points outside every cell: not searched for", outside, inside + outside))
     asked_for = {aggregation.name for aggregation in aggregations}
-    others = [aggregation.words for aggregation in AGGREGATIONS if aggregation.name not in asked_for]
+    others = [aggregation.description for aggregation in AGGREGATIONS if aggregation.name not in asked_for]
     if others:
         found.append(Omission(f"{', '.join(others)}: not asked for, not kept"))
     used = set(HEAVY) if num_workers else set(sys.modules)
@@ -134,12 +134,12 @@ def format_rig_yaml(name: str, sensors: Sequence[Sensor]) -> str:
     known = [sensor.model_dump(mode="json", exclude_unset=True) for sensor in sensors if isinstance(sensor, BaseModel)]
     if not known or len(known) < len(sensors):
         return ""
-    return as_yaml({"name": name, "sensors": known})
+    return to_yaml({"name": name, "sensors": known})
 
 
 def build_region_outline(region: Region) -> MapLine:
     """Its outline on the maps."""
-    (left, right), (low, high) = region.x, region.y
+    (left, right), (low, high) = region.x_m, region.y_m
     return MapLine(region.name, np.array(region.corners_m or [[left, low], [right, low], [right, high], [left, high]]))
 
 

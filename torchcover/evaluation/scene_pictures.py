@@ -7,7 +7,7 @@ import shapely
 from matplotlib.figure import Figure
 
 from torchcover.evaluation.result_page import build_sensor_views
-from torchcover.geometry import BoundingBox, invert, transform
+from torchcover.geometry import BoundingBox, invert, transform_points
 from torchcover.geometry.rigid import Matrix
 from torchcover.report import ActorMark, SkinPatch, StaticFaces, plot_depth_images, plot_rig, plot_scene, plot_vehicle
 from torchcover.simulation import GRID_X_M, GRID_Y_M, CameraSensor, PaperReference, Rig, Scenario, SimulatedFrames
@@ -89,7 +89,7 @@ def plot_scenario(
             reference_points=frame.reference.numpy(),
             title=f"{scenario.name}, step {step}",
             subtitle=f"t = {time_s:g} s, seed {seed}; points of {rig.name} on {frames.scenario.ego_name}",
-            path_m=transform(invert(ego.at(time_s)), ego.positions_m)[:, :2] if ego.moves else None,
+            path_m=transform_points(invert(ego.interpolate(time_s)), ego.positions_m)[:, :2] if ego.is_moving else None,
         )
 
 
@@ -100,7 +100,7 @@ def plot_vehicle_figure(vehicle: Vehicle) -> Figure:
         ValueError: Nothing of the vehicle is seen in a part of a region.
     """
     mesh = vehicle.mesh()
-    skin, size_m = Skin(mesh), BoundingBox.around(mesh.vertices_m).size_m
+    skin, size_m = Skin(mesh), BoundingBox.from_points(mesh.vertices_m).size_m
     patches = [_patch(name, region, skin) for name, region in vehicle.mount_regions.items()]
     subtitle = f"{' x '.join(f'{extent:.2f}' for extent in size_m)} m; {len(patches) or 'no'} mount regions"
     return plot_vehicle(mesh.vertices_m, mesh.faces, patches, title=vehicle.name, subtitle=subtitle)
@@ -123,11 +123,11 @@ def _frames(scenario: Scenario, rig: Rig, vehicle: str | None, step: int, seed: 
 
 def _standing(world: World, time_s: float) -> StaticFaces:
     """The scenery within the picture, from above, by its height over the ground below it."""
-    vehicle_T_world = invert(world.ego.trajectory.at(time_s))
+    vehicle_T_world = invert(world.ego.trajectory.interpolate(time_s))
     low, high = np.array([(GRID_X_M[end], GRID_Y_M[end]) for end in (0, 1)])
     standing, terrain = [np.empty((0, 3, 3))], [np.empty((0, 3, 3))]
     for mesh in world.static:
-        corners = transform(vehicle_T_world, mesh.vertices_m)[mesh.faces]
+        corners = transform_points(vehicle_T_world, mesh.vertices_m)[mesh.faces]
         # What faces up everywhere is the ground, and no body on it.
         lies = (_normals(corners)[:, 2] > 0).all()
         # What reaches into the picture may have its middle, and the ground below that, outside.
@@ -162,12 +162,16 @@ def _heights_m(corners_m: Matrix) -> Matrix:
 
 
 def _actor_marks(world: World, time_s: float) -> list[ActorMark]:
-    vehicle_T_world = invert(world.ego.trajectory.at(time_s))
-    there = [actor for actor in world.objects if np.isfinite(actor.trajectory.positions_at(np.array([time_s]))).all()]
+    vehicle_T_world = invert(world.ego.trajectory.interpolate(time_s))
+    there = [
+        actor
+        for actor in world.objects
+        if np.isfinite(actor.trajectory.interpolate_positions_m(np.array([time_s]))).all()
+    ]
     marks = []
     for actor in there:
-        corners = BoundingBox.around(actor.mesh.vertices_m).outline_m
-        vehicle_T_actor = vehicle_T_world @ actor.trajectory.at(time_s)
-        outline_m = transform(vehicle_T_actor, np.column_stack([corners, np.zeros(len(corners))]))[:, :2]
+        corners = BoundingBox.from_points(actor.mesh.vertices_m).outline_m
+        vehicle_T_actor = vehicle_T_world @ actor.trajectory.interpolate(time_s)
+        outline_m = transform_points(vehicle_T_actor, np.column_stack([corners, np.zeros(len(corners))]))[:, :2]
         marks.append(ActorMark(actor.category, outline_m))
     return marks

@@ -119,7 +119,7 @@ def _thresholds(given: "float | Iterable[float]") -> tuple[float, ...]:
 def _aggregations(given: "str | Sequence[Aggregation | str]") -> "tuple[Aggregation, ...]":
     if not given:
         return ()
-    from torchcover.coverage import aggregation_named
+    from torchcover.coverage import parse_aggregation
 
     each = [given] if isinstance(given, str) else given
     if not isinstance(each, Sequence):  # what is in it the metric checks
@@ -127,7 +127,7 @@ def _aggregations(given: "str | Sequence[Aggregation | str]") -> "tuple[Aggregat
             f"aggregations: names such as maximum, or a sequence of them or of objects such as Maximum(), are needed; "
             f"got {given!r}"
         )
-    return tuple(aggregation_named(one) if isinstance(one, str) else one for one in each)
+    return tuple(parse_aggregation(one) if isinstance(one, str) else one for one in each)
 
 
 def _metrics(given: str | Iterable[str]) -> tuple[str, ...]:

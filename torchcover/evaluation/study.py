@@ -16,15 +16,23 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchcover import __version__
-from torchcover.coverage import Coverage, Region, shown_places
+from torchcover.coverage import Coverage, Region, list_region_bands
 from torchcover.coverage.grid import BandFrame
-from torchcover.estimation import MIN_BLOCKS, ROUND_OFF, Difference, ErrorModel, Estimate, Quantity, blocks_needed
+from torchcover.estimation import (
+    MIN_BLOCKS,
+    ROUND_OFF,
+    Difference,
+    ErrorModel,
+    Estimate,
+    Quantity,
+    estimate_blocks_needed,
+)
 from torchcover.evaluation.config import STUDY_SETTINGS
 from torchcover.evaluation.measuring import measure_coverage
 from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.target_error import MIN_STEPS, round_up_frames
 from torchcover.evaluation.task import build_simulation_task
-from torchcover.files import AtomicOutput, end_with_parent, reporting_stopped
+from torchcover.files import AtomicOutput, end_with_parent, report_stopped_processes
 from torchcover.report import (
     PageTable,
     TextCell,
@@ -116,7 +124,7 @@ class StudiedNumber(NamedTuple):
     """
 
     region: str
-    height: str
+    band: str
     has_target: bool
     quantity: Quantity
     value: float
@@ -155,12 +163,12 @@ class Trial:
 
     def estimate_error(self, num_frames: int, unit: str) -> float:
         """The largest error of a unit after so many steps; NaN if one is unknown."""
-        errors = [one.error.error_after(num_frames) for one in self.select_numbers(unit)]
+        errors = [one.error.estimate_error(num_frames) for one in self.select_numbers(unit)]
         return math.nan if any(map(math.isnan, errors)) else max(errors, default=math.nan)
 
     def estimate_num_frames(self, error: float) -> int | None:
         """Steps after which every detection is this good, in two digits; None if there are none, or that is unknown."""
-        needed = [one.error.steps_for(error) for one in self.select_numbers("share")]
+        needed = [one.error.estimate_num_frames(error) for one in self.select_numbers("share")]
         known = [steps for steps in needed if steps is not None]
         return round_up_frames(max(self.min_frames, *known)) if known and len(known) == len(needed) else None
 
@@ -213,13 +221,17 @@ class Study:
     def _numbers(self) -> PageTable:
         first, rows = self.trials[0], []
         for one in first.numbers:
-            steps = [one.error.steps_for(error) for error in WANTED] if one.quantity.unit == "share" else [None] * 3
+            steps = (
+                [one.error.estimate_num_frames(error) for error in WANTED]
+                if one.quantity.unit == "share"
+                else [None] * 3
+            )
             words = [
                 _steps_words(first, each and round_up_frames(max(each, first.min_frames)), self.startup_s)
                 for each in steps
             ]
-            error = format_error(one.error.error_after(first.num_frames), one.quantity.unit)
-            place = f"{one.region} {one.height}"
+            error = format_error(one.error.estimate_error(first.num_frames), one.quantity.unit)
+            place = f"{one.region} {one.band}"
             rows.append(list(map(TextCell, [place, format_difference_heading(one.quantity), error, *words])))
         headings = ("place", "number", f"error after {first.num_frames:,}", *STEPS_HEADINGS)
         return PageTable("Each number, as given", headings, rows)
@@ -229,7 +241,11 @@ class Study:
         found = self.find_recommended(error)
         if found is None:
             first = self.trials[0]
-            unknown = [f"{one.region} {one.height}" for one in first.select_numbers("share") if math.isnan(one.error.a)]
+            unknown = [
+                f"{one.region} {one.band}"
+                for one in first.select_numbers("share")
+                if math.isnan(one.error.error_coefficient)
+            ]
             why = f"not known, for {first.num_frames:,} steps say no error of {', '.join(unknown) or 'any'}"
             return f"For {_points(error)} of every detection: {why}."
         trial, steps = found
@@ -297,9 +313,11 @@ def _record(trial: Trial) -> dict[str, Any]:
     for one in trial.numbers:
         difference = one.difference._asdict() if one.difference else {}
         told = {name: difference.get(name, math.nan) for name in ("value", "error", "p")}
-        own = {"region": one.region, "height": one.height, "quantity": one.quantity.key, "value": one.value}
+        own = {"region": one.region, "height": one.band, "quantity": one.quantity.key, "value": one.value}
         numbers.append(
-            to_json_record({**own, "a": one.error.a, "bias": one.error.bias, "difference": to_json_record(told)})
+            to_json_record(
+                {**own, "a": one.error.error_coefficient, "bias": one.error.bias, "difference": to_json_record(told)}
+            )
         )
     names = ("options", "num_frames", "min_frames", "duration_s", "processor_s", "band_frame")
     return {**{name: getattr(trial, name) for name in names}, "numbers": numbers}
@@ -332,7 +350,7 @@ def measure_error_against_time(plan: StudyPlan, *, show_progress: bool = False) 
 
 def _first_steps(coverage: Coverage) -> int:
     """Steps of the first quarter of its blocks, and of 8 at least."""
-    blocks = coverage.estimate(coverage.regions[0], next(iter(coverage.grid.heights))).steps
+    blocks = coverage.estimate(coverage.regions[0], next(iter(coverage.grid.heights))).frame_counts
     return int(blocks[: max(MIN_BLOCKS, len(blocks) // SHARE_OF_OTHERS)].sum())
 
 
@@ -343,26 +361,26 @@ def _tried(options: str, settings: Settings, first: Coverage | None) -> tuple[Tr
     assert result.run is not None  # it was not loaded
     result.run.raise_failure()
     coverage, awaited = result.coverage, task.query_plan.awaited
-    places = shown_places(result.regions, coverage.grid)
-    count, steps, worlds = len(places) * len(coverage.quantities), coverage.counts["frames"], math.inf
+    places = list_region_bands(result.regions, coverage.grid)
+    count, steps, worlds = len(places) * len(coverage.quantities), coverage.counts["num_frames"], math.inf
     numbers = []
     for region, height in places:
         estimate = coverage.estimate(region, height)
         against = None if first is None else _paired(first, coverage, region, height)
-        differences = estimate.differences(against) if against else {}
+        differences = estimate.compute_differences(against) if against else {}
         if region in awaited and not estimate.value.isnan().all():
-            worlds = min(worlds, float(estimate.effective.min()))
+            worlds = min(worlds, float(estimate.effective_blocks.min()))
         a = _known(estimate.error).square() * steps
         if against and first:  # who has more steps knows it better; on the same instants the ratio is known well
-            more = _known(first.estimate(region, height).error).square() * first.counts["frames"]
+            more = _known(first.estimate(region, height).error).square() * first.counts["num_frames"]
             a = torch.where(more.isnan(), a, more * (estimate.error / _known(against.error)).square())
         for quantity, value, own in zip(estimate.quantities, estimate.value.tolist(), a.tolist(), strict=True):
             difference = None if first is None else differences.get(quantity.key, Difference(quantity, math.nan))
-            is_biased = difference is not None and difference.p * count < LEVEL
+            is_biased = difference is not None and difference.p_value * count < LEVEL
             bias = abs(difference.value) if difference and (is_biased or math.isnan(difference.value)) else 0.0
             place = region.name, height, region in awaited
             numbers.append(StudiedNumber(*place, quantity, value, ErrorModel(own, bias), difference, is_biased))
-    least = max(MIN_STEPS, blocks_needed(steps, worlds) if worlds > 0 else steps)
+    least = max(MIN_STEPS, estimate_blocks_needed(steps, worlds) if worlds > 0 else steps)
     times = result.run.duration_s, processor_s
     return Trial(options, steps, least, *times, coverage.band_frame, numbers), coverage
 
@@ -375,10 +393,10 @@ def _known(errors: Tensor) -> Tensor:
 def _paired(first: Coverage, coverage: Coverage, region: Region, height: str) -> Estimate | None:
     """The first setting over the instants of another; None of numbers of another definition, or of other instants."""
     own, against = (each.estimate(region, height) for each in (coverage, first))
-    if first.measure != coverage.measure or len(own.steps) > len(against.steps):
+    if first.average != coverage.average or len(own.frame_counts) > len(against.frame_counts):
         return None
-    against = against.after(len(own.steps))
-    return against if against.steps.tolist() == own.steps.tolist() else None
+    against = against.truncate_blocks(len(own.frame_counts))
+    return against if against.frame_counts.tolist() == own.frame_counts.tolist() else None
 
 
 def measure_command_s(plan: StudyPlan) -> float:
@@ -394,7 +412,7 @@ def measure_command_s(plan: StudyPlan) -> float:
             stderr=subprocess.PIPE,
             preexec_fn=end_with_parent(),  # noqa: PLW1509  (one call of the system, no lock)
         )
-        with process, reporting_stopped([process.pid], "the command that is measured"):
+        with process, report_stopped_processes([process.pid], "the command that is measured"):
             complaints = process.communicate()[1]
     if process.returncode:
         raise ValueError(f"torchcover {' '.join(words)} ended with {process.returncode}: {complaints.strip()}")

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from itertools import groupby
 from typing import Any
 
-from torchcover.coverage import Coverage, Region, shown_places
+from torchcover.coverage import Coverage, Region, list_region_bands
 from torchcover.estimation import ROUND_OFF, ErrorModel
 from torchcover.evaluation.observers import Observer
 from torchcover.report import to_json_record
@@ -88,7 +88,7 @@ class ConvergenceStatus:
     Args:
         rig: Whose number, or `B minus A` for a difference.
         region: Name of the region.
-        height: Name of the height band.
+        band: Name of the height band.
         quantity: As in the columns of `summary.csv`.
         error: Standard error now, in metres or as a share; NaN if there are not enough steps.
         target: What is good enough.
@@ -97,7 +97,7 @@ class ConvergenceStatus:
 
     rig: str
     region: str
-    height: str
+    band: str
     quantity: str
     error: float
     target: float
@@ -122,7 +122,7 @@ class ConvergenceStatus:
             MIN_STEPS,
             self.num_frames
             if self.is_reached
-            else ErrorModel.of(self.error, self.num_frames).steps_for(self.target) or 0,
+            else ErrorModel.from_error(self.error, self.num_frames).estimate_num_frames(self.target) or 0,
         )
 
     @property
@@ -145,17 +145,17 @@ def compute_convergence(
     """
     (first_name, first), *_ = coverages.items()
     found = []
-    for region, height in shown_places(regions, first.grid):
+    for region, height in list_region_bands(regions, first.grid):
         estimates = {name: coverage.estimate(region, height) for name, coverage in coverages.items()}
         others = [name for name in estimates if name != first_name]
-        paired = {f"{name} minus {first_name}": estimates[name].minus(estimates[first_name]) for name in others}
+        paired = {f"{name} minus {first_name}": estimates[name].subtract(estimates[first_name]) for name in others}
         for name, estimate in (estimates | paired).items():
             numbers = zip(first.quantities, estimate.value.tolist(), estimate.error.tolist(), strict=True)
             for quantity, value, error in numbers:
                 good = target.radius_m if quantity.unit == "m" else target.detection
                 if good is not None and not math.isnan(value):
                     where = (name, region.name, height, quantity.key)
-                    found.append(ConvergenceStatus(*where, error, good, first.counts["frames"]))
+                    found.append(ConvergenceStatus(*where, error, good, first.counts["num_frames"]))
     return found
 
 
@@ -238,11 +238,11 @@ def summarize_target_error(
     if target is None:
         return None, []
     found, first = compute_convergence(target, coverages, regions), next(iter(coverages.values()))
-    blank = [f"{row.region} {row.height}" for row in first.summary(regions) if not row.observed_cells]
-    lines = _lines(found, first.counts["frames"], confirmed=is_confirmed)
+    blank = [f"{row.region} {row.band}" for row in first.summary(regions) if not row.observed_cells]
+    lines = _lines(found, first.counts["num_frames"], confirmed=is_confirmed)
     if blank:
         lines.append(f"Not waited for, as no cell of it is known: {', '.join(blank)}.")
-    if alike := [f"{one.region} {one.height}, {one.quantity} of {one.rig}" for one in found if one.error <= ROUND_OFF]:
+    if alike := [f"{one.region} {one.band}, {one.quantity} of {one.rig}" for one in found if one.error <= ROUND_OFF]:
         lines.append(f"Not waited for, as all steps say the same, which proves nothing: {'; '.join(alike)}.")
     return {**_record(target, found), "reached": is_confirmed, "unknown": blank}, lines
 
@@ -271,7 +271,7 @@ def _lines(found: Sequence[ConvergenceStatus], steps: int, *, confirmed: bool) -
     if all(standing.is_reached for standing in found):
         return [f"{after}: every error is small enough now, but was not at two looks in a row; take more steps."]
     lines = [f"{after}; the largest of each region:"]
-    for (region, height), group in groupby(found, key=lambda standing: (standing.region, standing.height)):
+    for (region, height), group in groupby(found, key=lambda standing: (standing.region, standing.band)):
         worst = max(group, key=lambda standing: standing.excess)
         where = f"  {region} {height}, {worst.quantity} of {worst.rig}"
         if worst.frames_needed is None:

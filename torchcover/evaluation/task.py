@@ -18,7 +18,7 @@ from torchcover.evaluation.config import DESCRIPTIONS
 from torchcover.evaluation.observers import AnyObserver
 from torchcover.evaluation.progress import show_wait
 from torchcover.evaluation.settings import DEFAULT_STEPS, MAX_STEPS, Settings
-from torchcover.frames import ChosenRigs, FrameSource
+from torchcover.frames import FrameSource, RigSubset
 from torchcover.recordings import RecordedFrames, open_recording
 from torchcover.simulation import (
     Asked,
@@ -138,7 +138,7 @@ def build_task(settings: Settings) -> Task[FrameSource]:
         )
     if settings.skip_bad_frames and isinstance(source, RecordedFrames):
         source.skip_unreadable_sweeps()
-    for doubt in source.doubts(settings.num_frames):
+    for doubt in source.check(settings.num_frames):
         warnings.warn(doubt, stacklevel=CALLER)
     return _recording(source, settings)
 
@@ -236,7 +236,7 @@ def _recording(frames: FrameSource, settings: Settings) -> Task[FrameSource]:
     rigs = settings.rigs
     names = make_rig_names(rigs or list(frames.rigs))
     only_one = len(names) == len(frames.rigs) == 1  # which goes by any name
-    chosen = ChosenRigs(frames, dict(zip(names, frames.rigs if only_one else names, strict=True)))
+    chosen = RigSubset(frames, dict(zip(names, frames.rigs if only_one else names, strict=True)))
     named = dict(zip(names, rigs, strict=True)) if rigs else {}
     given = {name: format_rig_source(named[name]) if named else None for name in names}
     # A name that is in the recording may be a name only; any other has to be that of a rig.
@@ -353,11 +353,11 @@ def build_run_identity(
 def _asked(asked: Asked) -> dict[str, object]:
     grid = asked.grid
     return {
-        "cell_m": grid.cell,
-        "grid": [grid.x, grid.y],
+        "cell_m": grid.cell_m,
+        "grid": [grid.x_m, grid.y_m],
         "heights": list(grid.heights.items()),
         "band_frame": grid.band_frame,
-        "regions": [[region.name, region.x, region.y, region.corners_m] for region in asked.regions],
+        "regions": [[region.name, region.x_m, region.y_m, region.corners_m] for region in asked.regions],
     }
 
 

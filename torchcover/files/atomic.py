@@ -25,7 +25,7 @@ TEMPORARY = ".torchcover_"  # prefix of temporary directories
 _locked: set[Path] = set()  # folders that this process has locked
 
 
-def refuse_links(path: Path) -> None:
+def reject_links(path: Path) -> None:
     """Raise a ValueError if a path is or leads through a symbolic link, except links in the root folder."""
     for place in (path, *path.parents):
         if place.is_symlink() and len(place.absolute().parts) > 2:
@@ -40,10 +40,10 @@ def lock_folder(folder: Path) -> Iterator[None]:
     """
     import fcntl
 
-    refuse_links(folder)
+    reject_links(folder)
     for name in {name.partition("/")[0] for name in (read_manifest(folder / SUMMARY) or {"files": ()})["files"]}:
         if (folder / name).is_symlink():
-            refuse_links(folder / name)
+            reject_links(folder / name)
     if (key := folder.resolve()) in _locked:
         yield
         return
@@ -121,7 +121,7 @@ def _is_entry(name: str, entry: object) -> bool:
     return is_within and isinstance(entry, dict) and isinstance(entry.get("bytes"), int)
 
 
-def matches_entry(path: Path, entry: Mapping[str, Any]) -> bool:
+def is_unchanged(path: Path, entry: Mapping[str, Any]) -> bool:
     """Return whether a path is a regular file with the listed size and, where one is listed, SHA-256."""
     try:
         status = path.lstat()
@@ -139,7 +139,7 @@ def find_changed(folder: Path, files: Mapping[str, Mapping[str, Any]]) -> list[s
     return [name for name, size_bytes in sizes.items() if size_bytes != files[name]["bytes"]]
 
 
-def check_listed(path: Path) -> None:
+def check_manifest_entry(path: Path) -> None:
     """Refuse a file of a result whose manifest lists another content, or that was not written to its end.
 
     A YAML document may have been edited on purpose, which is a warning.
@@ -151,7 +151,7 @@ def check_listed(path: Path) -> None:
         entry = manifest["files"].get(name) if manifest else None
         if manifest and manifest.get(WRITING) and (entry is not None or name == SUMMARY):
             raise ValueError(f"an incomplete result: the process that wrote {folder} was ended; run it again")
-        if entry is None or matches_entry(path, entry):
+        if entry is None or is_unchanged(path, entry):
             continue
         if path.suffix != ".yaml":
             raise ValueError(
@@ -173,7 +173,7 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
         ...     write_atomically(Path(folder, "a.txt"), lambda path: path.write_text("content"))
         ...     assert Path(folder, "a.txt").read_text() == "content"
     """
-    refuse_links(path)
+    reject_links(path)
     with _name_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(prefix=TEMPORARY, dir=path.parent, ignore_cleanup_errors=True) as temporary:
@@ -233,9 +233,9 @@ class AtomicOutput:
         """Move the files to their names, then the manifest with the record; more may be added and published."""
         manifest, earlier = self.folder / self._manifest, read_manifest(self.folder / self._manifest)
         listed = earlier["files"] if earlier else {}
-        outdated = [name for name in listed.keys() - self._files if matches_entry(self.folder / name, listed[name])]
+        outdated = [name for name in listed.keys() - self._files if is_unchanged(self.folder / name, listed[name])]
         for path in (self.folder / name for name in (*self._pending, *outdated, self._manifest)):
-            refuse_links(path)
+            reject_links(path)
             path.parent.mkdir(parents=True, exist_ok=True)
             if path.is_dir():
                 raise IsADirectoryError(errno.EISDIR, "a folder in the place of a file", str(path))

@@ -10,12 +10,12 @@ from typing import Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 
-from torchcover.files.atomic import check_listed
+from torchcover.files.atomic import check_manifest_entry
 
 Arguments = ParamSpec("Arguments")
 Content = TypeVar("Content")
 Reader = Callable[Concatenate[Path, Arguments], Content]
-Door = Callable[Concatenate[str | os.PathLike[str], Arguments], Content]
+GuardedReader = Callable[Concatenate[str | os.PathLike[str], Arguments], Content]
 
 common_link_roots: list[Path] = []  # folders that links in any recording may lead to
 _link_roots: dict[Path, list[Path]] = {}  # folders that links in each recording may lead to
@@ -40,7 +40,7 @@ class BadFileError(ValueError):
     """
 
 
-def reads(content: str) -> Callable[[Reader[Arguments, Content]], Door[Arguments, Content]]:
+def guard_reader(content: str) -> Callable[[Reader[Arguments, Content]], GuardedReader[Arguments, Content]]:
     """Make a function the door through which one kind of file is read.
 
     The function gets the path of a regular file that is not empty. It says what is wrong as a ValueError that does not
@@ -69,14 +69,14 @@ def reads(content: str) -> Callable[[Reader[Arguments, Content]], Door[Arguments
         7.5
     """
 
-    def decorate(read: Reader[Arguments, Content]) -> Door[Arguments, Content]:
+    def decorate(read: Reader[Arguments, Content]) -> GuardedReader[Arguments, Content]:
         @wraps(read)
         def door(path: str | os.PathLike[str], *args: Arguments.args, **kwargs: Arguments.kwargs) -> Content:
             path = Path(path)
             # Numbers of damaged files overflow; what they become is infinite or NaN, and judged as such.
-            with naming(path, content), np.errstate(all="ignore"):
+            with report_bad_file(path, content), np.errstate(all="ignore"):
                 check_regular(path, content)
-                check_listed(path)
+                check_manifest_entry(path)
                 return read(path, *args, **kwargs)
 
         return door  # type: ignore[return-value]  # which would have the path without a name
@@ -85,7 +85,7 @@ def reads(content: str) -> Callable[[Reader[Arguments, Content]], Door[Arguments
 
 
 @contextmanager
-def naming(path: Path, content: str) -> Iterator[None]:
+def report_bad_file(path: Path, content: str) -> Iterator[None]:
     """Turn whatever goes wrong into a `BadFileError` that names the file; a missing one, a folder and a package aside.
 
     `path`: the file, or the folder of several; `content`: what it is meant to be.
@@ -97,7 +97,7 @@ def naming(path: Path, content: str) -> Iterator[None]:
     except MemoryError as error:
         raise BadFileError(
             f"{path}: there is not enough memory to read {content} of this size: use a smaller one, or set the "
-            f"environment variable {VARIABLE} above {said_gb(VARIABLE, DEFAULT_GB):g}"
+            f"environment variable {VARIABLE} above {read_limit_gb(VARIABLE, DEFAULT_GB):g}"
         ) from error
     except Exception as error:
         reason = " ".join(str(error).split())[:MAX_REASON_CHARS] or type(error).__name__
@@ -152,7 +152,7 @@ def check_memory(needed_bytes: int) -> None:
     Example:
         >>> check_memory(16 * 100_000)  # a scan
     """
-    allowed_gb = said_gb(VARIABLE, DEFAULT_GB)
+    allowed_gb = read_limit_gb(VARIABLE, DEFAULT_GB)
     if needed_bytes > allowed_gb * 1e9:
         needed_gb = f"{needed_bytes / 1e9:.3g}" if needed_bytes < 10**300 else "endless"
         raise TooLargeError(
@@ -161,24 +161,24 @@ def check_memory(needed_bytes: int) -> None:
         )
 
 
-def most_gb() -> float:
+def find_memory_limit_gb() -> float:
     """What a process of its own may take that reads a file: beside what a file may take, its libraries."""
-    return said_gb(VARIABLE, DEFAULT_GB) + LIBRARIES_GB
+    return read_limit_gb(VARIABLE, DEFAULT_GB) + LIBRARIES_GB
 
 
-def said_gb(variable: str, usual_gb: float) -> float:
+def read_limit_gb(variable: str, default_gb: float) -> float:
     """Gigabytes that an environment variable says, or what is usual without it.
 
     ValueError: it is no number of at least 0.
     """
-    given = os.environ.get(variable, usual_gb)
+    given = os.environ.get(variable, default_gb)
     with suppress(ValueError):
         if (limit_gb := float(given)) >= 0:
             return limit_gb
     raise ValueError(f"the environment variable {variable} has to be a number of gigabytes; got {given!r}")
 
 
-def decode(data: bytes) -> str:
+def decode_utf8(data: bytes) -> str:
     """Decode UTF-8, with or without a byte order mark. ValueError: not UTF-8."""
     try:
         return data.decode("utf-8-sig")
@@ -191,4 +191,4 @@ def read_short_text(path: Path) -> str:
     size_bytes = path.stat().st_size
     if size_bytes > MAX_SHORT_BYTES:
         raise ValueError(f"{size_bytes} bytes; at most {MAX_SHORT_BYTES} are read of such a file")
-    return decode(path.read_bytes())
+    return decode_utf8(path.read_bytes())

@@ -11,7 +11,7 @@ import yaml
 from yaml.constructor import ConstructorError
 from yaml.nodes import MappingNode, Node, ScalarNode
 
-from torchcover.files.bad_file import check_memory, decode
+from torchcover.files.bad_file import check_memory, decode_utf8
 
 # Far above what people write, and read in seconds.
 MAX_CHARACTERS = 1_000_000
@@ -71,7 +71,7 @@ def parse_yaml_stream(text: str) -> list[Any]:
     return [document for document in documents if document is not None]
 
 
-def builtin_folder(kind: str) -> Path:
+def get_builtin_folder(kind: str) -> Path:
     """Where the built-in documents of a kind lie.
 
     Args:
@@ -84,17 +84,19 @@ def builtin_folder(kind: str) -> Path:
 
 
 @cache
-def road_user_classes() -> Mapping[str, Mapping[str, Any]]:
+def load_road_user_classes() -> Mapping[str, Mapping[str, Any]]:
     """What is said of road users by words of recordings, and by classes."""
-    found: dict[str, dict[str, Any]] = parse_yaml((builtin_folder("road_users") / "classes.yaml").read_text("utf-8"))
+    found: dict[str, dict[str, Any]] = parse_yaml(
+        (get_builtin_folder("road_users") / "classes.yaml").read_text("utf-8")
+    )
     return found
 
 
-def as_yaml(content: Mapping[str, Any]) -> str:
+def to_yaml(content: Mapping[str, Any]) -> str:
     """What `parse_yaml` reads as a mapping of plain values: keys in their order, short lists and mappings in one line.
 
     Example:
-        >>> print(as_yaml({"name": "roof", "mount": {"x_m": 0.5}}), end="")
+        >>> print(to_yaml({"name": "roof", "mount": {"x_m": 0.5}}), end="")
         name: roof
         mount: {x_m: 0.5}
     """
@@ -207,7 +209,7 @@ def parse_xml(path: Path) -> ElementTree.Element:
     ValueError: not XML in UTF-8, it declares entities, or its tree would not fit into memory.
     """
     check_memory(TREE_PER_BYTE * path.stat().st_size)
-    text = decode(path.read_bytes())
+    text = decode_utf8(path.read_bytes())
     if "<!ENTITY" in text:
         raise ValueError("an XML file without entities is needed")
     return ElementTree.fromstring(text)  # which resolves nothing that lies outside

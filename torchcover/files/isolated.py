@@ -23,8 +23,14 @@ from typing import Any, Concatenate, ParamSpec
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.files.bad_file import LIBRARIES_GB, VARIABLE, BadFileError, check_memory, most_gb
-from torchcover.files.processes import end_with_parent, is_stopped, limit, reporting_stopped, used_bytes
+from torchcover.files.bad_file import LIBRARIES_GB, VARIABLE, BadFileError, check_memory, find_memory_limit_gb
+from torchcover.files.processes import (
+    end_with_parent,
+    get_used_bytes,
+    is_stopped,
+    limit_resources,
+    report_stopped_processes,
+)
 
 Arguments = ParamSpec("Arguments")
 Arrays = dict[str, NDArray[Any]]
@@ -35,10 +41,10 @@ MOST_S = 60.0
 BYTES_PER_S = 1e6
 KNOWN_ERRORS = {kind.__name__: kind for kind in (BadFileError, ValueError, MemoryError, ImportError, FileNotFoundError)}
 # The same modules as here, whatever folder this one was started in.
-PROGRAM = "import sys; sys.path[:] = {path!r}; from torchcover.files.isolated import serve; serve()"
+PROGRAM = "import sys; sys.path[:] = {path!r}; from torchcover.files.isolated import serve_requests; serve_requests()"
 
 
-def apart(read: Reader[Arguments]) -> Reader[Arguments]:
+def run_isolated(read: Reader[Arguments]) -> Reader[Arguments]:
     """Let a function of a module without torch do its work in the process for such files.
 
     Args:
@@ -78,7 +84,7 @@ class _Process:
             )
 
     def ask(self, request: list[Any], limit_s: float) -> Arrays:
-        with self.lock, reporting_stopped([self.popen.pid], "the process that reads files"):
+        with self.lock, report_stopped_processes([self.popen.pid], "the process that reads files"):
             try:
                 self._connection.send_bytes(json.dumps(request).encode())
                 answer, arrays = _receive(self._connection, limit_s)
@@ -130,7 +136,7 @@ def _own_process() -> _Process:
         return found
 
 
-def serve() -> None:
+def serve_requests() -> None:
     """What the process does: answer until nobody asks."""
     connection = Connection(0)
     with suppress(EOFError):
@@ -138,7 +144,7 @@ def serve() -> None:
             allowed_gb, module, name, path, *args = json.loads(connection.recv_bytes())
             os.environ.pop(VARIABLE, None)
             os.environ |= {} if allowed_gb is None else {VARIABLE: allowed_gb}
-            limit(most_gb())
+            limit_resources(find_memory_limit_gb())
             error, arrays = None, Arrays()
             try:
                 read = unwrap(getattr(import_module(module), name))  # or it would ask another process
@@ -153,7 +159,7 @@ def serve() -> None:
                 for array in arrays.values():
                     pipe.write(array.reshape(-1).view(np.uint8).data)
             del arrays
-            if used_bytes() > LIBRARIES_GB * 1e9:  # or what is kept of one file would add to the next one's
+            if get_used_bytes() > LIBRARIES_GB * 1e9:  # or what is kept of one file would add to the next one's
                 os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
 
 

@@ -27,11 +27,11 @@ _prctl = ctypes.CDLL(None).prctl if sys.platform == "linux" else None
 
 
 def end_with_parent(
-    memory_gb: float = math.inf, cpu_s: float = math.inf, *, writes: bool = True
+    memory_gb: float = math.inf, cpu_s: float = math.inf, *, can_write: bool = True
 ) -> Callable[..., None] | None:
     """What a process that this one starts has to call first, to be killed when this one ends, however that ends.
 
-    `memory_gb`: what it may take in all; `writes`: whether it may write files. Returns for the `preexec_fn` of
+    `memory_gb`: what it may take in all; `can_write`: whether it may write files. Returns for the `preexec_fn` of
     `subprocess` and the `worker_init_fn` of a `DataLoader`; None where the system, any but Linux, cannot do so.
 
     Example:
@@ -39,7 +39,7 @@ def end_with_parent(
         >>> subprocess.run([sys.executable, "-c", ""], preexec_fn=end_with_parent()).returncode
         0
     """
-    return partial(_end_with, os.getpid(), memory_gb, cpu_s, writes) if _prctl else None
+    return partial(_end_with, os.getpid(), memory_gb, cpu_s, can_write) if _prctl else None
 
 
 def is_stopped(pid: int) -> bool:
@@ -57,13 +57,13 @@ def is_stopped(pid: int) -> bool:
 
 
 @contextmanager
-def reporting_stopped(pids: Collection[int], role: str, look_every_s: float = 5.0) -> Iterator[None]:
+def report_stopped_processes(pids: Collection[int], role: str, poll_interval_s: float = 5.0) -> Iterator[None]:
     """Warn about processes that this one waits for, and that someone has stopped: nothing else would end the silence.
 
     Args:
         pids: Process numbers.
         role: What they are, for the warning: "a worker".
-        look_every_s: Seconds between two looks; a process that is stopped at two of them in a row is reported, so that
+        poll_interval_s: Seconds between two looks; a process that is stopped at two of them in a row is reported, so that
             Ctrl-Z and `fg`, which stop and continue all processes of a command, are not.
     """
     if not pids:
@@ -73,7 +73,7 @@ def reporting_stopped(pids: Collection[int], role: str, look_every_s: float = 5.
 
     def watch() -> None:
         looks = dict.fromkeys(pids, 0)
-        while not ended.wait(look_every_s):
+        while not ended.wait(poll_interval_s):
             for pid in pids:
                 looks[pid] = looks[pid] + 1 if is_stopped(pid) else 0
                 if looks[pid] == 2:
@@ -93,7 +93,7 @@ def reporting_stopped(pids: Collection[int], role: str, look_every_s: float = 5.
         watcher.join()
 
 
-def limit(memory_gb: float) -> None:
+def limit_resources(memory_gb: float) -> None:
     """Limit what this process may take from now on: memory beyond what it has, files that are open; and write none."""
     if resource is not None:
         now_bytes = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
@@ -103,7 +103,7 @@ def limit(memory_gb: float) -> None:
         _lower(resource.RLIMIT_FSIZE, 0)
 
 
-def used_bytes() -> int:
+def get_used_bytes() -> int:
     """Return the resident memory of this process; 0 where the system, any but Linux, does not say it."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() if resource else 0
 

@@ -16,7 +16,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.files.bad_file import check_memory, decode, reads
+from torchcover.files.bad_file import check_memory, decode_utf8, guard_reader
 
 # Of terminals: control characters, and marks that turn the direction of what follows. Lines and tabs may stay.
 CONTROLS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -27,7 +27,7 @@ NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?(e[+-]?\d+)?|inf)", re.IGNORECASE)
 QUOTE = "'"
 
 
-def shown(text: str) -> str:
+def escape_control_chars(text: str) -> str:
     r"""Text whose control characters are written out.
 
     Example:
@@ -37,18 +37,18 @@ def shown(text: str) -> str:
     return CONTROLS.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
-def as_cell(value: object) -> object:
+def escape_cell(value: object) -> object:
     """A value as a cell of a spreadsheet: text that begins like a formula begins with a quote, numbers stay.
 
     Example:
-        >>> as_cell("=1+1"), as_cell(-1.5)
+        >>> escape_cell("=1+1"), escape_cell(-1.5)
         ("'=1+1", -1.5)
     """
-    return f"{QUOTE * _is_formula(value)}{shown(value)}" if isinstance(value, str) else value
+    return f"{QUOTE * _is_formula(value)}{escape_control_chars(value)}" if isinstance(value, str) else value
 
 
-def of_cell(text: str) -> str:
-    """The text that `as_cell` made a cell of."""
+def unescape_cell(text: str) -> str:
+    """The text that `escape_cell` made a cell of."""
     return text[1:] if text[:1] == QUOTE and _is_formula(text[1:]) else text
 
 
@@ -61,15 +61,18 @@ BYTES_PER_BYTE = 20
 
 
 class CsvTable(NamedTuple):
-    """Columns of a table by name: `numbers` (N,) float64, finite, and `words`, N of them each."""
+    """Columns of a table by name: `numbers` (N,) float64, finite, and `texts`, N of them each."""
 
     numbers: dict[str, NDArray[np.float64]]
-    words: dict[str, list[str]]
+    texts: dict[str, list[str]]
 
 
-@reads("a table in CSV")
+@guard_reader("a table in CSV")
 def read_csv(
-    path: Path, numbers: Sequence[str], words: Sequence[str] = (), optional: Sequence[str] | None = ()
+    path: Path,
+    number_columns: Sequence[str],
+    text_columns: Sequence[str] = (),
+    optional_columns: Sequence[str] | None = (),
 ) -> CsvTable:
     """Read a table whose first line names its columns, of numbers or of any words, in any order.
 
@@ -77,10 +80,10 @@ def read_csv(
     that are missing, doubled or unknown, a row of another width, or what is no finite number; it names line and column.
     """
     check_memory(BYTES_PER_BYTE * path.stat().st_size)
-    rows = _rows(decode(path.read_bytes()))
+    rows = _rows(decode_utf8(path.read_bytes()))
     _, header = next(rows, (0, []))
     names = [name.strip() for name in header]
-    _check_names(names, (*words, *numbers), optional)
+    _check_names(names, (*text_columns, *number_columns), optional_columns)
     lines, table = [], []
     for line, row in rows:
         if len(row) != len(names):
@@ -89,15 +92,19 @@ def read_csv(
         table.append(row)
     columns = dict(zip(names, zip(*table, strict=True) if table else [()] * len(names), strict=True))
     return CsvTable(
-        {name: _finite(name, columns[name], lines) for name in (*numbers, *(optional or ())) if name in columns},
-        {name: [of_cell(word.strip()) for word in columns[name]] for name in words},
+        {
+            name: _finite(name, columns[name], lines)
+            for name in (*number_columns, *(optional_columns or ()))
+            if name in columns
+        },
+        {name: [unescape_cell(word.strip()) for word in columns[name]] for name in text_columns},
     )
 
 
-def csv_text(rows: Iterable[Iterable[object]]) -> str:
+def format_csv(rows: Iterable[Iterable[object]]) -> str:
     """Rows as CSV; an empty field for None and NaN, infinity is `inf`, and text is safe to show in a spreadsheet."""
     text = io.StringIO()
-    cells = (["" if value != value else as_cell(value) for value in row] for row in rows)
+    cells = (["" if value != value else escape_cell(value) for value in row] for row in rows)
     csv.writer(text, lineterminator="\n").writerows(cells)
     return text.getvalue()
 
@@ -150,18 +157,18 @@ class JsonTable(NamedTuple):
     rows: list[dict[str, Any]]
     by_token: dict[str, dict[str, Any]]
 
-    def row(self, token: str) -> dict[str, Any]:
+    def get_row(self, token: str) -> dict[str, Any]:
         """The row of a token."""
         if token not in self.by_token:
             raise ValueError(f"{self.path}: no row has the token {str(token)[:40]!r}, which another table names")
         return self.by_token[token]
 
 
-@reads("a table of rows")
+@guard_reader("a table of rows")
 def read_json_table(path: Path) -> JsonTable:
     """Read a JSON list of objects. BadFileError: another content."""
     check_memory(OBJECTS_PER_BYTE * path.stat().st_size)
-    rows = json.loads(decode(path.read_bytes()))
+    rows = json.loads(decode_utf8(path.read_bytes()))
     if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
         raise ValueError(f"a list of objects is needed; got {type(rows).__name__}")
     return JsonTable(path, rows, {row["token"]: row for row in rows if "token" in row})
@@ -181,9 +188,9 @@ class NpyHeader(NamedTuple):
     dtype: np.dtype[Any]
 
 
-def check_kind(kinds: str, header: NpyHeader) -> None:
+def check_dtype_kind(allowed_kinds: str, header: NpyHeader) -> None:
     """Raise unless an array is of one of these kinds, by their letters in `numpy.dtype.kind`."""
-    if header.dtype.kind not in kinds:
+    if header.dtype.kind not in allowed_kinds:
         raise ValueError(f"an array of {header.dtype}")
 
 
@@ -199,9 +206,9 @@ def read_npy(path: Path, check: Callable[[NpyHeader], None]) -> NDArray[Any]:
 def read_npz(
     path: Path,
     check: Callable[[NpyHeader], None],
-    choose: Callable[[Collection[str]], Collection[str]] = lambda names: names,
+    select_names: Callable[[Collection[str]], Collection[str]] = lambda names: names,
 ) -> dict[str, NDArray[Any]]:
-    """Read arrays of a `.npz` by name, compressed or not; those that `choose` returns of all names, else all.
+    """Read arrays of a `.npz` by name, compressed or not; those that `select_names` returns of all names, else all.
 
     `check` gets each header before memory is reserved, and raises ValueError if it is not what is needed. ValueError:
     not such an archive, a damaged one, or one that grows beyond what a file may take.
@@ -213,7 +220,7 @@ def read_npz(
             members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
             if len(members) < len(archive.infolist()):
                 raise ValueError("two arrays of one name")
-            wanted = {name: members[name] for name in choose(members)}
+            wanted = {name: members[name] for name in select_names(members)}
             for member in wanted.values():
                 _check_growth(member)
             check_memory(sum(member.file_size for member in wanted.values()))
@@ -227,7 +234,7 @@ def read_npz(
         raise ValueError(f"not a readable .npz archive ({str(error)[:100]})") from error
 
 
-def npz_headers(path: Path) -> dict[str, NpyHeader]:
+def read_npz_headers(path: Path) -> dict[str, NpyHeader]:
     """What the arrays of a `.npz` are, unread; members that are no arrays are left out.
 
     ValueError: not such an archive, or a damaged one.

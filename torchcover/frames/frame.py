@@ -11,11 +11,11 @@ from torch import Tensor
 
 from torchcover.coverage.grid import BandFrame
 from torchcover.detection.boxes import Boxes
-from torchcover.devices import move
-from torchcover.notebooks import brief
+from torchcover.devices import move_tensor
+from torchcover.notebooks import format_short_repr
 
 
-class Measured(NamedTuple):
+class Measurement(NamedTuple):
     """What sensors that err made of the points of a rig.
 
     Args:
@@ -36,7 +36,7 @@ class Frame:
 
     Args:
         clouds: Name of each rig -> (N, 3) float32 points of all its sensors, where they truly are; one rig, unless
-            several were simulated side by side. Of a recording only `landed` is known, and stands for it.
+            several were simulated side by side. Of a recording only `get_measured_points` is known, and stands for it.
         reference: (M, 3) float32 points of the reference sensor.
         index: Position in its dataset.
         name: What a user calls it: a file stem, or scenario and step.
@@ -46,11 +46,11 @@ class Frame:
         reference_heights_m: (M,) float32 heights of the reference points above the local ground, NaN where there is
             none at or below; None if they are unknown: then height bands are those of the vehicle frame.
         boxes: The objects of that instant; None if they are unknown, which is not the same as none being there.
-        sensor_points: Name of each rig -> name of each of its sensors -> how many of the rig's points are its own, in
+        sensor_point_counts: Name of each rig -> name of each of its sensors -> how many of the rig's points are its own, in
             their order; None if it is unknown which points are whose.
         block_index: Number of what it shows, for standard errors: frames that share it, as of an instant that is
             seen again or of one city, do not count as independent. Not given: `index`, every frame is its own.
-        measured: Name of a rig -> what its sensors made of its points, if they err; the others land where they are.
+        measurements: Name of a rig -> what its sensors made of its points, if they err; the others land where they are.
     """
 
     clouds: Mapping[str, Tensor]
@@ -61,19 +61,19 @@ class Frame:
     reference_weights: Tensor | None = None
     boxes: Boxes | None = None
     block_index: int = None  # type: ignore[assignment]  # filled in at once
-    sensor_points: Mapping[str, Mapping[str, int]] | None = None
+    sensor_point_counts: Mapping[str, Mapping[str, int]] | None = None
     reference_heights_m: Tensor | None = None
-    measured: Mapping[str, Measured] = field(default_factory=dict)
+    measurements: Mapping[str, Measurement] = field(default_factory=dict)
 
-    __repr__ = brief
+    __repr__ = format_short_repr
 
     def __post_init__(self) -> None:
         # Plain numbers: those of NumPy would not be equal to them as text, nor load with `weights_only=True`.
         for name in ("index", "block_index"):
             number = getattr(self, name)
             object.__setattr__(self, name, self.index if number is None else operator.index(number))
-        for rig in self.measured.keys() & self.clouds.keys():
-            sizes = [len(self.clouds[rig]), *map(len, self.measured[rig])]
+        for rig in self.measurements.keys() & self.clouds.keys():
+            sizes = [len(self.clouds[rig]), *map(len, self.measurements[rig])]
             if len(set(sizes)) > 1:
                 raise ValueError(
                     f"frame {self.name!r}: {rig!r} has {sizes[0]} points, {sizes[1]} that were measured and {sizes[2]} "
@@ -87,38 +87,42 @@ class Frame:
         Raises:
             ValueError: There are several rigs: say which, `frame.cloud_of(name)`.
         """
-        return self.cloud_of()
+        return self.get_cloud()
 
-    def cloud_of(self, rig: str | None = None, *, within_m: float = math.inf) -> Tensor:
+    def get_cloud(self, rig_name: str | None = None, *, max_error_m: float = math.inf) -> Tensor:
         """(N, 3) points of one rig, where they truly are.
 
         Args:
-            rig: Which of several rigs; the only one if not given.
-            within_m: Only those that were measured with no larger error.
+            rig_name: Which of several rigs; the only one if not given.
+            max_error_m: Only those that were measured with no larger error.
 
         Raises:
             ValueError: The frame has no such rig, or several, and none was named.
         """
-        rig = self._named(rig)
-        cloud = self.clouds[rig]
-        return cloud[self._is_within(rig, within_m)] if rig in self.measured and within_m < math.inf else cloud
+        rig_name = self._named(rig_name)
+        cloud = self.clouds[rig_name]
+        return (
+            cloud[self._is_within(rig_name, max_error_m)]
+            if rig_name in self.measurements and max_error_m < math.inf
+            else cloud
+        )
 
-    def error_of(self, rig: str | None = None) -> Tensor | None:
+    def get_errors_m(self, rig_name: str | None = None) -> Tensor | None:
         """(N,) how far off the points of one rig were measured, along their rays; None if where they are.
 
-        It takes and refuses a `rig` as `cloud_of` does.
+        It takes and refuses a `rig_name` as `get_cloud` does.
         """
-        rig = self._named(rig)
-        return self.measured[rig].error_m if rig in self.measured else None
+        rig_name = self._named(rig_name)
+        return self.measurements[rig_name].error_m if rig_name in self.measurements else None
 
-    def landed(self, rig: str | None = None) -> Tensor:
+    def get_measured_points(self, rig_name: str | None = None) -> Tensor:
         """(N, 3) points of one rig as they were measured: what a network is fed with, or a file holds.
 
         Args:
-            rig: Which of several rigs; the only one if not given.
+            rig_name: Which of several rigs; the only one if not given.
 
         Raises:
-            ValueError: As `cloud_of`.
+            ValueError: As `get_cloud`.
 
         Example:
             >>> true, off = torch.tensor([[5.0, 0.0, 0.0]]), torch.tensor([[5.1, 0.0, 0.0]])
@@ -127,8 +131,8 @@ class Frame:
             >>> frame.landed() is off, frame.cloud_of(within_m=0.4), len(frame.cloud_of(within_m=0.05))
             (True, tensor([[5., 0., 0.]]), 0)
         """
-        rig = self._named(rig)
-        return self.measured[rig].points if rig in self.measured else self.clouds[rig]
+        rig_name = self._named(rig_name)
+        return self.measurements[rig_name].points if rig_name in self.measurements else self.clouds[rig_name]
 
     def _named(self, rig: str | None) -> str:
         if rig is None and len(self.clouds) != 1:
@@ -138,30 +142,30 @@ class Frame:
         return next(iter(self.clouds)) if rig is None else rig
 
     def _is_within(self, rig: str, within_m: float) -> Tensor:
-        return self.measured[rig].error_m.abs() <= within_m
+        return self.measurements[rig].error_m.abs() <= within_m
 
-    def clouds_by_sensor(self, rig: str | None = None, *, within_m: float = math.inf) -> dict[str, Tensor]:
+    def get_clouds_by_sensor(self, rig_name: str | None = None, *, max_error_m: float = math.inf) -> dict[str, Tensor]:
         """(N, 3) points of each sensor of a rig, where they truly are.
 
         Args:
-            rig: Which of several rigs; the only one if not given.
-            within_m: As in `cloud_of`.
+            rig_name: Which of several rigs; the only one if not given.
+            max_error_m: As in `get_cloud`.
 
         Raises:
             ValueError: No such rig, or it is unknown which points are whose.
         """
-        name = self._named(rig)
-        if self.sensor_points is None or name not in self.sensor_points:
+        name = self._named(rig_name)
+        if self.sensor_point_counts is None or name not in self.sensor_point_counts:
             raise ValueError(
                 f"frame {self.name!r}: it is unknown which points of {name!r} are of which sensor (sensor_points), as "
                 "redundancy needs"
             )
-        points = self.sensor_points[name]
+        points = self.sensor_point_counts[name]
         sizes = list(points.values())
         clouds = dict(zip(points, torch.split(self.clouds[name], sizes), strict=True))
-        if name not in self.measured or within_m == math.inf:
+        if name not in self.measurements or max_error_m == math.inf:
             return clouds
-        within = torch.split(self._is_within(name, within_m), sizes)
+        within = torch.split(self._is_within(name, max_error_m), sizes)
         return {sensor: cloud[kept] for (sensor, cloud), kept in zip(clouds.items(), within, strict=True)}
 
     def pin_memory(self) -> "Frame":
@@ -170,9 +174,11 @@ class Frame:
 
     def to(self, device: torch.device | str) -> "Frame":
         """A copy on another device, in float32 where that has no float64."""
-        return self._each(lambda cloud: move(cloud, device), None if self.boxes is None else self.boxes.to(device))
+        return self._each(
+            lambda cloud: move_tensor(cloud, device), None if self.boxes is None else self.boxes.to(device)
+        )
 
-    def heights_in(self, band_frame: BandFrame) -> Tensor | None:
+    def get_heights_m(self, band_frame: BandFrame) -> Tensor | None:
         """The heights of the reference points that such height bands need: None for those over z of the vehicle.
 
         Raises:
@@ -203,7 +209,7 @@ class Frame:
             reference_weights=None if weights is None else change(weights),
             reference_heights_m=None if heights_m is None else change(heights_m),
             boxes=boxes,
-            measured={name: Measured(*map(change, measured)) for name, measured in self.measured.items()},
+            measurements={name: Measurement(*map(change, measured)) for name, measured in self.measurements.items()},
         )
 
 
@@ -228,32 +234,32 @@ class FrameBatch:
         """One (N, 3) cloud a frame, of the only rig, where its points truly are; N differs."""
         return [frame.sensor for frame in self.frames]
 
-    def clouds_of(self, rig: str | None = None) -> list[Tensor]:
+    def get_clouds(self, rig_name: str | None = None) -> list[Tensor]:
         """One (N, 3) cloud a frame, as `Frame.cloud_of`.
 
         Raises:
             ValueError: A frame has no such rig.
         """
-        return [frame.cloud_of(rig) for frame in self.frames]
+        return [frame.get_cloud(rig_name) for frame in self.frames]
 
-    def errors_of(self, rig: str | None = None) -> list[Tensor] | None:
+    def get_errors_m(self, rig_name: str | None = None) -> list[Tensor] | None:
         """One (N,) tensor a frame, as `Frame.error_of`, zeros of points that are where they were; None if all are.
 
         Raises:
             ValueError: A frame has no such rig.
         """
-        pairs = [(frame.cloud_of(rig), frame.error_of(rig)) for frame in self.frames]
+        pairs = [(frame.get_cloud(rig_name), frame.get_errors_m(rig_name)) for frame in self.frames]
         if all(error is None for _, error in pairs):
             return None
         return [cloud.new_zeros(len(cloud)) if error is None else error for cloud, error in pairs]
 
-    def landed(self, rig: str | None = None) -> list[Tensor]:
+    def get_measured_points(self, rig_name: str | None = None) -> list[Tensor]:
         """One (N, 3) cloud a frame, as `Frame.landed`.
 
         Raises:
             ValueError: A frame has no such rig.
         """
-        return [frame.landed(rig) for frame in self.frames]
+        return [frame.get_measured_points(rig_name) for frame in self.frames]
 
     @property
     def reference(self) -> list[Tensor]:
@@ -276,17 +282,17 @@ class FrameBatch:
             )
         return given or None
 
-    def heights_in(self, band_frame: BandFrame) -> list[Tensor] | None:
+    def get_heights_m(self, band_frame: BandFrame) -> list[Tensor] | None:
         """One (M,) tensor a frame, as `Frame.heights_in`; None for bands over z of the vehicle.
 
         Raises:
             ValueError: As there.
         """
-        given = [frame.heights_in(band_frame) for frame in self.frames]
+        given = [frame.get_heights_m(band_frame) for frame in self.frames]
         return [heights_m for heights_m in given if heights_m is not None] or None
 
     @property
-    def block_index(self) -> list[int]:
+    def block_indices(self) -> list[int]:
         """That of each frame."""
         return [frame.block_index for frame in self.frames]
 
@@ -306,7 +312,7 @@ class FrameBatch:
             )
         return found
 
-    def padded_boxes(self, categories: Sequence[str]) -> Tensor:
+    def pad_boxes(self, categories: Sequence[str]) -> Tensor:
         """The objects as one tensor, as OpenPCDet's detectors take them.
 
         Args:
@@ -318,21 +324,21 @@ class FrameBatch:
         """
         rows = []
         for boxes in self.boxes:
-            wanted = boxes.of_category(*categories)
+            wanted = boxes.select_categories(*categories)
             numbers = [categories.index(category) + 1 for category in wanted.categories]
             rows.append(torch.cat([wanted.rows, wanted.rows.new_tensor(numbers)[:, None]], dim=1))
         return torch.nn.utils.rnn.pad_sequence(rows, batch_first=True)
 
-    def stacked_points(self, rig: str | None = None) -> Tensor:
+    def stack_points(self, rig_name: str | None = None) -> Tensor:
         """The clouds of one rig as they landed in one tensor, as voxel and pillar encoders take them.
 
         Args:
-            rig: Which of several rigs; the only one if not given.
+            rig_name: Which of several rigs; the only one if not given.
 
         Returns:
             (points of all frames, 4): number of the frame in the batch, x, y, z.
         """
-        landed = enumerate(self.landed(rig))
+        landed = enumerate(self.get_measured_points(rig_name))
         numbered = [torch.nn.functional.pad(cloud, (1, 0), value=number) for number, cloud in landed]
         return torch.cat(numbered)
 
@@ -366,4 +372,4 @@ def collate_frames(frames: Sequence[Frame]) -> FrameBatch:
 
 
 # `torch.load` gives them back with weights_only=True, its default.
-torch.serialization.add_safe_globals([Frame, FrameBatch, Measured])
+torch.serialization.add_safe_globals([Frame, FrameBatch, Measurement])

@@ -70,7 +70,7 @@ class FrameSource(Protocol):
         """Where the frames come from, for `summary.json`: `scenario`, `vehicle` and `seed`, or `frames`; else None."""
 
     @property
-    def square_metres(self) -> bool:
+    def has_area_weights(self) -> bool:
         """Whether all frames have `Frame.reference_weights`, the square metres of reference points; else none has."""
 
     @property
@@ -88,13 +88,13 @@ class FrameSource(Protocol):
         may be a hash.
         """
 
-    def world_of(self, index: int, /) -> int:
+    def get_scene_id(self, index: int, /) -> int:
         """Which world a frame is of, by any number: frames of one are made by one process, which builds it once.
 
         The index itself where nothing has to be built, so that any process may make any frame.
         """
 
-    def block_index(self, index: int, /) -> int:
+    def get_block_index(self, index: int, /) -> int:
         """`Frame.block_index` of a frame, without making it; of a simulation beyond its last frame, too.
 
         IndexError: there is no such frame.
@@ -106,10 +106,10 @@ class FrameSource(Protocol):
     def has_heights(self) -> bool:
         """Whether frames have `Frame.reference_heights_m`: then height bands are over the ground by default."""
 
-    def ego_mesh(self) -> "Mesh | None":
+    def get_ego_mesh(self) -> "Mesh | None":
         """The body of the ego in the vehicle frame; None if unknown."""
 
-    def doubts(self, steps: int | None, /) -> Sequence[str]:
+    def check(self, num_frames: int | None, /) -> Sequence[str]:
         """What looks wrong about so many frames (None: all), a sentence each: warnings before they are measured."""
 
     def __len__(self) -> int:
@@ -119,7 +119,7 @@ class FrameSource(Protocol):
         """One frame. BadFrameError: it cannot be used; the others can."""
 
 
-def worlds_of(frames: object) -> Callable[[int], int]:
+def build_scene_lookup(frames: object) -> Callable[[int], int]:
     """`FrameSource.world_of` of any map-style dataset or list of frames.
 
     A list holds what was made before; a torch `Subset` has the worlds of what it is of.
@@ -128,7 +128,7 @@ def worlds_of(frames: object) -> Callable[[int], int]:
         TypeError: A dataset that does not say which world a frame is of.
 
     Example:
-        >>> worlds_of(["a frame", "another one"])(1)
+        >>> build_scene_lookup(["a frame", "another one"])(1)
         1
     """
     if hasattr(frames, "world_of"):
@@ -137,7 +137,7 @@ def worlds_of(frames: object) -> Callable[[int], int]:
     if isinstance(frames, Sequence):
         return int
     if hasattr(frames, "dataset") and hasattr(frames, "indices"):
-        whole, indices = worlds_of(frames.dataset), frames.indices
+        whole, indices = build_scene_lookup(frames.dataset), frames.indices
         return lambda index: whole(indices[index])
     raise TypeError(
         f"frames: {type(frames).__name__} does not say which world a frame is of, so that each process would build "
@@ -156,7 +156,7 @@ class FrameDataset(Dataset[Frame]):
         """Nothing: which points are of which sensor is unknown."""
         return {}
 
-    def block_index(self, index: int) -> int:
+    def get_block_index(self, index: int) -> int:
         """The index: no two frames are known to be alike. IndexError: there is no such frame."""
         return range(len(self))[index]
 
@@ -168,11 +168,11 @@ class FrameDataset(Dataset[Frame]):
         """None of them."""
         return False
 
-    def ego_mesh(self) -> "Mesh | None":
+    def get_ego_mesh(self) -> "Mesh | None":
         """Unknown."""
         return None
 
-    def doubts(self, steps: int | None) -> Sequence[str]:
+    def check(self, num_frames: int | None) -> Sequence[str]:
         """None."""
         return ()
 
@@ -207,28 +207,28 @@ class FrameDataset(Dataset[Frame]):
         return (self[index] for index in range(len(self)))
 
 
-class ChosenRigs(FrameDataset):
+class RigSubset(FrameDataset):
     """The same frames with the clouds of some rigs only, each under a name of one's own: a `FrameSource` of another.
 
     Args:
         frames: Where the frames come from.
-        names: New name of each rig -> its name there, in the order that is wanted.
+        source_rigs: New name of each rig -> its name there, in the order that is wanted.
 
     Raises:
         ValueError: The source has no such rig.
     """
 
-    def __init__(self, frames: FrameSource, names: Mapping[str, str]) -> None:
-        unknown = [name for name in names.values() if name not in frames.rigs]
+    def __init__(self, frames: FrameSource, source_rigs: Mapping[str, str]) -> None:
+        unknown = [name for name in source_rigs.values() if name not in frames.rigs]
         if unknown:
             raise ValueError(f"no clouds of the rig {', '.join(unknown)}; the frames have {', '.join(frames.rigs)}")
         self.frames = frames
-        self.names = dict(names)
+        self.source_rigs = dict(source_rigs)
 
     @property
     def rigs(self) -> tuple[str, ...]:
         """The new names."""
-        return tuple(self.names)
+        return tuple(self.source_rigs)
 
     @property
     def sensors(self) -> Mapping[str, "Sequence[Sensor]"]:
@@ -245,13 +245,13 @@ class ChosenRigs(FrameDataset):
         """As there."""
         return self.frames.ego_outline_m
 
-    def world_of(self, index: int) -> int:
+    def get_scene_id(self, index: int) -> int:
         """As there."""
-        return self.frames.world_of(index)
+        return self.frames.get_scene_id(index)
 
-    def block_index(self, index: int) -> int:
+    def get_block_index(self, index: int) -> int:
         """As there."""
-        return self.frames.block_index(index)
+        return self.frames.get_block_index(index)
 
     def has_boxes(self) -> bool:
         """As there."""
@@ -261,13 +261,13 @@ class ChosenRigs(FrameDataset):
         """As there."""
         return self.frames.has_heights()
 
-    def ego_mesh(self) -> "Mesh | None":
+    def get_ego_mesh(self) -> "Mesh | None":
         """As there."""
-        return self.frames.ego_mesh()
+        return self.frames.get_ego_mesh()
 
-    def doubts(self, steps: int | None) -> Sequence[str]:
+    def check(self, num_frames: int | None) -> Sequence[str]:
         """As there."""
-        return self.frames.doubts(steps)
+        return self.frames.check(num_frames)
 
     @property
     def description(self) -> Mapping[str, object]:
@@ -275,9 +275,9 @@ class ChosenRigs(FrameDataset):
         return self.frames.description
 
     @property
-    def square_metres(self) -> bool:
+    def has_area_weights(self) -> bool:
         """As there."""
-        return self.frames.square_metres
+        return self.frames.has_area_weights
 
     @property
     def reference_record(self) -> Mapping[str, object] | None:
@@ -287,18 +287,20 @@ class ChosenRigs(FrameDataset):
     @property
     def content(self) -> Mapping[str, object]:
         """As there, and which rigs."""
-        return {**self.frames.content, "rigs of the recording": self.names}
+        return {**self.frames.content, "rigs of the recording": self.source_rigs}
 
     def __len__(self) -> int:
         return len(self.frames)
 
     def _frame_at(self, position: int) -> Frame:
         frame = self.frames[position]
-        boxes = None if frame.boxes is None else replace(frame.boxes, hits=self._chosen(frame.boxes.hits))
-        points = None if frame.sensor_points is None else self._chosen(frame.sensor_points)
-        clouds = {name: frame.cloud_of(of) for name, of in self.names.items()}
-        measured = self._chosen(frame.measured)
-        return replace(frame, clouds=clouds, boxes=boxes, sensor_points=points, measured=measured)
+        boxes = (
+            None if frame.boxes is None else replace(frame.boxes, points_in_box=self._chosen(frame.boxes.points_in_box))
+        )
+        points = None if frame.sensor_point_counts is None else self._chosen(frame.sensor_point_counts)
+        clouds = {name: frame.get_cloud(of) for name, of in self.source_rigs.items()}
+        measured = self._chosen(frame.measurements)
+        return replace(frame, clouds=clouds, boxes=boxes, sensor_point_counts=points, measurements=measured)
 
     def _chosen(self, by_rig: Mapping[str, ValueT]) -> dict[str, ValueT]:
-        return {name: by_rig[of] for name, of in self.names.items() if of in by_rig}
+        return {name: by_rig[of] for name, of in self.source_rigs.items() if of in by_rig}

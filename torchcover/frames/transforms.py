@@ -10,9 +10,9 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from torchcover.detection.boxes import Boxes
-from torchcover.detection.visibility import box_visibility
-from torchcover.devices import through_cpu
-from torchcover.frames.frame import Frame, Measured
+from torchcover.detection.visibility import measure_box_visibility
+from torchcover.devices import run_with_float64
+from torchcover.frames.frame import Frame, Measurement
 
 
 def flip(frame: Frame) -> Frame:
@@ -63,9 +63,9 @@ class Augmentation:
     step or in the collate function; coverage metrics are for frames as they are.
 
     Args:
-        flip: Probability of a flip.
+        flip_probability: Probability of a flip.
         max_yaw_rad: The rotation is uniform between this to the right and this to the left.
-        factors: The scaling is uniform between these two.
+        scale_range: The scaling is uniform between these two.
         seed: Seed.
 
     Raises:
@@ -78,18 +78,18 @@ class Augmentation:
         True
     """
 
-    flip: float = 0.5
+    flip_probability: float = 0.5
     max_yaw_rad: float = math.pi / 4
-    factors: tuple[float, float] = (0.95, 1.05)
+    scale_range: tuple[float, float] = (0.95, 1.05)
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not 0 <= self.flip <= 1:
-            raise ValueError(f"flip: a probability in [0, 1] is needed; got {self.flip}")
+        if not 0 <= self.flip_probability <= 1:
+            raise ValueError(f"flip: a probability in [0, 1] is needed; got {self.flip_probability}")
         if not 0 <= self.max_yaw_rad < math.inf:
             raise ValueError(f"max_yaw_rad: an angle >= 0 is needed; got {self.max_yaw_rad}")
-        if not 0 < self.factors[0] <= self.factors[1] < math.inf:
-            raise ValueError(f"factors: two numbers 0 < lowest <= highest are needed; got {self.factors}")
+        if not 0 < self.scale_range[0] <= self.scale_range[1] < math.inf:
+            raise ValueError(f"factors: two numbers 0 < lowest <= highest are needed; got {self.scale_range}")
         if self.seed < 0:
             raise ValueError(f"seed: a number >= 0 is needed; got {self.seed}")
 
@@ -101,9 +101,9 @@ class Augmentation:
                 "depends on them; use dataclasses.replace(frame, index=...)"
             )
         generator = np.random.default_rng([self.seed, epoch, frame.index])
-        flipped = generator.random() < self.flip
+        flipped = generator.random() < self.flip_probability
         yaw_rad = float(generator.uniform(-self.max_yaw_rad, self.max_yaw_rad))
-        factor = float(generator.uniform(*self.factors))
+        factor = float(generator.uniform(*self.scale_range))
         return scale(rotate(flip(frame) if flipped else frame, yaw_rad), factor)
 
 
@@ -121,9 +121,9 @@ def _moved(frame: Frame, similarity: Tensor) -> Frame:
         reference_weights=weights,
         reference_heights_m=heights_m,
         boxes=None if frame.boxes is None else _moved_boxes(frame.boxes, similarity),
-        measured={
-            name: Measured(_times(similarity, measured.points), measured.error_m * factor)
-            for name, measured in frame.measured.items()
+        measurements={
+            name: Measurement(_times(similarity, measured.points), measured.error_m * factor)
+            for name, measured in frame.measurements.items()
         },
     )
 
@@ -133,7 +133,7 @@ def _moved_boxes(boxes: Boxes, similarity: Tensor) -> Boxes:
     factor = float(similarity[2, 2])
     return replace(
         boxes,
-        centre_m=_times(similarity, boxes.centre_m),
+        center_m=_times(similarity, boxes.center_m),
         size_m=boxes.size_m * factor,
         yaw_rad=torch.atan2(heading[:, 1], heading[:, 0]).to(boxes.yaw_rad.dtype),
         velocity_mps=_times(similarity[:2, :2], boxes.velocity_mps),
@@ -141,23 +141,23 @@ def _moved_boxes(boxes: Boxes, similarity: Tensor) -> Boxes:
     )
 
 
-@through_cpu
+@run_with_float64
 def _times(matrix: Tensor, vectors: Tensor) -> Tensor:
     return (vectors.double() @ matrix.T.to(vectors.device)).to(vectors.dtype)
 
 
-class VisibleTargets(Dataset[Frame]):
+class VisibleBoxes(Dataset[Frame]):
     """Frames without the objects that a rig could hardly show, and with `boxes.visibility` of the others, as weights.
 
     What is hidden, or of unknown visibility, is left out too; `counts["targets_omitted"]` says how many in all. It
-    is measured each time that a frame is asked for: `list(VisibleTargets(...))` does so once.
+    is measured each time that a frame is asked for: `list(VisibleBoxes(...))` does so once.
 
     Args:
         frames: A data set or a list of frames with boxes and a reference; `SurfaceReference(object_points=...)` asks
             about every object.
-        least: Share of an object's visible surface, as of `box_visibility`, below which it is left out.
-        rig: Which of several rigs; the only one if not given.
-        threshold_m: As of `box_visibility`.
+        min_visibility: Share of an object's visible surface, as of `measure_box_visibility`, below which it is left out.
+        rig_name: Which of several rigs; the only one if not given.
+        threshold_m: As of `measure_box_visibility`.
 
     Raises:
         ValueError: A share beyond 0 to 1; when a frame is asked for, one without boxes or without a reference.
@@ -168,7 +168,7 @@ class VisibleTargets(Dataset[Frame]):
         >>> boxes = Boxes.from_rows(torch.tensor([[10.0, 0, 1, 4, 2, 2, 0], [30.0, 0, 1, 4, 2, 2, 0]]))
         >>> reference = torch.tensor([[8.0, 0.0, 0.5], [8.0, 0.0, 1.5], [28.0, 0.0, 1.0]])
         >>> frame = Frame({"rig": torch.tensor([[8.0, 0.0, 0.6]])}, reference, index=0, name="a", boxes=boxes)
-        >>> (seen,) = VisibleTargets([frame], least=0.2)
+        >>> (seen,) = VisibleBoxes([frame], least=0.2)
         >>> len(seen.boxes), seen.boxes.visibility, seen.counts
         (1, tensor([0.5000], dtype=torch.float64), {'targets_omitted': 1})
     """
@@ -176,14 +176,19 @@ class VisibleTargets(Dataset[Frame]):
     def __init__(
         self,
         frames: "Dataset[Frame] | Sequence[Frame]",
-        least: float = 0.2,
+        min_visibility: float = 0.2,
         *,
-        rig: str | None = None,
+        rig_name: str | None = None,
         threshold_m: float = 0.4,
     ) -> None:
-        if not 0.0 <= least <= 1.0:
-            raise ValueError(f"least: a share from 0 to 1 is needed; got {least}")
-        self.frames, self.least, self.rig, self.threshold_m = frames, least, rig, threshold_m
+        if not 0.0 <= min_visibility <= 1.0:
+            raise ValueError(f"least: a share from 0 to 1 is needed; got {min_visibility}")
+        self.frames, self.min_visibility, self.rig_name, self.threshold_m = (
+            frames,
+            min_visibility,
+            rig_name,
+            threshold_m,
+        )
 
     def __len__(self) -> int:
         return len(self.frames)  # type: ignore[arg-type]  # of a map-style data set
@@ -192,14 +197,14 @@ class VisibleTargets(Dataset[Frame]):
         frame = self.frames[index]
         if frame.boxes is None:
             raise ValueError(f"frame {frame.name!r} has no boxes: SimulatedFrames(..., boxes=True) makes them")
-        seen = box_visibility(
-            frame.cloud_of(self.rig),
+        seen = measure_box_visibility(
+            frame.get_cloud(self.rig_name),
             frame.reference,
             frame.boxes,
             self.threshold_m,
             reference_weights=frame.reference_weights,
         )
         boxes = replace(frame.boxes, visibility=seen.share.to(frame.boxes.yaw_rad.device))
-        kept = boxes.select(boxes.visibility >= self.least)
+        kept = boxes.select(boxes.visibility >= self.min_visibility)
         left_out = frame.counts.get("targets_omitted", 0) + len(boxes) - len(kept)
         return replace(frame, boxes=kept, counts={**frame.counts, "targets_omitted": left_out})

@@ -32,7 +32,7 @@ class BoundingBox:
             raise ValueError(f"a box needs lower < upper on every axis; got {self.lower_m} and {self.upper_m}")
 
     @classmethod
-    def around(cls, points_m: NDArray[np.floating]) -> "BoundingBox":
+    def from_points(cls, points_m: NDArray[np.floating]) -> "BoundingBox":
         """The smallest box that holds all (N, 3) points."""
         lower, upper = points_m.min(axis=0), points_m.max(axis=0)
         return cls(
@@ -57,15 +57,15 @@ class BoundingBox:
         return (x1 - x0, y1 - y0, z1 - z0)
 
 
-def overlapping(box: BoundingBox, there_T_box: Float64, corners_m: Float64) -> Bools:
+def find_overlaps(box: BoundingBox, world_T_box: Float64, other_corners_m: Float64) -> Bools:
     """(P,) whether a box at (P, 4, 4) poses shares space with another one that stands on about the same ground.
 
     By separating axes, of their outlines from above and of heights; touching is not sharing.
 
     Args:
         box: In its frame.
-        there_T_box: Where it is, turned mainly about z.
-        corners_m: (8, 3) of the other one there, in the order of `BoundingBox.corners_m`.
+        world_T_box: Where it is, turned mainly about z.
+        other_corners_m: (8, 3) of the other one there, in the order of `BoundingBox.corners_m`.
 
     Example:
         >>> car, away = BoundingBox((-2, -1, 0), (2, 1, 1.5)), np.eye(4)
@@ -73,29 +73,33 @@ def overlapping(box: BoundingBox, there_T_box: Float64, corners_m: Float64) -> B
         >>> overlapping(car, np.stack([np.eye(4), away]), car.corners_m).tolist()
         [True, False]
     """
-    ours_m = box.corners_m @ there_T_box[:, :3, :3].swapaxes(1, 2) + there_T_box[:, None, :3, 3]
-    sides = np.stack([corners_m[4] - corners_m[0], corners_m[2] - corners_m[0], [0.0, 0.0, 1.0]])
-    axes = np.concatenate([np.broadcast_to(sides, (len(ours_m), 3, 3)), there_T_box[:, :3, :2].swapaxes(1, 2)], 1)
-    ours_m, theirs_m = np.einsum("pak,pck->pac", axes, ours_m), np.einsum("pak,ck->pac", axes, corners_m)
+    ours_m = box.corners_m @ world_T_box[:, :3, :3].swapaxes(1, 2) + world_T_box[:, None, :3, 3]
+    sides = np.stack(
+        [other_corners_m[4] - other_corners_m[0], other_corners_m[2] - other_corners_m[0], [0.0, 0.0, 1.0]]
+    )
+    axes = np.concatenate([np.broadcast_to(sides, (len(ours_m), 3, 3)), world_T_box[:, :3, :2].swapaxes(1, 2)], 1)
+    ours_m, theirs_m = np.einsum("pak,pck->pac", axes, ours_m), np.einsum("pak,ck->pac", axes, other_corners_m)
     apart = (ours_m.min(axis=2) >= theirs_m.max(axis=2)) | (theirs_m.min(axis=2) >= ours_m.max(axis=2))
     return np.asarray(~apart.any(axis=1))
 
 
-def outlines_at(outline_m: Float64, poses: Float64) -> Float64:
+def transform_outline(outline_m: Float64, world_T_outline: Float64) -> Float64:
     """(..., 4, 2) corners x, y of an outline, (4, 2), at (..., 4, 4) poses, seen from above."""
-    return np.asarray(outline_m @ poses[..., :2, :2].swapaxes(-1, -2) + poses[..., None, :2, 3])
+    return np.asarray(outline_m @ world_T_outline[..., :2, :2].swapaxes(-1, -2) + world_T_outline[..., None, :2, 3])
 
 
-def contact_s(a_m: Float64, b_m: Float64, velocity_mps: Float64) -> Float64:
+def compute_contact_time_s(
+    first_corners_m: Float64, second_corners_m: Float64, relative_velocity_mps: Float64
+) -> Float64:
     """Time until two rectangles share area, if one passes the other straight on and neither turns.
 
     By separating axes: along each side of either, both have shadows, which overlap between two times; the rectangles do
     where all shadows do. Touching is not sharing, as for `overlapping`.
 
     Args:
-        a_m: (..., 4, 2) corners, one after the other around it.
-        b_m: (..., 4, 2) those of the other.
-        velocity_mps: (..., 2) of b as a has it.
+        first_corners_m: (..., 4, 2) corners, one after the other around it.
+        second_corners_m: (..., 4, 2) those of the other.
+        relative_velocity_mps: (..., 2) of b as a has it.
 
     Returns:
         (...) seconds: 0 if they share area already, infinite if they never do.
@@ -106,11 +110,17 @@ def contact_s(a_m: Float64, b_m: Float64, velocity_mps: Float64) -> Float64:
         [0.5, inf, inf]
     """
     # Differences first: coordinates may be of UTM size.
-    origin_m = a_m[..., :1, :]
-    a_m, b_m, velocity_mps = np.broadcast_arrays(a_m - origin_m, b_m - origin_m, velocity_mps[..., None, :])[:3]
-    sides_m = np.concatenate([np.diff(a_m[..., :3, :], axis=-2), np.diff(b_m[..., :3, :], axis=-2)], axis=-2)
-    ours, theirs = (np.einsum("...ak,...ck->...ac", sides_m, corners_m) for corners_m in (a_m, b_m))
-    speed = np.einsum("...ak,...k->...a", sides_m, velocity_mps[..., 0, :])
+    origin_m = first_corners_m[..., :1, :]
+    first_corners_m, second_corners_m, relative_velocity_mps = np.broadcast_arrays(
+        first_corners_m - origin_m, second_corners_m - origin_m, relative_velocity_mps[..., None, :]
+    )[:3]
+    sides_m = np.concatenate(
+        [np.diff(first_corners_m[..., :3, :], axis=-2), np.diff(second_corners_m[..., :3, :], axis=-2)], axis=-2
+    )
+    ours, theirs = (
+        np.einsum("...ak,...ck->...ac", sides_m, corners_m) for corners_m in (first_corners_m, second_corners_m)
+    )
+    speed = np.einsum("...ak,...k->...a", sides_m, relative_velocity_mps[..., 0, :])
     before = ours.min(axis=-1) - theirs.max(axis=-1)
     behind = ours.max(axis=-1) - theirs.min(axis=-1)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):

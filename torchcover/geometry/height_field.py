@@ -23,8 +23,8 @@ class HeightField(NamedTuple):
     """Heights at the corners of a raster; two triangles are between four of them.
 
     Args:
-        lower_m: (2,) the first corner.
-        corners_m: (rows, columns) heights, rows along y.
+        origin_m: (2,) the first corner.
+        corner_heights_m: (rows, columns) heights, rows along y.
         cell_m: Side of a square.
 
     Example:
@@ -33,28 +33,31 @@ class HeightField(NamedTuple):
         array([0.5, 1. , 3. ])
     """
 
-    lower_m: Float64
-    corners_m: Float64
+    origin_m: Float64
+    corner_heights_m: Float64
     cell_m: float
 
     @property
-    def places_m(self) -> Float64:
+    def corner_positions_m(self) -> Float64:
         """(rows x columns, 2) of the corners."""
-        rows, columns = self.corners_m.shape
+        rows, columns = self.corner_heights_m.shape
         y, x = np.indices((rows, columns)).reshape(2, -1)
-        return self.lower_m + self.cell_m * np.stack([x, y], axis=1)
+        return self.origin_m + self.cell_m * np.stack([x, y], axis=1)
 
-    def above(self, base: Callable[[Float64], Float64]) -> "HeightField":
+    def add_base(self, base_height_m: Callable[[Float64], Float64]) -> "HeightField":
         """The same above heights that are not 0."""
-        return self._replace(corners_m=self.corners_m + base(self.places_m).reshape(self.corners_m.shape))
+        return self._replace(
+            corner_heights_m=self.corner_heights_m
+            + base_height_m(self.corner_positions_m).reshape(self.corner_heights_m.shape)
+        )
 
-    def heights_m(self, places_m: Float64) -> Float64:
+    def compute_heights_m(self, positions_m: Float64) -> Float64:
         """(N,) at (N, 2) places; beyond its border those of the border."""
-        cells = (places_m - self.lower_m) / self.cell_m
-        rows, columns = self.corners_m.shape
+        cells = (positions_m - self.origin_m) / self.cell_m
+        rows, columns = self.corner_heights_m.shape
         low = np.clip(cells.astype(np.int64), 0, [columns - 2, rows - 2])
         x, y = np.clip(cells - low, 0.0, 1.0).T
-        corners_m, here = self.corners_m.ravel(), low[:, 1] * columns + low[:, 0]
+        corners_m, here = self.corner_heights_m.ravel(), low[:, 1] * columns + low[:, 0]
         first, across = corners_m[here], corners_m[here + columns + 1]
         # The triangles share the diagonal from the first to the one across: below it lies the right corner.
         right = x >= y
@@ -63,46 +66,46 @@ class HeightField(NamedTuple):
         return np.asarray(first + far * (side - first) + near * (across - side))
 
 
-def spread(
-    cells: Float64, heights_m: Float64, rows: int, columns: int, weights: Float64 | float = 1.0
+def accumulate_heights(
+    cell_positions: Float64, heights_m: Float64, num_rows: int, num_columns: int, weights: Float64 | float = 1.0
 ) -> tuple[Float64, Float64]:
     """(rows, columns) sums of weighted heights, and of weights, of (N, 2) places for the corners around each.
 
     The next but one have a share, too, that counts for nothing where anything else does: the verges of a street.
 
     Args:
-        cells: (N, 2) the places, counted in squares from the first corner.
+        cell_positions: (N, 2) the places, counted in squares from the first corner.
         heights_m: (N,) their heights.
-        rows: Of the raster's corners.
-        columns: Likewise.
+        num_rows: Of the raster's corners.
+        num_columns: Likewise.
         weights: (N,) of each place, or of all.
     """
-    low = np.floor(cells).astype(np.int64)
-    inside = ((low >= 0) & (low < [columns - 1, rows - 1])).all(axis=1)
-    weights = np.broadcast_to(weights, len(cells))[inside]
-    low, (x, y), heights_m = low[inside], (cells[inside] - low[inside]).T, heights_m[inside]
-    sums = np.zeros((2, rows * columns))
+    low = np.floor(cell_positions).astype(np.int64)
+    inside = ((low >= 0) & (low < [num_columns - 1, num_rows - 1])).all(axis=1)
+    weights = np.broadcast_to(weights, len(cell_positions))[inside]
+    low, (x, y), heights_m = low[inside], (cell_positions[inside] - low[inside]).T, heights_m[inside]
+    sums = np.zeros((2, num_rows * num_columns))
     for right, along in ((0, 1 - x), (1, x)):
         for above, across in ((0, 1 - y), (1, y)):
             share = along * across * weights
-            corner = (low[:, 1] + above) * columns + low[:, 0] + right
-            sums[0] += np.bincount(corner, share * heights_m, rows * columns)
-            sums[1] += np.bincount(corner, share, rows * columns)
-    around = np.pad(sums.reshape(2, rows, columns), ((0, 0), (1, 1), (1, 1)))
+            corner = (low[:, 1] + above) * num_columns + low[:, 0] + right
+            sums[0] += np.bincount(corner, share * heights_m, num_rows * num_columns)
+            sums[1] += np.bincount(corner, share, num_rows * num_columns)
+    around = np.pad(sums.reshape(2, num_rows, num_columns), ((0, 0), (1, 1), (1, 1)))
     beside = around[:, :-2] + around[:, 1:-1] + around[:, 2:]
     total, weight = around[:, 1:-1, 1:-1] + VERGE_SHARE * (beside[..., :-2] + beside[..., 1:-1] + beside[..., 2:])
     return total, weight
 
 
-def fitted(
-    across_m: Float64,
+def fit_height_field(
+    positions_m: Float64,
     heights_m: Float64,
-    size_m: Float64,
-    scales_m: Sequence[float],
+    extent_m: Float64,
+    cell_sizes_m: Sequence[float],
     *,
-    trusted: Bools | None = None,
-    beneath: float = 0.5,
-    on: HeightField | None = None,
+    trusted_mask: Bools | None = None,
+    above_weight: float = 0.5,
+    base_field: HeightField | None = None,
 ) -> HeightField:
     """Heights everywhere, through most of (N, 2) places.
 
@@ -111,35 +114,35 @@ def fitted(
     nothing.
 
     Args:
-        across_m: The places.
+        positions_m: The places.
         heights_m: (N,) their heights.
-        size_m: (2,) how far the raster reaches from 0.
-        scales_m: Sides of the rasters' squares; each is half of the one before.
-        trusted: (N,) which ones are right for sure; none if not given.
-        beneath: What a place counts that lies too high; one that lies too low counts the rest of 1. With less than a
+        extent_m: (2,) how far the raster reaches from 0.
+        cell_sizes_m: Sides of the rasters' squares; each is half of the one before.
+        trusted_mask: (N,) which ones are right for sure; none if not given.
+        above_weight: What a place counts that lies too high; one that lies too low counts the rest of 1. With less than a
             half, the heights are those of the lowest.
-        on: Instead of a plane; its squares are twice as large as the first.
+        base_field: Instead of a plane; its squares are twice as large as the first.
 
     Returns:
         The heights on the raster of the last scale, which begins two squares before 0.
     """
-    trusted = np.zeros(len(heights_m), dtype=np.bool_) if trusted is None else trusted
+    trusted_mask = np.zeros(len(heights_m), dtype=np.bool_) if trusted_mask is None else trusted_mask
     weights = np.ones(len(heights_m))
-    base = _plane(across_m, heights_m, weights) if on is None else on.heights_m
-    for _ in range(ROUNDS if on is None else 0):
-        weights = _weights(heights_m - base(across_m), trusted, 2 * scales_m[0], beneath)
-        base = _plane(across_m, heights_m, weights)
-    left_m, layers = heights_m - base(across_m), HeightField(np.zeros(2), np.zeros((2, 2)), 1.0)
-    for scale_m in scales_m:
-        weights = _weights(left_m, trusted, scale_m, beneath)
+    base = _plane(positions_m, heights_m, weights) if base_field is None else base_field.compute_heights_m
+    for _ in range(ROUNDS if base_field is None else 0):
+        weights = _weights(heights_m - base(positions_m), trusted_mask, 2 * cell_sizes_m[0], above_weight)
+        base = _plane(positions_m, heights_m, weights)
+    left_m, layers = heights_m - base(positions_m), HeightField(np.zeros(2), np.zeros((2, 2)), 1.0)
+    for scale_m in cell_sizes_m:
+        weights = _weights(left_m, trusted_mask, scale_m, above_weight)
         for _ in range(ROUNDS):
-            layer = _layer(across_m, left_m, weights, scale_m, size_m)
-            over_m = left_m - layer.heights_m(across_m)
-            weights = _weights(over_m, trusted, scale_m, beneath)
+            layer = _layer(positions_m, left_m, weights, scale_m, extent_m)
+            over_m = left_m - layer.compute_heights_m(positions_m)
+            weights = _weights(over_m, trusted_mask, scale_m, above_weight)
         left_m = over_m
         # The triangles of a scale lie within those of the one before: nothing is lost.
-        layers = layer.above(layers.heights_m)
-    return layers.above(base)
+        layers = layer.add_base(layers.compute_heights_m)
+    return layers.add_base(base)
 
 
 def _weights(left_m: Float64, trusted: Bools, scale_m: float, beneath: float) -> Float64:
@@ -165,5 +168,5 @@ def _layer(across_m: Float64, left_m: Float64, weights: Float64, scale_m: float,
     """The raster of one scale: 0 where nobody stands."""
     first_m = np.full(2, -2 * scale_m)
     columns, rows = (np.ceil(size_m / scale_m).astype(np.int64) + 5).tolist()
-    total, weight = spread((across_m - first_m) / scale_m, left_m, rows, columns, weights)
+    total, weight = accumulate_heights((across_m - first_m) / scale_m, left_m, rows, columns, weights)
     return HeightField(first_m, total / (weight + DOUBT), scale_m)

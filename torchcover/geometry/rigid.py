@@ -15,7 +15,7 @@ RIGID_TOLERANCE = 1e-3
 POINTS_AT_ONCE = 4096
 
 
-def rigid(rotation: ArrayLike, translation_m: ArrayLike) -> Matrix:
+def build_transform(rotation: ArrayLike, translation_m: ArrayLike) -> Matrix:
     """Assemble a transform from a rotation and a translation, or many of them.
 
     Args:
@@ -40,22 +40,22 @@ def invert(destination_T_source: Matrix) -> Matrix:
     """Invert a rigid transform, or each of (..., 4, 4): `source_T_destination`, by transposing the rotation.
 
     Example:
-        >>> world_T_vehicle = rigid(rotation_from_euler(90.0, 0.0, 0.0), [5.0, 0.0, 0.0])
+        >>> world_T_vehicle = rigid(convert_euler_to_rotation(90.0, 0.0, 0.0), [5.0, 0.0, 0.0])
         >>> bool(np.allclose(invert(world_T_vehicle) @ world_T_vehicle, np.eye(4)))
         True
     """
     transposed = destination_T_source[..., :3, :3].swapaxes(-1, -2)
-    return rigid(transposed, (-transposed @ destination_T_source[..., :3, 3:])[..., 0])
+    return build_transform(transposed, (-transposed @ destination_T_source[..., :3, 3:])[..., 0])
 
 
-def rotation_from_euler(yaw_deg: ArrayLike, pitch_deg: ArrayLike, roll_deg: ArrayLike) -> Matrix:
+def convert_euler_to_rotation(yaw_deg: ArrayLike, pitch_deg: ArrayLike, roll_deg: ArrayLike) -> Matrix:
     """Rotation by roll about x, then pitch about y, then yaw about z (all axes fixed): R = Rz(yaw) Ry(pitch) Rx(roll).
 
     In a frame with x forward, y left, z up a positive yaw turns left, a positive pitch turns the nose DOWN
     (right-handed about y) and a positive roll lowers the right side. Of (...) angles the rotations are (..., 3, 3).
 
     Example:
-        >>> rotation_from_euler(90.0, 0.0, 0.0).round(6) @ [1.0, 0.0, 0.0]
+        >>> convert_euler_to_rotation(90.0, 0.0, 0.0).round(6) @ [1.0, 0.0, 0.0]
         array([0., 1., 0.])
     """
     yaw, pitch, roll = np.deg2rad(np.array([yaw_deg, pitch_deg, roll_deg]))
@@ -70,8 +70,8 @@ def rotation_from_euler(yaw_deg: ArrayLike, pitch_deg: ArrayLike, roll_deg: Arra
     return rotation.transpose(*range(2, rotation.ndim), 0, 1)
 
 
-def euler_from_rotation(rotation: Matrix) -> Matrix:
-    """Yaw, pitch and roll in degrees: the inverse of `rotation_from_euler`. Straight up or down, the roll is 0.
+def convert_rotation_to_euler(rotation: Matrix) -> Matrix:
+    """Yaw, pitch and roll in degrees: the inverse of `convert_euler_to_rotation`. Straight up or down, the roll is 0.
 
     Args:
         rotation: (..., 3, 3) rotation matrices.
@@ -80,7 +80,7 @@ def euler_from_rotation(rotation: Matrix) -> Matrix:
         (..., 3) yaw, pitch, roll.
 
     Example:
-        >>> euler_from_rotation(rotation_from_euler(30.0, -20.0, 10.0)).round(9)
+        >>> convert_rotation_to_euler(convert_euler_to_rotation(30.0, -20.0, 10.0)).round(9)
         array([ 30., -20.,  10.])
     """
     r = rotation
@@ -96,14 +96,14 @@ def euler_from_rotation(rotation: Matrix) -> Matrix:
     return np.asarray(np.rad2deg(np.stack([yaw, pitch, roll], axis=-1)))
 
 
-def rotation_from_quaternion(wxyz: ArrayLike) -> Matrix:
+def convert_quaternion_to_rotation(wxyz: ArrayLike) -> Matrix:
     """(..., 3, 3) rotation matrices of quaternions (..., 4), each w, x, y, z, which are normalised first.
 
     Raises:
         ValueError: A quaternion is not four finite numbers, or its norm is 0.
 
     Example:
-        >>> rotation_from_quaternion([1.0, 0.0, 0.0, 0.0]).tolist()
+        >>> convert_quaternion_to_rotation([1.0, 0.0, 0.0, 0.0]).tolist()
         [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
     quaternion = np.asarray(wxyz, dtype=np.float64)
@@ -124,14 +124,14 @@ def rotation_from_quaternion(wxyz: ArrayLike) -> Matrix:
     return rotation.transpose(*range(2, rotation.ndim), 0, 1)
 
 
-def quaternion_from_rotation(rotation: Matrix) -> Matrix:
-    """(w, x, y, z) of a rotation matrix, w not negative; the inverse of `rotation_from_quaternion`.
+def convert_rotation_to_quaternion(rotation: Matrix) -> Matrix:
+    """(w, x, y, z) of a rotation matrix, w not negative; the inverse of `convert_quaternion_to_rotation`.
 
     Of the symmetric matrix that a rotation makes of its quaternion it is the eigenvector with the largest eigenvalue
     (Bar-Itzhack 2000), which no rotation makes inexact.
 
     Example:
-        >>> quaternion_from_rotation(rotation_from_euler(90.0, 0.0, 0.0)).round(6)
+        >>> convert_rotation_to_quaternion(convert_euler_to_rotation(90.0, 0.0, 0.0)).round(6)
         array([0.707107, 0.      , 0.      , 0.707107])
     """
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
@@ -147,15 +147,15 @@ def quaternion_from_rotation(rotation: Matrix) -> Matrix:
     return np.asarray(np.copysign(1.0, wxyz[0]) * wxyz + 0.0)  # no -0
 
 
-def slerp(first_wxyz: Matrix, second_wxyz: Matrix, share: Matrix) -> Matrix:
+def interpolate_quaternions(first_wxyz: Matrix, second_wxyz: Matrix, fraction: Matrix) -> Matrix:
     """(N, 4) unit quaternions at (N, 1) shares of the shorter way between two of (N, 4) each, at an even rate."""
     cosine = (first_wxyz * second_wxyz).sum(axis=1, keepdims=True)
     second_wxyz, cosine = np.where(cosine < 0, -second_wxyz, second_wxyz), np.abs(cosine).clip(max=1.0)
     angle = np.arccos(cosine)
     straight = angle < 1e-6
     sine = np.where(straight, 1.0, np.sin(angle))
-    of_first = np.where(straight, 1 - share, np.sin((1 - share) * angle) / sine)
-    of_second = np.where(straight, share, np.sin(share * angle) / sine)
+    of_first = np.where(straight, 1 - fraction, np.sin((1 - fraction) * angle) / sine)
+    of_second = np.where(straight, fraction, np.sin(fraction * angle) / sine)
     return np.asarray(of_first * first_wxyz + of_second * second_wxyz)
 
 
@@ -197,10 +197,10 @@ def check_rigid(matrix: ArrayLike, name: str) -> Matrix:
             f"{name}: a mirror, not a rotation (determinant {determinant:.6g}); flip one axis of the source frame"
         )
     u, _, vt = np.linalg.svd(rotation)
-    return rigid(u @ vt, array[:3, 3])
+    return build_transform(u @ vt, array[:3, 3])
 
 
-def transform(destination_T_source: Matrix, points_m: NDArray[np.floating]) -> Matrix:
+def transform_points(destination_T_source: Matrix, points_m: NDArray[np.floating]) -> Matrix:
     """Transform points, in float64 whatever their type, so that UTM-sized coordinates keep their millimetres.
 
     Args:
@@ -218,12 +218,12 @@ def transform(destination_T_source: Matrix, points_m: NDArray[np.floating]) -> M
     # R (p - R^T (-t)): the large numbers of a world frame cancel in the subtraction, before anything is multiplied.
     shift = rotation.T @ translation
     moved = np.empty(points_m.shape)
-    for rows in blocks(len(points_m)):
+    for rows in iterate_blocks(len(points_m)):
         np.matmul(points_m[rows].astype(np.float64, copy=False) + shift, rotation.T, out=moved[rows])
     return moved
 
 
-def blocks(points: int) -> Iterator[slice]:
+def iterate_blocks(num_points: int) -> Iterator[slice]:
     """Parts of a cloud, one after the other, for which memory is fast.
 
     Example:
@@ -231,9 +231,9 @@ def blocks(points: int) -> Iterator[slice]:
         [(0, 4096), (4096, 5000)]
     """
     start = 0
-    while start < points:
+    while start < num_points:
         # A last point alone goes with the others: by itself it would be rounded another way.
-        stop = points if points - start <= POINTS_AT_ONCE + 1 else start + POINTS_AT_ONCE
+        stop = num_points if num_points - start <= POINTS_AT_ONCE + 1 else start + POINTS_AT_ONCE
         yield slice(start, stop)
         start = stop
 
@@ -242,7 +242,7 @@ def blocks(points: int) -> Iterator[slice]:
 ROUND_DEG = {90: 2, 15: 3, 5: 4}
 
 
-def warn_of_radians(angles_deg: Mapping[str, float | Iterable[float]]) -> None:
+def warn_about_radians(angles_deg: Mapping[str, float | Iterable[float]]) -> None:
     """Warn of angles in degrees that are round angles in radians, such as 1.5708 or 3.14.
 
     Angles of one document have one unit: nothing is said if any of them is more than a full turn in radians.
@@ -256,7 +256,7 @@ def warn_of_radians(angles_deg: Mapping[str, float | Iterable[float]]) -> None:
     Example:
         >>> import pytest
         >>> with pytest.warns(UserWarning, match="yaw_deg: 1.5708 looks like 90 degrees in radians"):
-        ...     warn_of_radians({"yaw_deg": 1.5708})
+        ...     warn_about_radians({"yaw_deg": 1.5708})
     """
     named = []
     for name, value in angles_deg.items():
@@ -272,16 +272,16 @@ def warn_of_radians(angles_deg: Mapping[str, float | Iterable[float]]) -> None:
             )
 
 
-def find_round_degrees(angle: float) -> float | None:
+def find_round_degrees(angle_rad: float) -> float | None:
     """Return the round angle in degrees that a number is in radians, to all of its decimals; None if it is none.
 
     Example:
         >>> find_round_degrees(-0.7854), find_round_degrees(1.57), find_round_degrees(0.2)
         (-45, 90, None)
     """
-    decimals = len(repr(angle).partition(".")[2])
+    decimals = len(repr(angle_rad).partition(".")[2])
     for step_deg, least in ROUND_DEG.items():
-        degrees = step_deg * round(math.degrees(angle) / step_deg)
-        if degrees and decimals >= least and abs(math.radians(degrees) - angle) <= 10.0**-decimals + 1e-15:
+        degrees = step_deg * round(math.degrees(angle_rad) / step_deg)
+        if degrees and decimals >= least and abs(math.radians(degrees) - angle_rad) <= 10.0**-decimals + 1e-15:
             return degrees
     return None

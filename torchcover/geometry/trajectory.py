@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from torchcover.geometry import (
-    euler_from_rotation,
-    quaternion_from_rotation,
-    rigid,
-    rotation_from_euler,
-    rotation_from_quaternion,
-    slerp,
+    build_transform,
+    convert_euler_to_rotation,
+    convert_quaternion_to_rotation,
+    convert_rotation_to_euler,
+    convert_rotation_to_quaternion,
+    interpolate_quaternions,
 )
 from torchcover.geometry.rigid import Matrix
 
@@ -22,17 +22,17 @@ STEEP_DEG = 60.0
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Poses at times: (K,) ascending times, (K, 3) places and (K, 3) yaw, pitch and roll as of `rotation_from_euler`.
+    """Poses at times: (K,) ascending times, (K, 3) places and (K, 3) yaw, pitch and roll as of `convert_euler_to_rotation`.
 
     In between it moves on a straight line, and yaw, pitch and roll each turn the shorter way; beyond a pitch of 60
     degrees, where angles say little, it turns about one axis. Places are float64: they may be of UTM size. Before and
-    after it rests; who is `transient`, as in a recording that it enters and leaves, is not there then.
+    after it rests; who is `is_transient`, as in a recording that it enters and leaves, is not there then.
     """
 
     times_s: Matrix
     positions_m: Matrix
     angles_deg: Matrix
-    transient: bool = False
+    is_transient: bool = False
 
     def __post_init__(self) -> None:
         count = len(self.times_s)
@@ -60,28 +60,28 @@ class Trajectory:
         return cls(times, positions, angles)
 
     @classmethod
-    def resting(cls, position_m: ArrayLike, angles_deg: ArrayLike = (0.0, 0.0, 0.0)) -> "Trajectory":
+    def create_static(cls, position_m: ArrayLike, angles_deg: ArrayLike = (0.0, 0.0, 0.0)) -> "Trajectory":
         """A body that stays where it is."""
         return cls.from_arrays([0.0], np.array([position_m]), np.array([angles_deg]))
 
     @classmethod
     def from_poses(cls, times_s: ArrayLike, world_T_body: Matrix) -> "Trajectory":
         """From (K, 4, 4) rigid transforms."""
-        return cls.from_arrays(times_s, world_T_body[:, :3, 3], euler_from_rotation(world_T_body[:, :3, :3]))
+        return cls.from_arrays(times_s, world_T_body[:, :3, 3], convert_rotation_to_euler(world_T_body[:, :3, :3]))
 
-    def since(self, start_s: float) -> "Trajectory":
+    def shift_time(self, start_s: float) -> "Trajectory":
         """The same poses, with times that count from another instant.
 
         Args:
             start_s: Its time on the clock of this trajectory, in seconds.
         """
-        return Trajectory(self.times_s - start_s, self.positions_m, self.angles_deg, self.transient)
+        return Trajectory(self.times_s - start_s, self.positions_m, self.angles_deg, self.is_transient)
 
     @property
-    def moves(self) -> bool:
+    def is_moving(self) -> bool:
         """Whether the body ever changes its pose, enters or leaves."""
-        if self.transient or len(self.times_s) == 1:
-            return self.transient
+        if self.is_transient or len(self.times_s) == 1:
+            return self.is_transient
         # Most of those that move end elsewhere.
         return any((poses[at] != poses[0]).any() for at in (slice(-1, None), slice(None)) for poses in self._poses)
 
@@ -90,17 +90,17 @@ class Trajectory:
         return self.positions_m, self.angles_deg
 
     @property
-    def bytes(self) -> int:
+    def num_bytes(self) -> int:
         """How much memory its poses take."""
         return self.positions_m.nbytes + self.angles_deg.nbytes
 
-    def at(self, time_s: float) -> Matrix:
+    def interpolate(self, time_s: float) -> Matrix:
         """The (4, 4) pose `world_T_body` at a time."""
         before, after, share = _moment(self.times_s, time_s)
         places_m, angles_deg = self.positions_m, self.angles_deg
         return _between(places_m[before], places_m[after], angles_deg[before], angles_deg[after], share)
 
-    def at_each(self, times_s: Matrix) -> Matrix:
+    def interpolate_many(self, times_s: Matrix) -> Matrix:
         """(T, 4, 4) poses at (T,) times, as `at` has them but for rounding."""
         after = np.clip(self.times_s.searchsorted(times_s, side="right"), 0, len(self.times_s) - 1)
         before = np.maximum(after - (times_s < self.times_s[after]), 0)
@@ -109,17 +109,17 @@ class Trajectory:
         places_m, angles_deg = self.positions_m, self.angles_deg
         return _between(places_m[before], places_m[after], angles_deg[before], angles_deg[after], share[:, None])
 
-    def positions_at(self, times_s: Matrix) -> Matrix:
+    def interpolate_positions_m(self, times_s: Matrix) -> Matrix:
         """(T, 3) positions at (T,) times; NaN where the body is not there."""
         if np.array_equal(times_s, self.times_s[: len(times_s)]):
             return self.positions_m[: len(times_s)]
-        if len(self.times_s) == 1 and not self.transient:
+        if len(self.times_s) == 1 and not self.is_transient:
             return np.repeat(self.positions_m, len(times_s), axis=0)
-        outside = np.nan if self.transient else None
+        outside = np.nan if self.is_transient else None
         tracks = [np.interp(times_s, self.times_s, axis, outside, outside) for axis in self.positions_m.T]
         return np.stack(tracks, axis=1)
 
-    def velocity_at(self, time_s: float) -> Matrix:
+    def compute_velocity_mps(self, time_s: float) -> Matrix:
         """(3,) velocity in the world frame in m/s; where it changes, the mean of before and after; 0 at rest."""
         # The segments that touch the time: one, or two if a pose is given for it.
         first = max(int(np.searchsorted(self.times_s, time_s, side="left")) - 1, 0)
@@ -130,7 +130,7 @@ class Trajectory:
         return np.asarray((way / taken[:, None]).mean(axis=0))
 
 
-def poses_at(trajectories: Sequence[Trajectory], time_s: float) -> Matrix:
+def interpolate_poses(trajectories: Sequence[Trajectory], time_s: float) -> Matrix:
     """(P, 4, 4) poses `world_T_body` of P bodies at one time; see `Trajectory.at`."""
     # Bodies of one world share their times, or have views of them: they are looked up once.
     moments, ends, shares = dict[int, tuple[int, int, float]](), [], []
@@ -157,11 +157,13 @@ def _moment(times_s: Matrix, time_s: float) -> tuple[int, int, float]:
 def _between(from_m: Matrix, to_m: Matrix, from_deg: Matrix, to_deg: Matrix, share: float | Matrix) -> Matrix:
     """(..., 4, 4) poses at shares of the way from one to the other, of (..., 3) places and angles."""
     turn_deg = (to_deg - from_deg + 180.0) % 360.0 - 180.0
-    rotation = rotation_from_euler(*(from_deg + share * turn_deg).T)
+    rotation = convert_euler_to_rotation(*(from_deg + share * turn_deg).T)
     steep = np.maximum(np.abs(from_deg[..., 1]), np.abs(to_deg[..., 1])) > STEEP_DEG
     if steep.any():
-        ends = [np.reshape([quaternion_from_rotation(rotation_from_euler(*each)) for each in np.reshape(ends, (-1, 3))],
+        ends = [np.reshape([convert_rotation_to_quaternion(convert_euler_to_rotation(*each)) for each in np.reshape(ends, (-1, 3))],
                            (-1, 4)) for ends in (from_deg[steep], to_deg[steep])]  # fmt: skip
         shares = np.broadcast_to(share, (*steep.shape, 1))[steep].reshape(-1, 1)
-        rotation[steep] = rotation_from_quaternion(slerp(ends[0], ends[1], shares)).reshape(rotation[steep].shape)
-    return rigid(rotation, from_m + share * (to_m - from_m))
+        rotation[steep] = convert_quaternion_to_rotation(interpolate_quaternions(ends[0], ends[1], shares)).reshape(
+            rotation[steep].shape
+        )
+    return build_transform(rotation, from_m + share * (to_m - from_m))

@@ -1,7 +1,7 @@
-from .blocks import SumsInBlocks as SumsInBlocks
-from .blocks import TouchedSums as TouchedSums
-from .blocks import added_up as added_up
+from .blocks import BlockedSums as BlockedSums
+from .blocks import SparseSums as SparseSums
+from .blocks import sum_rows as sum_rows
 from .mergeable import MergeableMetric as MergeableMetric
 from .sums import MergeableSums as MergeableSums
-from .sums import figure_of as figure_of
-from .sums import with_rows as with_rows
+from .sums import get_figure as get_figure
+from .sums import insert_rows as insert_rows

@@ -10,7 +10,7 @@ from torchmetrics import Metric
 from torchmetrics.utilities.distributed import gather_all_tensors
 
 from torchcover.devices import has_float64
-from torchcover.metrics.sums import MergeableSums, filled
+from torchcover.metrics.sums import MergeableSums, pad_table
 
 
 def _refuse_resampling(module: torch.nn.Module, _name: str, submodule: torch.nn.Module | None) -> None:
@@ -81,8 +81,8 @@ class MergeableMetric(MergeableSums, Metric):
         self._align_ranks(lambda state: dist_sync_fn(state, group=process_group or self.process_group))
         for name in self._tables:
             table = getattr(self, name)
-            lengths = dist_sync_fn(self.steps.new_tensor(len(table)), group=process_group or self.process_group)
-            setattr(self, name, filled(table, max(map(int, lengths))))
+            lengths = dist_sync_fn(self.num_frames.new_tensor(len(table)), group=process_group or self.process_group)
+            setattr(self, name, pad_table(table, max(map(int, lengths))))
         Metric._sync_dist(self, dist_sync_fn, process_group)
 
     @torch.inference_mode(False)
@@ -102,7 +102,7 @@ class MergeableMetric(MergeableSums, Metric):
     def _follow_steps(self) -> None:
         # torchmetrics would go on answering from the result it had cached.
         self._computed = None
-        self._update_count = int(self.steps)
+        self._update_count = int(self.num_frames)
 
     @torch.inference_mode(False)
     def _apply(self, fn: Callable[[Tensor], Tensor], *args: Any, **kwargs: Any) -> Self:  # noqa: ANN401

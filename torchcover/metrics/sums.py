@@ -30,11 +30,11 @@ class MergeableSums:
     * States are copies: nothing that is loaded or merged is written to later.
     * On a device without float64 (MPS) the sums stay on the CPU, to which clouds follow.
 
-    A subclass passes its parameters to `__init__`, adds its states with `add_sum`, and counts `steps`. Their size is
-    fixed; only a table (`add_table`) grows. `MergeableMetric` before it in the bases makes a torchmetrics metric of it.
+    A subclass passes its parameters to `__init__`, adds its states with `define_sum`, and counts `num_frames`. Their size is
+    fixed; only a table (`define_table`) grows. `MergeableMetric` before it in the bases makes a torchmetrics metric of it.
 
     Args:
-        meaning: What the sums depend on, by the name of the parameter; compared by `==` and `repr`.
+        definition: What the sums depend on, by the name of the parameter; compared by `==` and `repr`.
         kwargs: For the next base.
 
     Example:
@@ -57,20 +57,20 @@ class MergeableSums:
     """
 
     fingerprint: Tensor
-    steps: Tensor
+    num_frames: Tensor
     _defaults: dict[str, Any]
 
-    def __init__(self, meaning: Mapping[str, object], **kwargs: Any) -> None:  # noqa: ANN401  (of the next base)
+    def __init__(self, definition: Mapping[str, object], **kwargs: Any) -> None:  # noqa: ANN401  (of the next base)
         self._defaults = {}
         super().__init__(**kwargs)
-        self.meaning = dict(meaning)
+        self.definition = dict(definition)
         self._tables: dict[str, Reduction] = {}
         self._largest: set[str] = set()
         # (32,) int64 numbers in [0, 256), equal for two metrics exactly if their sums mean the same.
-        words = repr((type(self).__name__, sorted(self.meaning.items())))
+        words = repr((type(self).__name__, sorted(self.definition.items())))
         fingerprint = torch.tensor(list(hashlib.sha256(words.encode()).digest()), device="cpu")
         self.define_state("fingerprint", fingerprint, "max")
-        self.add_sum("steps", (), torch.int64)
+        self.define_sum("num_frames", (), torch.int64)
 
     @torch.inference_mode(False)  # here and below: a tensor made under it could not be added to outside of it
     def define_state(self, name: str, default: Tensor, dist_reduce_fx: str | Callable[..., Tensor]) -> None:
@@ -99,21 +99,21 @@ class MergeableSums:
         self._defaults[name] = default
         setattr(self, name, default.clone())
 
-    def add_sum(self, name: str, shape: tuple[int, ...], dtype: torch.dtype = torch.float64) -> None:
+    def define_sum(self, name: str, shape: tuple[int, ...], dtype: torch.dtype = torch.float64) -> None:
         """Add a state that starts at zero and adds up; float64 or int64, for sums grow."""
         self.define_state(name, torch.zeros((), dtype=dtype, device="cpu").expand(shape), "sum")
 
-    def add_table(self, name: str, columns: int, reduction: Reduction | None = None) -> None:
+    def define_table(self, name: str, num_columns: int, reduction: Reduction | None = None) -> None:
         """Add a float64 state of rows that begin with a finite number, none at first.
 
         Args:
             name: Of the state.
-            columns: Numbers in a row.
+            num_columns: Numbers in a row.
             reduction: How several tables become one. Not given: all rows are kept, in the order of
-                `torchcover.metrics.with_rows`.
+                `torchcover.metrics.insert_rows`.
         """
-        self._tables[name] = reduction or joined
-        none = torch.empty((0, columns), dtype=torch.float64, device="cpu")
+        self._tables[name] = reduction or concat_tables
+        none = torch.empty((0, num_columns), dtype=torch.float64, device="cpu")
         self.define_state(name, none, partial(_of_filled, reduction=self._tables[name]))
 
     @property
@@ -194,9 +194,9 @@ class MergeableSums:
     def _check_meaning(self, other: object) -> None:
         if not isinstance(other, MergeableSums) or type(other) is not type(self):
             raise ValueError(f"cannot merge a {type(other).__name__} into a {type(self).__name__}")
-        for name, mine in self.meaning.items():
-            if mine != other.meaning.get(name):
-                raise ValueError(f"cannot merge metrics with different {name}: {mine} and {other.meaning.get(name)}")
+        for name, mine in self.definition.items():
+            if mine != other.definition.get(name):
+                raise ValueError(f"cannot merge metrics with different {name}: {mine} and {other.definition.get(name)}")
 
     def _copied(self, states: Mapping[str, Tensor]) -> dict[str, Any]:
         """The states of a metric, once they are known to mean the same, on this device and in these types."""
@@ -204,7 +204,7 @@ class MergeableSums:
         if fingerprint is None or not torch.equal(fingerprint.to(self.fingerprint), self.fingerprint):
             raise ValueError(
                 f"the state was made by another metric than this {type(self).__name__}, or with other "
-                f"{', '.join(self.meaning)}"
+                f"{', '.join(self.definition)}"
             )
         copies = {}
         for name in self._defaults:
@@ -222,30 +222,30 @@ class MergeableSums:
         """Take notice of steps that were added otherwise than by `update`."""
 
 
-def with_rows(table: Tensor, rows: Tensor) -> Tensor:
+def insert_rows(table: Tensor, new_rows: Tensor) -> Tensor:
     """A table with some more rows, in ascending order: by the first column, then by the second, and so on.
 
     Args:
         table: (K, C) float64 finite rows in that order.
-        rows: (N, C) more of them, in any order.
+        new_rows: (N, C) more of them, in any order.
 
     Example:
-        >>> with_rows(torch.tensor([[1.0, 5.0]]), torch.tensor([[1.0, 3.0], [0.0, 9.0]])).tolist()
+        >>> insert_rows(torch.tensor([[1.0, 5.0]]), torch.tensor([[1.0, 3.0], [0.0, 9.0]])).tolist()
         [[0.0, 9.0], [1.0, 3.0], [1.0, 5.0]]
     """
-    both = torch.cat([table, rows.to(table)])
+    both = torch.cat([table, new_rows.to(table)])
     order = np.lexsort(both.cpu().numpy().T[::-1])
     return both[torch.from_numpy(order).to(both.device)]
 
 
-def filled(table: Tensor, length: int) -> Tensor:
+def pad_table(table: Tensor, length: int) -> Tensor:
     """The table, filled up to a length."""
     return torch.nn.functional.pad(table, (0, 0, 0, length - len(table)), value=FILLER)
 
 
-def joined(tables: Sequence[Tensor]) -> Tensor:
+def concat_tables(tables: Sequence[Tensor]) -> Tensor:
     """One table with the rows of several."""
-    return with_rows(tables[0][:0], torch.cat(list(tables)))
+    return insert_rows(tables[0][:0], torch.cat(list(tables)))
 
 
 def _of_filled(tables: Tensor, reduction: Reduction) -> Tensor:
@@ -253,7 +253,7 @@ def _of_filled(tables: Tensor, reduction: Reduction) -> Tensor:
     return reduction([rows[rows[:, 0] != FILLER] for rows in tables])
 
 
-def figure_of(ax: "Axes | None") -> "tuple[Figure, Axes]":
+def get_figure(ax: "Axes | None") -> "tuple[Figure, Axes]":
     """The axes that a metric was given and their figure, or new ones of pyplot's, as torchmetrics has it."""
     if ax is None:
         import matplotlib.pyplot as plt

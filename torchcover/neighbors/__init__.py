@@ -5,6 +5,13 @@ that returns the index of a nearest point. What a distance is, and its gradient,
 """
 
 from torchcover.neighbors.choice import BACKENDS
-from torchcover.neighbors.query import Nearest, blind_spot_radius, check_cloud, check_tensor, check_weights, nearest
+from torchcover.neighbors.query import (
+    NearestPoints,
+    blind_spot_radius,
+    check_cloud,
+    check_tensor,
+    check_weights,
+    nearest,
+)
 
-__all__ = ["BACKENDS", "Nearest", "blind_spot_radius", "check_cloud", "check_tensor", "check_weights", "nearest"]
+__all__ = ["BACKENDS", "NearestPoints", "blind_spot_radius", "check_cloud", "check_tensor", "check_weights", "nearest"]

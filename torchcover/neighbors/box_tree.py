@@ -28,20 +28,20 @@ class BoxTree(NamedTuple):
 
     Args:
         points: (L LEAF, 3) in order; the last leaf is filled up with copies of the last point.
-        numbers: (L LEAF,) int64 which point each is.
+        point_indices: (L LEAF,) int64 which point each is.
         boxes: (2 F, 6) least and largest coordinates in each node; in a node without points inf and -inf.
-        smallest: (2 F,) int64 smallest number of a point in each node; `NONE` where there is none.
+        min_point_indices: (2 F,) int64 smallest number of a point in each node; `NONE` where there is none.
     """
 
     points: Tensor
-    numbers: Tensor
+    point_indices: Tensor
     boxes: Tensor
-    smallest: Tensor
+    min_point_indices: Tensor
 
 
-def box_tree(points: Tensor) -> BoxTree:
+def build_box_tree(points: Tensor) -> BoxTree:
     """The tree over (M, 3) points of finite coordinates, M > 0."""
-    order = along_the_curve(points)
+    order = compute_morton_order(points)
     numbers = torch.cat([order, order[-1:].expand(-len(order) % LEAF)])
     points = points[numbers]
     leaves = points.view(-1, LEAF, 3)
@@ -61,23 +61,23 @@ def box_tree(points: Tensor) -> BoxTree:
     return BoxTree(points, numbers, boxes, torch.cat([smallest, *reversed(all_smallest)]))
 
 
-def along_the_curve(cloud: Tensor) -> Tensor:
+def compute_morton_order(points: Tensor) -> Tensor:
     """(N,) int64 numbers of the points in the order of their Morton keys; equal keys in the order of the numbers.
 
     The cells are sized by where most points are, so that a point far away does not put all others into one; what lies
     beyond the last cell counts to it.
     """
-    sample = cloud[:: max(1, len(cloud) // SAMPLE)].sort(dim=0).values.double()
+    sample = points[:: max(1, len(points) // SAMPLE)].sort(dim=0).values.double()
     tail = len(sample) // 64
     low, middle = sample[tail], (sample[-1 - tail] - sample[tail]).amax()
-    least, most = cloud.amin(dim=0).double(), cloud.amax(dim=0).double()
+    least, most = points.amin(dim=0).double(), points.amax(dim=0).double()
     # Most points may be one and the same.
     low = torch.where(middle > 0, low - middle, least)
     extent = torch.where(middle > 0, 3 * middle, (most - least).amax())
     scale = (AXIS_CELLS / extent).nan_to_num(0.0, posinf=0.0)
-    key = torch.zeros(len(cloud), dtype=torch.int64, device=cloud.device)
+    key = torch.zeros(len(points), dtype=torch.int64, device=points.device)
     for axis in range(3):
-        cell = ((cloud[:, axis].double() - low[axis]) * scale).clamp_(0, AXIS_CELLS - 1).long()
+        cell = ((points[:, axis].double() - low[axis]) * scale).clamp_(0, AXIS_CELLS - 1).long()
         for bits, mask in SPREAD:
             cell = (cell | (cell << bits)) & mask
         key |= cell << axis

@@ -71,7 +71,7 @@ def choose_search(query: Tensor, points: Tensor, backend: str) -> Search:
         ) from error
 
 
-def backend_of_several(query: Tensor, clouds: Sequence[Tensor]) -> str:
+def choose_shared_backend(query: Tensor, clouds: Sequence[Tensor]) -> str:
     """The backend for the same queries in several clouds, one after the other: what pays for all together."""
     return "packets" if query.device.type == "cpu" and _packets_pay(query, clouds) else "auto"
 

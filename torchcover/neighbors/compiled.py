@@ -15,7 +15,7 @@ Array: TypeAlias = Any
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-def compiled(signature: str) -> Callable[[Function], Function]:
+def compile_function(signature: str) -> Callable[[Function], Function]:
     """Compile at once, and keep it on disk where a folder can be written (beside this file, or NUMBA_CACHE_DIR)."""
 
     def made(function: Function) -> Function:
@@ -29,6 +29,6 @@ def compiled(signature: str) -> Callable[[Function], Function]:
     return made
 
 
-def inlined(function: Function) -> Function:
+def inline_function(function: Function) -> Function:
     """Copy it into the functions that call it; a call in the inner loop costs a third of the search."""
     return numba.njit(inline="always")(function)  # type: ignore[no-any-return]

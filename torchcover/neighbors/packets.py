@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.neighbors import kdtree
-from torchcover.neighbors.compiled import Array, compiled, inlined
+from torchcover.neighbors.compiled import Array, compile_function, inline_function
 
 PACKET = 64  # queries
 LEAF = 16  # points
@@ -50,27 +50,27 @@ def search(query: Tensor, points: Tensor, max_distance: float, memory_mb: float)
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
         # With a single thread the pool is never asked, and starts none.
         run = pool.map if torch.get_num_threads() > 1 else map
-        order, tree_order = run(along_the_curve, (queries, tree_points))
+        order, tree_order = run(compute_morton_order, (queries, tree_points))
         leaves, indices, boxes, smallest = _build(tree_points, tree_order)
         parts = [order[start : start + SHARE] for start in range(0, len(order), SHARE)]
         list(run(lambda part: _search_part(queries, part, leaves, indices, boxes, smallest, bound, found), parts))
     return torch.from_numpy(found)
 
 
-def along_the_curve(cloud: NDArray[np.float32]) -> NDArray[np.int64]:
+def compute_morton_order(points: NDArray[np.float32]) -> NDArray[np.int64]:
     """Indices of the points in the order of their Morton keys; equal keys in the order of the indices."""
-    keys = _sorted(_morton_keys(cloud))
+    keys = _sorted(_morton_keys(points))
     crowds = _crowds(keys)
     order: NDArray[np.int64] = np.bitwise_and(keys, INDEX_MASK, out=keys).view(np.int64)
     # A point far away makes the cells large, and all others may lie in one. Equal points stay together for ever.
     for start, end in crowds:
-        if end - start < len(cloud):
+        if end - start < len(points):
             crowd = order[start:end]
-            crowd[:] = crowd[along_the_curve(cloud[crowd])]
+            crowd[:] = crowd[compute_morton_order(points[crowd])]
     return order
 
 
-@inlined
+@inline_function
 def _spread(value: Array, least: Array, scale: Array) -> Array:
     """The cell of a coordinate, its bits two places apart."""
     cell = np.uint64((value - least) * scale)
@@ -80,7 +80,7 @@ def _spread(value: Array, least: Array, scale: Array) -> Array:
     return (cell | (cell << np.uint64(2))) & np.uint64(0x249249249249)
 
 
-@compiled("uint64[::1](float32[:, ::1])")
+@compile_function("uint64[::1](float32[:, ::1])")
 def _morton_keys(cloud: NDArray[np.float32]) -> Array:
     """(N,) keys: the bits of the three cells in turn, then the index."""
     keys = np.empty(len(cloud), np.uint64)
@@ -104,7 +104,7 @@ def _morton_keys(cloud: NDArray[np.float32]) -> Array:
     return keys
 
 
-@compiled("uint64[::1](uint64[::1])")
+@compile_function("uint64[::1](uint64[::1])")
 def _sorted(keys: NDArray[np.uint64]) -> Array:
     """The keys in the order of their cells, equal cells in the order they came in: by digits, the last one first."""
     starts = np.zeros((PASSES, DIGITS), np.int64)
@@ -126,7 +126,7 @@ def _sorted(keys: NDArray[np.uint64]) -> Array:
     return keys
 
 
-@compiled("int64[:, ::1](uint64[::1])")
+@compile_function("int64[:, ::1](uint64[::1])")
 def _crowds(keys: NDArray[np.uint64]) -> Array:
     """(K, 2) begin and end of the runs of more than `CROWD` equal cells."""
     runs = np.empty((len(keys) // CROWD + 1, 2), np.int64)
@@ -140,7 +140,9 @@ def _crowds(keys: NDArray[np.uint64]) -> Array:
     return runs[:count]
 
 
-@compiled("Tuple((float32[:, :, ::1], int32[:, ::1], float32[:, ::1], int32[::1]))(float32[:, ::1], int64[::1])")
+@compile_function(
+    "Tuple((float32[:, :, ::1], int32[:, ::1], float32[:, ::1], int32[::1]))(float32[:, ::1], int64[::1])"
+)
 def _build(points: NDArray[np.float32], order: NDArray[np.int64]) -> Array:
     """Leaves (L, 3, LEAF) and the indices of their points, boxes of all nodes, and the smallest index beneath each."""
     count = (len(points) + LEAF - 1) // LEAF
@@ -181,7 +183,7 @@ def _build(points: NDArray[np.float32], order: NDArray[np.int64]) -> Array:
     return leaves, indices, boxes, smallest
 
 
-@inlined
+@inline_function
 def _load(queries: Array, part: Array, packet: Array, found: Array, bound: Array, around: Array) -> None:
     """Fill the packet with the queries `part`, the last one again where they are too few; `around` is their box."""
     around[:3] = HUGE
@@ -197,7 +199,7 @@ def _load(queries: Array, part: Array, packet: Array, found: Array, bound: Array
         found[i] = NONE
 
 
-@inlined
+@inline_function
 def _gap(boxes: Array, node: int, around: Array) -> Array:
     """Squared distance between the box of a node and the box around the packet."""
     x = max(ZERO, boxes[node, 0] - around[3], around[0] - boxes[node, 3])
@@ -206,7 +208,7 @@ def _gap(boxes: Array, node: int, around: Array) -> Array:
     return x * x + y * y + z * z
 
 
-@inlined
+@inline_function
 def _centre_gap(boxes: Array, node: int, around: Array) -> Array:
     """How far apart the centres of the two boxes are, by sums along the axes: the order of nodes that are as near."""
     x = abs(boxes[node, 0] + boxes[node, 3] - around[0] - around[3])
@@ -215,7 +217,7 @@ def _centre_gap(boxes: Array, node: int, around: Array) -> Array:
     return x + y + z
 
 
-@inlined
+@inline_function
 def _may_improve(packet: Array, found: Array, boxes: Array, smallest: Array, node: int) -> bool:
     """Whether the box may hold a nearer point for any query, or one as near with a smaller index."""
     x0, y0, z0, x1, y1, z1 = boxes[node]
@@ -236,7 +238,7 @@ def _may_improve(packet: Array, found: Array, boxes: Array, smallest: Array, nod
     return False
 
 
-@inlined
+@inline_function
 def _visit(packet: Array, found: Array, leaves: Array, indices: Array, leaf: int) -> Array:
     """Compare every query with every point of a leaf; the largest of the least squared distances."""
     for j in range(LEAF):
@@ -257,7 +259,7 @@ def _visit(packet: Array, found: Array, leaves: Array, indices: Array, leaf: int
     return packet[MOST]
 
 
-@compiled(
+@compile_function(
     "void(float32[:, ::1], int64[::1], "
     "float32[:, :, ::1], int32[:, ::1], float32[:, ::1], int32[::1], float32, int64[::1])"
 )

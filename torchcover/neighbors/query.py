@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchcover.devices import through_cpu
+from torchcover.devices import run_with_float64
 from torchcover.neighbors.choice import choose_search
 
 # Queries that are measured together on a CPU.
@@ -17,7 +17,7 @@ PART = 32_768
 LEAST_PART = 1024
 
 
-class Nearest(NamedTuple):
+class NearestPoints(NamedTuple):
     """Result of `nearest`: `distance` (N,) and `index` (N,) int64; inf and -1 where no point is within reach."""
 
     distance: Tensor
@@ -68,7 +68,7 @@ def nearest(
     max_distance: float = math.inf,
     backend: str = "auto",
     memory_mb: float = 256.0,
-) -> Nearest:
+) -> NearestPoints:
     """Distance from each query to its nearest point, and the index of that point. Exact.
 
     The backend finds the index; the distance is then computed from the coordinate differences in float64 and rounded
@@ -111,10 +111,10 @@ def nearest(
     return _nearest(query, points, max_distance, backend, memory_mb, ("query", "points"))
 
 
-@through_cpu
+@run_with_float64
 def _nearest(
     query: Tensor, points: Tensor, max_distance: float, backend: str, memory_mb: float, names: tuple[str, str]
-) -> Nearest:
+) -> NearestPoints:
     for cloud, name in zip((query, points), names, strict=True):
         check_shape(cloud, name)
     query, points = _check_together(query, points, max_distance, memory_mb)
@@ -228,10 +228,10 @@ def _rescale(query: Tensor, points: Tensor, max_distance: float) -> tuple[Tensor
     return query * half * rest, points * half * rest, max_distance * half * rest
 
 
-def _measure_distance(query: Tensor, points: Tensor, index: Tensor, max_distance: float) -> Nearest:
+def _measure_distance(query: Tensor, points: Tensor, index: Tensor, max_distance: float) -> NearestPoints:
     """Measure from the differences, in float64; mask what is out of reach."""
     if len(points) == 0:
-        return Nearest(query.new_full((len(query),), math.inf), index)
+        return NearestPoints(query.new_full((len(query),), math.inf), index)
     # Squares of float32 differences always fit float64; only float64 input can need scaling.
     norm = _scaled_norm if query.dtype == torch.float64 else _norm
     # In parts that stay in the processor's cache; a GPU takes all at once, a trace knows no number of parts.
@@ -240,7 +240,7 @@ def _measure_distance(query: Tensor, points: Tensor, index: Tensor, max_distance
     parts = zip(torch.split(query, part), torch.split(index.clamp(min=0), part), strict=True)
     distance = torch.cat([norm(q.double() - points.index_select(0, i).double()).to(query.dtype) for q, i in parts])
     within = (index >= 0) & (distance.detach() <= distance.new_tensor(max_distance))
-    return Nearest(distance.where(within, math.inf), index.where(within, -1))
+    return NearestPoints(distance.where(within, math.inf), index.where(within, -1))
 
 
 def _norm(difference: Tensor) -> Tensor:
@@ -257,7 +257,7 @@ def _scaled_norm(difference: Tensor) -> Tensor:
     return _norm(difference / scale[:, None]) * scale
 
 
-def check_tensor(given: object, name: str, *, floating: bool = False) -> None:
+def check_tensor(value: object, name: str, *, is_floating: bool = False) -> None:
     """Raise unless what arrived, which the caller calls so, is a tensor, of a floating-point type if it has to be.
 
     Raises:
@@ -268,24 +268,24 @@ def check_tensor(given: object, name: str, *, floating: bool = False) -> None:
         Traceback (most recent call last):
         TypeError: sensor: a torch tensor is needed; got a NumPy array of float64; torch.from_numpy(array) makes it one
     """
-    if isinstance(given, Tensor) and (given.is_floating_point() or not floating):
+    if isinstance(value, Tensor) and (value.is_floating_point() or not is_floating):
         return
-    wanted = "a floating-point torch tensor" if floating else "a torch tensor"
-    if isinstance(given, np.ndarray):
-        makes = "torch.from_numpy(array)" + (".float()" if floating and given.dtype.kind != "f" else "")
-        raise TypeError(f"{name}: {wanted} is needed; got a NumPy array of {given.dtype}; {makes} makes it one")
-    arrived = given.dtype if isinstance(given, Tensor) else type(given).__name__
+    wanted = "a floating-point torch tensor" if is_floating else "a torch tensor"
+    if isinstance(value, np.ndarray):
+        makes = "torch.from_numpy(array)" + (".float()" if is_floating and value.dtype.kind != "f" else "")
+        raise TypeError(f"{name}: {wanted} is needed; got a NumPy array of {value.dtype}; {makes} makes it one")
+    arrived = value.dtype if isinstance(value, Tensor) else type(value).__name__
     raise TypeError(f"{name}: {wanted} is needed; got {arrived}")
 
 
-def check_weights(weights: Tensor | None, points: int, name: str) -> None:
+def check_weights(weights: Tensor | None, num_points: int, name: str) -> None:
     """Raise unless there are none, or positive, finite ones: one for each reference point."""
     if weights is None:
         return
     check_tensor(weights, name)
-    if weights.shape != (points,):
+    if weights.shape != (num_points,):
         raise ValueError(
-            f"{name}: shape ({points},), one for each reference point, is needed; got {tuple(weights.shape)}"
+            f"{name}: shape ({num_points},), one for each reference point, is needed; got {tuple(weights.shape)}"
         )
     if not bool((weights.isfinite() & (weights > 0)).all()):
         raise ValueError(f"{name}: finite weights > 0 are needed")
@@ -304,7 +304,7 @@ def check_cloud(cloud: Tensor, name: str) -> None:
 
 def check_shape(cloud: Tensor, name: str) -> None:
     """Raise unless `cloud` is a floating-point tensor of shape (N, 3); looks at no coordinate."""
-    check_tensor(cloud, name, floating=True)
+    check_tensor(cloud, name, is_floating=True)
     if cloud.ndim != 2 or cloud.shape[1] != 3:
         raise ValueError(f"{name}: shape (N, 3) is needed; got {tuple(cloud.shape)}")
 

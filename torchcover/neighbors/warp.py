@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchcover.neighbors.box_tree import LEAF, NONE, along_the_curve, box_tree
+from torchcover.neighbors.box_tree import LEAF, NONE, build_box_tree, compute_morton_order
 
 try:
     import warp as wp
@@ -37,9 +37,9 @@ def search(query: Tensor, points: Tensor, max_distance: float, memory_mb: float)
     """As `cdist.search`, on a CPU or a CUDA device; -1 for queries without a point in reach."""
     scalar = SCALARS[query.dtype]
     bound = max_distance**2 if max_distance < torch.finfo(query.dtype).max ** 0.5 else torch.inf
-    tree = box_tree(points)
+    tree = build_box_tree(points)
     # Neighbours in the order walk much the same way, which is what makes a GPU fast.
-    order = along_the_curve(query)
+    order = compute_morton_order(query)
     found = torch.full_like(order, NONE)
     wp.launch(
         _walk,

@@ -7,7 +7,7 @@ from typing import Any, Literal, NamedTuple, Self
 
 from torch.utils.data import DataLoader, Dataset
 
-from torchcover.coverage import Measure
+from torchcover.coverage import Average
 from torchcover.estimation import Estimate
 from torchcover.evaluation import CoverageObserver
 from torchcover.evaluation.cores import get_start_method
@@ -26,7 +26,7 @@ EVERY_S = 20.0
 RAYS = 16_384
 BATCH = 3  # frames with their clouds that are in memory together
 BUDGET_BYTES = 2e9
-MEASURES: tuple[Measure, Measure] = ("area", "cells")
+MEASURES: tuple[Average, Average] = ("area", "cells")
 MANY = 10**9  # steps of a simulation, of which a few of many worlds are used
 
 AnyScenario = Scenario | str | Path
@@ -75,7 +75,7 @@ class CachedFrames(Dataset[Frame | MeasuredFrame]):
         simulations: Sequence[SimulatedFrames],
         indices: Sequence[FrameIndex],
         queries: Queries,
-        average: Measure,
+        average: Average,
     ) -> None:
         self._simulations, self._indices, self._queries, self._estimate = simulations, indices, queries, average
         self._held: dict[int, tuple[Frame, Balls | None]] = {}
@@ -89,7 +89,7 @@ class CachedFrames(Dataset[Frame | MeasuredFrame]):
             return frame
         if self._observer is None:
             self._observer = self._queries.build_observer(request.rig, self._estimate)
-        return MeasuredFrame(None, frame.counts, {self._estimate: self._observer.sums_of(frame)}, 0.0)
+        return MeasuredFrame(None, frame.counts, {self._estimate: self._observer.compute_sums(frame)}, 0.0)
 
     def _frame(self, rig: Rig | None, number: int) -> Frame:
         index = self._indices[number]
@@ -108,7 +108,7 @@ class CachedFrames(Dataset[Frame | MeasuredFrame]):
     def _build(self, index: FrameIndex, number: int) -> Frame:
         frames = self._simulations[index.scenario_index]
         frame = frames[index.frame_index]
-        heights_m = frame.heights_in(self._queries.grid.band_frame)
+        heights_m = frame.get_heights_m(self._queries.grid.band_frame)
         mask = self._queries.mask_points(frame.reference, heights_m)
         assert frame.reference_weights is not None  # those of a SurfaceReference
         return replace(
@@ -181,7 +181,7 @@ class CommonFrames:
         frame_interval_s: float = EVERY_S,
         seed: int = 0,
         rays: int = RAYS,
-        average: Measure = "area",
+        average: Average = "area",
         sensor_model: Literal["ideal", "real"] | None = None,
         budget_bytes: float = BUDGET_BYTES,
         workers: int = 0,
@@ -280,7 +280,7 @@ class CommonFrames:
         kept = {name: one.compute_met_share(rig, self._worlds[0], self.sensor_model) for name, one in required.items()}
         observer, rays, self_hits = self.queries.build_observer(rig, self.average), 0, 0
         for measured in self._compute(self._as_requested(rig), range(len(self)), is_measured=True):
-            observer.add(measured.sums[self.average])
+            observer.add_sums(measured.sums[self.average])
             rays, self_hits = rays + measured.counts["rays"], self_hits + measured.counts["self_hits"]
         return Score(self.queries.estimate(observer.metric, kept), self_hits / rays)
 

@@ -6,7 +6,7 @@ from typing import Annotated, Any, NamedTuple, Self
 
 from pydantic import Field, PlainValidator, model_validator
 
-from torchcover.geometry import euler_from_rotation
+from torchcover.geometry import convert_rotation_to_euler
 from torchcover.placement.host_vehicle import HostVehicle
 from torchcover.simulation import Document, Lidar, Pose, Sensor
 from torchcover.simulation.documents import FARTHEST_M, NameOrFile
@@ -255,7 +255,7 @@ def get_pose_values(pose: Pose) -> dict[str, float]:
     if pose.quaternion_wxyz is None:
         angles = (pose.yaw_deg, pose.pitch_deg, pose.roll_deg)
     else:
-        angles = tuple(euler_from_rotation(pose.matrix()[:3, :3]).round(DECIMALS).tolist())
+        angles = tuple(convert_rotation_to_euler(pose.matrix()[:3, :3]).round(DECIMALS).tolist())
     return dict(zip((*PLACES[:3], *ANGLES), (pose.x_m, pose.y_m, pose.z_m, *angles), strict=True))
 
 

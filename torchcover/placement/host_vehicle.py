@@ -46,7 +46,7 @@ class HostVehicle(NamedTuple):
     @property
     def outline_m(self) -> Float64:
         """(4, 2) corners x, y of the vehicle."""
-        return BoundingBox.around(self.skin.mesh.vertices_m).outline_m
+        return BoundingBox.from_points(self.skin.mesh.vertices_m).outline_m
 
     @classmethod
     def from_scenarios(cls, scenarios: Sequence[Scenario]) -> "HostVehicle":
@@ -105,15 +105,15 @@ class PlacementSpace(Readable):
         for one in required.requirements if required else ():
             if required is None or not isinstance(one, RegionRequirement):
                 continue
-            usual_m, own_m = PAPER_HEIGHTS.get(one.height), required.heights.get(one.height)
+            usual_m, own_m = PAPER_HEIGHTS.get(one.band), required.heights.get(one.band)
             if usual_m is None or own_m not in (None, usual_m):
                 raise ValueError(
-                    f"requirements: a search has the bands {dict(PAPER_HEIGHTS)} alone, and {one.height!r} is {own_m} "
+                    f"requirements: a search has the bands {dict(PAPER_HEIGHTS)} alone, and {one.band!r} is {own_m} "
                     "there; leave heights out, or check what was found"
                 )
             region = {one.region: required.regions[one.region]} if one.region in required.regions else one.region
             for key in (one.number, *(f"{one.number}_without_{name}" for name in one.failing_sensors)):
-                each = Objective(number=key, region=region, band=one.height)
+                each = Objective(number=key, region=region, band=one.band)
                 numbers |= {f"{REQUIRED}{each.description}, {bound.text}": (each, bound.value) for bound in one.bounds}
         return numbers
 

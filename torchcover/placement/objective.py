@@ -21,7 +21,7 @@ NonEmptyName = Annotated[str, Field(min_length=1)]
 
 THRESHOLD_M = 0.4
 # Numbers by area or over known cells.
-CHOSEN = re.compile(r"(radius_m|(detection|sensors|seen_by_two)_[\d.]+m)(_without_|$)")
+CHOSEN = re.compile(r"(radius_m|(detection|sensors|make_redundancy_quantity)_[\d.]+m)(_without_|$)")
 
 
 def check_requirements(
@@ -109,7 +109,7 @@ class Objective(Document):
             else math.nan
         )
         quantity = Quantity(self.key, self.description, "share", lower_is_better=False)
-        return Estimate.of([quantity], torch.tensor([share], dtype=torch.float64, device="cpu"))
+        return Estimate.from_values([quantity], torch.tensor([share], dtype=torch.float64, device="cpu"))
 
     @property
     def key(self) -> str:

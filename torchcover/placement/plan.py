@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from torchcover import __version__
-from torchcover.coverage import Measure
+from torchcover.coverage import Average
 from torchcover.placement.common_frames import EVERY_S, FRAMES_PER_WORLD, MEASURES, RAYS, WORLDS, CommonFrames
 from torchcover.placement.free_sensor import FreeChoice, VariableValue
 from torchcover.placement.host_vehicle import PlacementSpace
@@ -68,7 +68,7 @@ class SearchPlan:
     num_evaluations: int | None = None
     budget_s: float | None = None
     seed: int = 0
-    average: Measure = "area"
+    average: Average = "area"
     sensor_model: Literal["ideal", "real"] | None = None
     num_scenes: int = WORLDS
     num_held_out_scenes: int = 16

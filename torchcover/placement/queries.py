@@ -11,9 +11,9 @@ from typing import Any, NamedTuple, Self
 import torch
 from torch import Tensor
 
-from torchcover.coverage import AGGREGATIONS, Aggregation, BevGrid, CoverageSums, MeanOfMeans, Measure, Region
+from torchcover.coverage import AGGREGATIONS, Aggregation, Average, BevGrid, CoverageSums, MeanOfMeans, Region
 from torchcover.coverage.grid import PAPER_HEIGHTS
-from torchcover.coverage.quantity import RADIUS, detection, without
+from torchcover.coverage.quantity import RADIUS, make_detection_quantity, make_failure_quantity
 from torchcover.estimation import Estimate
 from torchcover.evaluation import CoverageObserver
 from torchcover.evaluation.measuring import BLOCKS
@@ -26,7 +26,7 @@ from torchcover.simulation.regions_of_interest import RegionOfInterest
 CELL_M = 0.5
 # What stands in a key for the sensor without which the number is worst.
 ANY = "any"
-SEEN_WITHIN = re.compile(r"(?:detection|sensors|seen_by_two)_(\d+(?:\.\d+)?)m")
+SEEN_WITHIN = re.compile(r"(?:detection|sensors|make_redundancy_quantity)_(\d+(?:\.\d+)?)m")
 # What is asked where nothing else is, for the steps.
 FOR_STEPS = {"": Objective(region="20m", band="ground")}
 FAILURE = re.compile(r"(.+)_without_(.+)")
@@ -83,7 +83,7 @@ class Queries(NamedTuple):
     def areas(self) -> Areas:
         """Rectangles of whole cells around the regions: over known cells a cell counts as a whole."""
         each = (_around(self.grid, [region]) for region in self.regions.values())
-        return tuple((own.x, own.y) for own in each)
+        return tuple((own.x_m, own.y_m) for own in each)
 
     def build_reference_sensor(self, rays: int) -> SurfaceReference:
         """One that is aimed at what is asked about."""
@@ -93,13 +93,15 @@ class Queries(NamedTuple):
 
     def mask_points(self, points: Tensor, heights_m: Tensor | None = None) -> Tensor:
         """Return (M,) bool: which of (M, 3) points lie in a queried region and band."""
-        inside, of, cell = self.grid.bins(points, heights_m)
+        inside, of, cell = self.grid.assign_cells(points, heights_m)
         kept = torch.zeros(len(points), dtype=torch.bool, device="cpu")
         x, y, bands = *points[inside[of], :2].T, list(self.grid.heights)
-        band, column = cell // (self.grid.cells // len(bands)), cell % (self.grid.cells // len(bands))
+        band, column = cell // (self.grid.num_cells // len(bands)), cell % (self.grid.num_cells // len(bands))
         for place in dict.fromkeys(place for objective in self.objectives.values() for place in objective.region_bands):
             region = self.regions[place[0]]
-            own = region.contains(x, y) | region.mask(self.grid).view(-1)[column]  # by area, or of a cell of it
+            own = (
+                region.mask_points(x, y) | region.mask_cells(self.grid).view(-1)[column]
+            )  # by area, or of a cell of it
             kept[inside[of[own & (band == bands.index(place[1]))]]] = True
         return kept
 
@@ -110,10 +112,10 @@ class Queries(NamedTuple):
         """
         queries = self._replace(thresholds_m=self.thresholds_m or (THRESHOLD_M,))
         with warnings.catch_warnings(action="ignore"):  # that they were fed with nothing
-            of_coverage = [one.key for one in queries.build_observer(rig, "area").compute().every_quantity]
-        single = (RADIUS, *map(detection, queries.thresholds_m))
+            of_coverage = [one.key for one in queries.build_observer(rig, "area").compute().all_quantities]
+        single = (RADIUS, *map(make_detection_quantity, queries.thresholds_m))
         others = [one.key for kind in AGGREGATIONS for one in kind.parse(kind.example).quantities]
-        of_coverage += [one.key for one in (*single, *(without(ANY, each) for each in single))] + others
+        of_coverage += [one.key for one in (*single, *(make_failure_quantity(ANY, each) for each in single))] + others
         for name, objective in self.objectives.items():
             if objective.key not in of_coverage:
                 near = get_close_matches(objective.key, of_coverage, n=1, cutoff=0.0)
@@ -122,23 +124,23 @@ class Queries(NamedTuple):
     @property
     def aggregations(self) -> tuple[Aggregation, ...]:
         """Those whose numbers are asked for."""
-        return tuple(one for kind in AGGREGATIONS if (one := kind.of_keys(set(self._keys))))
+        return tuple(one for kind in AGGREGATIONS if (one := kind.from_keys(set(self._keys))))
 
     @property
     def _keys(self) -> list[str]:
         return [objective.key for objective in self.objectives.values()]
 
-    def build_observer(self, rig: Rig, average: Measure) -> CoverageObserver:
+    def build_observer(self, rig: Rig, average: Average) -> CoverageObserver:
         """Return an observer of the coverage of a rig, fed with nothing yet, for means by area or over known cells."""
         coverage = CoverageSums(
             self.grid,
             self.thresholds_m,
-            max_radius=self.max_radius_m,
-            blocks=BLOCKS,
+            max_radius_m=self.max_radius_m,
+            num_blocks=BLOCKS,
             regions=tuple(self.regions.values()),
             aggregations=self.aggregations,
-            sensors=tuple(sensor.name for sensor in rig.sensors) if any(map(_of_failures, self._keys)) else (),
-            square_metres=average == "area",
+            sensor_names=tuple(sensor.name for sensor in rig.sensors) if any(map(_of_failures, self._keys)) else (),
+            has_area_weights=average == "area",
         )
         return CoverageObserver(coverage, rig.name)
 
@@ -151,24 +153,24 @@ class Queries(NamedTuple):
                 every block.
         """
         answers = self._answers(metric)
-        steps = max((one.steps for each in answers.values() for one in each), key=len)
+        steps = max((one.frame_counts for each in answers.values() for one in each), key=len)
         quantities, values, left_out = [], [], []
         for name in self.objective_names:
             each = answers.get(name) or [met_shares[name]]
             quantities.append(each[0].quantities[0]._replace(key=name))
             values.append(torch.cat([one.value for one in each]).mean())
-            whole = all(len(one.left_out) == len(steps) for one in each)
+            whole = all(len(one.jackknife_values) == len(steps) for one in each)
             unknown = torch.full((len(steps),), math.nan, dtype=torch.float64, device="cpu")
-            known = torch.cat([one.left_out for one in each], dim=1).mean(dim=1) if whole else unknown
+            known = torch.cat([one.jackknife_values for one in each], dim=1).mean(dim=1) if whole else unknown
             left_out.append(values[-1].expand(len(steps)) if name in met_shares else known)
         return Estimate(tuple(quantities), torch.stack(values), torch.stack(left_out, dim=1), steps)
 
     def _answers(self, metric: CoverageSums) -> dict[str, list[Estimate]]:
         """Return for each objective its number in each of its regions and bands."""
-        plain = [quantity.key for quantity in MeanOfMeans(metric.thresholds).quantities]
+        plain = [quantity.key for quantity in MeanOfMeans(metric.thresholds_m).quantities]
         places = list(dict.fromkeys(place for one in self.objectives.values() for place in one.region_bands))
-        if metric.square_metres and all(key in plain for key in self._keys):
-            by_area = metric.estimates([(self.regions[region], band) for region, band in places], "area")
+        if metric.has_area_weights and all(key in plain for key in self._keys):
+            by_area = metric.estimate_regions([(self.regions[region], band) for region, band in places], "area")
             found = dict(zip(places, by_area, strict=True))
 
             def number(key: str, place: tuple[str, str]) -> Estimate:
@@ -178,16 +180,18 @@ class Queries(NamedTuple):
             coverage = metric.compute()
 
             def number(key: str, place: tuple[str, str]) -> Estimate:
-                key = key if metric.square_metres else key.removeprefix("known_")
-                return coverage.estimate_of(key, self.regions[place[0]], place[1])
+                key = key if metric.has_area_weights else key.removeprefix("known_")
+                return coverage.estimate_number(key, self.regions[place[0]], place[1])
 
         def answer(key: str, place: tuple[str, str]) -> Estimate:
             alone, sensor = failed.groups() if (failed := FAILURE.match(key)) else (key, "")
             if sensor == ANY:
-                worst = _worst([number(f"{alone}_without_{one}", place) for one in metric.sensors])
-                title = worst.quantities[0].title.removesuffix(metric.sensors[0]) + "any one sensor"
+                worst = _worst([number(f"{alone}_without_{one}", place) for one in metric.sensor_names])
+                title = worst.quantities[0].title.removesuffix(metric.sensor_names[0]) + "any one sensor"
                 return replace(worst, quantities=(worst.quantities[0]._replace(title=title),))
-            return number(key if sensor in ("", *metric.sensors) else alone, place)  # what is not there cannot fail
+            return number(
+                key if sensor in ("", *metric.sensor_names) else alone, place
+            )  # what is not there cannot fail
 
         return {name: [answer(one.key, place) for place in one.region_bands] for name, one in self.objectives.items()}
 
@@ -200,15 +204,17 @@ def _of_failures(key: str) -> bool:
 def _worst(each: Sequence[Estimate]) -> Estimate:
     """The worst of one number of several rigs, and so without each block."""
     quantity = each[0].quantities[0]
-    value, left_out = (torch.stack(parts) for parts in zip(*((one.value, one.left_out) for one in each), strict=True))
+    value, left_out = (
+        torch.stack(parts) for parts in zip(*((one.value, one.jackknife_values) for one in each), strict=True)
+    )
     worst: Any = torch.amax if quantity.lower_is_better else torch.amin
-    return Estimate(each[0].quantities, worst(value, dim=0), worst(left_out, dim=0), each[0].steps)
+    return Estimate(each[0].quantities, worst(value, dim=0), worst(left_out, dim=0), each[0].frame_counts)
 
 
 def _written(region: Region) -> RegionOfInterest:
     if region.corners_m:
         return RegionOfInterest(polygon_m=region.corners_m)
-    return RegionOfInterest(x_m=region.x, y_m=region.y)
+    return RegionOfInterest(x_m=region.x_m, y_m=region.y_m)
 
 
 def _around(grid: BevGrid, regions: Collection[Region]) -> BevGrid:
@@ -218,5 +224,5 @@ def _around(grid: BevGrid, regions: Collection[Region]) -> BevGrid:
         low, high = min(low for low, _ in bounds), max(high for _, high in bounds)
         return float(edges[edges <= low].max()), float(edges[edges >= high].min())
 
-    x, y = outside(grid.x_edges_m, [one.x for one in regions]), outside(grid.y_edges_m, [one.y for one in regions])
-    return BevGrid(x, y, grid.cell, grid.heights, grid.band_frame)
+    x, y = outside(grid.x_edges_m, [one.x_m for one in regions]), outside(grid.y_edges_m, [one.y_m for one in regions])
+    return BevGrid(x, y, grid.cell_m, grid.heights, grid.band_frame)

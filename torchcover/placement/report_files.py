@@ -16,9 +16,9 @@ from torchcover.evaluation import build_sensor_views
 from torchcover.evaluation.progress import defer_signals
 from torchcover.evaluation.result_page import format_facts, format_rig_yaml
 from torchcover.evaluation.settings import FILES, parse_file_kinds
-from torchcover.files import AtomicOutput, csv_text
+from torchcover.files import AtomicOutput, format_csv
 from torchcover.geometry.arrays import Float64
-from torchcover.notebooks import data_frame, small_html
+from torchcover.notebooks import build_dataframe, build_result_html
 from torchcover.placement.validation import replace_nan
 from torchcover.report import Page, PagePicture, PageRig, PageTable, render_page
 from torchcover.simulation import Rig
@@ -78,7 +78,7 @@ class PlacementReport:
         for name, rig in self.rigs.items():
             files.add(name, rig.save)
         for name, rows in self.csv_tables.items():
-            files.add_text(name, csv_text([*map(_digits, row)] for row in rows))
+            files.add_text(name, format_csv([*map(_digits, row)] for row in rows))
         record = json.dumps(replace_nan({**self.record, "sentence": self.summary}), indent=2, allow_nan=False)
         files.add_text("search.json", f"{record}\n")
 
@@ -110,7 +110,7 @@ class ReportMixin:
 
     def _repr_html_(self) -> str:
         report = self.report
-        return small_html([report.title, report.summary], self.plot())
+        return build_result_html([report.title, report.summary], self.plot())
 
     def plot(self) -> Figure:
         """The first of its pictures: a figure of its own, outside pyplot."""
@@ -123,7 +123,7 @@ class ReportMixin:
             ModuleNotFoundError: pandas is not there.
         """
         headings, *rows = next(iter(self.report.csv_tables.values()))
-        return data_frame(dict(zip(map(str, headings), row, strict=True)) for row in rows)
+        return build_dataframe(dict(zip(map(str, headings), row, strict=True)) for row in rows)
 
     def save(self, folder: str | Path, *, files: str | Iterable[str] = FILES) -> list[Path]:
         """Write the files of the command line; see `PlacementReport.save`.

@@ -230,11 +230,11 @@ class SearchResult(ReportMixin):
                     format_improvement(gain.search_improvement, unit),
                     gain.description,
                     f"{gain.t_statistic:.1f}",
-                    f"{test.better} of {test.blocks}",
+                    f"{test.better_count} of {test.block_count}",
                     format_improvement(gain.optimism, unit),
                 )
                 known = ["-" if cell in ("nan", "+nan", UNKNOWN) else cell.replace("nan", "?") for cell in cells]
-                styles = ["significant" if at == 4 and test.significant else "" for at in range(len(cells))]
+                styles = ["significant" if at == 4 and test.is_significant else "" for at in range(len(cells))]
                 rows.append(tuple(map(TextCell, known, styles)))
             if finalist.improvements:
                 continue

@@ -13,7 +13,7 @@ import torch
 
 from torchcover.evaluation.checkpoint import describe_differences
 from torchcover.evaluation.progress import Progress, defer_signals
-from torchcover.files import BadFileError, check_memory, lock_folder, reads
+from torchcover.files import BadFileError, check_memory, guard_reader, lock_folder
 from torchcover.placement.plan import build_distributions, import_optuna, run_quietly
 from torchcover.placement.result import Finalist, SearchResult
 from torchcover.placement.search import RANDOM, START, Evaluation, PlacementSearch
@@ -278,7 +278,7 @@ def drop_torn_line(path: Path) -> None:
         file.truncate(file.read().rfind(b"\n") + 1)
 
 
-@reads("the journal of a placement search")
+@guard_reader("the journal of a placement search")
 def load_study(path: Path) -> tuple[Any, list[Evaluation], dict[str, str]]:
     """Return the study in a journal, its evaluations and its settings. Only JSON is read; no code is executed."""
     check_memory(4 * path.stat().st_size)

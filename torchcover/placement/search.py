@@ -62,7 +62,7 @@ class Evaluation:
         names = ("number", "strategy", "values", "self_hit_share", "infeasible", "shortfalls", "seconds")
         record: dict[str, Any] = {name: getattr(self, name) for name in names}
         if self.estimate is not None:
-            tensors = self.estimate.value, self.estimate.left_out, self.estimate.steps
+            tensors = self.estimate.value, self.estimate.jackknife_values, self.estimate.frame_counts
             record["estimate"] = [[*map(list, self.estimate.quantities)], *(tensor.tolist() for tensor in tensors)]
         return record
 
@@ -257,7 +257,9 @@ class PlacementSearch:
             if quantity.key in self.space.objectives:
                 continue
             bound = self.space.bounds.get(quantity.key, float(start.value[at]))
-            margin = -quantity.gain(float(evaluation.estimate.value[at]) - bound) / max(abs(bound), ROUNDING)
+            margin = -quantity.compute_improvement(float(evaluation.estimate.value[at]) - bound) / max(
+                abs(bound), ROUNDING
+            )
             margins[quantity.key] = 1.0 if math.isnan(margin) else margin
         return margins
 
@@ -372,9 +374,9 @@ def compute_improvements(estimate: Estimate, baseline: Estimate) -> tuple[Float6
 
     In units of the numbers; more is better. NaN where one is unknown; errors need three worlds.
     """
-    between = estimate.minus(baseline)
-    sign = [quantity.gain(1.0) for quantity in between.quantities]
-    return between.value.numpy() * sign, between.errors(3).numpy()
+    between = estimate.subtract(baseline)
+    sign = [quantity.compute_improvement(1.0) for quantity in between.quantities]
+    return between.value.numpy() * sign, between.compute_errors(3).numpy()
 
 
 def find_non_dominated(values: Float64) -> Bools:

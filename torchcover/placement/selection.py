@@ -10,9 +10,9 @@ import torch
 from matplotlib.figure import Figure
 
 from torchcover import __version__
-from torchcover.coverage import Measure
-from torchcover.coverage.quantity import detection
-from torchcover.coverage.regions import Places
+from torchcover.coverage import Average
+from torchcover.coverage.quantity import make_detection_quantity
+from torchcover.coverage.regions import RegionBands
 from torchcover.estimation import Number
 from torchcover.evaluation.progress import Progress
 from torchcover.evaluation.result import describe_sensor_models
@@ -63,7 +63,7 @@ class SelectionResult(ReportMixin):
     """
 
     space: SelectionSpace
-    average: Measure
+    average: Average
     sensor_model: str
     sensors: tuple[Sensor, ...]
     excluded: dict[str, str]
@@ -284,7 +284,7 @@ def run_selection(
     drawn = sorted(sample_selections(coverage, limits, SAMPLED, frames.seed), key=lambda one: one.values[0])
     now = now or drawn[len(drawn) // 2].selected
     rig = space.build_rig(tuple(sensors[one] for one in found[0].selected), f"{space.name}_best")
-    scored = frames.score(rig).estimate.numbers()
+    scored = frames.score(rig).estimate.to_numbers()
     model = rig.sensing(frames.sensor_model).sensor_model
     choice = tuple(found), scored, tuple(drawn), now
     chosen = SelectionResult(space, frames.average, model, sensors, refused, coverage, limits, *choice)
@@ -297,7 +297,7 @@ def observe_points(rig: Rig, frames: CommonFrames) -> tuple[Bools, float]:
     within: list[list[Bools]] = [[] for _ in queries.thresholds_m]
     for frame in frames.iterate_frames(rig):
         for threshold, masks in zip(queries.thresholds_m, within, strict=True):
-            points = frame.cloud_of(within_m=threshold)
+            points = frame.get_cloud(max_error_m=threshold)
             distance = nearest(frame.reference, points, max_distance=queries.max_radius_m).distance
             masks.append((distance <= threshold).numpy())
         rays, self_hits = rays + frame.counts["rays"], self_hits + frame.counts["self_hits"]
@@ -315,7 +315,7 @@ def compute_point_weights(frames: CommonFrames) -> Float64:
         ValueError: No frame shows a surface in one of the regions and bands.
     """
     queries, reference = frames.queries, list(frames.iterate_frames())
-    keys = [detection(threshold).key for threshold in queries.thresholds_m]
+    keys = [make_detection_quantity(threshold).key for threshold in queries.thresholds_m]
     points = sum(len(frame.reference) for frame in reference)
     weights = np.zeros((len(queries.objectives), len(keys), points))
     for row, (name, objective) in zip(weights, queries.objectives.items(), strict=True):
@@ -327,29 +327,33 @@ def compute_point_weights(frames: CommonFrames) -> Float64:
 def _weights_in(place: tuple[str, str], name: str, frames: CommonFrames, reference: Sequence[Frame]) -> Float64:
     """Return (P,) what each point adds to the number of a region and band."""
     (region, band), queries, grid = place, frames.queries, frames.queries.grid
-    where = Places([queries.regions[region]], grid)
+    where = RegionBands([queries.regions[region]], grid)
     cells = torch.zeros(grid.shape, dtype=torch.bool, device="cpu")
-    cells[list(grid.heights).index(band)] = where.regions[0].mask(grid)
-    of_frames, m2, probed = [], torch.zeros(0, device="cpu"), torch.zeros(grid.cells, dtype=torch.int64, device="cpu")
+    cells[list(grid.heights).index(band)] = where.regions[0].mask_cells(grid)
+    of_frames, m2, probed = (
+        [],
+        torch.zeros(0, device="cpu"),
+        torch.zeros(grid.num_cells, dtype=torch.int64, device="cpu"),
+    )
     for frame in reference:
-        inside, of, cell = grid.bins(frame.reference, frame.heights_in(grid.band_frame))
+        inside, of, cell = grid.assign_cells(frame.reference, frame.get_heights_m(grid.band_frame))
         if frames.average == "area":
-            at, point = where.of_points(frame.reference[inside[of]], cell)
-            selected = point[at == where.number_of(where.regions[0], band)]
+            at, point = where.assign_points(frame.reference[inside[of]], cell)
+            selected = point[at == where.find_index(where.regions[0], band)]
         else:
             selected = cells.view(-1)[cell].nonzero().squeeze(1)
         points, cell = inside[of[selected]], cell[selected]
         assert frame.reference_weights is not None  # square meters
         weight = frame.reference_weights[points].double()
         of_frames.append((points, weight, cell))
-        m2, probed = torch.cat([m2, weight]), probed + torch.bincount(cell, minlength=grid.cells).bool()
+        m2, probed = torch.cat([m2, weight]), probed + torch.bincount(cell, minlength=grid.num_cells).bool()
     if not len(m2):
         raise ValueError(f"{name}: no frame shows any surface of {band} in {region}; use more worlds")
     weights = []
     for frame, (points, weight, cell) in zip(reference, of_frames, strict=True):
         share = weight / m2.sum()
         if frames.average == "cells":
-            of_cell = torch.bincount(cell, weights=weight, minlength=grid.cells)
+            of_cell = torch.bincount(cell, weights=weight, minlength=grid.num_cells)
             share = weight / of_cell[cell] / probed[cell] / (probed > 0).sum()
         weights.append(
             torch.zeros(len(frame.reference), dtype=torch.float64, device="cpu").index_add_(0, points, share)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from torchcover.coverage.grid import PAPER_HEIGHTS
-from torchcover.coverage.quantity import detection
+from torchcover.coverage.quantity import make_detection_quantity
 from torchcover.estimation import Difference, Estimate, Quantity
 from torchcover.estimation.errors import ROUND_OFF
 from torchcover.evaluation.target_survey import build_flat_ground
@@ -53,12 +53,12 @@ class HeldOutImprovement(NamedTuple):
     @property
     def optimism(self) -> float:
         """How much larger the improvement was in the search."""
-        return self.search_improvement - self.difference.gain
+        return self.search_improvement - self.difference.improvement
 
     @property
     def t_statistic(self) -> float:
         """Gain over error; NaN if the error is unknown, or 0."""
-        return self.difference.gain / self.difference.error if self.difference.error > 0 else math.nan
+        return self.difference.improvement / self.difference.error if self.difference.error > 0 else math.nan
 
     @property
     def record(self) -> dict[str, Any]:
@@ -66,13 +66,15 @@ class HeldOutImprovement(NamedTuple):
         test = self.difference
         return {
             "unit": test.quantity.unit,
-            "gain": test.gain,
+            "gain": test.improvement,
             "error": test.error,
-            "interval": sorted([test.quantity.gain(test.low), test.quantity.gain(test.high)]),
+            "interval": sorted(
+                [test.quantity.compute_improvement(test.low), test.quantity.compute_improvement(test.high)]
+            ),
             "t": self.t_statistic,
-            "p": test.p,
-            "worlds": test.blocks,
-            "better": test.better,
+            "p": test.p_value,
+            "worlds": test.block_count,
+            "better": test.better_count,
             "search_improvement": self.search_improvement,
             "optimism": self.optimism,
         }
@@ -96,7 +98,7 @@ class SideEffect(NamedTuple):
     @property
     def is_worse(self) -> bool:
         """Whether it got worse beyond chance."""
-        return self.p_value <= 0.05 and self.difference.gain < 0
+        return self.p_value <= 0.05 and self.difference.improvement < 0
 
     @property
     def description(self) -> str:
@@ -147,7 +149,7 @@ class ValidationResult(NamedTuple):
         return [
             {
                 "what": one.name,
-                "gain": one.difference.gain,
+                "gain": one.difference.improvement,
                 "error": one.difference.error,
                 "p_holm": one.p_value,
                 "shares": one.objective_shares,
@@ -178,13 +180,13 @@ def validate(
     start_by_search = search_frames.score(start).estimate
     gains, found = {}, by_test[first]
     for name, winner in finalists.items():
-        in_search = search_frames.score(winner).estimate.differences(start_by_search)
+        in_search = search_frames.score(winner).estimate.compute_differences(start_by_search)
         gains[name] = tuple(
             HeldOutImprovement(
                 objective,
                 asked.fixed_average or search_frames.average,
                 by_test[name][objective],
-                in_search[objective].gain,
+                in_search[objective].improvement,
             )
             for objective, asked in search_frames.objectives.items()
         )
@@ -192,25 +194,25 @@ def validate(
     tests |= _of_targets(finalists[first], start, search_frames)
     shares: dict[str, dict[str, float]] = {name: {} for name in tests}
     for objective, each in parts.items():
-        whole = sum(found[part].gain for part in each)
-        for part in each if found[objective].significant and whole > 0 else ():  # of no gain there is no share
-            shares[part][objective] = found[part].gain / whole
+        whole = sum(found[part].improvement for part in each)
+        for part in each if found[objective].is_significant and whole > 0 else ():  # of no gain there is no share
+            shares[part][objective] = found[part].improvement / whole
     changes = [
         SideEffect(name, test, p, shares[name])
-        for (name, test), p in zip(tests.items(), adjust_holm([test.p for test in tests.values()]), strict=True)
+        for (name, test), p in zip(tests.items(), adjust_holm([test.p_value for test in tests.values()]), strict=True)
     ]
-    changes.sort(key=lambda one: (not one.is_worse, math.isnan(one.p_value), one.p_value, one.difference.gain))
+    changes.sort(key=lambda one: (not one.is_worse, math.isnan(one.p_value), one.p_value, one.difference.improvement))
     return ValidationResult(gains, tuple(changes))
 
 
 def _differences(one: Estimate, other: Estimate, asked: Mapping[str, Objective]) -> dict[str, Difference]:
     """Of two rigs. What is required is looked at once and not in worlds, so that chance has no part in it."""
-    found = one.differences(other)
+    found = one.compute_differences(other)
     for name in (name for name, each in asked.items() if each.requirement):
         value = found[name].value
         differs = abs(value) > ROUND_OFF
         p = 0.0 if differs else 1.0
-        found[name] = found[name]._replace(error=0.0, low=value, high=value, significant=differs, p=p)
+        found[name] = found[name]._replace(error=0.0, low=value, high=value, is_significant=differs, p_value=p)
     return found
 
 
@@ -237,7 +239,7 @@ def _others(asked: Mapping[str, Objective], *, failures: bool) -> tuple[dict[str
         each = {one.description: one for one in objective.parts}
         found, parts[name] = found | each, list(each)
     own = {region for objective in asked.values() if isinstance(objective.region, dict) for region in objective.region}
-    plain = detection(THRESHOLD_M).key
+    plain = make_detection_quantity(THRESHOLD_M).key
     for region in RegionsOfInterest().around(ANY_OUTLINE_M).regions:
         for band in PAPER_HEIGHTS if region.name not in own else ():
             one = Objective(region=region.name, band=band)
@@ -265,8 +267,8 @@ def _of_targets(rig: Rig, start: Rig, searched: CommonFrames) -> dict[str, Diffe
             cells = torch.bincount(of, minlength=16)
             enough = torch.bincount(of, torch.from_numpy(seen.enough[there]).double(), minlength=16)
             quantity = Quantity(target, f"{target} seen", "share", lower_is_better=False)
-            ends.append(Estimate.of_ratios((quantity,), cells.double(), enough[:, None], cells))
-        found[f"{target} within {WITHIN_M:g} m"] = ends[0].differences(ends[1])[target]
+            ends.append(Estimate.from_ratios((quantity,), cells.double(), enough[:, None], cells))
+        found[f"{target} within {WITHIN_M:g} m"] = ends[0].compute_differences(ends[1])[target]
     return found
 
 
@@ -298,12 +300,12 @@ def describe_improvement(improvement: HeldOutImprovement, *, optimism: bool = Fa
     if math.isnan(test.value):
         return "unknown in the held-out worlds"
     t = "t unknown" if math.isnan(improvement.t_statistic) else f"t {improvement.t_statistic:.1f}"
-    where = f"on {test.blocks} held-out worlds ({t}, better in {test.better})"
+    where = f"on {test.block_count} held-out worlds ({t}, better in {test.better_count})"
     rest = f"{improvement.description} {format_unit(unit)} {'in any world' if test.low == test.high else where}"
     if optimism and not math.isnan(improvement.optimism):
         rest += f", optimism {format_improvement(improvement.optimism, unit)}"
-    if test.significant:
-        return f"{'gained' if test.gain > 0 else 'lost'} {rest}"
+    if test.is_significant:
+        return f"{'gained' if test.improvement > 0 else 'lost'} {rest}"
     return f"no gain is shown: {rest}"
 
 

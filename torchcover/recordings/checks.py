@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchcover.detection import Boxes, points_in_boxes
+from torchcover.detection import Boxes, find_points_in_boxes
 from torchcover.neighbors import nearest
 from torchcover.recordings.ground_model import GroundModel, extract_low_surfaces
 from torchcover.recordings.in_vehicle import transform_to_vehicle
@@ -150,7 +150,7 @@ def check_mirrored_axis(sensor: str, frames: Sequence["CheckedFrame"]) -> str | 
     for frame in frames:
         if frame.boxes is None:
             continue
-        is_near = torch.linalg.vector_norm(frame.boxes.centre_m[:, :2], dim=1) < PARAMS.max_box_range_m
+        is_near = torch.linalg.vector_norm(frame.boxes.center_m[:, :2], dim=1) < PARAMS.max_box_range_m
         rows = frame.boxes.rows[is_near].clone()
         rows[:, 2] += PARAMS.box_bottom_margin_m / 2
         rows[:, 5] -= PARAMS.box_bottom_margin_m
@@ -280,7 +280,7 @@ def _read_frames(recording: Recording, sensors: Sequence[str], num_frames: int) 
 
 
 def _count_in_boxes(points_m: Cloud, boxes: Boxes) -> torch.Tensor:
-    return torch.bincount(points_in_boxes(torch.from_numpy(points_m), boxes).box, minlength=len(boxes))
+    return torch.bincount(find_points_in_boxes(torch.from_numpy(points_m), boxes).box_indices, minlength=len(boxes))
 
 
 def _spread(count: int, maximum: int) -> list[int]:

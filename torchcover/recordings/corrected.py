@@ -64,8 +64,8 @@ def correct_poses(world_T_vehicle: Matrix, times_s: NDArray[np.float64], setting
     """(N, 4, 4) poses of N instants in a row, put right; beyond the first and the last they go on as before."""
     poses = world_T_vehicle.copy()
     if settings.quaternions == "xyzw":  # what was read as w, x, y, z
-        wxyz = [geometry.quaternion_from_rotation(rotation) for rotation in poses[:, :3, :3]]
-        poses[:, :3, :3] = geometry.rotation_from_quaternion(np.roll(wxyz, 1, axis=1))
+        wxyz = [geometry.convert_rotation_to_quaternion(rotation) for rotation in poses[:, :3, :3]]
+        poses[:, :3, :3] = geometry.convert_quaternion_to_rotation(np.roll(wxyz, 1, axis=1))
     if settings.poses == "inverse":
         poses = geometry.invert(poses)
     elif settings.poses == "yx":
@@ -76,7 +76,7 @@ def correct_poses(world_T_vehicle: Matrix, times_s: NDArray[np.float64], setting
     known, known_s, wanted_s = poses[new], times_s[new], times_s + settings.time_offset_s
     after = np.searchsorted(known_s, wanted_s, side="right").clip(1, len(known) - 1)
     share = ((wanted_s - known_s[after - 1]) / np.diff(known_s)[after - 1])[:, None]
-    angles_deg, places_m = geometry.euler_from_rotation(known[:, :3, :3]), known[:, :3, 3]
+    angles_deg, places_m = geometry.convert_rotation_to_euler(known[:, :3, :3]), known[:, :3, 3]
     turns_deg = ((np.diff(angles_deg, axis=0) + 180) % 360 - 180)[after - 1]
-    rotations = geometry.rotation_from_euler(*(angles_deg[after - 1] + share * turns_deg).T)
-    return geometry.rigid(rotations, places_m[after - 1] + share * np.diff(places_m, axis=0)[after - 1])
+    rotations = geometry.convert_euler_to_rotation(*(angles_deg[after - 1] + share * turns_deg).T)
+    return geometry.build_transform(rotations, places_m[after - 1] + share * np.diff(places_m, axis=0)[after - 1])

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.geometry import BoundingBox, transform
+from torchcover.geometry import BoundingBox, transform_points
 from torchcover.geometry.rigid import Matrix
 
 Float64 = NDArray[np.float64]
@@ -107,7 +107,7 @@ def count_votes_by_arrays(
     increment: int,
 ) -> None:
     """`RangeImage.vote` where numba is missing."""
-    row, column, range_m = _bins(transform(sensor_T_local, points_m), COLUMNS // free_range_m.shape[1])
+    row, column, range_m = _bins(transform_points(sensor_T_local, points_m), COLUMNS // free_range_m.shape[1])
     inside = np.flatnonzero((range_m < max_free_range_m) & (row >= first_row) & (row < first_row + len(free_range_m)))
     votes[inside[range_m[inside] < free_range_m[row[inside] - first_row, column[inside]]]] += increment
 
@@ -154,7 +154,7 @@ def estimate_visible_share(points_m: Float64, ego_box: BoundingBox, voxel_m: flo
     return seen / PLACES
 
 
-def square_metres(points_m: Float64) -> Float64:
+def estimate_surface_areas_m2(points_m: Float64) -> Float64:
     """(N,) how much surface each of (N, 3) points stands for: the circle up to its eighth neighbour, shared by eight.
 
     Example:

@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.geometry import HeightField, fitted
+from torchcover.geometry import HeightField, fit_height_field
 
 Bools = NDArray[np.bool_]
 Float64 = NDArray[np.float64]
@@ -88,16 +88,16 @@ class GroundModel(NamedTuple):
             chosen = chosen[found[square[chosen]]]
             if len(chosen) < FEWEST:
                 return None
-            field = fitted(across_m[chosen], heights_m[chosen], size_m, COARSE_M, beneath=BENEATH)
-            on_field = np.abs(heights_m[chosen] - field.heights_m(across_m[chosen])) < ON_FIELD_M
+            field = fit_height_field(across_m[chosen], heights_m[chosen], size_m, COARSE_M, above_weight=BENEATH)
+            on_field = np.abs(heights_m[chosen] - field.compute_heights_m(across_m[chosen])) < ON_FIELD_M
             if on_field.mean() < SMOOTH:
                 return None
             chosen = chosen[on_field]
         own = found[square]
-        field = fitted(across_m[own], heights_m[own], size_m, FINE_M, on=field)
+        field = fit_height_field(across_m[own], heights_m[own], size_m, FINE_M, base_field=field)
         known = np.zeros(SIDE**2, dtype=np.bool_)
         known[square[chosen][:, None] + _around()[0]] = True
-        return cls(lower_m, field._replace(lower_m=field.lower_m + first_m), known)
+        return cls(lower_m, field._replace(origin_m=field.origin_m + first_m), known)
 
     def compute_heights_m(self, points_m: NDArray[np.floating]) -> Float64:
         """(N,) how high above the ground (N, 3) points are, below it less than 0; NaN where that is unknown."""
@@ -105,7 +105,7 @@ class GroundModel(NamedTuple):
         heights_m = np.full(len(points_m), np.nan)
         inside = np.flatnonzero(((across_m >= 0) & (across_m < 2 * AROUND_M)).all(axis=1))
         inside = inside[self.observed[_squares(across_m[inside])]]
-        heights_m[inside] = points_m[inside, 2] - self.height_field.heights_m(across_m[inside])
+        heights_m[inside] = points_m[inside, 2] - self.height_field.compute_heights_m(across_m[inside])
         return heights_m
 
 

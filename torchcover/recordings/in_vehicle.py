@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.geometry import BoundingBox, transform
-from torchcover.geometry.rigid import blocks
+from torchcover.geometry import BoundingBox, transform_points
+from torchcover.geometry.rigid import iterate_blocks
 from torchcover.recordings.clouds.arrays import Points
 from torchcover.recordings.recording import NO_RETURN_M, Scan
 
@@ -46,10 +46,10 @@ def transform_to_vehicle(scan: Scan, ego_box: BoundingBox | None = None) -> Vehi
         heights_m = None if heights_m is None else heights_m[kept]
     moved_m, count = np.empty(points_m.shape, np.float32), 0
     farthest_m, own = 0.0, [np.empty(0, np.intp)]
-    for rows in blocks(len(points_m)):
+    for rows in iterate_blocks(len(points_m)):
         part_m = points_m[rows]
         if scan.vehicle_T_sensor is not None:
-            part_m = transform(scan.vehicle_T_sensor, part_m)
+            part_m = transform_points(scan.vehicle_T_sensor, part_m)
         farthest_m = max(farthest_m, float(part_m.max()), -float(part_m.min()))
         if ego_box is not None:
             inside = find_points_in_box(part_m, ego_box)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.files import apart, check_memory, check_regular, naming, reads
+from torchcover.files import check_memory, check_regular, guard_reader, report_bad_file, run_isolated
 from torchcover.files.bad_file import MAX_REASON_CHARS
 
 ROS1_SUFFIX = ".bag"
@@ -70,7 +70,7 @@ def _naming_remedy(path: Path) -> Iterator[None]:
         ) from error
 
 
-@apart
+@run_isolated
 def read_bag_index(path: Path) -> dict[str, NDArray[Any]]:
     """Read which messages a bag has, without the messages themselves.
 
@@ -85,7 +85,7 @@ def read_bag_index(path: Path) -> dict[str, NDArray[Any]]:
         BadFileError: A damaged bag, or one that takes too much memory.
         ImportError: rosbags is not installed.
     """
-    with naming(path, "a bag"), _naming_remedy(path):
+    with report_bad_file(path, "a bag"), _naming_remedy(path):
         bag = _open(path)
         types = {connection.topic: str(connection.msgtype) for one in bag.readers for connection in one.connections}
         parts = [_times_of_ros1(one) if bag.is_ros1 else _times_of_ros2(one) for one in bag.readers]
@@ -99,7 +99,7 @@ def read_bag_index(path: Path) -> dict[str, NDArray[Any]]:
         }
 
 
-@apart
+@run_isolated
 def read_bag_messages(path: Path, topic: str, start_ns: int | None, stop_ns: int | None) -> dict[str, NDArray[Any]]:
     """Read the serialized messages of a topic that were recorded within [start_ns, stop_ns).
 
@@ -109,7 +109,7 @@ def read_bag_messages(path: Path, topic: str, start_ns: int | None, stop_ns: int
     Raises:
         BadFileError: A damaged bag, or messages that take too much memory.
     """
-    with naming(path, f"a bag, in {topic}"):
+    with report_bad_file(path, f"a bag, in {topic}"):
         messages: list[tuple[int, str, bytes]] = []
         total_bytes = 0
         for reader in _open(path).readers:
@@ -126,7 +126,7 @@ def read_bag_messages(path: Path, topic: str, start_ns: int | None, stop_ns: int
         }
 
 
-@apart
+@run_isolated
 def read_header_stamps(path: Path, topic: str, times_ns: list[int] | None) -> dict[str, NDArray[Any]]:
     """Read the time stamps with which the messages of a topic begin, without the messages.
 
@@ -141,7 +141,7 @@ def read_header_stamps(path: Path, topic: str, times_ns: list[int] | None) -> di
     Raises:
         BadFileError: A damaged bag.
     """
-    with naming(path, f"a bag, in {topic}"), _naming_remedy(path):
+    with report_bad_file(path, f"a bag, in {topic}"), _naming_remedy(path):
         bag, found = _open(path), list[tuple[int, int]]()
         for start_ns, stop_ns in [(None, None)] if times_ns is None else [(time, time + 1) for time in times_ns]:
             for reader in bag.readers:
@@ -231,8 +231,8 @@ def _read_mcap_index(file: Any, channel: int, offset: int) -> NDArray[np.int64]:
     return np.frombuffer(file.read(size_bytes), MCAP_INDEX_ENTRY)["time_ns"].astype(np.int64)
 
 
-@reads("a feather table")
-@apart
+@guard_reader("a feather table")
+@run_isolated
 def read_feather(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
     """Read columns of a feather table.
 
@@ -257,7 +257,7 @@ def read_feather(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
     return {name: table.column(name).to_numpy() for name in names}
 
 
-@apart
+@run_isolated
 def read_laz_points(path: Path, num_points: int) -> dict[str, NDArray[Any]]:
     """(N, 3) int32 `xyz` as they are written in a LAZ file, of so many points."""
     try:
@@ -272,7 +272,7 @@ def read_laz_points(path: Path, num_points: int) -> dict[str, NDArray[Any]]:
     return {"xyz": np.column_stack([found.X, found.Y, found.Z])}
 
 
-@apart
+@run_isolated
 def decompress_lzf_block(
     path: Path, start_byte: int, compressed_bytes: int, uncompressed_bytes: int
 ) -> dict[str, NDArray[Any]]:

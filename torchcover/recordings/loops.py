@@ -4,11 +4,11 @@ import math
 
 import numpy as np
 
-from torchcover.neighbors.compiled import Array, compiled, inlined
+from torchcover.neighbors.compiled import Array, compile_function, inline_function
 from torchcover.recordings.free_space import A1, A3, A5, A7, A9, BEHIND, BEHIND_M, COLUMNS, OVER_M, ROWS, TINY
 
 
-@compiled("void(f8[:, ::1], f4[:, ::1], i8, f8[:, ::1], f8, i2[::1], i8)")
+@compile_function("void(f8[:, ::1], f4[:, ::1], i8, f8[:, ::1], f8, i2[::1], i8)")
 def count_votes_by_loop(
     points_m: Array,
     free_range_m: Array,
@@ -46,7 +46,7 @@ def count_votes_by_loop(
             votes[i] += increment
 
 
-@inlined
+@inline_function
 def _angle_rad(y: Array, x: Array) -> Array:
     low, high = min(abs(x), abs(y)), max(abs(x), abs(y), TINY)
     share = low / high
@@ -59,7 +59,7 @@ def _angle_rad(y: Array, x: Array) -> Array:
     return -angle if y < 0 else angle
 
 
-@compiled("void(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], b1[::1])")
+@compile_function("void(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], b1[::1])")
 def mark_hidden_by_loop(
     points_m: Array,
     viewpoint_m: Array,
@@ -98,7 +98,7 @@ def mark_hidden_by_loop(
             hidden[i] |= nearest_m[number] * (1 + BEHIND) + BEHIND_M < range_m[i]
 
 
-@compiled("void(f8[:, ::1], f8[::1], u1[:, :, ::1], f8, f8[:, ::1], f8[::1])")
+@compile_function("void(f8[:, ::1], f8[::1], u1[:, :, ::1], f8, f8[:, ::1], f8[::1])")
 def compute_overlap_by_loop(
     positions_m: Array, time_offsets_s: Array, occupancy: Array, cell_m: float, velocities_mps: Array, overlap: Array
 ) -> None:

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchcover.detection.boxes import Boxes, upright_rows
-from torchcover.files import naming, road_user_classes
-from torchcover.geometry import euler_from_rotation, rigid, rotation_from_euler, transform
+from torchcover.detection.boxes import Boxes, build_upright_rows
+from torchcover.files import load_road_user_classes, report_bad_file
+from torchcover.geometry import build_transform, convert_euler_to_rotation, convert_rotation_to_euler, transform_points
 from torchcover.geometry.rigid import Matrix
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings.recording import Recording
@@ -61,8 +61,8 @@ class ObjectInterpolator:
         between = (self._between(seen, self._times[name], time_s) for name, seen in self._seen.items())
         found = [one for one in between if one is not None]
         poses = np.array([one.world_T_box for one in found]).reshape(-1, 4, 4)
-        rows = upright_rows(
-            transform(vehicle_T_world, poses[:, :3, 3]),
+        rows = build_upright_rows(
+            transform_points(vehicle_T_world, poses[:, :3, 3]),
             np.array([one.size_m for one in found]).reshape(-1, 3),
             poses[:, :3, 0] @ vehicle_T_world[:3, :3].T,
             None,
@@ -93,7 +93,7 @@ def _blend(first: Matrix, second: Matrix, share: float) -> Matrix:
     turn = first[:3, :3].T @ second[:3, :3]
     angle = share * np.arctan2(turn[1, 0], turn[0, 0])
     about_z = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
-    return rigid(first[:3, :3] @ about_z, place_m)
+    return build_transform(first[:3, :3] @ about_z, place_m)
 
 
 class Track(NamedTuple):
@@ -137,7 +137,7 @@ class RecordedObjects(NamedTuple):
         found = hashlib.sha256()
         for track in self.tracks:
             way = track.trajectory
-            found.update(repr((*track[:4], way.transient)).encode())
+            found.update(repr((*track[:4], way.is_transient)).encode())
             found.update(np.column_stack([way.times_s, way.positions_m, way.angles_deg]).tobytes())
         for ego in self.egos:
             found.update(repr((ego.name, ego.ego_T_vehicle.tolist(), ego.size_m, ego.times_s.tolist())).encode())
@@ -162,7 +162,7 @@ def build_track(
         check_box_size(name, size_m)
     length, width, height = check_box_size(name, np.median(sizes_m, axis=0))
     places_m = world_T_box[:, :3, 3] - sizes_m[:, 2:] / 2 * world_T_box[:, :3, 2]
-    angles_deg = euler_from_rotation(world_T_box[:, :3, :3])
+    angles_deg = convert_rotation_to_euler(world_T_box[:, :3, :3])
     trajectory = build_trajectory(name, np.array([one.time_s for one in states]), places_m, angles_deg)
     return Track(name, states[0].category, vehicle_class, (length, width, height), trajectory)
 
@@ -177,14 +177,14 @@ def check_box_size(name: str, size_m: Matrix) -> tuple[float, ...]:
 def build_trajectory(name: str, times_s: Matrix, positions_m: Matrix, angles_deg: Matrix) -> Trajectory:
     """A trajectory that is there within its times."""
     try:
-        return Trajectory(times_s, positions_m, angles_deg, transient=True)
+        return Trajectory(times_s, positions_m, angles_deg, is_transient=True)
     except ValueError as error:
         raise ValueError(f"id {name}: {error}") from error
 
 
 def extract_objects(recording: Recording) -> RecordedObjects:
     """The labelled objects of a recording, and the drive of its vehicle, in the world of its poses."""
-    with naming(recording.path, "objects of a recording"):
+    with report_bad_file(recording.path, "objects of a recording"):
         poses = [recording.get_world_T_vehicle(index) for index in range(len(recording.frame_names))]
         world_T_vehicle = np.stack([pose for pose in poses if pose is not None] or [np.eye(4)])
         if recording.times_s is None or len(world_T_vehicle) < len(poses):
@@ -208,7 +208,7 @@ def find_vehicle_class(category: str) -> str | None:
         >>> find_vehicle_class("Car"), find_vehicle_class("walker.pedestrian.0007"), find_vehicle_class("static.barrier")
         ('passenger', 'pedestrian', None)
     """
-    classes = road_user_classes()["usual"]
+    classes = load_road_user_classes()["usual"]
     return next((classes[word] for word in reversed(category.strip().lower().split(".")) if word in classes), None)
 
 
@@ -222,8 +222,8 @@ def _labelled(recording: Recording, times_s: NDArray[np.float64], world_T_vehicl
         if "" in boxes.ids:
             raise ValueError(f"an object of {name} has no id, by which it would be found again in other instants")
         rows = boxes.rows.double().numpy()
-        turned = rotation_from_euler(np.rad2deg(rows[:, 6]), np.zeros(len(rows)), np.zeros(len(rows)))
-        placed = world_T_vehicle[index] @ rigid(turned, rows[:, :3])
+        turned = convert_euler_to_rotation(np.rad2deg(rows[:, 6]), np.zeros(len(rows)), np.zeros(len(rows)))
+        placed = world_T_vehicle[index] @ build_transform(turned, rows[:, :3])
         for own, world_T_box, row, category in zip(boxes.ids, placed, rows, boxes.categories, strict=True):
             yield ObjectState(own, time_s, world_T_box, tuple(row[3:6].tolist()), category)
     if not labelled:

@@ -12,7 +12,7 @@ from operator import attrgetter
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.geometry import invert, transform
+from torchcover.geometry import invert, transform_points
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.corrected import correct_poses
 from torchcover.recordings.in_vehicle import transform_to_vehicle
@@ -207,7 +207,7 @@ class ScanPair:
             mount = self.scans[0].vehicle_T_sensor
             mirror = swap if mount is None else mount @ swap @ invert(mount)
             motion = mirror @ motion @ mirror
-        return self._maps[0].match(transform(motion, self._maps[1].points_m))
+        return self._maps[0].match(transform_points(motion, self._maps[1].points_m))
 
 
 def check_frozen_poses(segments: Sequence[PoseSegment]) -> str | None:

@@ -13,11 +13,11 @@ import torch
 from numpy.typing import NDArray
 
 from torchcover.detection import Boxes
-from torchcover.detection.inside import with_hits
+from torchcover.detection.inside import add_point_counts
 from torchcover.files import allow_links, find_link_roots
 from torchcover.frames.frame import Frame
 from torchcover.frames.source import BadFrameError, FrameDataset
-from torchcover.geometry import transform
+from torchcover.geometry import transform_points
 from torchcover.recordings.in_vehicle import VehicleCloud, join_clouds, transform_to_vehicle
 from torchcover.recordings.recording import Recording
 from torchcover.recordings.reference import AccumulatedReference, RecordedReference, Reference
@@ -119,11 +119,11 @@ class RecordedFrames(FrameDataset):
         """The names of the sensors of each rig."""
         return self.sensors_by_rig
 
-    def world_of(self, index: int) -> int:
+    def get_scene_id(self, index: int) -> int:
         """The index: nothing has to be built."""
         return index
 
-    def block_index(self, index: int) -> int:
+    def get_block_index(self, index: int) -> int:
         """The window of a frame; frames of one window share most of their reference points."""
         return self._block_indices[index]
 
@@ -150,12 +150,12 @@ class RecordedFrames(FrameDataset):
         self._has_heights = bool(self._has_heights)
         return self._has_heights
 
-    def doubts(self, steps: int | None = None) -> Sequence[str]:
+    def check(self, num_frames: int | None = None) -> Sequence[str]:
         """Faults of the recording with their remedies, as `torchcover.recordings.checks` finds them."""
         from torchcover.recordings.checks import check_recording  # only before a measurement
 
-        num_frames = len(self) if steps is None else min(steps, len(self))
-        return check_recording(self.recording, self.reference, self.sensors_by_rig, num_frames)
+        num_checked_frames = len(self) if num_frames is None else min(num_frames, len(self))
+        return check_recording(self.recording, self.reference, self.sensors_by_rig, num_checked_frames)
 
     @property
     def ego_outline_m(self) -> NDArray[np.float64] | None:
@@ -169,9 +169,9 @@ class RecordedFrames(FrameDataset):
         return {"scenario": None, "vehicle": None, "frames": str(self.recording.path), "seed": None}
 
     @property
-    def square_metres(self) -> bool:
+    def has_area_weights(self) -> bool:
         """Whether the reference has the square metres of its points."""
-        return self.reference.square_metres(self.recording)
+        return self.reference.has_area_weights(self.recording)
 
     @property
     def reference_record(self) -> Mapping[str, object]:
@@ -227,7 +227,7 @@ class RecordedFrames(FrameDataset):
         }
         tensors = {rig: torch.from_numpy(cloud.points_m) for rig, cloud in clouds.items()}
         if boxes is not None:
-            boxes = with_hits(boxes, tensors)
+            boxes = add_point_counts(boxes, tensors)
         return Frame(
             tensors,
             torch.from_numpy(reference.points_m),
@@ -238,7 +238,7 @@ class RecordedFrames(FrameDataset):
             reference_heights_m=None if heights_m is None else torch.from_numpy(heights_m),
             boxes=boxes,
             block_index=self._block_indices[position],
-            sensor_points={
+            sensor_point_counts={
                 rig: {sensor: len(scans[sensor].points_m) for sensor in of} for rig, of in self.sensors_by_rig.items()
             },
         )
@@ -290,11 +290,11 @@ class RecordedFrames(FrameDataset):
             return np.full(len(reference.points_m), np.nan, dtype=np.float32), boxes
         local_T_vehicle = self._sweeps.compute_local_T_vehicle(self.recording, instant)
         if boxes is not None:
-            centres_m = transform(local_T_vehicle, boxes.centre_m.double().numpy())
+            centres_m = transform_points(local_T_vehicle, boxes.center_m.double().numpy())
             bottoms_m = torch.from_numpy(ground.compute_heights_m(centres_m)).to(boxes.size_m) - boxes.size_m[:, 2] / 2
             known = boxes.bottom_heights_m
             boxes = replace(boxes, bottom_heights_m=torch.where(known.isnan(), bottoms_m, known))
-        return ground.compute_heights_m(transform(local_T_vehicle, reference.points_m)).astype(np.float32), boxes
+        return ground.compute_heights_m(transform_points(local_T_vehicle, reference.points_m)).astype(np.float32), boxes
 
     def _check_sensors(self) -> None:
         there = (*self.recording.sensors, *self.recording.reference_sensors)

@@ -9,10 +9,10 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from torchcover.detection.boxes import Boxes
-from torchcover.detection.visibility import box_visibility
-from torchcover.files import csv_text, write_npz
+from torchcover.detection.visibility import measure_box_visibility
+from torchcover.files import format_csv, write_npz
 from torchcover.frames.frame import Frame
-from torchcover.geometry import BoundingBox, invert, quaternion_from_rotation, transform
+from torchcover.geometry import BoundingBox, convert_rotation_to_quaternion, invert, transform_points
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.clouds.arrays import Points
 from torchcover.recordings.formats.folder import BOXES, POSES_FILE, REFERENCE, SETTINGS_FILE
@@ -23,14 +23,14 @@ from torchcover.recordings.formats.kitti import vehicle_T_velodyne
 class RecordingSetup(NamedTuple):
     """What is the same at every step: the mounts of the rig's sensors, which of these are LiDARs, the vehicle.
 
-    `square_metres` and `has_boxes` say whether the frames have those.
+    `has_area_weights` and `has_boxes` say whether the frames have those.
     """
 
     rig_name: str
     mounts: Mapping[str, Matrix]
     lidar_names: Collection[str]
     ego_box: BoundingBox
-    square_metres: bool
+    has_area_weights: bool
     has_boxes: bool
 
 
@@ -87,7 +87,7 @@ class FolderRecorder:
     def write(self, record: FrameRecord) -> Sequence[Any]:
         """Write a step; returns its line in `poses.csv`."""
         for sensor, points in record.clouds.items():
-            cloud = transform(invert(self._setup.mounts[sensor]), points)
+            cloud = transform_points(invert(self._setup.mounts[sensor]), points)
             self._add(f"sensors/{sensor}/{record.name}.npy", partial(np.save, arr=cloud))
         frame = record.frame
         arrays = {"points": frame.reference.numpy()}
@@ -99,12 +99,12 @@ class FolderRecorder:
         if frame.boxes is not None:
             self._add(f"{BOXES}/{record.name}.csv", partial(write_boxes, boxes=frame.boxes))
         pose = record.world_T_vehicle
-        wxyz = quaternion_from_rotation(pose[:3, :3])
+        wxyz = convert_rotation_to_quaternion(pose[:3, :3])
         return [record.name, record.time_s, *pose[:3, 3].tolist(), *wxyz.tolist(), frame.block_index]
 
     def finish(self, frame_entries: Sequence[Sequence[Any]]) -> None:
         """Write `poses.csv` and `frames.yaml`."""
-        poses = csv_text([["frame", "time_s", *PLACE, *ROTATION, "instant"], *frame_entries])
+        poses = format_csv([["frame", "time_s", *PLACE, *ROTATION, "instant"], *frame_entries])
         for name, text in ((POSES_FILE, poses), (SETTINGS_FILE, self._settings(self._setup))):
             self._add(name, partial(Path.write_text, data=text, encoding="utf-8"))
 
@@ -114,7 +114,7 @@ class FolderRecorder:
         body = BoundingBox((*own.lower_m[:2], own.lower_m[2] + CLEARANCE_M), own.upper_m)
         mounts = {name: {"vehicle_T_sensor": mount.tolist()} for name, mount in setup.mounts.items()}
         lines = ["sensors:", *(f"  {json.dumps(name)}: {json.dumps(mount)}" for name, mount in mounts.items())]
-        if setup.square_metres:
+        if setup.has_area_weights:
             lines.append("reference: {square_metres: true}")
         lines.append(f"vehicle: {json.dumps({'lower_m': body.lower_m, 'upper_m': body.upper_m})}")
         return "\n".join(lines) + "\n"
@@ -157,15 +157,17 @@ class KittiRecorder:
         frame, velodyne_T_vehicle = record.frame, invert(vehicle_T_velodyne)
         self._add_text(f"calib/{record.name}.txt", self._calibration)
         if frame.boxes is not None:
-            seen = box_visibility(frame.sensor, frame.reference, frame.boxes, reference_weights=frame.reference_weights)
-            self._add_text(f"label_2/{record.name}.txt", _labels(frame.boxes, seen.level.tolist()))
-        arrays = {"points": transform(velodyne_T_vehicle, frame.reference.numpy())}
+            seen = measure_box_visibility(
+                frame.sensor, frame.reference, frame.boxes, reference_weights=frame.reference_weights
+            )
+            self._add_text(f"label_2/{record.name}.txt", _labels(frame.boxes, seen.levels.tolist()))
+        arrays = {"points": transform_points(velodyne_T_vehicle, frame.reference.numpy())}
         if frame.reference_weights is not None:
             arrays["weights"] = frame.reference_weights.numpy()
         self._add(f"reference/{record.name}.npz", partial(write_npz, arrays=arrays))
         (cloud,) = record.clouds.values()
         records = np.zeros((len(cloud), 4), dtype="<f4")
-        records[:, :3] = transform(velodyne_T_vehicle, cloud)
+        records[:, :3] = transform_points(velodyne_T_vehicle, cloud)
         self._add(f"velodyne/{record.name}.bin", lambda path: path.write_bytes(records.tobytes()))
         return ()
 
@@ -180,7 +182,7 @@ def _labels(boxes: Boxes, levels: Sequence[int]) -> str:
     """A line an object, by its level of visibility: what is not known of an image is -1."""
     rows = boxes.rows.double().numpy()
     camera_T_vehicle = camera_T_velodyne @ invert(vehicle_T_velodyne)
-    centre_m = transform(camera_T_vehicle, rows[:, :3])
+    centre_m = transform_points(camera_T_vehicle, rows[:, :3])
     lines = []
     for (x, y, z), (_, _, _, length, width, height, yaw), category, level in zip(
         centre_m, rows, boxes.categories, levels, strict=True

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from torchcover.cameras.calibration import Calibration
 from torchcover.detection.boxes import Boxes
-from torchcover.files import RECORDING, WRITING, read_manifest, reads
+from torchcover.files import RECORDING, WRITING, guard_reader, read_manifest
 from torchcover.geometry import BoundingBox
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.clouds.arrays import Points
@@ -145,7 +145,7 @@ class Recording(Protocol):
         """Sensors that were recorded to be the reference; empty where there was none."""
 
     @property
-    def square_metres(self) -> bool:
+    def has_area_weights(self) -> bool:
         """Whether the scans of the reference sensors have weights, the square metres that their points stand for."""
 
     @property
@@ -172,7 +172,7 @@ class RecordingBase:
 
     frame_names: Sequence[str]
     reference_sensors: Sequence[str] = ()
-    square_metres = False
+    has_area_weights = False
     block_indices: Sequence[int] | None = None
     ego_box: BoundingBox | None = None
 
@@ -243,7 +243,7 @@ def warn_of_missing_poses(path: Path, frames_without_pose: Sequence[str], num_fr
         )
 
 
-@reads("the manifest of a recording")
+@guard_reader("the manifest of a recording")
 def read_recording_manifest(path: Path) -> dict[str, Any]:
     """Read `recording.json`, which lists the `files` of a recording that torchcover has written, and its `frames`.
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.detection.boxes import Boxes
-from torchcover.geometry import BoundingBox, invert, transform
-from torchcover.recordings.free_space import ScanKey, estimate_visible_share, square_metres
+from torchcover.geometry import BoundingBox, invert, transform_points
+from torchcover.recordings.free_space import ScanKey, estimate_surface_areas_m2, estimate_visible_share
 from torchcover.recordings.in_vehicle import VehicleCloud, find_points_in_box, join_clouds, transform_to_vehicle
 from torchcover.recordings.movers import COMPARED_S, WITHIN_M, MovingCluster, find_moving_clusters
 from torchcover.recordings.recording import Recording
@@ -45,7 +45,7 @@ class Reference(Protocol):
             OSError, ValueError: It cannot be read, or has no points.
         """
 
-    def square_metres(self, recording: Recording, /) -> bool:
+    def has_area_weights(self, recording: Recording, /) -> bool:
         """Whether its points have weights, the square metres that they stand for."""
 
     def describe(self, recording: Recording, evaluated_sensors: Collection[str], /) -> Mapping[str, object]:
@@ -72,9 +72,9 @@ class RecordedReference:
             raise ValueError(f"{where}: the reference cloud has no points, so there is nothing to measure against")
         return found
 
-    def square_metres(self, recording: Recording) -> bool:
+    def has_area_weights(self, recording: Recording) -> bool:
         """Whether they were recorded with them."""
-        return recording.square_metres
+        return recording.has_area_weights
 
     def describe(self, recording: Recording, evaluated_sensors: Collection[str]) -> Mapping[str, object]:
         """That it was recorded."""
@@ -226,7 +226,7 @@ class AccumulatedReference:
         first = first[np.argsort(compute_voxel_indices(level_m[first], BLOCK_M), kind="stable")]
         vehicle_T_local = invert(sweeps.compute_local_T_vehicle(recording, index))
         points_m, level_m = (
-            np.concatenate([transform(vehicle_T_local, of[first]), *(body.points_m for body in bodies)])
+            np.concatenate([transform_points(vehicle_T_local, of[first]), *(body.points_m for body in bodies)])
             for of in (local_m, level_m)
         )
         part = np.repeat(np.arange(1 + len(bodies)), [len(first), *(len(body.points_m) for body in bodies)])
@@ -243,7 +243,7 @@ class AccumulatedReference:
                 f"{dropped['sweeps']} were used and {dropped['sweeps_skipped']} not, as where poses jump; "
                 "--set skip_bad_frames=true leaves it out"
             )
-        m2 = square_metres(level_m)
+        m2 = estimate_surface_areas_m2(level_m)
         # Of few points in a box, the eighth neighbour is beside it.
         most_m2 = np.array([np.inf, *(body.most_m2 for body in bodies)])
         m2 *= np.minimum(1.0, most_m2[part] / np.bincount(part, m2)[part])
@@ -262,7 +262,7 @@ class AccumulatedReference:
                 dropped["gone"] += len(points_m)
                 continue
             first = find_first_occurrences(self._sweeps.compute_voxel_indices(points_m))
-            placed_m = transform(get_vehicle_T_box(labelled, boxes[name]), points_m[first])
+            placed_m = transform_points(get_vehicle_T_box(labelled, boxes[name]), points_m[first])
             found.append(_Body(placed_m, _sides_m2(*labelled.size_m[boxes[name]].tolist())))
         return found
 
@@ -370,7 +370,7 @@ class AccumulatedReference:
                 apart_s.append(since_s)
         return find_moving_clusters(near_m, np.array(apart_s))
 
-    def square_metres(self, recording: Recording) -> bool:
+    def has_area_weights(self, recording: Recording) -> bool:
         """Yes: what lies between the nearest points of each."""
         return True
 

@@ -26,12 +26,12 @@ class Mount(BaseModel):
 
     def to_matrix(self) -> "Matrix":
         """The (4, 4) transform."""
-        from torchcover.geometry import rigid, rotation_from_euler  # `--help` needs no NumPy
-        from torchcover.geometry.rigid import warn_of_radians
+        from torchcover.geometry import build_transform, convert_euler_to_rotation  # `--help` needs no NumPy
+        from torchcover.geometry.rigid import warn_about_radians
 
-        warn_of_radians({name: getattr(self, name) for name in ("yaw_deg", "pitch_deg", "roll_deg")})
-        rotation = rotation_from_euler(self.yaw_deg, self.pitch_deg, self.roll_deg)
-        return rigid(rotation, (self.x_m, self.y_m, self.z_m))
+        warn_about_radians({name: getattr(self, name) for name in ("yaw_deg", "pitch_deg", "roll_deg")})
+        rotation = convert_euler_to_rotation(self.yaw_deg, self.pitch_deg, self.roll_deg)
+        return build_transform(rotation, (self.x_m, self.y_m, self.z_m))
 
 
 class RecordingSettings(BaseModel):
@@ -101,10 +101,10 @@ def merge_recording_settings(recording: Path, settings: RecordingSettings | None
     Raises:
         BadFileError: Not YAML, or a key or value that is no setting; the message names the file and the key.
     """
-    from torchcover.files import reads  # loads NumPy, which `--help` does without
+    from torchcover.files import guard_reader  # loads NumPy, which `--help` does without
 
     path = recording / SETTINGS_FILE
-    content = reads("settings of a recording")(_read)(path) if path.is_file() else {}
+    content = guard_reader("settings of a recording")(_read)(path) if path.is_file() else {}
     given = {} if settings is None else settings.model_dump(exclude_unset=True)
     return RecordingSettings.model_validate({**content, **given})
 

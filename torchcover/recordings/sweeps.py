@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchcover.detection import Boxes, points_in_boxes
+from torchcover.detection import Boxes, find_points_in_boxes
 from torchcover.frames.source import BadFrameError
-from torchcover.geometry import invert, rigid, rotation_from_euler, transform
+from torchcover.geometry import build_transform, convert_euler_to_rotation, invert, transform_points
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.free_space import FreeSpaceCounter, RangeImage, ScanKey
 from torchcover.recordings.ground_model import GroundModel, extract_low_surfaces
@@ -152,7 +152,7 @@ class SweepWindow:
 
     def compute_local_T_vehicle(self, recording: Recording, index: int) -> Matrix:
         """Where the vehicle was: in the world, from the first place of the drive, for coordinates may be too large."""
-        return rigid(np.eye(3), -_pose(recording, 0)[:3, 3]) @ _pose(recording, index)
+        return build_transform(np.eye(3), -_pose(recording, 0)[:3, 3]) @ _pose(recording, index)
 
     def get_ground_model(self, recording: Recording, index: int) -> GroundModel | None:
         """What all sensors have seen of the ground within the window; None where there is none near the vehicle."""
@@ -189,23 +189,23 @@ class SweepWindow:
         if boxes is not None:
             beside_m = boxes.size_m.new_tensor([2 * BESIDE_BOX_M, 2 * BESIDE_BOX_M, 0.0])
             grown = replace(boxes, size_m=boxes.size_m + beside_m)
-            inside = points_in_boxes(torch.from_numpy(scan.points_m), grown)
-            in_box[inside.point.numpy()] = True
+            inside = find_points_in_boxes(torch.from_numpy(scan.points_m), grown)
+            in_box[inside.point_indices.numpy()] = True
             for number, name in enumerate(boxes.ids):
-                own_m = points_m[inside.point[inside.box == number].numpy()]
+                own_m = points_m[inside.point_indices[inside.box_indices == number].numpy()]
                 if name and len(own_m):
-                    own_m = transform(invert(get_vehicle_T_box(boxes, number)), own_m)
+                    own_m = transform_points(invert(get_vehicle_T_box(boxes, number)), own_m)
                     of_box[name] = own_m[find_first_occurrences(self.compute_voxel_indices(own_m))]
                 else:
                     unnamed += len(own_m)
         local_T_vehicle = self.compute_local_T_vehicle(recording, index)
-        still_m = transform(local_T_vehicle, points_m[~in_box])
+        still_m = transform_points(local_T_vehicle, points_m[~in_box])
         voxel = self.compute_voxel_indices(still_m)
         first = find_first_occurrences(voxel)
         image = None
         if self.window_s and _casts_rays(recording, index):
             mount = np.eye(4) if stored.vehicle_T_sensor is None else stored.vehicle_T_sensor
-            seen_m = transform(invert(mount), points_m)
+            seen_m = transform_points(invert(mount), points_m)
             image = RangeImage.from_points(seen_m, invert(local_T_vehicle @ mount))
         place_m = local_T_vehicle[:3, 3]
         thinned = ThinnedScan(still_m[first], voxel[first], of_box, unnamed, scan.excluded_counts, place_m, image)
@@ -273,14 +273,14 @@ def find_first_occurrences(values: NDArray[np.int64]) -> NDArray[np.int64]:
 def get_vehicle_T_box(boxes: Boxes, box_index: int) -> Matrix:
     """`vehicle_T_box` of one of them."""
     yaw_deg = float(np.rad2deg(boxes.yaw_rad[box_index].item()))
-    return rigid(rotation_from_euler(yaw_deg, 0.0, 0.0), boxes.centre_m[box_index].double().numpy())
+    return build_transform(convert_euler_to_rotation(yaw_deg, 0.0, 0.0), boxes.center_m[box_index].double().numpy())
 
 
 def _places_m(recording: Recording, index: int, boxes: Boxes | None) -> dict[str, NDArray[np.float64]]:
     """Where the boxes of an instant are in the world, by their names."""
     if boxes is None:
         return {}
-    return dict(zip(boxes.ids, transform(_pose(recording, index), boxes.centre_m.double().numpy()), strict=True))
+    return dict(zip(boxes.ids, transform_points(_pose(recording, index), boxes.center_m.double().numpy()), strict=True))
 
 
 def _casts_rays(recording: Recording, index: int) -> bool:

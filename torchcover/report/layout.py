@@ -99,7 +99,7 @@ def _of_failures(table: CoverageTable, rig: str) -> PageTable:
     rows = []
     for row in table.rows[rig]:
         cells = [TextCell(text, "significant" if marked else "") for text, marked in format_failure_cells(table, row)]
-        rows.append((TextCell(row.summary.region), TextCell(row.summary.height), *cells))
+        rows.append((TextCell(row.summary.region), TextCell(row.summary.band), *cells))
     return PageTable(
         format_failure_title(table, rig), [*PLACE_HEADINGS, *format_failure_headings(table, rig)], rows, PLACES
     )
@@ -113,7 +113,7 @@ def _of_each_failure(table: CoverageTable, rig: str) -> PageTable:
     for row in table.rows[rig]:
         words = format_failure_cells(table, row)
         lost = sorted(
-            (row.summary.redundancy.change[name][get_main_quantity(table).key].gain, name, *said)
+            (row.summary.redundancy.failure_effects[name][get_main_quantity(table).key].improvement, name, *said)
             for name, said in zip(names, words[seen:-1], strict=True)
             if row.summary.redundancy and said[0] not in ("0", UNKNOWN)
         )
@@ -121,7 +121,7 @@ def _of_each_failure(table: CoverageTable, rig: str) -> PageTable:
             of_place = [said[0] if at == 0 else "" for said in words[: min(seen, 1)]]
             last = TextCell(text, "significant" if marked else "")
             rows.append(
-                (TextCell(row.summary.region), TextCell(row.summary.height), *map(TextCell, (*of_place, name)), last)
+                (TextCell(row.summary.region), TextCell(row.summary.band), *map(TextCell, (*of_place, name)), last)
             )
     headings = [*PLACE_HEADINGS, *["sensors\nthat see it"][:seen], "without", "change"]
     return PageTable(format_failure_title(table, rig), headings, rows, PLACES)
@@ -135,12 +135,12 @@ def _part(
     numbers: Sequence[Sequence[TextCell]],
 ) -> PageTable:
     """A part with the columns that every part has: the place first, those of `COLUMNS` that are shown last."""
-    measure = places[0][0].summary.measure if places else table.average
+    measure = places[0][0].summary.average if places else table.average
     shown = [column for column in COLUMNS if column.heading and column.average in (None, measure)]
     rows = []
     for (row, *_), cells in zip(places, numbers, strict=True):
         last = [TextCell(column.format_value(column.get_value(table, row))) for column in shown]
-        rows.append((TextCell(row.summary.region), TextCell(row.summary.height), *cells, *last))
+        rows.append((TextCell(row.summary.region), TextCell(row.summary.band), *cells, *last))
     first = BODY_HEADINGS if measure == "target_positions" else PLACE_HEADINGS
     every = [*first, *headings, *(column.heading for column in shown)]
     return PageTable(title, every, rows, PLACES)
@@ -153,4 +153,4 @@ def _number(row: Row, quantity: Quantity) -> TextCell:
 
 def _difference(row: Row, quantity: Quantity) -> TextCell:
     difference = row.differences[quantity.key]
-    return TextCell(format_difference(difference), "significant" if difference.significant else "")
+    return TextCell(format_difference(difference), "significant" if difference.is_significant else "")

@@ -17,10 +17,10 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from torchcover.coverage import BevGrid, Coverage, Layer
-from torchcover.coverage.blocks import BlockSums, KnownCells
-from torchcover.coverage.quantity import by_area
+from torchcover.coverage.blocks import BlockSums, ObservedCells
+from torchcover.coverage.quantity import make_area_quantity
 from torchcover.estimation import Quantity
-from torchcover.metrics import added_up
+from torchcover.metrics import sum_rows
 from torchcover.report.colours import NEVER_PROBED, ColorScale, build_color_scale
 from torchcover.report.wording import format_resolution, get_display_unit
 
@@ -65,7 +65,7 @@ def sum_over_squares(values: Tensor, sides: Tensor) -> Tensor:
 
 def compute_ratios(area: BlockSums, sides: Tensor) -> Tensor:
     """(Q, H, Y, X) the radius in metres, then the detection at each threshold; NaN where nothing was seen."""
-    m2, *sums = area.totals()
+    m2, *sums = area.sum_blocks()
     return sum_over_squares(torch.stack(sums), sides) / sum_over_squares(m2, sides)
 
 
@@ -74,15 +74,18 @@ def downsample_coverage(coverage: Coverage) -> Coverage:
 
     Itself where cells are as large, and where there are layers that are no ratios of sums.
     """
-    grid, known, means = coverage.grid, coverage.known, coverage.quantities
-    side = 2 ** max(0, math.floor(math.log2(SMALLEST_M / grid.cell)))
-    by_surface = tuple(map(by_area, means)) if coverage.area else ()
-    if side == 1 or coverage.redundancy or len(coverage.listed) > len(means) + len(by_surface):
+    grid, known, means = coverage.grid, coverage.observed_cells, coverage.quantities
+    side = 2 ** max(0, math.floor(math.log2(SMALLEST_M / grid.cell_m)))
+    by_surface = tuple(map(make_area_quantity, means)) if coverage.area_sums else ()
+    if side == 1 or coverage.redundancy or len(coverage.sparse_layers) > len(means) + len(by_surface):
         return coverage
     rows, columns = (-(-count // side) for count in grid.shape[1:])
-    cell_m = side * grid.cell
+    cell_m = side * grid.cell_m
     coarse = replace(
-        grid, x=(grid.x[0], grid.x[0] + columns * cell_m), y=(grid.y[0], grid.y[0] + rows * cell_m), cell=cell_m
+        grid,
+        x_m=(grid.x_m[0], grid.x_m[0] + columns * cell_m),
+        y_m=(grid.y_m[0], grid.y_m[0] + rows * cell_m),
+        cell_m=cell_m,
     )
 
     def square(cell: Tensor) -> Tensor:
@@ -91,24 +94,27 @@ def downsample_coverage(coverage: Coverage) -> Coverage:
         return own
 
     def moved(sums: BlockSums | None) -> BlockSums | None:
-        return None if sums is None else sums.moved(square, coarse.cells, coarse.shape)
+        return None if sums is None else sums.remap_cells(square, coarse.num_cells, coarse.shape)
 
-    area, own = moved(coverage.area), [known.probed_steps * coverage.listed[one.key].values for one in means]
-    columns_of = [square(known.at), known.points, *own, known.probed_steps]
-    summed = added_up(torch.stack(columns_of, dim=1).double()).T
+    area, own = (
+        moved(coverage.area_sums),
+        [known.observed_frames * coverage.sparse_layers[one.key].values for one in means],
+    )
+    columns_of = [square(known.cell_indices), known.point_counts, *own, known.observed_frames]
+    summed = sum_rows(torch.stack(columns_of, dim=1).double()).T
     layers = list(map(Layer, means, summed[2:-1] / summed[-1]))
     if area is not None:
-        m2, *sums = area.totals().flatten(1)[:, summed[0].long()]
+        m2, *sums = area.sum_blocks().flatten(1)[:, summed[0].long()]
         layers += [Layer(quantity, own / m2) for quantity, own in zip(by_surface, sums, strict=True)]
     return Coverage(
         grid=coarse,
-        thresholds=coverage.thresholds,
-        max_radius=coverage.max_radius,
-        known=KnownCells(coarse.shape, summed[0].long(), summed[-1].long(), summed[1].long()),
+        thresholds_m=coverage.thresholds_m,
+        max_radius_m=coverage.max_radius_m,
+        observed_cells=ObservedCells(coarse.shape, summed[0].long(), summed[-1].long(), summed[1].long()),
         layers=layers,
         counts=coverage.counts,
-        blocks=moved(coverage.blocks),
-        area=area,
+        block_sums=moved(coverage.block_sums),
+        area_sums=area,
         regions=coverage.regions,
     )
 
@@ -119,7 +125,7 @@ def compute_opacity(area: BlockSums, num_frames: int, sides: Tensor, cell_m: flo
     Returns (H, Y, X): 0 where nothing was seen, 1 where as much as open ground has, which is the footprint of the
     square, or more; between them the root of the share, from 0.3 on.
     """
-    m2 = sum_over_squares(area.totals()[0], sides)
+    m2 = sum_over_squares(area.sum_blocks()[0], sides)
     footprint_m2 = sum_over_squares(torch.full_like(m2, cell_m**2), sides)
     share = (m2 / (max(num_frames, 1) * footprint_m2)).clamp(max=1)
     return (FAINTEST + (1 - FAINTEST) * share.sqrt()).where(m2 > 0, 0.0)
@@ -164,11 +170,11 @@ def find_observed_window(coverage: Coverage, ego_outline_m: Outline | None = Non
     metres.
     """
     grid = coverage.grid
-    known = coverage.known.spread(coverage.known.points > 0, False).any(dim=0)
-    x, y = _held(known.any(dim=0), grid.x_edges_m, grid.x), _held(known.any(dim=1), grid.y_edges_m, grid.y)
+    known = coverage.observed_cells.expand_to_grid(coverage.observed_cells.point_counts > 0, False).any(dim=0)
+    x, y = _held(known.any(dim=0), grid.x_edges_m, grid.x_m), _held(known.any(dim=1), grid.y_edges_m, grid.y_m)
     if coverage.regions:
-        in_x = _both(x, (min(one.x[0] for one in coverage.regions), max(one.x[1] for one in coverage.regions)))
-        in_y = _both(y, (min(one.y[0] for one in coverage.regions), max(one.y[1] for one in coverage.regions)))
+        in_x = _both(x, (min(one.x_m[0] for one in coverage.regions), max(one.x_m[1] for one in coverage.regions)))
+        in_y = _both(y, (min(one.y_m[0] for one in coverage.regions), max(one.y_m[1] for one in coverage.regions)))
         x, y = (in_x, in_y) if in_x and in_y else (x, y)
     if ego_outline_m is not None:
         x, y = (_including(bounds, ego_outline_m[:, axis].tolist()) for axis, bounds in enumerate((x, y)))
@@ -180,16 +186,16 @@ def find_near_field_window(grid: BevGrid, ego_outline_m: Outline) -> Window | No
     low, high = ego_outline_m.min(axis=0), ego_outline_m.max(axis=0)
     reach_m = NEAR_LENGTHS * float(high[0] - low[0])
     x, y = ((float(low[axis]) - reach_m, float(high[axis]) + reach_m) for axis in (0, 1))
-    return crop_grid(grid, x, y) if _both(x, grid.x) and _both(y, grid.y) else None
+    return crop_grid(grid, x, y) if _both(x, grid.x_m) and _both(y, grid.y_m) else None
 
 
 def crop_grid(grid: BevGrid, x: Bounds, y: Bounds) -> Window:
     """The cells of a grid that lie within some bounds, or in part; at least one."""
     (columns, own_x), (rows, own_y) = (
-        _cells(bounds, whole, grid.cell, count)
-        for bounds, whole, count in ((x, grid.x, grid.shape[2]), (y, grid.y, grid.shape[1]))
+        _cells(bounds, whole, grid.cell_m, count)
+        for bounds, whole, count in ((x, grid.x_m, grid.shape[2]), (y, grid.y_m, grid.shape[1]))
     )
-    return Window(replace(grid, x=own_x, y=own_y), rows, columns)
+    return Window(replace(grid, x_m=own_x, y_m=own_y), rows, columns)
 
 
 def _cells(bounds: Bounds, whole: Bounds, cell_m: float, count: int) -> tuple[slice, Bounds]:
@@ -238,7 +244,7 @@ def build_map_layers(coverages: Mapping[str, Coverage]) -> Iterator[MapLayer]:
     `coverages`: by the name of the rig; one, or several that are paired.
     """
     first = next(iter(coverages.values()))
-    if first.measure == "area":
+    if first.average == "area":
         yield from _of_surface(coverages)
     for quantity, by_surface in list_map_quantities(first):
         if not by_surface:
@@ -248,11 +254,11 @@ def build_map_layers(coverages: Mapping[str, Coverage]) -> Iterator[MapLayer]:
 
 def list_map_quantities(coverage: Coverage) -> list[tuple[Quantity, bool]]:
     """The quantities of the measure, then those of other aggregations, and whether each is over the visible surface."""
-    of_surface = [by_area(quantity) for quantity in coverage.quantities]
+    of_surface = [make_area_quantity(quantity) for quantity in coverage.quantities]
     of_both = {quantity.key for quantity in (*coverage.quantities, *of_surface)}
-    of_measure = of_surface if coverage.measure == "area" else coverage.quantities
+    of_measure = of_surface if coverage.average == "area" else coverage.quantities
     others = [layer.quantity for key, layer in coverage.layers.items() if key not in of_both]
-    return [*((one, coverage.measure == "area") for one in of_measure), *((one, False) for one in others)]
+    return [*((one, coverage.average == "area") for one in of_measure), *((one, False) for one in others)]
 
 
 def compute_difference(values: Tensor, baseline: Tensor) -> Tensor:
@@ -262,18 +268,18 @@ def compute_difference(values: Tensor, baseline: Tensor) -> Tensor:
 
 def _of_surface(coverages: Mapping[str, Coverage]) -> Iterator[MapLayer]:
     first = next(iter(coverages.values()))
-    areas = {name: coverage.area for name, coverage in coverages.items() if coverage.area is not None}
-    sides = compute_square_sides(first.points, first.grid.cell)
+    areas = {name: coverage.area_sums for name, coverage in coverages.items() if coverage.area_sums is not None}
+    sides = compute_square_sides(first.point_counts, first.grid.cell_m)
     # The rigs share the reference points, and so the square metres.
-    opacity = compute_opacity(next(iter(areas.values())), first.counts["frames"], sides, first.grid.cell)
+    opacity = compute_opacity(next(iter(areas.values())), first.counts["num_frames"], sides, first.grid.cell_m)
     each = {name: compute_ratios(area, sides) for name, area in areas.items()}
-    for at, quantity in enumerate(map(by_area, first.quantities)):
+    for at, quantity in enumerate(map(make_area_quantity, first.quantities)):
         values = {name: values[at] for name, values in each.items()}
         yield _subject(quantity, values, NOTHING_FOUND, _conditions(first) + LARGER, opacity)
 
 
 def _conditions(coverage: Coverage) -> str:
-    return format_resolution(coverage.counts["frames"], coverage.grid)
+    return format_resolution(coverage.counts["num_frames"], coverage.grid)
 
 
 def _subject(

@@ -14,7 +14,7 @@ from matplotlib.patches import FancyArrowPatch, Polygon
 from matplotlib.patheffects import AbstractPathEffect, withStroke
 from numpy.typing import NDArray
 
-from torchcover.geometry import euler_from_rotation
+from torchcover.geometry import convert_rotation_to_euler
 from torchcover.report.sheet import Sheet
 
 # Okabe and Ito's colours, which the colour-blind can tell apart; then all of them darker, then lighter.
@@ -84,12 +84,12 @@ class SensorView:
     @property
     def yaw_deg(self) -> float:
         """Its direction: 0 is forward, positive turns left."""
-        return float(euler_from_rotation(self.vehicle_T_sensor[:3, :3])[0])
+        return float(convert_rotation_to_euler(self.vehicle_T_sensor[:3, :3])[0])
 
     @property
     def tilt_deg(self) -> tuple[float, float]:
         """Its pitch and roll."""
-        _, pitch_deg, roll_deg = euler_from_rotation(self.vehicle_T_sensor[:3, :3])
+        _, pitch_deg, roll_deg = convert_rotation_to_euler(self.vehicle_T_sensor[:3, :3])
         return float(pitch_deg), float(roll_deg)
 
     def compute_outline_m(self, max_range_m: float, num_points: int = 361) -> NDArray[np.float64]:

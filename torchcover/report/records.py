@@ -6,10 +6,10 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
-from torchcover.coverage.measures import Measure
-from torchcover.coverage.redundancy import redundancy_quantities
+from torchcover.coverage.measures import Average
+from torchcover.coverage.redundancy import list_redundancy_quantities
 from torchcover.estimation import Difference, Number
-from torchcover.files import csv_text
+from torchcover.files import format_csv
 from torchcover.report.remarks import get_failure_sensors
 from torchcover.report.table import CoverageTable, Row
 from torchcover.report.wording import format_percent, format_square_meters
@@ -29,7 +29,7 @@ class Column(NamedTuple):
     get_value: Callable[[CoverageTable, Row], object]
     heading: str = ""
     format_value: Callable[[Any], str] = str
-    average: Measure | None = None
+    average: Average | None = None
 
 
 def _sensor_model(table: CoverageTable, row: Row) -> object:
@@ -42,7 +42,7 @@ COLUMNS = (
     Column(
         "average",
         "average of the numbers: `area`, `cells`, or `target_positions` of a test target",
-        lambda _, r: r.summary.measure,
+        lambda _, r: r.summary.average,
     ),
     Column(
         "visible_m2",
@@ -67,22 +67,22 @@ COLUMNS = (
         "free places",
         average="target_positions",
     ),
-    Column("cells", "of the region; of a body, places that were tried", lambda _, row: row.summary.cells),
-    Column("cell_m", "side of a cell", lambda table, _: table.grid.cell),
-    Column("num_frames", "number of measured frames", lambda table, row: table.conditions[row.rig].counts["frames"]),
+    Column("cells", "of the region; of a body, places that were tried", lambda _, row: row.summary.num_cells),
+    Column("cell_m", "side of a cell", lambda table, _: table.grid.cell_m),
+    Column(
+        "num_frames", "number of measured frames", lambda table, row: table.conditions[row.rig].counts["num_frames"]
+    ),
     Column("blocks", "how many the errors come from", lambda table, row: table.conditions[row.rig].blocks),
     Column("frames_per_block", "of a full one", lambda table, row: table.conditions[row.rig].frames_per_block),
     Column("vehicle", "what carries the rig; empty if unknown", lambda table, _: table.source.get("vehicle")),
     Column("sensor_model", "what sensors make of their hits: `ideal` or `real`; empty if unknown", _sensor_model),
-    Column("x_min_m", "where the region begins", lambda _, row: row.region.x[0]),
-    Column("x_max_m", "where it ends", lambda _, row: row.region.x[1]),
-    Column("y_min_m", "its right border", lambda _, row: row.region.y[0]),
-    Column("y_max_m", "its left border", lambda _, row: row.region.y[1]),
+    Column("x_min_m", "where the region begins", lambda _, row: row.region.x_m[0]),
+    Column("x_max_m", "where it ends", lambda _, row: row.region.x_m[1]),
+    Column("y_min_m", "its right border", lambda _, row: row.region.y_m[0]),
+    Column("y_max_m", "its left border", lambda _, row: row.region.y_m[1]),
     Column("band_frame", "what the band is over: `ground` or `vehicle`", lambda table, _: table.grid.band_frame),
-    Column(
-        "z_min_m", "where the band begins", lambda table, row: table.grid.heights.get(row.summary.height, NO_BAND)[0]
-    ),
-    Column("z_max_m", "where it ends", lambda table, row: table.grid.heights.get(row.summary.height, NO_BAND)[1]),
+    Column("z_min_m", "where the band begins", lambda table, row: table.grid.heights.get(row.summary.band, NO_BAND)[0]),
+    Column("z_max_m", "where it ends", lambda table, row: table.grid.heights.get(row.summary.band, NO_BAND)[1]),
 )
 
 
@@ -100,7 +100,7 @@ def build_columns(table: CoverageTable) -> ColumnGetters:
     columns: ColumnGetters = {
         "rig": lambda row: row.rig,
         "region": lambda row: row.summary.region,
-        "height": lambda row: row.summary.height,
+        "height": lambda row: row.summary.band,
     }
     for key in keys:
         columns |= _of_summary(key)
@@ -112,7 +112,7 @@ def build_columns(table: CoverageTable) -> ColumnGetters:
     sensors = dict.fromkeys(sensor for rows in table.rows.values() for sensor in get_failure_sensors(rows))
     if sensors:
         columns |= {"indispensable_sensor": _indispensable}
-        for quantity in redundancy_quantities((), table.thresholds_m):
+        for quantity in list_redundancy_quantities((), table.thresholds_m):
             columns |= _seen_by(quantity.key)
     for sensor in sensors:
         for key in means:
@@ -125,7 +125,7 @@ def _of_summary(key: str) -> ColumnGetters:
 
 
 def _known(key: str) -> ColumnGetters:
-    return _number(f"known_{key}", lambda row: row.summary.known.get(key))
+    return _number(f"known_{key}", lambda row: row.summary.cell_averages.get(key))
 
 
 def _compared(key: str) -> ColumnGetters:
@@ -137,12 +137,12 @@ def _compared(key: str) -> ColumnGetters:
 
 
 def _indispensable(row: Row) -> object:
-    return "" if row.summary.redundancy is None else row.summary.redundancy.indispensable or ""
+    return "" if row.summary.redundancy is None else row.summary.redundancy.most_critical_sensor or ""
 
 
 def _seen_by(key: str) -> ColumnGetters:
     def number(row: Row) -> Number | None:
-        return row.summary.redundancy.seen_by[key] if row.summary.redundancy else None
+        return row.summary.redundancy.detecting_sensors[key] if row.summary.redundancy else None
 
     return _number(key, number)
 
@@ -151,10 +151,10 @@ def _without(sensor: str, key: str) -> ColumnGetters:
     """NaN for a rig that has no such sensor."""
 
     def number(row: Row) -> Number | None:
-        return row.summary.redundancy.without.get(sensor, {}).get(key) if row.summary.redundancy else None
+        return row.summary.redundancy.failure_numbers.get(sensor, {}).get(key) if row.summary.redundancy else None
 
     def change(row: Row) -> Difference | None:
-        return row.summary.redundancy.change.get(sensor, {}).get(key) if row.summary.redundancy else None
+        return row.summary.redundancy.failure_effects.get(sensor, {}).get(key) if row.summary.redundancy else None
 
     without = f"{key}_without_{sensor}"
     significant = f"{without}_change_significant"
@@ -190,13 +190,13 @@ def build_table_dict(table: CoverageTable) -> dict[str, Any]:
     return {
         "band_frame": grid.band_frame,
         "grid": {
-            "x_m": list(grid.x),
-            "y_m": list(grid.y),
-            "cell_m": grid.cell,
+            "x_m": list(grid.x_m),
+            "y_m": list(grid.y_m),
+            "cell_m": grid.cell_m,
             "heights_m": {name: list(band) for name, band in grid.heights.items()},
         },
         "regions": {
-            row.region.name: {"x_m": row.region.x, "y_m": row.region.y, "corners_m": row.region.corners_m}
+            row.region.name: {"x_m": row.region.x_m, "y_m": row.region.y_m, "corners_m": row.region.corners_m}
             for row in table.rows[table.rigs[0]]
         },
         "thresholds_m": list(table.thresholds_m),
@@ -228,4 +228,4 @@ def _json_number(value: object) -> object:
 
 def render_csv(table: CoverageTable) -> str:
     """A line for each rig, region and band, under a header; an unknown number is an empty field, infinity is `inf`."""
-    return csv_text([build_columns(table), *(record.values() for record in build_records(table))])
+    return format_csv([build_columns(table), *(record.values() for record in build_records(table))])

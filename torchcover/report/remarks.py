@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from textwrap import fill
 
 from torchcover.coverage import Region, RegionRedundancy
-from torchcover.coverage.quantity import RADIUS, seen_by_two, sensors_seeing
-from torchcover.estimation import MIN_BLOCKS, Quantity, blocks_needed
+from torchcover.coverage.quantity import RADIUS, make_redundancy_quantity, make_sensor_count_quantity
+from torchcover.estimation import MIN_BLOCKS, Quantity, estimate_blocks_needed
 from torchcover.report.table import CoverageTable, Row
 from torchcover.report.wording import (
     UNKNOWN,
@@ -32,7 +32,7 @@ def get_main_quantity(table: CoverageTable) -> Quantity:
 def get_failure_sensors(rows: Sequence[Row]) -> tuple[str, ...]:
     """The sensors that the rows of a rig have numbers without; none if that was not asked for."""
     known = (row.summary.redundancy for row in rows)
-    return next((tuple(redundancy.without) for redundancy in known if redundancy), ())
+    return next((tuple(redundancy.failure_numbers) for redundancy in known if redundancy), ())
 
 
 def format_failure_title(table: CoverageTable, rig: str) -> str:
@@ -55,13 +55,13 @@ def format_failure_cells(table: CoverageTable, row: Row) -> list[tuple[str, bool
         return [(UNKNOWN, False)] * len(format_failure_headings(table, row.rig))
     words = []
     for threshold in table.thresholds_m[:1]:
-        words.append((format_number(redundancy.seen_by[sensors_seeing(threshold).key]), False))
-        words.append((format_number(redundancy.seen_by[seen_by_two(threshold).key]), False))
+        words.append((format_number(redundancy.detecting_sensors[make_sensor_count_quantity(threshold).key]), False))
+        words.append((format_number(redundancy.detecting_sensors[make_redundancy_quantity(threshold).key]), False))
     for sensor in sensors:
-        change = redundancy.change[sensor][key]
-        words.append((format_difference(change), bool(change.significant)))
+        change = redundancy.failure_effects[sensor][key]
+        words.append((format_difference(change), bool(change.is_significant)))
     known = not math.isnan(row.summary.numbers[key].value)
-    return [*words, (redundancy.indispensable or (NONE if known else UNKNOWN), False)]
+    return [*words, (redundancy.most_critical_sensor or (NONE if known else UNKNOWN), False)]
 
 
 @dataclass(frozen=True)
@@ -100,14 +100,14 @@ def describe_single_point_of_failure(table: CoverageTable, rig: str, params: Fai
     large = [row for row in large if _is_significant(row, quantity) is not False]
     real = [row for row in large if _is_significant(row, quantity)]
     worst = max(real or large, key=lambda row: _loss(row.summary.redundancy, quantity), default=None)
-    if worst is None or (redundancy := worst.summary.redundancy) is None or redundancy.indispensable is None:
+    if worst is None or (redundancy := worst.summary.redundancy) is None or redundancy.most_critical_sensor is None:
         least = f"{100 * params.min_share:g} %"
         return f"No single point of failure: no sensor's failure costs {least} or more of any number beyond chance."
-    sensor = redundancy.indispensable
-    before, after = worst.summary.numbers[quantity.key].value, redundancy.without[sensor][quantity.key].value
+    sensor = redundancy.most_critical_sensor
+    before, after = worst.summary.numbers[quantity.key].value, redundancy.failure_numbers[sensor][quantity.key].value
     whole, rest = (format_value(value, quantity.unit) for value in (before, after))
     unit = "m" if quantity.unit == "m" else "%"
-    where = f"{worst.summary.region} {worst.summary.height}"
+    where = f"{worst.summary.region} {worst.summary.band}"
     change = f"{quantity.title} is {rest} {unit} in {where}, not {whole} {unit}"
     if real:
         return f"Single point of failure: {sensor}; without it {change}."
@@ -123,15 +123,15 @@ def _lost_share(row: Row, quantity: Quantity) -> float:
 def _is_significant(row: Row, quantity: Quantity) -> bool | None:
     """Whether the loss with the sensor with which most is lost is more than chance; None if that is unknown."""
     redundancy = row.summary.redundancy
-    if redundancy is None or redundancy.indispensable is None:
+    if redundancy is None or redundancy.most_critical_sensor is None:
         return None
-    return redundancy.change[redundancy.indispensable][quantity.key].significant
+    return redundancy.failure_effects[redundancy.most_critical_sensor][quantity.key].is_significant
 
 
 def _loss(redundancy: RegionRedundancy | None, quantity: Quantity) -> float:
-    if redundancy is None or redundancy.indispensable is None:
+    if redundancy is None or redundancy.most_critical_sensor is None:
         return 0.0
-    return -redundancy.change[redundancy.indispensable][quantity.key].gain
+    return -redundancy.failure_effects[redundancy.most_critical_sensor][quantity.key].improvement
 
 
 # Buildings and trees are above every band; where more than such a share is outside, the clouds may be elsewhere.
@@ -167,7 +167,7 @@ def _looked_at(table: CoverageTable, rig: str) -> Iterator[TableNote]:
         seen = "Means over the square metres that the reference sees."
         yield TableNote("visible_surface", len(summaries), len(summaries), seen)
     else:
-        cells, known = sum(one.cells for one in summaries), sum(one.observed_cells for one in summaries)
+        cells, known = sum(one.num_cells for one in summaries), sum(one.observed_cells for one in summaries)
         flattered = "Means over the known cells only; the fewer are known, the more the numbers may flatter the rig."
         yield TableNote("unknown_cells", cells - known, cells, flattered)
     yield from _on_errors(table, rig)
@@ -177,8 +177,12 @@ def _looked_at(table: CoverageTable, rig: str) -> Iterator[TableNote]:
     doubt = " Is the ground at z = 0, and x ahead?" if outside > MOSTLY * every else ""
     some = {**counts, "outside_points": outside}
     for name, of, words in (
-        ("empty_sensor_frames", counts["frames"], "steps had no sensor point: they count as blind, not as missing."),
-        ("empty_reference_frames", counts["frames"], "steps had no reference point: they say nothing."),
+        (
+            "empty_sensor_frames",
+            counts["num_frames"],
+            "steps had no sensor point: they count as blind, not as missing.",
+        ),
+        ("empty_reference_frames", counts["num_frames"], "steps had no reference point: they say nothing."),
         ("saturated_points", inside, f"reference points count as {far}: no sensor point was nearer."),
         ("outside_points", every, f"reference points lie outside the grid: left out.{doubt}"),
         ("no_ground_points", every, "reference points have no known ground at or below them: in no band."),
@@ -192,7 +196,7 @@ def _on_errors(table: CoverageTable, rig: str) -> Iterator[TableNote]:
         return
     if not table.has_intervals:
         where = f" in {table.conditions[rig].smallest_scene_kind}" * bool(table.conditions[rig].smallest_scene_kind)
-        needed = blocks_needed(blocks, table.first_conditions.effective_blocks[0])
+        needed = estimate_blocks_needed(blocks, table.first_conditions.effective_blocks[0])
         few = f"Not enough steps for intervals{where}: {blocks} block{'s' * (blocks != 1)}, about {needed} are needed."
         yield TableNote("too_few_blocks", blocks, needed, few)
         return
@@ -238,7 +242,7 @@ def explain_marks(table: CoverageTable) -> dict[str, str]:
 
 def _of_rig(table: CoverageTable, rig: str) -> list[str]:
     bands = ", ".join(f"{name} {format_height_band(table.grid, name)}" for name in table.grid.heights)
-    first = f"{format_resolution(table.conditions[rig].counts['frames'], table.grid)}; {bands}."
+    first = f"{format_resolution(table.conditions[rig].counts['num_frames'], table.grid)}; {bands}."
     sentences = (remark.sentence for remark in collect_table_notes(table, rig))
     failure = describe_single_point_of_failure(table, rig)
     return [first, *sentences, *([failure] if failure else [])]
@@ -276,10 +280,10 @@ def explain_missing_intervals(table: CoverageTable, subject: str) -> str:
     Returns:
         A sentence; empty where some number has an interval, or where none was asked for.
     """
-    steps, blocks = table.first_conditions.counts["frames"], table.first_conditions.blocks
+    steps, blocks = table.first_conditions.counts["num_frames"], table.first_conditions.blocks
     if blocks is None or table.has_intervals:
         return ""
-    needed, ends = blocks_needed(blocks, table.first_conditions.effective_blocks[0]), table.block_ends
+    needed, ends = estimate_blocks_needed(blocks, table.first_conditions.effective_blocks[0]), table.block_ends
     begin = f"Not enough frames for {subject}: {steps:,} form {blocks} block{'s' * (blocks != 1)} of time, "
     if ends and len(ends) < needed:
         return f"{begin}intervals need about {needed}, and this source has {len(ends)} in all."
@@ -315,7 +319,7 @@ def describe_range(table: CoverageTable) -> str:
     region = find_forward_region(table)
     if region is None or not table.thresholds_m or not table.has_intervals:
         return ""
-    key, where = get_main_quantity(table).key, f"to {region.x[1]:g} m ahead ({detected_words(table)})"
+    key, where = get_main_quantity(table).key, f"to {region.x_m[1]:g} m ahead ({detected_words(table)})"
     bands = [of for of in table.rows_by_region if of[0].region is region]
     told = {surface_words(table, of[0]): _told(of, key, enough=True) for of in bands}
     known = [f"of {band} {words}" for band, words in told.items() if words]
@@ -339,7 +343,7 @@ def surface_words(table: CoverageTable, row: Row) -> str:
     Returns:
         Words such as "512.3 m² of visible ground".
     """
-    surface = BANDS.get(row.summary.height, row.summary.height)
+    surface = BANDS.get(row.summary.band, row.summary.band)
     if table.average == "area":
         return f"{format_square_meters(row.summary.visible_m2)} m² of visible {surface}"
     return f"{row.summary.observed_cells:,} observed cells of {surface}"
@@ -348,8 +352,8 @@ def surface_words(table: CoverageTable, row: Row) -> str:
 def find_forward_region(table: CoverageTable) -> Region | None:
     """The region that the range is told of: of those that begin at the vehicle the farthest to `RANGE_M`; else none."""
     regions = dict.fromkeys(of[0].region for of in table.rows_by_region)
-    reached = [one for one in regions if one.x[0] == 0.0 and one.x[1] <= RANGE_M and not one.corners_m]
-    return max(reached, key=lambda one: one.x[1], default=None)
+    reached = [one for one in regions if one.x_m[0] == 0.0 and one.x_m[1] <= RANGE_M and not one.corners_m]
+    return max(reached, key=lambda one: one.x_m[1], default=None)
 
 
 def describe_failures(table: CoverageTable) -> str:

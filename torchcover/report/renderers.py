@@ -16,7 +16,7 @@ from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
-from torchcover.files import shown
+from torchcover.files import escape_control_chars
 from torchcover.report.layout import BOLD_MARKS, PageTable, TextCell, build_page_tables
 from torchcover.report.records import render_csv, render_json
 from torchcover.report.remarks import explain_marks, list_notes, summarize_findings
@@ -36,7 +36,7 @@ class Terminal(Console):
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
         """What is to be printed: our own control codes, such as a cursor's, are segments of their own."""
         for segment in super().render(renderable, options):
-            yield segment if segment.control else segment._replace(text=shown(segment.text))
+            yield segment if segment.control else segment._replace(text=escape_control_chars(segment.text))
 
 
 def render_text(table: CoverageTable) -> str:
@@ -202,7 +202,7 @@ def _markdown_cell(cell: TextCell) -> str:
 
 def escape_markdown(text: str) -> str:
     """Words that Markdown takes for nothing else."""
-    return SPECIAL.sub(r"\\\g<0>", shown(" ".join(text.split())))
+    return SPECIAL.sub(r"\\\g<0>", escape_control_chars(" ".join(text.split())))
 
 
 def _markdown_line(cells: Iterable[str]) -> str:

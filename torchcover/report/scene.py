@@ -356,7 +356,7 @@ def _draw_points(sheet: Sheet, points: Float64) -> list[Artist]:
 
 def _draw_boundary(axes: Axes, enough: Bools, free: Bools, grid: BevGrid, hits: int) -> list[Artist]:
     """Lines along the edges between cells that are seen and cells that are not."""
-    x, y = np.linspace(*grid.x, enough.shape[1] + 1), np.linspace(*grid.y, enough.shape[0] + 1)
+    x, y = np.linspace(*grid.x_m, enough.shape[1] + 1), np.linspace(*grid.y_m, enough.shape[0] + 1)
     row, column = np.nonzero((enough[:, 1:] != enough[:, :-1]) & free[:, 1:] & free[:, :-1])
     upright = [((x[c + 1], y[r]), (x[c + 1], y[r + 1])) for r, c in zip(row, column, strict=True)]
     row, column = np.nonzero((enough[1:] != enough[:-1]) & free[1:] & free[:-1])

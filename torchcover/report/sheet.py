@@ -78,7 +78,7 @@ def create_sheets(grid: BevGrid, num_maps: int = 1) -> list[Sheet]:
     views = []
     for at in range(num_maps):
         left_in, top_in = (step_in * [at % across, at // across]).tolist()
-        views.append(figure.add_axes(place(left_in, top_in, map_in), xlim=grid.x, ylim=grid.y))
+        views.append(figure.add_axes(place(left_in, top_in, map_in), xlim=grid.x_m, ylim=grid.y_m))
         left, lowest = at % across == 0, at + across >= num_maps
         views[-1].set(xlabel="x forward (m)" if lowest else "", ylabel="y left (m)" if left else "")
         views[-1].tick_params(labelbottom=lowest, labelleft=left)
@@ -86,7 +86,7 @@ def create_sheets(grid: BevGrid, num_maps: int = 1) -> list[Sheet]:
     gap_in = GAP_IN if num_maps == 1 else BESIDE_IN  # the axis of a map above the last row has labels beside the bar
     bar = figure.add_axes(place(paper_in[0] + gap_in, 0.0, bar_in))
     legend_columns = max(1, int(paper_in[0] / LEGEND_COLUMN_IN))
-    scale = grid.cell / inches_per_cell
+    scale = grid.cell_m / inches_per_cell
     return [Sheet(figure, axes, bar, legend_columns, scale) for axes in views]
 
 

@@ -9,15 +9,15 @@ from torchcover.coverage import (
     PARTS,
     BevGrid,
     Coverage,
-    Mixture,
+    CoverageMixture,
     Region,
     RegionSummary,
     check_paired,
-    differences,
-    shown_places,
+    compute_differences,
+    list_region_bands,
 )
-from torchcover.coverage.measures import Measure
-from torchcover.coverage.paired import Parts, leaders
+from torchcover.coverage.measures import Average
+from torchcover.coverage.paired import EstimatorGetters, find_leaders
 from torchcover.estimation import MIN_BLOCKS, ROUND_OFF, Difference, Quantity
 
 
@@ -77,7 +77,7 @@ class CoverageTable:
     grid: BevGrid
     thresholds_m: tuple[float, ...]
     max_radius_m: float
-    average: Measure
+    average: Average
     rows: Mapping[str, tuple[Row, ...]]
     conditions: Mapping[str, Conditions]
     notes: tuple[str, ...]
@@ -88,7 +88,7 @@ class CoverageTable:
     @classmethod
     def from_coverages(
         cls,
-        coverages: Mapping[str, Coverage | Mixture],
+        coverages: Mapping[str, Coverage | CoverageMixture],
         regions: Sequence[Region],
         notes: Sequence[str] = (),
         source: Mapping[str, object] | None = None,
@@ -113,18 +113,20 @@ class CoverageTable:
             if len(coverages) > 1:
                 check_paired(dict(zip(coverages, of_one_world, strict=True)))
         first = next(iter(coverages.values()))
-        summaries = {rig: coverage.summary(regions) for rig, coverage in coverages.items()}
-        rows = _rows(coverages, shown_places(regions, first.grid), summaries)
+        summaries = {rig: coverage.summarize(regions) for rig, coverage in coverages.items()}
+        rows = _rows(coverages, list_region_bands(regions, first.grid), summaries)
         bodies = []
-        if first.bodies:
-            each = {rig: coverage.bodies.summary() for rig, coverage in coverages.items() if coverage.bodies}
-            bodies = _rows(coverages, first.bodies.places, each, OF_BODIES)
+        if first.target_sums:
+            each = {
+                rig: coverage.target_sums.summarize() for rig, coverage in coverages.items() if coverage.target_sums
+            }
+            bodies = _rows(coverages, first.target_sums.region_targets, each, OF_BODIES)
         return cls(
-            quantities=(*first.quantities, *(first.aggregated.quantities if first.aggregated else ())),
+            quantities=(*first.quantities, *(first.aggregated_numbers.quantities if first.aggregated_numbers else ())),
             grid=first.grid,
-            thresholds_m=first.thresholds,
-            max_radius_m=first.max_radius,
-            average=first.measure,
+            thresholds_m=first.thresholds_m,
+            max_radius_m=first.max_radius_m,
+            average=first.average,
             rows={rig: tuple(row[rig] for row in rows) for rig in coverages},
             conditions={rig: _conditions(coverage, regions) for rig, coverage in coverages.items()},
             notes=tuple(notes),
@@ -166,16 +168,16 @@ class CoverageTable:
 
 
 def _rows(
-    coverages: Mapping[str, Coverage | Mixture],
+    coverages: Mapping[str, Coverage | CoverageMixture],
     places: Sequence[tuple[Region, str]],
     summaries: Mapping[str, Sequence[RegionSummary]],
-    parts: Parts = PARTS,
+    parts: EstimatorGetters = PARTS,
 ) -> list[dict[str, Row]]:
     several = len(coverages) > 1
     rows = []
     for (region, height), of_rigs in zip(places, zip(*summaries.values(), strict=True), strict=True):
-        compared = differences(coverages, region, height, parts) if several else {}
-        best = leaders(coverages, region, height, parts)
+        compared = compute_differences(coverages, region, height, parts) if several else {}
+        best = find_leaders(coverages, region, height, parts)
         row = {}
         for rig, summary in zip(coverages, of_rigs, strict=True):
             marked = frozenset(key for key, leader in best.items() if leader == rig)
@@ -184,26 +186,28 @@ def _rows(
     return rows
 
 
-def _parts(coverage: Coverage | Mixture) -> list[Coverage]:
-    return [coverage] if isinstance(coverage, Coverage) else [part for _, part in coverage.parts]
+def _parts(coverage: Coverage | CoverageMixture) -> list[Coverage]:
+    return [coverage] if isinstance(coverage, Coverage) else [part for _, part in coverage.weighted_coverages]
 
 
-def _effective(coverage: Coverage | Mixture, regions: Sequence[Region], blocks: int) -> tuple[float, float]:
+def _effective(coverage: Coverage | CoverageMixture, regions: Sequence[Region], blocks: int) -> tuple[float, float]:
     """The least and the most effective blocks of regions that were seen; the blocks themselves if none was."""
-    places = shown_places(regions, coverage.grid)
-    each = [float(one) for place in places for one in coverage.estimate(*place).effective if one > 0]
+    places = list_region_bands(regions, coverage.grid)
+    each = [float(one) for place in places for one in coverage.estimate(*place).effective_blocks if one > 0]
     return (min(each), max(each)) if each else (float(blocks), float(blocks))
 
 
-def _conditions(coverage: Coverage | Mixture, regions: Sequence[Region]) -> Conditions:
+def _conditions(coverage: Coverage | CoverageMixture, regions: Sequence[Region]) -> Conditions:
     """Of a mixture those of all kinds of world, but too few blocks of any of them are too few."""
-    each = [part.blocks and (part.places or part.blocks) for part in _parts(coverage)]  # by area they are the fine ones
-    used = [int((blocks.steps > 0).sum()) for blocks in each if blocks]
-    longest = [int(blocks.steps.max()) for blocks in each if blocks]
+    each = [
+        part.block_sums and (part.region_sums or part.block_sums) for part in _parts(coverage)
+    ]  # by area they are the fine ones
+    used = [int((blocks.frame_counts > 0).sum()) for blocks in each if blocks]
+    longest = [int(blocks.frame_counts.max()) for blocks in each if blocks]
     found = Conditions(dict(coverage.counts), sum(used), max(longest, default=None), coverage.counts["inside_points"])
     if used:
         found = found._replace(effective_blocks=_effective(coverage, regions, min(used)))
     if min(used, default=0) >= MIN_BLOCKS:
         return found
-    fewest = coverage.kinds[used.index(min(used))] if used and isinstance(coverage, Mixture) else ""
+    fewest = coverage.scenario_names[used.index(min(used))] if used and isinstance(coverage, CoverageMixture) else ""
     return found._replace(blocks=min(used, default=None), smallest_scene_kind=fewest)

@@ -241,7 +241,7 @@ def format_height_band(grid: BevGrid, band: str) -> str:
 
 def format_resolution(num_frames: int, grid: BevGrid) -> str:
     """How much was measured and how finely: no number is worth anything without the two."""
-    return f"{num_frames:,} step{'s' * (num_frames != 1)}, cells of {grid.cell:g} m"
+    return f"{num_frames:,} step{'s' * (num_frames != 1)}, cells of {grid.cell_m:g} m"
 
 
 def _words(number: RoundedNumber) -> str:

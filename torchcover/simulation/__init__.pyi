@@ -1,6 +1,6 @@
 from .builtin import builtin_documents as builtin_documents
-from .builtin import builtin_folder as builtin_folder
 from .builtin import builtin_names as builtin_names
+from .builtin import get_builtin_folder as get_builtin_folder
 from .camera_sensor import CameraSensor as CameraSensor
 from .documents import Document as Document
 from .documents import Pose as Pose

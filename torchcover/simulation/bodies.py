@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, ValidationInfo, model_validator
 
-from torchcover.geometry import BoundingBox, rigid
+from torchcover.geometry import BoundingBox, build_transform
 from torchcover.geometry.arrays import Float64
 from torchcover.simulation import shapes
 from torchcover.simulation.documents import (
@@ -274,10 +274,10 @@ def in_vehicle_frame(mesh: Mesh, *, keep_height: bool = False) -> Mesh:
         mesh: The mesh, in any frame.
         keep_height: Whether a mesh above z = 0 stays so high above the ground. One that reaches below is lifted anyway.
     """
-    box = BoundingBox.around(mesh.vertices_m)
+    box = BoundingBox.from_points(mesh.vertices_m)
     (x0, y0, z0), (x1, y1, _) = box.lower_m, box.upper_m
     z_m = -min(z0, 0.0) if keep_height else -z0
-    return mesh.moved(rigid(np.eye(3), [-(x0 + x1) / 2, -(y0 + y1) / 2, z_m]))
+    return mesh.moved(build_transform(np.eye(3), [-(x0 + x1) / 2, -(y0 + y1) / 2, z_m]))
 
 
 def mover_mesh(name: str, shape: Shape, category: str = "ego", *, keep_height: bool = False) -> Mesh:

@@ -2,13 +2,13 @@
 
 from typing import Any
 
-from torchcover.files import builtin_folder as builtin_folder
+from torchcover.files import get_builtin_folder as get_builtin_folder
 from torchcover.files import parse_yaml
 
 
 def builtin_names(kind: str) -> list[str]:
     """Names of the built-in documents of a kind, in alphabetical order."""
-    return sorted(path.stem for path in builtin_folder(kind).glob("*.yaml"))
+    return sorted(path.stem for path in get_builtin_folder(kind).glob("*.yaml"))
 
 
 def builtin_documents(kind: str) -> dict[str, dict[str, Any]]:
@@ -21,5 +21,5 @@ def builtin_documents(kind: str) -> dict[str, dict[str, Any]]:
         >>> builtin_documents("scenarios")["courtyard"]["description"].split(",")[0]
         'A static yard'
     """
-    folder = builtin_folder(kind)
+    folder = get_builtin_folder(kind)
     return {name: parse_yaml((folder / f"{name}.yaml").read_text(encoding="utf-8")) for name in builtin_names(kind)}

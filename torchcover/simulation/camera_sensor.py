@@ -9,13 +9,13 @@ from pydantic import Field, PositiveFloat, PositiveInt, model_validator
 from torch import Tensor
 
 from torchcover.cameras import Camera
-from torchcover.geometry import rigid
+from torchcover.geometry import build_transform
 from torchcover.geometry.arrays import Float64
 from torchcover.simulation.documents import Document, Pose
 from torchcover.simulation.sensor import Ranging, ScanTimes
 
 # The camera frame is x right, y down, z forward; a mount looks along its x, with y left and z up.
-MOUNT_T_CAMERA = rigid(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
+MOUNT_T_CAMERA = build_transform(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
 ROWS_AT_ONCE = 64
 # Ten times the sides of the largest images that there are.
 MAX_PIXELS = 200_000
@@ -156,6 +156,6 @@ class CameraSensor(Ranging):
         """(3, rows, columns) of (rows, columns, 2) pixels."""
         camera = self.camera()
         # Only the pixels that are used, and not all at once: the solver needs many times their memory.
-        rays = torch.cat([camera.compute_rays(band)[0] for band in torch.split(pixels, ROWS_AT_ONCE)])
+        rays = torch.cat([camera.rays(band)[0] for band in torch.split(pixels, ROWS_AT_ONCE)])
         right, down, forward = np.moveaxis(rays.numpy(), 2, 0)
         return np.stack([forward, -right, -down])

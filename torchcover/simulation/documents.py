@@ -23,12 +23,12 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails
 
-from torchcover.files import BadFileError, parse_yaml, read_short_text, reads
-from torchcover.geometry import rigid, rotation_from_euler, rotation_from_quaternion
+from torchcover.files import BadFileError, guard_reader, parse_yaml, read_short_text
+from torchcover.geometry import build_transform, convert_euler_to_rotation, convert_quaternion_to_rotation
 from torchcover.geometry.arrays import Float64
-from torchcover.geometry.rigid import warn_of_radians
+from torchcover.geometry.rigid import warn_about_radians
 from torchcover.recordings.other_formats import find_remedy
-from torchcover.simulation.builtin import builtin_folder, builtin_names
+from torchcover.simulation.builtin import builtin_names, get_builtin_folder
 
 # Mistakes of one document that a message tells, and characters of what arrived.
 MAX_TOLD = 5
@@ -90,7 +90,7 @@ class Document(BaseModel):
         if not isinstance(content, dict):
             return content
         kept = {key: _kept(value) for key, value in content.items()}
-        warn_of_radians({key: kept[key] for key in ANGLES if is_numbers(kept.get(key))})
+        warn_about_radians({key: kept[key] for key in ANGLES if is_numbers(kept.get(key))})
         return kept
 
     def content(self) -> dict[str, Any]:
@@ -150,16 +150,16 @@ class Pose(Document):
         if self.quaternion_wxyz is not None:
             if self.yaw_deg or self.pitch_deg or self.roll_deg:
                 raise ValueError("give the rotation as a quaternion or as yaw, pitch and roll, not both")
-            rotation_from_quaternion(self.quaternion_wxyz)
+            convert_quaternion_to_rotation(self.quaternion_wxyz)
         return self
 
     def matrix(self) -> Float64:
         """The (4, 4) transform."""
         if self.quaternion_wxyz is not None:
-            rotation = rotation_from_quaternion(self.quaternion_wxyz)
+            rotation = convert_quaternion_to_rotation(self.quaternion_wxyz)
         else:
-            rotation = rotation_from_euler(self.yaw_deg, self.pitch_deg, self.roll_deg)
-        return rigid(rotation, (self.x_m, self.y_m, self.z_m))
+            rotation = convert_euler_to_rotation(self.yaw_deg, self.pitch_deg, self.roll_deg)
+        return build_transform(rotation, (self.x_m, self.y_m, self.z_m))
 
 
 DocumentT = TypeVar("DocumentT", bound=Document)
@@ -234,7 +234,7 @@ class BuiltIn(Document):
         return read_document(cls, found(cls.folder, path_or_name))
 
 
-@reads("a YAML document")
+@guard_reader("a YAML document")
 def read_mapping(path: Path) -> dict[str, Any]:
     """The keys of a YAML file and what they hold."""
     content = parse_yaml(read_short_text(path))
@@ -376,7 +376,7 @@ def found(kind: str, path_or_name: str | Path) -> Path:
         return path
     if remedy := find_remedy(path):
         raise BadFileError(f"{path}: one of the {kind} is a .yaml file; {remedy}")
-    builtin = builtin_folder(kind) / f"{path_or_name}.yaml"
+    builtin = get_builtin_folder(kind) / f"{path_or_name}.yaml"
     if path.name != str(path_or_name) or not builtin.is_file():
         kinds = [other for other in ("rigs", "scenarios", "vehicles", "encounters", "requirements") if other != kind]
         if of := [other for other in kinds if path.name in builtin_names(other)]:
@@ -390,10 +390,10 @@ def found(kind: str, path_or_name: str | Path) -> Path:
 
 def builtin_hashes(kind: str) -> dict[str, str]:
     """The hash of every built-in document of a kind, by its name."""
-    return {path.stem: file_hash(path) for path in sorted(builtin_folder(kind).glob("*.yaml"))}
+    return {path.stem: file_hash(path) for path in sorted(get_builtin_folder(kind).glob("*.yaml"))}
 
 
-@reads("a file")
+@guard_reader("a file")
 def file_hash(path: Path) -> str:
     """SHA-256 of what is in a file."""
     with path.open("rb") as file:

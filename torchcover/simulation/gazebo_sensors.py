@@ -10,7 +10,12 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from torchcover.geometry import euler_from_rotation, rigid, rotation_from_euler, rotation_from_quaternion
+from torchcover.geometry import (
+    build_transform,
+    convert_euler_to_rotation,
+    convert_quaternion_to_rotation,
+    convert_rotation_to_euler,
+)
 from torchcover.geometry.arrays import Float64
 
 LIDARS = ("ray", "gpu_ray", "lidar", "gpu_lidar")
@@ -70,9 +75,9 @@ def read_pose(element: Element | None) -> Float64:
         angles = read_numbers(element.get(key, "0 0 0"), count, f"origin {key}")
     if len(angles) == 4:
         x, y, z, w = angles
-        return rigid(rotation_from_quaternion([w, x, y, z]), position_m)
+        return build_transform(convert_quaternion_to_rotation([w, x, y, z]), position_m)
     roll, pitch, yaw = np.rad2deg(np.multiply(angles, unit))
-    return rigid(rotation_from_euler(yaw, pitch, roll), position_m)
+    return build_transform(convert_euler_to_rotation(yaw, pitch, roll), position_m)
 
 
 def read_sensors(root: Element, vehicle_T_frame: dict[str, Float64]) -> tuple[list[PlacedSensor], list[str]]:
@@ -124,7 +129,9 @@ def _find_pose(owner: Element, name: str, vehicle_T_frame: Mapping[str, Float64]
 
 def _add_mount(keys: dict[str, Any], pose: Float64) -> dict[str, Any]:
     """Add the mount, to the tenth of a millimeter and the hundredth of a degree, after type and name."""
-    angles = dict(zip(("yaw_deg", "pitch_deg", "roll_deg"), euler_from_rotation(pose[:3, :3]).round(2), strict=True))
+    angles = dict(
+        zip(("yaw_deg", "pitch_deg", "roll_deg"), convert_rotation_to_euler(pose[:3, :3]).round(2), strict=True)
+    )
     values = dict(zip(("x_m", "y_m", "z_m"), pose[:3, 3].round(4), strict=True)) | angles
     mount = {key: float(value) for key, value in values.items() if value}
     first = {key: keys.pop(key) for key in ("type", "name")}
@@ -163,7 +170,9 @@ def _read_lidar(
         **_read_noise(block, name, notes),
     }
     _note_visibility_mask(block, name, notes)
-    sensor_T_middle = rigid(rotation_from_euler(math.degrees((left + right) / 2), 0.0, 0.0), np.zeros(3))
+    sensor_T_middle = build_transform(
+        convert_euler_to_rotation(math.degrees((left + right) / 2), 0.0, 0.0), np.zeros(3)
+    )
     yield keys, frames[""] @ sensor_T_middle
 
 

@@ -46,7 +46,7 @@ class Slopes(NamedTuple):
 
     def heights_m(self, places_m: Float64) -> Float64:
         """(N,) at (N, 2) places."""
-        return HeightField(self.lower_m, self.corners_m, self.cell_m).heights_m(places_m)
+        return HeightField(self.lower_m, self.corners_m, self.cell_m).compute_heights_m(places_m)
 
     def mesh(self) -> Mesh:
         """The squares that are wanted, as one sheet."""

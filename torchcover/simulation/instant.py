@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.geometry import transform
+from torchcover.geometry import transform_points
 from torchcover.geometry.arrays import Bools, Float32, Float64, Int32, Int64
 from torchcover.geometry.rigid import Matrix
 from torchcover.simulation.local_ground import LocalGround
@@ -87,7 +87,7 @@ class Instant:
         It is within so much above, towards the (N, 3) `normals` of length one, and counted as `RayCaster.faces_met`
         does.
         """
-        starts_m = transform(self.static_T_vehicle, points_m + np.float32(within_m) * normals)
+        starts_m = transform_points(self.static_T_vehicle, points_m + np.float32(within_m) * normals)
         towards = -(normals @ self.static_T_vehicle[:3, :3].T)
         return self.static.faces_met(starts_m, towards, 2 * within_m)
 
@@ -200,7 +200,7 @@ class Instant:
         """Whether a place in the vehicle frame lies below the ground or inside a wall or another body than the ego."""
         if self.ground.is_above(position_m, self.world_T_vehicle):
             return True
-        inside = self.static.inside(transform(self.static_T_vehicle, position_m[None])[0])
+        inside = self.static.inside(transform_points(self.static_T_vehicle, position_m[None])[0])
         if (inside != self.ego).any():
             return True
         moving = self.moving
@@ -211,7 +211,7 @@ class Instant:
 
     def on_a_face(self, position_m: Matrix) -> bool:
         """Whether a place in the vehicle frame lies exactly on the ground, or on a face of what else never moves."""
-        touched = self.static.touched(transform(self.static_T_vehicle, position_m[None])[0])
+        touched = self.static.touched(transform_points(self.static_T_vehicle, position_m[None])[0])
         return bool((touched != self.ego).any())
 
     def outlines(self, origin_m: Matrix) -> Outlines:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.geometry import transform
+from torchcover.geometry import transform_points
 from torchcover.geometry.arrays import Bools, Float32, Float64, Int64
 from torchcover.simulation.patches import connected, edges_of, outward_faces
 from torchcover.simulation.raycaster import RayCaster
@@ -173,7 +173,7 @@ class LocalGround:
     def _local(self, points_m: NDArray[np.floating], world_T_points: Float64 | None) -> Float64:
         local_T_points = np.eye(4) if world_T_points is None else world_T_points.copy()
         local_T_points[:3, 3] -= self.origin_m
-        return transform(local_T_points, points_m)
+        return transform_points(local_T_points, points_m)
 
     def _cast(self, places_m: Float64, up: float) -> Float32:
         """(N,) how far the ground is above or below places, NaN where there is none."""

@@ -14,7 +14,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.files import apart, check_memory, check_regular
+from torchcover.files import check_memory, check_regular, run_isolated
 from torchcover.recordings.other_formats import find_remedy
 
 Float64 = NDArray[np.float64]
@@ -138,7 +138,7 @@ OBJ_TEXTURE = re.compile(rb"/\S*")
 PACKAGES = {"collada": "'torchcover[urdf]'", "openctm": "python-openctm"}
 
 
-@apart
+@run_isolated
 def mesh_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """All meshes of a file of any format of trimesh's.
 

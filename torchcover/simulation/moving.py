@@ -34,7 +34,7 @@ class Solid:
 
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
-        self.box = BoundingBox.around(mesh.vertices_m)
+        self.box = BoundingBox.from_points(mesh.vertices_m)
         centre_m = (np.array(self.box.lower_m) + np.array(self.box.upper_m)) / 2
         self.radius_m = float(np.linalg.norm(mesh.vertices_m - centre_m, axis=1).max())
         # Of the corners as they are cast: in float32.

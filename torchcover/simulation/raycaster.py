@@ -19,7 +19,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
-from torchcover.geometry import transform
+from torchcover.geometry import transform_points
 from torchcover.geometry.arrays import Bools, Float32, Float64, Int32, Int64
 from torchcover.geometry.rigid import Matrix
 from torchcover.simulation.patches import outward_faces
@@ -327,4 +327,4 @@ def cast_from(
 ) -> Hits:
     """Cast rays of the vehicle frame at a caster in its own frame."""
     towards = rotate(part_T_vehicle[:3, :3], directions)
-    return caster.cast(transform(part_T_vehicle, origin_m[None])[0], towards, limit_m)
+    return caster.cast(transform_points(part_T_vehicle, origin_m[None])[0], towards, limit_m)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.geometry import invert, transform
+from torchcover.geometry import invert, transform_points
 from torchcover.geometry.arrays import Bools, Float32, Float64, Int64
 from torchcover.recordings.in_vehicle import transform_to_vehicle
 from torchcover.recordings.recording import Recording
@@ -147,7 +147,7 @@ def _of_sweep(points_m: Float64, lidar: Lidar, number: int) -> GroundRays:
 
 def _in_rows(points_m: Float64, lidar: Lidar) -> tuple[NDArray[np.intp], Float64, Float64]:
     """(N,) row of a LiDAR that each point is nearest to, its azimuth in degrees and its range."""
-    in_sensor_m = transform(invert(lidar.mount.matrix()), points_m)
+    in_sensor_m = transform_points(invert(lidar.mount.matrix()), points_m)
     x, y, z = in_sensor_m.T
     rows_deg, elevation_deg = np.sort(lidar.rows_deg()), np.rad2deg(np.arctan2(z, np.hypot(x, y)))
     row = np.searchsorted((rows_deg[1:] + rows_deg[:-1]) / 2, elevation_deg)

@@ -9,7 +9,13 @@ from typing import Any
 import numpy as np
 
 from torchcover.cameras.calibration import Calibration
-from torchcover.geometry import BoundingBox, euler_from_rotation, invert, rigid, rotation_from_euler
+from torchcover.geometry import (
+    BoundingBox,
+    build_transform,
+    convert_euler_to_rotation,
+    convert_rotation_to_euler,
+    invert,
+)
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.formats.ros import RosBag
 from torchcover.recordings.recorders import CLEARANCE_M
@@ -105,7 +111,7 @@ def recorded_body(recording: Recording, vehicle: str | Path) -> BoundingBox:
             return BoundingBox((x0, y0, z0), (x1, y1, z1))
         except ValueError as error:
             raise ValueError(f"vehicle {vehicle}: x0,x1,y0,y1,z0,z1 in metres are needed, x0 < x1: {error}") from error
-    ego = BoundingBox.around(mover_mesh("vehicle", body_called(vehicle)).vertices_m)
+    ego = BoundingBox.from_points(mover_mesh("vehicle", body_called(vehicle)).vertices_m)
     mounts = recording.read_calibrations().mounts if isinstance(recording, RosBag) else {}
     top_m = max([ego.upper_m[2], *(float(mount[2, 3]) + ABOVE_SENSOR_M for mount in mounts.values())])
     return BoundingBox((*ego.lower_m[:2], CLEARANCE_M), (*ego.upper_m[:2], top_m))
@@ -136,7 +142,7 @@ def _lidar(recording: Recording, name: str, known: SensorCalibrations, model: st
             f"{recording.path}: the points of {name} do not lie in rows that can be told apart; name its model (see "
             f"`torchcover list`): --lidar {name}=MODEL"
         )
-    mount = mount @ rigid(rotation_from_euler(found.centre_deg, 0.0, 0.0), [0.0, 0.0, found.origin_m])
+    mount = mount @ build_transform(convert_euler_to_rotation(found.centre_deg, 0.0, 0.0), [0.0, 0.0, found.origin_m])
     mounted += f", its rays' origin {found.origin_m:+.2f} m higher" if found.origin_m else ""
     pattern = {
         "elevations_deg": [round(float(elevation), 3) + 0.0 for elevation in found.elevations_deg],
@@ -164,7 +170,7 @@ def _camera(camera: Calibration) -> dict[str, Any]:
 
 
 def _pose(vehicle_T_sensor: Matrix) -> dict[str, float]:
-    yaw, pitch, roll = euler_from_rotation(vehicle_T_sensor[:3, :3])
+    yaw, pitch, roll = convert_rotation_to_euler(vehicle_T_sensor[:3, :3])
     x, y, z = vehicle_T_sensor[:3, 3]
     keys = ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")
     return {key: round(float(value), 6) + 0.0 for key, value in zip(keys, (x, y, z, yaw, pitch, roll), strict=True)}

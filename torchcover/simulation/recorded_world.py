@@ -8,15 +8,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchcover.files import AtomicOutput, as_yaml, csv_text
+from torchcover.files import AtomicOutput, format_csv, to_yaml
 from torchcover.geometry import (
     BoundingBox,
     HeightField,
-    euler_from_rotation,
+    build_transform,
+    convert_euler_to_rotation,
+    convert_rotation_to_euler,
     invert,
-    rigid,
-    rotation_from_euler,
-    transform,
+    transform_points,
 )
 from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.geometry.rigid import Matrix
@@ -122,7 +122,7 @@ def write_world(recording: Recording, folder: Path, *, steps: int | None = None)
     )
     body = recording.ego_box or USUAL_BODY
     beside_m = np.array([BESIDE_M, BESIDE_M, 0.0])
-    own = BoundingBox.around(np.array([body.lower_m - beside_m, body.upper_m + beside_m]))
+    own = BoundingBox.from_points(np.array([body.lower_m - beside_m, body.upper_m + beside_m]))
     seen = _seen(recording, reference, times_s, poses, own)
     drive = Trajectory.from_poses(times_s, poses)
     labelled = recording.read_boxes(recording.key_frames[0]) is not None
@@ -130,8 +130,8 @@ def write_world(recording: Recording, folder: Path, *, steps: int | None = None)
     driven = [(pose, body) for pose in poses] + [_around(row) for row in rows]
     cells = _cells(seen, driven)
     instants_s: Float64 = STEP_S * np.arange(int(times_s[-1] / STEP_S + 1e-6) + 1.0)
-    placed = drive.at_each(instants_s)
-    way = np.column_stack([instants_s, placed[:, :3, 3], euler_from_rotation(placed[:, :3, :3])[:, ::-1]])
+    placed = drive.interpolate_many(instants_s)
+    way = np.column_stack([instants_s, placed[:, :3, 3], convert_rotation_to_euler(placed[:, :3, :3])[:, ::-1]])
     told = (
         f"{times_s[-1]:.1f} s; ground of {seen.ground.wanted.sum() * SQUARE_M**2:,.0f} m2, {len(cells):,} cells of "
         f"{CELL_M:g} m that stand, {len({row[1] for row in rows})} movers "
@@ -153,7 +153,7 @@ def write_world(recording: Recording, folder: Path, *, steps: int | None = None)
     tables: dict[str, list[Row]] = {"ego": [TRAJECTORY_COLUMNS, *map(tuple, way.tolist())]}
     if rows:
         tables["movers"] = [("t", "id", "category", *BOX_COLUMNS[1:]), *rows]
-    texts = {f"{name}.csv": csv_text(table) for name, table in tables.items()} | {"scenario.yaml": as_yaml(scenario)}
+    texts = {f"{name}.csv": format_csv(table) for name, table in tables.items()} | {"scenario.yaml": to_yaml(scenario)}
     with AtomicOutput(folder) as files:
         for name, mesh in bodies.items():
             files.add(f"{name}.ply", partial(_export, mesh))
@@ -182,7 +182,7 @@ def _seen(
             if not done < instant < len(times_s):
                 continue
             free = np.ones(len(points_m), np.bool_)
-            free[find_points_in_box(transform(invert(poses[instant]), points_m), own)] = False
+            free[find_points_in_box(transform_points(invert(poses[instant]), points_m), own)] = False
             parts.append(points_m[free & (told == 0)])
             loose.append((float(times_s[instant]), points_m[free & (told > 0)], told[free & (told > 0)] == 2))
             image = sweeps.get_thinned_scan(recording, sensor, instant).range_image
@@ -238,7 +238,7 @@ class _Field:
 def _cells(seen: Surveyed, driven: Sequence[tuple[Matrix, BoundingBox]]) -> Int64:
     """(N, 3) the cells, in steps of `CELL_M`, that something fills; none of where anything drives."""
     field = HeightField(seen.ground.lower_m, seen.ground.corners_m, SQUARE_M)
-    above_m = seen.standing_m[:, 2] - field.heights_m(seen.standing_m[:, :2])
+    above_m = seen.standing_m[:, 2] - field.compute_heights_m(seen.standing_m[:, :2])
     stands = ~(above_m < ON_GROUND_M)
     places_m, above_m = seen.standing_m[stands], above_m[stands]
     cells = np.floor(places_m / CELL_M).astype(np.int64)
@@ -263,7 +263,7 @@ def _cells(seen: Surveyed, driven: Sequence[tuple[Matrix, BoundingBox]]) -> Int6
         reach_m = float(np.linalg.norm(box.corners_m[:, :2], axis=1).max())
         first, end = np.searchsorted(cells[:, 0], (pose[0, 3] + np.array([-reach_m, reach_m])) / CELL_M)
         near = first + np.flatnonzero(np.abs((cells[first:end, 1] + 0.5) * CELL_M - pose[1, 3]) < reach_m)
-        free[near[find_points_in_box(transform(invert(pose), (cells[near] + 0.5) * CELL_M), box)]] = False
+        free[near[find_points_in_box(transform_points(invert(pose), (cells[near] + 0.5) * CELL_M), box)]] = False
     filling: Int64 = np.unique(cells[free], axis=0)
     return filling
 
@@ -273,7 +273,7 @@ def _around(row: Row) -> tuple[Matrix, BoundingBox]:
     x, y, z, *size_m, yaw_deg = (float(number) for number in row[3:])
     length, width, height = np.array(size_m) / 2 + BESIDE_M
     box = BoundingBox((-length, -width, -height), (length, width, 2 * height))
-    return rigid(rotation_from_euler(yaw_deg, 0.0, 0.0), [x, y, z]), box
+    return build_transform(convert_euler_to_rotation(yaw_deg, 0.0, 0.0), [x, y, z]), box
 
 
 def cell_mesh(cells: Int64) -> Mesh:
@@ -312,8 +312,8 @@ def _labelled(recording: Recording, last_s: float) -> Iterator[Row]:
             name = track.name if not number else f"{track.name} #{number + 1}"
             times_s = np.append(np.arange(piece.times_s[0], piece.times_s[-1] - 1e-6, STEP_S), piece.times_s[-1])
             times_s = times_s[times_s <= last_s]
-            placed = piece.at_each(times_s)
-            yaw_deg = euler_from_rotation(placed[:, :3, :3])[:, :1]
+            placed = piece.interpolate_many(times_s)
+            yaw_deg = convert_rotation_to_euler(placed[:, :3, :3])[:, :1]
             for row in np.column_stack([times_s, placed[:, :3, 3] - first_m, yaw_deg]).tolist():
                 yield (row[0], name, track.category, *row[1:4], *track.size_m, row[4])
 
@@ -326,7 +326,7 @@ def _found(seen: Surveyed, drive: Trajectory) -> Iterator[Row]:
     for time_s in np.unique(scan_s):
         if time_s - before_s < FOUND_EVERY_S - 1e-6:
             continue
-        before_s, ego_m = time_s, drive.positions_at(np.array([time_s]))[0]
+        before_s, ego_m = time_s, drive.interpolate_positions_m(np.array([time_s]))[0]
         near = np.flatnonzero(np.abs(scan_s - time_s) <= COMPARED_S)
         scans_m = [seen.loose[scan][1] for scan in near]
         scans_m = [of_m[np.linalg.norm(of_m[:, :2] - ego_m[:2], axis=1) < WITHIN_M] for of_m in scans_m]
@@ -355,7 +355,7 @@ def _seen_past(seen: Surveyed, scan_s: Float64, times_s: Sequence[float], boxes:
         pose, room = _around(("", "", "", *box.tolist()))
         for scan in np.flatnonzero(scan_s == time_s):
             _, points_m, is_past = seen.loose[scan]
-            rows = find_points_in_box(transform(invert(pose), points_m), room)
+            rows = find_points_in_box(transform_points(invert(pose), points_m), room)
             inside, past = inside + len(rows), past + int(is_past[rows].sum())
     return past / max(inside, 1)
 
@@ -398,14 +398,14 @@ def _boxes(track: Sequence[tuple[float, Float64, MovingCluster]], drive: Traject
     axes = np.stack([np.stack([np.cos(yaw), np.sin(yaw)], 1), np.stack([-np.sin(yaw), np.cos(yaw)], 1)], axis=1)
     ends = np.array([[np.quantile(moved.points_m[:, :2] @ axis.T, share, axis=0) for share in (0.02, 0.98)]
                      for axis, (*_, moved) in zip(axes, track, strict=True)])  # fmt: skip
-    under_m = HeightField(ground.lower_m, ground.corners_m, ground.cell_m).heights_m(middles_m)
+    under_m = HeightField(ground.lower_m, ground.corners_m, ground.cell_m).compute_heights_m(middles_m)
     lowest_m, highest_m = np.array([np.quantile(moved.points_m[:, 2], (0.02, 0.98)) for *_, moved in track]).T
     under_m = np.where(np.isfinite(under_m), under_m, lowest_m)
     seen_m = np.column_stack([ends[:, 1] - ends[:, 0], highest_m - under_m])
     size_m = np.clip(np.quantile(seen_m, USUALLY, axis=0), SMALLEST_M, LARGEST_M)
     if size_m[1] > CAR_M[1]:
         size_m[0] = max(size_m[0], CAR_M[0])
-    ego = np.einsum("kij,kj->ki", axes, drive.positions_at(times_s)[:, :2])
+    ego = np.einsum("kij,kj->ki", axes, drive.interpolate_positions_m(times_s)[:, :2])
     far = np.where(ego < ends[:, 0], 1, np.where(ego > ends[:, 1], -1, 0))
     near = np.where(far > 0, ends[:, 0], ends[:, 1])
     middle = np.where(far == 0, ends.mean(axis=1), near + far * size_m[:2] / 2)

@@ -12,7 +12,7 @@ from typing import ClassVar, NamedTuple, Protocol, Self
 import numpy as np
 
 from torchcover.coverage.grid import BandFrame
-from torchcover.geometry import BoundingBox, rigid, rotation_from_euler
+from torchcover.geometry import BoundingBox, build_transform, convert_euler_to_rotation
 from torchcover.geometry.arrays import Float32, Float64, Int64
 from torchcover.simulation.instant import Instant
 from torchcover.simulation.rays import Tile, into_tiles, unit_directions
@@ -103,7 +103,7 @@ class ReferenceSensor(Protocol):
 
     name: ClassVar[str]
     """What it is registered as, and what `--reference` and `summary.json` call it."""
-    square_metres: ClassVar[bool]
+    has_area_weights: ClassVar[bool]
     """Whether its points have weights, the square metres that they stand for. The same in every scan."""
 
     @property
@@ -205,7 +205,7 @@ class PaperReference:
 
     name: ClassVar[str] = "paper"
     band_frame: ClassVar[BandFrame] = "vehicle"
-    square_metres: ClassVar[bool] = False
+    has_area_weights: ClassVar[bool] = False
 
     rows: int = 1024
     columns: int = 1024
@@ -273,7 +273,9 @@ class PaperReference:
         """
         yaw = generator.uniform(-180.0, 180.0)
         pitch, roll = generator.uniform(-self.max_tilt_deg, self.max_tilt_deg, size=2)
-        return rigid(rotation_from_euler(yaw, pitch, roll), position_in_shell(ego, self.shell_m, generator))
+        return build_transform(
+            convert_euler_to_rotation(yaw, pitch, roll), position_in_shell(ego, self.shell_m, generator)
+        )
 
 
 # Kept for the process, not with the sensor, which travels to DataLoader workers.

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, NamedTuple, Self
 
 from pydantic import Field, PositiveFloat, model_validator
 
-from torchcover.coverage import BevGrid, Region, check_regions, forward_regions, near_field_regions
+from torchcover.coverage import BevGrid, Region, build_near_field_regions, check_regions, forward_regions
 from torchcover.coverage.grid import PAPER_HEIGHTS, BandFrame
 from torchcover.geometry.arrays import Float64
 from torchcover.simulation.documents import Bounds, Coordinate, Document, Readable
@@ -54,7 +54,7 @@ class RegionOfInterest(Document):
         if self.x_m is not None and self.y_m is not None:
             return Region(name, self.x_m, self.y_m)
         assert self.polygon_m is not None  # checked in _check_one_of
-        return Region.polygon(name, self.polygon_m)
+        return Region.from_corners(name, self.polygon_m)
 
 
 class GridOfInterest(Document):
@@ -76,7 +76,7 @@ class RegionsOfInterest(Readable):
 
     Args:
         regions: By name. Not given: the paper's three in front of the vehicle, and the near field on its four sides
-            (`near_field_regions`), as far as the grid holds them.
+            (`build_near_field_regions`), as far as the grid holds them.
         heights: Name of each height band -> lower and upper bound of z in metres; they may overlap. Not given: the
             paper's, ground and obstacle.
         grid: Extent and cell. Not given: x from -40 to 160 m, y from -40 to 40 m, more if regions need it, and cells
@@ -133,24 +133,24 @@ class RegionsOfInterest(Readable):
         if named:
             check_regions(named, grid)
             _warn_of_hidden(named, vehicle)
-            return Asked(grid, named, (*(_area(region) for region in named), (grid.x, grid.y)), named)
+            return Asked(grid, named, (*(_area(region) for region in named), (grid.x_m, grid.y_m)), named)
         ranges = forward_regions() if within is None else forward_regions(NEAR_RANGES_M)
-        forward = tuple(region for region in ranges if region.fits(grid))
+        forward = tuple(region for region in ranges if region.is_within(grid))
         if within is not None:
-            forward = *forward, Region(within.name, grid.x, grid.y)
+            forward = *forward, Region(within.name, grid.x_m, grid.y_m)
         check_regions(forward, grid)
         near = () if ego_outline_m is None else near_field(ego_outline_m)
         if not self.heights:  # of what is above the ground there, bodies are put there
             near = tuple(replace(region, bands=("ground",)) for region in near)
         # Cells may be larger than the near field.
-        near = tuple(region for region in near if region.fits(grid) and region.mask(grid).any())
+        near = tuple(region for region in near if region.is_within(grid) and region.mask_cells(grid).any())
         around = (_around(near),) if near else ()
-        usual = (*forward, *near) or (Region("grid", grid.x, grid.y),)
-        return Asked(grid, usual, (*map(_area, forward), *around, (grid.x, grid.y)), forward or usual)
+        usual = (*forward, *near) or (Region("grid", grid.x_m, grid.y_m),)
+        return Asked(grid, usual, (*map(_area, forward), *around, (grid.x_m, grid.y_m)), forward or usual)
 
     def _fitted(self, within: Region, vehicle: Area | None, cell_m: float, band_frame: BandFrame) -> BevGrid:
         """Of whole cells around what can be seen and the near field."""
-        areas = [_area(within)] + ([] if vehicle is None else [_around(near_field_regions(*vehicle))])
+        areas = [_area(within)] + ([] if vehicle is None else [_around(build_near_field_regions(*vehicle))])
         x, y = (
             (
                 round(math.floor(min(low for low, _ in of) / cell_m) * cell_m, 9),
@@ -161,8 +161,8 @@ class RegionsOfInterest(Readable):
         return BevGrid(x, y, cell_m, self.heights or PAPER_HEIGHTS, band_frame)
 
     def _grid(self, regions: tuple[Region, ...], cell_m: float, band_frame: BandFrame) -> BevGrid:
-        x = self.grid.x_m or _holding(GRID_X_M, [region.x for region in regions], cell_m)
-        y = self.grid.y_m or _holding(GRID_Y_M, [region.y for region in regions], cell_m)
+        x = self.grid.x_m or _holding(GRID_X_M, [region.x_m for region in regions], cell_m)
+        y = self.grid.y_m or _holding(GRID_Y_M, [region.y_m for region in regions], cell_m)
         return BevGrid(x, y, cell_m, self.heights or PAPER_HEIGHTS, band_frame)
 
 
@@ -189,8 +189,8 @@ class Asked(NamedTuple):
 
 
 def near_field(ego_outline_m: Float64) -> tuple[Region, ...]:
-    """That of a vehicle with (K, 2) corners x, y; see `near_field_regions`."""
-    return near_field_regions(*_bounds(ego_outline_m))
+    """That of a vehicle with (K, 2) corners x, y; see `build_near_field_regions`."""
+    return build_near_field_regions(*_bounds(ego_outline_m))
 
 
 def _bounds(outline_m: Float64) -> Area:
@@ -200,7 +200,7 @@ def _bounds(outline_m: Float64) -> Area:
 
 
 def _area(region: Region) -> Area:
-    return region.x, region.y
+    return region.x_m, region.y_m
 
 
 def _around(regions: tuple[Region, ...]) -> Area:

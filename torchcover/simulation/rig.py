@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, PlainValidator, TypeAdapter, ValidationInfo, model_validator
 
-from torchcover.files import as_yaml, write_atomically
+from torchcover.files import to_yaml, write_atomically
 from torchcover.geometry import BoundingBox
 from torchcover.simulation.bodies import Body, Shape, VehicleShape, body_called, merge
 from torchcover.simulation.documents import BuiltIn, Document, NameOrFile, is_file_name
@@ -87,7 +87,7 @@ class Rig(BuiltIn):
         """
         keys = self.model_dump(mode="json", exclude_unset=True, exclude={"sensors"})
         keys["sensors"] = [_written(sensor) for sensor in self.sensors]
-        write_atomically(Path(path), lambda aside: aside.write_text(as_yaml(keys), encoding="utf-8"))
+        write_atomically(Path(path), lambda aside: aside.write_text(to_yaml(keys), encoding="utf-8"))
 
     def own_mesh(self, ego: Mesh) -> Mesh:
         """All that hides something from its sensors on a vehicle: the body of that, and what the rig carries."""

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.geometry import invert, quaternion_from_rotation, transform
+from torchcover.geometry import convert_rotation_to_quaternion, invert, transform_points
 from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.formats.ros_poses import PoseSeries
@@ -316,7 +316,7 @@ def _read(recording: Recording, sensor: str, index: int, vehicle_T_sensor: Matri
     scan = recording.read_scan(sensor, index)
     points_m = scan.points_m.astype(np.float64)
     came = np.asarray(np.isfinite(points_m).all(axis=1) & (np.abs(points_m) > NO_RETURN_M).any(axis=1))
-    in_vehicle_m = points_m if scan.vehicle_T_sensor is None else transform(scan.vehicle_T_sensor, points_m)
+    in_vehicle_m = points_m if scan.vehicle_T_sensor is None else transform_points(scan.vehicle_T_sensor, points_m)
     if recording.ego_box is not None:
         came[find_points_in_box(in_vehicle_m, recording.ego_box)] = False
     rows = None if scan.rings is None else scan.rings[came]
@@ -328,9 +328,9 @@ def _read(recording: Recording, sensor: str, index: int, vehicle_T_sensor: Matri
         world_T_sensor = np.stack([pose for pose in poses if pose is not None]) @ vehicle_T_sensor
         times_s = recording.times_s[near.start : near.stop] - recording.times_s[index]
         times_ns = np.rint(times_s * 1e9).astype(np.int64)
-        wxyz = np.array([quaternion_from_rotation(pose[:3, :3]) for pose in world_T_sensor])
+        wxyz = np.array([convert_rotation_to_quaternion(pose[:3, :3]) for pose in world_T_sensor])
         way, turn_s = PoseSeries(times_ns, world_T_sensor[:, :3, 3], wxyz), float(np.diff(times_ns).min() * 1e-9)
-    return _Scan(transform(invert(vehicle_T_sensor), in_vehicle_m[came]), rows, offsets_s, way, turn_s)
+    return _Scan(transform_points(invert(vehicle_T_sensor), in_vehicle_m[came]), rows, offsets_s, way, turn_s)
 
 
 def _way_m(way: PoseSeries) -> float:

@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 from pydantic import NonNegativeFloat, PlainValidator, PositiveFloat, TypeAdapter, ValidationInfo, model_validator
 
-from torchcover.geometry import BoundingBox, invert, rigid, transform
+from torchcover.geometry import BoundingBox, build_transform, invert, transform_points
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings.formats.tracks import read_trajectory
 from torchcover.simulation.bodies import Body, Shape, VehicleShape, called, mover_mesh
@@ -244,7 +244,7 @@ class Scenario(BuiltIn):
             >>> [round(metres, 2) for metres in Scenario.load("courtyard").ego_box().size_m]
             [4.9, 1.94, 1.63]
         """
-        return BoundingBox.around(self.ego_mesh().vertices_m)
+        return BoundingBox.from_points(self.ego_mesh().vertices_m)
 
     def room_m(self) -> tuple[tuple[float, float], tuple[float, float]] | None:
         """Bounds x and y of all that stands around the ego, in its frame, wherever it drives.
@@ -267,8 +267,10 @@ class Scenario(BuiltIn):
         all_m, path = np.concatenate(moved), self.ego.path()
         (x0, y0, _), (x1, y1, z1) = all_m.min(axis=0).tolist(), all_m.max(axis=0).tolist()
         outline_m = np.array([(x0, y0, z1), (x0, y1, z1), (x1, y0, z1), (x1, y1, z1)])
-        times_s = np.linspace(path.times_s[0], path.times_s[-1], PLACES_ALONG if path.moves else 1)
-        corners_m = np.stack([transform(invert(pose), outline_m)[:, :2] for pose in path.at_each(times_s)])
+        times_s = np.linspace(path.times_s[0], path.times_s[-1], PLACES_ALONG if path.is_moving else 1)
+        corners_m = np.stack(
+            [transform_points(invert(pose), outline_m)[:, :2] for pose in path.interpolate_many(times_s)]
+        )
         # A room that the ego turns in is as large as what it sweeps.
         low_m, high_m = corners_m.min(axis=(0, 1)), corners_m.max(axis=(0, 1))
         if (corners_m.min(axis=1) > 0).any() or (corners_m.max(axis=1) < 0).any():
@@ -316,7 +318,7 @@ class Scenario(BuiltIn):
             ],
             self.duration_s,
         )
-        static_T_world = rigid(np.eye(3), -driver.trajectory.positions_m[0])
+        static_T_world = build_transform(np.eye(3), -driver.trajectory.positions_m[0])
         within = [isinstance(body.shape, MeshFile) for _, body in static]
         coincident = coincident_faces([mesh.moved(static_T_world) for mesh, _ in static], within)
         warn_of_coincidence([body.name for _, body in static], coincident)
@@ -337,17 +339,19 @@ def _on_run_clock(actors: Sequence[Actor], duration_s: float) -> list[Actor]:
     Files may have another clock, such as seconds since 1970: if all trajectories begin after the end of the run, the
     first of their times is its beginning. A warning names those that still lie outside of the run.
     """
-    moving = [actor for actor in actors if actor.trajectory.moves]
+    moving = [actor for actor in actors if actor.trajectory.is_moving]
     first_s = min((float(actor.trajectory.times_s[0]) for actor in moving), default=0.0)
     start_s = first_s if first_s > duration_s else 0.0
     placed = [
-        replace(actor, trajectory=actor.trajectory.since(start_s)) if start_s and actor.trajectory.moves else actor
+        replace(actor, trajectory=actor.trajectory.shift_time(start_s))
+        if start_s and actor.trajectory.is_moving
+        else actor
         for actor in actors
     ]
     for actor in placed:
         times_s = actor.trajectory.times_s
-        if actor.trajectory.moves and not (times_s[0] <= duration_s and times_s[-1] >= 0.0):
-            state = "is not there" if actor.trajectory.transient else "rests"
+        if actor.trajectory.is_moving and not (times_s[0] <= duration_s and times_s[-1] >= 0.0):
+            state = "is not there" if actor.trajectory.is_transient else "rests"
             warnings.warn(
                 f"{actor.name} {state}: its times, {times_s[0] + start_s:.3f} to {times_s[-1] + start_s:.3f} s, lie "
                 f"outside of the run, {start_s:.3f} to {start_s + duration_s:.3f} s; give all trajectories one clock",

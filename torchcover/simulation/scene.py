@@ -6,10 +6,10 @@ from functools import cached_property, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.geometry import BoundingBox, invert, overlapping
+from torchcover.geometry import BoundingBox, find_overlaps, invert
 from torchcover.geometry.arrays import Bools, Float32, Int32, Int64
 from torchcover.geometry.rigid import Matrix
-from torchcover.geometry.trajectory import poses_at
+from torchcover.geometry.trajectory import interpolate_poses
 from torchcover.simulation.instant import Instant, encloses
 from torchcover.simulation.local_ground import LocalGround, ground_under, level_faces, looks_down
 from torchcover.simulation.memory import check_fits
@@ -42,12 +42,12 @@ class Scene:
 
     def __init__(self, world: World, solids: Solids | None = None, device: str | None = None) -> None:
         self.world = world
-        self.ego_box = BoundingBox.around(world.ego.mesh.vertices_m)
+        self.ego_box = BoundingBox.from_points(world.ego.mesh.vertices_m)
         bodies = (world.ego, *world.objects)
         self._resting: list[Actor] = []
         self._moving: list[Actor] = []
         for actor in bodies:
-            (self._moving if actor.trajectory.moves else self._resting).append(actor)
+            (self._moving if actor.trajectory.is_moving else self._resting).append(actor)
         self._solids = Solids() if solids is None else solids
         # (steps, bodies, 3): where they are, to find out at once which are near; NaN, so never near, if absent.
         check_fits(
@@ -56,13 +56,13 @@ class Scene:
             "shorten the duration, or make the time steps longer",
         )
         times_s = world.time_step_s * np.arange(world.steps, dtype=np.float64)
-        tracks = [actor.trajectory.positions_at(times_s) for actor in self._resting + self._moving]
+        tracks = [actor.trajectory.interpolate_positions_m(times_s) for actor in self._resting + self._moving]
         self._positions_m = np.stack(tracks, axis=1)
         self._reach_m = np.array([self._solids.of(actor.mesh).reach_m for actor in self._resting + self._moving])
         # Subtracted in float64: world coordinates may be of UTM size. Where the ego rests, this frame is its own.
-        self._world_T_local = world.ego.trajectory.at(0.0)
+        self._world_T_local = world.ego.trajectory.interpolate(0.0)
         local_T_world = invert(self._world_T_local)
-        self._local_T_resting = [local_T_world @ actor.trajectory.at(0.0) for actor in self._resting]
+        self._local_T_resting = [local_T_world @ actor.trajectory.interpolate(0.0) for actor in self._resting]
         resting = [actor.mesh.moved(pose) for actor, pose in zip(self._resting, self._local_T_resting, strict=True)]
         scenery = self._scenery()
         self._static = RayCaster(resting + scenery, device)
@@ -87,7 +87,7 @@ class Scene:
         if known is None:
             looks = np.unique(np.linspace(0, self.world.steps - 1, GROUND_LOOKS).astype(np.int64))
             times_s = self.world.time_step_s * looks.astype(np.float64)
-            return ground_under(static, self.world.ego.trajectory.positions_at(times_s))
+            return ground_under(static, self.world.ego.trajectory.interpolate_positions_m(times_s))
         return [
             level_faces(mesh, outward) if number in known else np.zeros(len(mesh.faces), dtype=bool)
             for number, (mesh, outward) in enumerate(zip(static, self._outward, strict=True))
@@ -107,7 +107,7 @@ class Scene:
         box = (*lower_m.tolist(), *upper_m.tolist(), *(heights_m or ()))
         if box not in self._surfaces:
             ego, step_s = self.world.ego, self.world.time_step_s
-            poses = ego.trajectory.at_each(step_s * np.arange(self.world.steps, dtype=np.float64))
+            poses = ego.trajectory.interpolate_many(step_s * np.arange(self.world.steps, dtype=np.float64))
             bounds = bounds_along(invert(self._world_T_local) @ poses, Bounds(lower_m[None], upper_m[None]))
             objects = self.world.objects
             number = {id(actor): k for k, actor in enumerate(objects)}
@@ -132,7 +132,7 @@ class Scene:
         box = (*lower_m.tolist(), *upper_m.tolist(), "without ground")
         if box not in self._surfaces:
             ego, step_s = self.world.ego, self.world.time_step_s
-            poses = ego.trajectory.at_each(step_s * np.arange(self.world.steps, dtype=np.float64))
+            poses = ego.trajectory.interpolate_many(step_s * np.arange(self.world.steps, dtype=np.float64))
             bounds = bounds_along(invert(self._world_T_local) @ poses, Bounds(lower_m[None], upper_m[None]))
             above, scenery = self._above_ground(-np.inf, np.inf)._replace(is_below=True), self._scenery()
             self._surfaces[box] = SceneSurface(scenery, [], {}, {}, bounds, self._outward, above, self.coincident)
@@ -173,7 +173,7 @@ class Scene:
 
     def _at(self, step: int, within_m: float) -> "Instant":
         time_s = step * self.world.time_step_s
-        world_T_vehicle = self.world.ego.trajectory.at(time_s)
+        world_T_vehicle = self.world.ego.trajectory.interpolate(time_s)
         vehicle_T_world = invert(world_T_vehicle)
         distance_m = self._distance_m(step, world_T_vehicle)
         self._check_overlap(time_s, vehicle_T_world, distance_m)
@@ -182,7 +182,7 @@ class Scene:
         solids = [self._solids.of(self._moving[k].mesh) for k in near.tolist()]
         moving = Moving.placed(solids, self._parts(near, vehicle_T_world, time_s), first + near)
         # Either list of bodies begins with the ego.
-        if self.world.ego.trajectory.moves:
+        if self.world.ego.trajectory.is_moving:
             static_T_vehicle, ego = invert(self._world_T_local) @ world_T_vehicle, first
         else:
             static_T_vehicle, ego = np.eye(4), 0
@@ -199,7 +199,7 @@ class Scene:
         near = (np.linalg.norm(self._positions_m - ego_m, axis=2) < reach_m).sum(axis=1) > 1  # one is the ego itself
         for step in steps[near[steps]].tolist():
             time_s = step * self.world.time_step_s
-            world_T_vehicle = ego.trajectory.at(time_s)
+            world_T_vehicle = ego.trajectory.interpolate(time_s)
             self._check_overlap(time_s, invert(world_T_vehicle), self._distance_m(step, world_T_vehicle))
 
     def _distance_m(self, step: int, world_T_vehicle: Matrix) -> Matrix:
@@ -215,7 +215,7 @@ class Scene:
         """How much memory it takes, about, without the solids that it shares with others."""
         return (
             self._positions_m.nbytes
-            + sum(actor.trajectory.bytes for actor in self._moving)
+            + sum(actor.trajectory.num_bytes for actor in self._moving)
             + BYTES_PER_FACE * self._faces
             + sum(surface.bytes for surface in self._surfaces.values())
         )
@@ -228,7 +228,7 @@ class Scene:
     @property
     def knows_self_hits(self) -> bool:
         """Whether sensors fixed to the ego need not be cast at it at every step; see `own_m`."""
-        return self.world.ego.trajectory.moves or not self.moves
+        return self.world.ego.trajectory.is_moving or not self.moves
 
     def own_m(
         self, vehicle_T_sensor: Matrix, tiles: Sequence[Tile], *, max_range_m: float = np.inf
@@ -238,7 +238,7 @@ class Scene:
         For each tile (n,) metres, infinite where the ego is not hit within the range. Nothing at all for an ego that
         rests: it is part of what never moves, at which the rays are cast anyway.
         """
-        if not self.world.ego.trajectory.moves:
+        if not self.world.ego.trajectory.is_moving:
             return ()
         ego = self._solids.of(self.world.ego.mesh).caster
         return tuple(ends_at(ego, vehicle_T_sensor, tile, max_range_m) for tile in tiles)
@@ -253,9 +253,9 @@ class Scene:
         for k in np.flatnonzero(distance_m < ego_reach_m).tolist():
             if bodies[k] is self.world.ego:
                 continue
-            vehicle_T_actor = vehicle_T_world @ bodies[k].trajectory.at(time_s)
+            vehicle_T_actor = vehicle_T_world @ bodies[k].trajectory.interpolate(time_s)
             box = self._solids.of(bodies[k].mesh).box
-            if overlapping(box, vehicle_T_actor[None], self.ego_box.corners_m)[0]:
+            if find_overlaps(box, vehicle_T_actor[None], self.ego_box.corners_m)[0]:
                 raise ValueError(
                     f"actor {bodies[k].name!r} overlaps the ego at t = {time_s:g} s (their bounding boxes do); "
                     "change one of the trajectories"
@@ -264,7 +264,7 @@ class Scene:
     def _parts(self, numbers: NDArray[np.intp], vehicle_T_world: Matrix, time_s: float) -> Matrix:
         """(P, 4, 4) where some of the bodies that move are at a time."""
         actors = [self._moving[k] for k in numbers.tolist()]
-        vehicle_T_part: Matrix = vehicle_T_world @ poses_at([actor.trajectory for actor in actors], time_s)
+        vehicle_T_part: Matrix = vehicle_T_world @ interpolate_poses([actor.trajectory for actor in actors], time_s)
         # The ego is where it is, to the last bit: what a sensor sees of it is the same at every step.
         vehicle_T_part[[actor is self.world.ego for actor in actors]] = np.eye(4)
         return vehicle_T_part
@@ -281,9 +281,9 @@ class Scene:
         begin_s = max(min(first_s, end_s - (last_s - first_s)), -time_s)
         samples_s = np.linspace(begin_s, min(begin_s + last_s - first_s, end_s), SAMPLES)
         for each_s in (time_s + samples_s).tolist():
-            world_T_vehicle = world.ego.trajectory.at(each_s)
+            world_T_vehicle = world.ego.trajectory.interpolate(each_s)
             # As in `at`, to the bit.
-            moves = world.ego.trajectory.moves
+            moves = world.ego.trajectory.is_moving
             static_T_vehicle = invert(self._world_T_local) @ world_T_vehicle if moves else np.eye(4)
             found.append(Poses(static_T_vehicle, self._parts(numbers, invert(world_T_vehicle), each_s)))
         return samples_s, found

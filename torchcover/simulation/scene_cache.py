@@ -19,7 +19,7 @@ import shapely
 from numpy.typing import NDArray
 
 from torchcover import __version__
-from torchcover.files import BadFileError, check_kind, read_npz, reads, said_gb
+from torchcover.files import BadFileError, check_dtype_kind, guard_reader, read_limit_gb, read_npz
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.builtin import builtin_names
 from torchcover.simulation.documents import builtin_hashes
@@ -40,7 +40,7 @@ class SceneCache:
         self._scenario, self._seed = scenario, seed
         # The code of other packages may change unnoticed.
         is_known = not scenario.repeats and type(scenario.traffic).__module__.startswith("torchcover.")
-        self._limit_bytes = 1e9 * said_gb("TORCHCOVER_CACHE_GB", 1.0) if is_known and not no_cache else 0.0
+        self._limit_bytes = 1e9 * read_limit_gb("TORCHCOVER_CACHE_GB", 1.0) if is_known and not no_cache else 0.0
         self._folder = _open_folder() if self._limit_bytes else None
 
     def build(self, run: int, ego: Mesh | None) -> World:
@@ -165,10 +165,10 @@ def encode_scene(key: str, scene: World, bodies: Mapping[str, Mesh]) -> dict[str
     return {"scene": np.frombuffer(text, np.uint8), **arrays}
 
 
-@reads("a scene")
+@guard_reader("a scene")
 def read_scene(path: Path, bodies: Mapping[str, Mesh]) -> World:
     """Read a scene, whose key is the stem of the path, without running code of it; its arrays are read-only."""
-    arrays, meshes = read_npz(path, partial(check_kind, "biuf")), dict[str, Mesh]()
+    arrays, meshes = read_npz(path, partial(check_dtype_kind, "biuf")), dict[str, Mesh]()
     for array in arrays.values():
         array.flags.writeable = False
     key, scene = json.loads(arrays["scene"].tobytes())

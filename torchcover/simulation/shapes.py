@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat
 
-from torchcover.files import check_memory, reads
-from torchcover.geometry import transform
+from torchcover.files import check_memory, guard_reader
+from torchcover.geometry import transform_points
 from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.simulation.documents import Document, PathBeside
 from torchcover.simulation.mesh_files import mesh_arrays
@@ -42,7 +42,7 @@ class Mesh(NamedTuple):
 
     def moved(self, destination_T_source: Float64) -> "Mesh":
         """The mesh in another frame."""
-        return self._replace(vertices_m=transform(destination_T_source, self.vertices_m))
+        return self._replace(vertices_m=transform_points(destination_T_source, self.vertices_m))
 
     def with_faces(self, which: Bools | Int64) -> "Mesh":
         """Some of its faces, of what they were made of."""
@@ -244,7 +244,7 @@ class _MeshParts(NamedTuple):
     is_clear: Bools
 
 
-@reads("a mesh")
+@guard_reader("a mesh")
 def _read_mesh(path: Path) -> _MeshParts:
     with path.open("rb") as file:
         is_binary = b"\0" in file.read(PART)

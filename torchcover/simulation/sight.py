@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchcover.geometry import rigid
+from torchcover.geometry import build_transform
 from torchcover.geometry.arrays import Bools, Float32, Float64, Int32, Int64
 from torchcover.simulation.bodies import Body
 from torchcover.simulation.instant import Instant, SensorScan, in_threads
@@ -217,7 +217,7 @@ def sight(instant: Instant, place_m: Float64, targets_m: Float32, *, threads: in
 
     Targets lie a little above their surface, lest it hides them. The result does not depend on the number of threads.
     """
-    vehicle_T_place, bodies = rigid(np.eye(3), place_m), instant.outlines(place_m)
+    vehicle_T_place, bodies = build_transform(np.eye(3), place_m), instant.outlines(place_m)
     way_m = targets_m.T - place_m[:, None]
     distance_m = np.linalg.norm(way_m, axis=0)
     # A point at the place itself is seen in any direction.

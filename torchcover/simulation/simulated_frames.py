@@ -13,8 +13,8 @@ import torch
 
 from torchcover.coverage.quantity import MEASURED_WITHIN_M
 from torchcover.detection.boxes import Boxes
-from torchcover.detection.inside import with_hits
-from torchcover.frames.frame import Frame, Measured
+from torchcover.detection.inside import add_point_counts
+from torchcover.frames.frame import Frame, Measurement
 from torchcover.frames.source import FrameDataset
 from torchcover.geometry.arrays import Float32, Float64, Int64
 from torchcover.simulation.instant import SensorScan
@@ -153,11 +153,11 @@ class SimulatedFrames(FrameDataset):
         """The names of the sensors of each rig."""
         return {name: [sensor.name for sensor in rig.sensors] for name, rig in self.rigs.items()}
 
-    def world_of(self, index: int) -> int:
+    def get_scene_id(self, index: int) -> int:
         """Which world a frame is of; of one that plays again and again every process has it whole: the index."""
         return index if self.scenario.repeats else self.simulator.run_of(index)
 
-    def block_index(self, index: int) -> int:
+    def get_block_index(self, index: int) -> int:
         """As `Simulator.block_index`."""
         return self.simulator.block_index(index)
 
@@ -169,7 +169,7 @@ class SimulatedFrames(FrameDataset):
         """Whether the reference sensor finds them."""
         return self.reference_sensor.band_frame == "ground"
 
-    def ego_mesh(self) -> Mesh:
+    def get_ego_mesh(self) -> Mesh:
         """What carries the rigs, in the vehicle frame; no world is built for it."""
         return self.scenario.ego_mesh()
 
@@ -191,14 +191,14 @@ class SimulatedFrames(FrameDataset):
         }
 
     @property
-    def square_metres(self) -> bool:
+    def has_area_weights(self) -> bool:
         """Whether the reference sensor gives the square metres of its points."""
-        return self.reference_sensor.square_metres
+        return self.reference_sensor.has_area_weights
 
     @property
     def reference_record(self) -> Mapping[str, object]:
         """The reference sensor, the time between two frames; notes on ground, traffic and rays that the ego ends."""
-        traffic, ego = self.scenario.traffic, self.ego_mesh()
+        traffic, ego = self.scenario.traffic, self.get_ego_mesh()
         words = [self.simulator.ground_words, traffic.drawn_words if traffic else ""]
         if getattr(self.reference_sensor, "over_areas", False):
             words.append("Reference positions: anywhere in the regions, for the rig is on a mast and not on a vehicle.")
@@ -288,7 +288,7 @@ def of_rigs(rigs: Mapping[str, Rig], scans: Mapping[str, Sequence[SensorScan]]) 
     """What a `Frame` says of its rigs: clouds, what was measured of them, and which points are of which sensor."""
     clouds = {name: torch.from_numpy(np.concatenate([one.points for one in seen])) for name, seen in scans.items()}
     measured = {
-        name: Measured(
+        name: Measurement(
             torch.from_numpy(np.concatenate([one.points if one.landed is None else one.landed for one in seen])),
             torch.from_numpy(np.concatenate([_error_m(one) for one in seen])),
         )
@@ -304,14 +304,14 @@ def of_rigs(rigs: Mapping[str, Rig], scans: Mapping[str, Sequence[SensorScan]]) 
 
 def with_boxes(frame: Frame, boxes: Boxes, rigs: Mapping[str, Rig]) -> Frame:
     """The frame with its objects, and how many points each of its rigs has on them."""
-    clouds = {name: frame.cloud_of(name, within_m=MEASURED_WITHIN_M) for name in frame.clouds}
+    clouds = {name: frame.get_cloud(name, max_error_m=MEASURED_WITHIN_M) for name in frame.clouds}
     counts_as = {}
     for name, rig in rigs.items():
         if any(sensor.counts_as > 1 for sensor in rig.sensors):
-            of_sensors = frame.clouds_by_sensor(name, within_m=MEASURED_WITHIN_M).values()
+            of_sensors = frame.get_clouds_by_sensor(name, max_error_m=MEASURED_WITHIN_M).values()
             each = torch.tensor([sensor.counts_as for sensor in rig.sensors], device="cpu")
             counts_as[name] = each.repeat_interleave(torch.tensor([len(cloud) for cloud in of_sensors], device="cpu"))
-    return replace(frame, boxes=with_hits(boxes, clouds, counts_as))
+    return replace(frame, boxes=add_point_counts(boxes, clouds, counts_as))
 
 
 def _error_m(scan: SensorScan) -> Float32:

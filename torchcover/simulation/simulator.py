@@ -259,7 +259,7 @@ class Simulator:
     def bottom_heights_m(self, index: int, found: Sequence[Label]) -> Float32:
         """(K,) height of the bottom of each label's box at a step above the highest ground below its centre."""
         scene, step = self.scene_of(index)
-        world_T_vehicle = scene.world.ego.trajectory.at(step * scene.world.time_step_s)
+        world_T_vehicle = scene.world.ego.trajectory.interpolate(step * scene.world.time_step_s)
         centres_m = np.array([label.centre_m for label in found]).reshape(-1, 3)
         halves_m = np.array([label.size_m[2] / 2 for label in found], dtype=np.float32)
         return scene.ground.heights_m(centres_m, world_T_vehicle) - halves_m

@@ -163,7 +163,7 @@ class Stages:
         return Stage(scene, self._mounts[scene])
 
     def _sensors(self, scene: Scene) -> Mapping[str, Sequence[MountedSensor]]:
-        if self._scenes.scenario.traffic is None or not scene.world.ego.trajectory.moves:
+        if self._scenes.scenario.traffic is None or not scene.world.ego.trajectory.is_moving:
             return self._on(scene)
         # What a sensor on an ego that moves sees of it is the same in all runs.
         self._on_moving_ego = self._on_moving_ego or self._on(scene)
@@ -230,7 +230,7 @@ def warn_of_floating(name: str, scene: Scene, steps: Int64) -> None:
 def _grounded(scene: Scene, step: int) -> Int64:
     """(bodies, 2) whether each that is there at a step is the ego, and whether it has ground."""
     instant = scene.at(step, within_m=WITHIN_M)
-    up = scene.world.ego.trajectory.at(step * scene.world.time_step_s)[2, :3]
+    up = scene.world.ego.trajectory.interpolate(step * scene.world.time_step_s)[2, :3]
     others = instant.moving.vehicle_T_part[instant.moving.body != instant.ego, :3, 3]
     places_m = np.concatenate([np.zeros((1, 3)), others])
     is_ego = np.arange(len(places_m)) == 0

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchcover.geometry import invert, transform
+from torchcover.geometry import invert, transform_points
 from torchcover.geometry.arrays import Bools, Float32, Float64, Int32, Int64
 from torchcover.simulation.instant import Instant
 from torchcover.simulation.local_ground import SLACK_M as HEIGHT_SLACK_M
@@ -89,7 +89,7 @@ class AboveGround(NamedTuple):
         `count` (J,) how many patches each has.
         """
         squares_T_patches = self.squares_T_static @ static_T_patches
-        corners_m = transform(squares_T_patches, corners_m.reshape(-1, 3)).reshape(-1, 8, 3)
+        corners_m = transform_points(squares_T_patches, corners_m.reshape(-1, 3)).reshape(-1, 8, 3)
         lowest_m, highest_m = self.squares.between_m(corners_m.min(axis=1).T[:2], corners_m.max(axis=1).T[:2])
         up, columns = squares_T_patches[2], (patches.corner_m, patches.first_m, patches.second_m)
         corner_m, first_m, second_m = (up[:3] @ column for column in columns)
@@ -255,6 +255,6 @@ def _boxes_around(patches: Patches, count: Int64) -> Float64:
 
 def _moved_bounds(destination_T_source: Float64, bounds: Bounds) -> tuple[Float64, Float64]:
     """Upright boxes in another frame around boxes that were upright in theirs."""
-    middle_m = transform(destination_T_source, (bounds.lower_m + bounds.upper_m) / 2)
+    middle_m = transform_points(destination_T_source, (bounds.lower_m + bounds.upper_m) / 2)
     half_m = (bounds.upper_m - bounds.lower_m) / 2 @ np.abs(destination_T_source[:3, :3]).T
     return middle_m - half_m, middle_m + half_m

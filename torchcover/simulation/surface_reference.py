@@ -8,7 +8,7 @@ from typing import ClassVar, NamedTuple, Self, get_args
 import numpy as np
 
 from torchcover.coverage.grid import PAPER_HEIGHTS, BandFrame
-from torchcover.geometry import BoundingBox, rigid
+from torchcover.geometry import BoundingBox, build_transform
 from torchcover.geometry.arrays import Bools, Float32, Float64, Int32, Int64
 from torchcover.simulation.local_ground import SLACK_M as HEIGHT_SLACK_M
 from torchcover.simulation.local_ground import TOLERANCE_M
@@ -304,7 +304,7 @@ class SurfaceReference:
     """
 
     name: ClassVar[str] = "surface"
-    square_metres: ClassVar[bool] = True
+    has_area_weights: ClassVar[bool] = True
 
     areas: Areas
     rays: int = DEFAULT_RAYS
@@ -401,8 +401,8 @@ class SurfaceReference:
         if self.over_areas:
             areas_m = np.array(self.areas)
             lower_m, upper_m = areas_m[:, :, 0].min(axis=0), areas_m[:, :, 1].max(axis=0)
-            return rigid(np.eye(3), generator.uniform([*lower_m, 0.0], [*upper_m, ego.upper_m[2]]))
-        return rigid(np.eye(3), position_in_shell(ego, self.shell_m, generator))
+            return build_transform(np.eye(3), generator.uniform([*lower_m, 0.0], [*upper_m, ego.upper_m[2]]))
+        return build_transform(np.eye(3), position_in_shell(ego, self.shell_m, generator))
 
     def _gathered(self, looks: list[tuple[SurfacePoints, Sight]], objects: int, redrawn: int) -> ReferenceScan:
         # One place stands for one of so many: every place's points are a surface of their own.

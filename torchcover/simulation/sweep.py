@@ -11,7 +11,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from torchcover.geometry import invert, transform
+from torchcover.geometry import invert, transform_points
 from torchcover.geometry.arrays import Float32, Float64, Int64
 from torchcover.simulation.moving import Meetings, Moving
 from torchcover.simulation.raycaster import Hits, RayCaster, cast_from
@@ -153,7 +153,7 @@ class Sweep:
         starts_m = static_T_vehicle[:, :3, :3] @ origin_m + static_T_vehicle[:, :3, 3]
         towards = _turned(static_T_vehicle, of_ray, directions)
         hits = self.static.cast_from_each(starts_m.astype(np.float32).take(of_ray, axis=0), towards, limit_m)
-        starts_m = transform(now_T_static, starts_m).T
+        starts_m = transform_points(now_T_static, starts_m).T
         return hits, rotate(now_T_static[:3, :3], towards), starts_m.astype(np.float32).take(of_ray, axis=1)
 
     def _parts(self, weights: Float64, part: Int64) -> Float64:

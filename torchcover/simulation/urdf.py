@@ -11,8 +11,8 @@ import numpy as np
 from pydantic import ValidationError
 from scipy.spatial import cKDTree
 
-from torchcover.files import AtomicOutput, as_yaml, parse_xml, reads
-from torchcover.geometry import BoundingBox, rigid, rotation_from_quaternion
+from torchcover.files import AtomicOutput, guard_reader, parse_xml, to_yaml
+from torchcover.geometry import BoundingBox, build_transform, convert_quaternion_to_rotation
 from torchcover.geometry.arrays import Float64
 from torchcover.recordings.other_formats import find_remedy
 from torchcover.simulation.bodies import merge
@@ -61,10 +61,10 @@ class Robot(NamedTuple):
         part = {"name": "body", "shape": {"type": "mesh", "path": BODY}}
         with AtomicOutput(Path(folder)) as written:
             written.add(BODY, partial(_write_ply, mesh=self.body))
-            written.add_text(VEHICLE, as_yaml({"name": self.name, "description": told, "parts": [part]}))
+            written.add_text(VEHICLE, to_yaml({"name": self.name, "description": told, "parts": [part]}))
             if self.sensors:
                 keys = {"name": self.name, "description": told, "vehicle": VEHICLE, "sensors": self.sensors}
-                written.add_text(RIG, as_yaml(keys))
+                written.add_text(RIG, to_yaml(keys))
             written.publish({"robot": self.name, "notes": self.notes})
         return written.paths
 
@@ -81,7 +81,7 @@ def _write_ply(path: Path, mesh: Mesh) -> None:
     path.write_bytes(header.encode() + mesh.vertices_m.astype("<f4").tobytes() + faces.tobytes())
 
 
-@reads("a URDF")
+@guard_reader("a URDF")
 def read_robot(path: Path, packages: Mapping[str, str | Path] | None = None) -> Robot:
     """Read a robot from a URDF file, with every joint at 0 except those that mimic another one with an offset.
 
@@ -123,9 +123,9 @@ def read_robot(path: Path, packages: Mapping[str, str | Path] | None = None) -> 
     pieces = [mesh.moved(base_T_link[name]) for name, link in links.items() for mesh in _link_meshes(link, meshes)]
     if not pieces:
         raise ValueError("no link has a visual or collision geometry, so there is no body")
-    box = BoundingBox.around(merge(pieces).vertices_m)
+    box = BoundingBox.from_points(merge(pieces).vertices_m)
     middle_m = np.add(box.lower_m, box.upper_m) / 2
-    vehicle_T_base = rigid(np.eye(3), (-middle_m[0], -middle_m[1], -box.lower_m[2]))
+    vehicle_T_base = build_transform(np.eye(3), (-middle_m[0], -middle_m[1], -box.lower_m[2]))
     pieces = [piece.moved(vehicle_T_base) for piece in pieces]
     vehicle_T_frame = {"__model__": vehicle_T_base}
     for name, joint in joints.items():
@@ -189,9 +189,9 @@ def _joint_motion(joint: Element, position: float) -> Float64:
     direction = np.array(read_numbers("1 0 0" if axis is None else axis.get("xyz", "1 0 0"), 3, "axis xyz"))
     direction /= np.linalg.norm(direction) or 1.0
     if kind == "prismatic":
-        return rigid(np.eye(3), position * direction)
+        return build_transform(np.eye(3), position * direction)
     quaternion = [np.cos(position / 2), *np.sin(position / 2) * direction]
-    return rigid(rotation_from_quaternion(quaternion), np.zeros(3))
+    return build_transform(convert_quaternion_to_rotation(quaternion), np.zeros(3))
 
 
 def _link_poses(
@@ -320,11 +320,11 @@ def _shape_mesh(shape: Element, link: str, meshes: Mapping[str, Mesh]) -> Mesh:
     if shape.tag == "cylinder":
         return tube
     ends_m = (-length_m / 2, length_m / 2)
-    return merge([tube, *(ball.moved(rigid(np.eye(3), (0.0, 0.0, end_m))) for end_m in ends_m)])
+    return merge([tube, *(ball.moved(build_transform(np.eye(3), (0.0, 0.0, end_m))) for end_m in ends_m)])
 
 
 def _centered(mesh: Mesh, height_m: float) -> Mesh:
-    return mesh.moved(rigid(np.eye(3), (0.0, 0.0, -height_m / 2)))
+    return mesh.moved(build_transform(np.eye(3), (0.0, 0.0, -height_m / 2)))
 
 
 def _mounted(sensors: Sequence[PlacedSensor]) -> Sequence[Sensor]:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchcover.geometry import BoundingBox, euler_from_rotation, invert, transform
+from torchcover.geometry import BoundingBox, convert_rotation_to_euler, invert, transform_points
 from torchcover.geometry.arrays import Bools
 from torchcover.geometry.rigid import Matrix
 from torchcover.geometry.trajectory import Trajectory
@@ -101,28 +101,28 @@ def labels(world: World, step: int, within_m: float) -> list[Label]:
     tilts against the ego by a degree leaves its box by a few centimetres.
     """
     time_s = step * world.time_step_s
-    world_T_vehicle = world.ego.trajectory.at(time_s)
+    world_T_vehicle = world.ego.trajectory.interpolate(time_s)
     vehicle_T_world = invert(world_T_vehicle)
     found, box_of = [], dict[int, BoundingBox]()  # actors of one kind share a mesh
     for number, actor in enumerate(world.objects):
-        position_m = actor.trajectory.positions_at(np.array([time_s]))[0]
+        position_m = actor.trajectory.interpolate_positions_m(np.array([time_s]))[0]
         # Not near, too, if absent: NaN.
         if np.hypot(*(position_m - world_T_vehicle[:3, 3])[:2]) <= within_m:
             if id(actor.mesh) not in box_of:
-                box_of[id(actor.mesh)] = BoundingBox.around(actor.mesh.vertices_m)
+                box_of[id(actor.mesh)] = BoundingBox.from_points(actor.mesh.vertices_m)
             found.append(_label(number, actor, box_of[id(actor.mesh)], vehicle_T_world, time_s))
     return found
 
 
 def _label(number: int, actor: Actor, box: BoundingBox, vehicle_T_world: Matrix, time_s: float) -> Label:
-    vehicle_T_actor = vehicle_T_world @ actor.trajectory.at(time_s)
+    vehicle_T_actor = vehicle_T_world @ actor.trajectory.interpolate(time_s)
     middle_m = (np.array(box.lower_m) + np.array(box.upper_m)) / 2
     return Label(
         number,
         actor.name,
         actor.category,
-        centre_m=transform(vehicle_T_actor, middle_m[None])[0],
+        centre_m=transform_points(vehicle_T_actor, middle_m[None])[0],
         size_m=box.size_m,
-        yaw_rad=float(np.deg2rad(euler_from_rotation(vehicle_T_actor[:3, :3])[0])),
-        velocity_mps=(vehicle_T_world[:3, :3] @ actor.trajectory.velocity_at(time_s))[:2],
+        yaw_rad=float(np.deg2rad(convert_rotation_to_euler(vehicle_T_actor[:3, :3])[0])),
+        velocity_mps=(vehicle_T_world[:3, :3] @ actor.trajectory.compute_velocity_mps(time_s))[:2],
     )

@@ -106,7 +106,7 @@ def _setup(frames: SimulatedFrames) -> RecordingSetup:
         {sensor.name: sensor.mount.matrix() for sensor in rig.sensors},
         [sensor.name for sensor in rig.sensors if isinstance(sensor, Lidar)],
         frames.scenario.ego_box(),
-        frames.square_metres,
+        frames.has_area_weights,
         frames.boxes,
     )
 
@@ -121,7 +121,7 @@ def _step(frames: SimulatedFrames, index: int) -> FrameRecord:
     return FrameRecord(
         _name(index),
         index * frames.frame_interval_s + played * APART_S,
-        world.ego.trajectory.at(step * world.time_step_s),
+        world.ego.trajectory.interpolate(step * world.time_step_s),
         {sensor.name: cloud for sensor, cloud in zip(rig.sensors, landed, strict=True)},
         frames.frame_of(seen, index),
     )

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchcover.geometry import BoundingBox, rigid
+from torchcover.geometry import BoundingBox, build_transform
 from torchcover.geometry.arrays import Bools, Float32, Float64, Int32, Int64
 from torchcover.simulation.instant import Instant, in_threads
 from torchcover.simulation.moving import Moving
@@ -141,7 +141,7 @@ def free_places(instant: Instant, target: Target, surface: Surface, vehicle_T_ta
 
 def pose_in_shell(ego: BoundingBox, generator: np.random.Generator) -> Float64:
     """A (4, 4) random place of a reference sensor."""
-    return rigid(np.eye(3), position_in_shell(ego, SHELL_M, generator))
+    return build_transform(np.eye(3), position_in_shell(ego, SHELL_M, generator))
 
 
 def _chunks(poses: Float64) -> list[Float64]:

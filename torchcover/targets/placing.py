@@ -6,7 +6,7 @@ from typing import Literal, Self
 
 import numpy as np
 
-from torchcover.geometry import BoundingBox, overlapping
+from torchcover.geometry import BoundingBox, find_overlaps
 from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.simulation.instant import Instant
 
@@ -207,7 +207,7 @@ def blocked(instant: Instant, box: BoundingBox, samples_m: Float64, vehicle_T_ta
     away_m = np.linalg.norm(vehicle_T_target[:, None, :3, 3] - moving.centre_m, axis=2)
     near = (away_m <= moving.radius_m + reach_m) & (moving.body != instant.ego)
     for k in np.flatnonzero(near.any(axis=0)).tolist():
-        taken[near[:, k]] |= overlapping(box, vehicle_T_target[near[:, k]], moving.corners_m[k])
+        taken[near[:, k]] |= find_overlaps(box, vehicle_T_target[near[:, k]], moving.corners_m[k])
     return taken | _meets_static(instant, box, samples_m, vehicle_T_target)
 
 

@@ -7,12 +7,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchcover.coverage import NEAR_FIELD_M, BevGrid, BodySums, Region
+from torchcover.coverage import NEAR_FIELD_M, BevGrid, Region, TargetSums
 from torchcover.coverage.bodies import COLUMNS, FREE, SEEN, TRIED
 from torchcover.frames import Frame
-from torchcover.geometry import BoundingBox, overlapping
+from torchcover.geometry import BoundingBox, find_overlaps
 from torchcover.geometry.arrays import Bools, Float64, Int64
-from torchcover.metrics import SumsInBlocks
+from torchcover.metrics import BlockedSums
 from torchcover.simulation.reference_sensor import Surroundings
 from torchcover.simulation.regions_of_interest import near_field
 from torchcover.simulation.simulator import Simulator
@@ -49,11 +49,11 @@ class Probe(NamedTuple):
     def of(cls, body: Target, vehicle: BoundingBox, regions: Sequence[Region], grid: BevGrid) -> Self:
         """A body that is put beside a vehicle."""
         at_m = Raster.around(vehicle, NEAR_FIELD_M).positions_m
-        inside = np.stack([region.contains(*torch.from_numpy(at_m).T).numpy() for region in regions])
+        inside = np.stack([region.mask_points(*torch.from_numpy(at_m).T).numpy() for region in regions])
         region, place = inside.nonzero()
         vehicle_T_body = poses(at_m[place], yaws("narrow", body.solid.box, vehicle, at_m[place]))
-        room = ~overlapping(body.solid.box, vehicle_T_body, vehicle.corners_m)
-        cell = grid.cell_of(torch.from_numpy(vehicle_T_body[:, :3, 3].copy())).numpy()
+        room = ~find_overlaps(body.solid.box, vehicle_T_body, vehicle.corners_m)
+        cell = grid.find_cells(torch.from_numpy(vehicle_T_body[:, :3, 3].copy())).numpy()
         return cls(body, Surface.of(body), region, room, vehicle_T_body, cell)
 
     def some(self, places: int, generator: np.random.Generator) -> Int64:
@@ -73,14 +73,14 @@ class Probe(NamedTuple):
 
 
 class StepProbes(NamedTuple):
-    """What one step adds, of each rig to `BodySums`; it is small, and travels between processes."""
+    """What one step adds, of each rig to `TargetSums`; it is small, and travels between processes."""
 
     block_index: int
     sums: Tensor
     cells: Tensor
 
 
-class Probes(SumsInBlocks):
+class Probes(BlockedSums):
     """What the rigs of a simulation see of bodies beside the vehicle: an observer that measures where frames are made.
 
     Args:
@@ -105,14 +105,14 @@ class Probes(SumsInBlocks):
         self.grid = BevGrid(around.x, around.y, MAP_CELL_M)
         self.probes = [Probe.of(body, vehicle, regions, self.grid) for body in bodies]
         each = len(rigs), len(bodies)
-        self.add_block_sum("sums", (*each, len(regions), len(COLUMNS)), fine=True)
-        self.add_sum("cells", (*each, self.grid.cells // len(self.grid.heights), 2))
+        self.define_block_sum("sums", (*each, len(regions), len(COLUMNS)), is_fine=True)
+        self.define_sum("cells", (*each, self.grid.num_cells // len(self.grid.heights), 2))
 
     def update(self, frame: Frame) -> None:
         """Put them beside the vehicle at the time of a frame of the simulation."""
-        self.add(self.sums_of(frame))
+        self.add_sums(self.compute_sums(frame))
 
-    def sums_of(self, frame: Frame) -> StepProbes | None:
+    def compute_sums(self, frame: Frame) -> StepProbes | None:
         """What such a frame is to `add`, the same in every process; None where no body is put at its step."""
         if frame.index % self.every:
             return None
@@ -142,22 +142,22 @@ class Probes(SumsInBlocks):
                 np.add.at(cells[rig, number], probe.cell[some], each[:, [FREE, SEEN]])
         return StepProbes(simulator.block_index(index), torch.from_numpy(sums), torch.from_numpy(cells))
 
-    def add(self, step: StepProbes | None) -> None:
+    def add_sums(self, step: StepProbes | None) -> None:
         """Add what `sums_of` gives."""
         if step is not None:
             self._block_of(step.block_index)
             self.sums[self._fine_block_of(step.block_index)] += step.sums
             self.cells += step.cells
-            self.steps += 1
+            self.num_frames += 1
             self._follow_steps()
 
     def compute(self) -> Tensor:
-        """(rigs, bodies, regions, 5) the sums so far, as those of a block of `BodySums`."""
+        """(rigs, bodies, regions, 5) the sums so far, as those of a block of `TargetSums`."""
         return self.sums.sum(dim=0)
 
-    def seen_by(self, rig: str) -> BodySums:
+    def seen_by(self, rig: str) -> TargetSums:
         """What a rig saw of them so far."""
         bodies, at = tuple(probe.body.name for probe in self.probes), list(self.simulator.rigs).index(rig)
         cells = self.cells[at].view(len(bodies), *self.grid.shape[1:], 2).clone()
         told = bodies, self.regions, HITS, THRESHOLD_M, self.grid
-        return BodySums(*told, self.fine_steps.clone(), self.sums[:, at].clone(), cells)
+        return TargetSums(*told, self.fine_block_frame_counts.clone(), self.sums[:, at].clone(), cells)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torchcover.coverage import BevGrid
 from torchcover.geometry import BoundingBox
 from torchcover.geometry.arrays import Bools, Float64, Int64
-from torchcover.notebooks import data_set, small_html
+from torchcover.notebooks import build_result_html, build_xarray_dataset
 from torchcover.report import format_percent, plot_target_visibility
 from torchcover.targets.placing import SIDES, Heading, Raster, from_outline_m, side_of
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 import json
 from pathlib import Path
 
-from torchcover.files import csv_text, write_npz
+from torchcover.files import format_csv, write_npz
 
 # What a cell is: there is room for the target in a step at least; the vehicle is there; there is none in any step.
 STATES = ("free", "occupied", "outside")
@@ -231,7 +231,7 @@ class TargetMap(Spots):
     def _repr_html_(self) -> str:
         near = (f"{side.side} {format_percent(side.seen)} %" for side in self.sides(WITHIN_M[-1:]) if side.cells)
         where = f"Free places within {WITHIN_M[-1]:g} m where it gets {self.hits} points or more: {', '.join(near)}."
-        return small_html([f"Would {self.rig} see {self.target}?", where], self.plot())
+        return build_result_html([f"Would {self.rig} see {self.target}?", where], self.plot())
 
     @property
     def target_words(self) -> str:
@@ -247,7 +247,7 @@ class TargetMap(Spots):
         return plot_target_visibility(
             self.points,
             self.enough,
-            BevGrid(x=self.raster.x, y=self.raster.y, cell=self.raster.step_m),
+            BevGrid(x_m=self.raster.x, y_m=self.raster.y, cell_m=self.raster.step_m),
             vehicle_outline_m=self.vehicle_outline_m,
             vehicle_box_m=self.vehicle.outline_m,
             sensors_m=self.sensors_m,
@@ -275,7 +275,7 @@ class TargetMap(Spots):
         """
         maps: dict[str, NDArray[Any]] = {name: getattr(self, name) for name in MAPS}
         maps |= {f"points_{name}": of for name, of in zip(self.sensor_names, self.sensor_points, strict=True)}
-        return data_set(maps, {"y_m": self.y_m, "x_m": self.x_m})
+        return build_xarray_dataset(maps, {"y_m": self.y_m, "x_m": self.x_m})
 
     @property
     def counts(self) -> dict[str, int]:
@@ -324,7 +324,7 @@ def write_csv(seen: TargetMap, path: Path) -> None:
             f"{place.x_m:.9g}", f"{place.y_m:.9g}", f"{place.distance_m:.9g}", place.side, STATES[seen.state[at]],
             int(seen.steps[at]), *(_number(value) for value in (*known, *of_sensors)),
         ])  # fmt: skip
-    path.write_text(csv_text(rows), encoding="utf-8")
+    path.write_text(format_csv(rows), encoding="utf-8")
 
 
 def _number(value: float) -> str:

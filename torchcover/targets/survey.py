@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.geometry import overlapping
+from torchcover.geometry import find_overlaps
 from torchcover.geometry.arrays import Float64
 from torchcover.simulation.memory import check_fits
 from torchcover.simulation.rig import Rig, with_ego
@@ -122,7 +122,7 @@ def survey_places(
     vehicle, box = scenario.ego_box(), target.solid.box
     _check_memory(rig, len(positions_m), steps)
     vehicle_T_target = poses(positions_m, yaws(heading, box, vehicle, positions_m))
-    occupied = overlapping(box, vehicle_T_target, vehicle.corners_m)
+    occupied = find_overlaps(box, vehicle_T_target, vehicle.corners_m)
     for sensor in rig.sensors:
         occupied |= holding(box, vehicle_T_target, sensor.mount.matrix()[:3, 3])
     surface, elsewhere = Surface.of(target), np.flatnonzero(~occupied)

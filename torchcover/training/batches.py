@@ -3,13 +3,13 @@
 from torch import Tensor
 
 from torchcover.frames import Frame
-from torchcover.geometry import transform_tensor
+from torchcover.geometry import transform_points_tensor
 
 # In place of the index of a frame that only has a name, or not even that.
 UNKNOWN_INDEX = -1
 
 
-def frames_in(batch: object) -> tuple[Frame, ...]:
+def extract_frames(batch: object) -> tuple[Frame, ...]:
     """The frames of a `FrameBatch` or another object with `frames`, of a sequence of `Frame`, or one `Frame`."""
     frames = getattr(batch, "frames", batch)
     if isinstance(frames, Frame):
@@ -18,11 +18,11 @@ def frames_in(batch: object) -> tuple[Frame, ...]:
         return tuple(frames)
     raise TypeError(
         f"a FrameBatch or a sequence of Frame is needed; got {type(batch).__name__}; say how to get them from a batch, "
-        "for example frames_of=lambda batch: batch['frames']"
+        "for example get_frames=lambda batch: batch['frames']"
     )
 
 
-def frame_of(sensor: Tensor, reference: Tensor, name: object, vehicle_T_lidar: Tensor | None) -> Frame:
+def build_frame(sensor: Tensor, reference: Tensor, name: object, vehicle_T_lidar: Tensor | None) -> Frame:
     """A frame out of another framework's (N, 3 + ...) points of the rig and (M, 3 + ...) of the reference sensor.
 
     `name` is what that calls the sample, and its index if it is a number; None: neither is known. Without
@@ -45,4 +45,4 @@ def _in_vehicle_frame(points: Tensor, vehicle_T_lidar: Tensor | None) -> Tensor:
     if vehicle_T_lidar.shape != (4, 4):
         raise ValueError(f"vehicle_T_lidar: shape (4, 4) is needed; got {tuple(vehicle_T_lidar.shape)}")
     # From the points as they came: rounded first, UTM-sized ones would lose decimetres.
-    return transform_tensor(vehicle_T_lidar, points[:, :3].double()).float()
+    return transform_points_tensor(vehicle_T_lidar, points[:, :3].double()).float()

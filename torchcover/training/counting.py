@@ -14,20 +14,20 @@ from torchcover.training.batches import UNKNOWN_INDEX
 class Shard(NamedTuple):
     """How samples are dealt out: number k of a process is number `k * processes + process` of all.
 
-    `process`: rank of this process; `processes`: number of processes; `samples`: number of different samples; what is
+    `process_index`: rank of this process; `num_processes`: number of processes; `num_samples`: number of different samples; what is
     dealt out beyond it repeats the first ones. None as long as it is not known.
     """
 
-    process: int
-    processes: int
-    samples: int | None
+    process_index: int
+    num_processes: int
+    num_samples: int | None
 
     def is_padding(self, position: int) -> bool:
         """Whether a sample of this process, by its position among them, repeats one of the first of all samples."""
-        return self.samples is not None and position * self.processes + self.process >= self.samples
+        return self.num_samples is not None and position * self.num_processes + self.process_index >= self.num_samples
 
 
-class CountOnce:
+class FrameDeduplicator:
     """Leaves out the frames that this or another process counts, without talking to the other processes.
 
     A `torch.utils.data.DistributedSampler` deals out the same number of samples to every process and fills the last
@@ -47,7 +47,7 @@ class CountOnce:
     Example:
         >>> import torch
         >>> frames = [Frame({"rig": torch.zeros(5, 3)}, torch.zeros(9, 3), index=k, name="a") for k in (0, 1, 0)]
-        >>> once = CountOnce()
+        >>> once = FrameDeduplicator()
         >>> [frame.index for frame in once.new(frames)]
         [0, 1]
         >>> once.start_epoch()
@@ -58,37 +58,37 @@ class CountOnce:
     def __init__(self) -> None:
         self.start_epoch()
 
-    def start_epoch(self, *, forget: bool = True) -> None:
+    def start_epoch(self, *, clear_history: bool = True) -> None:
         """Begin with the first positions of the loaders again.
 
         Args:
-            forget: Whether frames that were counted in earlier epochs are to be counted again.
+            clear_history: Whether frames that were counted in earlier epochs are to be counted again.
         """
-        if forget:
+        if clear_history:
             self._counted: set[int] = set()
         self._position: dict[int, int] = {}
         self._held_back: dict[int, Sequence[Frame]] = {}
 
-    def new(self, frames: Sequence[Frame], shard: Shard | None = None, loader: int = 0) -> list[Frame]:
+    def select_new(self, frames: Sequence[Frame], shard: Shard | None = None, loader_index: int = 0) -> list[Frame]:
         """The frames of the next batch that are to be counted.
 
         Args:
             frames: One for each sample of the batch, in order.
-            shard: How the loader's samples are dealt out, see `shard_of`; None if this process gets all of them. As
+            shard: How the loader's samples are dealt out, see `find_shard`; None if this process gets all of them. As
                 long as their number is not known, the last frame waits for the next call; a call without frames, but
                 with the number, gives it back.
-            loader: Number of the loader, if there are several: equal frames of two loaders are different ones.
+            loader_index: Number of the loader, if there are several: equal frames of two loaders are different ones.
 
         Returns:
             Some or all of the frames, in order.
         """
-        frames = [*self._held_back.pop(loader, ()), *frames]
-        if shard is not None and shard.samples is None:
-            frames, self._held_back[loader] = frames[:-1], frames[-1:]
-        first = self._position.get(loader, 0)
-        self._position[loader] = first + len(frames)
+        frames = [*self._held_back.pop(loader_index, ()), *frames]
+        if shard is not None and shard.num_samples is None:
+            frames, self._held_back[loader_index] = frames[:-1], frames[-1:]
+        first = self._position.get(loader_index, 0)
+        self._position[loader_index] = first + len(frames)
         dealt = [frame for position, frame in enumerate(frames, first) if not (shard and shard.is_padding(position))]
-        return [frame for frame in dealt if self._is_new(frame, loader)]
+        return [frame for frame in dealt if self._is_new(frame, loader_index)]
 
     def _is_new(self, frame: Frame, loader: int) -> bool:
         if frame.index == UNKNOWN_INDEX and not frame.name:
@@ -115,7 +115,7 @@ class CountOnce:
         self._counted, self._position = set(state["counted"]), dict(state["position"])
 
 
-def shard_of(loader: object) -> Shard | None:
+def find_shard(loader: object) -> Shard | None:
     """How a DataLoader's samples are dealt out to processes.
 
     Args:
@@ -127,7 +127,7 @@ def shard_of(loader: object) -> Shard | None:
     Example:
         >>> from torch.utils.data import DataLoader
         >>> sampler = DistributedSampler(range(5), num_replicas=2, rank=1)
-        >>> shard_of(DataLoader(range(5), sampler=sampler))
+        >>> find_shard(DataLoader(range(5), sampler=sampler))
         Shard(process=1, processes=2, samples=5)
     """
     sampler = getattr(getattr(loader, "batch_sampler", None), "sampler", None) or getattr(loader, "sampler", None)

@@ -13,7 +13,7 @@ from torchcover.coverage import Coverage
 from torchcover.report import plot_band_maps
 
 # Takes the tag of a figure, the figure, and where on its axis.
-Taker = Callable[[str, Figure, int], Any]
+FigureLogger = Callable[[str, Figure, int], Any]
 
 
 def log_maps(coverage: Coverage, loggers: Sequence[Any], prefix: str, step: int) -> list[str]:
@@ -71,7 +71,7 @@ def log_result(result: Any, logger: Any, *, step: int = 0, tag: str = "torchcove
     elif type(experiment).__module__.partition(".")[0] == "wandb":
         from wandb import Image, Table
 
-        shown = {f"{tag}/rows": Table(dataframe=frame), f"{tag}/picture": Image(rgb_image(figure))}
+        shown = {f"{tag}/rows": Table(dataframe=frame), f"{tag}/picture": Image(render_rgb_image(figure))}
         experiment.log(shown, step=step)
     else:
         raise TypeError(
@@ -86,13 +86,13 @@ def _markdown(frame: Any) -> str:  # noqa: ANN401  (a DataFrame)
     return "\n".join("| " + " | ".join(escape(str(cell)).replace("|", "&#124;") for cell in row) + " |" for row in rows)
 
 
-def _taker(logger: Any) -> Taker | None:  # noqa: ANN401  (any logger)
+def _taker(logger: Any) -> FigureLogger | None:  # noqa: ANN401  (any logger)
     if callable(log_image := getattr(logger, "log_image", None)):
-        return lambda tag, figure, step: log_image(key=tag, images=[rgb_image(figure)], step=step)
+        return lambda tag, figure, step: log_image(key=tag, images=[render_rgb_image(figure)], step=step)
     experiment = getattr(logger, "experiment", None)
     for owner in (logger, experiment):
         if callable(add_figure := getattr(owner, "add_figure", None)):
-            taker: Taker = add_figure
+            taker: FigureLogger = add_figure
             return taker
     if callable(log_figure := getattr(experiment, "log_figure", None)):
         if hasattr(logger, "run_id"):
@@ -101,7 +101,7 @@ def _taker(logger: Any) -> Taker | None:  # noqa: ANN401  (any logger)
     return None
 
 
-def rgb_image(figure: Figure) -> NDArray[np.uint8]:
+def render_rgb_image(figure: Figure) -> NDArray[np.uint8]:
     """(H, W, 3) uint8 pixels of a figure."""
     canvas: Any = FigureCanvasAgg(figure)  # without types for what it draws
     canvas.draw()

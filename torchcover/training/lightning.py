@@ -13,8 +13,8 @@ from lightning.pytorch.utilities import CombinedLoader, rank_zero_warn
 
 from torchcover.coverage import Coverage, CoverageMetric, Region
 from torchcover.frames import FrameBatch
-from torchcover.training.batches import UNKNOWN_INDEX, frames_in
-from torchcover.training.counting import CountOnce, Shard, is_distributed, shard_of
+from torchcover.training.batches import UNKNOWN_INDEX, extract_frames
+from torchcover.training.counting import FrameDeduplicator, Shard, find_shard, is_distributed
 
 # Names of the stages in tags, as Lightning users write them.
 STAGES = {"validation": "val", "train": "train"}
@@ -29,24 +29,24 @@ class CoverageCallback(Callback):
     loggers get the numbers, and one warning says so.
 
     With several processes each measures its own frames and the sums are added up. The samples that a
-    `DistributedSampler` repeats to fill the last batch are left out, see `CountOnce`. A checkpoint within an epoch
+    `DistributedSampler` repeats to fill the last batch are left out, see `FrameDeduplicator`. A checkpoint within an epoch
     holds the sums so far of all processes, so that a resumed run ends with the same numbers; other checkpoints hold
     nothing. The sanity check before training is not measured.
 
     Args:
-        metric: What to measure. The callback resets it at the start of each epoch, or of each fit with `fixed_frames`,
+        metric: What to measure. The callback resets it at the start of each epoch, or of each fit with `has_fixed_frames`,
             and moves it to the model's device.
         regions: Regions to log; those of the paper that fit the grid if not given.
         stage: `"validation"` or `"train"`: whose batches to measure; the former also in `trainer.test`.
         every_n_epochs: Measure the last of every n epochs. The others cost nothing.
         every_n_steps: With `stage="train"`: also log the coverage of the epoch so far after every n batches.
-        fixed_frames: With `stage="validation"`: say that the frames are the same at every epoch. Each is then measured
+        has_fixed_frames: With `stage="validation"`: say that the frames are the same at every epoch. Each is then measured
             when it first comes in a fit, later epochs log the numbers again, and maps are logged where frames were
             added; a warning says so. They do not depend on the model: `ModelCheckpoint` has nothing to monitor in
             them. With several processes, the sampler must not shuffle.
-        maps: Whether to log maps.
-        rig: Which of several rigs in a frame; part of the tags if given.
-        frames_of: Gives the frames of a batch: a `FrameBatch` or a sequence of `Frame`, one for each sample, in order.
+        should_log_maps: Whether to log maps.
+        rig_name: Which of several rigs in a frame; part of the tags if given.
+        get_frames: Gives the frames of a batch: a `FrameBatch` or a sequence of `Frame`, one for each sample, in order.
             If not given, the batch is one of the two or has them as `frames`.
 
     Attributes:
@@ -72,25 +72,25 @@ class CoverageCallback(Callback):
         stage: str = "validation",
         every_n_epochs: int = 1,
         every_n_steps: int | None = None,
-        fixed_frames: bool = False,
-        maps: bool = True,
-        rig: str | None = None,
-        frames_of: Callable[[Any], Any] | None = None,
+        has_fixed_frames: bool = False,
+        should_log_maps: bool = True,
+        rig_name: str | None = None,
+        get_frames: Callable[[Any], Any] | None = None,
     ) -> None:
-        _check_arguments(stage, every_n_epochs, every_n_steps, fixed_frames)
+        _check_arguments(stage, every_n_epochs, every_n_steps, has_fixed_frames)
         self.metric = metric
         self.regions = regions
         self.stage = stage
         self.every_n_epochs = every_n_epochs
         self.every_n_steps = every_n_steps
-        self.fixed_frames = fixed_frames
-        self.maps = maps
-        self.rig = rig
-        self.frames_of = frames_of
-        self.tag = "/".join(["coverage", *([rig] if rig else []), STAGES[stage]])
+        self.has_fixed_frames = has_fixed_frames
+        self.should_log_maps = should_log_maps
+        self.rig_name = rig_name
+        self.get_frames = get_frames
+        self.tag = "/".join(["coverage", *([rig_name] if rig_name else []), STAGES[stage]])
         self.coverage: Coverage | None = None
         self._epoch: int | None = None  # being measured; the same on every process, as collective calls need it
-        self._once = CountOnce()
+        self._once = FrameDeduplicator()
         self._prefix = self.tag  # of what is logged: in `trainer.test` another one
         self._logged: dict[str, float] = {}  # the last numbers of this fit
         self._added = False  # whether there are frames that are not in them
@@ -115,8 +115,8 @@ class CoverageCallback(Callback):
         self._epoch = trainer.current_epoch if due and not trainer.sanity_checking else None
         if self._epoch is None:
             return
-        if self.fixed_frames and self._logged:
-            self._once.start_epoch(forget=False)
+        if self.has_fixed_frames and self._logged:
+            self._once.start_epoch(clear_history=False)
         else:
             self._once.start_epoch()
             self._logged, self._added = {}, True
@@ -127,19 +127,19 @@ class CoverageCallback(Callback):
         self._start(trainer, pl_module)
         if self._epoch is None:
             return
-        frames = frames_in(batch if self.frames_of is None else self.frames_of(batch))
-        new = FrameBatch(tuple(self._once.new(frames, self._shard(trainer, loader_index), loader_index)))
+        frames = extract_frames(batch if self.get_frames is None else self.get_frames(batch))
+        new = FrameBatch(tuple(self._once.select_new(frames, self._shard(trainer, loader_index), loader_index)))
         if not new.frames:
             return
         self._added = True
         indices = [frame.index for frame in new.frames]
         self.metric.update(
-            new.clouds_of(self.rig),
+            new.get_clouds(self.rig_name),
             new.reference,
-            error=new.errors_of(self.rig),
+            errors_m=new.get_errors_m(self.rig_name),
             weights=new.weights,
-            height=new.heights_in(self.metric.grid.band_frame),
-            block_index=None if UNKNOWN_INDEX in indices else new.block_index,
+            heights_m=new.get_heights_m(self.metric.grid.band_frame),
+            block_index=None if UNKNOWN_INDEX in indices else new.block_indices,
         )
 
     def _shard(self, trainer: Trainer, loader_index: int) -> Shard | None:
@@ -147,7 +147,7 @@ class CoverageCallback(Callback):
         loaders: Any = trainer.train_dataloader if self.stage == "train" else evaluated
         flat = CombinedLoader(loaders, "sequential").flattened
         # A batch of several training loaders side by side does not say which frame came from which.
-        shard = None if self.stage == "train" and len(flat) > 1 else shard_of(flat[loader_index])
+        shard = None if self.stage == "train" and len(flat) > 1 else find_shard(flat[loader_index])
         if shard is None and trainer.world_size > 1:
             self._warn_once(
                 "not one loader with a DistributedSampler: a frame that several processes get is counted several times"
@@ -159,8 +159,8 @@ class CoverageCallback(Callback):
             return
         self._epoch = None
         # Whether there is something new has the same answer on all processes, as collective calls need it.
-        if not self.fixed_frames or trainer.strategy.reduce_boolean_decision(self._added, all=False):
-            if self.fixed_frames and self._logged:
+        if not self.has_fixed_frames or trainer.strategy.reduce_boolean_decision(self._added, all=False):
+            if self.has_fixed_frames and self._logged:
                 self._warn_once("fixed_frames: an epoch had frames that were not there before; they are added")
             coverage = self._compute()
             self._logged, self._added = self._scalars(coverage), False
@@ -173,16 +173,16 @@ class CoverageCallback(Callback):
         self.metric.update([], [], weights=[])  # a process that was dealt nothing but padding has not updated yet
         coverage: Coverage = self.metric.compute()
         self.coverage = coverage
-        if not len(coverage.known.at):
+        if not len(coverage.observed_cells.cell_indices):
             self._warn_once("no reference point lies in the grid: the coverage of these frames is unknown (NaN)")
         return coverage
 
     def _scalars(self, coverage: Coverage) -> dict[str, float]:
-        scalars = {**coverage.scalars(self.regions), "steps": float(coverage.counts["frames"])}
+        scalars = {**coverage.scalars(self.regions), "steps": float(coverage.counts["num_frames"])}
         return {f"{self._prefix}/{name}": value for name, value in scalars.items()}
 
     def _log_maps(self, trainer: Trainer, coverage: Coverage) -> None:
-        if not (self.maps and trainer.is_global_zero and trainer.loggers):
+        if not (self.should_log_maps and trainer.is_global_zero and trainer.loggers):
             return
         from torchcover.training.figures import log_maps  # matplotlib only where there is something to draw
 

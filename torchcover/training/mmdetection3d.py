@@ -7,14 +7,14 @@ import torch
 from torch import Tensor
 
 from torchcover.frames import FrameBatch
-from torchcover.training.batches import frame_of
+from torchcover.training.batches import build_frame
 
 
-def frames_of_data_batch(
+def convert_data_batch(
     data_batch: Mapping[str, Any],
     data_samples: Sequence[Mapping[str, Any]],
     *,
-    reference: str = "reference_points",
+    reference_key: str = "reference_points",
     vehicle_T_lidar: Tensor | None = None,
 ) -> FrameBatch:
     """The frames of a batch of MMDetection3D, as MMEngine hands it to a metric.
@@ -23,7 +23,7 @@ def frames_of_data_batch(
         data_batch: With `inputs["points"]`: one (N, 3 + ...) cloud for each sample, in metres.
         data_samples: One dict for each sample, with the (M, 3 + ...) reference points, which `PackWithReference` of
             `torchcover.training.mmengine` carries there, and `sample_idx`.
-        reference: Key of the reference points, which a dataset of one's own has to add.
+        reference_key: Key of the reference points, which a dataset of one's own has to add.
         vehicle_T_lidar: (4, 4) pose of the points' frame; by default they are in the vehicle frame already.
 
     Returns:
@@ -40,14 +40,14 @@ def frames_of_data_batch(
         )
     frames = []
     for k, (cloud, sample) in enumerate(zip(clouds, data_samples, strict=True)):
-        if reference not in sample:
+        if reference_key not in sample:
             raise ValueError(
-                f"sample {k} has no {reference!r}; add it to the results in the pipeline, and pack them with "
+                f"sample {k} has no {reference_key!r}; add it to the results in the pipeline, and pack them with "
                 "PackWithReference of torchcover.training.mmengine"
             )
         points, reference_points = (
             each if isinstance(each, Tensor) else torch.as_tensor(each, device="cpu")
-            for each in (cloud, sample[reference])
+            for each in (cloud, sample[reference_key])
         )
-        frames.append(frame_of(points, reference_points, sample.get("sample_idx"), vehicle_T_lidar))
+        frames.append(build_frame(points, reference_points, sample.get("sample_idx"), vehicle_T_lidar))
     return FrameBatch(tuple(frames))

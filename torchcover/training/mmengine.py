@@ -15,9 +15,9 @@ from mmengine.dist import get_comm_device, get_dist_info
 
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric, Region
 from torchcover.frames import Frame
-from torchcover.training.batches import UNKNOWN_INDEX, frames_in
-from torchcover.training.counting import CountOnce, Shard
-from torchcover.training.mmdetection3d import frames_of_data_batch
+from torchcover.training.batches import UNKNOWN_INDEX, extract_frames
+from torchcover.training.counting import FrameDeduplicator, Shard
+from torchcover.training.mmdetection3d import convert_data_batch
 
 
 @TRANSFORMS.register_module()
@@ -26,25 +26,27 @@ class PackWithReference:
 
     Args:
         pack: The other, such as `Pack3DDetInputs`, or its config.
-        reference: Key of the reference points, which a dataset of one's own has to add.
+        reference_key: Key of the reference points, which a dataset of one's own has to add.
 
     Raises:
         ValueError: When it is called: the results have no reference points.
     """
 
-    def __init__(self, pack: Any, reference: str = "reference_points") -> None:  # noqa: ANN401  (any transform)
+    def __init__(self, pack: Any, reference_key: str = "reference_points") -> None:  # noqa: ANN401  (any transform)
         self.pack = TRANSFORMS.build(pack) if isinstance(pack, Mapping) else pack
-        self.reference = reference
+        self.reference_key = reference_key
 
     def __call__(self, results: Any) -> Any:  # noqa: ANN401  (of one sample, or of each augmentation of it)
         """What the other packs of it; `data_samples` has the reference points, too."""
         each = results if isinstance(results, list) else [results]
-        if any(self.reference not in one for one in each):
-            raise ValueError(f"the results have no {self.reference!r}: let the dataset, or a transform before, add it")
-        references = [one[self.reference] for one in each]
+        if any(self.reference_key not in one for one in each):
+            raise ValueError(
+                f"the results have no {self.reference_key!r}: let the dataset, or a transform before, add it"
+            )
+        references = [one[self.reference_key] for one in each]
         packed = self.pack(results)
         for one, reference in zip(packed if isinstance(packed, list) else [packed], references, strict=True):
-            one["data_samples"].set_metainfo({self.reference: reference})
+            one["data_samples"].set_metainfo({self.reference_key: reference})
         return packed
 
 
@@ -53,13 +55,13 @@ class MMEngineCoverage(BaseMetric):  # type: ignore[misc]  # MMEngine has no typ
     """Coverage of the frames that a model is validated on, under the names of `Coverage.scalars`.
 
     Where a `BaseMetric` gathers a result for each sample, this adds up fixed-size sums, which are reduced over the
-    processes. Padding samples and those that come again are left out, see `CountOnce`.
+    processes. Padding samples and those that come again are left out, see `FrameDeduplicator`.
 
     Args:
         metric: A `CoverageMetric`, or its arguments as a config has them, with `grid` as a dict of those of `BevGrid`.
         regions: Regions to report, or dicts of their arguments; those of the paper that fit the grid if not given.
-        vehicle_T_lidar: (4, 4) pose of the points' frame, as `frames_of_data_batch` takes it.
-        frames_of: Gives the frames from `data_batch` and `data_samples`; `frames_of_data_batch` if not given.
+        vehicle_T_lidar: (4, 4) pose of the points' frame, as `convert_data_batch` takes it.
+        get_frames: Gives the frames from `data_batch` and `data_samples`; `convert_data_batch` if not given.
         prefix: In front of the names, with a slash between; "coverage" if not given.
 
     Attributes:
@@ -82,16 +84,16 @@ class MMEngineCoverage(BaseMetric):  # type: ignore[misc]  # MMEngine has no typ
         *,
         regions: Sequence[Region | Mapping[str, Any]] | None = None,
         vehicle_T_lidar: Sequence[Sequence[float]] | None = None,
-        frames_of: Callable[[Any, Any], Any] | None = None,
+        get_frames: Callable[[Any, Any], Any] | None = None,
         prefix: str | None = None,
     ) -> None:
         super().__init__(prefix=prefix)
         self.metric = metric if isinstance(metric, CoverageMetric) else _metric_of(metric)
         self.regions = None if regions is None else [r if isinstance(r, Region) else Region(**r) for r in regions]
         pose = None if vehicle_T_lidar is None else torch.as_tensor(vehicle_T_lidar, dtype=torch.float64, device="cpu")
-        self.frames_of = frames_of or partial(frames_of_data_batch, vehicle_T_lidar=pose)
+        self.get_frames = get_frames or partial(convert_data_batch, vehicle_T_lidar=pose)
         self.coverage: Coverage | None = None
-        self._once = CountOnce()
+        self._once = FrameDeduplicator()
 
     def process(self, data_batch: Any, data_samples: Sequence[Mapping[str, Any]]) -> None:  # noqa: ANN401  (MMEngine's)
         """Add the frames of a batch.
@@ -99,18 +101,18 @@ class MMEngineCoverage(BaseMetric):  # type: ignore[misc]  # MMEngine has no typ
         Raises:
             ValueError: As `CoverageMetric.update`, or reference points without the square metres that the metric wants.
         """
-        self._add(frames_in(self.frames_of(data_batch, data_samples)), size=None)
+        self._add(extract_frames(self.get_frames(data_batch, data_samples)), size=None)
 
     def _add(self, frames: Sequence[Frame], size: int | None) -> None:
         rank, processes = get_dist_info()
-        for frame in self._once.new(frames, Shard(rank, processes, size)):
+        for frame in self._once.select_new(frames, Shard(rank, processes, size)):
             index = None if frame.index == UNKNOWN_INDEX else frame.block_index
             self.metric.update(
                 frame.sensor,
                 frame.reference,
-                error=frame.error_of(),
+                errors_m=frame.get_errors_m(),
                 weights=frame.reference_weights,
-                height=frame.heights_in(self.metric.grid.band_frame),
+                heights_m=frame.get_heights_m(self.metric.grid.band_frame),
                 block_index=index,
             )
 

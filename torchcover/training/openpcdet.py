@@ -7,11 +7,11 @@ import torch
 from torch import Tensor
 
 from torchcover.frames import FrameBatch
-from torchcover.training.batches import frame_of
+from torchcover.training.batches import build_frame
 
 
-def frames_of_batch_dict(
-    batch_dict: Mapping[str, Any], *, reference: str = "reference_points", vehicle_T_lidar: Tensor | None = None
+def convert_batch_dict(
+    batch_dict: Mapping[str, Any], *, reference_key: str = "reference_points", vehicle_T_lidar: Tensor | None = None
 ) -> FrameBatch:
     """The frames of a `batch_dict` of OpenPCDet, before or after `load_data_to_gpu`.
 
@@ -22,32 +22,32 @@ def frames_of_batch_dict(
     Args:
         batch_dict: With `points` (N, 1 + 3 + ...) in metres, the reference (M, 1 + 3 + ...), `batch_size`, and
             `frame_id` (B,) if there are any; arrays or tensors.
-        reference: Key of the reference points, which a dataset of one's own has to add.
+        reference_key: Key of the reference points, which a dataset of one's own has to add.
         vehicle_T_lidar: (4, 4) pose of the points' frame; by default they are in the vehicle frame already.
 
     Returns:
         One frame for each sample. Its name is the `frame_id`, and so is its index if that is a number; else it is -1.
-        Without `frame_id` the name is empty, and `CountOnce` cannot tell whether a sample comes again.
+        Without `frame_id` the name is empty, and `FrameDeduplicator` cannot tell whether a sample comes again.
 
     Raises:
         ValueError: A key is missing, an array of another shape, a sample number beyond the batch.
 
     Example:
         >>> points = torch.tensor([[0.0, 1.0, 2.0, 0.0, 0.3], [1.0, 4.0, 5.0, 0.0, 0.9], [1.0, 6.0, 5.0, 0.0, 0.9]])
-        >>> batch = frames_of_batch_dict({"points": points, "reference_points": points[:, :4], "batch_size": 2})
+        >>> batch = convert_batch_dict({"points": points, "reference_points": points[:, :4], "batch_size": 2})
         >>> [len(cloud) for cloud in batch.sensor]
         [1, 2]
     """
-    for key in ("points", reference, "batch_size"):
+    for key in ("points", reference_key, "batch_size"):
         if key not in batch_dict:
             raise ValueError(f"batch_dict has no {key!r}; it has {', '.join(map(str, batch_dict))}")
     size = int(batch_dict["batch_size"])
     names = batch_dict.get("frame_id")
     sensors = _split(batch_dict["points"], size, "points")
-    references = _split(batch_dict[reference], size, reference)
+    references = _split(batch_dict[reference_key], size, reference_key)
     return FrameBatch(
         tuple(
-            frame_of(sensors[k], references[k], None if names is None else names[k], vehicle_T_lidar)
+            build_frame(sensors[k], references[k], None if names is None else names[k], vehicle_T_lidar)
             for k in range(size)
         )
     )

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchcover.geometry import euler_from_rotation, invert, rigid
+from torchcover.geometry import build_transform, convert_rotation_to_euler, invert
 from torchcover.recordings.formats import argoverse2, nuscenes
 
 T0_NS = 315_966_000_000_000_000
@@ -70,7 +70,7 @@ def poses(somebody, heights=hill_m, times_s=TIMES_S):
     forward = np.column_stack([np.tile(ahead, (len(plan_m), 1)), np.column_stack(slopes) @ ahead])
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
     rotation = np.stack([forward, np.cross(up, forward), up], axis=2)
-    return rigid(rotation, np.column_stack([plan_m, heights(plan_m)]))
+    return build_transform(rotation, np.column_stack([plan_m, heights(plan_m)]))
 
 
 def seen(somebody):
@@ -95,7 +95,7 @@ def _half_turn(r):
 
 def about_middle(world_T_bottom, size_m):
     """The pose of the middle of a box."""
-    return world_T_bottom @ rigid(np.eye(3), [0.0, 0.0, size_m[2] / 2])
+    return world_T_bottom @ build_transform(np.eye(3), [0.0, 0.0, size_m[2] / 2])
 
 
 def write_argoverse2(folder, others=OTHERS, heights=hill_m):
@@ -203,7 +203,7 @@ def write_csv(folder, others=OTHERS, heights=hill_m):
         rows = csv.writer(file)
         rows.writerow(["t", "x", "y", "z", "roll", "pitch", "yaw"])
         for time_s, pose in zip(TIMES_S, driven, strict=True):
-            yaw, pitch, roll = euler_from_rotation(pose[:3, :3]).tolist()
+            yaw, pitch, roll = convert_rotation_to_euler(pose[:3, :3]).tolist()
             numbers = [*pose[:3, 3].tolist(), roll, pitch, yaw]
             rows.writerow([f"{time_s:.1f}", *(f"{number:.9f}" for number in numbers)])
     return folder

@@ -24,7 +24,7 @@ from tests.simulation.recorded.test_tracks import FEW, RIG, scenario
 from torchcover import Scenario
 from torchcover.cli.app import main
 from torchcover.files import BadFileError, isolated
-from torchcover.geometry import rotation_from_euler
+from torchcover.geometry import convert_euler_to_rotation
 from torchcover.recordings.formats import read_objects
 from torchcover.simulation import Simulator
 
@@ -143,7 +143,7 @@ def test_shapes_of_commonroad(tmp_path):
     path = replaced(write_commonroad(tmp_path / "a.xml"), box, f"<polygon>{corners}</polygon>")
     actor = scenario(path, ego_id=5, duration_s=0.4).world().actors[0]
     np.testing.assert_allclose(np.ptp(actor.mesh.vertices_m, axis=0)[:2], [4.0, 2.0])
-    np.testing.assert_allclose(actor.trajectory.at(0.0)[:2, 3], [1426.0, 2200.0])
+    np.testing.assert_allclose(actor.trajectory.interpolate(0.0)[:2, 3], [1426.0, 2200.0])
 
 
 RECTANGLE = "<rectangle><length>4.5</length><width>1.8</width>{}</rectangle>"
@@ -180,7 +180,7 @@ def test_shapes_of_commonroad_have_centers_and_turns(tmp_path, shapes, size_m, m
     )
     np.testing.assert_allclose(track.size_m[:2], size_m)
     yaw_deg = before.angles_deg[0, 0]
-    turn = rotation_from_euler(yaw_deg, 0.0, 0.0)[:2, :2]
+    turn = convert_euler_to_rotation(yaw_deg, 0.0, 0.0)[:2, :2]
     np.testing.assert_allclose(
         track.trajectory.positions_m[0, :2], before.positions_m[0, :2] + turn @ middle_m, atol=1e-6
     )

@@ -24,9 +24,9 @@ from tests.simulation.recorded.drives import (
 )
 from torchcover import Rig, Scenario
 from torchcover.evaluation.task import compute_frame_interval_s
-from torchcover.geometry import BoundingBox, invert, rigid
+from torchcover.geometry import BoundingBox, build_transform, invert
 from torchcover.simulation import PaperReference, SimulatedFrames, Simulator
-from torchcover.simulation.builtin import builtin_folder, builtin_names
+from torchcover.simulation.builtin import builtin_names, get_builtin_folder
 from torchcover.simulation.height_field import Slopes
 
 FEW = PaperReference(rows=24, columns=48)
@@ -88,7 +88,7 @@ def test_everybody_is_where_a_slow_twin_says_at_instants_and_between(written, ki
             if kind == "nuscenes":  # samples are every fifth instant
                 known_s = np.array([time for time in TIMES_S[::5] if TIMES_S[one.first] <= time <= TIMES_S[one.last]])
             there = (one.speed_mps == 0 and kind == "commonroad") or known_s[0] <= time_s <= known_s[-1]
-            at = actor.trajectory.positions_at(np.array([time_s]))[0]
+            at = actor.trajectory.interpolate_positions_m(np.array([time_s]))[0]
             if actor is not world.ego and not there:
                 assert np.isnan(at).all(), (name, time_s)
                 continue
@@ -98,7 +98,7 @@ def test_everybody_is_where_a_slow_twin_says_at_instants_and_between(written, ki
             twin = [np.interp(time_s, own_s, column) for column in places_m.T]
             np.testing.assert_allclose(at, twin, atol=atol, err_msg=f"{name} {time_s}")
     turned = poses(ego, heights)[4, :3, :3]
-    np.testing.assert_allclose(world.ego.trajectory.at(TIMES_S[4])[:3, :3], turned, atol=1e-6)
+    np.testing.assert_allclose(world.ego.trajectory.interpolate(TIMES_S[4])[:3, :3], turned, atol=1e-6)
 
 
 @pytest.mark.parametrize("kind", FORMATS)
@@ -166,7 +166,7 @@ def test_wheels_stand_on_slopes_whether_or_not_tilts_were_recorded(written, kind
             continue
         trajectory, length_m = actor.trajectory, np.ptp(actor.mesh.vertices_m[:, 0])
         for time_s in trajectory.times_s[::4]:
-            pose = trajectory.at(time_s)
+            pose = trajectory.interpolate(time_s)
             wheels_m = np.array([[along * length_m, across, 0.0] for along in (-0.3, 0.3) for across in (-0.8, 0.8)])
             wheels_m = wheels_m @ pose[:3, :3].T + pose[:3, 3]
             assert np.abs(wheels_m[:, 2] - hill_m(wheels_m[:, :2])).max() < 0.07
@@ -215,7 +215,7 @@ def test_bodies_have_the_sizes_of_the_boxes(written):
         world = opened(written, kind)[0].world()
         for one in OTHERS:
             actor = of(world, one.name)
-            np.testing.assert_allclose(BoundingBox.around(actor.mesh.vertices_m).size_m, one.size_m)
+            np.testing.assert_allclose(BoundingBox.from_points(actor.mesh.vertices_m).size_m, one.size_m)
             if one.category in of_category:
                 assert actor.category == one.category
                 assert len(actor.mesh.faces) > 12
@@ -225,33 +225,39 @@ def test_bodies_have_the_sizes_of_the_boxes(written):
 
 def test_a_body_without_a_recorded_height_has_its_own(written):
     world = opened(written, "commonroad")[0].world()
-    size_m = BoundingBox.around(of(world, "3").mesh.vertices_m).size_m
+    size_m = BoundingBox.from_points(of(world, "3").mesh.vertices_m).size_m
     np.testing.assert_allclose(size_m, (9.5, 2.5, 1.07 * 3.45))  # of the lorry whose length is nearest
 
 
 def test_another_track_may_be_the_ego_and_then_the_recordings_own_is_one_of_the_others(written):
     world = scenario(written / "argoverse2", ego_id="a1").world()
-    np.testing.assert_allclose(world.ego.trajectory.at(1.0), poses(OTHERS[0], times_s=np.array([1.0]))[0], atol=2e-4)
+    np.testing.assert_allclose(
+        world.ego.trajectory.interpolate(1.0), poses(OTHERS[0], times_s=np.array([1.0]))[0], atol=2e-4
+    )
     own = of(world, "ego")
-    np.testing.assert_allclose(own.trajectory.at(1.0), poses(EGO, times_s=np.array([1.0]))[0], atol=2e-4)
-    np.testing.assert_allclose(BoundingBox.around(own.mesh.vertices_m).size_m, (4.869, 1.852, 1.476))
+    np.testing.assert_allclose(own.trajectory.interpolate(1.0), poses(EGO, times_s=np.array([1.0]))[0], atol=2e-4)
+    np.testing.assert_allclose(BoundingBox.from_points(own.mesh.vertices_m).size_m, (4.869, 1.852, 1.476))
     assert "a1" not in [actor.name for actor in world.actors]
 
 
 def test_the_frame_of_the_ego_may_be_given(written):
-    known = scenario(written / "argoverse2").world().ego.trajectory.at(1.0)
-    given = scenario(written / "argoverse2", ego_T_vehicle={"x_m": 0.339, "z_m": -0.3}).world().ego.trajectory.at(1.0)
-    np.testing.assert_allclose(given, known @ rigid(np.eye(3), [-1.0, 0.0, 0.0]), atol=1e-9)
+    known = scenario(written / "argoverse2").world().ego.trajectory.interpolate(1.0)
+    given = (
+        scenario(written / "argoverse2", ego_T_vehicle={"x_m": 0.339, "z_m": -0.3})
+        .world()
+        .ego.trajectory.interpolate(1.0)
+    )
+    np.testing.assert_allclose(given, known @ build_transform(np.eye(3), [-1.0, 0.0, 0.0]), atol=1e-9)
 
 
 def test_the_start_of_a_planning_problem_is_one_instant_unless_a_time_is_given(written):
     start = scenario(written / "commonroad.xml")
     assert (start.steps, start.instants) == (1, 1)
-    np.testing.assert_allclose(start.world().ego.trajectory.at(0.0)[:2, 3], ORIGIN_M)
+    np.testing.assert_allclose(start.world().ego.trajectory.interpolate(0.0)[:2, 3], ORIGIN_M)
     standing = scenario(written / "commonroad.xml", duration_s=1.0)
     assert standing.steps == 11
     world = standing.world()
-    assert not world.ego.trajectory.moves
+    assert not world.ego.trajectory.is_moving
     assert len(Simulator(standing, {"rig": RIG}, FEW).step(3).clouds["rig"]) > 200
 
 
@@ -261,9 +267,11 @@ def test_who_was_not_seen_for_too_long_was_not_there(tmp_path):
     rewrite(folder / "boxes.csv", lambda row: None if row[1] == "a1" and 1.1 < float(row[0]) < 2.5 else row)
     world = drive_of(folder).world()
     times_s = np.array([0.9, 1.0, 1.1, 1.8, 2.5, 2.6, 3.0])
-    there = [np.isfinite(of(world, name).trajectory.positions_at(times_s)[:, 0]) for name in ("a1", "a1 #2")]
+    there = [np.isfinite(of(world, name).trajectory.interpolate_positions_m(times_s)[:, 0]) for name in ("a1", "a1 #2")]
     np.testing.assert_array_equal(there, [[1, 1, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 1, 1]])
-    assert np.isfinite(of(drive_of(folder, max_gap_s=2.0).world(), "a1").trajectory.positions_at(times_s)).all()
+    assert np.isfinite(
+        of(drive_of(folder, max_gap_s=2.0).world(), "a1").trajectory.interpolate_positions_m(times_s)
+    ).all()
 
 
 def test_who_is_where_the_ego_is_is_left_out_and_named(tmp_path):
@@ -286,7 +294,9 @@ def test_who_is_seen_at_an_instant_is_there_whatever_is_subtracted_of_the_times(
         last = round((2.8 - begin_s) / 0.1)
         times_s = 0.1 * np.array([last, last + 1], dtype=np.float64)
         np.testing.assert_array_equal(
-            np.isfinite(of(world, "a8").trajectory.positions_at(times_s)[:, 0]), [True, False], err_msg=str(begin_s)
+            np.isfinite(of(world, "a8").trajectory.interpolate_positions_m(times_s)[:, 0]),
+            [True, False],
+            err_msg=str(begin_s),
         )
 
 
@@ -299,12 +309,12 @@ def test_whatever_recording_has_boxes_plays_as_traffic(tmp_path, layout, name, f
     world = drive.world()
     (car,) = world.actors
     assert (drive.steps, car.name) == (5, name)
-    np.testing.assert_allclose(BoundingBox.around(car.mesh.vertices_m).size_m, CAR_SIZE_M, atol=1e-6)
+    np.testing.assert_allclose(BoundingBox.from_points(car.mesh.vertices_m).size_m, CAR_SIZE_M, atol=1e-6)
     assert len(car.mesh.faces) >= faces  # a plain folder calls it "car, red", which is no word for a road user
     for instant, time_s in enumerate(recorded.times_s):
         wanted = invert(recorded.get_world_T_vehicle(instant)) @ recorded.world_T_car(instant)
-        wanted = wanted @ rigid(np.eye(3), [0.0, 0.0, -CAR_SIZE_M[2] / 2])
-        found = invert(world.ego.trajectory.at(time_s)) @ car.trajectory.at(time_s)
+        wanted = wanted @ build_transform(np.eye(3), [0.0, 0.0, -CAR_SIZE_M[2] / 2])
+        found = invert(world.ego.trajectory.interpolate(time_s)) @ car.trajectory.interpolate(time_s)
         np.testing.assert_allclose(found, wanted, atol=1e-4, err_msg=str(instant))
     assert len(Simulator(drive, {"rig": RIG}, FEW).step(2).clouds["rig"]) > 100
 
@@ -313,7 +323,7 @@ def test_the_vehicle_of_a_recording_is_one_of_the_others_if_another_is_the_ego(t
     world = scenario(LAYOUTS["kitti_raw"](Drive(), tmp_path), ego_id="0").world()
     (own,) = world.actors
     assert own.name == "ego"
-    np.testing.assert_allclose(BoundingBox.around(own.mesh.vertices_m).size_m, (4.774, 1.82, 1.93))
+    np.testing.assert_allclose(BoundingBox.from_points(own.mesh.vertices_m).size_m, (4.774, 1.82, 1.93))
 
 
 def test_one_scene_of_several_is_shown(tmp_path):
@@ -344,7 +354,7 @@ def test_what_a_run_means_depends_on_what_is_in_the_files(tmp_path):
 
 
 def test_the_built_in_ones_are_those_that_are_written_here(written):
-    built_in = builtin_folder("scenarios") / "tracks"
+    built_in = get_builtin_folder("scenarios") / "tracks"
     for path in written.rglob("*.*"):
         if path.suffix in (".csv", ".json", ".xml"):
             assert path.read_text() == built_in.joinpath(path.relative_to(written)).read_text(), path

@@ -148,7 +148,7 @@ def test_links_of_open_drive_that_lead_nowhere_are_named_and_may_be_left_out(tmp
     told = "road 1, predecessor road 7; junction 8, connection 0, connectingRoad .none.; `leave_out_links: true`"
     with pytest.raises(BadFileError, match=f"road.xodr: SUMO's netconvert fails: .*{told}"):
         made.world(0)
-    assert made.model_copy(update={"leave_out_links": True}).world(0).ego.trajectory.moves
+    assert made.model_copy(update={"leave_out_links": True}).world(0).ego.trajectory.is_moving
 
 
 @pytest.mark.parametrize(

@@ -49,8 +49,8 @@ def test_who_comes_and_goes_is_there_for_that_time_and_who_is_far_never(tmp_path
     late = {t: row for t, row in drive("late", y=3.0).items() if 1.0 <= t <= 2.0}
     world = made(tmp_path, steps=together(drive(), late, drive("far", y=260.0)), ego_id="ego").world(0)
     (actor,) = world.actors
-    assert (actor.category, actor.trajectory.transient) == ("car", True)
-    there = np.isfinite(actor.trajectory.positions_at(np.array([0.8, 1.0, 2.0, 2.2]))[:, 0])
+    assert (actor.category, actor.trajectory.is_transient) == ("car", True)
+    there = np.isfinite(actor.trajectory.interpolate_positions_m(np.array([0.8, 1.0, 2.0, 2.2]))[:, 0])
     assert there.tolist() == [False, True, True, False]
 
 

@@ -26,7 +26,7 @@ KINDS = {
 
 @cache
 def boxes():
-    sizes = {kind: BoundingBox.around(mesh.vertices_m).size_m for kind, mesh in load_bodies().items()}
+    sizes = {kind: BoundingBox.from_points(mesh.vertices_m).size_m for kind, mesh in load_bodies().items()}
     return {kind: shapes.Box(type="box", size_m=size).mesh() for kind, size in sizes.items()}
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from torchcover.geometry import rigid, rotation_from_euler
+from torchcover.geometry import build_transform, convert_euler_to_rotation
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.bodies import Vehicle
 from torchcover.simulation.traffic.fleet import DRAWS, REAR_OF, Fleet, load_bodies, rears_of, tractrix
@@ -83,4 +83,4 @@ def poses(actor: Actor):
 
 
 def at(pose):
-    return rigid(rotation_from_euler(np.rad2deg(pose[2]), 0.0, 0.0), [*pose[:2], 0.0])
+    return build_transform(convert_euler_to_rotation(np.rad2deg(pose[2]), 0.0, 0.0), [*pose[:2], 0.0])

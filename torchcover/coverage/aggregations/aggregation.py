@@ -27,7 +27,7 @@ class Layer(NamedTuple):
     values: Tensor
 
 
-class State(NamedTuple):
+class SumState(NamedTuple):
     """A sum of an aggregation.
 
     Args:
@@ -39,21 +39,21 @@ class State(NamedTuple):
     reduction: Literal["sum", "max"] = "sum"
 
 
-class BinnedStep(NamedTuple):
+class BinnedFrame(NamedTuple):
     """The reference points of one step, in those C cells that they lie in.
 
     Args:
-        cell: (N,) int64 which of the C cells each point lies in.
+        cell_indices: (N,) int64 which of the C cells each point lies in.
         values: (V, N) float64 of each point: its `radius`, then 1 for each threshold that it is within, or 0; then what
             there is to say of the sensors, if the metric knows them.
-        weight: (N,) weight of each point; None if all weigh the same.
-        means: Of each value over the points of each cell.
+        weights: (N,) weight of each point; None if all weigh the same.
+        cell_means: Of each value over the points of each cell.
     """
 
-    cell: Tensor
+    cell_indices: Tensor
     values: Tensor
-    weight: Tensor | None
-    means: CellMeans
+    weights: Tensor | None
+    cell_means: CellMeans
 
     @property
     def radius(self) -> Tensor:
@@ -67,31 +67,31 @@ class Aggregation(ABC):
 
     It gives maps, and numbers of regions: a region in a height band is one large cell. The numbers have errors where
     all its states are added up. An aggregation is a frozen dataclass: its fields are part of what the sums of a metric
-    mean. A new one is a class and a line in `AGGREGATIONS`; one with fields reads them in `parse` and `of_keys`.
+    mean. A new one is a class and a line in `AGGREGATIONS`; one with fields reads them in `parse` and `from_keys`.
 
     Attributes:
         name: Tells it from the others; its states begin with it.
-        words: What it gives, in the plural, for what a run says that it left out.
+        description: What it gives, in the plural, for what a run says that it left out.
         example: Its parameters as they are written behind its name; empty if it has none.
     """
 
     name: ClassVar[str]
-    words: ClassVar[str]
+    description: ClassVar[str]
     example: ClassVar[str] = ""
 
     @classmethod
-    def parse(cls, words: str) -> Self:
+    def parse(cls, text: str) -> Self:
         """The one with these parameters, which are written as in `example`.
 
         Raises:
             ValueError: Others than it takes.
         """
-        if words:
+        if text:
             raise ValueError(f"{cls.name} takes no parameters; leave out what is behind the colon")
         return cls()
 
     @classmethod
-    def of_keys(cls, keys: AbstractSet[str]) -> Self | None:
+    def from_keys(cls, keys: AbstractSet[str]) -> Self | None:
         """The one that gives those of some numbers that this kind can give; None if there are none."""
         one = cls.parse("")
         return None if keys.isdisjoint(quantity.key for quantity in one.quantities) else one
@@ -99,26 +99,26 @@ class Aggregation(ABC):
     @property
     def quantities(self) -> tuple[Quantity, ...]:
         """What it gives a map, and a number of each region of, whatever it has seen."""
-        empty = {name: state.initial.clone() for name, state in self.states(1).items()}
+        empty = {name: state.initial.clone() for name, state in self.create_states(1).items()}
         nothing = torch.zeros(1, dtype=torch.int64, device="cpu")
-        return tuple(layer.quantity for layer in self.layers(empty, nothing, math.inf))
+        return tuple(layer.quantity for layer in self.compute_layers(empty, nothing, math.inf))
 
     @abstractmethod
-    def states(self, cells: int) -> dict[str, State]:
+    def create_states(self, num_cells: int) -> dict[str, SumState]:
         """The empty sums over so many cells, by name."""
 
     @abstractmethod
-    def update(self, sums: Mapping[str, Tensor], step: BinnedStep) -> None:
+    def update(self, sums: Mapping[str, Tensor], frame: BinnedFrame) -> None:
         """Add a step to the empty sums over its cells, in place."""
 
     @abstractmethod
-    def layers(self, sums: Mapping[str, Tensor], probed_steps: Tensor, max_radius: float) -> list[Layer]:
+    def compute_layers(self, sums: Mapping[str, Tensor], observed_frames: Tensor, max_radius_m: float) -> list[Layer]:
         """What the sums say.
 
         Args:
             sums: The sums.
-            probed_steps: (C,) steps that had a reference point in each cell.
-            max_radius: Saturation of the radius in metres.
+            observed_frames: (C,) steps that had a reference point in each cell.
+            max_radius_m: Saturation of the radius in metres.
 
         Returns:
             Layers of (C,) values, which the metric gives the shape of the grid, or reads as the numbers of C regions;

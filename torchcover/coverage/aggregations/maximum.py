@@ -8,8 +8,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchcover.coverage.aggregations.aggregation import Aggregation, BinnedStep, Layer, State
-from torchcover.coverage.quantity import radius
+from torchcover.coverage.aggregations.aggregation import Aggregation, BinnedFrame, Layer, SumState
+from torchcover.coverage.quantity import make_radius_quantity
 
 
 @dataclass(frozen=True)
@@ -17,16 +17,18 @@ class Maximum(Aggregation):
     """The largest radius of any point of any step."""
 
     name: ClassVar[str] = "maximum"
-    words: ClassVar[str] = "maxima"
+    description: ClassVar[str] = "maxima"
 
-    def states(self, cells: int) -> dict[str, State]:
+    def create_states(self, num_cells: int) -> dict[str, SumState]:
         """`radius` (C,): the largest so far, minus infinity before the first."""
-        return {"radius": State(torch.full((cells,), -math.inf, dtype=torch.float64, device="cpu"), reduction="max")}
+        return {
+            "radius": SumState(torch.full((num_cells,), -math.inf, dtype=torch.float64, device="cpu"), reduction="max")
+        }
 
-    def update(self, sums: Mapping[str, Tensor], step: BinnedStep) -> None:
+    def update(self, sums: Mapping[str, Tensor], frame: BinnedFrame) -> None:
         """Keep what is larger."""
-        sums["radius"].scatter_reduce_(0, step.cell, step.radius, "amax")
+        sums["radius"].scatter_reduce_(0, frame.cell_indices, frame.radius, "amax")
 
-    def layers(self, sums: Mapping[str, Tensor], probed_steps: Tensor, max_radius: float) -> list[Layer]:
+    def compute_layers(self, sums: Mapping[str, Tensor], observed_frames: Tensor, max_radius_m: float) -> list[Layer]:
         """The largest radius."""
-        return [Layer(radius("maximum", "largest"), sums["radius"].where(probed_steps > 0, math.nan))]
+        return [Layer(make_radius_quantity("maximum", "largest"), sums["radius"].where(observed_frames > 0, math.nan))]

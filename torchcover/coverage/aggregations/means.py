@@ -8,8 +8,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchcover.coverage.aggregations.aggregation import Aggregation, BinnedStep, Layer, State
-from torchcover.coverage.quantity import RADIUS, by_area, detection, radius
+from torchcover.coverage.aggregations.aggregation import Aggregation, BinnedFrame, Layer, SumState
+from torchcover.coverage.quantity import RADIUS, make_area_quantity, make_detection_quantity, make_radius_quantity
 from torchcover.estimation import Quantity
 
 
@@ -23,35 +23,35 @@ class MeanOfMeans(Aggregation):
     A step with one point in a cell weighs as much as one with a thousand. Every `CoverageMetric` has it.
 
     Args:
-        thresholds: Detection thresholds in metres.
+        thresholds_m: Detection thresholds in metres.
     """
 
     name: ClassVar[str] = "mean"
-    words: ClassVar[str] = "means of means"
+    description: ClassVar[str] = "means of means"
 
-    thresholds: tuple[float, ...]
+    thresholds_m: tuple[float, ...]
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
         """The radius, then the detection at each threshold."""
-        return (RADIUS, *map(detection, self.thresholds))
+        return (RADIUS, *map(make_detection_quantity, self.thresholds_m))
 
-    def states(self, cells: int) -> dict[str, State]:
+    def create_states(self, num_cells: int) -> dict[str, SumState]:
         """`sums` (Q, C): sums over the steps of the cell's mean of each quantity."""
-        return {"sums": State(torch.zeros(len(self.quantities), cells, dtype=torch.float64, device="cpu"))}
+        return {"sums": SumState(torch.zeros(len(self.quantities), num_cells, dtype=torch.float64, device="cpu"))}
 
-    def update(self, sums: Mapping[str, Tensor], step: BinnedStep) -> None:
+    def update(self, sums: Mapping[str, Tensor], frame: BinnedFrame) -> None:
         """Add the means of a step."""
-        sums["sums"].add_(step.means.mean[: len(self.quantities)])
+        sums["sums"].add_(frame.cell_means.means[: len(self.quantities)])
 
-    def layers(self, sums: Mapping[str, Tensor], probed_steps: Tensor, max_radius: float) -> list[Layer]:
+    def compute_layers(self, sums: Mapping[str, Tensor], observed_frames: Tensor, max_radius_m: float) -> list[Layer]:
         """The radius, then the detection at each threshold."""
-        steps = probed_steps.double().where(probed_steps > 0, math.nan)
+        steps = observed_frames.double().where(observed_frames > 0, math.nan)
         return list(map(Layer, self.quantities, sums["sums"] / steps))
 
 
 @dataclass(frozen=True)
-class VisibleArea(Aggregation):
+class AreaAverage(Aggregation):
     """Means over the surface that the reference sees, from points whose weights w are square metres.
 
         radius[cell]    = sum of w r(q) / sum of w,    over all points q of all steps
@@ -60,32 +60,32 @@ class VisibleArea(Aggregation):
     Sums over cells and steps are as good: the mean over a region is the ratio of its sums. A `CoverageMetric` with
     `square_metres=True` has it.
 
-    `thresholds`: detection thresholds in metres.
+    `thresholds_m`: detection thresholds in metres.
     """
 
     name: ClassVar[str] = "area"
-    words: ClassVar[str] = "means over the visible surface"
+    description: ClassVar[str] = "means over the visible surface"
 
-    thresholds: tuple[float, ...]
+    thresholds_m: tuple[float, ...]
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
         """The radius, then the detection at each threshold."""
-        return tuple(map(by_area, (RADIUS, *map(detection, self.thresholds))))
+        return tuple(map(make_area_quantity, (RADIUS, *map(make_detection_quantity, self.thresholds_m))))
 
-    def states(self, cells: int) -> dict[str, State]:
+    def create_states(self, num_cells: int) -> dict[str, SumState]:
         """`m2` (C,): square metres; `sums` (Q, C): each quantity times them."""
         return {
-            "m2": State(torch.zeros(cells, dtype=torch.float64, device="cpu")),
-            "sums": State(torch.zeros(len(self.thresholds) + 1, cells, dtype=torch.float64, device="cpu")),
+            "m2": SumState(torch.zeros(num_cells, dtype=torch.float64, device="cpu")),
+            "sums": SumState(torch.zeros(len(self.thresholds_m) + 1, num_cells, dtype=torch.float64, device="cpu")),
         }
 
-    def update(self, sums: Mapping[str, Tensor], step: BinnedStep) -> None:
+    def update(self, sums: Mapping[str, Tensor], frame: BinnedFrame) -> None:
         """Add the points of a step."""
-        sums["m2"].add_(step.means.weight)
-        sums["sums"].add_(step.means.mean[: len(self.quantities)] * step.means.weight)
+        sums["m2"].add_(frame.cell_means.weight_sums)
+        sums["sums"].add_(frame.cell_means.means[: len(self.quantities)] * frame.cell_means.weight_sums)
 
-    def layers(self, sums: Mapping[str, Tensor], probed_steps: Tensor, max_radius: float) -> list[Layer]:
+    def compute_layers(self, sums: Mapping[str, Tensor], observed_frames: Tensor, max_radius_m: float) -> list[Layer]:
         """The radius, then the detection at each threshold; 0 / 0, which is NaN, where nothing was seen."""
         return list(map(Layer, self.quantities, sums["sums"] / sums["m2"]))
 
@@ -100,18 +100,18 @@ class PooledMean(Aggregation):
     """
 
     name: ClassVar[str] = "pooled"
-    words: ClassVar[str] = "pooled means"
+    description: ClassVar[str] = "pooled means"
 
-    def states(self, cells: int) -> dict[str, State]:
+    def create_states(self, num_cells: int) -> dict[str, SumState]:
         """`sum` (C,) of weighted radii and `weight` (C,) of the points."""
-        return {name: State(torch.zeros(cells, dtype=torch.float64, device="cpu")) for name in ("sum", "weight")}
+        return {name: SumState(torch.zeros(num_cells, dtype=torch.float64, device="cpu")) for name in ("sum", "weight")}
 
-    def update(self, sums: Mapping[str, Tensor], step: BinnedStep) -> None:
+    def update(self, sums: Mapping[str, Tensor], frame: BinnedFrame) -> None:
         """Add the points of a step."""
-        sums["sum"].add_(step.means.mean[0] * step.means.weight)
-        sums["weight"].add_(step.means.weight)
+        sums["sum"].add_(frame.cell_means.means[0] * frame.cell_means.weight_sums)
+        sums["weight"].add_(frame.cell_means.weight_sums)
 
-    def layers(self, sums: Mapping[str, Tensor], probed_steps: Tensor, max_radius: float) -> list[Layer]:
+    def compute_layers(self, sums: Mapping[str, Tensor], observed_frames: Tensor, max_radius_m: float) -> list[Layer]:
         """The pooled mean radius."""
-        weight = sums["weight"].where(probed_steps > 0, math.nan)
-        return [Layer(radius("pooled", "pooled mean"), sums["sum"] / weight)]
+        weight = sums["weight"].where(observed_frames > 0, math.nan)
+        return [Layer(make_radius_quantity("pooled", "pooled mean"), sums["sum"] / weight)]

@@ -10,8 +10,8 @@ from typing import ClassVar, Self
 import torch
 from torch import Tensor
 
-from torchcover.coverage.aggregations.aggregation import Aggregation, BinnedStep, Layer, State
-from torchcover.coverage.quantity import radius
+from torchcover.coverage.aggregations.aggregation import Aggregation, BinnedFrame, Layer, SumState
+from torchcover.coverage.quantity import make_radius_quantity
 from torchcover.estimation import Quantity
 
 # A sum of weights that misses its target by rounding has reached it: 0.1 + 0.2 + 0.3 is half of 1.2.
@@ -22,13 +22,13 @@ RADIUS_EDGES_M = torch.cat(
 ).double()
 
 
-def bin_of(values: Tensor, edges: Tensor) -> Tensor:
+def find_bins(values: Tensor, edges: Tensor) -> Tensor:
     """(N,) int64 which half-open bin [edges[i], edges[i + 1]) each value is in, -1 outside; of equal edges none is."""
     index = torch.bucketize(values, edges.to(values.device), right=True) - 1
     return index.where(index < len(edges) - 1, -1)
 
 
-def histogram_quantiles(histogram: Tensor, edges: Tensor, levels: Sequence[float]) -> Tensor:
+def compute_histogram_quantiles(histogram: Tensor, edges: Tensor, levels: Sequence[float]) -> Tensor:
     """(Q, C) quantiles from (B, C) weights in bins between (B + 1,) ascending edges, linear within a bin.
 
     The last edge may be infinite, and then are the quantiles in that bin; NaN in a column without weight.
@@ -59,13 +59,13 @@ def check_levels(levels: Sequence[float]) -> tuple[float, ...]:
 
 
 @dataclass(frozen=True)
-class AtLevels(Aggregation):
+class QuantileAggregation(Aggregation):
     """Quantiles at some levels, from a `histogram` (bins, C)."""
 
     example: ClassVar[str] = "0.5,0.9"
     # Of the keys and titles: what stands before a level, and behind it.
-    before: ClassVar[str]
-    behind: ClassVar[str]
+    key_prefix: ClassVar[str]
+    title_prefix: ClassVar[str]
 
     levels: tuple[float, ...]
 
@@ -73,33 +73,36 @@ class AtLevels(Aggregation):
         object.__setattr__(self, "levels", check_levels(self.levels))
 
     @classmethod
-    def parse(cls, words: str) -> Self:
+    def parse(cls, text: str) -> Self:
         """That at levels with commas between them."""
         try:
-            return cls(tuple(map(float, words.split(","))))
+            return cls(tuple(map(float, text.split(","))))
         except ValueError as error:
             raise ValueError(f"levels are needed, as in {cls.name}:{cls.example} ({error})") from error
 
     @classmethod
-    def of_keys(cls, keys: AbstractSet[str]) -> Self | None:
+    def from_keys(cls, keys: AbstractSet[str]) -> Self | None:
         """That at the levels of the keys."""
-        found = (re.fullmatch(rf"radius_{cls.before}(0(?:\.\d+)?|1)_m", key) for key in keys)
+        found = (re.fullmatch(rf"radius_{cls.key_prefix}(0(?:\.\d+)?|1)_m", key) for key in keys)
         levels = sorted({float(each[1]) for each in found if each})
         return cls(tuple(levels)) if levels else None
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
         """One for each level."""
-        return tuple(radius(f"{self.before}{level:g}", f"{level:g} {self.behind}") for level in self.levels)
+        return tuple(
+            make_radius_quantity(f"{self.key_prefix}{level:g}", f"{level:g} {self.title_prefix}")
+            for level in self.levels
+        )
 
-    def layers(self, sums: Mapping[str, Tensor], probed_steps: Tensor, max_radius: float) -> list[Layer]:
+    def compute_layers(self, sums: Mapping[str, Tensor], observed_frames: Tensor, max_radius_m: float) -> list[Layer]:
         """A map for each level."""
-        values = histogram_quantiles(sums["histogram"], RADIUS_EDGES_M, self.levels).clamp(max=max_radius)
+        values = compute_histogram_quantiles(sums["histogram"], RADIUS_EDGES_M, self.levels).clamp(max=max_radius_m)
         return list(map(Layer, self.quantities, values))
 
 
 @dataclass(frozen=True)
-class Quantiles(AtLevels):
+class Quantiles(QuantileAggregation):
     """Quantiles of r over the points of a cell, steps weighing the same, from a histogram whose size is fixed.
 
     The histogram has 20 bins a decade from 1 cm to 100 m. The error is at most a bin: 12 % of the value, or 1 cm; a
@@ -117,24 +120,29 @@ class Quantiles(AtLevels):
     """
 
     name: ClassVar[str] = "quantiles"
-    words: ClassVar[str] = "quantiles"
-    before: ClassVar[str] = "q"
-    behind: ClassVar[str] = "quantile of the"
+    description: ClassVar[str] = "quantiles"
+    key_prefix: ClassVar[str] = "q"
+    title_prefix: ClassVar[str] = "quantile of the"
 
-    def states(self, cells: int) -> dict[str, State]:
+    def create_states(self, num_cells: int) -> dict[str, SumState]:
         """`histogram` (bins, C): for each step that has probed the cell, shares that add up to 1."""
-        return {"histogram": State(torch.zeros(len(RADIUS_EDGES_M) - 1, cells, dtype=torch.float64, device="cpu"))}
+        return {
+            "histogram": SumState(torch.zeros(len(RADIUS_EDGES_M) - 1, num_cells, dtype=torch.float64, device="cpu"))
+        }
 
-    def update(self, sums: Mapping[str, Tensor], step: BinnedStep) -> None:
+    def update(self, sums: Mapping[str, Tensor], frame: BinnedFrame) -> None:
         """Add the points of a step, each with its share of its cell."""
-        share = torch.ones_like(step.radius) if step.weight is None else step.weight.double()
-        share = share / step.means.weight[step.cell]
-        bin_and_cell = bin_of(step.radius.clamp(max=1e300), RADIUS_EDGES_M) * len(step.means.cell) + step.cell
+        share = torch.ones_like(frame.radius) if frame.weights is None else frame.weights.double()
+        share = share / frame.cell_means.weight_sums[frame.cell_indices]
+        bin_and_cell = (
+            find_bins(frame.radius.clamp(max=1e300), RADIUS_EDGES_M) * len(frame.cell_means.cell_indices)
+            + frame.cell_indices
+        )
         sums["histogram"].view(-1).index_add_(0, bin_and_cell, share)
 
 
 @dataclass(frozen=True)
-class StepQuantiles(AtLevels):
+class FrameQuantiles(QuantileAggregation):
     """Quantiles over the steps that have probed a cell of the mean radius of its points in the step.
 
     Where `Quantiles` asks for the bad points of a cell, this asks for its bad moments: at level 0.9, one step in ten
@@ -148,15 +156,15 @@ class StepQuantiles(AtLevels):
     """
 
     name: ClassVar[str] = "step_quantiles"
-    words: ClassVar[str] = "quantiles over steps"
-    before: ClassVar[str] = "step_q"
-    behind: ClassVar[str] = "quantile over steps of the mean"
+    description: ClassVar[str] = "quantiles over steps"
+    key_prefix: ClassVar[str] = "step_q"
+    title_prefix: ClassVar[str] = "quantile over steps of the mean"
 
-    def states(self, cells: int) -> dict[str, State]:
+    def create_states(self, num_cells: int) -> dict[str, SumState]:
         """`histogram` (bins, C): in how many steps the mean radius of the cell fell into each bin."""
-        return {"histogram": State(torch.zeros(len(RADIUS_EDGES_M) - 1, cells, dtype=torch.int64, device="cpu"))}
+        return {"histogram": SumState(torch.zeros(len(RADIUS_EDGES_M) - 1, num_cells, dtype=torch.int64, device="cpu"))}
 
-    def update(self, sums: Mapping[str, Tensor], step: BinnedStep) -> None:
+    def update(self, sums: Mapping[str, Tensor], frame: BinnedFrame) -> None:
         """Count the step in every cell that it has probed."""
-        bins = bin_of(step.means.mean[0].clamp(max=1e300), RADIUS_EDGES_M)
+        bins = find_bins(frame.cell_means.means[0].clamp(max=1e300), RADIUS_EDGES_M)
         sums["histogram"].scatter_(0, bins[None], 1)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from torchcover.files import reads
+from torchcover.files import guard_reader
 from torchcover.recordings.clouds.arrays import Points, read_float32_cloud, read_npy_cloud, read_npz_cloud
 from torchcover.recordings.clouds.las import read_las
 from torchcover.recordings.clouds.pcd import read_pcd
@@ -43,7 +43,7 @@ def split_name(name: str, suffixes: Collection[str] | None = None) -> tuple[str,
     return name, ""
 
 
-@reads("a point cloud")
+@guard_reader("a point cloud")
 def read_cloud(path: Path) -> Points:
     """Read a point cloud; the suffix says how.
 

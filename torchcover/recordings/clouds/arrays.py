@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.files import NpyHeader, check_memory, npz_headers, read_npy, read_npz, reads
-from torchcover.geometry.rigid import blocks
+from torchcover.files import NpyHeader, check_memory, guard_reader, read_npy, read_npz, read_npz_headers
+from torchcover.geometry.rigid import iterate_blocks
 
 # Beyond, float32 does not resolve a centimetre; no sensor reaches as far.
 MAX_COORDINATE_M = 1e5
@@ -103,7 +103,7 @@ def _complaint(points: NDArray[np.float32]) -> str | None:
 def _plainly_coordinates(records: NDArray[np.float32]) -> bool:
     """Whether there is nothing to complain of; in a fraction of the time, for numbers are looked at side by side."""
     diagonal = 0
-    for rows in blocks(len(records)):
+    for rows in iterate_blocks(len(records)):
         part = records[rows]
         if not (part.max() <= MAX_COORDINATE_M and part.min() >= -MAX_COORDINATE_M):
             return False  # NaN is neither
@@ -170,7 +170,7 @@ def read_float32_cloud(path: Path, num_columns: int) -> Points:
     return check_records(path.read_bytes(), num_columns)[:, :3]
 
 
-@reads("a point cloud with rings")
+@guard_reader("a point cloud with rings")
 def read_cloud_with_rings(path: Path) -> tuple[Points, NDArray[np.int64]]:
     """(N, 3) points and (N,) rings of rows x y z intensity ring, as those of nuScenes."""
     check_memory(2 * path.stat().st_size)
@@ -189,7 +189,7 @@ def read_npz_cloud(path: Path) -> Points:
     return _coordinates(points)
 
 
-@reads("a point cloud with weights")
+@guard_reader("a point cloud with weights")
 def read_cloud_with_weights(path: Path) -> tuple[Points, NDArray[np.float64]]:
     """Read a cloud and what each of its points counts for: the arrays `points` and `weights` of a `.npz`.
 
@@ -208,14 +208,14 @@ def read_cloud_with_weights(path: Path) -> tuple[Points, NDArray[np.float64]]:
     return _coordinates(points), weights.astype(np.float64)
 
 
-@reads("a point cloud with heights")
+@guard_reader("a point cloud with heights")
 def read_heights(path: Path, num_points: int) -> NDArray[np.float32] | None:
     """Read how high above the local ground the points of a cloud are: the array `heights_m` of a `.npz`.
 
     Returns (N,) metres, NaN where there is no ground at or below; None if the file does not say. BadFileError: another
     number of them, or infinite ones.
     """
-    if path.suffix.lower() != ".npz" or "heights_m" not in npz_headers(path):
+    if path.suffix.lower() != ".npz" or "heights_m" not in read_npz_headers(path):
         return None
     (heights_m,) = read_npz(path, partial(_check_values, "heights_m"), partial(_only, "heights_m")).values()
     if len(heights_m) != num_points:
@@ -244,7 +244,7 @@ def _choose(path: Path, names: Collection[str]) -> Collection[str]:
         return ("points",)
     if len(names) == 1:
         return names
-    fit = [name for name, (shape, dtype) in npz_headers(path).items() if shape[1:] == (3,) and _is_float(dtype)]
+    fit = [name for name, (shape, dtype) in read_npz_headers(path).items() if shape[1:] == (3,) and _is_float(dtype)]
     if len(fit) != 1:
         raise ValueError(
             f"an array called points, a single array, or a single one of shape (N, 3) is needed; got {len(names)} "

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from torchcover.cameras.calibration import Calibration
 from torchcover.detection.boxes import Boxes
-from torchcover.files import naming, road_user_classes
-from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_quaternion
+from torchcover.files import load_road_user_classes, report_bad_file
+from torchcover.geometry import BoundingBox, build_transform, convert_quaternion_to_rotation, invert
 from torchcover.geometry.rigid import Matrix
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings.isolated_readers import read_feather
@@ -29,7 +29,7 @@ from torchcover.recordings.recording import RecordingBase, Scan, SensorCalibrati
 
 # The ego frame lies in the rear axle, 0.30 m above the ground; the centre of a Ford Fusion is 1.339 m before it, as in
 # the rig `argoverse2`, where the source is.
-vehicle_T_ego = rigid(np.eye(3), [-1.339, 0.0, 0.30])
+vehicle_T_ego = build_transform(np.eye(3), [-1.339, 0.0, 0.30])
 # As in the body `ford_fusion`, where its source is.
 SIZE_M = (4.869, 1.852, 1.476)
 POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
@@ -83,7 +83,7 @@ class Argoverse2(RecordingBase):
     @property
     def vehicle_classes(self) -> Mapping[str, str]:
         """By the words of the data set."""
-        return road_user_classes()["argoverse2"]
+        return load_road_user_classes()["argoverse2"]
 
     @classmethod
     def can_read(cls, path: Path) -> bool:
@@ -124,7 +124,7 @@ class Argoverse2(RecordingBase):
         folder = self.path / "calibration"
         poses = read_feather(folder / "egovehicle_SE3_sensor.feather", ("sensor_name", *POSE))
         lenses = read_feather(folder / "intrinsics.feather", ("sensor_name", *_LENS))
-        with naming(folder, "calibrations of Argoverse 2"):
+        with report_bad_file(folder, "calibrations of Argoverse 2"):
             ego_T = {str(name): pose for name, pose in zip(poses["sensor_name"], build_poses(poses), strict=True)}
             missing = ({*LASERS} | {str(name) for name in lenses["sensor_name"]}) - ego_T.keys()
             if missing:
@@ -168,13 +168,13 @@ def read_objects(path: Path) -> RecordedObjects:
     """
     annotations = next(path / name for name in ANNOTATIONS if (path / name).exists())
     cuboids, poses = read_feather(annotations, CUBOIDS), read_feather(path / POSES, ("timestamp_ns", *POSE))
-    with naming(path / POSES, "poses of Argoverse 2"):
+    with report_bad_file(path / POSES, "poses of Argoverse 2"):
         origin_ns = int(poses["timestamp_ns"].min())
         ego_s = _seconds(poses, origin_ns)
         order = np.argsort(ego_s, kind="stable")
         world_T_driven = build_poses(poses)[order]
         drive = Trajectory.from_poses(ego_s[order], world_T_driven)
-    with naming(annotations, "cuboids of Argoverse 2"):
+    with report_bad_file(annotations, "cuboids of Argoverse 2"):
         times_s = _seconds(cuboids, origin_ns)
         if (
             times_s.min() < drive.times_s[0] - MAX_ANNOTATION_GAP_S
@@ -184,8 +184,8 @@ def read_objects(path: Path) -> RecordedObjects:
                 f"its times lie {times_s.min():g} to {times_s.max():g} s after the first pose of {POSES}, and the last "
                 f"pose is at {drive.times_s[-1]:g} s: are both of one log?"
             )
-        world_T_ego = {time_s: drive.at(time_s) for time_s in np.unique(times_s).tolist()}
-        classes = road_user_classes()["argoverse2"]
+        world_T_ego = {time_s: drive.interpolate(time_s) for time_s in np.unique(times_s).tolist()}
+        classes = load_road_user_classes()["argoverse2"]
         tracks = tuple(
             build_track(seen, classes.get(seen[0].category), np.stack([world_T_ego[one.time_s] for one in seen]))
             for seen in group_by_name(_seen(cuboids, origin_ns)).values()
@@ -212,7 +212,7 @@ def build_poses(columns: Mapping[str, NDArray[Any]]) -> Matrix:
     """(N, 4, 4) of the rows of a table with the columns `POSE`."""
     rotations = np.column_stack([columns[name] for name in POSE[:4]])
     places = np.column_stack([columns[name] for name in POSE[4:]])
-    return rigid(rotation_from_quaternion(rotations), places)
+    return build_transform(convert_quaternion_to_rotation(rotations), places)
 
 
 _PINHOLE: dict[str, Any] = {"model": "pinhole", "coefficients": ()}

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.files import naming, parse_yaml, read_short_text, reads
+from torchcover.files import guard_reader, parse_yaml, read_short_text, report_bad_file
 from torchcover.recordings.clouds.arrays import Points
 from torchcover.recordings.isolated_readers import (
     METADATA,
@@ -56,7 +56,7 @@ class Bag:
             check_suffix(path)
         for database in path.glob(f"*{SUFFIXES['sqlite3']}") if path.is_dir() else [path]:
             check_journal(database)
-        with naming(path, "a bag"):
+        with report_bad_file(path, "a bag"):
             index = read_bag_index(path)
         topics, types = index["topics"].tolist(), index["types"].tolist()
         times_ns = np.split(index["times_ns"], np.cumsum(index["counts"]))
@@ -83,7 +83,7 @@ class Bag:
         return self._read_stamps(topic, None)
 
     def _read_stamps(self, topic: str, times_ns: NDArray[np.int64] | None) -> NDArray[np.int64]:
-        with naming(self.path, f"a bag, in {topic}"):
+        with report_bad_file(self.path, f"a bag, in {topic}"):
             wanted = None if times_ns is None else times_ns.tolist()
             stamps_ns = read_header_stamps(self.path, topic, wanted)["stamps_ns"]
             recorded = len(self.get_log_times_ns(topic) if times_ns is None else times_ns)
@@ -101,7 +101,7 @@ class Bag:
 
     def read_messages(self, topic: str, start_ns: int | None = None, stop_ns: int | None = None) -> list[Any]:
         """The messages of a topic that were recorded from a time on, until before another."""
-        with naming(self.path, f"a bag, in {topic}"), np.errstate(all="ignore"):
+        with report_bad_file(self.path, f"a bag, in {topic}"), np.errstate(all="ignore"):
             data, ends, types = read_bag_messages(self.path, topic, start_ns, stop_ns).values()
             deserialize = _deserializer(is_ros1=self._is_ros1)
             starts = [0, *ends.tolist()]
@@ -114,7 +114,7 @@ class Bag:
         """The message of a topic that was recorded at a time."""
         found = self.read_messages(topic, time_ns, time_ns + 1)
         if not found:
-            with naming(self.path, "a bag"):
+            with report_bad_file(self.path, "a bag"):
                 raise ValueError(
                     f"{topic}: the message at {time_ns} is in the index only; {find_repair_command(self.path)}"
                 )
@@ -133,7 +133,7 @@ def _deserializer(*, is_ros1: bool) -> Callable[[memoryview, str], Any]:
     return deserialize
 
 
-@reads("a bag")
+@guard_reader("a bag")
 def check_suffix(path: Path) -> None:
     """Whether a file is called as bags are."""
     if path.suffix not in SUFFIXES.values():
@@ -141,7 +141,7 @@ def check_suffix(path: Path) -> None:
         raise ValueError(f"a folder with {METADATA}, or a file of {suffixes} is needed")
 
 
-@reads("a bag")
+@guard_reader("a bag")
 def check_journal(path: Path) -> None:
     """Refuse a database with changes in a file beside it, where its recorder was killed or still runs."""
     for ending in ("-wal", "-journal"):
@@ -153,7 +153,7 @@ def check_journal(path: Path) -> None:
             )
 
 
-@reads("the metadata of a bag")
+@guard_reader("the metadata of a bag")
 def check_metadata(path: Path) -> None:
     """Whether the files that `metadata.yaml` names can be read one message at a time.
 

@@ -13,9 +13,9 @@ from pydantic import AliasChoices, BaseModel, ConfigDict, Field, TypeAdapter, Va
 
 from torchcover.cameras import Camera, read_depth
 from torchcover.cameras.calibration import LOOKING_FORWARD
-from torchcover.detection.boxes import Boxes, upright_rows
-from torchcover.files import naming, parse_yaml, read_csv, read_short_text, reads
-from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_euler, transform
+from torchcover.detection.boxes import Boxes, build_upright_rows
+from torchcover.files import guard_reader, parse_yaml, read_csv, read_short_text, report_bad_file
+from torchcover.geometry import BoundingBox, build_transform, convert_euler_to_rotation, invert, transform_points
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.clouds import read_cloud
 from torchcover.recordings.formats.frame_files import check_same_names, find_frame_files, find_frame_rows
@@ -103,7 +103,7 @@ class CarlaVehicle(BaseModel):
     @property
     def vehicle_T_actor(self) -> Matrix:
         """(4, 4) the actor's frame in the vehicle frame, whose origin is under the centre of the box."""
-        return rigid(np.eye(3), [-self.location.x, self.location.y, 0.0])
+        return build_transform(np.eye(3), [-self.location.x, self.location.y, 0.0])
 
     @property
     def ego_box(self) -> BoundingBox:
@@ -113,7 +113,7 @@ class CarlaVehicle(BaseModel):
         return BoundingBox((-half.x, -half.y, low_m), (half.x, half.y, z + half.z))
 
 
-@reads("a list of CARLA's sensors")
+@guard_reader("a list of CARLA's sensors")
 def read_carla_sensors(path: Path) -> list[CarlaSensor]:
     """Read the LiDARs and depth cameras of a list of sensors; JSON is YAML, too."""
     try:
@@ -130,7 +130,7 @@ def read_carla_sensors(path: Path) -> list[CarlaSensor]:
     return found
 
 
-@reads("the bounding box of a vehicle of CARLA")
+@guard_reader("the bounding box of a vehicle of CARLA")
 def read_carla_vehicle(path: Path) -> CarlaVehicle:
     """Read `{"location": {"x": ..., "y": ..., "z": ...}, "extent": {...}}`."""
     try:
@@ -150,23 +150,23 @@ def read_carla_boxes(path: Path, vehicle_T_world: Matrix) -> Boxes:
     """
     table = read_csv(path, (*POSE, *EXTENT), ("id", "category"), VELOCITY)
     has_size = np.all([table.numbers[name] > 0 for name in EXTENT], axis=0)
-    words = {name: [word for word, has in zip(of, has_size, strict=True) if has] for name, of in table.words.items()}
+    words = {name: [word for word, has in zip(of, has_size, strict=True) if has] for name, of in table.texts.items()}
     numbers, count = {name: of[has_size] for name, of in table.numbers.items()}, int(has_size.sum())
     if count < len(has_size):
         empty = int(np.argmin(has_size))
         extent = ", ".join(f"{name} {table.numbers[name][empty]:g}" for name in EXTENT)
         warnings.warn(
             f"{path.parent}: boxes of objects without a size are left out: {len(has_size) - count} of {len(has_size)} "
-            f"in one frame, such as {table.words['id'][empty]} ({table.words['category'][empty]}): {extent}",
+            f"in one frame, such as {table.texts['id'][empty]} ({table.texts['category'][empty]}): {extent}",
             stacklevel=2,
         )
     poses = to_right_handed([numbers[name] for name in POSE])
     size_m = 2 * np.column_stack([numbers[name] for name in EXTENT])
     over_ground = np.column_stack([numbers.get(name, np.full(count, np.nan)) for name in VELOCITY]) * [1.0, -1.0]
     velocity_mps = over_ground @ vehicle_T_world[:2, :2].T
-    with naming(path, "a table of boxes"):
+    with report_bad_file(path, "a table of boxes"):
         return Boxes.from_rows(
-            upright_rows(poses[:, :3, 3], size_m, poses[:, :3, 0], vehicle_T_world),
+            build_upright_rows(poses[:, :3, 3], size_m, poses[:, :3, 0], vehicle_T_world),
             velocity_mps=torch.from_numpy(velocity_mps).float(),
             ids=tuple(words["id"]),
             categories=tuple(words["category"]),
@@ -176,7 +176,7 @@ def read_carla_boxes(path: Path, vehicle_T_world: Matrix) -> Boxes:
 def to_right_handed(pose: list[float] | list[NDArray[np.float64]]) -> Matrix:
     """(..., 4, 4) of x, y, z, roll, pitch, yaw in CARLA's axes: y and yaw to the right, pitch up."""
     x, y, z, roll, pitch, yaw = map(np.asarray, pose)
-    return rigid(rotation_from_euler(-yaw, -pitch, roll), np.stack([x, -y, z], axis=-1))
+    return build_transform(convert_euler_to_rotation(-yaw, -pitch, roll), np.stack([x, -y, z], axis=-1))
 
 
 def _complaints(error: ValidationError) -> str:
@@ -267,10 +267,10 @@ class Carla(RecordingBase):
         cloud_m, vehicle_T_sensor, source = self._read(sensor, last)
         if self._parts[sensor] == 1:
             return Scan(cloud_m, vehicle_T_sensor, source)
-        parts = [transform(vehicle_T_sensor, cloud_m)]
+        parts = [transform_points(vehicle_T_sensor, cloud_m)]
         for tick in range(last - self._parts[sensor] + 1, last):
             cloud_m, vehicle_T_sensor, _ = self._read(sensor, tick)
-            parts.append(self._moved(transform(vehicle_T_sensor, cloud_m), tick, last))
+            parts.append(self._moved(transform_points(vehicle_T_sensor, cloud_m), tick, last))
         return Scan(np.concatenate(parts), None, source)
 
     def get_world_T_vehicle(self, index: int) -> Matrix | None:
@@ -291,7 +291,7 @@ class Carla(RecordingBase):
         if sensor in self._moving:
             mount = self._vehicle_T_actor @ self._moving[sensor][tick]
         if sensor in self._cameras:
-            with naming(path, "a depth image"):
+            with report_bad_file(path, "a depth image"):
                 points = self._cameras[sensor].unproject(read_depth(path))
             return points.numpy(), mount @ LOOKING_FORWARD, str(path)  # type: ignore[union-attr]  # one image
         points_m = read_cloud(path)
@@ -303,7 +303,7 @@ class Carla(RecordingBase):
         before, after = self._pose(tick), self._pose(last)
         assert before is not None  # without times there are no parts
         assert after is not None
-        moved_m = transform(invert(after) @ before, points_m)
+        moved_m = transform_points(invert(after) @ before, points_m)
         if self.ego_box is None:
             return moved_m
         own = ((points_m > self.ego_box.lower_m) & (points_m < self.ego_box.upper_m)).all(axis=1, keepdims=True)
@@ -333,8 +333,8 @@ class Carla(RecordingBase):
     def _table(self, path: Path, timed: tuple[str, ...]) -> tuple[NDArray[np.float64], Matrix]:
         """(F,) times, or nothing, and (F, 4, 4) poses of the frames of a table."""
         table = read_csv(path, (*timed, *POSE), ("frame",))
-        with naming(path, "a table of poses"):
-            order = find_frame_rows(table.words["frame"], self._ticks)
+        with report_bad_file(path, "a table of poses"):
+            order = find_frame_rows(table.texts["frame"], self._ticks)
         poses = to_right_handed([table.numbers[name][order] for name in POSE])
         return (table.numbers["time_s"][order] if timed else np.empty(0)), poses
 

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, NamedTuple
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from torchcover.detection.boxes import Boxes
-from torchcover.files import parse_yaml, read_short_text, reads
+from torchcover.files import guard_reader, parse_yaml, read_short_text
 from torchcover.geometry import BoundingBox
 from torchcover.geometry.rigid import Matrix, check_rigid
 from torchcover.recordings.clouds import read_cloud
@@ -68,11 +68,11 @@ class CloudSettings(NamedTuple):
 class FolderSettings(NamedTuple):
     """What the file says, by `sensor`, `sensors/NAME`, `rigs/NAME` or `reference`, where it does.
 
-    With `square_metres` the reference's files have weights; `ego_box` is the vehicle itself, None if unknown.
+    With `has_area_weights` the reference's files have weights; `ego_box` is the vehicle itself, None if unknown.
     """
 
     cloud_settings: dict[str, CloudSettings]
-    square_metres: bool = False
+    has_area_weights: bool = False
     ego_box: BoundingBox | None = None
 
 
@@ -81,7 +81,7 @@ def read_folder_settings(path: Path) -> FolderSettings:
     return _read(path) if path.exists() else FolderSettings({})
 
 
-@reads("a file of poses")
+@guard_reader("a file of poses")
 def _read(path: Path) -> FolderSettings:
     content = parse_yaml(read_short_text(path))
     if not isinstance(content, dict):
@@ -144,7 +144,7 @@ class FolderRecording(RecordingBase):
             flip_y: true               # the cloud has y to the right, as CARLA's: turned before anything else
             min_range_m: 0.5           # nearer to the sensor is no return
           reference:
-            square_metres: true        # its files are .npz with points and weights
+            has_area_weights: true        # its files are .npz with points and weights
           vehicle:                     # what lies in it is the vehicle itself
             lower_m: [-2.4, -0.9, 0.05]
             upper_m: [2.4, 0.9, 1.6]
@@ -178,7 +178,7 @@ class FolderRecording(RecordingBase):
         self._files = files
         self.frame_names = tuple(next(iter(files.values())))
         self._settings = read_folder_settings(self.path / SETTINGS_FILE)
-        self.ego_box, self.square_metres = self._settings.ego_box, self._settings.square_metres
+        self.ego_box, self.has_area_weights = self._settings.ego_box, self._settings.has_area_weights
         self._poses = self._table(self.path, timed=True)
         self.block_indices = None if self._poses is None else self._poses.block_indices
         times_s = None if self._poses is None else self._poses.times_s
@@ -202,7 +202,7 @@ class FolderRecording(RecordingBase):
         place = self._places[sensor]
         path = self._files[place][self.frame_names[index]]
         weights = None
-        if sensor == REFERENCE and self.square_metres:
+        if sensor == REFERENCE and self.has_area_weights:
             points_m, weights = read_cloud_with_weights(path)
         else:
             points_m = read_cloud(path)

@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 
 from torchcover.detection.boxes import Boxes
-from torchcover.files import csv_text, naming, read_csv
-from torchcover.geometry import rigid, rotation_from_quaternion
+from torchcover.files import format_csv, read_csv, report_bad_file
+from torchcover.geometry import build_transform, convert_quaternion_to_rotation
 from torchcover.geometry.rigid import RIGID_TOLERANCE, Matrix
 from torchcover.recordings.clouds import READERS, split_name
 
@@ -112,8 +112,8 @@ class PoseTable:
     def __init__(self, path: Path, frame_names: Sequence[str], *, has_times: bool) -> None:
         optional = ("instant",) if has_times else ()
         table = read_csv(path, (*("time_s",) * has_times, *PLACE, *ROTATION), ("frame",), optional)
-        with naming(path, "a table of poses"):
-            order = find_frame_rows(table.words["frame"], frame_names)
+        with report_bad_file(path, "a table of poses"):
+            order = find_frame_rows(table.texts["frame"], frame_names)
             columns = {name: values[order] for name, values in table.numbers.items()}
             self._place_m = np.column_stack([columns[name] for name in PLACE])
             self._wxyz = np.column_stack([columns[name] for name in ROTATION])
@@ -123,7 +123,7 @@ class PoseTable:
 
     def __getitem__(self, index: int) -> Matrix:
         """(4, 4) the pose of a frame."""
-        return rigid(rotation_from_quaternion(self._wxyz[index]), self._place_m[index])
+        return build_transform(convert_quaternion_to_rotation(self._wxyz[index]), self._place_m[index])
 
     def _check_norms(self, names: Sequence[str]) -> None:
         norms = np.linalg.norm(self._wxyz, axis=1)
@@ -143,12 +143,12 @@ def read_boxes(path: Path) -> Boxes:
     the vehicle's x and y, and `drawn_points` and `bottom_height_m`, see `Boxes`.
     """
     table = read_csv(path, BOX, NAMES, (*VELOCITY, DRAWN, BOTTOM))
-    numbers, ids = table.numbers, table.words["id"]
-    with naming(path, "a table of boxes"):
+    numbers, ids = table.numbers, table.texts["id"]
+    with report_bad_file(path, "a table of boxes"):
         doubled = [name for name, count in Counter(ids).items() if name and count > 1]
         if doubled:
             raise ValueError(f"id: every object has its own; {format_names(doubled)}: there twice")
-        known: dict[str, object] = {"ids": tuple(ids), "categories": tuple(table.words["category"])}
+        known: dict[str, object] = {"ids": tuple(ids), "categories": tuple(table.texts["category"])}
         if set(VELOCITY) & numbers.keys():
             unknown = np.full(len(ids), np.nan)
             velocity_mps = np.column_stack([numbers.get(name, unknown) for name in VELOCITY])
@@ -167,8 +167,8 @@ def write_boxes(path: Path, boxes: Boxes) -> None:
         columns |= dict(zip(VELOCITY, boxes.velocity_mps.T.tolist(), strict=True))
     if boxes.bottom_heights_m.isfinite().all():
         columns[BOTTOM] = boxes.bottom_heights_m.tolist()
-    columns |= {DRAWN: boxes.drawn_points.tolist(), "id": boxes.ids, "category": boxes.categories}
-    path.write_text(csv_text([list(columns), *zip(*columns.values(), strict=True)]), encoding="utf-8")
+    columns |= {DRAWN: boxes.sampled_points.tolist(), "id": boxes.ids, "category": boxes.categories}
+    path.write_text(format_csv([list(columns), *zip(*columns.values(), strict=True)]), encoding="utf-8")
 
 
 def _whole_numbers(name: str, values: NDArray[np.float64]) -> list[int]:

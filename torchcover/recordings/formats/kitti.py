@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from torchcover.cameras.calibration import Calibration, read_kitti, split_matrix, split_projection
 from torchcover.detection.boxes import Boxes
-from torchcover.files import BadFileError, check_memory, decode, naming, read_short_text, reads
-from torchcover.geometry import BoundingBox, check_rigid, invert, rigid, rotation_from_euler
+from torchcover.files import BadFileError, check_memory, decode_utf8, guard_reader, read_short_text, report_bad_file
+from torchcover.geometry import BoundingBox, build_transform, check_rigid, convert_euler_to_rotation, invert
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.clouds import read_cloud
 from torchcover.recordings.formats.frame_files import check_same_names, find_frame_files
@@ -28,13 +28,13 @@ OXTS_COLUMNS = 30
 # The LiDAR is 0.76 m before the rear axle and 1.73 m above the ground, the centre of the car's box 1.337 m before the
 # axle: as in the rig `kitti`, where the sources are. The car is a Volkswagen Passat B6 estate of 4.77 x 1.82 m; nothing
 # but the car and what is mounted on it can be in that outline, up to a little above the LiDAR.
-vehicle_T_velodyne = rigid(np.eye(3), [-0.577, 0.0, 1.73])
+vehicle_T_velodyne = build_transform(np.eye(3), [-0.577, 0.0, 1.73])
 # Of the rectified images; those of the days differ by a few pixels.
 IMAGE_SIZE = (1242, 375)
 BODY = BoundingBox((-2.387, -0.91, 0.05), (2.387, 0.91, 1.93))
 
 
-@reads("a KITTI calibration")
+@guard_reader("a KITTI calibration")
 def read_calibration(path: Path) -> dict[str, NDArray[np.float64]]:
     """Read `KEY: numbers` lines; a line of other things than numbers, such as `calib_time`, is left out."""
     found: dict[str, NDArray[np.float64]] = {}
@@ -73,7 +73,7 @@ def read_transform(path: Path) -> Matrix:
     translation_m = numbers.get("T", np.empty(0))
     if translation_m.size != 3:
         raise BadFileError(f"{path}: T with 3 numbers is needed; got {translation_m.size}")
-    return rigid(parse_transform(numbers, "R", path)[:3, :3], translation_m)
+    return build_transform(parse_transform(numbers, "R", path)[:3, :3], translation_m)
 
 
 def read_rectified_cameras(path: Path, vehicle_T_camera0: Matrix) -> tuple[Calibration, ...]:
@@ -86,7 +86,7 @@ def read_rectified_cameras(path: Path, vehicle_T_camera0: Matrix) -> tuple[Calib
         if matrix.size != 12 or size.size != 2:
             arrived = f"{matrix.size} and {size.size}"
             raise BadFileError(f"{path}: 12 numbers of P_rect_{name} and 2 of S_rect_{name} are needed; got {arrived}")
-        with naming(path, "a KITTI calibration"):
+        with report_bad_file(path, "a KITTI calibration"):
             intrinsics, camera_T_rectified = split_projection(matrix, f"P_rect_{name}")
         pose = vehicle_T_rectified @ invert(camera_T_rectified)
         found.append(Calibration(int(size[0]), int(size[1]), *intrinsics, vehicle_T_camera=pose, name=f"image_{name}"))
@@ -113,9 +113,9 @@ def read_distorted_cameras(path: Path, vehicle_T_camera0: Matrix) -> tuple[Calib
         if (size.size, matrix.size, lens.size, place_m.size) != (2, 9, 5, 3):
             arrived = f"{size.size}, {matrix.size}, {lens.size} and {place_m.size}"
             raise BadFileError(f"{path}: 2, 9, 5 and 3 numbers of S, K, D and T_{name} are needed; got {arrived}")
-        with naming(path, "a KITTI calibration"):
+        with report_bad_file(path, "a KITTI calibration"):
             intrinsics = split_matrix(matrix.reshape(3, 3), f"K_{name}")
-        camera_T_camera0 = rigid(parse_transform(numbers, f"R_{name}", path)[:3, :3], place_m)
+        camera_T_camera0 = build_transform(parse_transform(numbers, f"R_{name}", path)[:3, :3], place_m)
         cameras.append(
             Calibration(
                 int(size[0]),
@@ -130,7 +130,7 @@ def read_distorted_cameras(path: Path, vehicle_T_camera0: Matrix) -> tuple[Calib
     return tuple(cameras)
 
 
-@reads("a PNG image")
+@guard_reader("a PNG image")
 def read_png_size(path: Path) -> tuple[int, int]:
     """Width and height of an image; its pixels are not read."""
     with path.open("rb") as file:
@@ -140,7 +140,7 @@ def read_png_size(path: Path) -> tuple[int, int]:
     return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:], "big")
 
 
-@reads("KITTI labels")
+@guard_reader("KITTI labels")
 def read_labels(path: Path) -> list[tuple[str, NDArray[np.float64]]]:
     """Read the objects of a `label_2` file: category and 14 numbers, without what is marked `DontCare`."""
     found = []
@@ -155,7 +155,7 @@ def read_labels(path: Path) -> list[tuple[str, NDArray[np.float64]]]:
     return found
 
 
-@reads("a record of the GPS and IMU")
+@guard_reader("a record of the GPS and IMU")
 def read_oxts(path: Path) -> NDArray[np.float64]:
     """Read latitude, longitude, altitude, roll, pitch and yaw (degrees, metres, radians) of one instant."""
     numbers = np.array([float(word) for word in read_short_text(path).split()])
@@ -179,11 +179,11 @@ def compute_world_T_imu(oxts: NDArray[np.float64], latitude_deg: float) -> Matri
     scale = math.cos(math.radians(latitude_deg))
     east_m = scale * EARTH_RADIUS_M * math.radians(longitude)
     north_m = scale * EARTH_RADIUS_M * math.log(math.tan(math.pi / 4 + math.radians(latitude) / 2))
-    rotation = rotation_from_euler(*np.rad2deg([yaw, pitch, roll]))
-    return rigid(rotation, [east_m, north_m, altitude_m])
+    rotation = convert_euler_to_rotation(*np.rad2deg([yaw, pitch, roll]))
+    return build_transform(rotation, [east_m, north_m, altitude_m])
 
 
-@reads("time stamps")
+@guard_reader("time stamps")
 def read_timestamps(path: Path, frame_numbers: Sequence[int]) -> NDArray[np.datetime64]:
     """Read lines such as `2011-09-26 13:02:25.964389445`: one for each frame number.
 
@@ -201,7 +201,7 @@ def read_timestamps(path: Path, frame_numbers: Sequence[int]) -> NDArray[np.date
         BadFileError: A line that is no date and time, or neither a line for each frame nor one for each scan.
     """
     check_memory(BYTES_PER_BYTE * path.stat().st_size)
-    lines = [line.strip().replace(" ", "T") for line in decode(path.read_bytes()).rstrip().split("\n")]
+    lines = [line.strip().replace(" ", "T") for line in decode_utf8(path.read_bytes()).rstrip().split("\n")]
     stamps = [line for line in lines if line]
     if len(lines) > frame_numbers[-1]:
         stamps = [lines[number] for number in frame_numbers]

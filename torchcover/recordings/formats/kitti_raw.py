@@ -13,9 +13,15 @@ from numpy.typing import NDArray
 
 from torchcover.cameras.calibration import Calibration
 from torchcover.detection.boxes import Boxes
-from torchcover.files import parse_xml, reads
+from torchcover.files import guard_reader, parse_xml
 from torchcover.geometry import BoundingBox
-from torchcover.geometry.rigid import Matrix, euler_from_rotation, invert, rotation_from_euler, transform
+from torchcover.geometry.rigid import (
+    Matrix,
+    convert_euler_to_rotation,
+    convert_rotation_to_euler,
+    invert,
+    transform_points,
+)
 from torchcover.recordings.clouds import read_cloud
 from torchcover.recordings.formats.frame_files import check_same_names, find_frame_files, format_names
 from torchcover.recordings.formats.kitti import (
@@ -148,7 +154,7 @@ def parse_frame_numbers(folder: Path, names: Sequence[str]) -> list[int]:
     return [int(name) for name in names]
 
 
-@reads("KITTI tracklets")
+@guard_reader("KITTI tracklets")
 def read_tracklets(path: Path, vehicle_T_velodyne: Matrix) -> dict[int, Boxes]:
     """Read the boxes of every frame that has any, by frame number.
 
@@ -170,9 +176,9 @@ def read_tracklets(path: Path, vehicle_T_velodyne: Matrix) -> dict[int, Boxes]:
 
 def _boxes(found: list[tuple[list[float], str, str]], vehicle_T_velodyne: Matrix) -> Boxes:
     rows = np.array([row for row, _, _ in found])
-    rows[:, :3] = transform(vehicle_T_velodyne, rows[:, :3])
-    turned = [vehicle_T_velodyne[:3, :3] @ rotation_from_euler(np.rad2deg(yaw), 0.0, 0.0) for yaw in rows[:, 6]]
-    rows[:, 6] = np.deg2rad(euler_from_rotation(np.stack(turned))[:, 0])
+    rows[:, :3] = transform_points(vehicle_T_velodyne, rows[:, :3])
+    turned = [vehicle_T_velodyne[:3, :3] @ convert_euler_to_rotation(np.rad2deg(yaw), 0.0, 0.0) for yaw in rows[:, 6]]
+    rows[:, 6] = np.deg2rad(convert_rotation_to_euler(np.stack(turned))[:, 0])
     return Boxes.from_rows(
         torch.from_numpy(rows).float(),
         ids=tuple(name for _, name, _ in found),

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from torchcover.cameras.calibration import read_nuscenes
 from torchcover.detection.boxes import Boxes
-from torchcover.files import naming, read_json_table, road_user_classes
-from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_quaternion
+from torchcover.files import load_road_user_classes, read_json_table, report_bad_file
+from torchcover.geometry import BoundingBox, build_transform, convert_quaternion_to_rotation, invert
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.clouds.arrays import read_cloud_with_rings
 from torchcover.recordings.objects import (
@@ -29,7 +29,7 @@ from torchcover.recordings.recording import Scan, SensorCalibrations, check_time
 
 # The ego frame lies under the rear axle, on the ground; the centre of a Renault Zoe's box is 1.385 m before it, as in
 # the rig `nuscenes`, where the source is.
-vehicle_T_ego = rigid(np.eye(3), [-1.385, 0.0, 0.0])
+vehicle_T_ego = build_transform(np.eye(3), [-1.385, 0.0, 0.0])
 # As in the body `renault_zoe`, where its source is.
 SIZE_M = (4.084, 1.730, 1.562)
 CHANNEL = "LIDAR_TOP"
@@ -55,7 +55,7 @@ class NuScenes:
     layout: ClassVar[str] = "v1.0-*/*.json, samples/LIDAR_TOP, sweeps/LIDAR_TOP"
     sensors = (CHANNEL,)
     reference_sensors = ()
-    square_metres = False
+    has_area_weights = False
     block_indices = None
     ego_box: BoundingBox | None = BODY
 
@@ -63,7 +63,7 @@ class NuScenes:
         tables = _tables(Path(path))
         self.path = tables.parent
         self.rigs = {"nuscenes": self.sensors}
-        with naming(tables, "tables of nuScenes"):  # rows without a column, numbers that are none
+        with report_bad_file(tables, "tables of nuScenes"):  # rows without a column, numbers that are none
             self._read(tables, scenes)
 
     @classmethod
@@ -79,7 +79,7 @@ class NuScenes:
 
     def get_world_T_vehicle(self, index: int) -> Matrix:
         """The pose of the ego when the sweep was made."""
-        world_T_ego = rigid(rotation_from_quaternion(self._rotations[index]), self._places_m[index])
+        world_T_ego = build_transform(convert_quaternion_to_rotation(self._rotations[index]), self._places_m[index])
         return world_T_ego @ invert(vehicle_T_ego)
 
     def read_boxes(self, index: int) -> Boxes:
@@ -88,7 +88,7 @@ class NuScenes:
 
     def read_calibrations(self) -> SensorCalibrations:
         """The LiDAR's mount, and the cameras of its first key frame."""
-        with naming(self._tables, "tables of nuScenes"):
+        with report_bad_file(self._tables, "tables of nuScenes"):
             first = self._sample_tokens[self.key_frames[0]]
             rows = [
                 row
@@ -127,12 +127,12 @@ class NuScenes:
             raise ValueError(f"no key frame of {CHANNEL}")
         self.times_s = check_times(np.array([row["timestamp"] for row in data]) * 1e-6, len(data), CHANNEL)
         self._files = [check_path_within(self.path, row["filename"]) for row in data]
-        driven = [poses.row(row["ego_pose_token"]) for row in data]
+        driven = [poses.get_row(row["ego_pose_token"]) for row in data]
         self._rotations = np.array([row["rotation"] for row in driven], dtype=np.float64)
         self._places_m = np.array([row["translation"] for row in driven], dtype=np.float64)
         _check_poses(self._rotations, self._places_m)
         mounts = {
-            token: parse_pose(calibrations.row(token)) for token in {row["calibrated_sensor_token"] for row in data}
+            token: parse_pose(calibrations.get_row(token)) for token in {row["calibrated_sensor_token"] for row in data}
         }
         self._mounts = [mounts[row["calibrated_sensor_token"]] for row in data]
         self._sample_tokens = [row["sample_token"] for row in data]
@@ -140,7 +140,7 @@ class NuScenes:
 
     @cached_property
     def _tracks(self) -> ObjectInterpolator:
-        with naming(self._tables, "annotations of nuScenes"):
+        with report_bad_file(self._tables, "annotations of nuScenes"):
             return ObjectInterpolator(_seen(self._tables, self._sample_times))
 
     def _samples(self, tables: Path, scenes: Sequence[str] | None) -> dict[str, float]:
@@ -172,7 +172,7 @@ def read_objects(path: Path, scene: str | None = None) -> RecordedObjects:
     """
     (tables,) = _tables_with("sample_annotation", path)
     samples, poses = (read_json_table(tables / f"{name}.json").rows for name in ("sample", "ego_pose"))
-    with naming(tables, "tables of nuScenes"):
+    with report_bad_file(tables, "tables of nuScenes"):
         token = _scene(samples, tables / "scene.json", scene)
         taken = {row["token"]: row["timestamp"] for row in samples if row["scene_token"] == token}
         first_us, last_us = min(taken.values()), max(taken.values())
@@ -193,8 +193,8 @@ def _seen(tables: Path, times_s: Mapping[str, float]) -> list[ObjectState]:
         if row["sample_token"] in times_s:
             width, length, height = row["size"]
             name = row["instance_token"]
-            category = str(categories.row(instances.row(name)["category_token"])["name"])
-            world_T_box = rigid(rotation_from_quaternion(row["rotation"]), row["translation"])
+            category = str(categories.get_row(instances.get_row(name)["category_token"])["name"])
+            world_T_box = build_transform(convert_quaternion_to_rotation(row["rotation"]), row["translation"])
             visibility = SHARES.get(str(row.get("visibility_token")), np.nan)
             size_m = (length, width, height)
             seen.append(ObjectState(name, times_s[row["sample_token"]], world_T_box, size_m, category, visibility))
@@ -215,13 +215,13 @@ def _scene(samples: list[dict[str, Any]], path: Path, scene: str | None) -> str:
 
 
 def _class(category: str) -> str | None:
-    classes = road_user_classes()["nuscenes"].items()
+    classes = load_road_user_classes()["nuscenes"].items()
     return next((found for beginning, found in classes if category.lower().startswith(beginning)), None)
 
 
 def parse_pose(row: dict[str, Any]) -> Matrix:
     """(4, 4) the pose of a row with `rotation` (w, x, y, z) and `translation`."""
-    matrix = rigid(rotation_from_quaternion(row["rotation"]), row["translation"])
+    matrix = build_transform(convert_quaternion_to_rotation(row["rotation"]), row["translation"])
     if not np.isfinite(matrix).all():
         raise ValueError(f"translation: three finite numbers are needed; got {row['translation']}")
     return matrix

@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.files import naming
+from torchcover.files import report_bad_file
 from torchcover.geometry import invert
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.formats.bag import (
@@ -96,7 +96,7 @@ class RosBag(RecordingBase):
             "mounts": {name: np.asarray(of).tolist() for name, of in (mounts or {}).items()},
         }
         self._bag = Bag(self.path)
-        with naming(self.path, "a bag"):
+        with report_bad_file(self.path, "a bag"):
             frames = self._frames_of_clouds()
             tree = FrameTree(read_static_transforms(self._bag))
             self.vehicle_frame = vehicle_frame or _vehicle_frame({*tree.frames, *frames.values()}, mounts or {})
@@ -289,7 +289,7 @@ class RosBag(RecordingBase):
         logged_ns, first_ns = int(self._logged_ns[sensor][index]), self._stamped_ns[self.sensors[0]]
         apart_s = abs(int(self._stamped_ns[sensor][index]) - int(first_ns[index])) * 1e-9
         frame_interval_s = float(np.median(np.diff(first_ns))) * 1e-9 if len(first_ns) > 1 else np.inf
-        with naming(self.path, f"a cloud of {sensor}"):
+        with report_bad_file(self.path, f"a cloud of {sensor}"):
             if apart_s > FARTHEST_SCAN * frame_interval_s:
                 raise ValueError(f"the scan of {sensor} nearest to {first_ns[index]} is {apart_s:.3f} s off")
             cloud = parse_cloud(self._bag.read_message(self._topic(sensor), logged_ns), self._point_times[sensor])

@@ -7,8 +7,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.files import naming
-from torchcover.geometry import invert, quaternion_from_rotation, rigid, rotation_from_quaternion, slerp
+from torchcover.files import report_bad_file
+from torchcover.geometry import (
+    build_transform,
+    convert_quaternion_to_rotation,
+    convert_rotation_to_quaternion,
+    interpolate_quaternions,
+    invert,
+)
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.formats.bag import Bag, get_stamp_ns
 
@@ -123,7 +129,9 @@ def parse_pose(translation: Any, rotation: Any, name: str) -> Matrix:  # noqa: A
     if not np.isfinite(place_m).all():
         raise ValueError(f"{name}: three finite coordinates are needed; got {place_m.tolist()}")
     try:
-        return rigid(rotation_from_quaternion([rotation.w, rotation.x, rotation.y, rotation.z]), place_m)
+        return build_transform(
+            convert_quaternion_to_rotation([rotation.w, rotation.x, rotation.y, rotation.z]), place_m
+        )
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from error
 
@@ -187,8 +195,10 @@ class PoseSeries(NamedTuple):
             )
         share = (since_s / gap_s)[:, None]
         first_m, second_m = self.positions_m[after - 1], self.positions_m[after]
-        rotations = rotation_from_quaternion(slerp(self.wxyz[after - 1], self.wxyz[after], share))
-        return rigid(rotations, first_m + share * (second_m - first_m))
+        rotations = convert_quaternion_to_rotation(
+            interpolate_quaternions(self.wxyz[after - 1], self.wxyz[after], share)
+        )
+        return build_transform(rotations, first_m + share * (second_m - first_m))
 
     def estimate_zigzag_m(self) -> float:
         """How far poses jump to and fro, in metres; 0 if a vehicle can move like that."""
@@ -240,7 +250,7 @@ class VehiclePoses:
 
     def interpolate(self, times_ns: NDArray[np.int64], log_time_ns: int) -> Matrix:
         """(N, 4, 4) `world_T_vehicle`. `times_ns`: (N,) when; `log_time_ns`: about when such messages were recorded."""
-        with naming(self._bag.path, "a bag"):
+        with report_bad_file(self._bag.path, "a bag"):
             series = self._around(log_time_ns)
             world_T_here = np.broadcast_to(np.eye(4), (len(times_ns), 4, 4))
             for link in self._links:
@@ -397,5 +407,5 @@ def _series(stamped: Sequence[tuple[int, Matrix]]) -> PoseSeries:
         poses[time_ns] = pose
     times_ns = np.array(sorted(poses), dtype=np.int64)
     sorted_poses = np.array([poses[int(time_ns)] for time_ns in times_ns])
-    wxyz = np.array([quaternion_from_rotation(pose[:3, :3]) for pose in sorted_poses])
+    wxyz = np.array([convert_rotation_to_quaternion(pose[:3, :3]) for pose in sorted_poses])
     return PoseSeries(times_ns, sorted_poses[:, :3, 3], wxyz, apart_m)

@@ -10,9 +10,9 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.files import NpyHeader, parse_xml, read_csv, read_npz, reads
-from torchcover.geometry import check_rigid, rigid, rotation_from_euler
-from torchcover.geometry.rigid import Matrix, warn_of_radians
+from torchcover.files import NpyHeader, guard_reader, parse_xml, read_csv, read_npz
+from torchcover.geometry import build_transform, check_rigid, convert_euler_to_rotation
+from torchcover.geometry.rigid import Matrix, warn_about_radians
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings.objects import (
     Ego,
@@ -34,7 +34,7 @@ MIN_STEP_M = 0.05
 MIN_OFF = 0.05
 
 
-@reads("a trajectory")
+@guard_reader("a trajectory")
 def read_trajectory(path: Path) -> Trajectory:
     """Read a trajectory.
 
@@ -51,7 +51,7 @@ def read_trajectory(path: Path) -> Trajectory:
     return trajectory
 
 
-@reads("a file of boxes")
+@guard_reader("a file of boxes")
 def read_box_tracks(path: Path) -> tuple[Track, ...]:
     """Read recorded boxes, one track for each id: of its first size, there between its first and last time.
 
@@ -67,11 +67,11 @@ def _tracks(path: Path) -> Iterator[Track]:
     rows = _columns(table.numbers, BOX_COLUMNS)
     check_seconds(np.unique(rows[:, 0]))
     own: dict[str, list[int]] = {}
-    for row, name in enumerate(table.words["id"]):
+    for row, name in enumerate(table.texts["id"]):
         own.setdefault(name, []).append(row)
     _check_degrees("yaw", [(rows[of, 1:3], rows[of, 7]) for of in own.values()])
     for name, of in own.items():
-        numbers, category = rows[of], table.words["category"][of[0]]
+        numbers, category = rows[of], table.texts["category"][of[0]]
         length, width, height = check_box_size(name, numbers[0, 4:7])
         angles_deg = np.column_stack([numbers[:, 7], np.zeros((len(of), 2))])
         trajectory = build_trajectory(name, numbers[:, 0], numbers[:, 1:4], angles_deg)
@@ -79,7 +79,7 @@ def _tracks(path: Path) -> Iterator[Track]:
 
 
 def _read_csv(path: Path) -> Trajectory:
-    numbers = _columns(read_csv(path, TRAJECTORY_COLUMNS, optional=None).numbers, TRAJECTORY_COLUMNS)
+    numbers = _columns(read_csv(path, TRAJECTORY_COLUMNS, optional_columns=None).numbers, TRAJECTORY_COLUMNS)
     time_s, position_m, (roll, pitch, yaw) = numbers[:, 0], numbers[:, 1:4], numbers[:, 4:].T
     _check_degrees("yaw", [(position_m[:, :2], yaw)])
     return Trajectory.from_arrays(time_s, position_m, np.stack([yaw, pitch, roll], axis=1))
@@ -105,7 +105,7 @@ def _check_degrees(column: str, drives: Sequence[tuple[NDArray[np.float64], NDAr
             constant.add(float(heading[0]))
     if max(np.abs(heading).max() for _, heading in drives) > 2 * np.pi + 0.01:
         return
-    warn_of_radians({column: sorted(constant)})
+    warn_about_radians({column: sorted(constant)})
     way_rad, heading = np.concatenate(ways_rad), np.concatenate(headings)
     if len(way_rad):
         off, off_deg = (np.abs(np.sin(way_rad - angle)).mean() for angle in (heading, np.deg2rad(heading)))
@@ -156,7 +156,7 @@ def check_gaps(times_s: NDArray[np.float64]) -> None:
 OBSTACLES = ("obstacle", "dynamicObstacle", "staticObstacle")
 
 
-@reads("a scenario of CommonRoad")
+@guard_reader("a scenario of CommonRoad")
 def read_commonroad(path: Path) -> RecordedObjects:
     """Read the obstacles and planning problems of a file.
 
@@ -184,7 +184,7 @@ def _ego(problem: Element, step_s: float) -> Ego:
     if start is None:
         raise ValueError(f"planningProblem {name}: no initialState")
     time_s, place_m, yaw = _state(start, step_s, f"planningProblem {name}")
-    pose = rigid(rotation_from_euler(math.degrees(yaw), 0.0, 0.0), place_m)
+    pose = build_transform(convert_euler_to_rotation(math.degrees(yaw), 0.0, 0.0), place_m)
     return Ego(name, np.array([time_s]), pose[None], np.eye(4))
 
 

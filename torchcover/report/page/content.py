@@ -197,16 +197,16 @@ def build_page_maps(coverages: Mapping[str, Coverage]) -> Iterator[PageMap]:
     """
     coverages = {name: downsample_coverage(coverage) for name, coverage in coverages.items()}
     first = next(iter(coverages.values()))
-    for rig, bodies in ((rig, coverage.bodies) for rig, coverage in coverages.items() if coverage.bodies):
-        for body, cells in zip(bodies.bodies, bodies.cells, strict=True):
+    for rig, bodies in ((rig, coverage.target_sums) for rig, coverage in coverages.items() if coverage.target_sums):
+        for body, cells in zip(bodies.target_names, bodies.position_counts, strict=True):
             free, share, quantity = _nan_where_none(cells[..., 0]), cells[..., 1] / cells[..., 0], bodies.quantities[0]
             yield PageMap(
                 quantity=quantity.title,
                 band=body,
                 rig=rig,
-                x=bodies.grid.x,
-                y=bodies.grid.y,
-                cell_m=bodies.grid.cell,
+                x=bodies.grid.x_m,
+                y=bodies.grid.y_m,
+                cell_m=bodies.grid.cell_m,
                 values=get_display_unit(quantity.unit).factor * to_array(share),
                 scale=build_color_scale(quantity, share),
                 unobserved_label="no place was free",
@@ -214,13 +214,13 @@ def build_page_maps(coverages: Mapping[str, Coverage]) -> Iterator[PageMap]:
                 weight_name="free places",
             )
     shown = list_map_quantities(first)
-    surface = _weights(first) if first.measure == "area" else None
-    steps = CellWeights([_nan_where_none(one) for one in first.probed_steps], "steps that probed it")
+    surface = _weights(first) if first.average == "area" else None
+    steps = CellWeights([_nan_where_none(one) for one in first.observed_frames], "steps that probed it")
     for quantity, by_surface in shown:
-        layers = {rig: coverage.listed[quantity.key] for rig, coverage in coverages.items()}
-        errors = {rig: one.listed_errors.get(quantity.key) for rig, one in coverages.items()}
+        layers = {rig: coverage.sparse_layers[quantity.key] for rig, coverage in coverages.items()}
+        errors = {rig: one.sparse_errors.get(quantity.key) for rig, one in coverages.items()}
         yield from _of_quantity(layers, errors, (surface if by_surface else None) or steps, first)
-    of_sensors = {rig: one.redundancy.listed for rig, one in coverages.items() if one.redundancy is not None}
+    of_sensors = {rig: one.redundancy.sparse_layers for rig, one in coverages.items() if one.redundancy is not None}
     for key in dict.fromkeys(key for layers in of_sensors.values() for key in layers):
         having = {rig: layers[key] for rig, layers in of_sensors.items() if key in layers}
         yield from _of_quantity(having, dict.fromkeys(having), surface or steps, first)
@@ -246,9 +246,10 @@ def _of_quantity(
     expected, *others = values.values()
     differences = [compute_difference(one, expected) for one in others]
     against = build_difference_scale(quantity, torch.stack(differences)) if differences else None
-    spread = {rig: to_array(first.known.spread(one)) for rig, one in values.items()}
+    spread = {rig: to_array(first.observed_cells.expand_to_grid(one)) for rig, one in values.items()}
     of_errors = {
-        rig: None if one is None else factor * to_array(first.known.spread(one)) for rig, one in errors.items()
+        rig: None if one is None else factor * to_array(first.observed_cells.expand_to_grid(one))
+        for rig, one in errors.items()
     }
     for band, height in enumerate(grid.heights):
         for at, rig in enumerate(values):
@@ -257,9 +258,9 @@ def _of_quantity(
                 quantity=quantity.title,
                 band=f"{height}, {format_height_band(grid, height)}",
                 rig=rig,
-                x=grid.x,
-                y=grid.y,
-                cell_m=grid.cell,
+                x=grid.x_m,
+                y=grid.y_m,
+                cell_m=grid.cell_m,
                 values=spread[rig][band],
                 scale=scale,
                 unobserved_label=NEVER_PROBED if weights.sides is None else NOTHING_FOUND,
@@ -274,11 +275,11 @@ def _of_quantity(
 
 def _weights(first: Coverage) -> CellWeights | None:
     """Square metres; the rigs share the reference points, and so the square metres."""
-    if first.area is None:
+    if first.area_sums is None:
         return None
-    m2 = [_nan_where_none(one) for one in first.area.totals()[0]]
-    sides = [one.cpu().numpy() for one in compute_square_sides(first.points, first.grid.cell)]
-    return CellWeights(m2, "m² of surface seen in all steps", first.counts["frames"] * first.grid.cell**2, sides)
+    m2 = [_nan_where_none(one) for one in first.area_sums.sum_blocks()[0]]
+    sides = [one.cpu().numpy() for one in compute_square_sides(first.point_counts, first.grid.cell_m)]
+    return CellWeights(m2, "m² of surface seen in all steps", first.counts["num_frames"] * first.grid.cell_m**2, sides)
 
 
 def _nan_where_none(counts: Tensor) -> Array:

@@ -6,7 +6,7 @@ from itertools import groupby
 
 import numpy as np
 
-from torchcover.notebooks import attribute_of, html_of
+from torchcover.notebooks import escape_html, escape_html_attribute
 from torchcover.report.layout import PageTable, TextCell
 from torchcover.report.overlay import SensorView, get_sensor_color
 from torchcover.report.page.content import Array, DetectionShares, TargetVisibilityMap
@@ -23,7 +23,7 @@ SEEN_BY = "not seen", "by one sensor only", "by two or more"
 
 def render_text_html(text: str) -> str:
     """A sentence in HTML: no break before a per cent sign, and words between backticks as code."""
-    return html_of(text).replace(" %", "&nbsp;%")
+    return escape_html(text).replace(" %", "&nbsp;%")
 
 
 def build_detection_shares(table: CoverageTable) -> list[DetectionShares]:
@@ -31,11 +31,11 @@ def build_detection_shares(table: CoverageTable) -> list[DetectionShares]:
     key = get_main_quantity(table).key
     return [
         DetectionShares(
-            f"{surface_words(table, rows[0])} to {rows[0].region.x[1]:g} m: {detected_words(table)}",
+            f"{surface_words(table, rows[0])} to {rows[0].region.x_m[1]:g} m: {detected_words(table)}",
             {row.rig: row.summary.numbers[key] for row in rows},
         )
         for rows in table.rows_by_region
-        if rows[0].region.x[0] == 0.0 and not rows[0].region.corners_m and table.thresholds_m
+        if rows[0].region.x_m[0] == 0.0 and not rows[0].region.corners_m and table.thresholds_m
     ]
 
 
@@ -98,7 +98,7 @@ def _plan_drawing(plan: TargetVisibilityMap) -> str:
         parts.append(f'<text x="{left - ring_m + 0.06:.2f}" y="0.1">{ring_m:g} m</text>')
     corners = " ".join(f"{x:.2f},{-y:.2f}" for x, y in plan.vehicle_outline_m)
     parts.append(f'<polygon points="{corners}"/><text x="{right - 0.25:.2f}" y="0.1" text-anchor="end">front →</text>')
-    title = attribute_of(f"Where {plan.rig} sees it, from above, forward to the right")
+    title = escape_html_attribute(f"Where {plan.rig} sees it, from above, forward to the right")
     return f'<svg viewBox="{box}" role="img" aria-label="{title}">{"".join(parts)}</svg>'
 
 

@@ -12,7 +12,7 @@ from string import Template
 
 import numpy as np
 
-from torchcover.notebooks import attribute_of
+from torchcover.notebooks import escape_html_attribute
 from torchcover.report.layout import PageTable, TextCell
 from torchcover.report.page.content import Array, Page, PageMap, PagePicture, PageRig
 from torchcover.report.page.drawings import (
@@ -115,7 +115,7 @@ def render_page(page: Page) -> str:
     more = "".join(f"<li>{render_text_html(words)}</li>" for words in page.findings[1:])
     more = f'<ul class="more">{more}</ul>' if more else ""
     return Template(_file("page.html")).substitute(
-        title=attribute_of(page.title),
+        title=escape_html_attribute(page.title),
         heading=render_text_html(page.title),
         lead=render_text_html(page.lead),
         verdict="".join(f'<p class="verdict">{render_text_html(words)}</p>' for words in page.findings[:1]),
@@ -166,7 +166,7 @@ def render_table(table: PageTable) -> str:
 
 def _picture(picture: PagePicture) -> str:
     title, data = picture.title, base64.b64encode(picture.png).decode()
-    image = f'<img src="data:image/png;base64,{data}" alt="{attribute_of(title)}">'
+    image = f'<img src="data:image/png;base64,{data}" alt="{escape_html_attribute(title)}">'
     return f'<figure class="picture">{image}<figcaption>{render_text_html(title)}</figcaption></figure>'
 
 
@@ -178,7 +178,7 @@ def _notes(notes: Sequence[str]) -> str:
 def _cell(cell: TextCell, kind: str) -> str:
     if not kind:
         return f'<th scope="row">{render_text_html(cell.text)}</th>'
-    return f'<td class="{kind} {attribute_of(cell.mark)}">{render_text_html(cell.text)}</td>'
+    return f'<td class="{kind} {escape_html_attribute(cell.mark)}">{render_text_html(cell.text)}</td>'
 
 
 def _rig(rig: PageRig, ego_outline_m: Array | None, number: int) -> str:

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import shapely
 
-from torchcover.files import reads
-from torchcover.geometry import BoundingBox, fitted
+from torchcover.files import guard_reader
+from torchcover.geometry import BoundingBox, fit_height_field
 from torchcover.geometry.arrays import Float64
 from torchcover.recordings.formats.tracks import check_gaps, read_box_tracks
 from torchcover.recordings.objects import Track
@@ -47,14 +47,14 @@ def ground_below(places_m: Float64, ego_m: Float64) -> Plain | Slopes:
     inside = ((places_m[:, :2] > lower_m) & (places_m[:, :2] < upper_m)).all(axis=1)
     across_m, over_m = places_m[inside, :2] - lower_m, places_m[inside, 2] - base_m
     rows, columns = corners_of(lower_m, upper_m)
-    field = fitted(across_m, over_m, upper_m - lower_m, SCALES_M, trusted=trusted[inside])
+    field = fit_height_field(across_m, over_m, upper_m - lower_m, SCALES_M, trusted_mask=trusted[inside])
     corners: Float64 = CELL_M * np.indices((rows, columns))[::-1].reshape(2, -1).T.astype(np.float64)
     way_m = ego_m[:, :2] if len(ego_m) > 1 else np.repeat(ego_m[:, :2], 2, axis=0)
     way = shapely.LineString(way_m - lower_m).simplify(0.5)
     shapely.prepare(way)
     seen = shapely.dwithin(shapely.points(middles_m(np.zeros(2), rows, columns)), way, HORIZON_M + BEYOND_M)
     return Slopes(
-        lower_m, base_m + field.heights_m(corners).reshape(rows, columns), seen.reshape(rows - 1, columns - 1)
+        lower_m, base_m + field.compute_heights_m(corners).reshape(rows, columns), seen.reshape(rows - 1, columns - 1)
     )
 
 
@@ -127,7 +127,7 @@ class Bodies:
         # A box is all of a truck.
         self._meshes = {**load_bodies(), "truck": Vehicle.load("truck").mesh()}
         self._sizes_m = {
-            kind: np.array(BoundingBox.around(mesh.vertices_m).size_m) for kind, mesh in self._meshes.items()
+            kind: np.array(BoundingBox.from_points(mesh.vertices_m).size_m) for kind, mesh in self._meshes.items()
         }
         self._lengths_m = {kind: float(size_m[0]) for kind, size_m in self._sizes_m.items()}
         self._made: dict[tuple[str | None, tuple[float, float, float]], Mesh] = {}
@@ -154,7 +154,7 @@ class Bodies:
         return mesh._replace(vertices_m=mesh.vertices_m * (np.array(size_m) / self._sizes_m[kind]))
 
 
-@reads("a file of boxes")
+@guard_reader("a file of boxes")
 def read_boxes(path: Path) -> tuple[Actor, ...]:
     """Read recorded boxes as actors; see `read_box_tracks`."""
     tracks, bodies = read_box_tracks(path), Bodies()

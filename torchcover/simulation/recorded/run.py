@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchcover.geometry import rigid, rotation_from_euler
+from torchcover.geometry import build_transform, convert_euler_to_rotation
 from torchcover.geometry.rigid import Matrix
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings.objects import Ego, RecordedObjects, Track
@@ -59,7 +59,7 @@ def excerpt_of(cast: Excerpt, begin_s: float, duration_s: float | None, max_gap_
     """
     drive_s = cast.drive.times_s
     stands = len(drive_s) == 1
-    known_s = [track.trajectory.times_s for track in cast.others if track.trajectory.transient]
+    known_s = [track.trajectory.times_s for track in cast.others if track.trajectory.is_transient]
     earliest_s = min((float(times_s[0]) for times_s in known_s), default=-np.inf)
     latest_s = max((float(times_s[-1]) for times_s in known_s), default=np.inf)
     first_s = float(drive_s[0]) if stands else max(float(drive_s[0]), earliest_s)
@@ -106,7 +106,7 @@ def pieces(trajectory: Trajectory, max_gap_s: float) -> list[Trajectory]:
     taken_s, way_m = np.diff(times_s), np.linalg.norm(np.diff(places_m, axis=0), axis=1)
     breaks = np.flatnonzero((taken_s > max_gap_s) | (way_m > FASTEST_MPS * taken_s + JUMP_M)) + 1
     return [
-        Trajectory(times_s[first:end], places_m[first:end], angles_deg[first:end], trajectory.transient)
+        Trajectory(times_s[first:end], places_m[first:end], angles_deg[first:end], trajectory.is_transient)
         for first, end in pairwise([0, *breaks.tolist(), len(times_s)])
     ]
 
@@ -132,7 +132,7 @@ def _as_track(ego: Ego) -> Track | None:
     if ego.size_m is None:
         return None
     drive = _drive(ego, None)
-    there = Trajectory(drive.times_s, drive.positions_m, drive.angles_deg, transient=True)
+    there = Trajectory(drive.times_s, drive.positions_m, drive.angles_deg, is_transient=True)
     return Track(ego.name, "car", "passenger", ego.size_m, there)
 
 
@@ -147,4 +147,4 @@ def _told(recording: RecordedObjects, like: str) -> str:
 
 def poses_at_all(trajectory: Trajectory) -> Matrix:
     """(K, 4, 4) the poses that a trajectory was given."""
-    return rigid(rotation_from_euler(*trajectory.angles_deg.T), trajectory.positions_m)
+    return build_transform(convert_euler_to_rotation(*trajectory.angles_deg.T), trajectory.positions_m)

@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
-from torchcover.geometry import BoundingBox, invert, overlapping
+from torchcover.geometry import BoundingBox, find_overlaps, invert
 from torchcover.geometry.rigid import Matrix
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings.formats import read_objects
@@ -120,7 +120,9 @@ class RecordedTraffic(Traffic):
         stood: tuple[Mesh, ...] = ()
         if self.ground is None:
             standing = [track.trajectory.positions_m for track in run.others if track.vehicle_class is not None]
-            below = ground_below(stood_on(standing), stood_on([driver.trajectory.positions_at(self._times_s)]))
+            below = ground_below(
+                stood_on(standing), stood_on([driver.trajectory.interpolate_positions_m(self._times_s)])
+            )
             if self.built_share is not None:
                 generator = np.random.default_rng(seed)
                 sides, driven, walked = sides_of(driver, shown, self.built_share, generator)
@@ -156,7 +158,7 @@ class RecordedTraffic(Traffic):
         steps = np.round(times_s / self.time_step_s)
         instants_s = self.time_step_s * steps
         times_s = np.where(np.abs(times_s - instants_s) < SNAP_S, instants_s, times_s)
-        return Trajectory(times_s, trajectory.positions_m, trajectory.angles_deg, trajectory.transient)
+        return Trajectory(times_s, trajectory.positions_m, trajectory.angles_deg, trajectory.is_transient)
 
     @property
     def _times_s(self) -> Matrix:
@@ -169,23 +171,25 @@ class RecordedTraffic(Traffic):
             category, mesh = bodies.of(track)
             for number, piece in enumerate(pieces(track.trajectory, self.max_gap_s), 1):
                 shown = self._shown(piece)
-                there = not shown.transient or (shown.times_s[0] <= self._run.duration_s and shown.times_s[-1] >= 0.0)
-                away_m = np.linalg.norm(shown.positions_m - drive.positions_at(shown.times_s), axis=1)
+                there = not shown.is_transient or (
+                    shown.times_s[0] <= self._run.duration_s and shown.times_s[-1] >= 0.0
+                )
+                away_m = np.linalg.norm(shown.positions_m - drive.interpolate_positions_m(shown.times_s), axis=1)
                 if there and away_m.min() < HORIZON_M + max(track.size_m[:2]):
                     yield Actor(track.name if number == 1 else f"{track.name} #{number}", category, mesh, shown)
 
     def _apart(self, ego: Actor, others: list[Actor]) -> list[Actor]:
         """Those whose bounding boxes meet that of the ego at no instant; a warning names the others."""
         times_s = self._times_s
-        ego_m, box = ego.trajectory.positions_at(times_s), BoundingBox.around(ego.mesh.vertices_m)
+        ego_m, box = ego.trajectory.interpolate_positions_m(times_s), BoundingBox.from_points(ego.mesh.vertices_m)
         reach_m = float(np.linalg.norm(box.corners_m, axis=1).max())
         met: list[str] = []
         for other in others:
-            its_box = BoundingBox.around(other.mesh.vertices_m)
-            away_m = np.linalg.norm(other.trajectory.positions_at(times_s) - ego_m, axis=1)
+            its_box = BoundingBox.from_points(other.mesh.vertices_m)
+            away_m = np.linalg.norm(other.trajectory.interpolate_positions_m(times_s) - ego_m, axis=1)
             near_s = times_s[away_m < reach_m + np.linalg.norm(its_box.corners_m, axis=1).max()]
-            there = invert(ego.trajectory.at_each(near_s)) @ other.trajectory.at_each(near_s)
-            if overlapping(its_box, there, box.corners_m).any():
+            there = invert(ego.trajectory.interpolate_many(near_s)) @ other.trajectory.interpolate_many(near_s)
+            if find_overlaps(its_box, there, box.corners_m).any():
                 met.append(other.name)
         if met:
             warnings.warn(

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from torchcover.files import reads
+from torchcover.files import guard_reader
 from torchcover.simulation.sumo.floating import Recorded, SumoTrack
 from torchcover.simulation.sumo.motion import RoadUser
 from torchcover.simulation.sumo.network import feed_xml, pair_attributes, read_pieces
@@ -40,7 +40,7 @@ def type_of(name: str, known: Mapping[str, VehicleType]) -> VehicleType:
     return VehicleType(vehicle_class, USUAL_LENGTH_M.get(vehicle_class, CAR_LENGTH_M))
 
 
-@reads("routes of SUMO")
+@guard_reader("routes of SUMO")
 def read_types(path: Path) -> dict[str, VehicleType]:
     """The types that a file of routes declares."""
     found: dict[str, VehicleType] = {}

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchcover.files import reads
+from torchcover.files import guard_reader
 from torchcover.geometry.arrays import Float64
 from torchcover.simulation.sumo.network import feed_xml, read_pieces
 
@@ -164,7 +164,7 @@ def record(pieces: Iterable[bytes], window: TimeWindow) -> Recorded:
     return Recorded(tuple(_tracks(collector)), collector.begin_s, collector.last_s)
 
 
-@reads("floating car data of SUMO")
+@guard_reader("floating car data of SUMO")
 def read_floating(path: Path, window: TimeWindow) -> Recorded:
     """Read it from a file; see `record`."""
     recorded = record(read_pieces(path), window)

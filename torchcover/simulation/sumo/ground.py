@@ -8,7 +8,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from torchcover.geometry import spread
+from torchcover.geometry import accumulate_heights
 from torchcover.geometry.arrays import Bools, Float64
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.height_field import CELL_M, MARGIN_M, Ground, Plain, Slopes, corners_of, middles_m
@@ -37,7 +37,7 @@ def ground_of(vicinity: Vicinity) -> Plain | Slopes:
     if np.ptp(vicinity.samples_m[:, 2]) == 0.0:
         return Plain(float(places_m[0, 2]), lower_m, upper_m)
     rows, columns = corners_of(lower_m, upper_m)
-    total, weight = spread((places_m[:, :2] - lower_m) / CELL_M, places_m[:, 2], rows, columns)
+    total, weight = accumulate_heights((places_m[:, :2] - lower_m) / CELL_M, places_m[:, 2], rows, columns)
     wanted = vicinity.sees(middles_m(lower_m, rows, columns)).reshape(rows - 1, columns - 1)
     return Slopes(lower_m, _filled(total, weight), wanted)
 

@@ -10,7 +10,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from torchcover.files import check_memory, reads
+from torchcover.files import check_memory, guard_reader
 from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.simulation.traffic.assemble import HORIZON_M
 
@@ -80,7 +80,7 @@ def _read_again(path: Path, _version: tuple[int, int] | None) -> Network:
     return _read(path)
 
 
-@reads("a road network of SUMO")
+@guard_reader("a road network of SUMO")
 def _read(path: Path) -> Network:
     check_memory(KEPT_PER_BYTE * path.stat().st_size)
     collector = _Collector()

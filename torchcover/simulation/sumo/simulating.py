@@ -18,7 +18,7 @@ from typing import IO, Literal
 from xml.etree import ElementTree
 from xml.sax.saxutils import quoteattr
 
-from torchcover.files import end_with_parent, most_gb, parse_xml, reads, reporting_stopped
+from torchcover.files import end_with_parent, find_memory_limit_gb, guard_reader, parse_xml, report_stopped_processes
 from torchcover.files.bad_file import VARIABLE
 from torchcover.simulation.sumo.floating import ATTRIBUTES
 from torchcover.simulation.sumo.network import feed_xml, read_pieces
@@ -51,7 +51,7 @@ OUTPUT = re.compile(r"(?<!pro)file|output|href|^dest$|\bport$", re.IGNORECASE)
 LEFT_OUT = frozenset({"imgFile", "osgFile", "emissionClass"})
 
 
-@reads("a file of SUMO")
+@guard_reader("a file of SUMO")
 def copy_checked(path: Path, target: Path, kind: Literal["network", "routes"]) -> Path:
     """Copy a network or routes, as the parser understands them, if nothing in them names an output or an address.
 
@@ -153,7 +153,7 @@ def output_of(program: str, *options: str | Path, cpu_s: float = math.inf, write
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             env={**os.environ, "SUMO_HOME": str(folder), "PROJ_NETWORK": "OFF"},
-            preexec_fn=end_with_parent(most_gb(), cpu_s, writes=writes),  # noqa: PLW1509  (system calls, no lock)
+            preexec_fn=end_with_parent(find_memory_limit_gb(), cpu_s, can_write=writes),  # noqa: PLW1509  (system calls, no lock)
         )
         assert process.stdout is not None  # as asked for
         assert process.stderr is not None
@@ -163,7 +163,7 @@ def output_of(program: str, *options: str | Path, cpu_s: float = math.inf, write
         try:
             with closing(process.stdout):
                 while True:
-                    with reporting_stopped([process.pid], f"SUMO's {program}"):
+                    with report_stopped_processes([process.pid], f"SUMO's {program}"):
                         piece = process.stdout.read(PIECE_BYTES)
                     if not piece:
                         break
@@ -180,7 +180,7 @@ def output_of(program: str, *options: str | Path, cpu_s: float = math.inf, write
         if ended:
             told = _errors(last.decode("utf-8", "replace").splitlines())
             if "bad_alloc" in told:
-                told += f"; it may take {most_gb():g} GB: take a piece of the network, or set {VARIABLE} to more"
+                told += f"; it may take {find_memory_limit_gb():g} GB: take a piece of the network, or set {VARIABLE} to more"
             raise ValueError(f"SUMO's {program} fails: {told}")
 
 
@@ -237,7 +237,7 @@ def simulate(
         )  # fmt: skip
 
 
-@reads("an OpenDRIVE road")
+@guard_reader("an OpenDRIVE road")
 def from_opendrive(path: Path, folder: Path, *, leave_out_links: bool) -> Path:
     """Let SUMO turn an OpenDRIVE file into a network in a folder; links to what is not there may be left out."""
     root = parse_xml(path)

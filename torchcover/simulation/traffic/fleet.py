@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchcover.files import road_user_classes
+from torchcover.files import load_road_user_classes
 from torchcover.geometry import BoundingBox
 from torchcover.geometry.arrays import Float64
 from torchcover.geometry.trajectory import Trajectory
@@ -103,7 +103,7 @@ class VehicleType(NamedTuple):
         """The body whose length is nearest among those of the class; None if there is none of this class."""
         if self.vehicle_class in LEFT_OUT:
             return None
-        kinds = road_user_classes()["bodies"].get(self.vehicle_class, CARS)
+        kinds = load_road_user_classes()["bodies"].get(self.vehicle_class, CARS)
         if kinds[0] in ON_FOOT:
             return str(kinds[0])  # the simulation's lengths of people are all the same
         bodies = [name for name in lengths_m if name.partition("_")[0] in kinds]
@@ -170,7 +170,7 @@ class Fleet:
         if missing:
             raise ValueError(f"traffic needs a body for each kind; there is none for {', '.join(missing)}")
         self.meshes = {EGO: bodies["suv"] if ego is None else ego, **{kind: bodies[kind] for kind in CATEGORIES}}
-        self._sizes = {kind: BoundingBox.around(mesh.vertices_m).size_m for kind, mesh in self.meshes.items()}
+        self._sizes = {kind: BoundingBox.from_points(mesh.vertices_m).size_m for kind, mesh in self.meshes.items()}
         self._lengths_m = {kind: self._length_m(kind) for kind in self.meshes}  # asked thousands of times a world
         self._generator = generator
         self.parked: list[Actor] = []
@@ -218,7 +218,7 @@ class Fleet:
     ) -> None:
         """Note a body down in `parked`, at a pose x, y in metres and yaw in degrees; pitch and roll on a slope."""
         x_m, y_m, yaw_deg = pose
-        place = Trajectory.resting((x_m, y_m, height_m), (yaw_deg, *tilt_deg))
+        place = Trajectory.create_static((x_m, y_m, height_m), (yaw_deg, *tilt_deg))
         self.parked.append(Actor(f"parked {kind} {len(self.parked)}", CATEGORIES[kind], self.meshes[kind], place))
 
     def fill(

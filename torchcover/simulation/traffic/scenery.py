@@ -7,7 +7,7 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike
 
-from torchcover.geometry import rigid, rotation_from_euler
+from torchcover.geometry import build_transform, convert_euler_to_rotation
 from torchcover.geometry.arrays import Float64
 from torchcover.simulation.bodies import merge
 from torchcover.simulation.patches import outward_faces
@@ -100,7 +100,7 @@ def box(centre_m: ArrayLike, size_m: ArrayLike, bottom_m: float = 0.0, yaw_deg: 
     """A box about a point (x, y), turned."""
     length, width, height = np.asarray(size_m, dtype=np.float64)
     shape = block((-length / 2, length / 2), (-width / 2, width / 2), (bottom_m, bottom_m + height))
-    return shape.moved(rigid(rotation_from_euler(yaw_deg, 0.0, 0.0), [*np.asarray(centre_m), 0.0]))
+    return shape.moved(build_transform(convert_euler_to_rotation(yaw_deg, 0.0, 0.0), [*np.asarray(centre_m), 0.0]))
 
 
 def post(centre_m: ArrayLike, radius_m: float, bottom_m: float, height_m: float) -> Mesh:
