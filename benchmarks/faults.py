@@ -27,7 +27,7 @@ from torchcover.files import isolated
 # Of the processor's time.
 LIMIT_S = 20
 # The maps of those that make sense after all are left out: they take most of the time, and tests/report has them.
-NO_MAPS = mock.patch("torchcover.evaluation.result.map_figures", return_value=())
+NO_MAPS = mock.patch("torchcover.evaluation.result.plot_maps", return_value=())
 # Rather a MemoryError than a machine that stands still.
 MOST_BYTES = 12_000_000_000
 

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 @pytest.fixture
 def blank_maps(monkeypatch):
     """Maps with nothing on them, under their names: drawing one takes a third of a second."""
-    monkeypatch.setattr("torchcover.report.maps.draw_side_by_side", lambda *_, **__: Figure((0.2, 0.2)))
+    monkeypatch.setattr("torchcover.report.maps.plot_side_by_side", lambda *_, **__: Figure((0.2, 0.2)))
 
 
 @pytest.fixture

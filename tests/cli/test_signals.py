@@ -17,7 +17,7 @@ from torchcover.coverage import CoverageSums
 from torchcover.evaluation import progress
 from torchcover.report.maps import plot_side_by_side
 
-DRAW = "torchcover.report.maps.draw_side_by_side"
+DRAW = "torchcover.report.maps.plot_side_by_side"
 
 
 def arguments(worlds, *, steps=3):

@@ -456,7 +456,7 @@ def test_a_rule_ends_the_run_and_a_bar_tells_of_it(frames, progress, capsys):
 
 @pytest.mark.parametrize(("workers", "threads"), [(0, 2), (1, 1), (2, 1)])
 def test_each_worker_is_left_a_core(frame_of, monkeypatch, workers, threads):
-    monkeypatch.setattr("torchcover.evaluation.pipeline.cores", lambda: 2)
+    monkeypatch.setattr("torchcover.evaluation.pipeline.count_cores", lambda: 2)
     before, seen = torch.get_num_threads(), []
     torch.set_num_threads(2)
     try:

@@ -18,13 +18,13 @@ SMALL = Settings("front_roof_32", "courtyard", num_frames=8, cell_m=4.0, num_ray
 
 @pytest.fixture(autouse=True)
 def no_command(monkeypatch):
-    monkeypatch.setattr("torchcover.evaluation.study.command_s", lambda plan: 100.0)
+    monkeypatch.setattr("torchcover.evaluation.study.measure_command_s", lambda plan: 100.0)
 
 
 @pytest.fixture(scope="module")
 def study():
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("torchcover.evaluation.study.command_s", lambda plan: 100.0)
+        patched.setattr("torchcover.evaluation.study.measure_command_s", lambda plan: 100.0)
         return measure_error_against_time(StudyPlan(SMALL, ({"rays": 64}, {"reference": "paper", "rays": 1024})))
 
 

@@ -79,7 +79,7 @@ class RecordingSettings(BaseModel):
     @property
     def corrections(self) -> dict[str, Any]:
         """Name -> value of the settings that change points, poses or times."""
-        names = ("units", "axes", "quaternions", "poses", "lag_s")
+        names = ("units", "axes", "quaternions", "poses", "time_offset_s")
         return {
             name: getattr(self, name) for name in names if getattr(self, name) != type(self).model_fields[name].default
         }
