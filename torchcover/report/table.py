@@ -113,7 +113,7 @@ class CoverageTable:
             if len(coverages) > 1:
                 check_paired(dict(zip(coverages, of_one_world, strict=True)))
         first = next(iter(coverages.values()))
-        summaries = {rig: coverage.summarize(regions) for rig, coverage in coverages.items()}
+        summaries = {rig: coverage.summary(regions) for rig, coverage in coverages.items()}
         rows = _rows(coverages, list_region_bands(regions, first.grid), summaries)
         bodies = []
         if first.target_sums:
