@@ -47,10 +47,10 @@ IMAGE = torch.ones(6, 8)
         (torch.ones(8, 6), {}, ValueError, r"depth must be \(6, 8\) or \(B, 6, 8\); got \(8, 6\)"),
         (torch.ones(1, 1, 6, 8), {}, ValueError, "depth must be"),
         (torch.ones(6, 8, dtype=torch.int32), {}, TypeError, "int32, whose unit is unknown"),
-        (IMAGE, {"kind": "range"}, ValueError, "'range' is unknown; allowed: z, distance"),
+        (IMAGE, {"depth_kind": "range"}, ValueError, "'range' is unknown; allowed: z, distance"),
         (IMAGE, {"stride": 0}, ValueError, "stride must be an integer of at least 1; got 0"),
-        (IMAGE, {"valid": torch.ones(6, 8)}, TypeError, "valid must be boolean; got torch.float32"),
-        (IMAGE, {"valid": torch.ones(6, 7, dtype=torch.bool)}, ValueError, r"valid must be \(6, 8\).*got \(6, 7\)"),
+        (IMAGE, {"valid_mask": torch.ones(6, 8)}, TypeError, "valid must be boolean; got torch.float32"),
+        (IMAGE, {"valid_mask": torch.ones(6, 7, dtype=torch.bool)}, ValueError, r"valid must be \(6, 8\).*got \(6, 7\)"),
     ],
 )
 def test_a_depth_image_that_does_not_fit(depth, options, error, message):

@@ -47,7 +47,7 @@ def test_a_colour_png_is_carlas(tmp_path, order):
 
 def test_a_grey_png_is_scaled(tmp_path):
     Image.fromarray(np.array([[0, 1500, 65535]], dtype=np.uint16)).save(tmp_path / "depth.png")
-    depth = read_depth(tmp_path / "depth.png", metres_per_unit=0.001)
+    depth = read_depth(tmp_path / "depth.png", meters_per_unit=0.001)
     assert depth.tolist() == [[0.0, 1.5, torch.inf]]
 
 
@@ -102,11 +102,11 @@ def test_an_image_is_not_larger_than_its_file_can_be_nor_than_is_granted(tmp_pat
         else:
             save(path, np.ones((100, 100), np.uint16))
         scale = None if name == "d.exr" else 0.5
-        assert read_depth(path, metres_per_unit=scale).shape == (100, 100)
+        assert read_depth(path, meters_per_unit=scale).shape == (100, 100)
         with monkeypatch.context() as context:
             context.setenv("TORCHCOVER_MAX_FILE_GB", "0.0003")
             with pytest.raises(BadFileError, match=rf"{name}: reading it takes 0\.00032 GB"):
-                read_depth(path, metres_per_unit=scale)
+                read_depth(path, meters_per_unit=scale)
 
 
 def test_a_truncated_image_is_named(tmp_path):
@@ -127,10 +127,10 @@ def save(path, array):
     ("name", "array", "scale", "message"),
     [
         ("d.png", np.zeros((2, 2), np.uint8), None, "8 bits, colour type 0"),
-        ("d.png", np.zeros((2, 2), np.uint16), None, "metres_per_unit > 0 .*got None"),
+        ("d.png", np.zeros((2, 2), np.uint16), None, "meters_per_unit > 0 .*got None"),
         ("d.png", np.zeros((2, 2), np.uint16), -1.0, "got -1.0"),
-        ("d.png", np.zeros((2, 2, 3), np.uint8), 0.001, "takes no metres_per_unit"),
-        ("d.npy", np.zeros((2, 2)), 0.001, "takes no metres_per_unit"),
+        ("d.png", np.zeros((2, 2, 3), np.uint8), 0.001, "takes no meters_per_unit"),
+        ("d.npy", np.zeros((2, 2)), 0.001, "takes no meters_per_unit"),
         ("d.npy", np.zeros((2, 2), np.int32), None, "int32 depth needs"),
         ("d.npy", np.zeros((2, 2), bool), 1.0, "integers or floats; got bool"),
         ("d.npy", np.zeros((2, 2, 2)), None, r"shape \(H, W\); got \(2, 2, 2\)"),
@@ -140,7 +140,7 @@ def save(path, array):
 def test_what_cannot_be_depth_is_refused(tmp_path, name, array, scale, message):
     save(tmp_path / name, array)
     with pytest.raises(BadFileError, match=rf"{name}: .*{message}"):
-        read_depth(tmp_path / name, metres_per_unit=scale)
+        read_depth(tmp_path / name, meters_per_unit=scale)
 
 
 @pytest.mark.parametrize(

@@ -73,7 +73,7 @@ def test_the_jacobian_is_the_derivative(name, make_camera):
     distortion = make_camera(name)._optics._solver.distortion
     a, b = (torch.from_numpy(x).requires_grad_() for x in np.random.default_rng(2).uniform(-0.4, 0.4, (2, 200)))
     u, v = distortion.distort(a, b)
-    at = distortion.linearise(a.detach().numpy(), b.detach().numpy())
+    at = distortion.linearize(a.detach().numpy(), b.detach().numpy())
     u_a, u_b = torch.autograd.grad(u.sum(), (a, b), retain_graph=True)
     v_a, v_b = torch.autograd.grad(v.sum(), (a, b))
     for ours, theirs in ((at.u_a, u_a), (at.u_b, u_b), (at.v_a, v_a), (at.v_b, v_b)):
@@ -148,7 +148,7 @@ def test_shown_directions_are_looked_at_by_their_pixels(camera, directions):
     pixels, visible = camera.project(3.0 * directions)
     # Also far outside the image, but not at the horizon, 1e16 px away, nor straight back, where azimuth is rounding.
     shown = (pixels.abs() < 1e5).all(dim=1) & (directions[:, 2] > -0.999)
-    rays, valid = camera.rays(pixels[shown])
+    rays, valid = camera.compute_rays(pixels[shown])
     assert shown[visible].all()
     assert valid.all()
     torch.testing.assert_close(rays, directions[shown], rtol=0, atol=1e-7)

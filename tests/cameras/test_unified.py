@@ -24,7 +24,7 @@ def rim_of(chart):
     shown, hidden = 0.0, math.pi
     for _ in range(60):
         middle = (shown + hidden) / 2
-        is_shown = bool(chart.draw(*directions([middle]))[2])
+        is_shown = bool(chart.project(*directions([middle]))[2])
         shown, hidden = (middle, hidden) if is_shown else (shown, middle)
     return shown
 
@@ -34,27 +34,27 @@ def test_an_image_grows_up_to_its_rim_and_ends_there(chart):
     """All before the rim is shown, farther out the farther off the axis, and lifted to where it came from."""
     rim = rim_of(chart)
     angles = rim * (1 - torch.logspace(-6, 0, 400, dtype=torch.float64))
-    x, y, shown = chart.draw(*directions(angles))
+    x, y, shown = chart.project(*directions(angles))
     radius = torch.hypot(x, y)
     assert shown.all()
     assert (radius[:-1] >= radius[1:] * (1 - 1e-12)).all()
     assert radius.max() <= chart.limit * (1 + 1e-9)
     well = angles < 0.999 * rim
-    lifted = chart.lift(x[well], y[well])
+    lifted = chart.unproject(x[well], y[well])
     torch.testing.assert_close(lifted, torch.stack(directions(angles[well]), dim=-1), atol=1e-5, rtol=0)
     if rim < math.pi - 1e-5:  # else all is shown but what lies straight back
         beyond = rim + (math.pi - rim) * torch.logspace(-9, 0, 50, dtype=torch.float64)
-        assert not chart.draw(*directions(beyond))[2].any()
+        assert not chart.project(*directions(beyond))[2].any()
 
 
 @pytest.mark.parametrize("chart", [one for one in CHARTS if one.limit < 1e3], ids=str)
 def test_an_image_that_folds_is_largest_where_it_ends(chart):
     rim = rim_of(chart)
-    radius = [torch.hypot(*chart.draw(*directions([rim * share]))[:2]).item() for share in (1 - 1e-4, 1 - 1e-8)]
+    radius = [torch.hypot(*chart.project(*directions([rim * share]))[:2]).item() for share in (1 - 1e-4, 1 - 1e-8)]
     assert radius == pytest.approx([chart.limit] * 2, rel=1e-4)
 
 
 @pytest.mark.parametrize("chart", [one for one in CHARTS if math.isinf(one.limit)], ids=str)
 def test_an_image_without_end_goes_to_infinity(chart):
     rim = rim_of(chart)
-    assert torch.hypot(*chart.draw(*directions([rim * (1 - 1e-6)]))[:2]).item() > 100.0
+    assert torch.hypot(*chart.project(*directions([rim * (1 - 1e-6)]))[:2]).item() > 100.0

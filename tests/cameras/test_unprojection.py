@@ -20,15 +20,15 @@ def depth_for(camera, dtype=torch.float64):
 def test_distance_is_the_length_of_the_point(camera):
     depth = depth_for(camera)
     points = camera.unproject(depth, "distance")
-    torch.testing.assert_close(points.norm(dim=1), depth[camera.rays()[1]])
+    torch.testing.assert_close(points.norm(dim=1), depth[camera.compute_rays()[1]])
 
 
 def test_z_depth_is_the_third_coordinate(camera):
     depth = depth_for(camera)
-    rays, valid = camera.rays(dtype=torch.float64)
+    rays, valid = camera.compute_rays(dtype=torch.float64)
     front = valid & (rays[..., 2] > 0)
     torch.testing.assert_close(camera.unproject(depth, "z")[:, 2], depth[front])
-    assert camera.count_dropped(depth)["no_ray"] == int((~front).sum())
+    assert camera.count_excluded(depth)["no_ray"] == int((~front).sum())
 
 
 def test_stride_takes_every_nth_row_and_column(make_camera):
@@ -36,7 +36,7 @@ def test_stride_takes_every_nth_row_and_column(make_camera):
     depth = depth_for(camera)
     chosen = torch.zeros(depth.shape, dtype=torch.bool)
     chosen[::3, ::3] = True
-    assert torch.equal(camera.unproject(depth, stride=3), camera.unproject(depth, valid=chosen))
+    assert torch.equal(camera.unproject(depth, stride=3), camera.unproject(depth, valid_mask=chosen))
 
 
 def test_a_batch_is_its_images(make_camera):
@@ -44,12 +44,12 @@ def test_a_batch_is_its_images(make_camera):
     batch = torch.stack([depth_for(camera), depth_for(camera) - 5.0, torch.zeros(72, 96, dtype=torch.float64)])
     masks = torch.rand(batch.shape, generator=torch.Generator().manual_seed(1)) > 0.3
     for valid in (None, masks[0], masks):
-        clouds = camera.unproject(batch, valid=valid)
+        clouds = camera.unproject(batch, valid_mask=valid)
         own = [valid] * 3 if valid is None or valid.ndim == 2 else valid
         assert len(clouds) == 3
         assert len(clouds[2]) == 0
         for cloud, image, mask in zip(clouds, batch, own, strict=True):
-            assert torch.equal(cloud, camera.unproject(image, valid=mask))
+            assert torch.equal(cloud, camera.unproject(image, valid_mask=mask))
 
 
 BAD = {"zero": 0.0, "negative": -1.0, "nan": NAN, "infinite": INF, "beyond_range": 80.0}
@@ -73,9 +73,9 @@ def test_points_and_reasons_add_up_to_the_pixels(make_camera, shape):
     values = torch.tensor([2.0, 60.0, 0.0, -1.0, NAN, INF, -INF])
     depth = values[torch.randint(len(values), shape, generator=generator)]
     valid = torch.rand(72, 96, generator=generator) > 0.2
-    clouds = camera.unproject(depth, stride=2, valid=valid, max_depth=50.0)
+    clouds = camera.unproject(depth, stride=2, valid_mask=valid, max_depth_m=50.0)
     points = sum(len(cloud) for cloud in clouds) if depth.ndim == 3 else len(clouds)
-    counts = camera.count_dropped(depth, stride=2, valid=valid, max_depth=50.0)
+    counts = camera.count_excluded(depth, stride=2, valid_mask=valid, max_depth_m=50.0)
     assert points + sum(counts.values()) == depth[..., ::2, ::2].numel()
     assert min(counts.values()) > 0
 
@@ -98,7 +98,7 @@ def test_a_pickled_camera_is_small_and_the_same():
     table = camera.rays()[0]
     payload = pickle.dumps(camera)
     assert len(payload) < table.nbytes / 2
-    assert torch.equal(pickle.loads(payload).rays()[0], table)
+    assert torch.equal(pickle.loads(payload).compute_rays()[0], table)
 
 
 def test_points_move_between_camera_and_vehicle():

@@ -53,7 +53,7 @@ class Camera:
 
     Example:
         >>> camera = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, "brown_conrady", [-0.3, 0.1, 0.0, 0.0])
-        >>> rays, valid = camera.rays()
+        >>> rays, valid = camera.compute_rays()
         >>> rays.shape, bool(valid.all())
         (torch.Size([480, 640, 3]), True)
         >>> pixels, visible = camera.project(10.0 * rays[:2, 0].double())
@@ -291,7 +291,7 @@ class Camera:
 
         Example:
             >>> camera = Camera.from_fov(2, 1, 90.0)
-            >>> camera.distance_to_z(camera.z_to_distance(torch.tensor([[3.0, 5.0]])))
+            >>> camera.convert_distance_to_z(camera.convert_z_to_distance(torch.tensor([[3.0, 5.0]])))
             tensor([[3., 5.]])
         """
         depth = check_depth(depth, "distance", 1, None, (self.height, self.width), self.name)

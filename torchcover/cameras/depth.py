@@ -92,7 +92,7 @@ def read_depth(path: Path, *, meters_per_unit: float | None = None) -> Tensor:
 
 def _refuse_scale(scale: float | None, encoding: str) -> None:
     if scale is not None:
-        raise ValueError(f"holds {encoding}, which takes no metres_per_unit; got {scale}")
+        raise ValueError(f"holds {encoding}, which takes no meters_per_unit; got {scale}")
 
 
 def _check_shape(shape: tuple[int, ...]) -> None:
@@ -104,7 +104,7 @@ def _scaled(values: NDArray[Any], scale: float | None) -> Tensor:
     if not np.issubdtype(values.dtype, np.integer):
         raise ValueError(f"depths are integers or floats; got {values.dtype}")
     if scale is None or not 0.0 < scale < np.inf:
-        raise ValueError(f"{values.dtype} depth needs metres_per_unit > 0 (0.001 for millimetres); got {scale}")
+        raise ValueError(f"{values.dtype} depth needs meters_per_unit > 0 (0.001 for millimetres); got {scale}")
     metres = values.astype(np.float64) * scale
     metres[values == np.iinfo(values.dtype).max] = np.inf
     return torch.from_numpy(metres.astype(np.float32))
