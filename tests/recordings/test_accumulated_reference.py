@@ -20,11 +20,11 @@ def distances_m(points_m, to_m):
 
 
 def standing(drive, index):
-    return transform_points(invert(drive.world_T_vehicle(index)), drive.wall_m)
+    return transform_points(invert(drive.get_world_T_vehicle(index)), drive.wall_m)
 
 
 def moving(drive, index):
-    return transform_points(invert(drive.world_T_vehicle(index)) @ drive.world_T_car(index), drive.back_m)
+    return transform_points(invert(drive.get_world_T_vehicle(index)) @ drive.world_T_car(index), drive.back_m)
 
 
 @pytest.mark.parametrize("origin_m", [(0.0, 0.0, 0.0), FAR_M])
@@ -256,7 +256,7 @@ def test_one_bad_sweep_costs_its_own_frame():
         frames[2]
     result = evaluate(frames=frames, skip_bad_frames=True, cell_m=8.0)
     assert (result.run.num_frames, result.run.skipped_frames) == (5, ["f2 (frame 2): f2.bin: truncated"])
-    assert pickle.loads(pickle.dumps(frames.reference)).sweeps.skip_bad
+    assert pickle.loads(pickle.dumps(frames.reference)).sweep_window.skip_unreadable
     assert all(len(frames[each].reference) for each in (0, 1, 3, 5))
     assert frames[0].counts["reference_sweeps_skipped"] == 2  # both sensors
     whole = RecordedFrames(Drive(steps=6), reference=AccumulatedReference(1.0))[0]

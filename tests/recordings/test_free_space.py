@@ -25,7 +25,7 @@ def upright(x_m, half_m=6.0, step_m=0.05, low_m=-2.0, high_m=2.0):
 
 def votes_of(image, points_m):
     votes = np.zeros(len(points_m), np.int16)
-    image.vote(np.ascontiguousarray(points_m, dtype=np.float64), votes)
+    image.add_votes(np.ascontiguousarray(points_m, dtype=np.float64), votes)
     return votes.tolist()
 
 

@@ -60,7 +60,7 @@ def ground_of(*parts, place_m=HERE_M):
 def rms_m(ground, heights, within_m=38.0):
     """How far from the truth, where a raster of places has heights; and the share that has."""
     x, y = (axis.ravel() for axis in np.meshgrid(np.arange(-within_m, within_m, 0.7), np.arange(-within_m, within_m)))
-    off_m = ground.heights_m(np.stack([x, y, heights(x, y)], axis=1))
+    off_m = ground.compute_heights_m(np.stack([x, y, heights(x, y)], axis=1))
     return np.sqrt(np.nanmean(off_m**2)), np.isfinite(off_m).mean()
 
 

@@ -26,7 +26,7 @@ def turn(generator):
 
 
 def test_numbers_are_those_of_an_independent_computation(tmp_path):
-    metric = CoverageMetric(GRID, max_radius=5.0)
+    metric = CoverageMetric(GRID, max_radius_m=5.0)
     for place in ("sensor", "reference"):
         (tmp_path / place).mkdir()
     mount = f"{{vehicle_T_sensor: {MOUNT.tolist()}}}"

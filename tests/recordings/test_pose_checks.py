@@ -102,12 +102,12 @@ class Yard:
 
 
 def doubts(yard):
-    stretches = list(read_pose_segments(yard, len(yard.frames)))
+    stretches = list(read_pose_segments(yard, len(yard.key_frames)))
     return check_frozen_poses(stretches) or check_pose_conventions(yard, stretches, "lidar") or ""
 
 
 def jumped(yard):
-    return check_pose_discontinuities(yard, list(read_pose_segments(yard, len(yard.frames))))
+    return check_pose_discontinuities(yard, list(read_pose_segments(yard, len(yard.key_frames))))
 
 
 @pytest.mark.parametrize(
@@ -130,7 +130,7 @@ MENDED = {
     "inverse": "--set recording.poses=inverse",
     "yx": "--set recording.poses=yx",
     "axes": "--set recording.axes=yxz",
-    "late": "--set recording.lag_s=0.10",
+    "late": "--set recording.time_offset_s=0.10",
     "held": "--set recording.poses=held",
 }
 
@@ -140,11 +140,11 @@ def test_what_would_mend_a_fault_is_named_and_mends_it(fault):
     doubt = doubts(Yard(fault))
     assert MENDED[fault] in doubt
     name, value = MENDED[fault].removeprefix("--set recording.").split("=")
-    corrections = RecordingSettings(**{name: float(value) if name == "lag_s" else value})
+    corrections = RecordingSettings(**{name: float(value) if name == "time_offset_s" else value})
     mended = correct_recording(Yard(fault), corrections)
-    assert corrections.command_line_options in (MENDED[fault], "--set recording.lag_s=0.1")
+    assert corrections.command_line_options in (MENDED[fault], "--set recording.time_offset_s=0.1")
     assert not doubts(mended)
-    off = [invert(Yard().true(step)) @ pickle.loads(pickle.dumps(mended)).world_T_vehicle(step) for step in range(10)]
+    off = [invert(Yard().true(step)) @ pickle.loads(pickle.dumps(mended)).get_world_T_vehicle(step) for step in range(10)]
     # The last poses, and those between two, are not there: where the vehicle went on evenly they would be right.
     exact = fault not in ("late", "held")
     assert max(np.linalg.norm(each[:3, 3]) for each in off) < (1e-9 if exact else 0.05)
@@ -211,7 +211,7 @@ def test_lags_that_are_none():
         RecordingSettings(time_offset_s=3.0)
     untimed = Yard()
     untimed.times_s = None
-    with pytest.raises(ValueError, match=r"yard: --set recording.lag_s=0\.1 needs the times"):
+    with pytest.raises(ValueError, match=r"yard: --set recording.time_offset_s=0\.1 needs the times"):
         correct_recording(untimed, RecordingSettings(time_offset_s=0.1)).get_world_T_vehicle(0)
     assert correct_recording(untimed, RecordingSettings()) is untimed
     assert RecordingSettings(units="mm").command_line_options == "--set recording.units=mm"
@@ -225,7 +225,7 @@ def test_poses_with_noise_are_not_late():
         width_s: float
 
         def match(self, settings):
-            return 0.7 + 0.2 * np.exp(-(((settings.lag_s - self.better_s) / self.width_s) ** 2))
+            return 0.7 + 0.2 * np.exp(-(((settings.time_offset_s - self.better_s) / self.width_s) ** 2))
 
     assert find_time_offset([Noisy(0.1, 0.2)]) == (pytest.approx(0.1), pytest.approx(0.9))
     assert find_time_offset([Noisy(0.1, 0.2), Noisy(-0.2, 0.03)]) == (0.0, 0.0)

@@ -290,4 +290,4 @@ def test_frames_of_one_window_share_a_place_in_time():
     # A pause is no room for more blocks; an instant that is seen again is at its first place.
     later_s = drive.times_s + np.where(np.arange(30) < 15, 0.0, 1e6)
     assert places(0.5, times_s=later_s) == [index // 5 for index in range(30)]
-    assert places(0.5, instants=[*range(15), *range(15)]) == 2 * [index // 5 for index in range(15)]
+    assert places(0.5, block_indices=[*range(15), *range(15)]) == 2 * [index // 5 for index in range(15)]

@@ -242,7 +242,7 @@ def check_pose_conventions(recording: Recording, segments: Sequence[PoseSegment]
     remedy = best.command_line_options
     if match < max(given + PARAMS.min_match_gain, PARAMS.min_match_gain_ratio * given):
         lag_s, match = find_time_offset(pairs)
-        remedy = f"--set recording.lag_s={lag_s:.2f}"
+        remedy = f"--set recording.time_offset_s={lag_s:.2f}"
         if match < max(given + PARAMS.min_time_offset_gain, PARAMS.min_time_offset_match):
             return None
     return (
