@@ -74,7 +74,7 @@ class RecordedFrames(FrameDataset):
             recording = open_recording(recording)
         self.recording = recording
         settings = getattr(recording, "settings", None)
-        self.corrections: str = settings.words if settings else ""
+        self.corrections: str = settings.command_line_options if settings else ""
         self.sensors_by_rig = {name: tuple(of) for name, of in (rigs or self.recording.rigs).items()}
         self._check_sensors()
         if reference is None:
