@@ -50,7 +50,12 @@ IMAGE = torch.ones(6, 8)
         (IMAGE, {"depth_kind": "range"}, ValueError, "'range' is unknown; allowed: z, distance"),
         (IMAGE, {"stride": 0}, ValueError, "stride must be an integer of at least 1; got 0"),
         (IMAGE, {"valid_mask": torch.ones(6, 8)}, TypeError, "valid must be boolean; got torch.float32"),
-        (IMAGE, {"valid_mask": torch.ones(6, 7, dtype=torch.bool)}, ValueError, r"valid must be \(6, 8\).*got \(6, 7\)"),
+        (
+            IMAGE,
+            {"valid_mask": torch.ones(6, 7, dtype=torch.bool)},
+            ValueError,
+            r"valid must be \(6, 8\).*got \(6, 7\)",
+        ),
     ],
 )
 def test_a_depth_image_that_does_not_fit(depth, options, error, message):

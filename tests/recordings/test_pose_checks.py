@@ -144,7 +144,9 @@ def test_what_would_mend_a_fault_is_named_and_mends_it(fault):
     mended = correct_recording(Yard(fault), corrections)
     assert corrections.command_line_options in (MENDED[fault], "--set recording.time_offset_s=0.1")
     assert not doubts(mended)
-    off = [invert(Yard().true(step)) @ pickle.loads(pickle.dumps(mended)).get_world_T_vehicle(step) for step in range(10)]
+    off = [
+        invert(Yard().true(step)) @ pickle.loads(pickle.dumps(mended)).get_world_T_vehicle(step) for step in range(10)
+    ]
     # The last poses, and those between two, are not there: where the vehicle went on evenly they would be right.
     exact = fault not in ("late", "held")
     assert max(np.linalg.norm(each[:3, 3]) for each in off) < (1e-9 if exact else 0.05)
