@@ -146,9 +146,9 @@ def of_drive(drive, poses=odometry, topic="/poses"):
     messages = [("/tf_static", T0_NS, tree(*mounts(drive)))]
     for index in range(drive.steps):
         time_ns = T0_NS + round(1e9 * drive.times_s[index])
-        messages.append((topic, time_ns + 1_000_000, poses(drive.world_T_vehicle(index), time_ns)))
+        messages.append((topic, time_ns + 1_000_000, poses(drive.get_world_T_vehicle(index), time_ns)))
         for number, sensor in enumerate(drive.sensors):
-            message = cloud(points(drive.scan(sensor, index).points_m), time_ns, sensor)
+            message = cloud(points(drive.read_scan(sensor, index).points_m), time_ns, sensor)
             messages.append((f"/{sensor}", time_ns + 20_000_000 + number, message))
     return messages
 

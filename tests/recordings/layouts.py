@@ -23,7 +23,7 @@ velodyne_T_imu = build_transform(convert_euler_to_rotation(0.1, -0.2, 0.3), [-0.
 
 def seen(drive, index):
     """All points of both sensors in the vehicle frame, those of `left` first."""
-    scans = [drive.scan(sensor, index) for sensor in drive.sensors]
+    scans = [drive.read_scan(sensor, index) for sensor in drive.sensors]
     return [transform_points(scan.vehicle_T_sensor, scan.points_m) for scan in scans]
 
 
@@ -58,7 +58,7 @@ def kitti_raw(drive, root):
     for index, name in enumerate(f"{k:010d}" for k in range(drive.steps)):
         points_m = transform_points(invert(vehicle_T_velodyne), np.concatenate(seen(drive, index)))
         (path / "velodyne_points" / "data" / f"{name}.bin").write_bytes(records(points_m, 4))
-        pose = drive.world_T_vehicle(index) @ vehicle_T_velodyne @ velodyne_T_imu
+        pose = drive.get_world_T_vehicle(index) @ vehicle_T_velodyne @ velodyne_T_imu
         first_m = pose[:3, 3] if first_m is None else first_m
         # Mercator, the other way round; the first record is at the given place.
         scale = math.cos(math.radians(LATITUDE_DEG))
@@ -77,10 +77,10 @@ def tracklets(drive):
     velodyne_T_vehicle = invert(kitti.vehicle_T_velodyne)
     poses = []
     for index in range(drive.steps):
-        row = drive.boxes(index).rows[0].double().numpy()
+        row = drive.read_boxes(index).rows[0].double().numpy()
         x, y, z = transform_points(velodyne_T_vehicle, row[None, :3])[0] - [0.0, 0.0, row[5] / 2]
         poses.append(f"<item><tx>{x}</tx><ty>{y}</ty><tz>{z}</tz><rx>0</rx><ry>0</ry><rz>{row[6]}</rz></item>")
-    length, width, height = drive.boxes(0).size_m[0].tolist()
+    length, width, height = drive.read_boxes(0).size_m[0].tolist()
     return f"""<?xml version="1.0" encoding="UTF-8" standalone="yes" ?>
 <!DOCTYPE boost_serialization>
 <boost_serialization signature="serialization::archive" version="9"><tracklets class_id="0"><count>1</count>
@@ -101,7 +101,7 @@ def nuscenes_tables(drive, root):
     tables["calibrated_sensor"] = [{"token": "m", "rotation": quaternion(mount), "translation": mount[:3, 3].tolist()}]
     for index in range(drive.steps):
         key, time_us = index % 2 == 0, T0_NS // 1000 + round(1e6 * drive.times_s[index])
-        world_T_ego = drive.world_T_vehicle(index) @ nuscenes.vehicle_T_ego
+        world_T_ego = drive.get_world_T_vehicle(index) @ nuscenes.vehicle_T_ego
         name = f"{'samples' if key else 'sweeps'}/LIDAR_TOP/n015__LIDAR_TOP__{time_us}.pcd.bin"
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         points_m = np.concatenate(seen(drive, index))
@@ -146,7 +146,7 @@ def argoverse2_log(drive, root):
         columns = {axis: points_m[:, k].astype(np.float32) for k, axis in enumerate("xyz")}
         columns |= {"laser_number": laser, "offset_ns": np.zeros(len(laser), np.int32)}
         feather.write_feather(pa.table(columns), str(sweeps / f"{time_ns}.feather"))
-        pose = drive.world_T_vehicle(index) @ argoverse2.vehicle_T_ego
+        pose = drive.get_world_T_vehicle(index) @ argoverse2.vehicle_T_ego
         poses.append({"timestamp_ns": time_ns, **posed(pose)})
         car = invert(pose) @ drive.world_T_car(index)
         size = {"length_m": 4.0, "width_m": 2.0, "height_m": 1.5}
@@ -183,10 +183,10 @@ def plain_folder(drive, root):
     for sensor in drive.sensors:
         (root / "sensors" / sensor).mkdir(parents=True)
     poses, mounts = [], []
-    for index, name in enumerate(drive.names):
-        poses.append([name, drive.times_s[index], *pose_row(drive.world_T_vehicle(index))])
+    for index, name in enumerate(drive.frame_names):
+        poses.append([name, drive.times_s[index], *pose_row(drive.get_world_T_vehicle(index))])
         for sensor in drive.sensors:
-            scan = drive.scan(sensor, index)
+            scan = drive.read_scan(sensor, index)
             turned = build_transform(convert_euler_to_rotation(40.0 * index, 0.0, 0.0), [index, 0.0, 1.0])
             points_m = transform_points(scan.vehicle_T_sensor, scan.points_m)
             if sensor == "left":
@@ -199,7 +199,7 @@ def plain_folder(drive, root):
                     1,
                 ]  # its own inverse but for z
             np.save(root / "sensors" / sensor / f"{name}.npy", points_m)
-        row = drive.boxes(index).rows[0].tolist()
+        row = drive.read_boxes(index).rows[0].tolist()
         table(root / "boxes" / f"{name}.csv", (*BOX, "id", "category"), [[*row, "car", "car, red"]])
     table(root / "poses.csv", ("frame", "time_s", *POSE), poses[::-1])
     table(root / "sensors" / "left" / "poses.csv", ("frame", *POSE), mounts)
@@ -237,9 +237,9 @@ def carla_folder(drive, root):
     (root / "sensors.json").write_text(json.dumps(listed))
     for tick in range(2 * drive.steps):
         instant, name = (tick - 1) / 2, f"{tick + 90}"
-        poses.append([name, 0.1 * instant + 7, *carla_row(drive.world_T_vehicle(instant) @ vehicle_T_actor)])
+        poses.append([name, 0.1 * instant + 7, *carla_row(drive.get_world_T_vehicle(instant) @ vehicle_T_actor)])
         for sensor in drive.sensors:
-            points_m = drive.scan(sensor, instant).points_m * [1, -1, 1]
+            points_m = drive.read_scan(sensor, instant).points_m * [1, -1, 1]
             half = points_m[tick % 2 :: 2] if sensor == "left" else points_m
             np.save(root / sensor / f"{name}.npy", np.c_[half, np.ones(len(half))].astype(np.float32))
         row = ["17", "vehicle.car", *carla_row(drive.world_T_car(instant)), 2.0, 1.0, 0.75]

@@ -33,8 +33,8 @@ def test_a_drive_is_found_again_with_its_names_and_its_body(tmp_path):
     recording = pickle.loads(pickle.dumps(open_recording(plain_folder(Drive(), tmp_path))))
     assert recording.sensors == ("left", "right")
     assert recording.reference_sensors == ()
-    assert recording.body.upper_m == (2.0, 1.0, 1.5)
-    assert (recording.boxes(1).ids, recording.boxes(1).categories) == (("car",), ("car, red",))
+    assert recording.ego_box.upper_m == (2.0, 1.0, 1.5)
+    assert (recording.read_boxes(1).ids, recording.read_boxes(1).categories) == (("car",), ("car, red",))
 
 
 def test_what_is_nearer_than_a_sensor_sees_is_no_return(tmp_path):

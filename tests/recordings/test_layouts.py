@@ -31,15 +31,15 @@ def written(layout, tmp_path):
 def test_a_layout_is_recognised(layout, written):
     _, recording = written
     assert isinstance(recording, FORMATS[layout.partition(" ")[0]])
-    assert len(recording.names) == 5 == len(recording.times_s)
-    assert list(recording.frames) == ([0, 2, 4] if layout == "nuscenes" else [0, 1, 2, 3, 4])
+    assert len(recording.frame_names) == 5 == len(recording.times_s)
+    assert list(recording.key_frames) == ([0, 2, 4] if layout == "nuscenes" else [0, 1, 2, 3, 4])
     assert all(set(of) <= set(recording.sensors) for of in recording.rigs.values())
 
 
 def test_clouds_are_where_the_world_is(layout, written):
     drive, recording = written
     frames = RecordedFrames(recording, reference=AccumulatedReference(10.0, voxel_m=0.05))
-    for number, index in enumerate(recording.frames):
+    for number, index in enumerate(recording.key_frames):
         frame = frames[number]
         wall_m, car_m = standing(drive, index), moving(drive, index)
         assert distances_m(frame.sensor, np.concatenate([wall_m, car_m])).max() < 1e-3
@@ -47,25 +47,29 @@ def test_clouds_are_where_the_world_is(layout, written):
         world_m = np.concatenate([wall_m, car_m])
         assert distances_m(frame.reference, world_m).max() < (2e-3 if drive.labelled else 0.3 * 2**0.5)
         assert distances_m(world_m if drive.labelled else wall_m, frame.reference).max() < 0.05 * 3**0.5
-        assert frame.name == recording.names[index]
+        assert frame.name == recording.frame_names[index]
 
 
 def test_poses_and_boxes_are_those_of_the_world(layout, written):
     drive, recording = written
     for index in range(5):
-        moved = invert(recording.world_T_vehicle(0)) @ recording.world_T_vehicle(index)
-        np.testing.assert_allclose(moved, invert(drive.world_T_vehicle(0)) @ drive.world_T_vehicle(index), atol=1e-6)
+        moved = invert(recording.get_world_T_vehicle(0)) @ recording.get_world_T_vehicle(index)
+        np.testing.assert_allclose(
+            moved, invert(drive.get_world_T_vehicle(0)) @ drive.get_world_T_vehicle(index), atol=1e-6
+        )
         if not drive.labelled:
-            assert recording.boxes(index) is None
+            assert recording.read_boxes(index) is None
             continue
-        (row,) = recording.boxes(index).rows
+        (row,) = recording.read_boxes(index).rows
         between = layout == "nuscenes" and index % 2  # half-way between two headings
-        torch.testing.assert_close(row, drive.boxes(index).rows[0], atol=1e-2 if between else 1e-4, rtol=0)
-        assert recording.boxes(index).ids == recording.boxes(0).ids != ("",)
+        torch.testing.assert_close(row, drive.read_boxes(index).rows[0], atol=1e-2 if between else 1e-4, rtol=0)
+        assert recording.read_boxes(index).ids == recording.read_boxes(0).ids != ("",)
         shares = {0: 0.2, 2: 0.7, 4: 0.2} if layout == "nuscenes" else {}  # between two, that of the first
         share = shares.get(index // 2 * 2, np.nan)
-        assert recording.boxes(index).visibility.tolist() == pytest.approx([share], nan_ok=True)
-        assert "car" in recording.boxes(index).categories[0] or "vehicle" in recording.boxes(index).categories[0]
+        assert recording.read_boxes(index).visibility.tolist() == pytest.approx([share], nan_ok=True)
+        assert (
+            "car" in recording.read_boxes(index).categories[0] or "vehicle" in recording.read_boxes(index).categories[0]
+        )
 
 
 def test_a_recording_survives_pickle(written):
@@ -77,7 +81,7 @@ def test_a_recording_survives_pickle(written):
 def test_a_reader_reads_nothing_but_what_is_asked_for(written, monkeypatch):
     _, recording = written
     monkeypatch.setattr("torchcover.recordings.clouds.read_cloud", lambda path: pytest.fail("a scan was read"))
-    assert recording.world_T_vehicle(1).shape == (4, 4)
+    assert recording.get_world_T_vehicle(1).shape == (4, 4)
 
 
 @pytest.mark.parametrize(

@@ -229,8 +229,8 @@ def test_a_part_of_a_recording_is_never_read_and_gone_on_with(both, simulated_on
 
 def anything(recorder, add, setup, init=KittiRecorder.__init__):
     """Two sensors in a layout of one, whose clouds are the first's."""
-    name = setup.lidars[0]
-    init(recorder, add, setup._replace(mounts={name: setup.mounts[name]}, lidars=[name]))
+    name = setup.lidar_names[0]
+    init(recorder, add, setup._replace(mounts={name: setup.mounts[name]}, lidar_names=[name]))
     write = recorder.write
     recorder.write = lambda step: write(step._replace(clouds={name: step.clouds[name]}))
 

@@ -336,7 +336,7 @@ def test_to_open_a_bag_reads_few_clouds(tmp_path, monkeypatch, storage):
         read.extend([topic] * len(found))
         return found
 
-    monkeypatch.setattr(Bag, "messages", counted)
+    monkeypatch.setattr(Bag, "read_messages", counted)
     recording = RosBag(path)
     assert len(recording.frame_names) == 27  # 2.49 s of poses
     # The first for its frame; those within 1 s of the first pose and of the last for their stamps.

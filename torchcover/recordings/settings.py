@@ -89,8 +89,8 @@ class RecordingSettings(BaseModel):
         """The corrections as options of the command line; empty if there are none.
 
         Example:
-            >>> RecordingSettings(units="mm", lag_s=0.1).words
-            '--set recording.units=mm --set recording.lag_s=0.1'
+            >>> RecordingSettings(units="mm", time_offset_s=0.1).command_line_options
+            '--set recording.units=mm --set recording.time_offset_s=0.1'
         """
         return " ".join(f"--set recording.{name}={value}" for name, value in self.corrections.items())
 
