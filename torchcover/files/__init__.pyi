@@ -36,6 +36,7 @@ from .tables import NpyHeader as NpyHeader
 from .tables import check_dtype_kind as check_dtype_kind
 from .tables import escape_control_chars as escape_control_chars
 from .tables import format_csv as format_csv
+from .tables import parse_json as parse_json
 from .tables import read_csv as read_csv
 from .tables import read_json_table as read_json_table
 from .tables import read_npy as read_npy
