@@ -15,7 +15,7 @@ from torch import Tensor
 from torchcover.coverage import BevGrid
 from torchcover.coverage.quantity import RADIUS, make_area_quantity
 from torchcover.detection import Boxes
-from torchcover.files import refuse_links, write_atomically
+from torchcover.files import reject_links, write_atomically
 from torchcover.files.atomic import TEMPORARY
 from torchcover.frames import Frame
 from torchcover.neighbors import blind_spot_radius
@@ -47,7 +47,7 @@ class RerunLog:
             import rerun as rr
         except ImportError as error:
             raise ImportError(f"{path}: rerun-sdk is needed: pip install 'torchcover[rerun]'") from error
-        refuse_links(self._path)
+        reject_links(self._path)
         self._path.parent.mkdir(parents=True, exist_ok=True)
         folder = Path(mkdtemp(prefix=TEMPORARY, dir=self._path.parent))
         self._unfinished = folder / self._path.name

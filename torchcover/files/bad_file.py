@@ -26,8 +26,7 @@ VARIABLE = "TORCHCOVER_MAX_FILE_GB"
 # thousand of them.
 DEFAULT_GB = 2.0
 LIBRARIES_GB = 1.0
-# A calibration has kilobytes; what is parsed slowly must not be long.
-MAX_SHORT_BYTES = 1_000_000
+MAX_SHORT_BYTES = 1_000_000  # a calibration has kilobytes; what is parsed slowly must not be long
 
 
 class BadFileError(ValueError):

@@ -59,21 +59,13 @@ def _parse(text: str, load: Callable[[str, type["_Loader"]], Any]) -> Any:  # no
 
 
 def parse_yaml_stream(text: str) -> list[Any]:
-    """Read all documents of a YAML text, each as `parse_yaml` does; empty ones are left out.
-
-    Raises:
-        ValueError: As `parse_yaml`.
-    """
+    """Read all documents of a YAML text, each as `parse_yaml` does, with its errors; empty ones are left out."""
     documents = _parse(text, lambda text, loader: list(yaml.load_all(text, loader)))
     return [document for document in documents if document is not None]
 
 
 def get_builtin_folder(kind: str) -> Path:
-    """Where the built-in documents of a kind lie.
-
-    Args:
-        kind: As `builtin_documents` takes it, or "road_users" and "published", which have tables.
-    """
+    """Return the folder of the built-in documents of a kind; "road_users" and "published" are tables."""
     package = Path(__file__).parents[1]
     # In a wheel the folder lies inside the package; in a checkout beside it.
     installed = package / "_datasets"
@@ -83,10 +75,9 @@ def get_builtin_folder(kind: str) -> Path:
 @cache
 def load_road_user_classes() -> Mapping[str, Mapping[str, Any]]:
     """What is said of road users by words of recordings, and by classes."""
-    found: dict[str, dict[str, Any]] = parse_yaml(
-        (get_builtin_folder("road_users") / "classes.yaml").read_text("utf-8")
-    )
-    return found
+    path = get_builtin_folder("road_users") / "classes.yaml"
+    classes: dict[str, dict[str, Any]] = parse_yaml(path.read_text("utf-8"))
+    return classes
 
 
 def to_yaml(content: Mapping[str, Any]) -> str:

@@ -36,8 +36,7 @@ Arguments = ParamSpec("Arguments")
 Arrays = dict[str, NDArray[Any]]
 Reader = Callable[Concatenate[Path, Arguments], Arrays]
 
-# A file may take so long, and a second more for each megabyte.
-MOST_S = 60.0
+MOST_S = 60.0  # for a file, and a second more for each megabyte
 BYTES_PER_S = 1e6
 KNOWN_ERRORS = {kind.__name__: kind for kind in (BadFileError, ValueError, MemoryError, ImportError, FileNotFoundError)}
 # The same modules as here, whatever folder this one was started in.

@@ -21,8 +21,7 @@ else:
 
 # Of Linux: the signal that a process gets when the thread that has started it ends, or its whole process does.
 PR_SET_PDEATHSIG = 1
-# Libraries are files, too, and a bag may be split into hundreds.
-MOST_FILES = 1024
+MOST_FILES = 1024  # libraries are files, too, and a bag may be split into hundreds
 _prctl = ctypes.CDLL(None).prctl if sys.platform == "linux" else None
 
 

@@ -30,7 +30,7 @@ def escape_control_chars(text: str) -> str:
     r"""Text whose control characters are written out.
 
     Example:
-        >>> print(shown("roof\x1b[2J"))
+        >>> print(escape_control_chars("roof\x1b[2J"))
         roof\x1b[2J
     """
     return CONTROLS.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
@@ -89,12 +89,9 @@ def read_csv(
         lines.append(line)
         table.append(row)
     columns = dict(zip(names, zip(*table, strict=True) if table else [()] * len(names), strict=True))
+    present = [name for name in (*number_columns, *(optional_columns or ())) if name in columns]
     return CsvTable(
-        {
-            name: _finite(name, columns[name], lines)
-            for name in (*number_columns, *(optional_columns or ()))
-            if name in columns
-        },
+        {name: _finite(name, columns[name], lines) for name in present},
         {name: [unescape_cell(word.strip()) for word in columns[name]] for name in text_columns},
     )
 
@@ -179,8 +176,7 @@ def read_json_table(path: Path) -> JsonTable:
 
 
 DEFLATE_MAX_RATIO = 1032  # Deflate spends at least 2 bits on 258 bytes
-# How often its compressed size a member can have.
-MAX_RATIOS = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: DEFLATE_MAX_RATIO}
+MAX_RATIOS = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: DEFLATE_MAX_RATIO}  # of a member to its compressed size
 _HEADER_READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
