@@ -333,7 +333,7 @@ def test_an_array_that_its_header_describes_wrongly_is_refused(tmp_path, change,
 
 def test_an_array_that_is_listed_often_counts_as_often(tmp_path, monkeypatch):
     path = tmp_path / "a.npz"
-    header = {"identity": {}, "run": {"steps": 1, "counts": {}, "skipped": [], "seconds": 0.0}}
+    header = {"identity": {}, "run": {"num_frames": 1, "counts": {}, "skipped_frames": [], "duration_s": 0.0}}
     write_checkpoint(path, header, {"one": {"of it": torch.zeros(100_000)}})
     header = read_header(path)
     states = header["states"]["one"]["dict"]
