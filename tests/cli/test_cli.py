@@ -304,12 +304,12 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
             "recording.units: for a recording, which --frames",
         ),
         (
-            ["evaluate", "--frames", "recording", "--set", "recording.lag_s=3"],
-            "--set recording.lag_s: at most 1 s of time offset",
+            ["evaluate", "--frames", "recording", "--set", "recording.time_offset_s=3"],
+            "--set recording.time_offset_s: at most 1 s of time offset",
         ),
         (
-            ["compare", "--frames", "recording", "--set", "recording.poses=wrong"],
-            "recording.poses: 'given', 'inverse', 'yx' or 'held' is needed; got 'wrong'",
+            ["compare", "--frames", "recording", "--set", "recording.pose_convention=wrong"],
+            "recording.pose_convention: 'world_T_vehicle', 'vehicle_T_world' or 'swapped_xy' is needed; got 'wrong'",
         ),
         (["measure"], "No such command 'measure'"),
     ],

@@ -28,7 +28,7 @@ def test_the_written_defaults_are_all_settings_with_a_comment_each(tmp_path):
 
 def test_an_option_wins_over_set_which_wins_over_the_file_and_both_are_recorded(tmp_path):
     path = tmp_path / "run.yaml"
-    path.write_text("rays: 1\ncell_m: 1.0\nseed: 1\nrecording: {units: mm, lag_s: 0.2}\n")
+    path.write_text("rays: 1\ncell_m: 1.0\nseed: 1\nrecording: {units: mm, time_offset_s: 0.2}\n")
     config, record = load_config(path, ["rays=2", "cell_m=2", "recording.units=cm"], {"rays": 3})
     assert (config.num_rays, config.cell_m, config.seed) == (3, 2.0, 1)
     assert (config.recording.units, config.recording.time_offset_s) == ("cm", 0.2)
@@ -56,7 +56,7 @@ def test_an_option_wins_over_set_which_wins_over_the_file_and_both_are_recorded(
         ("redundancy: 1", "redundancy: a valid boolean is needed; got 1"),
         ("target_error: 1%", "target_error: a valid list is needed; got '1%'"),
         ("recording: {units: km}", "recording.units: 'm', 'cm', 'mm' or 'ft' is needed; got 'km'"),
-        ("recording: {lag_s: 5}", "recording.lag_s: at most 1 s of time offset"),
+        ("recording: {time_offset_s: 5}", "recording.time_offset_s: at most 1 s of time offset"),
         ("[1, 2]", "a YAML mapping of settings is needed"),
         ("name: r\nsensors: []", "this is a rig; a file of settings is needed"),
     ],
@@ -97,7 +97,7 @@ def test_a_recording_says_how_to_read_it_and_settings_win(tmp_path):
         (tmp_path / source / "frame0.xyz").write_text("1 2 3")
     (recording / "recording.yaml").write_text("units: cm\n")
     plain = open_recording(recording)
-    assert plain.settings.words == "--set recording.units=cm"
+    assert plain.settings.command_line_options == "--set recording.units=cm"
     assert (
         open_recording(recording, RecordingSettings(units="m")).read_scan("sensor", 0).points_m.tolist()
         == (100 * plain.read_scan("sensor", 0).points_m).tolist()

@@ -12,6 +12,7 @@ import torch
 
 from torchcover.data import AccumulatedReference, RecordedFrames, RecordingSettings, Scan
 from torchcover.detection import Boxes
+from torchcover.files import parse_yaml
 from torchcover.geometry import (
     build_transform,
     convert_euler_to_rotation,
@@ -21,7 +22,7 @@ from torchcover.geometry import (
     invert,
     transform_points,
 )
-from torchcover.recordings.corrected import correct_recording
+from torchcover.recordings.corrections import correct_recording
 from torchcover.recordings.pose_checks import (
     check_frozen_poses,
     check_pose_conventions,
@@ -126,12 +127,12 @@ def test_what_is_right_is_left_alone(right):
 
 
 MENDED = {
-    "xyzw": "--set recording.quaternions=xyzw",
-    "inverse": "--set recording.poses=inverse",
-    "yx": "--set recording.poses=yx",
-    "axes": "--set recording.axes=yxz",
+    "xyzw": "--set recording.quaternion_order=xyzw",
+    "inverse": "--set recording.pose_convention=vehicle_T_world",
+    "yx": "--set recording.pose_convention=swapped_xy",
+    "axes": "--set recording.axis_order=yxz",
     "late": "--set recording.time_offset_s=0.10",
-    "held": "--set recording.poses=held",
+    "held": "--set recording.interpolate_poses=true",
 }
 
 
@@ -140,7 +141,7 @@ def test_what_would_mend_a_fault_is_named_and_mends_it(fault):
     doubt = doubts(Yard(fault))
     assert MENDED[fault] in doubt
     name, value = MENDED[fault].removeprefix("--set recording.").split("=")
-    corrections = RecordingSettings(**{name: float(value) if name == "time_offset_s" else value})
+    corrections = RecordingSettings(**{name: parse_yaml(value)})
     mended = correct_recording(Yard(fault), corrections)
     assert corrections.command_line_options in (MENDED[fault], "--set recording.time_offset_s=0.1")
     assert not doubts(mended)

@@ -140,12 +140,12 @@ def test_times_of_points_in_no_unit_are_refused_with_the_setting(tmp_path, store
 
     path = bag(tmp_path / "a", MOUNTED + driven() + clouds(timed, 3))
     with pytest.raises(
-        BadFileError, match=r"lidar: .*'t'.* no unit of s, ms, us, ns .* --set recording\.point_times=UNIT \(s, ms"
+        BadFileError, match=r"lidar: .*'t'.* no unit of s, ms, us, ns .* --set recording\.point_time_unit=UNIT \(s, ms"
     ):
         RosBag(path)
-    assert RosBag(path, point_times="none").read_scan("lidar", 1).offsets_s is None
-    with pytest.raises(ValueError, match="point_times: one of s, ms, us, ns, turn, none is needed; got 'h'"):
-        RosBag(path, point_times="h")
+    assert RosBag(path, point_time_unit="none").read_scan("lidar", 1).offsets_s is None
+    with pytest.raises(ValueError, match="point_time_unit: one of s, ms, us, ns, scan_share, none is needed; got 'h'"):
+        RosBag(path, point_time_unit="h")
 
 
 def test_times_of_points_over_a_part_of_a_turn_are_said(tmp_path):

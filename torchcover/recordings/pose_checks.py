@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from torchcover.geometry import invert, transform_points
 from torchcover.geometry.rigid import Matrix
-from torchcover.recordings.corrected import correct_poses
+from torchcover.recordings.corrections import correct_poses
 from torchcover.recordings.in_vehicle import transform_to_vehicle
 from torchcover.recordings.recording import Recording
 from torchcover.recordings.settings import RecordingSettings
@@ -146,10 +146,10 @@ PARAMS = PoseCheckParams()
 LAGS_S = tuple(step * 0.025 for step in range(-12, 13))
 UNCORRECTED = RecordingSettings()
 CONVENTIONS = (
-    RecordingSettings(quaternions="xyzw"),
-    RecordingSettings(poses="inverse"),
-    RecordingSettings(poses="yx"),
-    RecordingSettings(axes="yxz"),
+    RecordingSettings(quaternion_order="xyzw"),
+    RecordingSettings(pose_convention="vehicle_T_world"),
+    RecordingSettings(pose_convention="swapped_xy"),
+    RecordingSettings(axis_order="yxz"),
 )
 
 
@@ -202,7 +202,7 @@ class ScanPair:
     def match(self, settings: RecordingSettings) -> float:
         """Return how well the scans match (0 to 1) if they are read with these settings."""
         motion = self.compute_motion(settings)
-        if settings.axes == "yxz":  # both clouds are mirrored, each in the frame of its sensor
+        if settings.axis_order == "yxz":  # both clouds are mirrored, each in the frame of its sensor
             swap = np.eye(4)[[1, 0, 2, 3]]
             mount = self.scans[0].vehicle_T_sensor
             mirror = swap if mount is None else mount @ swap @ invert(mount)
@@ -224,7 +224,7 @@ def check_frozen_poses(segments: Sequence[PoseSegment]) -> str | None:
         return None
     return (
         f"{repeated} of {steps} poses repeat the previous one while the vehicle drives: give a pose for each instant, "
-        "or have them interpolated (--set recording.poses=held)"
+        "or have them interpolated (--set recording.interpolate_poses=true)"
     )
 
 

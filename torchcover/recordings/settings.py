@@ -1,4 +1,4 @@
-"""How to read a recording that says too little of itself, or says it wrongly: `recording.yaml` and `--set`."""
+"""Settings for recordings with missing or wrong metadata: `recording.yaml` and `--set recording.KEY=VALUE`."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,7 +13,16 @@ SETTINGS_FILE = "recording.yaml"
 
 
 class Mount(BaseModel):
-    """Pose of a sensor in the vehicle frame, as `vehicle_T_sensor`; positive pitch turns the nose down."""
+    """Extrinsics of a sensor in the vehicle frame (x forward, y left, z up).
+
+    Args:
+        x_m: Position along x.
+        y_m: Position along y.
+        z_m: Height above the ground.
+        yaw_deg: Rotation about z; positive turns left.
+        pitch_deg: Rotation about y; positive lowers the nose.
+        roll_deg: Rotation about x.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
 
@@ -25,7 +34,7 @@ class Mount(BaseModel):
     roll_deg: float = 0.0
 
     def to_matrix(self) -> "Matrix":
-        """The (4, 4) transform."""
+        """Build the (4, 4) transform `vehicle_T_sensor`; angles that look like radians cause a warning."""
         from torchcover.geometry import build_transform, convert_euler_to_rotation  # `--help` needs no NumPy
         from torchcover.geometry.rigid import warn_about_radians
 
@@ -35,81 +44,94 @@ class Mount(BaseModel):
 
 
 class RecordingSettings(BaseModel):
-    """Settings of a recording; what is wrong about a recording is corrected only if a user asks for it.
+    """Settings of a recording; a fault of the recording is corrected only on request.
 
     Raises:
-        ValidationError: A value of a wrong type, or a time offset of more than a second.
+        ValidationError: A value has a wrong type, or the time offset exceeds one second.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
 
     format: str | None = Field(None, description="Format of the recording, if it is not recognized.")
     vehicle_frame: str | None = Field(
-        None, description="Of a bag: the frame of the vehicle. Not given: base_footprint, else base_link."
+        None, description="Frame of the vehicle in a bag. Default: base_footprint, else base_link."
     )
     mounts: dict[str, Mount] = Field(
-        {}, description="Of a bag: name of a sensor -> its pose on the vehicle, {x_m, y_m, z_m, yaw_deg, ...}."
+        {}, description="Extrinsics of the sensors of a bag by name: {x_m, y_m, z_m, yaw_deg, pitch_deg, roll_deg}."
     )
-    point_times: Literal["s", "ms", "us", "ns", "turn", "none"] | None = Field(
+    point_time_unit: Literal["s", "ms", "us", "ns", "scan_share", "none"] | None = Field(
         None,
-        description="Of a bag: unit of the times of points, or turn for shares of the scan period, or none to ignore "
-        "them. Not given: the unit that fits the time between scans.",
+        description="Unit of the point times of a bag; scan_share: shares of the scan period; none: ignore them. "
+        "Default: the unit that fits the time between scans.",
     )
-    units: Literal["m", "cm", "mm", "ft"] = Field("m", description="Unit of the coordinates of its clouds.")
-    axes: Literal["xyz", "yxz"] = Field("xyz", description="Order of the columns of its clouds.")
-    quaternions: Literal["wxyz", "xyzw"] = Field("wxyz", description="Order of the numbers of its rotations.")
-    poses: Literal["given", "inverse", "yx", "held"] = Field(
-        "given",
-        description="Its poses are world_T_vehicle (given), vehicle_T_world (inverse), have x and y exchanged (yx), or "
-        "are each repeated until the next one (held: they are interpolated).",
+    units: Literal["m", "cm", "mm", "ft"] = Field("m", description="Unit of the coordinates of the clouds.")
+    axis_order: Literal["xyz", "yxz"] = Field("xyz", description="Order of the columns of the clouds.")
+    quaternion_order: Literal["wxyz", "xyzw"] = Field("wxyz", description="Order of the numbers of quaternions.")
+    pose_convention: Literal["world_T_vehicle", "vehicle_T_world", "swapped_xy"] = Field(
+        "world_T_vehicle", description="Direction of the poses; swapped_xy: world_T_vehicle with x and y exchanged."
     )
-    time_offset_s: float = Field(0.0, description="Seconds by which its poses are late.")
+    interpolate_poses: bool = Field(
+        False, description="Interpolate between poses that repeat the previous one, as from a slow localization."
+    )
+    time_offset_s: float = Field(0.0, description="Delay of the poses in seconds.")
     window_s: Annotated[float, Field(gt=0)] | None = Field(
-        None, description="Seconds over which `reference: accumulated` adds up the scans of all sensors (2)."
+        None, description="Accumulation window in seconds of `reference: accumulated`. Default: 2."
     )
 
     @field_validator("time_offset_s")
     @classmethod
-    def _check_lag(cls, lag_s: float) -> float:
+    def _check_time_offset(cls, time_offset_s: float) -> float:
         # The two nearest poses are extrapolated before the first and after the last, which a second allows.
-        if abs(lag_s) > 1.0:
-            raise ValueError(f"at most 1 s of time offset is corrected; got {lag_s:g}; correct the times instead")
-        return lag_s
+        if abs(time_offset_s) > 1.0:
+            raise ValueError(
+                f"at most 1 s of time offset is corrected; got {time_offset_s:g}; correct the times instead"
+            )
+        return time_offset_s
 
     @property
     def corrections(self) -> dict[str, Any]:
-        """Name -> value of the settings that change points, poses or times."""
-        names = ("units", "axes", "quaternions", "poses", "time_offset_s")
-        return {
-            name: getattr(self, name) for name in names if getattr(self, name) != type(self).model_fields[name].default
-        }
+        """Name and value of the settings that change points, poses or times."""
+        names = ("units", "axis_order", "quaternion_order", "pose_convention", "interpolate_poses", "time_offset_s")
+        fields = type(self).model_fields
+        return {name: getattr(self, name) for name in names if getattr(self, name) != fields[name].default}
 
     @property
     def command_line_options(self) -> str:
         """The corrections as options of the command line; empty if there are none.
 
         Example:
-            >>> RecordingSettings(units="mm", time_offset_s=0.1).command_line_options
-            '--set recording.units=mm --set recording.time_offset_s=0.1'
+            >>> RecordingSettings(units="mm", interpolate_poses=True).command_line_options
+            '--set recording.units=mm --set recording.interpolate_poses=true'
         """
-        return " ".join(f"--set recording.{name}={value}" for name, value in self.corrections.items())
+        options = []
+        for name, value in self.corrections.items():
+            text = "true" if value is True else value
+            options.append(f"--set recording.{name}={text}")
+        return " ".join(options)
 
 
 def merge_recording_settings(recording: Path, settings: RecordingSettings | None = None) -> RecordingSettings:
-    """Merge `recording.yaml` in the folder of a recording with settings that a user gives, which win.
+    """Merge `recording.yaml` in the folder of a recording with settings of the caller, which take precedence.
+
+    Args:
+        recording: Folder or file of the recording.
+        settings: Settings of the caller; only values that were set explicitly count.
+
+    Returns:
+        The merged settings.
 
     Raises:
-        BadFileError: Not YAML, or a key or value that is no setting; the message names the file and the key.
+        BadFileError: The file is not YAML, or has an unknown key or a wrong value; the message names both.
     """
     from torchcover.files import guard_reader  # loads NumPy, which `--help` does without
 
     path = recording / SETTINGS_FILE
-    content = guard_reader("settings of a recording")(_read)(path) if path.is_file() else {}
-    given = {} if settings is None else settings.model_dump(exclude_unset=True)
-    return RecordingSettings.model_validate({**content, **given})
+    file_values = guard_reader("settings of a recording")(_read_settings)(path) if path.is_file() else {}
+    caller_values = {} if settings is None else settings.model_dump(exclude_unset=True)
+    return RecordingSettings.model_validate({**file_values, **caller_values})
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read_settings(path: Path) -> dict[str, Any]:
     from torchcover.files import parse_yaml, read_short_text
 
     content = parse_yaml(read_short_text(path))
@@ -123,7 +145,14 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def explain_validation_error(error: ValidationError) -> Iterator[str]:
-    """Yield a sentence for each mistake that pydantic found: the key, what is wrong, what arrived."""
+    """Explain each mistake that pydantic found in one sentence.
+
+    Args:
+        error: Error of a validated model.
+
+    Yields:
+        The key, the fault and the value of each mistake.
+    """
     for detail in error.errors(include_url=False):
         key = ".".join(str(part) for part in detail["loc"])
         if detail["type"] == "extra_forbidden":

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 from torchcover.files import RECORDING, allow_links, find_changed
-from torchcover.recordings.corrected import correct_recording
+from torchcover.recordings.corrections import correct_recording
 from torchcover.recordings.formats import argoverse2, nuscenes
 from torchcover.recordings.formats.argoverse2 import Argoverse2
 from torchcover.recordings.formats.carla import Carla
@@ -86,10 +86,10 @@ def _open_checked(path: Path, settings: RecordingSettings) -> Recording:
             continue
         if recording_format is RosBag:
             mounts = {sensor: mount.to_matrix() for sensor, mount in settings.mounts.items()}
-            return correct_recording(RosBag(path, settings.vehicle_frame, mounts, settings.point_times), settings)
-        if settings.vehicle_frame is not None or settings.mounts or settings.point_times is not None:
+            return correct_recording(RosBag(path, settings.vehicle_frame, mounts, settings.point_time_unit), settings)
+        if settings.vehicle_frame is not None or settings.mounts or settings.point_time_unit is not None:
             raise ValueError(
-                f"{path}: vehicle_frame, mounts and point_times are for bags; {name} has its own (a plain folder in "
+                f"{path}: vehicle_frame, mounts and point_time_unit are for bags; {name} has its own (a plain folder in "
                 "frames.yaml)"
             )
         return correct_recording(_checked(recording_format(path), written), settings)

@@ -191,7 +191,7 @@ TIME_FIELDS = ("t", "time", "timestamp", "time_stamp", "offset_time", "time_offs
 ROW_FIELDS = ("ring", "channel", "laser_number", "laser_id", "line")
 # Units of these times: nanoseconds in each. A turn is the share of the scan period from 0 to 1.
 UNITS_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
-TURN = "turn"
+TURN = "scan_share"
 # Settings for the times of points: a unit, or to leave them aside.
 POINT_TIMES = (*UNITS_NS, TURN, "none")
 
@@ -315,7 +315,7 @@ def choose_point_times(message: Any, period_s: float | None) -> tuple[PointTimes
     return None, (
         f"{span} where scans are {period_s:.3g} s apart, or are far from the stamp of the cloud: no unit of "
         f"{', '.join(UNITS_NS)} and no share of a turn fits; choose one by --set "
-        f"recording.point_times=UNIT ({', '.join(POINT_TIMES)})"
+        f"recording.point_time_unit=UNIT ({', '.join(POINT_TIMES)})"
     )
 
 

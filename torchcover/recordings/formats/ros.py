@@ -66,7 +66,7 @@ class RosBag(RecordingBase):
         vehicle_frame: The frame that is the vehicle's: x forward, y left, z up, on the ground. If not given it is
             `base_footprint`, or else `base_link`.
         mounts: Name of a sensor -> (4, 4) `vehicle_T_sensor`, where the bag does not say it, or something else.
-        point_times: What the times of points count: `s`, `ms`, `us`, `ns`, `turn` (shares of the scan period), or
+        point_time_unit: What the times of points count: `s`, `ms`, `us`, `ns`, `scan_share` (shares of the scan period), or
             `none` to leave them aside. If not given it is what fits the time between scans.
 
     Raises:
@@ -85,14 +85,14 @@ class RosBag(RecordingBase):
         path: str | os.PathLike[str],
         vehicle_frame: str | None = None,
         mounts: Mapping[str, Matrix] | None = None,
-        point_times: str | None = None,
+        point_time_unit: str | None = None,
     ) -> None:
         self.path = Path(path)
-        if point_times not in (None, *POINT_TIMES):
-            raise ValueError(f"point_times: one of {', '.join(POINT_TIMES)} is needed; got {point_times!r}")
+        if point_time_unit not in (None, *POINT_TIMES):
+            raise ValueError(f"point_time_unit: one of {', '.join(POINT_TIMES)} is needed; got {point_time_unit!r}")
         self.reader_options = {
             "vehicle_frame": vehicle_frame,
-            "point_times": point_times,
+            "point_time_unit": point_time_unit,
             "mounts": {name: np.asarray(of).tolist() for name, of in (mounts or {}).items()},
         }
         self._bag = Bag(self.path)
@@ -107,7 +107,7 @@ class RosBag(RecordingBase):
             self._poses = found[0] if found else None
             self._stamps_ns: dict[int, int] = {}
             self._pair_scans()
-            self._point_times = {sensor: self._choose_point_times(sensor, point_times) for sensor in self.sensors}
+            self._point_times = {sensor: self._choose_point_times(sensor, point_time_unit) for sensor in self.sensors}
             self._leave_out_ends()
             if vehicle_frame is None and {*VEHICLE_FRAMES} <= tree.frames:
                 self._warn(f"{self.vehicle_frame} is taken for the vehicle's frame, not {VEHICLE_FRAMES[1]}")
@@ -240,12 +240,12 @@ class RosBag(RecordingBase):
         self._warn(f"clouds of {sensor} have no stamps: they are taken as made when they were recorded")
         return logged_ns
 
-    def _choose_point_times(self, sensor: str, point_times: str | None) -> PointTimes:
+    def _choose_point_times(self, sensor: str, point_time_unit: str | None) -> PointTimes:
         """How the times of the points of a sensor are stored, by the scan in its middle."""
         logged_ns, stamped_ns = self._logged_ns[sensor], np.unique(self._stamped_ns[sensor])
         period_s = float(np.median(np.diff(stamped_ns))) * 1e-9 if len(stamped_ns) > 1 else None
-        if point_times is not None:
-            return PointTimes(point_times, period_s or PARAMS.default_period_s)
+        if point_time_unit is not None:
+            return PointTimes(point_time_unit, period_s or PARAMS.default_period_s)
         message = self._bag.read_message(self._topic(sensor), int(logged_ns[len(logged_ns) // 2]))
         try:
             chosen, note = choose_point_times(message, period_s)
@@ -254,7 +254,7 @@ class RosBag(RecordingBase):
         if chosen is None:
             raise ValueError(f"{sensor}: {note}")
         if note:
-            self._warn(f"{sensor}: {note}; choose another by --set recording.point_times=UNIT")
+            self._warn(f"{sensor}: {note}; choose another by --set recording.point_time_unit=UNIT")
         return chosen
 
     def _leave_out_ends(self) -> None:
