@@ -12,7 +12,7 @@ def slow_coverage():
     return _slow_coverage
 
 
-def _slow_coverage(grid, steps, thresholds=(0.4,), max_radius=math.inf):
+def _slow_coverage(grid, steps, thresholds_m=(0.4,), max_radius=math.inf):
     per_cell = defaultdict(list)  # cell -> for each step with points there, the distances of those points
     for sensor, reference in steps:
         in_step = defaultdict(list)
@@ -40,5 +40,5 @@ def _slow_coverage(grid, steps, thresholds=(0.4,), max_radius=math.inf):
 def _cell_of(grid, point):
     x, y, z = point
     bands = [h for h, (low, high) in enumerate(grid.heights.values()) if low <= z < high]
-    inside = grid.x[0] <= x < grid.x[1] and grid.y[0] <= y < grid.y[1] and bands
-    return (bands[0], int((y - grid.y[0]) // grid.cell), int((x - grid.x[0]) // grid.cell)) if inside else None
+    inside = grid.x_m[0] <= x < grid.x_m[1] and grid.y_m[0] <= y < grid.y_m[1] and bands
+    return (bands[0], int((y - grid.y_m[0]) // grid.cell_m), int((x - grid.x_m[0]) // grid.cell_m)) if inside else None

@@ -68,7 +68,7 @@ def test_steps_weigh_the_same_in_a_quantile():
 def test_quantiles_beyond_the_histogram_are_max_radius():
     grid = BevGrid(x_m=(0.0, 512.0), y_m=(0.0, 512.0), cell_m=512.0, heights={"all": (-1.0, 1.0)})
     steps = [(ORIGIN, points_at(1.0, 200.0, 300.0))]
-    assert quantile(steps, 0.9, grid, max_radius=250.0) == 250.0
+    assert quantile(steps, 0.9, grid, max_radius_m=250.0) == 250.0
     assert quantile(steps, 0.9, grid) == math.inf
     assert quantile([(NOTHING, points_at(0.5))], 0.5) == math.inf
 
@@ -103,7 +103,7 @@ def test_a_bad_moment_is_no_bad_point():
 def test_blind_steps_saturate_and_unprobed_ones_do_not_count():
     steps = [(ORIGIN, points_at(0.1)), (ORIGIN, NOTHING), (NOTHING, points_at(0.1))]
     assert quantile(steps, 1.0, kind=FrameQuantiles) == math.inf
-    assert quantile(steps, 1.0, kind=FrameQuantiles, max_radius=2.0) == 2.0
+    assert quantile(steps, 1.0, kind=FrameQuantiles, max_radius_m=2.0) == 2.0
     assert quantile(steps, 0.4, kind=FrameQuantiles) == pytest.approx(0.1, rel=0.13)
 
 
@@ -126,7 +126,7 @@ EVERY = (Maximum(), PooledMean(), Quantiles((0.5, 0.9)), FrameQuantiles((0.5,)))
 
 
 def in_regions(steps, first=0, **options):
-    metric = CoverageMetric(FOUR, blocks=8, aggregations=EVERY, regions=[NEAR, ALL], max_radius=9.0, **options)
+    metric = CoverageMetric(FOUR, num_blocks=8, aggregations=EVERY, regions=[NEAR, ALL], max_radius_m=9.0, **options)
     for index, (sensor, reference, weights) in enumerate(steps, first):
         metric.update(sensor, reference, weights=weights, block_index=index)
     return metric
@@ -134,14 +134,14 @@ def in_regions(steps, first=0, **options):
 
 def radii_in(region, sensor, reference, weights, band=BANDS["all"]):
     """Of the points of a region, with their weights."""
-    low, high = (torch.tensor([region.x[end], region.y[end], band[end]]) for end in (0, 1))
+    low, high = (torch.tensor([region.x_m[end], region.y_m[end], band[end]]) for end in (0, 1))
     inside = ((reference >= low) & (reference < high)).all(dim=1)
     return torch.cdist(reference[inside], sensor).amin(dim=1).numpy(), weights[inside].numpy()
 
 
 def test_the_number_of_a_region_is_what_the_aggregation_makes_of_all_its_points():
     steps = list(random_steps(40))
-    coverage = in_regions(steps, square_metres=True).compute()
+    coverage = in_regions(steps, has_area_weights=True).compute()
     for row, (region, band) in zip(coverage.summary(), product((NEAR, ALL), BANDS.values()), strict=True):
         each = [radii_in(region, *step, band) for step in steps]
         radii, m2 = (np.concatenate(parts) for parts in zip(*each, strict=True))
@@ -155,32 +155,32 @@ def test_the_number_of_a_region_is_what_the_aggregation_makes_of_all_its_points(
         half = radii[order][np.searchsorted(shares[order].cumsum(), 0.5 * len(steps))]
         assert found["radius_q0.5_m"] == pytest.approx(half, rel=0.13)
         means = [(own * weights).sum() / weights.sum() for own, weights in each]
-        assert found["radius_step_q0.5_m"] == pytest.approx(np.quantile(means, 0.5), rel=0.13)
+        assert found["radius_frame_q0.5_m"] == pytest.approx(np.quantile(means, 0.5), rel=0.13)
 
 
 def test_the_error_of_a_region_s_number_is_the_jackknife_over_its_blocks():
     steps = list(random_steps(16))
-    coverage = in_regions(steps, square_metres=True).compute()
+    coverage = in_regions(steps, has_area_weights=True).compute()
     numbers = coverage.summary()[-1].numbers
     whole = numbers["radius_q0.9_m"].value
     left_out = []
     for block in range(8):
         rest = [step for at, step in enumerate(steps) if at // 2 != block]
-        left_out.append(in_regions(rest, square_metres=True).compute().summary()[-1].numbers["radius_q0.9_m"].value)
+        left_out.append(in_regions(rest, has_area_weights=True).compute().summary()[-1].numbers["radius_q0.9_m"].value)
     pseudo = 8 * whole - 7 * np.array(left_out)
     assert numbers["radius_q0.9_m"].error == pytest.approx(pseudo.std(ddof=1) / 8**0.5, rel=1e-9)
-    few = in_regions(steps[:8], square_metres=True).compute().summary()[-1].numbers  # a block each, coarse or fine
+    few = in_regions(steps[:8], has_area_weights=True).compute().summary()[-1].numbers  # a block each, coarse or fine
     assert few["radius_pooled_m"].error == pytest.approx(few["radius_m"].error, rel=1e-9)
     assert math.isnan(numbers["radius_maximum_m"].error)
     assert all(math.isnan(number.error) for number in in_regions(steps[:7]).compute().summary()[0].numbers.values())
 
 
-@pytest.mark.parametrize("square_metres", [True, False])
-def test_parts_and_files_give_the_numbers_of_the_whole(tmp_path, square_metres):
+@pytest.mark.parametrize("has_area_weights", [True, False])
+def test_parts_and_files_give_the_numbers_of_the_whole(tmp_path, has_area_weights):
     steps = list(random_steps(64))
-    whole = in_regions(steps, square_metres=square_metres).compute()
+    whole = in_regions(steps, has_area_weights=has_area_weights).compute()
     one, other = (
-        in_regions(part, first, square_metres=square_metres) for part, first in ((steps[:5], 0), (steps[5:], 5))
+        in_regions(part, first, has_area_weights=has_area_weights) for part, first in ((steps[:5], 0), (steps[5:], 5))
     )
     one.merge_state(other)
     for row, expected in zip(one.compute().summary(), whole.summary(), strict=True):
@@ -196,7 +196,7 @@ def test_what_was_not_seen_or_not_asked_for_is_unknown():
     other = Region("other", (0.0, 2.0), (0.0, 2.0))
     for coverage, region in ((empty, NEAR), (in_regions(random_steps(9)).compute(), other)):
         numbers = coverage.summary([region])[0].numbers
-        assert numbers.keys() >= {"radius_maximum_m", "radius_pooled_m", "radius_q0.5_m", "radius_step_q0.5_m"}
+        assert numbers.keys() >= {"radius_maximum_m", "radius_pooled_m", "radius_q0.5_m", "radius_frame_q0.5_m"}
         assert all(
             not number.has_value and math.isnan(number.error) for key, number in numbers.items() if key not in MEANS
         )
@@ -205,7 +205,7 @@ def test_what_was_not_seen_or_not_asked_for_is_unknown():
 def test_any_number_of_a_result_has_an_estimate():
     def measured(shift):
         metric = CoverageMetric(
-            FOUR, aggregations=EVERY, regions=[NEAR], sensors=["a", "b"], square_metres=True, blocks=8, max_radius=9.0
+            FOUR, aggregations=EVERY, regions=[NEAR], sensor_names=["a", "b"], has_area_weights=True, num_blocks=8, max_radius_m=9.0
         )
         for world, (seen, reference, weights) in enumerate(random_steps(3)):
             metric.update({"a": seen[:2] + shift, "b": seen[2:]}, reference, weights=weights, block_index=world)
@@ -257,7 +257,7 @@ class Blind(Aggregation):
 
 def test_an_aggregation_of_ones_own_has_a_map_numbers_errors_and_a_place_in_every_table():
     steps = list(random_steps(16))
-    metric = CoverageMetric(FOUR, blocks=16, aggregations=[Blind()], regions=[NEAR])
+    metric = CoverageMetric(FOUR, num_blocks=16, aggregations=[Blind()], regions=[NEAR])
     for index, (sensor, reference, _) in enumerate(steps):
         metric.update(sensor, reference, block_index=index)
     found = metric.compute()
@@ -297,7 +297,7 @@ class Minimum(Aggregation):
 
 def test_what_is_known_of_means_only_is_told_of_means_only():
     metric = CoverageMetric(
-        FOUR, (), aggregations=[Blind()], regions=[NEAR], sensors=["a"], square_metres=True, max_radius=9.0
+        FOUR, (), aggregations=[Blind()], regions=[NEAR], sensor_names=["a"], has_area_weights=True, max_radius_m=9.0
     )
     for sensor, reference, weights in random_steps(4):
         metric.update({"a": sensor}, reference, weights=weights)
@@ -312,7 +312,7 @@ def test_what_is_known_of_means_only_is_told_of_means_only():
 
 def test_an_aggregation_of_ones_own_is_measured_merged_saved_and_loaded(tmp_path):
     grid = BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 1.0), cell_m=1.0, heights={"all": (-1.0, 1.0)})
-    one, other = (CoverageMetric(grid, aggregations=[Minimum()], blocks=8) for _ in range(2))
+    one, other = (CoverageMetric(grid, aggregations=[Minimum()], num_blocks=8) for _ in range(2))
     one.update(ORIGIN, points_at(0.5, 0.25))
     other.update(ORIGIN, points_at(0.75, 0.125), block_index=1)
     one.merge_state(other)
@@ -321,7 +321,7 @@ def test_an_aggregation_of_ones_own_is_measured_merged_saved_and_loaded(tmp_path
     assert layer.quantity.title == "smallest blind spot radius"
     assert layer.values.flatten().tolist() == pytest.approx([0.125, math.nan], nan_ok=True)
     with pytest.raises(ValueError, match="cannot merge metrics with different aggregations"):
-        one.merge_state(CoverageMetric(grid, blocks=8))
+        one.merge_state(CoverageMetric(grid, num_blocks=8))
 
 
 def test_aggregations_have_names_of_their_own():
@@ -346,7 +346,7 @@ def test_each_of_the_package_has_a_name_that_makes_it():
 
 
 def test_the_numbers_of_a_search_make_its_aggregations():
-    assert Quantiles.from_keys({"radius_q0.9_m", "radius_q0_m", "radius_step_q0.5_m"}) == Quantiles((0.0, 0.9))
+    assert Quantiles.from_keys({"radius_q0.9_m", "radius_q0_m", "radius_frame_q0.5_m"}) == Quantiles((0.0, 0.9))
     assert FrameQuantiles.from_keys({"radius_q0.9_m", "radius_q2_m"}) is None
     assert Quantiles.from_keys({"radius_q2_m", "radius_q1.5_m", "radius_q_m", "radius_q0.9_m_without_roof"}) is None
 

@@ -14,7 +14,7 @@ REGION = Region("all", x_m=(0.0, 8.0), y_m=(0.0, 4.0))
 HEIGHTS = {"low": (0.0, 1.0), "high": (1.0, 2.0)}
 
 
-def grid(cell=1.0):
+def grid(cell_m=1.0):
     return BevGrid(x_m=(0.0, 8.0), y_m=(0.0, 4.0), cell_m=cell, heights=HEIGHTS)
 
 
@@ -32,8 +32,8 @@ def steps_of(count, seed=0, points=40):
     ]
 
 
-def metric_over(steps, index=None, cell=1.0, **options):
-    metric = CoverageMetric(grid(cell), (0.4, 0.8), square_metres=True, **options)
+def metric_over(steps, index=None, cell_m=1.0, **options):
+    metric = CoverageMetric(grid(cell), (0.4, 0.8), has_area_weights=True, **options)
     for number, (sensor, reference, m2) in zip(index or range(len(steps)), steps, strict=True):
         metric.update(sensor, reference, weights=m2, block_index=number)
     return metric
@@ -62,7 +62,7 @@ def test_it_is_the_ratio_of_sums_whatever_the_cells(cell):
 
 def test_what_is_left_out_is_what_a_run_without_the_block_gives():
     steps = steps_of(40)
-    coverage = metric_over(steps, blocks=16).compute()
+    coverage = metric_over(steps, num_blocks=16).compute()
     estimate = coverage.estimate(REGION, "low", "area")
     assert estimate.frame_counts.tolist() == [4] * 10
     for block in range(10):
@@ -82,8 +82,8 @@ def test_points_that_are_split_up_change_nothing():
 @pytest.mark.parametrize("blocks", [1, 8])
 def test_two_halves_merge_to_the_whole_and_a_file_gives_back_what_was_saved(tmp_path, blocks):
     steps = steps_of(20)
-    whole = metric_over(steps, blocks=blocks)
-    first, second = metric_over(steps[:7], blocks=blocks), metric_over(steps[7:], list(range(7, 20)), blocks=blocks)
+    whole = metric_over(steps, num_blocks=blocks)
+    first, second = metric_over(steps[:7], num_blocks=blocks), metric_over(steps[7:], list(range(7, 20)), num_blocks=blocks)
     first.merge_state(second)
     coverage = whole.compute()
     coverage.save(tmp_path / "coverage.npz")
@@ -106,7 +106,7 @@ ODD = (
 
 def of_odd(steps, index=None, regions=ODD):
     odd = BevGrid(x_m=(0.0, 8.0), y_m=(0.0, 6.4), cell_m=0.32, heights=HEIGHTS)
-    metric = CoverageMetric(odd, (0.4, 0.8), square_metres=True, blocks=8, regions=regions)
+    metric = CoverageMetric(odd, (0.4, 0.8), has_area_weights=True, num_blocks=8, regions=regions)
     for number, (sensor, reference, m2) in zip(index or range(len(steps)), steps, strict=True):
         metric.update(sensor, reference, weights=m2, block_index=number)
     return metric
@@ -119,8 +119,8 @@ def twin(steps, region, low, high):
         points = reference.double().numpy()
         radius = np.linalg.norm(points[:, None] - sensor.double().numpy(), axis=2).min(axis=1)
         x, y, z = points.T
-        inside = (z >= low) & (z < high) & (x >= region.x[0]) & (x < region.x[1])
-        inside &= (y >= region.y[0]) & (y < region.y[1])
+        inside = (z >= low) & (z < high) & (x >= region.x_m[0]) & (x < region.x_m[1])
+        inside &= (y >= region.y_m[0]) & (y < region.y_m[1])
         for (ax, ay), (bx, by) in zip(region.corners_m, region.corners_m[1:] + region.corners_m[:1], strict=True):
             inside &= (bx - ax) * (y - ay) > (by - ay) * (x - ax)
         weight = m2.double().numpy() * inside
@@ -177,11 +177,11 @@ def test_a_region_that_was_not_asked_for_is_made_from_whole_cells_or_refused(tmp
     ):
         with pytest.raises(ValueError, match=r"'later': no points were summed up over it, and cells of 0\.32 m"):
             loaded.estimate(other, "low")
-        assert loaded.estimate(other, "low", "known").value.isfinite().all()
+        assert loaded.estimate(other, "low", "cells").value.isfinite().all()
 
 
 def test_a_cell_has_the_ratio_of_its_own_sums():
-    coverage = metric_over(steps_of(30), cell=4.0).compute()
+    coverage = metric_over(steps_of(30), cell_m=4.0).compute()
     band = coverage.area_sums.sum_blocks()[0, 0]
     radius = coverage.layers["radius_area_m"].values[0]
     detection = coverage.layers["detection_area_0.8m"].values[0]
@@ -198,15 +198,15 @@ def test_no_square_metre_is_unknown_and_no_sensor_point_is_infinitely_far():
     assert value.tolist() == [math.inf, 0.0, 0.0]
 
 
-def test_it_needs_square_metres():
+def test_it_needs_has_area_weights():
     sensor, reference, _ = steps_of(1)[0]
     with pytest.raises(ValueError, match="weights: the square metres of each reference point are needed"):
-        CoverageMetric(grid(), square_metres=True).update(sensor, reference)
+        CoverageMetric(grid(), has_area_weights=True).update(sensor, reference)
     plain = CoverageMetric(grid())
     plain.update(sensor, reference)
     with pytest.raises(ValueError, match="no estimate by area: the reference points had no square metres"):
         plain.compute().estimate(REGION, "low", "area")
-    with pytest.raises(ValueError, match="different square_metres"):
+    with pytest.raises(ValueError, match="different has_area_weights"):
         metric_over(steps_of(1)).merge_state(CoverageMetric(grid(), (0.4, 0.8)))
 
 
@@ -226,7 +226,7 @@ def test_the_ray_budget_does_not_move_it():
 def simulated(region, reference_sensor, steps):
     """Height -> (value, error) of the radius and of the detection."""
     metric = CoverageMetric(
-        BevGrid(x_m=region.x, y_m=region.y, cell_m=0.5), max_radius=50.0, blocks=16, square_metres=True
+        BevGrid(x_m=region.x_m, y_m=region.y_m, cell_m=0.5), max_radius_m=50.0, num_blocks=16, has_area_weights=True
     )
     for frame in SimulatedFrames("courtyard", "front_roof_32", steps=steps, reference_sensor=reference_sensor):
         metric.update(frame.sensor, frame.reference, weights=frame.reference_weights, block_index=frame.index)

@@ -13,7 +13,7 @@ from torchcover.data import Frame
 from torchcover.evaluation import CoverageObserver
 from torchcover.simulation import Lidar
 
-EXTENT = {"x": (0.0, 40.0), "y": (0.0, 1.0), "cell": 1.0}
+EXTENT = {"x_m": (0.0, 40.0), "y_m": (0.0, 1.0), "cell_m": 1.0}
 GROUND, VEHICLE = (BevGrid(**EXTENT, band_frame=band_frame) for band_frame in ("ground", "vehicle"))
 # A ramp of 1 in 10 from x = 0 on: a point on it, and one that stands 1 m above it, in every cell.
 ALONG_M = torch.arange(40) + 0.5
@@ -44,7 +44,7 @@ def test_on_level_ground_both_are_the_same():
     points = REFERENCE * torch.tensor([1.0, 1.0, 0.0]) + torch.tensor([0.0, 0.0, 1.0]) * HEIGHT[:, None]
     both = []
     for grid, height in ((GROUND, HEIGHT), (VEHICLE, None)):
-        metric = CoverageMetric(grid, aggregations=(Maximum(),), sensors=("low", "high"))
+        metric = CoverageMetric(grid, aggregations=(Maximum(),), sensor_names=("low", "high"))
         metric.update({"low": ON_RAMP, "high": ABOVE}, points, heights_m=height)
         both.append(metric.compute())
     by_ground, by_z = both

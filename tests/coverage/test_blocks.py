@@ -13,7 +13,7 @@ from torchcover.coverage.blocks import BlockSums, ObservedCells
 from torchcover.estimation import compute_jackknife_error, estimate_ratio_errors
 
 # Cells so large that the sensor point below a reference point is always the nearest.
-SHAPE = {"x": (0.0, 400.0), "y": (0.0, 100.0), "cell": 100.0, "heights": {"all": (-1.0, 1.0)}}
+SHAPE = {"x_m": (0.0, 400.0), "y_m": (0.0, 100.0), "cell_m": 100.0, "heights": {"all": (-1.0, 1.0)}}
 GRID = BevGrid(**SHAPE)
 CELLS = GRID.num_cells
 THRESHOLD = 0.5
@@ -46,7 +46,7 @@ def random_steps(count: int, seed: int = 0, *, dyadic: bool = False, weighted: b
 
 
 def metric_over(steps, *, blocks=16, **options) -> CoverageMetric:
-    metric = CoverageMetric(GRID, (THRESHOLD,), blocks=blocks, **options)
+    metric = CoverageMetric(GRID, (THRESHOLD,), num_blocks=blocks, **options)
     for step in steps:
         metric.update(*step["clouds"], **step["more"])
     return metric
@@ -214,7 +214,7 @@ def test_the_error_of_a_difference_is_that_of_the_paired_values():
 @pytest.mark.parametrize("blocks", [0, 2, 6, 9, -8])
 def test_a_number_of_blocks_that_gives_no_error_to_believe_is_refused(blocks):
     with pytest.raises(ValueError, match=f"blocks: 1, or an even number from 8 on, is needed; got {blocks}"):
-        CoverageMetric(GRID, blocks=blocks)
+        CoverageMetric(GRID, num_blocks=blocks)
 
 
 # Which block a step is in
@@ -246,7 +246,7 @@ def test_interleaved_parts_merge_into_the_whole(parts):
 
 def test_a_run_goes_on_from_its_state_dict_as_if_it_had_never_stopped():
     steps = random_steps(70, dyadic=True)
-    resumed = CoverageMetric(GRID, (THRESHOLD,), blocks=16)
+    resumed = CoverageMetric(GRID, (THRESHOLD,), num_blocks=16)
     stopped = metric_over(steps[:23])
     stopped.persistent(True)
     resumed.load_state_dict(stopped.state_dict())
@@ -258,7 +258,7 @@ def test_a_run_goes_on_from_its_state_dict_as_if_it_had_never_stopped():
 @pytest.mark.parametrize("indexed", [True, False])
 def test_forward_fills_the_same_blocks_as_update(indexed):
     steps = random_steps(40, dyadic=True)
-    metric = CoverageMetric(GRID, (THRESHOLD,), blocks=16)
+    metric = CoverageMetric(GRID, (THRESHOLD,), num_blocks=16)
     for step in steps:
         metric(*step["clouds"], **(step["more"] if indexed else {}))
     assert_same_state(metric, metric_over(steps))
@@ -267,7 +267,7 @@ def test_forward_fills_the_same_blocks_as_update(indexed):
 @pytest.mark.parametrize("forward", [True, False])
 def test_steps_without_a_number_are_counted_on(forward):
     steps = random_steps(40, dyadic=True)
-    metric = CoverageMetric(GRID, (THRESHOLD,), blocks=16)
+    metric = CoverageMetric(GRID, (THRESHOLD,), num_blocks=16)
     for start in range(0, 40, 8):
         batch = [step["clouds"] for step in steps[start : start + 8]]
         (metric if forward else metric.update)([sensor for sensor, _ in batch], [cloud for _, cloud in batch])
@@ -296,7 +296,7 @@ def test_fine_blocks_are_worlds_as_long_as_there_is_room_and_parts_merge_to_them
 
     def over(some):
         metric = CoverageMetric(
-            grid, blocks=blocks, square_metres=True, regions=[Region("all", (0.0, 1.0), (0.0, 1.0))]
+            grid, num_blocks=blocks, has_area_weights=True, regions=[Region("all", (0.0, 1.0), (0.0, 1.0))]
         )
         for place in some:
             point = torch.tensor([[0.5, 0.5, 0.0]])
@@ -339,7 +339,7 @@ def test_a_step_far_ahead_makes_room_and_leaves_a_gap():
 )
 def test_numbers_of_steps_that_make_no_sense_are_refused(index, message):
     with pytest.raises(ValueError, match=message):
-        CoverageMetric(GRID, blocks=16).update(*clouds_of({0: [0.5]}), block_index=index)
+        CoverageMetric(GRID, num_blocks=16).update(*clouds_of({0: [0.5]}), block_index=index)
 
 
 # Weights

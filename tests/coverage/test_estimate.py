@@ -34,7 +34,7 @@ def metric_over(steps, index=None, **options):
 
 def test_what_is_left_out_is_what_a_run_without_the_block_gives():
     steps = steps_of(40)  # blocks of 4 steps, ten of them in use
-    coverage = metric_over(steps, blocks=16).compute()
+    coverage = metric_over(steps, num_blocks=16).compute()
     for height in GRID.heights:
         estimate = coverage.estimate(PART, height)
         assert estimate.frame_counts.tolist() == [4] * 10
@@ -48,7 +48,7 @@ def test_what_is_left_out_is_what_a_run_without_the_block_gives():
 def test_a_difference_is_that_of_its_parts_block_by_block():
     steps = steps_of(40)
     nearer = [(torch.cat([sensor, sensor + 0.2]), reference) for sensor, reference in steps]
-    one, other = (metric_over(run, blocks=16).compute().estimate(PART, "low") for run in (steps, nearer))
+    one, other = (metric_over(run, num_blocks=16).compute().estimate(PART, "low") for run in (steps, nearer))
     difference = other.subtract(one)
     torch.testing.assert_close(difference.value, other.value - one.value)
     assert (difference.error < one.error + other.error).all()
@@ -73,7 +73,7 @@ def test_nothing_known_is_unknown():
 
 
 def test_the_summary_has_the_numbers_with_their_errors():
-    coverage = metric_over(steps_of(64, points=6), blocks=16).compute()
+    coverage = metric_over(steps_of(64, points=6), num_blocks=16).compute()
     row, estimate = coverage.summary([PART])[0], coverage.estimate(PART, "low")
     assert list(row.numbers) == ["radius_m", "detection_0.4m", "detection_0.8m"]
     assert [number.value for number in row.numbers.values()] == estimate.value.tolist()
@@ -86,13 +86,13 @@ def test_no_such_band_is_said():
         metric_over(steps_of(2)).compute().estimate(PART, "middle")
 
 
-@pytest.mark.parametrize("measure", ["known", "area"])
+@pytest.mark.parametrize("measure", ["cells", "area"])
 def test_numbers_of_worlds_that_are_drawn_again_are_those_of_a_run_over_them(measure):
     random = np.random.default_rng(1)
     steps = [(sensor, reference, torch.from_numpy(random.uniform(0.1, 2, 12))) for sensor, reference in steps_of(10)]
 
     def over(numbers):
-        metric = CoverageMetric(GRID, (0.4, 0.8), blocks=16, square_metres=True)
+        metric = CoverageMetric(GRID, (0.4, 0.8), num_blocks=16, has_area_weights=True)
         for number in numbers:
             sensor, reference, m2 = steps[number]
             metric.update(sensor, reference, weights=m2, block_index=number)
@@ -107,9 +107,9 @@ def test_numbers_of_worlds_that_are_drawn_again_are_those_of_a_run_over_them(mea
     torch.testing.assert_close(whole[1:].resample(1 - torch.eye(10)), whole.jackknife_values[:, 1:])
 
 
-@pytest.mark.parametrize("measure", ["area", "known"])
+@pytest.mark.parametrize("measure", ["area", "cells"])
 def test_numbers_without_maps_are_those_of_the_result_to_the_last_bit(measure):
-    metric = CoverageMetric(GRID, (0.4, 0.8), blocks=16, square_metres=True)
+    metric = CoverageMetric(GRID, (0.4, 0.8), num_blocks=16, has_area_weights=True)
     for number, (sensor, reference) in enumerate(steps_of(40)):
         metric.update(sensor, reference, weights=reference[:, 0] + 0.1, block_index=number)
     places = [(PART, height) for height in GRID.heights]

@@ -20,7 +20,7 @@ def at(x=0.5, y=0.5, z=0.0, dtype=torch.float64):
 
 def index_of(grid, point):
     """(h, y, x) of the one point's cell, or None."""
-    cell = grid.cell_of(point).item()
+    cell = grid.find_cells(point).item()
     return None if cell < 0 else tuple(int(i) for i in np.unravel_index(cell, grid.shape))
 
 

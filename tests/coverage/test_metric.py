@@ -151,13 +151,13 @@ def test_a_step_in_which_the_rig_saw_nothing_is_blind_not_missing():
 
 
 def test_an_empty_sensor_cloud_gives_max_radius():
-    result = coverage([(NOTHING, points_at(0.5)), (ORIGIN, points_at(0.5))], max_radius=8.0)
+    result = coverage([(NOTHING, points_at(0.5)), (ORIGIN, points_at(0.5))], max_radius_m=8.0)
     assert result.radius.item() == 4.25
     assert result.max_radius_m == 8.0
 
 
 def test_a_blind_step_detects_nothing_even_at_a_threshold_of_max_radius():
-    result = coverage([(NOTHING, points_at(0.5)), (ORIGIN, points_at(0.4, 0.5))], ONE_CELL, (0.4,), max_radius=0.4)
+    result = coverage([(NOTHING, points_at(0.5)), (ORIGIN, points_at(0.4, 0.5))], ONE_CELL, (0.4,), max_radius_m=0.4)
     assert result.detection.item() == 0.25
     assert result.radius.item() == pytest.approx(0.4)
 
@@ -176,8 +176,8 @@ def test_everything_that_happened_is_counted():
         (ORIGIN, NOTHING),
         (ORIGIN, cloud([7, 7, 7])),
     ]
-    assert coverage(steps, ONE_CELL, (0.4,), max_radius=0.5).counts == {
-        "steps": 4,
+    assert coverage(steps, ONE_CELL, (0.4,), max_radius_m=0.5).counts == {
+        "num_frames": 4,
         "empty_sensor_frames": 1,
         "empty_reference_frames": 1,
         "saturated_points": 4,
@@ -187,10 +187,10 @@ def test_everything_that_happened_is_counted():
     }
 
 
-@pytest.mark.parametrize("max_radius", [0.5, 1e39, 1e300])
+@pytest.mark.parametrize("max_radius_m", [0.5, 1e39, 1e300])
 def test_max_radius_saturates_every_number(max_radius):
     steps = [(ORIGIN, points_at(0.25, 0.75))]
-    result = coverage(steps, ONE_CELL, (0.4,), max_radius=max_radius, **OPTIONS)
+    result = coverage(steps, ONE_CELL, (0.4,), max_radius_m=max_radius, **OPTIONS)
     assert map_of(result, "radius_maximum_m").item() == min(0.75, max_radius)
     assert result.radius.item() == map_of(result, "radius_pooled_m").item() == (0.25 + min(0.75, max_radius)) / 2
     assert map_of(result, "radius_q0.9_m").item() <= max_radius
@@ -199,7 +199,7 @@ def test_max_radius_saturates_every_number(max_radius):
 def test_a_search_bounded_by_the_threshold_detects_the_same_to_the_last_bit():
     """Whoever wants detection only may bound the search by the largest threshold."""
     steps = random_steps(11, steps=6)
-    whole, bounded = (coverage(steps, GRID, (0.25, 0.5), max_radius=limit) for limit in (math.inf, 0.5))
+    whole, bounded = (coverage(steps, GRID, (0.25, 0.5), max_radius_m=limit) for limit in (math.inf, 0.5))
     assert torch.equal(whole.detection.nan_to_num(-1), bounded.detection.nan_to_num(-1))
     assert (bounded.radius[bounded.observed_frames > 0] <= 0.5).all()
 
@@ -228,7 +228,7 @@ def test_random_clouds_give_what_plain_loops_give(slow_coverage, seed, dyadic, m
     thresholds = (0.5, 1.25, 2.0)
     expected = slow_coverage(GRID, steps, thresholds, max_radius)
     for backend in ("cdist", "kdtree"):
-        result = coverage(steps, GRID, thresholds, max_radius=max_radius, backend=backend, **OPTIONS)
+        result = coverage(steps, GRID, thresholds, max_radius_m=max_radius, backend=backend, **OPTIONS)
         for name, values in expected.items():
             np.testing.assert_allclose(map_of(result, name).numpy(), values, rtol=1e-12, err_msg=name)
 
@@ -261,7 +261,7 @@ def test_types_that_are_too_coarse_for_cells_or_thresholds_are_refused(dtype, ce
 def test_numbers_that_mean_something_else_than_they_seem_are_warned_of_once():
     grid = BevGrid(x_m=(0.0, 10.0), y_m=(0.0, 10.0), cell_m=1.0)
     ground = torch.rand(1200, 3) * torch.tensor([10.0, 10.0, 0.2])
-    in_lidar_frame, over_cells, right = (CoverageMetric(grid, max_radius=9.0) for _ in range(3))
+    in_lidar_frame, over_cells, right = (CoverageMetric(grid, max_radius_m=9.0) for _ in range(3))
     in_lidar_frame.update(ground, ground - torch.tensor([0.0, 0.0, 1.8]))
     with pytest.warns(UserWarning, match=r"reference: 1,200 of 1,200 points lie outside .* in the vehicle frame"):
         in_lidar_frame.compute()
@@ -290,7 +290,7 @@ def test_neither_the_order_of_points_nor_of_steps_matters(seed):
     steps = random_steps(seed)
     generator = torch.Generator().manual_seed(seed)
     shuffled = [[c[torch.randperm(len(c), generator=generator)] for c in step] for step in reversed(steps)]
-    options = {"max_radius": 3.0, "aggregations": EVERY_AGGREGATION}
+    options = {"max_radius_m": 3.0, "aggregations": EVERY_AGGREGATION}
     assert_same(coverage(steps, GRID, **options), coverage(shuffled, GRID, **options))
 
 
@@ -318,12 +318,12 @@ def test_more_sensor_points_never_make_it_worse(seed):
 def test_a_point_covers_from_a_threshold_as_large_as_its_error_on_whatever_else_is_asked():
     points, reference = torch.rand(2, 40, 3, generator=torch.Generator().manual_seed(2)).unbind()
     error = torch.linspace(-0.6, 0.6, 40)[torch.randperm(40, generator=torch.Generator().manual_seed(3))]
-    asked = {thresholds: CoverageMetric(ONE_CELL, thresholds, max_radius=9.0) for thresholds in SETS_OF_THRESHOLDS}
+    asked = {thresholds: CoverageMetric(ONE_CELL, thresholds, max_radius_m=9.0) for thresholds in SETS_OF_THRESHOLDS}
     for metric in asked.values():
         metric.update([points], [reference], errors_m=[error])
     found = {thresholds: metric.compute() for thresholds, metric in asked.items()}
     (radius,) = {float(one.radius) for one in found.values()}
-    assert radius == float(coverage([(points[error.abs() <= 0.4], reference)], max_radius=9.0).radius)
+    assert radius == float(coverage([(points[error.abs() <= 0.4], reference)], max_radius_m=9.0).radius)
     for threshold in (0.1, 0.25, 0.5):
         (known,) = {float(one.detection[given.index(threshold)]) for given, one in found.items() if threshold in given}
         near = torch.cdist(reference, points[error.abs() <= threshold]).amin(dim=1) <= threshold
@@ -334,14 +334,14 @@ def test_a_point_covers_from_a_threshold_as_large_as_its_error_on_whatever_else_
 def test_errors_are_those_of_all_sensors_one_after_the_other():
     points, reference = torch.rand(2, 40, 3, generator=torch.Generator().manual_seed(2)).unbind()
     error, far = torch.linspace(-0.6, 0.6, 40), torch.full((5,), math.inf)
-    by_name, plain = (CoverageMetric(ONE_CELL, (0.3,), max_radius=9.0, sensors=("a", "b")) for _ in range(2))
+    by_name, plain = (CoverageMetric(ONE_CELL, (0.3,), max_radius_m=9.0, sensor_names=("a", "b")) for _ in range(2))
     by_name.update({"b": points[:5], "a": points}, reference, errors_m=torch.cat([far, error]))
     plain.update({"a": points[error.abs() <= 0.3], "b": NOTHING}, reference)
     layers, expected = (metric.compute().redundancy.layers for metric in (by_name, plain))
     assert [key for key in layers if "radius" not in key and torch.equal(layers[key].values, expected[key].values)] == [
         key for key in layers if "radius" not in key
     ]
-    blind = CoverageMetric(ONE_CELL, (3.0,), max_radius=9.0)
+    blind = CoverageMetric(ONE_CELL, (3.0,), max_radius_m=9.0)
     blind.update(points, reference, errors_m=torch.full((40,), 0.5))
     assert int(blind.empty_sensor_frames) == 1
     assert (float(blind.compute().radius), float(blind.compute().detection)) == (9.0, 1.0)
@@ -383,16 +383,16 @@ def test_a_step_split_in_two_is_another_number():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"thresholds": (0.4, -0.1)}, r"thresholds: finite distances >= 0 in metres are needed; got \(0.4, -0.1\)"),
-        ({"thresholds": (math.nan,)}, "thresholds: finite distances >= 0"),
+        ({"thresholds_m": (0.4, -0.1)}, r"thresholds: finite distances >= 0 in metres are needed; got \(0.4, -0.1\)"),
+        ({"thresholds_m": (math.nan,)}, "thresholds: finite distances >= 0"),
         # Within it lies whatever a blind rig has not seen.
-        ({"thresholds": (0.4, math.inf)}, r"thresholds: finite distances .*got \(0.4, inf\)"),
-        ({"thresholds": (0.4, 0.5, 0.4)}, r"thresholds: each may be given once.*got \(0.4, 0.5, 0.4\)"),
-        ({"thresholds": (0.4, 0.40000004)}, "thresholds: each may be given once, to the six digits that name it"),
-        ({"thresholds": (0.4, 3.0), "max_radius": 2.0}, "thresholds: at most max_radius = 2.0 m"),
-        ({"max_radius": 0.0}, "max_radius: a positive distance in metres is needed; got 0.0"),
-        ({"max_radius": -1.0}, "max_radius: a positive distance"),
-        ({"max_radius": math.nan}, "max_radius: a positive distance"),
+        ({"thresholds_m": (0.4, math.inf)}, r"thresholds: finite distances .*got \(0.4, inf\)"),
+        ({"thresholds_m": (0.4, 0.5, 0.4)}, r"thresholds: each may be given once.*got \(0.4, 0.5, 0.4\)"),
+        ({"thresholds_m": (0.4, 0.40000004)}, "thresholds: each may be given once, to the six digits that name it"),
+        ({"thresholds_m": (0.4, 3.0), "max_radius_m": 2.0}, "thresholds: at most max_radius = 2.0 m"),
+        ({"max_radius_m": 0.0}, "max_radius: a positive distance in metres is needed; got 0.0"),
+        ({"max_radius_m": -1.0}, "max_radius: a positive distance"),
+        ({"max_radius_m": math.nan}, "max_radius: a positive distance"),
         ({"aggregations": [Maximum(), Maximum()]}, "aggregations: one of each kind.*got maximum, maximum"),
         ({"aggregations": [MeanOfMeans((0.4,))]}, "none of those that are built in; got mean"),
     ],
@@ -402,7 +402,7 @@ def test_parameters_that_make_no_sense_are_refused(options, message):
         CoverageMetric(ONE_CELL, **options)
 
 
-@pytest.mark.parametrize("thresholds", [0.4, "0.4", ("0.4",), {0.4: 1}])
+@pytest.mark.parametrize("thresholds_m", [0.4, "0.4", ("0.4",), {0.4: 1}])
 def test_what_is_no_sequence_of_thresholds_is_refused(thresholds):
     with pytest.raises(TypeError, match=r"thresholds: a sequence of metres, as in \(0.4,\), is needed; got"):
         CoverageMetric(ONE_CELL, thresholds)
@@ -422,14 +422,14 @@ def test_what_is_no_sequence_of_thresholds_is_refused(thresholds):
     ],
 )
 def test_a_number_of_a_step_that_is_none_is_refused(index, error, message):
-    metric = CoverageMetric(ONE_CELL, blocks=8)
+    metric = CoverageMetric(ONE_CELL, num_blocks=8)
     with pytest.raises(error, match=message):
         metric.update(ORIGIN, ORIGIN, block_index=index)
     assert int(metric.num_frames) == 0
 
 
 def test_the_largest_number_of_a_step_has_its_block():
-    metric = CoverageMetric(ONE_CELL, blocks=8)
+    metric = CoverageMetric(ONE_CELL, num_blocks=8)
     metric.update(ORIGIN, ORIGIN, block_index=np.int64(3))
     metric.update(ORIGIN, ORIGIN, block_index=10**15)
     assert metric.block_frame_counts.sum() == 2

@@ -14,7 +14,7 @@ from torchcover.coverage import CoverageNumberMetric, sums
 
 GRID = BevGrid(x_m=(0.0, 8.0), y_m=(-2.0, 2.0), cell_m=1.0, heights={"low": (-1.0, 0.5), "high": (0.5, 2.0)})
 NEAR, FAR = Region("near", (0.0, 4.0), (-2.0, 2.0)), Region("far", (4.0, 8.0), (-2.0, 2.0))
-OPTIONS = {"thresholds": (0.4, 1.0), "max_radius": 9.0}
+OPTIONS = {"thresholds_m": (0.4, 1.0), "max_radius_m": 9.0}
 # Named so that neither the order of names nor that of making is that of the directions.
 NUMBERS = {
     "d_far": ("detection_1m", FAR, "high"),
@@ -39,7 +39,7 @@ def scalar(coverage, name):
     return coverage.scalars([NEAR, FAR])[f"{quantity}/{region.name}/{height}"]
 
 
-@pytest.mark.parametrize("options", [{}, {"square_metres": True, "blocks": 8}])
+@pytest.mark.parametrize("options", [{}, {"has_area_weights": True, "num_blocks": 8}])
 def test_a_number_is_that_of_the_summary(options):
     whole, each = CoverageMetric(GRID, **OPTIONS, **options), numbers(**options)
     for seed in range(3):

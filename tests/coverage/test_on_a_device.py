@@ -96,7 +96,7 @@ def test_the_sums_stay_on_the_device():
     grid = BevGrid(x_m=(0.0, 20.0), y_m=(0.0, 20.0), cell_m=1.0, heights={"low": (0.0, 4.0), "high": (4.0, 20.0)})
     every = (Maximum(), PooledMean(), Quantiles((0.5, 0.9)), FrameQuantiles((0.9,)))
     # 8 blocks for 10 steps, so that some are added up in pairs.
-    options = {"max_radius": 30.0, "blocks": 8, "aggregations": every, "square_metres": True}
+    options = {"max_radius_m": 30.0, "num_blocks": 8, "aggregations": every, "has_area_weights": True}
     here, there = (CoverageMetric(grid, (0.4, 1.0), backend="cdist", **options) for _ in range(2))
     for sensor, reference, weights in each_step():
         here.update(sensor, reference, weights=weights)
@@ -121,7 +121,7 @@ def test_the_sums_stay_on_the_device():
 def test_a_gpu_adds_up_what_the_cpu_does():
     """But for the order in which float64 is added up, and the last bit of a distance."""
     grid = BevGrid(x_m=(0.0, 20.0), y_m=(0.0, 20.0), cell_m=1.0, heights={"low": (0.0, 4.0), "high": (4.0, 20.0)})
-    options = {"max_radius": 30.0, "blocks": 8, "aggregations": (Maximum(), PooledMean()), "square_metres": True}
+    options = {"max_radius_m": 30.0, "num_blocks": 8, "aggregations": (Maximum(), PooledMean()), "has_area_weights": True}
     metrics = [CoverageMetric(grid, (0.4, 1.0), **options).to(device) for device in ("cpu", "cuda")]
     for metric in metrics:
         for clouds in each_step():
@@ -169,7 +169,7 @@ def test_devices_without_float64_get_what_the_cpu_computes():
         ]  # fmt: skip
 
     def measure(sensor, reference, weights, boxes):
-        metric, recall = CoverageMetric(grid, max_radius=30.0, square_metres=True), RecallByVisibility()
+        metric, recall = CoverageMetric(grid, max_radius_m=30.0, has_area_weights=True), RecallByVisibility()
         for each in (metric, recall):
             each.to(reference.device)
         metric.update(sensor, reference, weights=weights)

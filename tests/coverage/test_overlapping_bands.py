@@ -14,7 +14,7 @@ def grid_of(heights):
 
 
 def measured(heights, **options):
-    metric = CoverageMetric(grid_of(heights), max_radius=3.0, blocks=8, aggregations=[Maximum()], **options)
+    metric = CoverageMetric(grid_of(heights), max_radius_m=3.0, num_blocks=8, aggregations=[Maximum()], **options)
     for index in range(12):
         generator = torch.Generator().manual_seed(index)
         sensor, reference = (torch.randn(count, 3, generator=generator) for count in (20, 200))
@@ -23,11 +23,11 @@ def measured(heights, **options):
 
 
 @pytest.mark.filterwarnings("ignore:reference. .* points lie outside the grid or in no height band:UserWarning")
-@pytest.mark.parametrize("square_metres", [False, True])
-def test_each_of_several_overlapping_bands_is_what_it_is_alone(square_metres):
-    together = measured(BANDS, square_metres=square_metres)
+@pytest.mark.parametrize("has_area_weights", [False, True])
+def test_each_of_several_overlapping_bands_is_what_it_is_alone(has_area_weights):
+    together = measured(BANDS, has_area_weights=has_area_weights)
     for number, (name, band) in enumerate(BANDS.items()):
-        alone = measured({name: band}, square_metres=square_metres)
+        alone = measured({name: band}, has_area_weights=has_area_weights)
         assert torch.equal(together.point_counts[number], alone.point_counts[0])
         for key, layer in alone.layers.items():
             torch.testing.assert_close(

@@ -11,8 +11,8 @@ SQUARE = BevGrid(x_m=(0.0, 10.0), y_m=(-5.0, 5.0), cell_m=1.0)
 NEAR = Region("near", (0.0, 5.0), (-5.0, 5.0))
 
 
-def measured(*, weighed=False, steps=(0, 1), radius=1.0, more=0, blocks=8):
-    metric = CoverageMetric(SQUARE, blocks=blocks, square_metres=weighed)
+def measured(*, weighed=False, steps=(0, 1), radius=1.0, more=0, num_blocks=8):
+    metric = CoverageMetric(SQUARE, num_blocks=blocks, has_area_weights=weighed)
     for at in steps:
         reference = torch.tensor([[0.5, 0.5, 0.0], [3.5, 0.5, 0.0], [3.6, 0.5, 0.0]])[: 2 + more]
         weights = {"weights": torch.ones(len(reference))} if weighed else {}
@@ -28,7 +28,7 @@ def measured(*, weighed=False, steps=(0, 1), radius=1.0, more=0, blocks=8):
         ({"more": -1}, "different reference points"),
         ({"steps": (0, 0)}, "different reference points"),
         ({"steps": (0, 1, 1)}, "different reference points"),
-        ({"blocks": 1}, "different reference points"),
+        ({"num_blocks": 1}, "different reference points"),
     ],
 )
 def test_only_what_was_measured_at_the_same_points_by_the_same_measure_is_compared(other, message):
@@ -49,7 +49,7 @@ def test_significant_is_what_a_paired_t_test_calls_so(shift, seed):
     radii = {"a": shared, "b": shared + shift + 0.2 * random.standard_normal(16)}
     coverages = {}
     for name, own in radii.items():
-        metric = CoverageMetric(SQUARE, blocks=16)
+        metric = CoverageMetric(SQUARE, num_blocks=16)
         for at, radius in enumerate(own.tolist()):
             metric.update(torch.tensor([[0.5, 0.5, -radius]]), torch.tensor([[0.5, 0.5, 0.0]]), block_index=at)
         coverages[name] = metric.compute()

@@ -32,7 +32,7 @@ def drawn(axes):
 
 def test_the_map_holds_the_layer_in_its_place_and_the_vehicle_is_at_the_origin():
     sensor = torch.tensor([[5.5, -0.5, 0.5]])
-    metric = metric_over(sensor, sensor + torch.tensor([[0.0, 0.0, 0.0], [2.0, 1.0, 0.0]]), max_radius=9.0)
+    metric = metric_over(sensor, sensor + torch.tensor([[0.0, 0.0, 0.0], [2.0, 1.0, 0.0]]), max_radius_m=9.0)
     _, axes = metric.plot(band="high", quantity_key="radius_m")
     corners = drawn(axes).get_coordinates()
     assert (corners[0, 0].tolist(), corners[-1, -1].tolist()) == ([5.0, -1.0], [8.0, 1.0])
@@ -48,8 +48,8 @@ def test_the_map_holds_the_layer_in_its_place_and_the_vehicle_is_at_the_origin()
     ("options", "title"),
     [
         ({}, "detection within 0.4 m, low, 1 steps (grey: unknown)"),
-        ({"thresholds": ()}, "mean blind spot radius, low, 1 steps (grey: unknown)"),
-        ({"square_metres": True}, "detection within 0.4 m, by area, low, 1 steps (grey: unknown)"),
+        ({"thresholds_m": ()}, "mean blind spot radius, low, 1 steps (grey: unknown)"),
+        ({"has_area_weights": True}, "detection within 0.4 m, by area, low, 1 steps (grey: unknown)"),
     ],
 )
 def test_detection_of_the_first_band_unless_something_else_is_asked_for(options, title):

@@ -14,7 +14,7 @@ REGIONS = [
     Region.from_corners("corner", [(-2.0, -1.0), (2.0, -1.0), (-2.0, 1.0)]),
 ]
 SENSORS = ("roof", "left", "rear")
-OPTIONS = {"thresholds": (0.3, 0.8), "max_radius": 3.0, "blocks": 8, "regions": REGIONS}
+OPTIONS = {"thresholds_m": (0.3, 0.8), "max_radius_m": 3.0, "num_blocks": 8, "regions": REGIONS}
 
 
 def steps(count=16, empty=()):
@@ -35,25 +35,25 @@ def measured(of_steps, *, without=None, by_sensor=True, **options):
     return metric.compute()
 
 
-@pytest.mark.parametrize("square_metres", [True, False])
-def test_with_all_sensors_it_is_the_rig(square_metres):
-    by_sensor, union = (measured(steps(), by_sensor=each, square_metres=square_metres).layers for each in (True, False))
+@pytest.mark.parametrize("has_area_weights", [True, False])
+def test_with_all_sensors_it_is_the_rig(has_area_weights):
+    by_sensor, union = (measured(steps(), by_sensor=each, has_area_weights=has_area_weights).layers for each in (True, False))
     assert by_sensor.keys() == union.keys()
     for key, layer in union.items():
         torch.testing.assert_close(by_sensor[key].values, layer.values, rtol=0, atol=0, equal_nan=True)
 
 
 @pytest.mark.parametrize("empty", [(), ("left",)])
-@pytest.mark.parametrize("square_metres", [True, False])
-def test_without_a_sensor_it_is_the_rig_of_the_others(square_metres, empty):
-    whole = measured(steps(empty=empty), square_metres=square_metres)
-    alone = measured(steps(empty=empty), by_sensor=False, square_metres=square_metres)
+@pytest.mark.parametrize("has_area_weights", [True, False])
+def test_without_a_sensor_it_is_the_rig_of_the_others(has_area_weights, empty):
+    whole = measured(steps(empty=empty), has_area_weights=has_area_weights)
+    alone = measured(steps(empty=empty), by_sensor=False, has_area_weights=has_area_weights)
     for sensor in SENSORS:
-        rest = measured(steps(empty=empty), without=sensor, by_sensor=False, square_metres=square_metres)
+        rest = measured(steps(empty=empty), without=sensor, by_sensor=False, has_area_weights=has_area_weights)
         for quantity in rest.quantities:
-            key = quantity.key.replace("_", "_area_", 1) if square_metres else quantity.key
+            key = quantity.key.replace("_", "_area_", 1) if has_area_weights else quantity.key
             found = whole.redundancy.layers[f"{quantity.key}_without_{sensor}"].values
-            exact = {"rtol": 0, "atol": 0} if square_metres and "detection" in key else {"rtol": 1e-13, "atol": 1e-15}
+            exact = {"rtol": 0, "atol": 0} if has_area_weights and "detection" in key else {"rtol": 1e-13, "atol": 1e-15}
             torch.testing.assert_close(found, rest.layers[key].values, equal_nan=True, **exact)
         for found, expected, full in zip(whole.summary(), rest.summary(), alone.summary(), strict=True):
             region = next(region for region in REGIONS if region.name == found.region)
@@ -63,7 +63,7 @@ def test_without_a_sensor_it_is_the_rig_of_the_others(square_metres, empty):
                 assert own.value == pytest.approx(number.value, rel=1e-13)
                 change = found.redundancy.failure_effects[sensor][key]
                 assert change.value == pytest.approx(number.value - full.numbers[key].value, rel=1e-9, abs=1e-13)
-                if square_metres:
+                if has_area_weights:
                     assert own.error == pytest.approx(number.error, rel=1e-9)
                     assert change.error == pytest.approx(compared[key].error, rel=1e-6, abs=1e-12)
                     assert change.is_significant == compared[key].is_significant
@@ -73,12 +73,12 @@ def test_without_a_sensor_it_is_the_rig_of_the_others(square_metres, empty):
 
 
 def test_how_many_sensors_see_a_point_is_counted():
-    whole = measured(steps(), square_metres=True)
+    whole = measured(steps(), has_area_weights=True)
     # The mean number is the sum of what each sees alone.
     alone = []
     for sensor in SENSORS:
         only = [({sensor: clouds[sensor]}, reference, weights) for clouds, reference, weights in steps()]
-        alone.append(measured(only, by_sensor=False, square_metres=True))
+        alone.append(measured(only, by_sensor=False, has_area_weights=True))
     number = sum(each.layers["detection_area_0.3m"].values for each in alone)
     torch.testing.assert_close(
         whole.redundancy.layers["sensors_0.3m"].values, number, rtol=1e-13, atol=0, equal_nan=True
@@ -96,21 +96,21 @@ def test_a_twin_makes_a_sensor_dispensable_and_the_only_one_is_indispensable():
         for clouds, reference, weights in steps():
             yield {"roof": clouds["roof"], "left": clouds["roof"], "rear": torch.empty(0, 3)}, reference, weights
 
-    for row in measured(twins(), square_metres=True).summary():
+    for row in measured(twins(), has_area_weights=True).summary():
         assert row.redundancy.most_critical_sensor is None
         assert {change.value for changes in row.redundancy.failure_effects.values() for change in changes.values()} == {
             0.0
         }
         assert row.redundancy.detecting_sensors["seen_by_two_0.3m"].value == row.numbers["detection_0.3m"].value
-    for row in measured(steps(empty=("left", "rear")), square_metres=True).summary():
+    for row in measured(steps(empty=("left", "rear")), has_area_weights=True).summary():
         assert row.redundancy.most_critical_sensor == "roof"
         assert row.redundancy.failure_numbers["roof"]["radius_m"].value == 3.0
         assert row.redundancy.failure_numbers["roof"]["detection_0.8m"].value == 0.0
 
 
-@pytest.mark.parametrize("square_metres", [True, False])
-def test_a_file_keeps_it(tmp_path, square_metres):
-    whole = measured(steps(), square_metres=square_metres)
+@pytest.mark.parametrize("has_area_weights", [True, False])
+def test_a_file_keeps_it(tmp_path, has_area_weights):
+    whole = measured(steps(), has_area_weights=has_area_weights)
     whole.save(tmp_path / "c.npz")
     loaded = Coverage.load(tmp_path / "c.npz")
     assert loaded.regions == tuple(REGIONS)
@@ -120,7 +120,7 @@ def test_a_file_keeps_it(tmp_path, square_metres):
 
 def test_a_region_that_the_metric_was_not_told_of_has_no_redundancy_by_area():
     other = Region("other", (0.0, 2.0), (-1.0, 1.0))
-    assert measured(steps(2), square_metres=True).summary([other])[0].redundancy is None
+    assert measured(steps(2), has_area_weights=True).summary([other])[0].redundancy is None
     assert measured(steps(2)).summary([other])[0].redundancy is not None
 
 

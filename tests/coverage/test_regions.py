@@ -45,10 +45,10 @@ def test_two_regions_side_by_side_share_no_cell():
 @pytest.mark.parametrize(
     ("bounds", "message"),
     [
-        ({"x": (0.0, 4.5), "y": (-2.0, 2.0)}, "spans x = 0 to 4.5 m, beyond the grid's -4 to 4 m; enlarge the grid"),
-        ({"x": (-5.0, 4.0), "y": (-2.0, 2.0)}, "spans x = -5 to 4 m, beyond"),
-        ({"x": (0.0, 4.0), "y": (-3.0, 2.0)}, "spans y = -3 to 2 m, beyond"),
-        ({"x": (0.0, 4.0), "y": (-2.0, 2.5)}, "spans y = -2 to 2.5 m, beyond"),
+        ({"x_m": (0.0, 4.5), "y_m": (-2.0, 2.0)}, "spans x = 0 to 4.5 m, beyond the grid's -4 to 4 m; enlarge the grid"),
+        ({"x_m": (-5.0, 4.0), "y_m": (-2.0, 2.0)}, "spans x = -5 to 4 m, beyond"),
+        ({"x_m": (0.0, 4.0), "y_m": (-3.0, 2.0)}, "spans y = -3 to 2 m, beyond"),
+        ({"x_m": (0.0, 4.0), "y_m": (-2.0, 2.5)}, "spans y = -2 to 2.5 m, beyond"),
     ],
 )
 def test_a_region_beyond_the_grid_is_refused(bounds, message):
@@ -60,7 +60,7 @@ def test_a_region_beyond_the_grid_is_refused(bounds, message):
 @pytest.mark.parametrize("axis", ["x", "y"])
 def test_bounds_without_inside_are_refused(axis, bounds):
     with pytest.raises(ValueError, match=f"region 'r': {axis} needs finite bounds, lower first; got"):
-        Region("r", **{"x": (0.0, 1.0), "y": (0.0, 1.0), axis: bounds})
+        Region("r", **{"x_m": (0.0, 1.0), "y_m": (0.0, 1.0), axis: bounds})
 
 
 def test_a_region_needs_a_name():

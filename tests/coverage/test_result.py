@@ -23,7 +23,7 @@ EVERY_AGGREGATION = (Maximum(), PooledMean(), Quantiles((0.5, 0.9)), FrameQuanti
 COUNTS = dict.fromkeys(Coverage.COUNTS, 3)
 
 
-def a_coverage(seed=0, thresholds=(0.4, 0.8), grid=GRID, frames=None):
+def a_coverage(seed=0, thresholds_m=(0.4, 0.8), grid=GRID, frames=None):
     random = torch.Generator().manual_seed(seed)
     if frames is None:
         frames = torch.randint(0, 3, grid.shape, generator=random)
@@ -56,7 +56,7 @@ def test_a_regions_number_is_the_unweighted_mean_over_its_known_cells(region):
             (y, x)
             for y, centre_y in enumerate(np.arange(-4.75, 5, 0.5))
             for x, centre_x in enumerate(np.arange(-0.75, 20, 0.5))
-            if region.x[0] <= centre_x < region.x[1] and region.y[0] <= centre_y < region.y[1]
+            if region.x_m[0] <= centre_x < region.x_m[1] and region.y_m[0] <= centre_y < region.y_m[1]
         ]
         known = [cell for cell in inside if result.observed_frames[(band, *cell)] > 0]
         assert 0 < len(known) < len(inside)
@@ -124,7 +124,7 @@ def test_scalars_are_the_summary_laid_flat():
 def test_a_table_has_the_scalars_and_errors_where_there_are_blocks(blocks, errors):
     random = torch.Generator().manual_seed(7)
     metric = CoverageMetric(
-        GRID, blocks=blocks, regions=[Region("a", GRID.x_m, GRID.y_m), Region("b", (0, 5), (-5, 5))]
+        GRID, num_blocks=blocks, regions=[Region("a", GRID.x_m, GRID.y_m), Region("b", (0, 5), (-5, 5))]
     )
     for _ in range(8):
         metric.update(torch.rand(9, 3, generator=random), 10 * torch.rand(60, 3, generator=random))
@@ -141,7 +141,7 @@ def test_a_table_has_the_scalars_and_errors_where_there_are_blocks(blocks, error
 def test_without_a_block_of_one_step_a_pooled_mean_is_that_of_the_others():
     grid = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=1.0, heights={"all": (-1.0, 1.0)})
     region, radii = Region("one", grid.x_m, grid.y_m), [3.0, 1.0, 4.0, 1.5, 9.0, 2.0, 6.0, 5.0]
-    metric = CoverageMetric(grid, aggregations=[PooledMean()], regions=[region], blocks=8)
+    metric = CoverageMetric(grid, aggregations=[PooledMean()], regions=[region], num_blocks=8)
     for at, radius in enumerate(radii):
         metric.update(torch.tensor([[0.5, 0.5, -radius]]), torch.tensor([[0.5, 0.5, 0.0]]), block_index=at)
     found = metric.compute().estimate_aggregated(region, "all")
@@ -169,7 +169,7 @@ def test_the_share_of_known_cells_is_in_the_repr():
 def assert_same(one, other):
     assert one.grid == other.grid
     assert list(one.grid.heights) == list(other.grid.heights)
-    for name in ("thresholds", "max_radius", "quantities", "counts"):
+    for name in ("thresholds_m", "max_radius_m", "quantities", "counts"):
         assert getattr(one, name) == getattr(other, name), name
     pairs = [(getattr(one, name), getattr(other, name)) for name in ("observed_frames", "points")]
     assert [layer.quantity for layer in one.layers.values()] == [layer.quantity for layer in other.layers.values()]
@@ -185,13 +185,13 @@ def assert_same(one, other):
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"thresholds": (), "max_radius": math.inf}, {"aggregations": EVERY_AGGREGATION, "blocks": 8}],
+    [{}, {"thresholds_m": (), "max_radius_m": math.inf}, {"aggregations": EVERY_AGGREGATION, "num_blocks": 8}],
 )
 @pytest.mark.parametrize("as_text", [False, True])
 def test_a_file_gives_back_what_was_saved(tmp_path, options, as_text):
     heights = {"high": (1.0, 2.0), "low": (-1.0, 0.1)}
     metric = CoverageMetric(
-        BevGrid(x_m=(-1, 1), y_m=(0, 0.3), cell_m=0.1, heights=heights), **{"max_radius": 2.5, **options}
+        BevGrid(x_m=(-1, 1), y_m=(0, 0.3), cell_m=0.1, heights=heights), **{"max_radius_m": 2.5, **options}
     )
     metric.update(torch.zeros(1, 3), torch.rand(50, 3, generator=torch.Generator().manual_seed(0)))
     result = metric.compute()
@@ -206,7 +206,7 @@ def test_a_loaded_result_has_its_errors_and_can_be_compared(tmp_path):
     random = torch.Generator().manual_seed(3)
     grid = BevGrid(x_m=(0.0, 4.0), y_m=(-2.0, 2.0), cell_m=1.0, heights={"all": (-1.0, 1.0)})
     region, found = Region("all", grid.x_m, grid.y_m), {}
-    metrics = {name: CoverageMetric(grid, blocks=16) for name in ("a", "b")}
+    metrics = {name: CoverageMetric(grid, num_blocks=16) for name in ("a", "b")}
     for _ in range(20):
         reference = torch.rand(40, 3, generator=random) * 4 - torch.tensor([0.0, 2.0, 0.0])
         for metric in metrics.values():
@@ -298,7 +298,7 @@ def rewrite(path, header=None, **arrays):
         {"header": lambda _: "no JSON"},
         {"header": lambda _: '{"format": 10}'},
         {"header": lambda old: json.dumps({name: value for name, value in old.items() if name != "counts"})},
-        {"header": lambda old: json.dumps({**old, "grid": {**old["grid"], "cell": 0.7}})},
+        {"header": lambda old: json.dumps({**old, "grid": {**old["grid"], "cell_m": 0.7}})},
     ],
 )
 def test_a_file_with_wrong_parts_is_refused(saved, change):
@@ -310,7 +310,7 @@ def test_a_file_with_wrong_parts_is_refused(saved, change):
 @pytest.fixture
 def saved_in_blocks(tmp_path):
     grid = BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 1.0), cell_m=0.5)
-    metric = CoverageMetric(grid, blocks=8, max_radius=9.0, square_metres=True)
+    metric = CoverageMetric(grid, num_blocks=8, max_radius_m=9.0, has_area_weights=True)
     for _ in range(8):
         reference = torch.rand(20, 3)
         metric.update(reference[:3], reference, weights=torch.ones(20))
@@ -321,8 +321,8 @@ def saved_in_blocks(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"header": lambda old: json.dumps({**old, "blocks": 10**9})}, "the steps of 1000000000 blocks have shape"),
-        ({"header": lambda old: json.dumps({**old, "blocks": -8})}, "the steps of -8 blocks have shape"),
+        ({"header": lambda old: json.dumps({**old, "num_blocks": 10**9})}, "the steps of 1000000000 blocks have shape"),
+        ({"header": lambda old: json.dumps({**old, "num_blocks": -8})}, "the steps of -8 blocks have shape"),
         ({"cell": lambda old: old[1:]}, "observed_frames has shape"),
         ({"cell": lambda old: old[::-1]}, "cell: numbers of cells in ascending order, below 16, are needed"),
         ({"block_cell": lambda old: old.astype(np.int64) - 1000}, "block_cell: numbers of cells in ascending order"),
@@ -345,7 +345,7 @@ def test_blocks_that_do_not_fit_are_refused(saved_in_blocks, change, message):
 def test_blocks_in_which_nothing_is_listed_count_as_memory(saved_in_blocks, monkeypatch):
     """A million blocks are some kB in a file, and errors are made of all known cells in all blocks."""
     many = np.zeros(1_000_000, np.int64)
-    rewrite(saved_in_blocks, lambda old: json.dumps({**old, "blocks": len(many)}), block_steps=many, area_steps=many)
+    rewrite(saved_in_blocks, lambda old: json.dumps({**old, "num_blocks": len(many)}), block_steps=many, area_steps=many)
     monkeypatch.setenv("TORCHCOVER_MAX_FILE_GB", "0.1")
     with pytest.raises(BadFileError, match=r"coverage\.npz: reading it takes 0\.\d+ GB .* more than the 0\.1 GB"):
         Coverage.load(saved_in_blocks)
@@ -371,8 +371,8 @@ def test_another_format_is_refused_by_its_number(saved, number, then):
 def test_torch_loads_plain_objects_without_running_what_a_file_says():
     """As Lightning does with the hyperparameters of a checkpoint."""
     grid, region = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0)), Region("a", x_m=(0.0, 1.0), y_m=(0.0, 1.0))
-    options = {"blocks": 8, "square_metres": True, "sensors": ("a",), "aggregations": (Maximum(), PooledMean())}
-    metric = CoverageMetric(grid, max_radius=5.0, regions=[region], **options)
+    options = {"num_blocks": 8, "has_area_weights": True, "sensor_names": ("a",), "aggregations": (Maximum(), PooledMean())}
+    metric = CoverageMetric(grid, max_radius_m=5.0, regions=[region], **options)
     clouds = torch.rand(5, 3)
     for _ in range(9):
         metric.update({"a": clouds}, clouds, weights=torch.ones(5))

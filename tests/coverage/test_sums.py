@@ -33,7 +33,7 @@ def clouds(seed: int, points: int = 300) -> tuple[torch.Tensor, torch.Tensor]:
 @pytest.mark.parametrize("cell", [0.1, 0.001])
 def test_the_state_is_a_few_numbers_for_each_cell_that_a_step_has_touched(cell):
     grid = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=cell, heights={"all": (-1.0, 1.0)})
-    metric = CoverageMetric(grid, blocks=8)
+    metric = CoverageMetric(grid, num_blocks=8)
     for at in range(16):
         metric.update(*clouds(at), block_index=at)
     assert len(metric.cell_sums) <= min(8 * grid.num_cells, 16 * 300)
@@ -43,7 +43,7 @@ def test_the_state_is_a_few_numbers_for_each_cell_that_a_step_has_touched(cell):
 def test_when_rows_are_added_up_changes_no_bit_and_a_state_has_no_order():
     """Reading the state adds up what waits: after every step, or once."""
     grid = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=0.1, heights={"all": (-1.0, 1.0)})
-    every = [CoverageMetric(grid, blocks=8, aggregations=[Maximum(), PooledMean()]) for _ in range(3)]
+    every = [CoverageMetric(grid, num_blocks=8, aggregations=[Maximum(), PooledMean()]) for _ in range(3)]
     for at in range(40):
         for number, metric in enumerate(every):
             metric.update(*clouds(at, points=60), block_index=at)

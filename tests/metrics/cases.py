@@ -96,9 +96,9 @@ def flat(value: object, path: str = "") -> dict[str, object]:
 
 # Coverage.
 
-SHAPE = {"x": (-2.0, 2.0), "y": (-1.0, 1.0), "cell": 0.5}
+SHAPE = {"x_m": (-2.0, 2.0), "y_m": (-1.0, 1.0), "cell_m": 0.5}
 BANDS = {"low": (-2.0, 0.0), "high": (0.0, 2.0)}
-COVERAGE = {"grid": BevGrid(**SHAPE, heights=BANDS), "thresholds": (0.4, 0.8), "max_radius": 3.0}
+COVERAGE = {"grid": BevGrid(**SHAPE, heights=BANDS), "thresholds_m": (0.4, 0.8), "max_radius_m": 3.0}
 ALL = tuple(kind.parse(kind.example) for kind in AGGREGATIONS)
 
 
@@ -119,13 +119,13 @@ def coverage(steps: int, changes: Mapping[str, Step], **options: Any) -> Case:
         [coverage_step(index) for index in range(steps)],
         {"sensor": torch.zeros(1, 3), "reference": torch.empty(0, 3), "weights": torch.empty(0), "block_index": 0},
         {
-            "grid": {"grid": BevGrid(**{**SHAPE, "x": (-1.0, 3.0)}, heights=BANDS)},
+            "grid": {"grid": BevGrid(**{**SHAPE, "x_m": (-1.0, 3.0)}, heights=BANDS)},
             "grid, bands in another order": {"grid": BevGrid(**SHAPE, heights=dict(reversed(BANDS.items())))},
-            "thresholds": {"thresholds": (1.0, 0.8)},
-            "thresholds in another order": {"thresholds": (0.8, 0.4)},
-            "thresholds, one less": {"thresholds": (0.4,)},
-            "max_radius": {"max_radius": 4.0},
-            "blocks": {"blocks": 16},
+            "thresholds_m": {"thresholds_m": (1.0, 0.8)},
+            "thresholds_m in another order": {"thresholds_m": (0.8, 0.4)},
+            "thresholds_m, one less": {"thresholds_m": (0.4,)},
+            "max_radius_m": {"max_radius_m": 4.0},
+            "num_blocks": {"num_blocks": 16},
             **changes,
         },
     )
@@ -142,13 +142,13 @@ def by_sensor(steps: int) -> Case:
     whole = coverage(
         steps,
         {
-            "sensors in another order": {"sensors": ("rear", "roof")},
+            "sensors in another order": {"sensor_names": ("rear", "roof")},
             "regions": {"regions": regions[:1]},
-            "square_metres": {"square_metres": False},
+            "has_area_weights": {"has_area_weights": False},
         },
-        blocks=8,
-        square_metres=True,
-        sensors=("roof", "rear"),
+        num_blocks=8,
+        has_area_weights=True,
+        sensor_names=("roof", "rear"),
         regions=regions,
     )
     # Regions are within the other cases' grid only.
@@ -262,11 +262,11 @@ CASES = {
                 "aggregations": (*(one for one in ALL if not isinstance(one, FrameQuantiles)), FrameQuantiles((0.9,)))
             },
         },
-        blocks=8,
+        num_blocks=8,
         aggregations=ALL,
     ),
     "coverage, by sensor": by_sensor(24),
-    "coverage, by area": coverage(24, {"square_metres": {"square_metres": False}}, blocks=8, square_metres=True),
+    "coverage, by area": coverage(24, {"has_area_weights": {"has_area_weights": False}}, num_blocks=8, has_area_weights=True),
     "recall": Case(
         lambda **changed: RecallByVisibility(**{"score_thresholds": (0.0, 0.5), **changed}),
         [detection_step(seed) for seed in range(24)],
@@ -306,7 +306,7 @@ CASES = {
             "regions": {"regions": ()},
             "threshold_m": {"threshold_m": 0.2},
             "at_least": {"at_least": (1, 2)},
-            "square_metres": {"square_metres": False},
+            "has_area_weights": {"has_area_weights": False},
         },
     ),
     "point density": of_frames(

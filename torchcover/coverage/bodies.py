@@ -73,8 +73,8 @@ class TargetSums:
 
     def to_record(self) -> dict[str, Any]:
         """All but the tensors, for JSON."""
-        told = {name: getattr(self, name) for name in ("bodies", "hits", "threshold_m")}
-        extent = {"x": self.grid.x_m, "y": self.grid.y_m, "cell": self.grid.cell_m}
+        told = {name: getattr(self, name) for name in ("target_names", "detection_points", "threshold_m")}
+        extent = {"x_m": self.grid.x_m, "y_m": self.grid.y_m, "cell_m": self.grid.cell_m}
         return {**told, "regions": [asdict(region) for region in self.regions], "grid": extent}
 
     def _of(self, region: Region, body: str) -> Tensor:
@@ -95,8 +95,8 @@ class TargetMixture(NamedTuple):
         """As `TargetSums.summary`; places are those of all kinds together."""
         rows = []
         for place, *each in zip(self.region_targets, *(part.summarize() for _, part in self.parts), strict=True):
-            tried, free = (sum(getattr(row, name) for row in each) for name in ("cells", "observed_cells"))
+            tried, free = (sum(getattr(row, name) for row in each) for name in ("num_cells", "observed_cells"))
             numbers = self.estimate(*place).to_numbers(count=free, counted_items="free places")
             m2 = sum(weight * row.visible_m2 for (weight, _), row in zip(self.parts, each, strict=True))
-            rows.append(replace(each[0], cells=tried, observed_cells=free, numbers=numbers, visible_m2=m2))
+            rows.append(replace(each[0], num_cells=tried, observed_cells=free, numbers=numbers, visible_m2=m2))
         return rows

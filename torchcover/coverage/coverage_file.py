@@ -115,24 +115,24 @@ def _parts(header: dict[str, Any], arrays: Arrays) -> dict[str, Any]:
     )
     return {
         "grid": grid,
-        "thresholds": tuple(header["thresholds"]),
-        "max_radius": header["max_radius"],
-        "known": known,
+        "thresholds_m": tuple(header["thresholds"]),
+        "max_radius_m": header["max_radius"],
+        "observed_cells": known,
         "layers": layers,
         "counts": header["counts"],
-        "blocks": None if header["blocks"] == 1 else _read_listed(IN_BLOCKS, header, grid, arrays),
-        "area": _read_listed(OVER_AREA, header, grid, arrays) if header["square_metres"] else None,
+        "block_sums": None if header["blocks"] == 1 else _read_listed(IN_BLOCKS, header, grid, arrays),
+        "area_sums": _read_listed(OVER_AREA, header, grid, arrays) if header["square_metres"] else None,
         "regions": [_region(stored) for stored in header["regions"]],
-        "places": _places(header, grid, arrays) if header["by_area"] else None,
-        "aggregated": _aggregated(header, grid, arrays) if header["aggregated"] else None,
+        "region_sums": _places(header, grid, arrays) if header["by_area"] else None,
+        "aggregated_numbers": _aggregated(header, grid, arrays) if header["aggregated"] else None,
         "redundancy": None if header["sensors"] is None else _redundancy(header, known, arrays),
-        "bodies": None if header["bodies"] is None else _bodies(header["bodies"], arrays),
+        "target_sums": None if header["bodies"] is None else _bodies(header["bodies"], arrays),
     }
 
 
 def _bodies(stored: dict[str, Any], arrays: Arrays) -> TargetSums:
     grid = BevGrid(**stored.pop("grid"))
-    bodies, regions = tuple(stored.pop("bodies")), tuple(map(_region, stored.pop("regions")))
+    bodies, regions = tuple(stored.pop("target_names")), tuple(map(_region, stored.pop("regions")))
     steps, sums, cells = (torch.from_numpy(arrays[name]) for name in BODIES)
     shapes = (len(steps), len(bodies), len(regions), len(COLUMNS)), (len(bodies), *grid.shape[1:], 2)
     if (tuple(sums.shape), tuple(cells.shape)) != shapes:
@@ -200,7 +200,7 @@ def _short(at: NDArray[Any], end: int) -> NDArray[Any]:
 
 def _region(stored: Mapping[str, Any]) -> Region:
     corners = tuple((x, y) for x, y in stored["corners_m"])
-    return Region(stored["name"], tuple(stored["x"]), tuple(stored["y"]), corners, tuple(stored["bands"]))
+    return Region(stored["name"], tuple(stored["x_m"]), tuple(stored["y_m"]), corners, tuple(stored["bands"]))
 
 
 def _listed(blocks: BlockSums, names: Sequence[str]) -> Arrays:

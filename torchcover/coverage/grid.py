@@ -91,7 +91,7 @@ class BevGrid:
             raise ValueError(f"the grid has {math.prod(self.shape):,} cells, over {MAX_CELLS:,}: use larger cells")
         # Plain floats in copies: lists, whole numbers and a dict that its owner changes later make no difference.
         heights = {name: (float(low), float(high)) for name, (low, high) in self.heights.items()}
-        own = {"x": tuple(map(float, self.x_m)), "y": tuple(map(float, self.y_m)), "cell": float(self.cell_m)}
+        own = {"x_m": tuple(map(float, self.x_m)), "y_m": tuple(map(float, self.y_m)), "cell_m": float(self.cell_m)}
         for name, value in {**own, "heights": heights}.items():
             object.__setattr__(self, name, value)
 

@@ -53,7 +53,7 @@ class CoverageMetric(MergeableMetric, CoverageSums):
         Warns:
             UserWarning: Once, of square metres that the metric does not average over.
         """
-        given = {"weights": weights, "height": heights_m, "block_index": block_index, "error": errors_m}
+        given = {"weights": weights, "heights_m": heights_m, "block_index": block_index, "errors_m": errors_m}
         CoverageSums.update(self, sensor, reference, **given)  # type: ignore[arg-type]  # each of its own type
         self._is_updated = True
         if weights is not None and len(weights) and not self.has_area_weights:

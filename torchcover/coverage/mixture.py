@@ -10,7 +10,7 @@ from torchcover.coverage.result import Coverage
 from torchcover.coverage.summary import RegionSummary, summarize_redundancy
 from torchcover.estimation import Estimate
 
-SAME = ("band_frame", "grid", "thresholds", "max_radius", "measure", "regions")
+SAME = ("band_frame", "grid", "thresholds_m", "max_radius_m", "average", "regions")
 
 
 class CoverageMixture:

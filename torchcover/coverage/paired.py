@@ -16,7 +16,7 @@ EstimatorGetters: TypeAlias = tuple[Callable[[Coverage | CoverageMixture], Calla
 
 # What there is an estimate of, in each region and band, and in each region of each body.
 PARTS = attrgetter("estimate"), attrgetter("estimate_aggregated")
-OF_BODIES = (attrgetter("bodies.estimate"),)
+OF_BODIES = (attrgetter("target_sums.estimate"),)
 
 
 def check_paired(coverages: Mapping[str, Coverage]) -> None:
@@ -30,7 +30,7 @@ def check_paired(coverages: Mapping[str, Coverage]) -> None:
         raise ValueError(f"a comparison needs at least two rigs; got {', '.join(coverages) or 'none'}")
     (first, expected), *others = coverages.items()
     for name, coverage in others:
-        for what in ("band_frame", "grid", "thresholds", "max_radius"):
+        for what in ("band_frame", "grid", "thresholds_m", "max_radius_m"):
             if getattr(coverage, what) != getattr(expected, what):
                 raise ValueError(f"{first!r} and {name!r} cannot be compared: they differ in their {what}")
         if (coverage.target_sums and coverage.target_sums.region_targets) != (

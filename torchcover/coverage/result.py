@@ -66,7 +66,7 @@ class Coverage:
     """
 
     COUNTS: ClassVar[tuple[str, ...]] = (
-        "steps",
+        "num_frames",
         "empty_sensor_frames",
         "empty_reference_frames",
         "saturated_points",
@@ -143,7 +143,7 @@ class Coverage:
         """
         rows, errors = self._rows(regions), self.block_sums is not None
         return build_dataframe(
-            {"region": row.region, "height": row.band, **row.to_dict(include_errors=errors)} for row in rows
+            {"region": row.region, "band": row.band, **row.to_dict(include_errors=errors)} for row in rows
         )
 
     def to_xarray(self) -> "xarray.Dataset":
@@ -157,10 +157,10 @@ class Coverage:
         """
         maps = {key: layer.values for key, layer in self.layers.items()}
         maps |= {f"{key}_error": values for key, values in self.errors.items()}
-        maps |= {"points": self.point_counts, "observed_frames": self.observed_frames}
+        maps |= {"point_counts": self.point_counts, "observed_frames": self.observed_frames}
         of_cells = {"y_m": self.grid.y_centers_m.numpy(), "x_m": self.grid.x_centers_m.numpy()}
         arrays = {key: values.cpu().numpy() for key, values in maps.items()}
-        return build_xarray_dataset(arrays, {"height": list(self.grid.heights), **of_cells})
+        return build_xarray_dataset(arrays, {"band": list(self.grid.heights), **of_cells})
 
     @property
     def layers(self) -> Mapping[str, Layer]:

@@ -114,13 +114,13 @@ class CoverageSums(BlockedSums):
         thresholds_m, max_radius_m = tuple(float(threshold) for threshold in thresholds_m), float(max_radius_m)
         meaning = {
             "grid": grid,
-            "thresholds": thresholds_m,
-            "max_radius": max_radius_m,
-            "blocks": num_blocks,
+            "thresholds_m": thresholds_m,
+            "max_radius_m": max_radius_m,
+            "num_blocks": num_blocks,
             "aggregations": tuple(aggregations),
-            "square_metres": has_area_weights,
-            **({"sensors": tuple(sensor_names)} if sensor_names else {}),
-            **({} if needs_radii else {"radii": needs_radii}),
+            "has_area_weights": has_area_weights,
+            **({"sensor_names": tuple(sensor_names)} if sensor_names else {}),
+            **({} if needs_radii else {"needs_radii": needs_radii}),
             **({"regions": regions} if has_area_weights or aggregations else {}),
         }
         super().__init__(num_blocks, meaning, **kwargs)
@@ -133,10 +133,10 @@ class CoverageSums(BlockedSums):
         self.aggregations: tuple[Aggregation, ...] = (*self._of_grid, *([self._failures] if self._failures else []))
         self._aggregated, self._columns = tuple(aggregations), SumColumns(self.aggregations)
         self._places = RegionBands(regions if has_area_weights or aggregations else (), grid)
-        shape: dict[str, Any] = {"columns": self._columns.num_columns, "maxima": self._columns.num_maxima}
-        self.define_sparse_sums("cells", grid.num_cells, **shape)
-        self.define_sparse_sums("places", self._places.num_region_bands, **shape, is_fine=True)
-        for name in Coverage.COUNTS[1:]:  # but for the steps
+        shape: dict[str, Any] = {"num_columns": self._columns.num_columns, "num_maxima": self._columns.num_maxima}
+        self.define_sparse_sums("cell_sums", grid.num_cells, **shape)
+        self.define_sparse_sums("region_sums", self._places.num_region_bands, **shape, is_fine=True)
+        for name in Coverage.COUNTS[1:]:  # the base counts the frames
             self.define_sum(name, (), torch.int64)
 
     def update(
@@ -175,7 +175,7 @@ class CoverageSums(BlockedSums):
                 heights, places in time or errors as `torchcover.coverage.steps.build_frame_inputs` refuses them.
             TypeError: A cloud is not a floating-point tensor, a place in time not a whole number.
         """
-        given = {"weights": weights, "height": heights_m, "block_index": block_index, "error": errors_m}
+        given = {"weights": weights, "heights_m": heights_m, "block_index": block_index, "errors_m": errors_m}
         for sums in self.compute_sums(sensor, reference, **given):
             self.add_sums(sums)
 
@@ -184,10 +184,10 @@ class CoverageSums(BlockedSums):
 
         It takes and refuses what `update` does.
         """
-        options = dict.fromkeys(("weights", "height", "block_index", "error")) | options
+        options = dict.fromkeys(("weights", "heights_m", "block_index", "errors_m")) | options
         sensor, reference, options = map_tensors((sensor, reference, options), ensure_float64)
-        parameters: dict[str, Any] = {name: getattr(self, name) for name in ("grid", "thresholds", "square_metres")}
-        parameters |= {"names": self.sensor_names, "first": int(self.num_frames)}
+        parameters: dict[str, Any] = {name: getattr(self, name) for name in ("grid", "thresholds_m", "has_area_weights")}
+        parameters |= {"sensor_names": self.sensor_names, "first_block_index": int(self.num_frames)}
         return list(map(self._sums_of, build_frame_inputs(sensor, reference, **options, **parameters)))
 
     @torch.no_grad()  # the sums would hold on to every step's graph
@@ -219,8 +219,8 @@ class CoverageSums(BlockedSums):
     def add_sums(self, sums: FrameSums) -> None:
         """Add a step that `sums_of` a metric of the same parameters has measured."""
         block, fine = self._block_of(sums.block_index), self._fine_block_of(sums.block_index)
-        self.add_to_sparse_sums("cells", block, sums.cell_columns)
-        self.add_to_sparse_sums("places", fine, sums.region_columns)
+        self.add_to_sparse_sums("cell_sums", block, sums.cell_columns)
+        self.add_to_sparse_sums("region_sums", fine, sums.region_columns)
         for name, count in sums.counts.items():
             getattr(self, name).add_(count)
         self._follow_steps()

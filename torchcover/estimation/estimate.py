@@ -130,7 +130,7 @@ class Estimate:
 
     def __post_init__(self) -> None:
         if self.effective_blocks is None:
-            object.__setattr__(self, "effective", torch.full_like(self.value, len(self.frame_counts)))
+            object.__setattr__(self, "effective_blocks", torch.full_like(self.value, len(self.frame_counts)))
 
     @classmethod
     def from_values(cls, quantities: Sequence[Quantity], value: Tensor) -> "Estimate":

@@ -60,7 +60,7 @@ def sum_rows(rows: Tensor, num_maxima: int = 0) -> Tensor:
     So many of the last columns as `num_maxima` says keep the largest instead.
 
     Example:
-        >>> sum_rows(torch.tensor([[7.0, 1.0, 3.0], [2.0, 5.0, 4.0], [7.0, 2.0, 9.0]]).double(), maxima=1).tolist()
+        >>> sum_rows(torch.tensor([[7.0, 1.0, 3.0], [2.0, 5.0, 4.0], [7.0, 2.0, 9.0]]).double(), num_maxima=1).tolist()
         [[2.0, 5.0, 4.0], [7.0, 3.0, 9.0]]
     """
     keys, of_row = torch.unique(rows[:, 0].long(), return_inverse=True)

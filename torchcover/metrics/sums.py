@@ -41,10 +41,10 @@ class MergeableSums:
         >>> class Points(MergeableSums):
         ...     def __init__(self, above_m: float) -> None:
         ...         super().__init__({"above_m": above_m})
-        ...         self.add_sum("points", (), torch.int64)
+        ...         self.define_sum("points", (), torch.int64)
         ...     def update(self, cloud):
-        ...         self.points += (cloud[:, 2] > self.meaning["above_m"]).sum()
-        ...         self.steps += 1
+        ...         self.points += (cloud[:, 2] > self.definition["above_m"]).sum()
+        ...         self.num_frames += 1
         ...     def compute(self):
         ...         return int(self.points)
         >>> low, high = Points(0.0), Points(1.0)

@@ -155,10 +155,10 @@ class FrameQuantiles(QuantileAggregation):
         ValueError: No level, or one outside [0, 1].
     """
 
-    name: ClassVar[str] = "step_quantiles"
-    description: ClassVar[str] = "quantiles over steps"
-    key_prefix: ClassVar[str] = "step_q"
-    title_prefix: ClassVar[str] = "quantile over steps of the mean"
+    name: ClassVar[str] = "frame_quantiles"
+    description: ClassVar[str] = "quantiles over frames"
+    key_prefix: ClassVar[str] = "frame_q"
+    title_prefix: ClassVar[str] = "quantile over frames of the mean"
 
     def create_states(self, num_cells: int) -> dict[str, SumState]:
         """`histogram` (bins, C): in how many steps the mean radius of the cell fell into each bin."""
