@@ -205,7 +205,13 @@ def test_what_was_not_seen_or_not_asked_for_is_unknown():
 def test_any_number_of_a_result_has_an_estimate():
     def measured(shift):
         metric = CoverageMetric(
-            FOUR, aggregations=EVERY, regions=[NEAR], sensor_names=["a", "b"], has_area_weights=True, num_blocks=8, max_radius_m=9.0
+            FOUR,
+            aggregations=EVERY,
+            regions=[NEAR],
+            sensor_names=["a", "b"],
+            has_area_weights=True,
+            num_blocks=8,
+            max_radius_m=9.0,
         )
         for world, (seen, reference, weights) in enumerate(random_steps(3)):
             metric.update({"a": seen[:2] + shift, "b": seen[2:]}, reference, weights=weights, block_index=world)

@@ -83,7 +83,10 @@ def test_points_that_are_split_up_change_nothing():
 def test_two_halves_merge_to_the_whole_and_a_file_gives_back_what_was_saved(tmp_path, blocks):
     steps = steps_of(20)
     whole = metric_over(steps, num_blocks=blocks)
-    first, second = metric_over(steps[:7], num_blocks=blocks), metric_over(steps[7:], list(range(7, 20)), num_blocks=blocks)
+    first, second = (
+        metric_over(steps[:7], num_blocks=blocks),
+        metric_over(steps[7:], list(range(7, 20)), num_blocks=blocks),
+    )
     first.merge_state(second)
     coverage = whole.compute()
     coverage.save(tmp_path / "coverage.npz")

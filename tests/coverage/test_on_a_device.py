@@ -121,7 +121,12 @@ def test_the_sums_stay_on_the_device():
 def test_a_gpu_adds_up_what_the_cpu_does():
     """But for the order in which float64 is added up, and the last bit of a distance."""
     grid = BevGrid(x_m=(0.0, 20.0), y_m=(0.0, 20.0), cell_m=1.0, heights={"low": (0.0, 4.0), "high": (4.0, 20.0)})
-    options = {"max_radius_m": 30.0, "num_blocks": 8, "aggregations": (Maximum(), PooledMean()), "has_area_weights": True}
+    options = {
+        "max_radius_m": 30.0,
+        "num_blocks": 8,
+        "aggregations": (Maximum(), PooledMean()),
+        "has_area_weights": True,
+    }
     metrics = [CoverageMetric(grid, (0.4, 1.0), **options).to(device) for device in ("cpu", "cuda")]
     for metric in metrics:
         for clouds in each_step():

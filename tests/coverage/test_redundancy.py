@@ -37,7 +37,9 @@ def measured(of_steps, *, without=None, by_sensor=True, **options):
 
 @pytest.mark.parametrize("has_area_weights", [True, False])
 def test_with_all_sensors_it_is_the_rig(has_area_weights):
-    by_sensor, union = (measured(steps(), by_sensor=each, has_area_weights=has_area_weights).layers for each in (True, False))
+    by_sensor, union = (
+        measured(steps(), by_sensor=each, has_area_weights=has_area_weights).layers for each in (True, False)
+    )
     assert by_sensor.keys() == union.keys()
     for key, layer in union.items():
         torch.testing.assert_close(by_sensor[key].values, layer.values, rtol=0, atol=0, equal_nan=True)
@@ -53,7 +55,9 @@ def test_without_a_sensor_it_is_the_rig_of_the_others(has_area_weights, empty):
         for quantity in rest.quantities:
             key = quantity.key.replace("_", "_area_", 1) if has_area_weights else quantity.key
             found = whole.redundancy.layers[f"{quantity.key}_without_{sensor}"].values
-            exact = {"rtol": 0, "atol": 0} if has_area_weights and "detection" in key else {"rtol": 1e-13, "atol": 1e-15}
+            exact = (
+                {"rtol": 0, "atol": 0} if has_area_weights and "detection" in key else {"rtol": 1e-13, "atol": 1e-15}
+            )
             torch.testing.assert_close(found, rest.layers[key].values, equal_nan=True, **exact)
         for found, expected, full in zip(whole.summary(), rest.summary(), alone.summary(), strict=True):
             region = next(region for region in REGIONS if region.name == found.region)

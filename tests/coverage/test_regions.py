@@ -45,7 +45,10 @@ def test_two_regions_side_by_side_share_no_cell():
 @pytest.mark.parametrize(
     ("bounds", "message"),
     [
-        ({"x_m": (0.0, 4.5), "y_m": (-2.0, 2.0)}, "spans x = 0 to 4.5 m, beyond the grid's -4 to 4 m; enlarge the grid"),
+        (
+            {"x_m": (0.0, 4.5), "y_m": (-2.0, 2.0)},
+            "spans x = 0 to 4.5 m, beyond the grid's -4 to 4 m; enlarge the grid",
+        ),
         ({"x_m": (-5.0, 4.0), "y_m": (-2.0, 2.0)}, "spans x = -5 to 4 m, beyond"),
         ({"x_m": (0.0, 4.0), "y_m": (-3.0, 2.0)}, "spans y = -3 to 2 m, beyond"),
         ({"x_m": (0.0, 4.0), "y_m": (-2.0, 2.5)}, "spans y = -2 to 2.5 m, beyond"),

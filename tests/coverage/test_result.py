@@ -345,7 +345,9 @@ def test_blocks_that_do_not_fit_are_refused(saved_in_blocks, change, message):
 def test_blocks_in_which_nothing_is_listed_count_as_memory(saved_in_blocks, monkeypatch):
     """A million blocks are some kB in a file, and errors are made of all known cells in all blocks."""
     many = np.zeros(1_000_000, np.int64)
-    rewrite(saved_in_blocks, lambda old: json.dumps({**old, "num_blocks": len(many)}), block_steps=many, area_steps=many)
+    rewrite(
+        saved_in_blocks, lambda old: json.dumps({**old, "num_blocks": len(many)}), block_steps=many, area_steps=many
+    )
     monkeypatch.setenv("TORCHCOVER_MAX_FILE_GB", "0.1")
     with pytest.raises(BadFileError, match=r"coverage\.npz: reading it takes 0\.\d+ GB .* more than the 0\.1 GB"):
         Coverage.load(saved_in_blocks)
@@ -371,7 +373,12 @@ def test_another_format_is_refused_by_its_number(saved, number, then):
 def test_torch_loads_plain_objects_without_running_what_a_file_says():
     """As Lightning does with the hyperparameters of a checkpoint."""
     grid, region = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0)), Region("a", x_m=(0.0, 1.0), y_m=(0.0, 1.0))
-    options = {"num_blocks": 8, "has_area_weights": True, "sensor_names": ("a",), "aggregations": (Maximum(), PooledMean())}
+    options = {
+        "num_blocks": 8,
+        "has_area_weights": True,
+        "sensor_names": ("a",),
+        "aggregations": (Maximum(), PooledMean()),
+    }
     metric = CoverageMetric(grid, max_radius_m=5.0, regions=[region], **options)
     clouds = torch.rand(5, 3)
     for _ in range(9):

@@ -266,7 +266,9 @@ CASES = {
         aggregations=ALL,
     ),
     "coverage, by sensor": by_sensor(24),
-    "coverage, by area": coverage(24, {"has_area_weights": {"has_area_weights": False}}, num_blocks=8, has_area_weights=True),
+    "coverage, by area": coverage(
+        24, {"has_area_weights": {"has_area_weights": False}}, num_blocks=8, has_area_weights=True
+    ),
     "recall": Case(
         lambda **changed: RecallByVisibility(**{"score_thresholds": (0.0, 0.5), **changed}),
         [detection_step(seed) for seed in range(24)],

@@ -19,7 +19,7 @@ from torchcover.simulation.shapes import Mesh
 
 # boxes: `Frame.boxes`. sensors: the rig's sensors, with mounts and rays. sensor_points: which points are of which
 # sensor.
-Need: TypeAlias = Literal["boxes", "sensors", "sensor_points"]
+Need: TypeAlias = Literal["boxes", "sensors", "sensor_point_counts"]
 
 GRID = BevGrid(x_m=(-40.0, 160.0), y_m=(-40.0, 40.0))
 # Of smaller cells most are empty whatever the rig.
@@ -53,7 +53,7 @@ class MetricSetup:
     @property
     def common_arguments(self) -> dict[str, Any]:
         """The arguments that metrics of what frames show have in common."""
-        return {"rig": self.rig_name, "sights": self.query_cache}
+        return {"rig_name": self.rig_name, "query_cache": self.query_cache}
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ PUBLISHED: Mapping[str, PublishedMetric] = {
             has_area_weights=setup.has_area_weights,
             **setup.common_arguments,
         ),
-        frozenset({"sensor_points"}),
+        frozenset({"sensor_point_counts"}),
         "share of the surface seen by 1, 2, 3 sensors",
     ),
     "point_density": PublishedMetric(_point_density, frozenset(), "points, for each square metre, and how evenly"),
@@ -115,7 +115,7 @@ PUBLISHED: Mapping[str, PublishedMetric] = {
     ),
     "s_mig_occluded": PublishedMetric(
         lambda setup: SMig(setup.sensors, ends_at_hits=True, **setup.common_arguments),
-        frozenset({"boxes", "sensors", "sensor_points"}),
+        frozenset({"boxes", "sensors", "sensor_point_counts"}),
         "the same, up to what the rays hit",
     ),
     "m_sog": PublishedMetric(
@@ -146,7 +146,7 @@ def parse_metric_names(names_or_text: str | Iterable[str]) -> tuple[str, ...]:
 REASONS: Mapping[Need, str] = {
     "boxes": "it needs boxes of objects, which simulations and labelled recordings have",
     "sensors": "it needs the rig's sensors, with mounts and rays: give the rig's YAML file or a built-in name",
-    "sensor_points": "which points are of which sensor is unknown",
+    "sensor_point_counts": "which points are of which sensor is unknown",
 }
 
 
@@ -206,7 +206,7 @@ def _find_missing_needs(task: Task[FrameSource]) -> frozenset[Need]:
     available: dict[Need, bool] = {
         "sensors": all(task.sensors.get(rig) for rig in task.rigs),
         "boxes": task.frames.has_boxes(),
-        "sensor_points": all(rig in task.frames.sensor_names for rig in task.rigs),
+        "sensor_point_counts": all(rig in task.frames.sensor_names for rig in task.rigs),
     }
     return frozenset(need for need, is_available in available.items() if not is_available)
 

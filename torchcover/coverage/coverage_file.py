@@ -25,7 +25,15 @@ from torchcover.coverage.redundancy import Redundancy, list_redundancy_quantitie
 from torchcover.coverage.region_sums import AggregatedNumbers, RegionSums
 from torchcover.coverage.regions import Region
 from torchcover.estimation import Quantity
-from torchcover.files import TooLargeError, check_dtype_kind, check_memory, parse_json, read_npz, guard_reader, write_npz
+from torchcover.files import (
+    TooLargeError,
+    check_dtype_kind,
+    check_memory,
+    parse_json,
+    read_npz,
+    guard_reader,
+    write_npz,
+)
 from torchcover.metrics.blocks import FINER
 
 if TYPE_CHECKING:

@@ -186,7 +186,9 @@ class CoverageSums(BlockedSums):
         """
         options = dict.fromkeys(("weights", "heights_m", "block_index", "errors_m")) | options
         sensor, reference, options = map_tensors((sensor, reference, options), ensure_float64)
-        parameters: dict[str, Any] = {name: getattr(self, name) for name in ("grid", "thresholds_m", "has_area_weights")}
+        parameters: dict[str, Any] = {
+            name: getattr(self, name) for name in ("grid", "thresholds_m", "has_area_weights")
+        }
         parameters |= {"sensor_names": self.sensor_names, "first_block_index": int(self.num_frames)}
         return list(map(self._sums_of, build_frame_inputs(sensor, reference, **options, **parameters)))
 

@@ -29,7 +29,7 @@ class Observer(Protocol[ResultT]):
     """Something that looks at frames, one after the other, and says something in the end.
 
     Over several processes or ranks each has an observer of its own over other frames; one merges the others. A run with
-    a checkpoint needs those that are `Stateful`, too. One that has `sums_of`, from a frame to what is to `add`, as
+    a checkpoint needs those that are `Stateful`, too. One that has `compute_sums`, from a frame to what is to `add`, as
     `CoverageObserver` has, measures frames where they are made.
 
     Example:
@@ -75,7 +75,7 @@ class CoverageObserver:
         self.rig = rig
 
     def update(self, frame: Frame) -> None:
-        """Add a frame: what is made of it by `sums_of`."""
+        """Add a frame: what is made of it by `compute_sums`."""
         self.add_sums(self.compute_sums(frame))
 
     def compute_sums(self, frame: Frame) -> list[FrameSums]:
@@ -92,14 +92,14 @@ class CoverageObserver:
         return self.metric.compute_sums(
             clouds(self.rig),
             frame.reference,
-            error=frame.get_errors_m(self.rig),
+            errors_m=frame.get_errors_m(self.rig),
             weights=frame.reference_weights,
-            height=frame.get_heights_m(self.metric.grid.band_frame),
+            heights_m=frame.get_heights_m(self.metric.grid.band_frame),
             block_index=frame.block_index,
         )
 
     def add_sums(self, sums: Sequence[FrameSums]) -> None:
-        """Add a frame that `sums_of` an observer of the same rig and parameters has measured."""
+        """Add a frame that `compute_sums` an observer of the same rig and parameters has measured."""
         for one in sums:
             self.metric.add_sums(one)
 

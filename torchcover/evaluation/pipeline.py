@@ -78,7 +78,7 @@ class MeasuredFrame(NamedTuple):
 class MeasuredFrames:
     """Frames that are measured where they are made, in this process or in a worker.
 
-    By observers with `sums_of`, but for coverage on another device; others are fed with the frame itself.
+    By observers with `compute_sums`, but for coverage on another device; others are fed with the frame itself.
     """
 
     def __init__(self, frames: Frames, observers: Sequence[AnyObserver], device: torch.device | str) -> None:
@@ -93,7 +93,7 @@ class MeasuredFrames:
 
     def __getitem__(self, index: int) -> MeasuredFrame:
         frame, start = self.frames[index], time.perf_counter()
-        sums = {number: observer.sums_of(frame) for number, observer in self._observers.items()}
+        sums = {number: observer.compute_sums(frame) for number, observer in self._observers.items()}
         measuring_s = 0.0 if get_worker_info() else time.perf_counter() - start
         return MeasuredFrame(frame if self._needs_frame else None, frame.counts, sums, measuring_s)
 
@@ -259,7 +259,7 @@ def _feed(seen: MeasuredFrame, observers: Sequence[AnyObserver], run: Run, devic
     frame = None if seen.frame is None else seen.frame.to(device)
     for number, observer in enumerate(observers):
         if number in seen.sums:
-            observer.add(seen.sums[number])  # type: ignore[attr-defined]  # who has `sums_of` has it
+            observer.add_sums(seen.sums[number])  # type: ignore[attr-defined]  # who has `compute_sums` has it
         elif frame is not None:
             observer.update(frame)
     run.measurement_s += seen.measurement_s + time.perf_counter() - start

@@ -252,7 +252,7 @@ def _record(target: TargetError, found: Sequence[ConvergenceStatus]) -> dict[str
     known = [steps for steps in needed if steps is not None]
     numbers = []
     for standing, steps in zip(found, needed, strict=True):
-        record = {name: value for name, value in asdict(standing).items() if name != "steps"}
+        record = {name: value for name, value in asdict(standing).items() if name != "num_frames"}
         numbers.append(to_json_record({**record, "reached": standing.is_reached, "frames_needed": steps}))
     return {
         **asdict(target),

@@ -120,7 +120,7 @@ class FrameSource(Protocol):
 
 
 def build_scene_lookup(frames: object) -> Callable[[int], int]:
-    """`FrameSource.world_of` of any map-style dataset or list of frames.
+    """`FrameSource.get_scene_id` of any map-style dataset or list of frames.
 
     A list holds what was made before; a torch `Subset` has the worlds of what it is of.
 
@@ -131,9 +131,9 @@ def build_scene_lookup(frames: object) -> Callable[[int], int]:
         >>> build_scene_lookup(["a frame", "another one"])(1)
         1
     """
-    if hasattr(frames, "world_of"):
-        known: Callable[[int], int] = frames.world_of
-        return known
+    if hasattr(frames, "get_scene_id"):
+        get_scene_id: Callable[[int], int] = frames.get_scene_id
+        return get_scene_id
     if isinstance(frames, Sequence):
         return int
     if hasattr(frames, "dataset") and hasattr(frames, "indices"):
@@ -141,7 +141,7 @@ def build_scene_lookup(frames: object) -> Callable[[int], int]:
         return lambda index: whole(indices[index])
     raise TypeError(
         f"frames: {type(frames).__name__} does not say which world a frame is of, so that each process would build "
-        "every world; give it world_of(index), see FrameSource, or use a single process"
+        "every world; give it get_scene_id(index), see FrameSource, or use a single process"
     )
 
 

@@ -299,7 +299,7 @@ def of_rigs(rigs: Mapping[str, Rig], scans: Mapping[str, Sequence[SensorScan]]) 
         name: {sensor.name: len(one.points) for sensor, one in zip(rigs[name].sensors, seen, strict=True)}
         for name, seen in scans.items()
     }
-    return {"clouds": clouds, "measured": measured, "sensor_points": points}
+    return {"clouds": clouds, "measurements": measured, "sensor_point_counts": points}
 
 
 def with_boxes(frame: Frame, boxes: Boxes, rigs: Mapping[str, Rig]) -> Frame:

@@ -178,7 +178,7 @@ class CoverageCallback(Callback):
         return coverage
 
     def _scalars(self, coverage: Coverage) -> dict[str, float]:
-        scalars = {**coverage.scalars(self.regions), "steps": float(coverage.counts["num_frames"])}
+        scalars = {**coverage.scalars(self.regions), "num_frames": float(coverage.counts["num_frames"])}
         return {f"{self._prefix}/{name}": value for name, value in scalars.items()}
 
     def _log_maps(self, trainer: Trainer, coverage: Coverage) -> None:
